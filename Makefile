@@ -34,11 +34,11 @@ help: ## show this list
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  make \1\t\2/p' Makefile | expand -t 20
 
 .PHONY: demo
-demo: $(STAMP)/demo ## fly sliding_masses, the paper's way and the fast way; see out/
+demo: $(STAMP)/demo ## fly sliding_masses, the paper's way, and the fast way by the nodes; see out/
 	@mkdir -p out
 	@rm -f out/sliding_masses_paper.mcap out/sliding_masses.mcap
 	$(BIN)/spacerobot run sliding_masses --method lie_bracket --bag out/sliding_masses_paper.mcap
-	$(BIN)/spacerobot run sliding_masses --bag out/sliding_masses.mcap
+	$(BIN)/spacerobot run sliding_masses --nodes --bag out/sliding_masses.mcap
 	$(BIN)/spacerobot report out/sliding_masses.mcap --beside out/sliding_masses_paper.mcap
 
 .PHONY: test
@@ -180,7 +180,7 @@ hand-goals: $(STAMP)/test ## plan HAND_GOALS random goals of end-effectors for e
 	PYTHONPATH=.:test nice $(BIN)/python3 test/planning/hand_goals.py --goals $(HAND_GOALS) --only "$(ONLY)"
 
 .PHONY: campaigns
-campaigns: $(STAMP)/test ## kill workers and campaigns, fly rows again through ROS: the slow tests of campaigns and flights
+campaigns: $(STAMP)/test ## kill workers and campaigns, fly rows again: the slow tests of campaigns and flights
 	$(BIN)/python3 -m pytest -m slow test/campaign test/flight
 
 .PHONY: bench

@@ -76,7 +76,6 @@ setup(
             "viewer/*.js",
             "report/*.mplstyle",
             "report/vendor/*",
-            "session/*.xml",
         ]
     },
     data_files=[

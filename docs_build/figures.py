@@ -13,6 +13,7 @@ import numpy as np
 from docs_build.singularities import singularity_figures
 from spacerobot_ros.control import ControlState, PoseReference
 from spacerobot_ros.control.controller import build_controller
+from spacerobot_ros.flight.trials import PlanningProblem, robot_state_of, try_method
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.rotations import (
     attitude_error,
@@ -23,7 +24,6 @@ from spacerobot_ros.planning import GaitSchedule, PlanRequest
 from spacerobot_ros.resources import robot_file
 from spacerobot_ros.scenario import load_scenario
 from spacerobot_ros.simulation.actuators import build_plant
-from spacerobot_ros.simulation.trials import PlanningProblem, robot_state_of, try_method
 
 FIGURES = Path(__file__).resolve().parents[1] / "docs" / "figures.json"
 
@@ -44,7 +44,7 @@ def figures() -> dict[str, str]:
 
 def _lie_bracket() -> dict[str, str]:
     """Paper 1's manoeuvre, planned and flown in the plant."""
-    trial = try_method(load_scenario("sliding_masses").problem(), "lie_bracket")
+    trial = try_method(PlanningProblem.of(load_scenario("sliding_masses")), "lie_bracket")
     schedule = trial.pieces[0]
     error = trial.error
     return {
@@ -62,7 +62,7 @@ def _lie_bracket() -> dict[str, str]:
 
 def _square_path() -> dict[str, str]:
     """Paper 3's manoeuvre."""
-    problem = load_scenario("planar_chain").problem()
+    problem = PlanningProblem.of(load_scenario("planar_chain"))
     notes = _planned(problem, "square_path").notes
     return {
         "square_path.turn_of_step_1": f"{notes['turn_of_step_1']:.6f}",
@@ -73,7 +73,7 @@ def _square_path() -> dict[str, str]:
 
 def _area_loop() -> dict[str, str]:
     """Paper 2's manoeuvre, cycle by cycle in the plant: what is left about each axis."""
-    problem = load_scenario("arm_attitude").problem()
+    problem = PlanningProblem.of(load_scenario("arm_attitude"))
     method, plant = problem.method("area_loop"), problem.plant()
     found, previous = {}, None
     for cycle in range(1, _CYCLES + 1):

@@ -1,7 +1,9 @@
 """The exceptions of this package: each has a message that a user can act on."""
 
+import traceback
 from collections.abc import Iterable
 from enum import Enum
+from pathlib import Path
 
 _MAX_MESSAGE_LENGTH = 2000
 
@@ -113,3 +115,11 @@ class RecordingError(SpaceRobotError):
 
 class CommandError(SpaceRobotError):
     """The plant refuses a command; the message states the reason."""
+
+
+def describe_exception(error: BaseException) -> str:
+    """Return type, text and source line of an unexpected exception."""
+    frames = traceback.extract_tb(error.__traceback__)
+    place = f" ({Path(frames[-1].filename).name}, line {frames[-1].lineno})" if frames else ""
+    text = " ".join(str(error).split()).rstrip(".")
+    return f"{type(error).__name__}{': ' if text else ''}{text}{place}"

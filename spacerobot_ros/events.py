@@ -252,6 +252,8 @@ class Event:
         The goal that the event is about; empty: none.
     about
         Further facts by name.
+    node
+        Name of the node that reports it; empty: it is not known.
     """
 
     kind: EventKind
@@ -260,6 +262,7 @@ class Event:
     time_s: float | None = None
     goal_id: str = ""
     about: Mapping[str, str] = field(default_factory=dict)
+    node: str = ""
 
     def to_values(self, wall_time_s: float | None) -> dict[str, str]:
         """Return the event as the key-value pairs of a DiagnosticStatus.

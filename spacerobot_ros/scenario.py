@@ -46,10 +46,8 @@ from spacerobot_ros.resources import (
     share_directory,
     suggestion,
 )
-from spacerobot_ros.simulation import InitialState
 from spacerobot_ros.simulation.config import PlantConfig
 from spacerobot_ros.simulation.faults import line_refusal, parse_times
-from spacerobot_ros.simulation.trials import PlanningProblem
 from spacerobot_ros.viewer.server import ViewerConfig
 
 CONFIGS: Mapping[str, type[Any]] = {
@@ -284,26 +282,6 @@ class Scenario:
             for name, goal in poses.items()
             for part, values in (("position", goal.position), ("orientation", goal.quaternion))
         }
-
-    def problem(self) -> PlanningProblem:
-        """Return the planning problem of the goal of the base.
-
-        Raises
-        ------
-        ParameterError
-            The scenario names no robot, or a parameter is refused.
-        GoalError
-            The shape of the goal is of another robot.
-        """
-        plant, planner = self.plant, self.planner
-        name = planner.robot or plant.robot
-        if not name:
-            raise ParameterError(f"The scenario '{self.name}' names no robot; see plant.robot.")
-        described = planner.described(plant.described(load_robot(robot_file(name))))
-        robot = SpaceRobot(described)
-        self.require_shape_of(robot)
-        goal = self.goal.for_robot(robot.description)
-        return PlanningProblem(self.name, robot, InitialState.of(plant), goal, planner)
 
     def require_shape_of(self, robot: SpaceRobot) -> None:
         """Refuse a goal whose joint positions are of another robot.

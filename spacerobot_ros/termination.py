@@ -238,14 +238,6 @@ def start_child(
     )
 
 
-def run_child(words: Sequence[str], **options: Any) -> subprocess.CompletedProcess[str]:
-    """Run Python with arguments ``words`` until it or this process ends; return its output."""
-    import subprocess
-
-    options = {"capture_output": True, "text": True, "check": False, **options}
-    return subprocess.run([sys.executable, *words], env=_child_environment(), **options)
-
-
 def _child_environment(environment: Mapping[str, str] | None = None) -> dict[str, str]:
     variables = os.environ if environment is None else environment
     return {**variables, _PARENT_VARIABLE: f"{os.getpid()}"}

@@ -446,7 +446,7 @@ _TOPIC_TABLE = (
         _STATUS_TYPE,
         ("plant", "planner", "coordinated_control", "recorder", "replay"),
         "one record for each change of state: `event` is its kind, `time` simulated, `wall_time` "
-        "since the epoch (not in a lockstep run in one process), both in s",
+        "since the epoch (not of flights without nodes), both in s",
     ),
     Topic(
         "heartbeat",

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import atexit
-import fcntl
 import gc
 import importlib.util
-import itertools
 import os
 import re
 import shutil
 import tempfile
 from collections.abc import Generator, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -45,12 +42,6 @@ lost_values.apply()
 # The same examples in every run, on every machine.
 settings.register_profile("repeatable", derandomize=True, deadline=None, max_examples=40)
 settings.load_profile("repeatable")
-
-_DOMAINS = 101
-"""Higher domains take ports that Linux hands out to others."""
-
-_turn = itertools.count(os.getpid())
-"""Two tests of one process do not follow each other in one domain."""
 
 
 def pytest_collection_finish() -> None:
@@ -127,28 +118,12 @@ def pytest_unconfigure() -> None:
     atexit.register(os.dup2, os.open(os.devnull, os.O_WRONLY), 2)
 
 
-@contextmanager
-def _free_domain() -> Iterator[int]:
-    """Hold a domain that no other test on this machine, of whatever process, is in."""
-    folder = Path(tempfile.gettempdir()) / f"spacerobot_ros_domains_{os.getuid()}"
-    folder.mkdir(exist_ok=True)
-    for _ in range(_DOMAINS):
-        domain = 1 + next(_turn) % _DOMAINS
-        with (folder / str(domain)).open("w") as lock:
-            try:
-                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                continue
-            # The lock goes with the file that is closed, and with a process that is killed.
-            yield domain
-            return
-    raise RuntimeError("every ROS domain from 1 to 101 is taken by another test")
-
-
 @pytest.fixture
 def ros_domain() -> Iterator[int]:
     """Return the number of a ROS domain that is this test's own."""
-    with _free_domain() as domain:
+    from spacerobot_ros.nodes.common.process import free_domain  # This import loads ROS.
+
+    with free_domain() as domain:
         yield domain
 
 

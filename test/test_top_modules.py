@@ -41,6 +41,7 @@ from spacerobot_ros.files import (
     write_output,
     write_whole,
 )
+from spacerobot_ros.flight.trials import PlanningProblem
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.parameters import (
     replaced,
@@ -585,7 +586,7 @@ def test_what_a_scenario_needs_is_said(tmp_path: Path) -> None:
     assert found.with_goal() is found
     bare = written(tmp_path, text_of(plant={"robot": ""}, planner={"ros__parameters": {}}))
     with pytest.raises(ParameterError) as refused:
-        bare.problem()
+        PlanningProblem.of(bare)
     assert str(refused.value) == "The scenario 'own' names no robot; see plant.robot."
     with pytest.raises(ParameterError) as refused:
         found.with_overrides("plant", {"tick_rat": 1}).config("plant")

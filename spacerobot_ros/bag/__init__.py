@@ -3,7 +3,7 @@
 from spacerobot_ros.bag.mcap_file import LATCHED, QosProfile
 from spacerobot_ros.bag.playback import Playback, ReplayMessage, ReplayTopic
 from spacerobot_ros.bag.reader import Bag, RecordedRobot, iterate_raw, read_bag
-from spacerobot_ros.bag.recording import Derived, FirstTime, Recording, RecordingState
+from spacerobot_ros.bag.recording import Recording, RecordingState
 from spacerobot_ros.bag.series import TopicSeries
 from spacerobot_ros.bag.writer import BagWriter, free_name
 from spacerobot_ros.errors import RecordingError
@@ -13,8 +13,6 @@ __all__ = [
     "LATCHED",
     "Bag",
     "BagWriter",
-    "Derived",
-    "FirstTime",
     "Playback",
     "QosProfile",
     "RecordedRobot",

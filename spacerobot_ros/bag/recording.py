@@ -4,17 +4,14 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import suppress
 from enum import Enum
 from typing import NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
-
 from spacerobot_ros.bag.writer import BagWriter
 from spacerobot_ros.errors import RecordingError, RobotDescriptionError
-from spacerobot_ros.times import HEADER_STAMP, LATEST_NS, SECOND
+from spacerobot_ros.times import SECOND
 
 
 class RecordingState(Enum):
@@ -46,39 +43,6 @@ _WAITING, _ON_CLOCK, _ON_WALL_TIME = (
     RecordingState.ON_WALL_TIME,
 )
 _DROPPING_STATES = (RecordingState.PAUSED, RecordingState.FAILED, RecordingState.CLOSED)
-
-
-class FirstTime(Enum):
-    """Meaning of the time with which the messages of a topic begin."""
-
-    NONE = 0
-    """The messages begin with something else than a time."""
-
-    STAMP = 1
-    """The time is the stamp of the header."""
-
-    CLOCK = 2
-    """The time is that of the clock; all later messages carry it."""
-
-
-_BATCH_SIZE = 1000
-"""Number of messages that are written together."""
-
-
-class Derived(NamedTuple):
-    """A message that is computed from those before it, and recorded after one of them."""
-
-    source_index: int
-    """Index of that message."""
-    channel: int
-    message: bytes
-    published_ns: int
-
-
-Derive = Callable[[NDArray[np.intp], Sequence[bytes], NDArray[np.int64]], Sequence[Derived]]
-"""Computes further messages from recorded ones, in their order.
-
-Arguments are the channel, the bytes and the first time (ns; 0: none) of each."""
 
 
 class _EarlyMessage(NamedTuple):
@@ -118,16 +82,10 @@ class Recording:
     ) -> None:
         self.writer = writer
         self.state = RecordingState.PAUSED
-        self.derive: Derive | None = None
-        """Computes messages from those that are written together, to be recorded among them."""
-        self._now_ns = 0
-        self._written = 0
-        self._batch: list[bytes] = []
-        """Messages on the clock that wait to be written together."""
-        self._batch_channels: list[int] = []
-        """Their channels: a list of pairs would keep the garbage collector busy."""
-        self._first_times: NDArray[np.int8] = np.zeros(0, np.int8)
-        """Values of :class:`FirstTime` by channel."""
+        self.now_ns = 0
+        """The latest time of the clock, or the arrival of the latest message, ns."""
+        self.messages = 0
+        """Number of messages written to the bag."""
         self.clock_steps_back = 0
         """How often the clock has gone back: once by a restart, again and again by two clocks."""
         self.lost: Counter[str] = Counter()
@@ -143,17 +101,6 @@ class Recording:
         self._early_messages: list[_EarlyMessage] = []
         self._time_base: RecordingState | None = None
         self._write = writer.write
-
-    @property
-    def now_ns(self) -> int:
-        """The latest time of the clock, or the arrival of the latest message, ns."""
-        self._write_batch()
-        return self._now_ns
-
-    @property
-    def messages(self) -> int:
-        """Number of messages written to the bag."""
-        return self._written + len(self._batch)
 
     @property
     def running(self) -> bool:
@@ -177,59 +124,23 @@ class Recording:
 
     def pause(self) -> None:
         """Pause recording until the next start."""
-        self._write_batch()
         if self.running:
             self.state = RecordingState.PAUSED
 
     def set_clock(self, time_ns: int) -> None:
         """Set the time of the clock; without effect once the bag uses wall time."""
-        self._write_batch()
         if self._time_base is _ON_WALL_TIME:
             return
-        self.clock_steps_back += time_ns < self._now_ns
-        self._now_ns = time_ns
+        self.clock_steps_back += time_ns < self.now_ns
+        self.now_ns = time_ns
         if self.state is _WAITING:
             self._choose_time_base(_ON_CLOCK)
-
-    def collector(
-        self, channel: int, first_time: FirstTime, take: Callable[[bytes], None]
-    ) -> Callable[[bytes], None]:
-        """Return a function that records messages of a topic, many together on the clock.
-
-        Parameters
-        ----------
-        channel
-            The topic's channel.
-        first_time
-            Meaning of the time with which the messages begin.
-        take
-            Records one message, when they are not written together.
-        """
-        if channel >= len(self._first_times):
-            self._first_times.resize(channel + 1, refcheck=False)
-        self._first_times[channel] = first_time.value
-        add_channel, add_message = self._batch_channels.append, self._batch.append
-
-        def collect(raw: bytes) -> None:
-            if self.state is not _ON_CLOCK:
-                take(raw)
-                return
-            add_channel(channel)
-            add_message(raw)
-
-        def collect_clock(raw: bytes) -> None:
-            if len(self._batch) >= _BATCH_SIZE:
-                self._write_batch()
-            collect(raw)
-
-        return collect_clock if first_time is FirstTime.CLOCK else collect
 
     def record(self, channel: int, message: bytes, published_ns: int = 0) -> None:
         """Write a message, or keep it until the time base of the bag is chosen.
 
         ``published_ns`` is its stamp; 0: the time at which it is recorded.
         """
-        self._write_batch()
         if self.state is not _ON_CLOCK:
             arrival_ns = self._wall_time()
             if not self.running:
@@ -243,50 +154,16 @@ class Recording:
                     _EarlyMessage(channel, message, published_ns, arrival_ns)
                 )
                 return
-            self._now_ns = arrival_ns
+            self.now_ns = arrival_ns
         try:
-            self._write(channel, message, self._now_ns, published_ns or self._now_ns)
+            self._write(channel, message, self.now_ns, published_ns or self.now_ns)
         except RecordingError as error:
             self._fail(error)
             return
-        self._written += 1
-
-    def _write_batch(self) -> None:
-        """Write the messages that wait, each as :meth:`set_clock` and :meth:`record` would."""
-        if not self._batch:
-            return
-        numbers, messages = self._batch_channels.copy(), self._batch.copy()
-        self._batch_channels.clear()
-        self._batch.clear()
-        channels = np.array(numbers)
-        kinds = self._first_times[channels]
-        times = _first_times(messages, kinds != FirstTime.NONE.value)
-        clock = np.where(kinds == FirstTime.CLOCK.value, np.arange(len(messages)), -1)
-        clock = np.maximum.accumulate(clock)
-        logged = np.where(clock >= 0, times[clock], self._now_ns)
-        self.clock_steps_back += int(np.sum(np.diff(logged, prepend=self._now_ns) < 0))
-        self._now_ns = int(logged[-1])
-        published = np.where(times == 0, logged, times)
-        if self.derive is not None:
-            derived = self.derive(channels, messages, times)
-            after = np.array([each.source_index for each in derived], np.intp)
-            for each in reversed(derived):
-                numbers.insert(each.source_index + 1, each.channel)
-                messages.insert(each.source_index + 1, each.message)
-            published = np.insert(published, after + 1, [each.published_ns for each in derived])
-            logged = np.insert(logged, after + 1, logged[after])
-        try:
-            for message in zip(numbers, messages, logged.tolist(), published.tolist(), strict=True):
-                self._write(*message)
-        except RecordingError as error:
-            self._written = self.writer.messages_written
-            self._fail(error)
-            return
-        self._written += len(messages)
+        self.messages += 1
 
     def flush(self, clock_is_published: bool) -> None:
         """Write data in memory to the file once per flush period of wall time."""
-        self._write_batch()
         if self._early_messages and not clock_is_published:
             waited_ns = self._wall_time() - self._early_messages[0].arrival_ns
             if waited_ns > self._clock_wait_ns:
@@ -295,7 +172,6 @@ class Recording:
 
     def check(self) -> None:
         """Check that the bag file still exists with its full size."""
-        self._write_batch()
         self._fail_on_error(self.writer.check)
 
     def describe(self, name: str, values: dict[str, str]) -> None:
@@ -329,7 +205,6 @@ class Recording:
         """
         if self.state is RecordingState.CLOSED:
             return
-        self._write_batch()
         self._choose_time_base(_ON_WALL_TIME)
         counts = {"messages": self.messages, "messages_lost": self.lost.total()}
         self.describe("recorder", {name: str(count) for name, count in counts.items()})
@@ -353,9 +228,9 @@ class Recording:
 
         def write_early_messages() -> None:
             for channel, message, published_ns, arrival_ns in early:
-                log_ns = self._now_ns if on_clock else arrival_ns
+                log_ns = self.now_ns if on_clock else arrival_ns
                 self._write(channel, message, log_ns, published_ns or log_ns)
-                self._written += 1
+                self.messages += 1
 
         self._fail_on_error(write_early_messages)
 
@@ -369,21 +244,3 @@ class Recording:
     def _fail(self, error: RecordingError) -> None:
         self.failure, self.state = error, RecordingState.FAILED
         self._on_failure(error)
-
-
-def _first_times(messages: Sequence[bytes], given: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Return the times (k,) at the beginning of messages, ns, as ``first_time_ns`` does; else 0.
-
-    ``given`` says which messages begin with a time.
-    """
-    places = np.flatnonzero(given).tolist()
-    size = HEADER_STAMP.stop - HEADER_STAMP.start
-    stamps = [messages[i][HEADER_STAMP] for i in places]
-    data = b"".join(stamps)
-    if len(data) != size * len(stamps):  # A message is cut.
-        data = b"".join(stamp.ljust(size, b"\0") for stamp in stamps)
-    pairs = np.frombuffer(data, np.dtype([("sec", "<i4"), ("nanosec", "<u4")]))
-    times = np.zeros(len(messages), np.int64)
-    found = pairs["sec"].astype(np.int64) * SECOND + pairs["nanosec"]
-    times[places] = np.clip(found, 0, LATEST_NS)
-    return times

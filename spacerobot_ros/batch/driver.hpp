@@ -4,8 +4,7 @@
 // native.py generates the declarations before this file: the first row of each name (namespace row),
 // sizes, enumerations, struct Job, and the rows of the arguments and results of CasADi's functions.
 // FLIGHT and REPORT step a tick; REPORT also gives the results of reports. MOMENTUMLESS is FLIGHT for
-// flights without angular momentum. CONTROL gives a controller's command and decision for a state,
-// PULSES the pulses of thrusters.
+// flights without angular momentum. CONTROL gives a controller's command and decision for a state.
 
 static bool any(V flags) {
   for (int lane = 0; lane < LANES; ++lane)
@@ -128,53 +127,6 @@ static void command(const Job &job, long long g, long long tick, V *group) {
       to[j] = measured[j] * -gain + (velocity + gain * wanted);
     }
   }
-}
-#endif
-
-#if THRUSTERS > 0
-// Allocate the pending impulse and that of the command; return whether lanes need Python for it.
-static bool allocate(const Job &job, V *group) {
-  bool waits = false;
-  for (int i = 0; i < 6; ++i) group[row::wanted + i] = group[row::command + JOINTS + i];
-  for (int lane = 0; lane < LANES; ++lane) {
-    double impulse[6], most[THRUSTERS], levels[THRUSTERS];
-    for (int i = 0; i < 6; ++i)
-      impulse[i] = group[row::pending_impulse + i].x[lane] +
-                   job.period * group[row::wanted + i].x[lane];
-    for (int j = 0; j < THRUSTERS; ++j)
-      most[j] = group[row::shortest + j].x[lane] + job.period - group[row::remaining + j].x[lane];
-    const bool beyond =
-        group[row::alive].x[lane] != 0.0 &&
-        !allocate_levels(job.thruster_matrix, job.thruster_weights, impulse, most, levels);
-    for (int j = 0; j < THRUSTERS; ++j)
-      group[row::levels + j].x[lane] = beyond ? 0.0 : levels[j];
-    group[row::unallocated].x[lane] = beyond;
-    waits = waits || beyond;
-  }
-  return waits;
-}
-
-// Fire the thrusters for a period; their wrench replaces that of the command.
-static void fire(const Job &job, V *group) {
-  call(PULSES, group, PULSES_ARGUMENTS, PULSES_RESULTS);
-  const V h(job.period);
-  V pending[6], wrench[6], flow(0.0);
-  for (int i = 0; i < 6; ++i) pending[i] = wrench[i] = V(0.0);
-  for (int j = 0; j < THRUSTERS; ++j) {
-    const V missing = group[row::levels + j] - group[row::added + j];
-    const V duty = group[row::on_time + j] / h;
-    for (int i = 0; i < 6; ++i) {
-      pending[i] += V(job.thruster_wrenches[j * 6 + i]) * missing;
-      wrench[i] += V(job.thruster_wrenches[j * 6 + i]) * duty;
-    }
-    flow += V(job.thruster_flow[j]) * duty;
-  }
-  for (int i = 0; i < 6; ++i) {
-    group[row::pending_impulse + i] = pending[i];
-    group[row::command + JOINTS + i] = wrench[i];
-  }
-  V &used = group[row::propellant];
-  assign_where(group[row::alive], used, used + h * flow);
 }
 #endif
 
@@ -303,20 +255,11 @@ extern "C" long long fly_until(const Job *job, long long until) {
     while (job->at[g] < until && any(group[row::alive])) {
       const long long tick = job->at[g];
 #ifdef CONTROL
-      if (job->pending[g] != pending::TICK && job->pending[g] != pending::FIRE &&
-          control(*job, g, tick, group)) {
+      if (job->pending[g] != pending::TICK && control(*job, g, tick, group)) {
         job->pending[g] = pending::TICK;
         ++waiting;
         break;
       }
-#if THRUSTERS > 0
-      if (job->pending[g] != pending::FIRE && allocate(*job, group)) {
-        job->pending[g] = pending::FIRE;
-        ++waiting;
-        break;
-      }
-      fire(*job, group);
-#endif
       job->pending[g] = pending::NOTHING;
       evaluate(group, true);
 #else

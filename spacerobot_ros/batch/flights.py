@@ -15,7 +15,6 @@ import numpy.typing as npt
 from spacerobot_ros.control.config import ControllerConfig
 from spacerobot_ros.control.goal_monitor import Decision
 from spacerobot_ros.control.laws.law import Gains
-from spacerobot_ros.control.thrusters import ThrusterTable
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
@@ -283,8 +282,6 @@ class Flights:
         Longest Runge-Kutta step, s; 0: by the actuation.
     report_ticks
         Ticks after which the state is reported, ascending; 0 is the start. Empty: the end alone.
-    thrusters
-        Thrusters that realise a controller's wrench in pulses; None: it acts as commanded.
 
     Raises
     ------
@@ -304,7 +301,6 @@ class Flights:
     sensors: SensorErrors | None = None
     integration_step: float = 0.0
     report_ticks: tuple[int, ...] = field(default=())
-    thrusters: ThrusterTable | None = None
 
     def __post_init__(self) -> None:
         count, robot = len(self), self.robot
@@ -338,8 +334,6 @@ class Flights:
 
     def _require_program(self) -> None:
         count, n = len(self), self.robot.n
-        if self.thrusters is not None and not isinstance(self.program, ControlledGoals):
-            raise ParameterError("Only the wrench of a controller can come from thrusters.")
         match self.program:
             case FollowedSchedule(positions=positions):
                 if self.actuation != "velocity":
@@ -371,11 +365,6 @@ class Flights:
         """Runge-Kutta steps in a tick."""
         step = self.integration_step or PLANTS[self.actuation].integration_step
         return count_steps(self.control_period, step)
-
-    @property
-    def thruster_count(self) -> int:
-        """Number of thrusters; 0: a controller's wrench acts as commanded."""
-        return 0 if self.thrusters is None else len(self.thrusters.names)
 
     def robot_of(self, index: int) -> SpaceRobot:
         """Return the robot of one flight."""
@@ -423,8 +412,6 @@ class BatchResult:
         (N, 2) largest force (N) and torque (N m) commanded on the base.
     impulse
         (N, 2) integrals of their norms over time, N s and N m s.
-    propellant
-        (N,) propellant used, kg; NaN without thrusters.
     limited_ticks
         (N, n) numbers of ticks in which each joint was limited, by the limit, as the plant counts.
     fallback_ticks
@@ -461,7 +448,6 @@ class BatchResult:
     peak_effort: Array
     peak_wrench: Array
     impulse: Array
-    propellant: Array
     limited_ticks: Mapping[str, Counts]
     fallback_ticks: Counts
     lowest: Array
@@ -497,7 +483,6 @@ class BatchResult:
             peak_effort=np.zeros((N, n)),
             peak_wrench=np.zeros((N, 2)),
             impulse=np.zeros((N, 2)),
-            propellant=np.full(N, np.nan if flights.thrusters is None else 0.0),
             limited_ticks={name: np.zeros((N, n), np.int64) for name in (first, "stroke")},
             fallback_ticks=np.zeros(N, np.int64),
             lowest=flights.initial_states.q.copy(),

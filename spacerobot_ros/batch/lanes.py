@@ -27,7 +27,6 @@ from spacerobot_ros.batch.scalar import fly_one_by_one, plant_of, pose_of_link
 from spacerobot_ros.control.goal_monitor import Decision, GoalMonitor
 from spacerobot_ros.control.reference import ReferenceProfile
 from spacerobot_ros.control.state import ControlState
-from spacerobot_ros.control.thrusters import ThrusterModulator
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.files import warn_once
 from spacerobot_ros.model.compilation import NoLibraryError
@@ -145,9 +144,6 @@ class LaneBlock:
         count = self._groups * self._lanes
         self._surplus = count - len(rows)
         self._rows_of_lanes = np.concatenate([rows, np.repeat(rows[-1:], self._surplus)])
-        self._modulator = None
-        if flights.thrusters is not None:
-            self._modulator = ThrusterModulator(flights.thrusters, flights.control_period)
         self._memory = _aligned_array((self._groups, self._rows.total_rows, self._lanes))
         self._memory[:, self._rows["alive"]] = 1.0
         self._memory[:, self._rows["decided_state"]] = np.nan
@@ -235,16 +231,6 @@ class LaneBlock:
             "instants": self._instants,
             "reports": self._reports,
         }
-        if self._modulator is not None:
-            matrix, weights = self._modulator.allocation.problem
-            thrusters = self._modulator.table
-            arrays |= {
-                "thruster_matrix": np.ascontiguousarray(matrix.T),
-                "thruster_weights": weights,
-                "thruster_wrenches": np.ascontiguousarray(thrusters.wrenches.T),
-                "thruster_flow": np.ascontiguousarray(thrusters.mass_flow),
-            }
-            self._memory[:, self._rows["shortest"]] = thrusters.min_on_time[:, np.newaxis]
         job = Job(
             groups=self._groups,
             period=flights.control_period,
@@ -411,7 +397,7 @@ class LaneBlock:
         self._write_rows("bounds", most)
 
     def _step_outside_lanes(self, result: BatchResult, failures: dict[int, str]) -> None:
-        """Do the step that lanes wait for: a command, an allocation, or a tick of the plant."""
+        """Do the step that lanes wait for: a command, or a tick of the plant."""
         rows, alive = self._rows, self._rows.first_row("alive")
         steps: dict[Pending, tuple[int, Callable[[int, int, int, BatchResult], None]]] = {
             Pending.COMMIT: (
@@ -421,8 +407,6 @@ class LaneBlock:
         }
         if self._tick.controller is not None:
             steps[Pending.TICK] = rows.first_row("exact"), self._command_lane
-        if self._modulator is not None:
-            steps[Pending.FIRE] = rows.first_row("unallocated"), self._allocate_lane
         for group in np.flatnonzero(self._pending):
             waiting, step = steps[Pending(self._pending[group])]
             lanes = (self._memory[group, waiting] != 0.0) & (self._memory[group, alive] != 0.0)
@@ -445,18 +429,6 @@ class LaneBlock:
         realised = controller.exact_command(row, self._profiles[index], tick, state).realised
         command = np.concatenate([realised.tau, realised.wrench_B])
         self._memory[group, self._rows["command"], lane] = command
-
-    def _allocate_lane(self, group: int, lane: int, index: int, result: BatchResult) -> None:
-        """Allocate an impulse beyond the thrust, which is a linear programme."""
-        modulator, period = self._modulator, self._flights.control_period
-        assert modulator is not None
-
-        def rows(name: str) -> Array:
-            return self._memory[group, self._rows[name], lane]
-
-        impulse = rows("pending_impulse") + period * rows("wanted")
-        most = modulator.table.min_on_time + period - rows("remaining")
-        rows("levels")[:] = modulator.allocation.allocate(impulse, most).levels
 
     def _step_lane(self, group: int, lane: int, index: int, result: BatchResult) -> None:
         """Step the scalar plant, in which a joint touches its stop."""
@@ -495,8 +467,6 @@ class LaneBlock:
         result.limited_ticks[first][rows] = limits[:, :n]
         if first == "rate":
             result.limited_ticks["stroke"][rows] = limits[:, n:]
-        if self._modulator is not None:
-            result.propellant[rows] = self._read_rows("propellant")[:count, 0]
         if self._tick.controller is not None:
             self._write_decisions(result, rows)
         pose, q = self._noise.measure(result.pose[rows], result.q[rows])

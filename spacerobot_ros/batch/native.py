@@ -23,7 +23,6 @@ import casadi as ca
 from spacerobot_ros.batch.controlling import CONTROL_INPUTS, CONTROL_OUTPUTS, BatchController
 from spacerobot_ros.batch.flights import ControlledGoals, Flights
 from spacerobot_ros.control.goal_monitor import Decision
-from spacerobot_ros.control.thrusters import PULSE_INPUTS, PULSE_OUTPUTS, pulse_function
 from spacerobot_ros.model.compilation import (
     NoLibraryError,
     compilation_settings,
@@ -105,8 +104,6 @@ class Pending(IntEnum):
     """To commit a tick, after the scalar plant has stepped some lanes."""
     TICK = 2
     """To step, after the controller has computed the commands of some lanes."""
-    FIRE = 3
-    """To fire thrusters, after the scalar allocation of some lanes."""
 
 
 _JOB_MEMBERS = (
@@ -131,10 +128,6 @@ _JOB_MEMBERS = (
     ("long long", "instant_count", ""),
     ("V *", "reports", "(groups, instants, REPORT_ROWS)"),
     ("long long", "ends", "CONTROLLED: whether flights end with the decision about their goals"),
-    ("const double *", "thruster_matrix", "(THRUSTERS, 7) of the allocation"),
-    ("const double *", "thruster_weights", "(6,) of a wrench in the allocation"),
-    ("const double *", "thruster_wrenches", "(THRUSTERS, 6) N, N m"),
-    ("const double *", "thruster_flow", "(THRUSTERS,) kg/s"),
 )
 """Members of :class:`Job`: type in C++, name, meaning."""
 
@@ -225,7 +218,6 @@ class CompiledTick:
             parameters = [each for each in values if not each[0].startswith("gains.")]
             believed = program.robot or flights.robot
             key = (*key, believed, repr(parameters), repr(program.config.motion))
-            key = (*key, flights.thruster_count)
         if key not in model.derived:
             model.derived[key] = cls._compile(flights, model, link)
         compiled: CompiledTick = model.derived[key]
@@ -268,18 +260,14 @@ class CompiledTick:
             functions["MOMENTUMLESS"] = _momentumless_function(flights, model)
             arguments["MOMENTUMLESS"] = arguments["FLIGHT"]
             results["MOMENTUMLESS"] = results["FLIGHT"]
-        controller, count = None, flights.thruster_count
+        controller = None
         if isinstance(flights.program, ControlledGoals):
             controller = BatchController.of(flights)
             functions["CONTROL"] = controller.function()
             arguments["CONTROL"], results["CONTROL"] = CONTROL_INPUTS, CONTROL_OUTPUTS
-        if count:
-            functions["PULSES"] = pulse_function(count)
-            arguments["PULSES"], results["PULSES"] = PULSE_INPUTS, PULSE_OUTPUTS
-        for kind in ("CONTROL", "PULSES"):
-            if function := functions.get(kind):
-                sizes |= {each: function.nnz_in(i) for i, each in enumerate(arguments[kind])}
-                sizes |= {each: function.nnz_out(i) for i, each in enumerate(results[kind])}
+            control = functions["CONTROL"]
+            sizes |= {each: control.nnz_in(i) for i, each in enumerate(CONTROL_INPUTS)}
+            sizes |= {each: control.nnz_out(i) for i, each in enumerate(CONTROL_OUTPUTS)}
         rows = RowLayout(
             {
                 **{"alive": 1, "measured": n, "joint_bias": n, "joint_noise": 1},
@@ -287,8 +275,7 @@ class CompiledTick:
                 **{"peak_wrench": 2, "impulse": 2, "lowest": n, "highest": n},
                 **{"decision": 1, "decided": 1, "decided_state": 2 * n + 13},
                 **{"ended": 1, "end_state": 2 * n + 20},
-                **{"first_momenta": 6, "drift": 2, "propellant": 1, "unallocated": 1},
-                **{"wanted": 6, "pending_impulse": 6},
+                **{"first_momenta": 6, "drift": 2},
                 **sizes,
             }
         )
@@ -301,8 +288,6 @@ class CompiledTick:
         copies = dict(names.results_fed_back)
         if controller is not None:
             copies["next_monitor"] = "monitor"
-        if count:
-            copies |= {"next_remaining": "remaining", "next_open": "open"}
         state, limited = rows.first_row("next_state"), rows.first_row("limited", 1)
         rates = state + n + 4 if effort else rows.first_row("qdot")
         efforts = rows.first_row("realised" if effort else "effort")
@@ -325,13 +310,11 @@ class CompiledTick:
         if effort:
             # Lanes whose joint touches a stop are stepped by the scalar plant.
             constants["STOP_ROW"] = limited + n
-            constants["WRENCH_ROW"] = rows.first_row(
-                "wanted" if count else "realised", 0 if count else n
-            )
+            constants["WRENCH_ROW"] = rows.first_row("realised", n)
         if controller is not None:
             constants["EXPECTED_ROW"] = state + 2 * n + 4
         declarations, unit = _shared_declarations(rows, constants, arrays, spans), vector_unit()
-        library = _load_library(functions, declarations, unit, count)
+        library = _load_library(functions, declarations, unit)
         return cls(library, unit, rows, width, link, controller)
 
 
@@ -389,16 +372,15 @@ def _momentumless_function(flights: Flights, model: ModelFunctions) -> ca.Functi
 
 
 def _load_library(
-    functions: Mapping[str, ca.Function], declarations: str, unit: VectorUnit, thrusters: int
+    functions: Mapping[str, ca.Function], declarations: str, unit: VectorUnit
 ) -> ctypes.CDLL:
     """Return the library of ``driver.hpp``, with the C library's vector functions if it has them.
 
     ``functions`` are CasADi's by their names in the driver: ``FLIGHT`` and ``REPORT``, the tick
     without and with the results of reports; ``MOMENTUMLESS``, the former of robots without angular
-    momentum; ``CONTROL``, the command for a state, and ``PULSES``, those of thrusters, where there
-    are any.
+    momentum; ``CONTROL``, the command for a state.
     """
-    library = _compile_library(functions, declarations, unit, thrusters)
+    library = _compile_library(functions, declarations, unit)
     names = ["start_flights", "fly_until"]
     names += ["measure_starts", "end_flights"] if "CONTROL" in functions else []
     for name in names:
@@ -411,7 +393,7 @@ def _load_library(
 
 
 def _compile_library(
-    functions: Mapping[str, ca.Function], declarations: str, unit: VectorUnit, thrusters: int
+    functions: Mapping[str, ca.Function], declarations: str, unit: VectorUnit
 ) -> ctypes.CDLL:
     given = list(functions.values())
     parts = [
@@ -419,19 +401,18 @@ def _compile_library(
         _CASADI_SELECTION.sub(r"where(\1,\2)", _vector_source(given)),
         *(f"#define {name} {function.name()}" for name, function in functions.items()),
         declarations,
-        _read_source("thrusters.hpp"),
         _read_source("driver.hpp"),
     ]
     # Vectors as arguments between functions of this file: no other is called with them.
     flags = ("-O2", "-std=c++17", "-fno-math-errno", "-Wno-psabi", *_SCHEDULING, *unit.flags)
     name = f"lanes_{given[0].name()}"
     if unit.libmvec:
-        source = "\n".join([_define_sizes(given, unit, unit.libmvec, thrusters), *parts])
+        source = "\n".join([_define_sizes(given, unit, unit.libmvec), *parts])
         with suppress(NoLibraryError):
             return load_library(
                 name, source, ctypes.CDLL, flags=flags, libraries=("-lmvec",), language="cpp"
             )
-    source = "\n".join([_define_sizes(given, unit, "", thrusters), *parts])
+    source = "\n".join([_define_sizes(given, unit, ""), *parts])
     return load_library(name, source, ctypes.CDLL, flags=flags, language="cpp")
 
 
@@ -472,11 +453,8 @@ def _shared_declarations(
     return "\n".join(lines)
 
 
-def _define_sizes(
-    functions: Sequence[ca.Function], unit: VectorUnit, libmvec: str, thrusters: int
-) -> str:
+def _define_sizes(functions: Sequence[ca.Function], unit: VectorUnit, libmvec: str) -> str:
     numbers = {
-        "THRUSTERS": thrusters,
         "LANES": unit.lanes,
         "WORK_SIZE": max(function.sz_w() for function in functions) + 1,
         "ARGUMENT_POINTERS": max(function.sz_arg() for function in functions) + 1,

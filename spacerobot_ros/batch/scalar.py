@@ -23,7 +23,7 @@ from spacerobot_ros.model.description import Array
 from spacerobot_ros.planning.core.goal import Goal
 from spacerobot_ros.planning.core.schedule import BasePath, GaitSchedule
 from spacerobot_ros.planning.execution.tracker import ScheduleFollower
-from spacerobot_ros.simulation.actuators import PLANTS, PlantWithFaults, ThrusterPlant
+from spacerobot_ros.simulation.actuators import PLANTS, PlantWithFaults
 from spacerobot_ros.simulation.config import SensorConfig
 from spacerobot_ros.simulation.plant import Plant
 from spacerobot_ros.simulation.sensors import Sensors
@@ -73,9 +73,6 @@ def _fly_row(
     flights: Flights, row: int, result: BatchResult, controller: BatchController | None
 ) -> None:
     plant, period = plant_of(flights, row), flights.control_period
-    thrusters = None
-    if flights.thrusters is not None:
-        plant = thrusters = ThrusterPlant(plant, period, flights.thrusters)
     config = SensorConfig() if flights.sensors is None else flights.sensors.config(row)
     faulty = PlantWithFaults(plant, (), period, wrench=flights.actuation == "effort")
     sensors = Sensors(faulty, config, period)
@@ -109,8 +106,6 @@ def _fly_row(
             parts = plant.q, plant.qdot, plant.pose, plant.twist, plant.momentum
             result.end_state[row] = np.concatenate(parts)
             result.momentum_drift[row] = drift
-        if thrusters is not None:
-            result.propellant[row] = thrusters.propellant
     finally:
         for name, counts in plant.limit_counts.items():
             result.limited_ticks[name][row] = counts

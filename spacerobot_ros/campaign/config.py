@@ -36,7 +36,7 @@ _CAMPAIGN_KEYS = (
     *("criteria", "engine", "description"),
 )
 _MAX_FLIGHTS = 10_000_000
-ENGINES = ("auto", "lanes", "flights", "ros")
+ENGINES = ("auto", "lanes", "flights")
 """Names of the engines that may fly a campaign."""
 
 
@@ -124,7 +124,7 @@ class Campaign:
     criteria
         Requirements on metrics, beside a goal that is reached.
     engine
-        Name of the engine: ``auto``, ``lanes``, ``flights`` or ``ros``.
+        Name of the engine: ``auto``, ``lanes`` or ``flights``.
     description
         Text for the reader of the report.
     section

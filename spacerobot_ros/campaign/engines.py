@@ -9,14 +9,13 @@ from functools import cache
 from spacerobot_ros.campaign.config import Campaign
 from spacerobot_ros.campaign.draws import Draw
 from spacerobot_ros.campaign.lanes import LanesEngine
-from spacerobot_ros.campaign.one_by_one import FlightsEngine, RosEngine
+from spacerobot_ros.campaign.one_by_one import FlightsEngine
 from spacerobot_ros.campaign.rows import FLIGHTS, Engine, Fallback, Row
 from spacerobot_ros.errors import SpaceRobotError
 
 ENGINE_FACTORIES: Mapping[str, Callable[[], Engine]] = {
     "lanes": LanesEngine,
     "flights": FlightsEngine,
-    "ros": RosEngine,
 }
 """The engines by name, the preferred ones first."""
 
@@ -31,7 +30,7 @@ def select_engine(campaign: Campaign, engine_name: str) -> Engine:
     """
     if engine_name != "auto":
         engine = ENGINE_FACTORIES[engine_name]()
-        reason = engine.refusal(campaign, asked=True)
+        reason = engine.refusal(campaign)
         if reason:
             raise SpaceRobotError(f"The engine '{engine_name}' cannot fly this campaign: {reason}")
         return engine

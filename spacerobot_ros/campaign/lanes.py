@@ -36,7 +36,6 @@ from spacerobot_ros.control.executive import decided_message
 from spacerobot_ros.control.laws.registry import LAWS
 from spacerobot_ros.control.outputs import OutputDistance
 from spacerobot_ros.control.status import ControllerState
-from spacerobot_ros.control.thrusters import find_thrusters
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.flight.lockstep import fly_scenario
 from spacerobot_ros.measures import Measures, Outcome, momentum_drift
@@ -138,7 +137,7 @@ class LanesEngine:
         self._flights = FlightsEngine()
         self._scheduled, self._controlled = _ScheduledLanes(), _ControlledLanes()
 
-    def refusal(self, campaign: Campaign, *, asked: bool = False) -> str:
+    def refusal(self, campaign: Campaign) -> str:
         """Return the reason why lanes cannot fly a campaign, as a clause; empty if they can."""
         reason = self._flights.refusal(campaign)
         if reason:
@@ -163,7 +162,7 @@ class LanesEngine:
             case ("planner",), "velocity":
                 return self._scheduled.refusal(campaign)
             case ("coordinated_control",), "effort":
-                return self._controlled.refusal(campaign, asked=asked)
+                return self._controlled.refusal(campaign)
         return "lanes have velocities of a planner, or efforts of coordinated control"
 
     def fly(
@@ -376,19 +375,12 @@ class _ControlledLanes:
     max_batch_flights = 128
     """Largest number of flights of one batch."""
 
-    def refusal(self, campaign: Campaign, *, asked: bool) -> str:
-        """Return the reason why lanes cannot fly a campaign, as a clause; empty if they can.
-
-        On/off thrusters amplify rounding: 1e-15 m at the start become 1e-4 m and 0.1 s at the end.
-        A draw in lanes then differs from that of the engine ``flights``, and is flown only if lanes
-        are ``asked`` for by name.
-        """
+    def refusal(self, campaign: Campaign) -> str:
+        """Return the reason why lanes cannot fly a campaign, as a clause; empty if they can."""
         scenario = campaign.scenario
         plant = scenario.plant
-        if plant.thrusters and not asked:
-            return "its thrusters are on or off, which amplifies rounding: ask for lanes by name"
-        if plant.thrusters and plant.thrusters_excluded:
-            return "some of its thrusters are excluded"
+        if plant.thrusters:
+            return "its thrusters are on or off, which engine 'flights' flies"
         if plant.beyond_limits != "clip":
             return "the plant refuses commands beyond limits"
         if nominal_robots(scenario).controller.description.wheel_names:
@@ -510,7 +502,6 @@ class _ControlledLanes:
             momentum_drift=result.momentum_drift[row],
             end_effector_distance=distance,
             end_effector_angle=angle,
-            propellant=math.nan if flights.thrusters is None else float(result.propellant[row]),
             plan_time=0.0,
             wall_time=taken + ready.plan_time,
         )
@@ -534,7 +525,6 @@ def _batch_of_flights(
         seed if each.seed is None else each.seed
         for each, seed in zip(drawn, sensors.seeds.tolist(), strict=True)
     ]
-    source = plants[0].thrusters
     return Flights(
         robot=robot,
         actuation="effort" if isinstance(program, ControlledGoals) else "velocity",
@@ -546,7 +536,6 @@ def _batch_of_flights(
         sensors=sensors,
         integration_step=plants[0].integration_step,
         report_ticks=instants,
-        thrusters=find_thrusters(source, robot.description) if source else None,
     )
 
 

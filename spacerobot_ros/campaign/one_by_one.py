@@ -1,14 +1,10 @@
-"""Draws flown one after the other: without ROS, and through the whole stack."""
+"""Draws flown one after the other, without ROS."""
 
 from __future__ import annotations
 
-import tempfile
-import time
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from functools import lru_cache
-from pathlib import Path
 
 from spacerobot_ros.campaign.config import Campaign
 from spacerobot_ros.campaign.draws import Draw, drawn_flight
@@ -17,7 +13,6 @@ from spacerobot_ros.campaign.targets import DrawnFlight, description_of
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.flight.flight import Flight
 from spacerobot_ros.flight.lockstep import Robots, fly_scenario, require_flyable
-from spacerobot_ros.flight.reading import read_run
 from spacerobot_ros.measures import Outcome
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.shared_parameters import AssumedRobotConfig, RobotConfig, robot_of
@@ -25,15 +20,22 @@ from spacerobot_ros.planning.core.clearance import Clearance
 from spacerobot_ros.planning.core.method import GaitMethod
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.methods.registry import build_method
-from spacerobot_ros.scenario import Scenario, scenario_text
-from spacerobot_ros.termination import run_child
+from spacerobot_ros.scenario import Scenario
 
 
-class _OneByOneEngine(ABC):
-    """Flies one draw after the other; a draw that cannot be flown does not end the others."""
+class FlightsEngine:
+    """Engine that flies one draw after the other; one that cannot be flown does not end others."""
 
-    name: str
+    name = "flights"
     efficient_flights = 1
+
+    def refusal(self, campaign: Campaign) -> str:
+        """Return the reason why this engine cannot fly a campaign, as a clause."""
+        try:
+            require_flyable(campaign.scenario)
+        except SpaceRobotError as error:
+            return str(error)
+        return ""
 
     def fly(
         self, campaign: Campaign, draws: Iterable[Draw], stopped: Callable[[], bool]
@@ -52,30 +54,10 @@ class _OneByOneEngine(ABC):
             except Exception as error:  # The error becomes a row with its message as the reason.
                 yield Row.of_error(draw, error, self.name)
 
-    @abstractmethod
-    def fly_draw(
-        self, campaign: Campaign, flight: DrawnFlight, stopped: Callable[[], bool]
-    ) -> Flight:
-        """Fly one draw; a refused draw raises a :class:`.SpaceRobotError`."""
-
-
-class FlightsEngine(_OneByOneEngine):
-    """Engine that flies plant, planner and controller without ROS."""
-
-    name = "flights"
-
-    def refusal(self, campaign: Campaign, *, asked: bool = False) -> str:
-        """Return the reason why this engine cannot fly a campaign, as a clause."""
-        try:
-            require_flyable(campaign.scenario)
-        except SpaceRobotError as error:
-            return str(error)
-        return ""
-
     def fly_draw(
         self, campaign: Campaign, flight: DrawnFlight, stopped: Callable[[], bool] = lambda: False
     ) -> Flight:
-        """Fly one draw; see the base class."""
+        """Fly one draw; a refused draw raises a :class:`.SpaceRobotError`."""
         return fly_scenario(
             flight.seeded_scenario,
             robots=robots_of(flight),
@@ -154,40 +136,3 @@ def _build_robot(
     if error:
         return robot_of(AssumedRobotConfig(text, name, world, error, seed))
     return robot_of(RobotConfig(text, name, world))
-
-
-class RosEngine(_OneByOneEngine):
-    """Engine that runs ``spacerobot run`` for each draw, in a process and with a bag."""
-
-    name = "ros"
-
-    def refusal(self, campaign: Campaign, *, asked: bool = False) -> str:
-        """Return the reason why this engine cannot fly a campaign, as a clause."""
-        return "it kills nodes on the way" if campaign.scenario.kills else ""
-
-    def fly_draw(
-        self, campaign: Campaign, flight: DrawnFlight, stopped: Callable[[], bool]
-    ) -> Flight:
-        """Fly one draw; see :meth:`FlightsEngine.fly_draw`. It is not stopped on the way."""
-        began = time.perf_counter()
-        with tempfile.TemporaryDirectory(prefix="spacerobot_") as folder:
-            bag = Path(folder, "flight.mcap")
-            scenario = flight.with_draws_in_scenario().scenario
-            self._run_scenario(scenario, Path(folder, "draw.yaml"), bag, campaign.max_flight_time)
-            flown = read_run(bag)
-        if (
-            flown.duration > campaign.max_flight_time
-        ):  # The stack looks five times a second of wall time.
-            message = f"Interrupted after {flown.duration:.6g} s of simulated time."
-            flown = replace(flown, outcome=Outcome.INTERRUPTED, message=message)
-        return replace(flown, wall_time=time.perf_counter() - began)
-
-    def _run_scenario(self, scenario: Scenario, file: Path, bag: Path, longest: float) -> None:
-        """Fly a scenario in another process: signals and the contexts of ROS are a process's."""
-        file.write_text(scenario_text(scenario), encoding="utf-8")
-        command = ["-m", "spacerobot_ros", "run", str(file), "--bag", str(bag)]
-        command += ["--longest", repr(longest)]
-        done = run_child(command)
-        if not bag.exists():
-            lines = (done.stderr or done.stdout).strip().splitlines() or ["it left no bag"]
-            raise SpaceRobotError(f"spacerobot run ended with {done.returncode}: {lines[-1]}")

@@ -108,12 +108,8 @@ class Engine(Protocol):
     name: str
     efficient_flights: int
 
-    def refusal(self, campaign: Campaign, *, asked: bool = False) -> str:
-        """Return why this engine does not fly a campaign, as a clause; empty if it does.
-
-        ``asked``: the user has named it; its flights may then differ from those of other engines by
-        more than rounding.
-        """
+    def refusal(self, campaign: Campaign) -> str:
+        """Return why this engine does not fly a campaign, as a clause; empty if it does."""
 
     def fly(
         self, campaign: Campaign, draws: Iterable[Draw], stopped: Callable[[], bool]

@@ -1,4 +1,4 @@
-"""Runs a campaign into its dataset, and flies single flights of it again through the ROS stack.
+"""Runs a campaign into its dataset, and flies single flights of it again, into bags.
 
 :func:`sweep` is a small campaign from Python: one function, in the words of ``fly``.
 """
@@ -20,7 +20,7 @@ from spacerobot_ros.campaign.config import Campaign, parse_campaign, scenario_of
 from spacerobot_ros.campaign.dataset import Dataset
 from spacerobot_ros.campaign.draws import Draws, drawn_flight
 from spacerobot_ros.campaign.engines import engine_by_name, fly_all, select_engine
-from spacerobot_ros.campaign.rows import LANES, Row
+from spacerobot_ros.campaign.rows import FLIGHTS, Row
 from spacerobot_ros.campaign.workers import (
     THIS_PROCESS,
     Cluster,
@@ -30,8 +30,7 @@ from spacerobot_ros.campaign.workers import (
 )
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.flight.api import scenario_to_fly
-from spacerobot_ros.flight.reading import read_run
-from spacerobot_ros.measures import Outcome
+from spacerobot_ros.flight.lockstep import fly_scenario
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.api import EndEffectorValues, end_effector_goals
@@ -211,7 +210,7 @@ class Rerun:
 
 
 def rerun_flight(folder: Path, number: int, bag: Path) -> Rerun:
-    """Fly one draw of a campaign through the ROS stack.
+    """Fly one draw of a campaign again, into a bag.
 
     Raises
     ------
@@ -220,8 +219,6 @@ def rerun_flight(folder: Path, number: int, bag: Path) -> Rerun:
     SpaceRobotError
         The drawn values are refused, or the bag cannot be written.
     """
-    from spacerobot_ros.session.run import run_scenario  # This import loads ROS.
-
     dataset = Dataset(folder)
     campaign = dataset.campaign()
     draws = Draws(campaign)
@@ -232,24 +229,22 @@ def rerun_flight(folder: Path, number: int, bag: Path) -> Rerun:
         )
     draw = draws[number]
     flight = drawn_flight(campaign, draw)
-    run_scenario(flight.with_draws_in_scenario().scenario, bag, longest=campaign.max_flight_time)
-    measures = read_run(bag).measured(clearance=campaign.measures_clearance)
-    row = Row.of(campaign, draw, measures, "ros")
+    scenario = flight.with_draws_in_scenario().scenario
+    flown = fly_scenario(scenario, longest=campaign.max_flight_time)
+    flown.save(bag)
+    measures = flown.measured(clearance=campaign.measures_clearance)
+    row = Row.of(campaign, draw, measures, FLIGHTS)
     known = stored_flight(dataset, number)
     if known is None:
         return Rerun(row, None, "", "", bag)
-    outcome, engine, metrics = known
+    outcome, _, metrics = known
     deviation, at = largest_deviation(metrics, row.metrics)
     note = ""
-    if campaign.scenario.plant.thrusters and engine == LANES:
-        note = "It was flown in lanes: thrusters that are on or off multiply rounding."
-    elif campaign.scenario.plant.thrusters and flight.inertial is not None:
+    if campaign.scenario.plant.thrusters and flight.inertial is not None:
         note = (
-            "Its masses are drawn: the plants of campaign and stack differ in rounding, which "
-            "thrusters that are on or off multiply."
+            "Its masses are drawn: the plant of the campaign and that of this flight differ in "
+            "rounding, which thrusters that are on or off multiply."
         )
-    elif outcome == Outcome.INTERRUPTED.value:
-        note = "It was interrupted: the stack flies on for up to a fifth of a second of wall time."
     return Rerun(row, deviation, at, outcome, bag, note)
 
 

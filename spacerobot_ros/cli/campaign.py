@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from spacerobot_ros.campaign.running import Progress
     from spacerobot_ros.campaign.workers import Cluster
 
-_ENGINES = ("auto", "lanes", "flights", "ros")
+_ENGINES = ("auto", "lanes", "flights")
 
 
 class _CampaignGroup(DefaultGroup):
@@ -126,7 +126,7 @@ def report(folder: Path, report: Path | None) -> None:
 @click.argument("number", metavar="N", type=click.IntRange(min=0))
 @bag_option("Bag to write [DIR/flight_N.mcap, or the next free].")
 def rerun(folder: Path, number: int, bag: Path | None) -> None:
-    """Fly flight N of DIR alone through ROS, and record a bag.
+    """Fly flight N of DIR again, and record a bag.
 
     Exit code 0: it is the flight of the dataset; 1: it is another one; 2: bad input.
     """

@@ -23,7 +23,6 @@ from spacerobot_ros.cli.options import (
     goal_options,
     json_option,
     numbers,
-    processes_option,
     report_option,
     settings_option,
     view_option,
@@ -57,7 +56,7 @@ if TYPE_CHECKING:
     flag_value=1.0,
     type=click.FloatRange(min=0.0, min_open=True),
     metavar="[FACTOR]",
-    help="Run on the wall clock, FACTOR times as fast (1 without a number).",
+    help="Fly by the nodes on the wall clock, FACTOR times as fast (1 without a number).",
 )
 @click.option(
     "--longest",
@@ -66,7 +65,13 @@ if TYPE_CHECKING:
     metavar="SECONDS",
     help="Simulated time after which the flight is interrupted.",
 )
-@processes_option
+@click.option(
+    "--nodes",
+    "--processes",
+    "nodes",
+    is_flag=True,
+    help="Fly by the ROS 2 nodes, each in a process of its own.",
+)
 @view_option
 def run_command(
     scenario: str,
@@ -78,12 +83,14 @@ def run_command(
     report: Path | None,
     realtime: float | None,
     longest: float,
-    processes: bool,
+    nodes: bool,
     view: bool,
 ) -> None:
     """Fly a SCENARIO or a ROBOT to its goal, and record a bag.
 
-    A SCENARIO is a name or a parameter file, a ROBOT a name or a URDF file.
+    A SCENARIO is a name or a parameter file, a ROBOT a name or a URDF file. The flight needs no ROS
+    2, unless --nodes or --realtime has it flown by the nodes: with equal states and commands in
+    lockstep.
 
     Exit code 0: the goal was reached within tolerance; 1: it was not; 2: bad input. A signal ends
     the flight early: the bag and the summary cover it until then, and the exit code is 128 plus the
@@ -98,7 +105,8 @@ def run_command(
     usual = bag or Path("out") / f"{chosen.name}.mcap"
     taken, path = os.path.lexists(usual), bag or free_name(usual)
     with viewer_if_requested(view, chosen.parameters("viewer")), display(chosen.name) as shown:
-        result = run_scenario(chosen, path, shown.fly, processes=processes, longest=longest)
+        by_nodes = nodes or realtime is not None
+        result = run_scenario(chosen, path, shown.fly, nodes=by_nodes, longest=longest)
     path = Path(result.summary["bag"])
     if result.summary["state"] == "refused" and not result.summary["ticks"]:
         if bag is None and report is None:
@@ -263,14 +271,21 @@ def _published_lines(scenario: Scenario, summary: dict[str, Any]) -> list[str]:
     type=click.FloatRange(min=0.0, min_open=True),
     help="Simulated time per wall time.",
 )
-@processes_option
+@click.option(
+    "--nodes",
+    "--processes",
+    is_flag=True,
+    hidden=True,
+    expose_value=False,
+    help="Accepted as of `run`: the nodes always have processes of their own.",
+)
 @click.option(
     "--restarts",
     default=3,
     show_default=True,
     type=click.IntRange(min=0),
-    help="How often a minute viewer, and with --processes planner and controller, are started "
-    "again when they die; 0: never.",
+    help="How often a minute planner, controller and viewer are started again when they die; "
+    "0: never.",
 )
 @click.option(
     "--namespace", default="", help="Namespace of all nodes and topics, also of /clock and /tf."
@@ -281,20 +296,20 @@ def up_command(
     settings: tuple[str, ...],
     bag: Path | None,
     rate: float,
-    processes: bool,
     restarts: int,
     namespace: str,
     view: bool,
 ) -> None:
     """Keep the nodes of a SCENARIO or a ROBOT running in real time.
 
-    A SCENARIO is a name or a parameter file, a ROBOT a name or a URDF file. Send goals by topic or
-    with the command spacerobot goal. Ctrl-C, SIGTERM or SIGHUP ends the nodes.
+    A SCENARIO is a name or a parameter file, a ROBOT a name or a URDF file. Each node is a process.
+    Send goals by topic or with the command spacerobot goal. Ctrl-C, SIGTERM or SIGHUP ends the
+    nodes.
     """
     from spacerobot_ros.scenario import scenario_or_robot
 
     chosen = scenario_or_robot(scenario).in_real_time(rate).with_settings(settings)
-    from spacerobot_ros.session.run import run_until_stopped
+    from spacerobot_ros.session.live import run_until_stopped
 
     with viewer_if_requested(view, chosen.parameters("viewer"), namespace) as viewer:
         if viewer is not None:
@@ -303,9 +318,8 @@ def up_command(
             chosen,
             bag,
             click.echo,
-            processes=processes,
             namespace=namespace,
-            restarts=restarts if processes else 0,
+            restarts=restarts,
             supervise=lambda: None if viewer is None else viewer.supervise(),
         )
     if recorded is not None:
@@ -357,7 +371,7 @@ def goal_command(
             goal = Goal.from_rpy(pose[:3], rpy_deg)
         goal = replace(goal, end_effectors=tuple(hands))
     from spacerobot_ros.measures import Outcome
-    from spacerobot_ros.session.run import send_goal
+    from spacerobot_ros.session.live import send_goal
 
     outcome = send_goal(goal, click.echo, namespace=namespace, timeout=timeout)
     exit_if_terminated()

@@ -99,9 +99,6 @@ report_option = _path_option("--report")
 namespace_option = click.option(
     "--namespace", metavar="NAME", help="Robot of a bag that has several [the first]."
 )
-processes_option = click.option(
-    "--processes", is_flag=True, help="Give each node a process of its own."
-)
 settings_option = click.option(
     "--set",
     "settings",

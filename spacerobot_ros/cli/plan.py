@@ -29,8 +29,8 @@ from spacerobot_ros.errors import ParameterError, SpaceRobotError
 from spacerobot_ros.files import write_output
 
 if TYPE_CHECKING:
+    from spacerobot_ros.flight.trials import PlanEvaluation, PlanningProblem
     from spacerobot_ros.planning import Goal
-    from spacerobot_ros.simulation.trials import MethodRecord, PlanEvaluation, PlanningProblem
 
 
 _NO_GOAL = GoalOptions(None, None, None)
@@ -75,8 +75,8 @@ def plan_command(
     The gait is simulated. Exit code 0: it ends within tolerance; 1: it does not, or the goal cannot
     be reached; 2: bad input.
     """
+    from spacerobot_ros.flight.trials import PlanEvaluation, compare, fastest, try_method
     from spacerobot_ros.planning.core.method import BEYOND_EFFORT_LIMITS
-    from spacerobot_ros.simulation.trials import PlanEvaluation, compare, fastest, try_method
 
     problem = problem_of_scenario(scenario, goal, settings)
     method = method or problem.config.method
@@ -167,13 +167,14 @@ def problem_of_scenario(
     GoalError
         The goal is not finite.
     """
+    from spacerobot_ros.flight.trials import PlanningProblem
     from spacerobot_ros.scenario import parse_setting, scenario_or_robot
 
     for text in settings:
         node, _, _ = parse_setting(text)
         if node not in ("plant", "planner"):
             raise ParameterError(f"'{text}' sets a parameter of {node}, which plans nothing.")
-    return goal.apply_to(scenario_or_robot(name).with_settings(settings)).problem()
+    return PlanningProblem.of(goal.apply_to(scenario_or_robot(name).with_settings(settings)))
 
 
 def plan_json(problem: PlanningProblem, trial: PlanEvaluation) -> dict[str, Any]:
@@ -240,45 +241,44 @@ def comparison_lines(plans: Mapping[str, PlanEvaluation | SpaceRobotError]) -> I
         yield f"{name:<14}{times}{angle:>14}{distance:>14}"
 
 
-def _random_goals(problem: PlanningProblem, count: int, within: tuple[float, float]) -> list[Goal]:
-    """Return random goals; ``within`` are the largest distance, m, and angle, deg."""
-    from spacerobot_ros.simulation.trials import random_goals
-
-    return random_goals(problem, count, within[0], math.radians(within[1]))
-
-
 def _plan_random_goals(
     problem: PlanningProblem, methods: list[str], count: int, within: tuple[float, float]
 ) -> None:
-    """Plan and print random goals; exit code 0: all that were simulated were reached."""
-    from spacerobot_ros.simulation.trials import try_goals
+    """Plan and print random goals; exit code 0: all that were simulated were reached.
 
-    goals = _random_goals(problem, count, within)
+    ``within`` are the largest distance, m, and angle, deg.
+    """
+    from spacerobot_ros.flight.trials import PlanEvaluation, random_goals, try_goals
+
+    goals = random_goals(problem, count, within[0], math.radians(within[1]))
     show = partial(click.echo, err=True) if sys.stderr.isatty() else lambda line: None
-    records = try_goals(problem, goals, methods, show)
+    results = try_goals(problem, goals, methods, show)
+    flown = {
+        name: [each for each in found if isinstance(each, PlanEvaluation)]
+        for name, found in results.items()
+    }
     click.echo(
         f"{'method':<14}{'goals':>7}{'met':>7}{'missed':>8}{'refused':>9}{'shortest':>10}"
         f"{'median':>10}{'longest':>10}{'planned in':>11}{'at most':>9}"
     )
-    for record in records:
-        click.echo(_record_row(record))
-    for record in records:
-        for reason in dict.fromkeys(record.refused):
-            click.echo(f"{record.method} refused: {reason}")
-    if records[0].missed:
+    for name, trials in flown.items():
+        click.echo(_row_of_method(name, len(results[name]), trials))
+    for name, found in results.items():
+        for reason in dict.fromkeys(str(each) for each in found if isinstance(each, Exception)):
+            click.echo(f"{name} refused: {reason}")
+    if not all(each.reached for each in flown[methods[0]]):
         fail()
 
 
-def _record_row(record: MethodRecord) -> str:
+def _row_of_method(name: str, goals: int, trials: Sequence[PlanEvaluation]) -> str:
+    """Return the row of a method for a number of goals, of which these were simulated."""
     import numpy as np
 
-    goals = record.reached + record.missed + len(record.refused)
-    counts = (
-        f"{record.method:<14}{goals:>7}{record.reached:>7}{record.missed:>8}"
-        f"{len(record.refused):>9}"
-    )
-    if not record.durations:
+    reached = sum(each.reached for each in trials)
+    missed, refused = len(trials) - reached, goals - len(trials)
+    counts = f"{name:<14}{goals:>7}{reached:>7}{missed:>8}{refused:>9}"
+    if not trials:
         return counts
-    low, middle, high = np.quantile(record.durations, [0.0, 0.5, 1.0])
-    planned, longest = np.quantile(record.plan_times, [0.5, 1.0])
+    low, middle, high = np.quantile([each.duration for each in trials], [0.0, 0.5, 1.0])
+    planned, longest = np.quantile([each.plan_time for each in trials], [0.5, 1.0])
     return f"{counts}{low:>10.4g}{middle:>10.4g}{high:>10.4g}{planned:>11.3g}{longest:>9.3g}"

@@ -362,11 +362,11 @@ def new_command(robot: str, out: Path | None) -> None:
     """
     from spacerobot_ros.bag import free_name
     from spacerobot_ros.cli.plan import comparison_lines
+    from spacerobot_ros.flight.trials import compare, fastest
     from spacerobot_ros.model import SpaceRobot
     from spacerobot_ros.planning.analysis import analyze
     from spacerobot_ros.resources import is_path, robot_file
     from spacerobot_ros.session.own_robot import first_problem, scenario_text, urdf_remarks
-    from spacerobot_ros.simulation.trials import compare, fastest
 
     file = robot_file(robot)
     model = SpaceRobot.from_file(file)

@@ -1,12 +1,7 @@
 """Distances between the bodies of a robot: shapes, pairs, exact checks, rows for a solver."""
 
-from spacerobot_ros.collision.geometry import (
-    BasePoses,
-    CollisionGeometry,
-    LinkPair,
-    ObstaclePair,
-    Solid,
-)
+from spacerobot_ros.collision.distances import Solid
+from spacerobot_ros.collision.geometry import BasePoses, CollisionGeometry, LinkPair, ObstaclePair
 from spacerobot_ros.collision.nearest import Approach, NearestPair, PathCheck
 
 __all__ = [

@@ -8,20 +8,52 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
-from spacerobot_ros.collision.rounded_box import separating_planes, separation
+from spacerobot_ros.collision.rounded_box import RoundedBox, separating_planes, separation
 from spacerobot_ros.files import warn_first_time
 from spacerobot_ros.model.compilation import cache_directory
-from spacerobot_ros.model.description import Array
-
-if TYPE_CHECKING:
-    from spacerobot_ros.collision.geometry import Solid
+from spacerobot_ros.model.description import Array, Shape
 
 _LOG = logging.getLogger(__name__)
+
+WORLD_BODY = -1
+"""Index of the body of obstacles."""
+
+
+@dataclass(frozen=True)
+class Solid:
+    """One convex solid of a robot or an obstacle.
+
+    Attributes
+    ----------
+    link
+        Name of its link.
+    body
+        Index of the rigid body that the link is part of; 0: the base, -1: an obstacle, whose link
+        frame is that of the world here.
+    shape
+        Its description in the URDF.
+    enclosure
+        A rounded box around it, in the frame of the link.
+    vertices
+        (V, 3) vertices of a mesh's convex hull in the frame of the link, m; None: no mesh.
+    """
+
+    link: str
+    body: int
+    shape: Shape
+    enclosure: RoundedBox
+    vertices: Array | None = field(default=None, repr=False)
+
+    @property
+    def is_obstacle(self) -> bool:
+        """Whether the solid is an obstacle, fixed in the world."""
+        return self.body == WORLD_BODY
 
 
 class DistanceFunction(Protocol):

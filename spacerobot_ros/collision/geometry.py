@@ -11,14 +11,19 @@ is drawn.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from spacerobot_ros.collision.distances import DistanceFunction, distance_function
+from spacerobot_ros.collision.distances import (
+    WORLD_BODY,
+    DistanceFunction,
+    Solid,
+    distance_function,
+)
 from spacerobot_ros.collision.rounded_box import RoundedBox, nearest_points
 from spacerobot_ros.errors import MeshError
 from spacerobot_ros.model.description import (
@@ -40,9 +45,6 @@ _SHAPES, _SEED = 1000, 0
 _HALF_RANGE = {JointKind.PRISMATIC: 1.0}
 """Half of the sampled range of a joint without limits, m; revolute joints have pi."""
 
-
-_WORLD_BODY = -1
-"""Index of the body of obstacles."""
 
 _COAXIAL_TOLERANCE = 1e-9
 """Largest distance (m) and tilt (rad) from the axis of a joint of a body of revolution about it."""
@@ -102,37 +104,6 @@ class BasePoses(NamedTuple):
         """Attitudes ``R_BW`` (N, 3, 3) and positions ``r_BW_B`` (N, 3) of the world, m."""
         R_BW = np.swapaxes(matrices_from_quaternions(self.quaternion), 1, 2)
         return R_BW, -np.einsum("nab,nb->na", R_BW, self.position)
-
-
-@dataclass(frozen=True)
-class Solid:
-    """One convex solid of a robot or an obstacle.
-
-    Attributes
-    ----------
-    link
-        Name of its link.
-    body
-        Index of the rigid body that the link is part of; 0: the base, -1: an obstacle, whose link
-        frame is that of the world here.
-    shape
-        Its description in the URDF.
-    enclosure
-        A rounded box around it, in the frame of the link.
-    vertices
-        (V, 3) vertices of a mesh's convex hull in the frame of the link, m; None: no mesh.
-    """
-
-    link: str
-    body: int
-    shape: Shape
-    enclosure: RoundedBox
-    vertices: Array | None = field(default=None, repr=False)
-
-    @property
-    def is_obstacle(self) -> bool:
-        """Whether the solid is an obstacle, fixed in the world."""
-        return self.body == _WORLD_BODY
 
 
 @dataclass(frozen=True)
@@ -467,7 +438,7 @@ def _solid_in_world(obstacle: Solid, pose: Pose) -> Solid:
     box, vertices = obstacle.enclosure, obstacle.vertices
     return replace(
         obstacle,
-        body=_WORLD_BODY,
+        body=WORLD_BODY,
         shape=replace(obstacle.shape, pose=pose @ obstacle.shape.pose),
         enclosure=replace(box, pose=pose @ box.pose),
         vertices=None if vertices is None else vertices @ pose.R.T + pose.r,

@@ -9,7 +9,6 @@ and about one axis within a tick.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -285,8 +284,3 @@ class PathCheck:
             d_0, d_1 = np.concatenate([d_0, d]), np.concatenate([d, d_1])
             v = np.concatenate([v, v]) / 2
         return approach(best, at) if best < limit else None
-
-
-def names_of_links(approaches: Iterable[Approach]) -> list[LinkPair]:
-    """Return the links of approaches, each pair once."""
-    return list(dict.fromkeys(each.links for each in approaches))

@@ -21,7 +21,8 @@ from dataclasses import dataclass
 
 import casadi as ca
 
-from spacerobot_ros.collision.geometry import CollisionGeometry, Solid
+from spacerobot_ros.collision.distances import Solid
+from spacerobot_ros.collision.geometry import CollisionGeometry
 from spacerobot_ros.model import symbolic_rotations
 from spacerobot_ros.model.description import JointKind, RobotDescription
 from spacerobot_ros.model.kinematics import joint_positions

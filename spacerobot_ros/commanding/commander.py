@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from enum import Enum
 from typing import Any, Literal, Protocol
@@ -49,11 +49,8 @@ from spacerobot_ros.planning.execution.goal_file import (
     IdentifiedGoal,
 )
 from spacerobot_ros.planning.execution.status import ScheduleStart
-from spacerobot_ros.simulation.status import PlantStatus
+from spacerobot_ros.simulation.status import PlantState, PlantStatus
 from spacerobot_ros.times import SECOND
-
-_PROCESS_DELAY_TIME = 0.005
-"""Wall time (s) without an answer after which only the last waiting state is answered."""
 
 _REPORT_PERIOD = 1.0
 """Shortest wall time between two warnings about ignored states, s."""
@@ -82,10 +79,6 @@ class CommanderActivity(Enum):
     """The commander has stopped after a decision about its goal (``stop_when_decided``)."""
 
 
-_ACTIVE = CommanderActivity.ACTIVE
-"""Found faster than the member of the enum, for every state."""
-
-
 class CommanderHost(Protocol):
     """The surroundings of a commander: a node, a loop without ROS, or a test."""
 
@@ -104,13 +97,10 @@ class CommanderHost(Protocol):
     def log(self, level: LogLevel, message: str) -> None:
         """Write a line into the log."""
 
-    def log_about_goals(self, level: LogLevel, message: str) -> None:
-        """Log a line about a goal, at a limited rate where many goals arrive."""
-
     def has_publisher(self, topic: str) -> bool:
         """Whether a publisher of odom, or of a reference, is connected."""
 
-    def waiting_states(self) -> tuple[Iterable[Stamped], Iterable[Stamped]]:
+    def waiting_states(self) -> tuple[Sequence[Stamped], Sequence[Stamped]]:
         """Return received odoms and joints that the commander does not have yet."""
 
 
@@ -241,8 +231,8 @@ class Commander(ABC):
         self._waiting_goals: dict[str, IdentifiedGoal] = {}
         """Goals that were received before the robot's description."""
         self._fly_to = FlyToGoals(self._goal_errors, self._report_aborted)
-        self._activated = self._answer_time = self._heard = self._checked = clock()
-        """Wall times of the activation, the last answer, the last state and the last look, s."""
+        self._activated = self._heard = self._checked = clock()
+        """Wall times of the activation, the last state and the last look, s."""
         self.refusal = ""
         """Why the last joint states were refused, as a clause; empty: they were not."""
         self._reported_missing = self._reported_waiting = ""
@@ -259,7 +249,7 @@ class Commander(ABC):
     @property
     def active(self) -> bool:
         """Whether states are answered and goals accepted."""
-        return self.activity is _ACTIVE
+        return self.activity is CommanderActivity.ACTIVE
 
     def use_robot(self, robot: SpaceRobot, decoder: StateDecoder) -> None:
         """Command this robot from now on, and accept the goals that wait for it.
@@ -269,7 +259,7 @@ class Commander(ABC):
         SpaceRobotError
             The configuration does not go with the robot.
         """
-        self._described, self._payload = robot, self.plant.payload
+        self._described, self._payload = robot, self.plant.status.payload
         self.config = self._adapted(self._given)
         robot = self._with_payload(robot)
         self._build_executive(robot, decoder)
@@ -282,7 +272,9 @@ class Commander(ABC):
     def _follow_rate(self) -> None:
         """Command at the rate of the plant, as soon as it is known."""
         present = self.config.tick_rate
-        rate = self.plant.rate or (self.stamps.steady_rate if present else self.stamps.rate)
+        rate = self.plant.status.tick_rate_hz or (
+            self.stamps.steady_rate if present else self.stamps.rate
+        )
         if not rate or abs(rate - present) <= _EQUAL_RATES * present:
             return
         self.config = replace(self.config, tick_rate=rate)
@@ -312,7 +304,7 @@ class Commander(ABC):
         ParameterError
             The file of goals is refused.
         """
-        self._activated = self._answer_time = self._heard = self._checked = self._clock()
+        self._activated = self._heard = self._checked = self._clock()
         self._reported_missing = ""
         self._resume_goals(self._goal_file.load())
         self.activity = CommanderActivity.ACTIVE
@@ -535,14 +527,11 @@ class Commander(ABC):
 
     def receive_joints(self, stamp_ns: int, joints: Any) -> None:
         """Take received joints: those of another time are set aside, and late ones skipped."""
-        if self._clock() - self._answer_time > _PROCESS_DELAY_TIME:
-            odoms, waiting = self.host.waiting_states()
-            self._answer_last_state([*odoms], [Stamped(stamp_ns, joints), *waiting])
-        elif self._is_of_robot(joints) and self.stamps.accepts_joints(stamp_ns, joints):
-            self.take_joints(stamp_ns, joints)
+        odoms, waiting = self.host.waiting_states()
+        self._take_states(odoms, [Stamped(stamp_ns, joints), *waiting])
         if self._fly_to:
             self._watch_fly_to()
-        self._answer_time = self._heard = self._clock()
+        self._heard = self._clock()
 
     def take_odom(self, stamp_ns: int, odom: Any) -> None:
         """Take an odom of the present time, and answer its state if complete."""
@@ -605,7 +594,7 @@ class Commander(ABC):
             return f"states on {_quoted(absent)}{refused}{nobody}"
         silence = self._clock() - self._heard
         longest = max(_LONGEST_SILENCE, _SILENT_PERIODS * self.config.control_period)
-        if silence > longest and self.plant.inactive:
+        if silence > longest and self.plant.status.state is PlantState.INACTIVE:
             return "the plant, which is inactive: activate it"
         if silence > longest and not (self.plant.paused or self.plant.in_lockstep):
             ceased = "" if refused else ", which have ceased"
@@ -635,37 +624,28 @@ class Commander(ABC):
 
     def answer_latest(self) -> None:
         """Answer the latest state that has come, after work for which states have waited."""
-        odoms, joints = (list(waiting) for waiting in self.host.waiting_states())
-        if joints:
-            self._answer_last_state(odoms, joints)
-        else:
-            self.answer()
+        self._take_states(*self.host.waiting_states())
+        self.answer()
 
-    def _answer_last_state(self, odoms: list[Stamped], states: list[Stamped]) -> None:
-        """Answer only the last of some states after this process stood still.
+    def _take_states(self, odoms: Sequence[Stamped], states: Sequence[Stamped]) -> None:
+        """Take what waits, and of the states of the present time only the last one.
 
         An answer to one before it comes too late, and the motion of the joints before the first
         answer does not tell whether they obey it.
         """
-        joints, *others = states
-        skipped = []
-        for newer in others:
-            ahead = newer.stamp_ns - joints.stamp_ns
-            if (
-                ahead > 0
-                and self.stamps.would_accept(newer.stamp_ns)
-                and self._is_of_robot(newer.message)
-            ):
-                joints = newer
-            else:
-                skipped.append(newer)
-        for each in (joints, *skipped):
-            if self._is_of_robot(each.message) and self.stamps.accepts_joints(*each):
-                for odom in odoms:
-                    if odom.stamp_ns >= self.stamps.now_ns:
-                        self.receive_odom(*odom)
-                odoms = []
+        states = [each for each in states if self._is_of_robot(each.message)]
+        present = [each.stamp_ns for each in states if self.stamps.is_present(each.stamp_ns)]
+        last = max(present, default=self.stamps.now_ns)
+        later = [each for each in odoms if each.stamp_ns > last]
+        for each in odoms:
+            if each.stamp_ns <= last:
+                self.receive_odom(*each)
+        for each in states:
+            skipped = each.stamp_ns in present and each.stamp_ns < last
+            if not skipped and self.stamps.accepts_joints(*each):
                 self.take_joints(*each)
+        for each in later:
+            self.receive_odom(*each)
 
     def _is_of_robot(self, joints: Any) -> bool:
         # Joint states of another robot neither set the time nor replace this robot's.
@@ -702,8 +682,8 @@ class Commander(ABC):
         if self._actuation_refusal:
             self._log_fault("actuation", self._actuation_refusal)
         self._follow_rate()
-        if self.plant.payload != self._payload:
-            self._payload = self.plant.payload
+        if self.plant.status.payload != self._payload:
+            self._payload = self.plant.status.payload
             if self._described is not None:
                 self.robot = self._with_payload(self._described)
                 self._change_masses(self.robot)

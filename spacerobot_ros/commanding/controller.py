@@ -13,7 +13,6 @@ import numpy as np
 
 from spacerobot_ros.commanding.commander import (
     Commander,
-    CommanderActivity,
     CommanderHost,
     StateDecoder,
 )
@@ -41,10 +40,6 @@ TARGET_ODOMETRY = "target/odom"
 
 _LONGEST_CHECK_PERIOD = 0.2
 """Longest wall time that one look at waiting states counts for, s: this process may have slept."""
-
-# Constants save the slow look-up of enum members for every state.
-_ACTIVE = CommanderActivity.ACTIVE
-_WHOLE = Pairing.WHOLE
 
 
 class ControllerCommander(Commander):
@@ -163,7 +158,7 @@ class ControllerCommander(Commander):
     def take_odom(self, stamp_ns: int, odom: Any) -> None:
         """Take odom of the present time, after answering a state whose reference never came."""
         missing = self.states.missing
-        if missing and self.activity is _ACTIVE and self.executive is not None:
+        if missing and self.active and self.executive is not None:
             pairing = self.states.take_overdue()
             assert pairing is not None
             self._answer_state(pairing)
@@ -173,7 +168,7 @@ class ControllerCommander(Commander):
     def take_accepted_jump(self) -> str:
         """Take a set-aside state once its time is accepted, and look at what states wait for."""
         warning = super().take_accepted_jump()
-        if self.activity is _ACTIVE:
+        if self.active:
             self._watch_waiting_state()
         return warning
 
@@ -227,7 +222,7 @@ class ControllerCommander(Commander):
         if overdue is not None:
             # An answer to a state whose pose was lost would come a tick late, so the state only
             # advances the estimate.
-            self._answer_state(overdue, send=overdue is _WHOLE)
+            self._answer_state(overdue, send=overdue is Pairing.WHOLE)
         super().take_joints(stamp_ns, joints)
 
     def rehearse(self) -> None:
@@ -280,7 +275,7 @@ class ControllerCommander(Commander):
 
     @property
     def _actuation_refusal(self) -> str:
-        if self.plant.actuation != "velocity":
+        if self.plant.status.actuation != "velocity":
             return ""
         return (
             "The plant takes velocities, and this controller sends efforts and a wrench: start the "
@@ -366,7 +361,7 @@ class ControllerCommander(Commander):
 
     def answer(self) -> None:
         """Answer a state once, as soon as all its messages are there."""
-        if self.executive is not None and self.activity is _ACTIVE and self._knows_rate:
+        if self.executive is not None and self.active and self._knows_rate:
             pairing = self.states.take_ready()
             if pairing is not None:
                 self._answer_state(pairing)
@@ -376,16 +371,15 @@ class ControllerCommander(Commander):
         executive, decoder, states = self.executive, self._decoder, self.states
         assert executive is not None
         assert decoder is not None
-        self._pose_has_come = self._pose_has_come or pairing is _WHOLE
+        self._pose_has_come = self._pose_has_come or pairing is Pairing.WHOLE
         try:
             stamp = decoder.decode_joints(states.joints)
         except CommandError as error:
-            self.stamps.undo_last()
             self._log_fault("state", f"The state is refused: {error}")
             return
         try:
             q, qdot, measured = decoder.q, decoder.qdot, None
-            if pairing is _WHOLE:
+            if pairing is Pairing.WHOLE:
                 measured = self._measured_state(*decoder.measured_base(states.odom), q, qdot)
             now = stamp / SECOND
             self._read_target(decoder)

@@ -10,7 +10,6 @@ from typing import Any
 
 from spacerobot_ros.commanding.commander import (
     Commander,
-    CommanderActivity,
     CommanderHost,
     StateDecoder,
 )
@@ -41,7 +40,6 @@ from spacerobot_ros.planning.execution.status import (
     PlannerStatistics,
     PlannerStatus,
     ScheduleStart,
-    Severity,
     end_effector_values,
     goal_values,
     waypoint_counts,
@@ -51,10 +49,6 @@ from spacerobot_ros.planning.execution.tracker import Setpoint
 from spacerobot_ros.planning.execution.worker import PlanningWorker
 from spacerobot_ros.simulation.status import PlantStatus
 from spacerobot_ros.topics import twist_topic
-
-# Constants save the slow look-up of enum members for every state.
-_ACTIVE = CommanderActivity.ACTIVE
-_WITHOUT_POSE, _LATE_POSE = Pairing.WITHOUT_POSE, Pairing.LATE_POSE
 
 
 class _MeasuredState:
@@ -215,7 +209,7 @@ class PlannerCommander(Commander):
 
     @property
     def _actuation_refusal(self) -> str:
-        if self.config.output != "commands" or self.plant.actuation != "effort":
+        if self.config.output != "commands" or self.plant.status.actuation != "effort":
             return ""
         return (
             "The plant takes efforts, and this planner sends velocities: start the plant with "
@@ -347,21 +341,20 @@ class PlannerCommander(Commander):
     def answer(self) -> None:
         """Answer a state as soon as its joints are there; only plans need its pose."""
         executive = self.executive
-        if executive is None or self.activity is not _ACTIVE or not self._knows_rate:
+        if executive is None or not self.active or not self._knows_rate:
             return
         states = self.states
         pairing = states.take_ready()
         if pairing is None:
             return
         measured = self._measured
-        measured.odom = None if pairing is _WITHOUT_POSE else states.odom
+        measured.odom = None if pairing is Pairing.WITHOUT_POSE else states.odom
         try:
             measured.stamp_ns = measured.decoder.decode_joints(states.joints)
         except CommandError as error:
-            self.stamps.undo_last()
             self._log_fault("state", f"joint_states: {error}.")
             return
-        if pairing is _LATE_POSE:
+        if pairing is Pairing.LATE_POSE:
             # The state was answered without its pose; a plan uses the pose at the next joints.
             executive.add_base_measurement(measured)
         else:
@@ -370,7 +363,7 @@ class PlannerCommander(Commander):
             executive.update(measured)
             if executive.outputs:
                 self._forward_outputs()
-                if self.activity is not _ACTIVE:
+                if not self.active:
                     return
             self.host.send_command(measured.stamp_ns)
         if measured.base_error is not None:
@@ -392,10 +385,8 @@ class PlannerCommander(Commander):
                     self._warn_of_disturbances(self._disturbances)
                 case Event() as event:
                     host.report_event(event)
-                case Notice(Severity.ERROR, message):
-                    host.log("error", message)
                 case Notice(severity, message):
-                    host.log_about_goals(severity.value, message)
+                    host.log(severity.value, message)
                 case Transition(source, event, target):
                     host.log("debug", f"{source.value} -> {target.value}: {event.value}")
                     if self.trajectories is not None:

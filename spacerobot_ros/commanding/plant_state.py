@@ -33,8 +33,8 @@ _NO_MESSAGE = Stamped(_NO_STAMP, None)
 
 # -- states of the present time ---------------------------------------------------------------
 
-_MIN_JUMP_CONFIRMATION_TIME = 0.2
-"""Shortest wall time without a state of the old time before a time jump is accepted, s."""
+_JUMP_CONFIRMATION_TIME = 0.5
+"""Wall time without a state of the old time before a time jump is accepted, s."""
 
 _STEP_SLACK = 1.5
 """Largest distance between two states without a loss, in steps of the plant."""
@@ -45,11 +45,8 @@ _PACE_SLACK = 2.0
 _MEETING_TIME = 1.0
 """Wall time from the first state in which poses may come before or long after their joints, s."""
 
-_MIN_CHECKS = 2
-"""Number of checks without a state of the old time before a time jump is accepted."""
-
-_EQUAL_STEPS, _MEASURED_STEPS = 2, 8
-"""Number of steps that tell the rate of the states: if they are equal, and if they are not."""
+_MEASURED_STEPS = 8
+"""Number of steps that tell the rate of the states if they are not equal."""
 
 _STEADY = 1.2
 """Largest ratio of two steps of a steady rate: states that a busy node skips make longer ones."""
@@ -58,32 +55,20 @@ _STEP_ROUNDING_NS = 1_000
 """Largest difference between equal steps, from stamps that were computed as floating point, ns."""
 
 
-@dataclass
-class _PendingJump:
-    """The latest state with a stamp of another time, set aside."""
-
-    since: float
-    """Wall time at which the first state of the other time arrived, s."""
-    joints: Stamped
-    checks: int = 0
-    """Number of calls of :meth:`StampFilter.accepted_jump` since ``since``."""
-
-
 class StampFilter:
     """Separates states of the plant's present time from states stamped with another time.
 
     The steps between the states, and so the rate of the plant, are learnt from the stamps. A stamp
-    is plausible
+    is of the present time if it is
 
-    * if only one state is known and the stamp is not behind it;
-    * within 1.5 steps after the state before, or equal to it: no message was lost;
+    * equal to that of the state before, or at most 1.5 steps after it: no message was lost;
     * further ahead by no more than twice the time that passed in as much wall time before:
       messages were lost, or this process was stopped for a while.
 
-    Any other state is a *time jump*, and set aside. When a state of the old time follows, it is
-    ignored and counted. When none does for 0.2 s of wall time (and for four states), the time has
-    really changed, as after a restart of the plant, and the jump is accepted. A plant in lockstep
-    waits that long for its answer.
+    Any other state is a *time jump*, and set aside. If a state of the present time follows, the
+    jump is ignored and counted. If none does for 0.5 s of wall time, the time has really changed,
+    as after a restart of the plant, and the jump is accepted. A plant in lockstep waits that long
+    for its answer.
 
     Parameters
     ----------
@@ -93,15 +78,14 @@ class StampFilter:
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
-        self._max_step_ns: float = math.inf
-        """Largest plausible step without a loss, ns; infinite while one state is known at most."""
         self._steps: deque[int] = deque(maxlen=_MEASURED_STEPS)
         """Latest steps between two states, ns."""
-        self._previous_ns, self._admission_wall = _NO_STAMP, 0.0
-        self._origin_ns, self._origin_wall = _NO_STAMP, 0.0
-        """The first state of the present time, from which the plant's pace is measured."""
-        self._pending_jump: _PendingJump | None = None
-        self._jump_odom = _NO_MESSAGE
+        self._longest_step = math.inf
+        """Largest step without a loss, ns; infinite while one state is known at most."""
+        self._first_ns, self._first_wall, self._wall = _NO_STAMP, 0.0, 0.0
+        """Stamp (ns) and wall time (s) of the first state of the present time; of the last one."""
+        self._jump = self._jump_odom = _NO_MESSAGE
+        self._jump_wall = 0.0
         self.now_ns = 0
         """Stamp of the latest admitted state, ns; 0 before the first state."""
         self.ignored = 0
@@ -113,9 +97,8 @@ class StampFilter:
     def rate(self) -> float:
         """Rate of the states by their stamps, Hz; 0 while too few are known."""
         steps = list(self._steps)
-        latest = steps[-_EQUAL_STEPS:]
-        if len(latest) == _EQUAL_STEPS and max(latest) - min(latest) <= _STEP_ROUNDING_NS:
-            return SECOND / latest[-1]
+        if len(steps) > 1 and abs(steps[-1] - steps[-2]) <= _STEP_ROUNDING_NS:
+            return SECOND / steps[-1]
         if len(steps) < _MEASURED_STEPS:
             return 0.0
         # Sensors are read at whole rates, with some jitter; steps with losses are longer.
@@ -126,117 +109,74 @@ class StampFilter:
     @property
     def steady_rate(self) -> float:
         """Rate of the states if many steps in a row agree, Hz; 0: they do not."""
-        steps = list(self._steps)
+        steps = self._steps
         steady = len(steps) == _MEASURED_STEPS and max(steps) <= _STEADY * min(steps)
         return self.rate if steady else 0.0
 
+    def is_present(self, stamp_ns: int, behind_ns: float = 0.0) -> bool:
+        """Whether a stamp is of the present time, by at most ``behind_ns`` before the last one."""
+        ahead = stamp_ns - self.now_ns
+        if ahead <= self._longest_step:
+            return ahead >= -behind_ns
+        elapsed = self._wall - self._first_wall
+        pace = (self.now_ns - self._first_ns) / elapsed if elapsed > 0 else 0.0
+        return ahead <= self._longest_step + _PACE_SLACK * pace * (self._clock() - self._wall)
+
     def accepts_joints(self, stamp_ns: int, joints: Any) -> bool:
         """Return whether joints are of the present time; set other joints aside."""
-        if self._origin_ns == _NO_STAMP:
-            self._begin(stamp_ns)
-        elif 0 <= stamp_ns - self.now_ns <= self._longest_ahead(self._max_step_ns, stamp_ns):
-            step = stamp_ns - self.now_ns
-            if step:
-                self._steps.append(step)
-                self._max_step_ns = round(_STEP_SLACK * step)
-            self._previous_ns, self.now_ns = self.now_ns, stamp_ns
-            self._admission_wall = self._clock()
-        else:
-            self._set_aside(Stamped(stamp_ns, joints))
+        if not self.is_present(stamp_ns):
+            if self._jump.message is None:
+                self._jump_wall = self._clock()
+            self._jump = Stamped(stamp_ns, joints)
             return False
-        if self._pending_jump is not None or self._jump_odom.message is not None:
+        if self._first_ns == _NO_STAMP:
+            self._begin(stamp_ns)
+            return True
+        if stamp_ns > self.now_ns:
+            self._steps.append(stamp_ns - self.now_ns)
+            self._longest_step = _STEP_SLACK * self._steps[-1]
+        self.now_ns, self._wall = stamp_ns, self._clock()
+        if self._jump.message is not None or self._jump_odom.message is not None:
             self._ignore_jump()
         return True
-
-    def would_accept(self, stamp_ns: int) -> bool:
-        """Return whether joints with a stamp would be admitted, without a change."""
-        return 0 <= stamp_ns - self.now_ns <= self._longest_ahead(self._max_step_ns, stamp_ns)
 
     def accepts_odom(self, stamp_ns: int, odom: Any) -> bool:
         """Return whether a pose is of the present time; set other poses aside.
 
         It comes before the joints of its stamp, or after them.
         """
-        ahead, longest = stamp_ns - self.now_ns, self._max_step_ns
-        if self._origin_ns == _NO_STAMP or -longest <= ahead <= self._longest_ahead(
-            longest, stamp_ns
-        ):
+        if self.is_present(stamp_ns, self._longest_step):
             return True
         self._jump_odom = Stamped(stamp_ns, odom)
         return False
-
-    def undo_last(self) -> None:
-        """Undo the last admission: the state is not one of the robot."""
-        if self._previous_ns == _NO_STAMP:
-            self._origin_ns, self.now_ns = _NO_STAMP, 0
-            return
-        self.now_ns = self._origin_ns = self._previous_ns
-        self._origin_wall = self._admission_wall
-        if self._steps:
-            self._steps.pop()
-        self._max_step_ns = _STEP_SLACK * self._steps[-1] if self._steps else math.inf
 
     def accepted_jump(self) -> tuple[Stamped | None, Stamped] | None:
         """Return set-aside odom (or None) and joints once their time is accepted.
 
         To be called several times a second; None: no jump is accepted.
         """
-        jump = self._pending_jump
-        if jump is None:
+        joints, odom = self._jump, self._jump_odom
+        if joints.message is None or self._clock() - self._jump_wall < _JUMP_CONFIRMATION_TIME:
             return None
-        # While this process itself stood still, states of the old time may have come unseen.
-        jump.checks += 1
-        if jump.checks < _MIN_CHECKS or self._clock() - jump.since < self._jump_confirmation_time:
-            return None
-        stamp, before = jump.joints.stamp_ns, self.now_ns
-        odom, self._pending_jump, self._jump_odom = self._jump_odom, None, _NO_MESSAGE
-        self._begin(stamp)
-        self._previous_ns = before
-        return (odom if odom.stamp_ns == stamp else None), jump.joints
+        self._begin(joints.stamp_ns)
+        return (odom if odom.stamp_ns == joints.stamp_ns else None), joints
 
     def _begin(self, stamp_ns: int) -> None:
         """Begin a time with its first state."""
-        self._previous_ns, self.now_ns, self._origin_ns = _NO_STAMP, stamp_ns, stamp_ns
-        self._admission_wall = self._origin_wall = self._clock()
-        self._max_step_ns = math.inf
+        self.now_ns = self._first_ns = stamp_ns
+        self._wall = self._first_wall = self._clock()
+        self._longest_step = math.inf
         self._steps.clear()
-
-    def _longest_ahead(self, step_ns: float, stamp_ns: int) -> float:
-        """Return the largest plausible step at present, ns; the clock is read only if it counts."""
-        if stamp_ns - self.now_ns <= step_ns:
-            return step_ns
-        since = self._clock() - self._admission_wall
-        return step_ns + _PACE_SLACK * self._simulation_pace * since
-
-    @property
-    def _simulation_pace(self) -> float:
-        """Pace of the present time: simulated ns per wall s."""
-        elapsed = self._admission_wall - self._origin_wall
-        return (self.now_ns - self._origin_ns) / elapsed if elapsed > 0 else 0.0
-
-    @property
-    def _jump_confirmation_time(self) -> float:
-        """Wall time (s) without a state of the old time after which a jump is accepted."""
-        step, pace = self._steps[-1] if self._steps else 0, self._simulation_pace
-        return max(_MIN_JUMP_CONFIRMATION_TIME, 4 * step / pace if pace > 0 else 0.0)
-
-    def _set_aside(self, joints: Stamped) -> None:
-        """Keep a state of another time, in place of an earlier kept state."""
-        jump = self._pending_jump
-        if jump is not None and joints.stamp_ns >= jump.joints.stamp_ns:
-            jump.joints = joints
-        else:
-            self._pending_jump = _PendingJump(self._clock(), joints)
+        self._jump = self._jump_odom = _NO_MESSAGE
 
     def _ignore_jump(self) -> None:
-        """Count the set-aside messages as ignored: the old time goes on.
+        """Count the set-aside messages as ignored: the present time goes on.
 
         While nodes meet, they receive one topic earlier than the other: such poses do not count.
         """
-        joints = _NO_MESSAGE if self._pending_jump is None else self._pending_jump.joints
-        meeting = self._clock() - self._origin_wall < _MEETING_TIME
+        meeting = self._wall - self._first_wall < _MEETING_TIME
         odom = _NO_MESSAGE if meeting else self._jump_odom
-        for name, given in (("joint_states", joints), ("odom", odom)):
+        for name, given in (("joint_states", self._jump), ("odom", odom)):
             if given.message is None or given.stamp_ns == self.now_ns:
                 continue
             ahead = (given.stamp_ns - self.now_ns) / SECOND
@@ -245,7 +185,7 @@ class StampFilter:
                 f"A message on '{name}' is ignored: its stamp is {abs(ahead):.4g} s "
                 f"{'ahead of' if ahead > 0 else 'behind'} the time of the states."
             )
-        self._pending_jump, self._jump_odom = None, _NO_MESSAGE
+        self._jump = self._jump_odom = _NO_MESSAGE
 
 
 # -- whole states -----------------------------------------------------------------------------
@@ -262,10 +202,6 @@ class Pairing(str, Enum):
 
     LATE_POSE = "late pose"
     """Odom of a state that was handed over without odom before."""
-
-
-# Constants save the slow look-up of enum members for every state.
-_WHOLE, _WITHOUT_POSE, _LATE_POSE = Pairing.WHOLE, Pairing.WITHOUT_POSE, Pairing.LATE_POSE
 
 
 class StateSynchroniser:
@@ -360,15 +296,15 @@ class StateSynchroniser:
             self._odom_fresh = self._odom_fresh and not together
             if self._joints_fresh:
                 self._joints_fresh = False
-                return _WHOLE if posed else _WITHOUT_POSE
-            return _LATE_POSE if posed else None
+                return Pairing.WHOLE if posed else Pairing.WITHOUT_POSE
+            return Pairing.LATE_POSE if posed else None
         if (
             self._joints_fresh
             and (self._without_pose or (self._odom_fresh and together))
             and all(given.stamp_ns == stamp for given in self._required.values())
         ):
             self._odom_fresh = self._joints_fresh = False
-            return _WITHOUT_POSE if self._without_pose else _WHOLE
+            return Pairing.WITHOUT_POSE if self._without_pose else Pairing.WHOLE
         return None
 
     def take_overdue(self) -> Pairing | None:
@@ -381,7 +317,7 @@ class StateSynchroniser:
             return None
         self._joints_fresh = False
         self._without_pose = self._joints_ns != self._odom_ns
-        return _WITHOUT_POSE if self._without_pose else _WHOLE
+        return Pairing.WITHOUT_POSE if self._without_pose else Pairing.WHOLE
 
 
 # -- the status of the plant ------------------------------------------------------------------
@@ -419,15 +355,14 @@ class PlantListener:
     """Follows plant/status: whether the plant obeys, and its resets; none need be published."""
 
     def __init__(self) -> None:
-        self._status: PlantStatus | None = None
-        self._name = "plant"
+        self.status = PlantStatus(PlantState.RUNNING)
+        """The latest status; before the first one, that of a plant that obeys."""
+        self._heard, self._name = False, "plant"
 
     @property
     def refusal_of_goals(self) -> str:
         """Message on why goals are refused at present; empty: goals are accepted."""
-        status = self._status
-        if status is None:
-            return ""
+        status = self.status
         if status.latched_fault:
             return f"The plant is latched: {status.latched_fault}; call '{self._name}/rearm' first."
         if status.state is PlantState.FAILED:
@@ -435,57 +370,33 @@ class PlantListener:
         return ""
 
     @property
-    def inactive(self) -> bool:
-        """Whether the plant says that it is inactive."""
-        return self._status is not None and self._status.state is PlantState.INACTIVE
-
-    @property
-    def rate(self) -> float:
-        """Ticks a second of the plant, Hz; 0: it is not known."""
-        return 0.0 if self._status is None else self._status.tick_rate_hz
-
-    @property
     def in_lockstep(self) -> bool:
         """Whether the plant waits for commands."""
-        return self._status is not None and self._status.time_mode == "lockstep"
-
-    @property
-    def actuation(self) -> str:
-        """What the plant takes: ``velocity`` or ``effort``; empty: either, or it is not known."""
-        actuation = "" if self._status is None else self._status.actuation
-        return "" if actuation == "auto" else actuation
+        return self.status.time_mode == "lockstep"
 
     @property
     def has_no_command(self) -> bool:
         """Whether no command is in force: none has come, or none is obeyed."""
-        status = self._status
-        return status is not None and (
-            status.state is PlantState.RESTING or bool(self.refusal_of_goals)
-        )
-
-    @property
-    def payload(self) -> str:
-        """The body that the robot holds, as the text of a :class:`.Payload`; empty: none."""
-        return "" if self._status is None else self._status.payload
+        return self.status.state is PlantState.RESTING or bool(self.refusal_of_goals)
 
     @property
     def paused(self) -> bool:
         """Whether the plant's time stands still."""
-        return self._status is not None and self._status.state is PlantState.PAUSED
+        return self.status.state is PlantState.PAUSED
 
     def update(self, status: PlantStatus, name: str = "plant") -> list[PlantStopped | PlantChange]:
         """Take the next status of the named plant; return the changes to react to.
 
         Statuses may be missed: the counters of a plant tell the changes in between.
         """
-        before, was_blocked = self._status, bool(self.refusal_of_goals)
-        self._status, self._name = status, name
+        before, heard, was_blocked = self.status, self._heard, bool(self.refusal_of_goals)
+        self.status, self._name, self._heard = status, name, True
         changes: list[PlantStopped | PlantChange] = []
         if self.refusal_of_goals:
-            if before is None or not was_blocked or status.latched_fault != before.latched_fault:
+            if not was_blocked or status.latched_fault != before.latched_fault:
                 changes.append(PlantStopped(status.message))
             return changes
-        if before is None:
+        if not heard:
             return changes
         if status.rearms > before.rearms and not was_blocked:
             changes.append(PlantStopped("Commands pass again after a fault was latched."))

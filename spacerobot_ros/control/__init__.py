@@ -8,7 +8,7 @@ if TYPE_CHECKING:
     from spacerobot_ros.control.laws.law import ControlLaw, GainPair, Gains, LawOptions, LawStatus
     from spacerobot_ros.control.laws.registry import LAWS
     from spacerobot_ros.control.limits import ActuatorLimits, MotionLimits, Saturated
-    from spacerobot_ros.control.outputs import OutputSelection, default_selection, plane_normal
+    from spacerobot_ros.control.outputs import OutputSelection, default_selection
     from spacerobot_ros.control.reference import (
         PROFILES,
         QuinticReference,
@@ -25,6 +25,7 @@ if TYPE_CHECKING:
         Reference,
         TargetNotSetError,
     )
+    from spacerobot_ros.model.description import plane_normal
 
 __all__ = [
     "LAWS",
@@ -68,7 +69,7 @@ __getattr__ = lazy_names(
         "Saturated": "spacerobot_ros.control.limits",
         "OutputSelection": "spacerobot_ros.control.outputs",
         "default_selection": "spacerobot_ros.control.outputs",
-        "plane_normal": "spacerobot_ros.control.outputs",
+        "plane_normal": "spacerobot_ros.model.description",
         "PROFILES": "spacerobot_ros.control.reference",
         "QuinticReference": "spacerobot_ros.control.reference",
         "ReferenceProfile": "spacerobot_ros.control.reference",

@@ -28,7 +28,7 @@ from spacerobot_ros.control.state import (
     TargetNotSetError,
 )
 from spacerobot_ros.errors import ParameterError
-from spacerobot_ros.model.description import Array, JointKind, RobotDescription
+from spacerobot_ros.model.description import Array, RobotDescription, plane_normal
 from spacerobot_ros.model.kinematics import link_quaternion
 from spacerobot_ros.model.space_robot import SpaceRobot
 from spacerobot_ros.model.symbolic_rotations import (
@@ -169,32 +169,6 @@ def default_selection(description: RobotDescription, end_effector_link: str) -> 
     selection = OutputSelection(base, point, (), end_effector_link)
     selection.require_valid(description)
     return selection
-
-
-def plane_normal(description: RobotDescription) -> Array | None:
-    """Return the unit normal (3,), base components, of the plane a robot moves in; None: spatial.
-
-    A robot is planar if it has a joint that turns, the axes of all such joints are parallel, and
-    those of all prismatic joints are perpendicular to them. Its bodies then move in parallel
-    planes of the base.
-    """
-    normal: Array | None = None
-    rotations = [np.eye(3)]
-    slides = []
-    for body in description.bodies[1:]:
-        assert body.joint is not None
-        # All turns are about the one normal, or the robot is spatial: the shape q = 0 tells both.
-        rotations.append(rotations[body.parent] @ body.origin.R)
-        axis = rotations[-1] @ body.joint.axis
-        if body.joint.kind is JointKind.PRISMATIC:
-            slides.append(axis)
-        elif normal is None:
-            normal = axis
-        elif np.linalg.norm(np.cross(normal, axis)) > _PARALLEL_TOLERANCE:
-            return None
-    if normal is None or any(abs(normal @ slide) > _PARALLEL_TOLERANCE for slide in slides):
-        return None
-    return normal
 
 
 _POSE_REFERENCE_SIZE = 19

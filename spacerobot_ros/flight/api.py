@@ -16,6 +16,7 @@ from spacerobot_ros.control.laws.law import ControlLaw
 from spacerobot_ros.errors import GoalError, ParameterError, PlanningError
 from spacerobot_ros.flight.flight import Flight
 from spacerobot_ros.flight.lockstep import Robots, fly_scenario
+from spacerobot_ros.flight.trials import PlanningProblem, robot_state_of
 from spacerobot_ros.measures import Outcome
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.parameters import configured, require_known
@@ -33,7 +34,6 @@ from spacerobot_ros.scenario import (
     scenario_of,
     scenario_or_robot,
 )
-from spacerobot_ros.simulation.trials import robot_state_of
 
 _ORIGIN = [0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]
 """The pose of a base that is nowhere else."""
@@ -223,7 +223,7 @@ def plan(
         name, options
     )  # Names are checked here, so that a message has the names as given.
     settings |= {f"{name}.{option}": value for option, value in options.items()}
-    problem = scenario.with_overrides("planner", settings).problem()
+    problem = PlanningProblem.of(scenario.with_overrides("planner", settings))
     state, tolerance = robot_state_of(problem.plant()), problem.config.tolerance
     request = planning.PlanRequest(state, problem.goal, tolerance)
     return problem.method(name).plan(request)

@@ -47,6 +47,7 @@ from spacerobot_ros.simulation.actuators import PlantWithFaults, thrusters_in
 from spacerobot_ros.simulation.capture import capture_values, load_target
 from spacerobot_ros.simulation.commands import CommandValidator, Refusal
 from spacerobot_ros.simulation.sensors import ReportedState
+from spacerobot_ros.simulation.status import PlantStatus
 from spacerobot_ros.times import SECOND
 
 if TYPE_CHECKING:
@@ -55,6 +56,7 @@ if TYPE_CHECKING:
     import pandas as pd
     import xarray as xr
 
+    from spacerobot_ros.messages.statuses import StatusRecord
     from spacerobot_ros.scenario import Scenario
 
 _INITIAL_ROW_COUNT = 1024
@@ -106,10 +108,21 @@ class Signal:
 
 @dataclass(frozen=True)
 class Commands:
-    """The commands on one topic: ``tick`` (N,) that each answers, ``values`` (N, size)."""
+    """The commands on one topic.
+
+    Attributes
+    ----------
+    tick
+        (N,) tick that each answers.
+    values
+        (N, size) numbers that the plant, or the controller, takes from them.
+    setpoints
+        (N, 2 n) joint positions and rates in the messages of a planner; None: not known.
+    """
 
     tick: npt.NDArray[np.int64]
     values: Array
+    setpoints: Array | None = None
 
 
 @dataclass(frozen=True)
@@ -156,6 +169,10 @@ class Flight:
         All goals that were sent.
     schedules
         The gaits that were flown, each with the stamp of its beginning, ns; none of a bag.
+    plant_statuses, diagnostics, covariances
+        Statuses of the plant, diagnostics of plant and commanders, and covariances (72,) of
+        measured pose and twist, each with the time from which on it is published, ns; none of a
+        bag, nor covariances of sensors without errors.
     status, gait
         The last status of the commander that decides, and the planner's when its first gait began.
     plan_time, wall_time
@@ -181,6 +198,9 @@ class Flight:
     goals: tuple[SentGoal, ...] = ()
     end_effector_goals: tuple[SentGoal, ...] = ()
     schedules: tuple[tuple[int, GaitSchedule], ...] = ()
+    plant_statuses: tuple[tuple[int, PlantStatus], ...] = ()
+    diagnostics: tuple[tuple[int, tuple[StatusRecord, ...]], ...] = ()
+    covariances: tuple[tuple[int, Array], ...] = ()
     status: Status | None = None
     gait: PlannerStatus | None = None
     plan_time: float = math.nan
@@ -808,6 +828,9 @@ class FlightLog:
         self.events: list[Event] = []
         self.statuses: list[tuple[int, Status]] = []
         self.schedules: list[tuple[int, GaitSchedule]] = []
+        self.plant_statuses: list[tuple[int, PlantStatus]] = []
+        self.diagnostics: list[tuple[int, tuple[StatusRecord, ...]]] = []
+        self.covariances: list[tuple[int, Array]] = []
         self.refusals: list[tuple[float, str, Refusal]] = []
         self._period_ns = period_ns
         self._thrusters = thrusters_in(plant)
@@ -829,6 +852,9 @@ class FlightLog:
             source.topic: (array("q"), _GrowingTable(len(source.limits)))
             for source in commands.sources
         }
+        self._setpoints: dict[str, _GrowingTable] = {}
+        self._plant = plant
+        self._faults_seen: object = None
         self._ticks_without_pose: list[int] = []
         self._ticks_without_target: list[int] = []
         self._reported = reported
@@ -838,18 +864,29 @@ class FlightLog:
         if self._thrusters is not None:
             self._propellant[0] = self._thrusters.propellant
         np.concatenate(self._parts, out=self._states.next_row())
-        if self._reported.sensors.dropout:
+        sensors = self._reported.sensors
+        if sensors.used and self._plant.active is not self._faults_seen:
+            self._faults_seen = self._plant.active
+            both = np.concatenate([sensors.pose_covariance, sensors.twist_covariance])
+            self.covariances.append((tick * self._period_ns, both))
+        if sensors.dropout:
             self._ticks_without_pose.append(tick)
         if self._reported.misses_target:
             self._ticks_without_target.append(tick)
 
-    def add_command(self, topic: str, tick: int, values: Array) -> None:
-        """Add a command."""
+    def add_command(
+        self, topic: str, tick: int, values: Array, setpoint: tuple[Array, Array] | None = None
+    ) -> None:
+        """Add a command; a planner's has its setpoint, joint positions and rates."""
         if topic not in self._commands:
             self._commands[topic] = array("q"), _GrowingTable(len(values))
         ticks, rows = self._commands[topic]
         ticks.append(tick)
         rows.next_row()[:] = values
+        if setpoint is not None:
+            if topic not in self._setpoints:
+                self._setpoints[topic] = _GrowingTable(2 * len(setpoint[0]))
+            np.concatenate(setpoint, out=self._setpoints[topic].next_row())
 
     def flight(
         self,
@@ -881,7 +918,11 @@ class FlightLog:
             joint_names=tuple(robot.joint_names),
             series={name: Signal(time, values) for name, values in states.items()},
             commands={
-                topic: Commands(np.array(ticks, np.int64), rows.table().copy())
+                topic: Commands(
+                    np.array(ticks, np.int64),
+                    rows.table().copy(),
+                    self._setpoints[topic].table().copy() if topic in self._setpoints else None,
+                )
                 for topic, (ticks, rows) in self._commands.items()
             },
             statuses=tuple(self.statuses),
@@ -891,6 +932,9 @@ class FlightLog:
             goal=scenario.goal,
             end_effector_goal=scenario.end_effector_goal,
             schedules=tuple(self.schedules),
+            plant_statuses=tuple(self.plant_statuses),
+            diagnostics=tuple(self.diagnostics),
+            covariances=tuple(self.covariances),
             status=status,
             gait=gait,
             plan_time=plan_time,

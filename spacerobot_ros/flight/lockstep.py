@@ -1,6 +1,6 @@
 """A flight in lockstep without ROS: the plant and its commanders, in the order of their nodes.
 
-The nodes of a stack in one process pass messages to each other in the order of publication. The
+Nodes in lockstep pass messages to each other in the order of publication. The
 loop makes the same calls in the same order:
 
 1. The plant reports the state of tick k.
@@ -39,6 +39,8 @@ from spacerobot_ros.errors import ParameterError, SpaceRobotError
 from spacerobot_ros.events import CONTACTS, Event, EventKind
 from spacerobot_ros.flight.flight import Flight, FlightLog
 from spacerobot_ros.measures import Outcome
+from spacerobot_ros.messages.diagnostics import PlantDiagnostics, state_diagnostics
+from spacerobot_ros.messages.statuses import StatusRecord
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array, RobotDescription
 from spacerobot_ros.model.shared_parameters import RobotConfig, robot_from_text, robot_of
@@ -135,9 +137,10 @@ def require_flyable(scenario: Scenario) -> None:
     elif len(scenario.commanders) > 1 and scenario.planner.output == "commands":
         why = "planner and controller both command the joints"
     if why:
+        realtime = " --realtime" if scenario.kills and scenario.lockstep else ""
         raise ParameterError(
-            f"The scenario '{scenario.name}' cannot be flown without ROS, because {why}; "
-            "`spacerobot run` flies it."
+            f"The scenario '{scenario.name}' cannot be flown without nodes, because {why}: fly it "
+            f"with `spacerobot run --nodes{realtime}`."
         )
 
 
@@ -149,7 +152,7 @@ def fly_scenario(
     longest: float = math.inf,
     contacts: bool = True,
 ) -> Flight:
-    """Fly a scenario from its initial state to its goal, without ROS: as `spacerobot run` does.
+    """Fly a scenario from its initial state to its goal, without ROS: as ``spacerobot run`` does.
 
     Parameters
     ----------
@@ -172,8 +175,8 @@ def fly_scenario(
         The shape of the goal is of another robot.
     """
     require_flyable(scenario)
-    flight = _LockstepFlight(scenario, robots or Robots.of(scenario)).fly(progress, longest)
-    return _with_contacts(flight) if contacts else flight
+    flight = LockstepFlight(scenario, robots or Robots.of(scenario))
+    return flight.fly(progress, longest, contacts=contacts)
 
 
 def _with_contacts(flight: Flight) -> Flight:
@@ -194,7 +197,8 @@ def _with_contacts(flight: Flight) -> Flight:
             or each.kind in CONTACTS
             for each in events
         ]
-        events.insert(earlier.index(False) if False in earlier else len(events), contact)
+        place = earlier.index(False) if False in earlier else len(events)
+        events.insert(place, replace(contact, node="plant"))
     return replace(flight, events=tuple(events))
 
 
@@ -209,22 +213,21 @@ class _DecisionState(Enum):
 class _Host:
     """The :class:`~spacerobot_ros.commanding.commander.CommanderHost` of a commander here."""
 
-    flight: _LockstepFlight
+    flight: LockstepFlight
+    node: str
     send_command: Callable[[int], None]
 
     def publish_status(self, status: Status) -> None:
         self.flight.take_status(status)
 
     def report_event(self, event: Event) -> None:
-        self.flight.take_event(event)
+        self.flight.take_event(self.node, event)
 
     def publish_start(self, start: ScheduleStart) -> None:
         self.flight.log.schedules.append((start.stamp_ns, start.schedule))
 
     def log(self, level: str, message: str) -> None:
         pass
-
-    log_about_goals = log
 
     def has_publisher(self, topic: str) -> bool:
         return topic == "odom" or (topic == JOINT_REFERENCE and self.flight.has_planner)
@@ -233,8 +236,23 @@ class _Host:
         return [], []
 
 
-class _LockstepFlight:
-    """One flight in lockstep, tick by tick."""
+class LockstepFlight:
+    """One flight in lockstep, tick by tick.
+
+    Parameters
+    ----------
+    scenario
+        What to fly; :func:`require_flyable` accepts it.
+    robots
+        The models.
+
+    Raises
+    ------
+    ParameterError
+        A parameter or the robot is refused.
+    GoalError
+        The shape of the goal is of another robot.
+    """
 
     def __init__(self, scenario: Scenario, robots: Robots) -> None:
         config = scenario.plant
@@ -247,11 +265,18 @@ class _LockstepFlight:
         self._commands = CommandValidator(self._plant, config)
         self._monitor = PlantMonitor(self._commands, self._plant, config)
         self._injected_seen = self._plant.injected
+        self._diagnostics = PlantDiagnostics("/plant", self._plant, self._commands)
+        self._report_ticks = config.ticks_of(config.diagnostics_period)
+        self._diagnosed_ns: dict[str, int] = {}
+        """When the diagnostics of each commander were published last, ns."""
+        self._statuses: dict[str, StatusRecord] = {}
+        """The last status of each commander."""
         self.log = FlightLog(self._plant, self._reported, self._commands, self._period_ns)
         self._follower = GoalFollower(GoalIds().of(*_FIRST_GOAL_STAMP))
         self._decided: _DecisionState | None = None
         self._moment = _DecisionState.BEFORE_COMMAND
         self._status: Status | None = None
+        self._interrupted = False
         self._planner: PlannerCommander | None = None
         self._controller: ControllerCommander | None = None
         commanders: dict[str, Commander] = {}
@@ -260,30 +285,50 @@ class _LockstepFlight:
             if "coordinated_control" in scenario.commanders:
                 send = self._send_reference
             commanders["planner"] = self._planner = PlannerCommander(
-                scenario.planner, _Host(self, send), method=robots.method
+                scenario.planner, _Host(self, "planner", send), method=robots.method
             )
             self._planner.use_robot(robots.planner, ArrayDecoder())
         if "coordinated_control" in scenario.commanders:
+            host = _Host(self, "coordinated_control", self._send_actuation)
             commanders["coordinated_control"] = self._controller = ControllerCommander(
-                scenario.controller, _Host(self, self._send_actuation), own_law=robots.own_law
+                scenario.controller, host, own_law=robots.own_law
             )
             self._controller.use_robot(robots.controller, ArrayDecoder())
             if self._plant.capturing is not None:
                 self._controller.use_target(self._plant.capturing.target.description)
-        self._commanders = [commanders[name] for name in scenario.commanders]
+        self._commanders = {name: commanders[name] for name in scenario.commanders}
 
     # -- the flight ---------------------------------------------------------------------------
 
-    def fly(self, progress: Progress, longest: float) -> Flight:
-        """Fly to the decision about the goal."""
-        began, interrupted = time.perf_counter(), ""
-        reported_at = began
+    def fly(
+        self,
+        progress: Progress = lambda now, end: False,
+        longest: float = math.inf,
+        *,
+        contacts: bool = True,
+    ) -> Flight:
+        """Fly to the decision about the goal; parameters are those of :func:`fly_scenario`."""
+        began = time.perf_counter()
+        interrupted = self._fly(progress, longest)
+        flight = self.until_now(time.perf_counter() - began, interrupted)
+        return _with_contacts(flight) if contacts else flight
+
+    def interrupt(self) -> None:
+        """End the flight, and the plan that is being made; called from another thread."""
+        self._interrupted = True
+        if self._planner is not None:
+            self._planner.interrupt()
+
+    def _fly(self, progress: Progress, longest: float) -> str:
+        """Fly; return why the flight was interrupted, empty if the goal was decided."""
+        reported_at = time.perf_counter()
         self._commands.revoke_before(0)
         for source in self._commands.sources:
             wrench = source.quantity == "wrench"
             source.commanders = int(self._controller is not None) if wrench else 1
         self._commands.require_commanded()
-        for commander in self._commanders:
+        self.log.plant_statuses.append((0, self._monitor.status))
+        for commander in self._commanders.values():
             commander.activate()
         self._report_plant_status(PlantState.RUNNING)
         self._moment = _DecisionState.BEFORE_COMMAND
@@ -291,31 +336,33 @@ class _LockstepFlight:
         self._report_state()
         while True:
             self._answer_state()
+            if self._interrupted:
+                return self._interruption
             if self._decided is _DecisionState.BEFORE_COMMAND:
-                break
+                return ""
             if not self._commands.complete and not self._reported.sensors.dropout:
-                interrupted = f"No command answers the state of {self._time:g} s."
-                break
+                return f"No command answers the state of {self.time:g} s."
             ends = self._decided is not None
             if not self._step():
-                break
+                return ""
             self._report_state()
             if self._plant.injected is not self._injected_seen:
                 self._report_plant_status(PlantState.RUNNING)
             if ends:
-                break
-            if self._time >= longest:
-                interrupted = f"Interrupted after {self._time:.6g} s of simulated time."
-                break
+                return ""
+            if self.time >= longest:
+                return self._interruption
             if (
                 self._tick % _TICKS_PER_CLOCK_READ == 0
                 and time.perf_counter() - reported_at >= _PROGRESS_PERIOD
             ):
                 reported_at = time.perf_counter()
-                if progress(self._time, self._expected_end):
-                    interrupted = f"Interrupted after {self._time:.6g} s of simulated time."
-                    break
-        return self._result(time.perf_counter() - began, interrupted)
+                if progress(self.time, self._expected_end):
+                    return self._interruption
+
+    @property
+    def _interruption(self) -> str:
+        return f"Interrupted after {self.time:.6g} s of simulated time."
 
     @property
     def has_planner(self) -> bool:
@@ -323,8 +370,13 @@ class _LockstepFlight:
         return self._planner is not None
 
     @property
-    def _time(self) -> float:
-        return self._tick * self._period_ns / SECOND
+    def _now_ns(self) -> int:
+        return self._tick * self._period_ns
+
+    @property
+    def time(self) -> float:
+        """Simulated time, s."""
+        return self._now_ns / SECOND
 
     @property
     def _expected_end(self) -> float:
@@ -334,6 +386,8 @@ class _LockstepFlight:
         """Report the state of a tick, as the node publishes it."""
         self._reported.update()
         self.log.add_state(self._tick)
+        if self._report_ticks and self._tick % self._report_ticks == 0:
+            self.log.diagnostics.append((self._now_ns, tuple(self._diagnostics.records())))
 
     def _step(self) -> bool:
         """Step under the commands of the tick; return whether the plant could."""
@@ -341,7 +395,7 @@ class _LockstepFlight:
         try:
             self._plant.step(*commands)
         except SpaceRobotError as error:
-            self._monitor.failure = "model", f"The plant stops at {self._time:g} s: {error}"
+            self._monitor.failure = "model", f"The plant stops at {self.time:g} s: {error}"
             self._commands.rest()
             self._report_plant_status(PlantState.FAILED)
             return False
@@ -353,7 +407,7 @@ class _LockstepFlight:
     def _answer_state(self) -> None:
         """Have the commanders answer the present state."""
         self._moment = _DecisionState.BEFORE_COMMAND
-        quantities, now = self._reported.quantities, self._tick * self._period_ns
+        quantities, now = self._reported.quantities, self._now_ns
         q, qdot = quantities["measured_q"], quantities["measured_qdot"]
         if self._controller is not None:
             # Joints whose pose is lost are answered at the next tick.
@@ -364,10 +418,22 @@ class _LockstepFlight:
         if self._controller is not None and measured:
             pose, twist = quantities["target_pose"], quantities["target_twist"]
             self._controller.receive_target(now, StateArrays(now, q, qdot, pose, twist))
-        for commander in self._commanders:
+        for name, commander in self._commanders.items():
             if not self._reported.sensors.dropout:
                 commander.take_odom(now, state)
             commander.take_joints(now, state)
+            period_ns = commander.config.diagnostics_period * SECOND
+            if period_ns and now - self._diagnosed_ns.get(name, 0) >= period_ns:
+                self._report_commander(name, now)
+
+    def _report_commander(self, name: str, now: int) -> None:
+        """Report how a commander answers states: it misses none."""
+        robot = self._commanders[name].robot
+        assert robot is not None
+        last, ignored = self._statuses.get(name), {"ignored": 0}
+        records = state_diagnostics(f"/{name}", robot.description.name, ignored, last)
+        self.log.diagnostics.append((now, tuple(records)))
+        self._diagnosed_ns[name] = now
 
     def _send_setpoint(self, stamp_ns: int) -> None:
         """Offer the setpoint of a planner that commands the joints itself."""
@@ -375,7 +441,7 @@ class _LockstepFlight:
         source, setpoint = self._commands.sources[0], self._planner.setpoint
         velocity = source.quantity == "velocity"
         values = setpoint.velocity if velocity else np.zeros(len(setpoint.velocity))
-        self._offer_command(source, values, stamp_ns)
+        self._offer_command(source, values, stamp_ns, (setpoint.position, setpoint.velocity))
         self._moment = _DecisionState.AFTER_COMMAND
 
     def _send_reference(self, stamp_ns: int) -> None:
@@ -385,12 +451,12 @@ class _LockstepFlight:
         position, velocity = self._planner.setpoint.position, self._planner.setpoint.velocity
         reference = StateArrays(stamp_ns, position.copy(), velocity.copy())
         self._controller.receive_reference(JOINT_REFERENCE, stamp_ns, reference)
-        self.log.add_command(JOINT_REFERENCE, self._tick, velocity)
+        self.log.add_command(JOINT_REFERENCE, self._tick, velocity, (position, velocity))
 
     def _send_actuation(self, _: int) -> None:
         """Offer the commands of the controller; its later decisions follow them."""
         assert self._controller is not None
-        now, effort = self._tick * self._period_ns, self._controller.effort
+        now, effort = self._now_ns, self._controller.effort
         for source in reversed(self._commands.sources):  # The wrench is sent first.
             values = self._controller.wrench if source.quantity == "wrench" else effort
             if source.quantity == "velocity":
@@ -398,13 +464,20 @@ class _LockstepFlight:
             self._offer_command(source, values, now)
         self._moment = _DecisionState.AFTER_COMMAND
 
-    def _offer_command(self, source: CommandSource, values: Array, now: int) -> None:
-        self.log.add_command(source.topic, self._tick, values)
+    def _offer_command(
+        self,
+        source: CommandSource,
+        values: Array,
+        now: int,
+        setpoint: tuple[Array, Array] | None = None,
+    ) -> None:
+        self.log.add_command(source.topic, self._tick, values, setpoint)
         if self._decided is _DecisionState.BEFORE_COMMAND:
             return
         refusal = self._commands.accept_or_refuse(source, now, values, now)
         if refusal is not None:
-            self.log.refusals.append((self._time, source.topic, refusal))
+            self._diagnostics.note_refusal(source, refusal)
+            self.log.refusals.append((self.time, source.topic, refusal))
             if refusal.latches:
                 self._report_plant_status(PlantState.RUNNING)
 
@@ -414,11 +487,16 @@ class _LockstepFlight:
         """Pass a change of the plant's status to the commanders."""
         self._injected_seen, self._moment = self._plant.injected, _DecisionState.AFTER_COMMAND
         before = self._monitor.status
-        self.log.events += self._monitor.update(activity, self._time)
+        self.log.events += self._events_until(activity)
         status = self._monitor.status
         if status is not before:
-            for commander in self._commanders:
+            self.log.plant_statuses.append((self._now_ns, status))
+            for commander in self._commanders.values():
                 commander.receive_plant_status(status)
+
+    def _events_until(self, activity: PlantState) -> list[Event]:
+        events = self._monitor.update(activity, self.time)
+        return [replace(event, node="plant") for event in events]
 
     # -- goals and statuses -------------------------------------------------------------------
 
@@ -443,7 +521,11 @@ class _LockstepFlight:
 
     def take_status(self, status: Status) -> None:
         """Follow the status as the client of a mission does."""
-        self.log.statuses.append((self._tick * self._period_ns, status))
+        self.log.statuses.append((self._now_ns, status))
+        name = "planner" if isinstance(status, PlannerStatus) else "coordinated_control"
+        self._statuses[name] = StatusRecord(
+            f"/{name}", status.state.level, status.message, status.to_values()
+        )
         if isinstance(status, PlannerStatus) is not self.has_planner:
             return
         if self._decided is not None:
@@ -452,19 +534,23 @@ class _LockstepFlight:
         if self._follower.update(status):
             self._decided = self._moment
 
-    def take_event(self, event: Event) -> None:
-        """Take an event; its time is now unless it has one."""
-        stamped = event if event.time_s is not None else replace(event, time_s=self._time)
-        self.log.events.append(stamped)
+    def take_event(self, node: str, event: Event) -> None:
+        """Take an event of a commander; its time is now unless it has one."""
+        time = self.time if event.time_s is None else event.time_s
+        self.log.events.append(replace(event, time_s=time, node=node))
 
-    def _result(self, wall_time: float, interrupted: str) -> Flight:
-        decision = self._follower.decision
+    def until_now(self, wall_time: float, interrupted: str = "") -> Flight:
+        """Return the flight so far; ``interrupted`` says why it ended early, if it did."""
+        decision = None if self._interrupted else self._follower.decision
         outcome = Outcome.INTERRUPTED if decision is None else Outcome(decision.state.value)
         message = interrupted
         if decision is not None:
             message = decision.message
         elif not interrupted and self._status is not None:
             message = self._monitor.status.message or self._status.message
+        if self._monitor.status.state is not PlantState.FAILED:
+            self.log.events += self._events_until(PlantState.INACTIVE)
+            self.log.plant_statuses.append((self._now_ns, self._monitor.status))
         plan_time = 0.0
         if self._planner is not None:
             plan_time = self._planner.statistics.plan_time_s

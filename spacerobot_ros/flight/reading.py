@@ -19,7 +19,6 @@ import numpy as np
 
 from spacerobot_ros.bag import Bag, RecordedRobot, TopicSeries, read_bag
 from spacerobot_ros.commanding.goal_follower import STATUS_TOPICS, GoalFollower, Status
-from spacerobot_ros.control.thrusters import IN_URDF, find_thrusters
 from spacerobot_ros.errors import (
     GoalError,
     PlanningError,
@@ -32,6 +31,7 @@ from spacerobot_ros.flight.flight import Commands, Flight, SentGoal, Signal, goa
 from spacerobot_ros.measures import Outcome
 from spacerobot_ros.messages.statuses import read_status
 from spacerobot_ros.model.description import Array, RobotDescription
+from spacerobot_ros.model.thrusters import IN_URDF, find_thrusters
 from spacerobot_ros.model.urdf import parse_robot
 from spacerobot_ros.model.world import obstacles_from_topic, with_world
 from spacerobot_ros.parameters import declared, known_values
@@ -511,6 +511,29 @@ def with_propellant(flight: Flight, thrusters: str, names: Sequence[str]) -> Fli
 
     makers = {name: partial(series.__getitem__, name) for name in series}
     return replace(flight, series=_LazyMapping({**makers, "propellant": used}))
+
+
+def since(flight: Flight, start: float) -> Flight:
+    """Return a flight with times since ``start``, s."""
+    series = flight.series
+
+    def moved(name: str) -> Signal:
+        return Signal(series[name].time - start, series[name].values)
+
+    def earlier(goals: tuple[SentGoal, ...]) -> tuple[SentGoal, ...]:
+        return tuple(replace(sent, time=sent.time - start) for sent in goals)
+
+    return replace(
+        flight,
+        series=_LazyMapping({name: partial(moved, name) for name in series}),
+        statuses=tuple((ns - round(start * SECOND), status) for ns, status in flight.statuses),
+        events=tuple(
+            each if each.time_s is None else replace(each, time_s=each.time_s - start)
+            for each in flight.events
+        ),
+        goals=earlier(flight.goals),
+        end_effector_goals=earlier(flight.end_effector_goals),
+    )
 
 
 def impulse(thrust: Signal, weights: Array) -> Signal:

@@ -6,14 +6,14 @@ A table has the columns and units of the tables of the bag.
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from spacerobot_ros.bag import LATCHED, BagWriter
+from spacerobot_ros.bag import LATCHED, BagWriter, QosProfile
 from spacerobot_ros.bag.tables import (
     Field,
     TopicTable,
@@ -21,34 +21,86 @@ from spacerobot_ros.bag.tables import (
     number_field,
     with_euler_angles,
 )
+from spacerobot_ros.commanding.goal_follower import STATUS_TOPICS, Status
 from spacerobot_ros.control.status import ControllerStatus
-from spacerobot_ros.control.thrusters import IN_URDF, find_thrusters
 from spacerobot_ros.messages.builders import (
+    RobotTransforms,
+    given_path_message,
     goal_message,
     path_message,
     state_message,
     trajectory_message,
 )
+from spacerobot_ros.messages.diagnostics import encode_diagnostics
 from spacerobot_ros.messages.layout import encode, stamped_copies
+from spacerobot_ros.messages.markers import RobotMarkers, goal_markers
 from spacerobot_ros.messages.statuses import StatusRecord
 from spacerobot_ros.model.description import DEFAULT_END_EFFECTOR, Array
+from spacerobot_ros.model.kinematics import ForwardKinematics
+from spacerobot_ros.model.thrusters import IN_URDF, find_thrusters
 from spacerobot_ros.model.visuals import meshes_for_bag
 from spacerobot_ros.planning.execution.status import PlannerStatus
 from spacerobot_ros.times import SECOND
-from spacerobot_ros.topics import TOPICS, Topic, goal_topic, pose_topic, state_topics, topic_named
+from spacerobot_ros.topics import (
+    TOPICS,
+    Topic,
+    goal_topic,
+    path_topic,
+    pose_topic,
+    state_topics,
+    topic_named,
+)
 from spacerobot_ros.version import __version__
 
 if TYPE_CHECKING:
     from spacerobot_ros.flight.flight import Flight
+    from spacerobot_ros.planning import GaitSchedule
+    from spacerobot_ros.scenario import Scenario
+
+_GOAL_STAMP_NS = 1
+"""Stamp of the goals of a mission at time zero, ns."""
+
+
+_BLOCK_NS = 60 * SECOND
+"""Time whose messages are made at once, ns: those of a long flight would fill the memory."""
+
+_CHUNK_SIZE = 262_144
+"""Chunk size before compression, bytes: larger chunks have lower fixed costs, but slow seeking."""
+
+_PUBLISHED_QOS = QosProfile(depth=100)
+"""QoS that the nodes offer on topics that are not latched."""
 
 
 @dataclass(frozen=True)
 class _Stream:
-    """The messages of a topic: when each was published, ns, and its bytes."""
+    """The messages of a topic.
+
+    Attributes
+    ----------
+    topic
+        The topic.
+    time_ns
+        (N,) when each was published, ns, in ascending order.
+    messages
+        Returns the bytes of some of them.
+    stamp_ns
+        The stamp of all of them, ns; None: the time of their publication.
+    """
 
     topic: Topic
     time_ns: NDArray[np.int64]
-    messages: list[bytes]
+    messages: Callable[[slice], Sequence[bytes]]
+    stamp_ns: int | None = None
+
+    @classmethod
+    def of(
+        cls, topic: Topic, messages: Iterable[tuple[int, bytes]], stamp_ns: int | None = None
+    ) -> _Stream:
+        """Return the stream of messages with their times, in any order."""
+        ordered = sorted(messages, key=lambda each: each[0])
+        times = np.array([time for time, _ in ordered], dtype=np.int64)
+        found = [message for _, message in ordered]
+        return cls(topic, times, lambda rows: found[rows], stamp_ns)
 
 
 def save_flight(flight: Flight, path: str | os.PathLike[str], *, overwrite: bool = False) -> None:
@@ -60,29 +112,85 @@ def save_flight(flight: Flight, path: str | os.PathLike[str], *, overwrite: bool
         The file is there and is not to be replaced, or cannot be written; a type of message is not
         installed.
     """
-    scenario, robot = flight.scenario, flight.required_robot()
-    streams = [*_state_streams(flight), *_clearance_streams(flight), *_other_streams(flight)]
-    with BagWriter(path, overwrite=overwrite) as writer:
-        writer.add_metadata("spacerobot", {"version": __version__})
-        nodes = ["plant", *scenario.commanders]
-        for title, values in scenario.records(nodes).items():
-            writer.add_metadata(title, values)
-        urdf = robot.urdf.encode()
-        writer.add_attachment("robot_description.urdf", urdf, "application/xml", 0)
-        for name, mesh in meshes_for_bag(robot).items():
-            writer.add_attachment(name, mesh, "model/stl", 0)
-        entries = []
-        for place, stream in enumerate(streams):
-            name = stream.topic.name
-            full = name if name.startswith("/") else f"/{name}"
-            qos = LATCHED if stream.topic.latched else None
-            channel = writer.add_topic(full, stream.topic.type, qos)
-            entries += [
-                (time, place, channel, data)
-                for time, data in zip(stream.time_ns.tolist(), stream.messages, strict=True)
-            ]
-        for time, _, channel, data in sorted(entries, key=lambda entry: entry[:2]):
-            writer.write(channel, data, time, time)
+    flight.required_robot()
+    with open_bag(flight.scenario, path, overwrite=overwrite) as writer:
+        write_flight(flight, writer)
+
+
+def open_bag(
+    scenario: Scenario, path: str | os.PathLike[str], *, overwrite: bool = False
+) -> BagWriter:
+    """Return a new bag, with the compression and the largest file of the scenario's recorder.
+
+    Raises
+    ------
+    RecordingError
+        The file is there and is not to be replaced, or cannot be made.
+    """
+    config = scenario.config("recorder")
+    return BagWriter(
+        path,
+        compression=config.compression,
+        overwrite=overwrite,
+        chunk_size=_CHUNK_SIZE,
+        max_size=round(config.max_size * 1e6),
+        max_duration_ns=round(config.max_duration * SECOND),
+    )
+
+
+def write_flight(flight: Flight, writer: BagWriter) -> None:
+    """Write a flight into an empty bag: every topic that the nodes publish.
+
+    Raises
+    ------
+    RecordingError
+        The bag cannot be written, or a type of message is not installed.
+    """
+    scenario = flight.scenario
+    chosen = {f"/{name.lstrip('/')}" for name in scenario.config("recorder").topics.split()}
+    streams = []
+    for stream in _streams(flight):
+        name = f"/{stream.topic.name.lstrip('/')}"
+        if len(stream.time_ns) and (not chosen or name in chosen):
+            qos = LATCHED if stream.topic.latched else _PUBLISHED_QOS
+            streams.append((writer.add_topic(name, stream.topic.type, qos), stream))
+    writer.add_metadata("spacerobot", {"version": __version__})
+    for title, values in scenario.records(["plant", *scenario.commanders]).items():
+        writer.add_metadata(title, values)
+    bodies = {"robot_description.urdf": flight.required_robot()}
+    if flight.target is not None:
+        bodies["target.robot_description.urdf"] = flight.target
+    for name, body in bodies.items():
+        writer.add_attachment(name, body.urdf.encode(), "application/xml", 0)
+        for mesh, data in meshes_for_bag(body).items():
+            writer.add_attachment(mesh, data, "model/stl", 0)
+    end = max((int(stream.time_ns[-1]) for _, stream in streams), default=0)
+    for begin in range(0, end + 1, _BLOCK_NS):
+        entries: list[tuple[int, int, bytes, int]] = []
+        for channel, stream in streams:
+            rows = slice(*np.searchsorted(stream.time_ns, (begin, begin + _BLOCK_NS)).tolist())
+            for time, message in zip(
+                stream.time_ns[rows].tolist(), stream.messages(rows), strict=True
+            ):
+                stamp = time if stream.stamp_ns is None else stream.stamp_ns
+                entries.append((time, channel, message, stamp))
+        # The sort is stable: messages of one time stay in the order of the streams.
+        for time, channel, message, stamp in sorted(entries, key=lambda entry: entry[0]):
+            writer.write(channel, message, time, stamp)
+    counts = {"messages": str(writer.messages_written), "messages_lost": "0"}
+    writer.add_metadata("recorder", counts)
+
+
+def _streams(flight: Flight) -> Iterator[_Stream]:
+    """Yield all topics; those of one time in this order."""
+    yield from _description_streams(flight)
+    yield from _goal_streams(flight)
+    yield from _state_streams(flight)
+    yield from _clearance_streams(flight)
+    yield from _frame_streams(flight)
+    yield from _command_streams(flight)
+    yield from _plan_streams(flight)
+    yield from _status_streams(flight)
 
 
 def _state_streams(flight: Flight) -> Iterator[_Stream]:
@@ -95,9 +203,9 @@ def _state_streams(flight: Flight) -> Iterator[_Stream]:
     if "thruster_duty" in quantities:
         thrusters = tuple(find_thrusters(config.thrusters, robot).names)
     clock = TOPICS["/clock"]
-    yield _Stream(clock, stamps, stamped_copies(encode(clock.type), clock.type, stamps, {}))
+    yield _stamped_stream(clock, stamps, encode(clock.type), {})
     lost = {name: flight.quantities.get(name) for name in ("pose_lost", "target_lost")}
-    every = max(1, round(config.base_pose_period * SECOND / period))
+    every = config.ticks_of(config.base_pose_period) or 1
     poses = {"odom", *(pose_topic(name).name for name in config.end_effectors)}
     for topic in state_topics(config.end_effectors):
         if not all(field.quantity in quantities for field in topic.state):
@@ -118,10 +226,24 @@ def _state_streams(flight: Flight) -> Iterator[_Stream]:
             rows = missing[:, 0] == 0
         if not topic.every_tick:
             rows = np.arange(len(stamps)) % every == 0
+        if topic.name == "odom" and flight.covariances:
+            since, covariances = zip(*flight.covariances, strict=True)
+            at = np.array(covariances)[np.searchsorted(since, stamps, side="right") - 1]
+            columns |= {"pose.covariance": at[:, :36], "twist.covariance": at[:, 36:]}
         chosen = {path: values[rows] for path, values in columns.items()}
-        yield _Stream(
-            topic, stamps[rows], stamped_copies(message, topic.type, stamps[rows], chosen)
-        )
+        yield _stamped_stream(topic, stamps[rows], message, chosen)
+
+
+def _stamped_stream(
+    topic: Topic, stamps: NDArray[np.int64], message: bytes, columns: Mapping[str, Array]
+) -> _Stream:
+    """Return the stream of copies of a message with other stamps and numbers."""
+
+    def copies(rows: slice) -> list[bytes]:
+        chosen = {path: values[rows] for path, values in columns.items()}
+        return stamped_copies(message, topic.type, stamps[rows], chosen)
+
+    return _Stream(topic, stamps, copies)
 
 
 def _clearance_streams(flight: Flight) -> Iterator[_Stream]:
@@ -129,12 +251,74 @@ def _clearance_streams(flight: Flight) -> Iterator[_Stream]:
     if flight.clearance is None or not flight.clearance.geometry.exact:
         return
     statuses = flight.clearance.statuses(max(1, flight.scenario.plant.clearance_ticks))
-    times = np.array([round(each.time_s * SECOND) for each in statuses], dtype=np.int64)
-    messages = [
-        StatusRecord("/plant", each.level, each.message, each.to_values()).encoded()
-        for each in statuses
-    ]
-    yield _Stream(TOPICS["clearance"], times, messages)
+    yield _Stream.of(
+        TOPICS["clearance"],
+        (
+            (
+                round(each.time_s * SECOND),
+                StatusRecord("/plant", each.level, each.message, each.to_values()).encoded(),
+            )
+            for each in statuses
+        ),
+    )
+
+
+def _frame_streams(flight: Flight) -> Iterator[_Stream]:
+    """Yield the transforms of the measured frames, and the markers of the true ones."""
+    config, robot = flight.scenario.plant, flight.required_robot()
+    period, quantities = config.period_ns, topic_quantities(flight)
+    # As those that the recorder writes where no node publishes transforms.
+    every = config.ticks_of(flight.scenario.config("recorder").tf_period)
+    if every:
+        frames = RobotTransforms(robot, config.world_frame, config.frame_prefix, links=True)
+        ticks = np.arange(0, len(flight.time), every)
+        lost = flight.quantities.get("pose_lost")
+        if lost is not None:
+            ticks = ticks[lost[ticks, 0] == 0]
+        pose, q = (quantities[f"measured_{name}"][ticks] for name in ("pose", "q"))
+        stamps = ticks * period
+
+        def transforms(rows: slice) -> list[bytes]:
+            return frames.messages(stamps[rows], pose[rows], q[rows])
+
+        yield _Stream(TOPICS["/tf"], stamps, transforms)
+        static = frames.static_message(0)
+        if static is not None:
+            yield _Stream.of(TOPICS["/tf_static"], [(0, static)])
+    every = config.ticks_of(config.marker_period)
+    if every:
+        ticks = np.arange(0, len(flight.time), every)
+        markers = RobotMarkers(robot, flight.target, config.world_frame)
+        yield _Stream(TOPICS["markers"], ticks * period, _marker_maker(flight, markers, ticks))
+
+
+def _marker_maker(
+    flight: Flight, markers: RobotMarkers, ticks: NDArray[np.int64]
+) -> Callable[[slice], list[bytes]]:
+    """Return the function that makes the markers of some of the ticks."""
+    robot, period = flight.required_robot(), flight.scenario.plant.period_ns
+    kinematics = ForwardKinematics(robot)
+    order = [kinematics.links.index(link.name) for link in robot.links]
+    target = flight.quantities.get("true_target_pose", flight.quantities.get("target_pose"))
+
+    def make(rows: slice) -> list[bytes]:
+        chosen = ticks[rows]
+        R, r = (each[:, order] for each in kinematics.link_poses(flight.q[chosen]))
+        # Attitudes of links stand side by side.
+        R = R.transpose(0, 2, 1, 3).reshape(len(chosen), 3, -1)
+        made = (
+            markers.message(
+                tick * period,
+                flight.pose[tick],
+                R[k],
+                r[k].T,
+                None if target is None else target[tick],
+            )
+            for k, tick in enumerate(chosen.tolist())
+        )
+        return [each or b"" for each in made]
+
+    return make
 
 
 def topic_quantities(flight: Flight) -> dict[str, Array]:
@@ -149,49 +333,40 @@ def topic_quantities(flight: Flight) -> dict[str, Array]:
     return {**found, "pose": flight.pose}
 
 
-def _other_streams(flight: Flight) -> Iterator[_Stream]:
-    """Yield goals, commands, plans, statuses, events and the description of the robot."""
-    scenario, zero = flight.scenario, np.zeros(1, dtype=np.int64)
-    world = scenario.plant.world_frame
-    described = encode("std_msgs/msg/String", {"data": flight.required_robot().urdf})
-    yield _Stream(TOPICS["robot_description"], zero, [described])
+def _description_streams(flight: Flight) -> Iterator[_Stream]:
+    robots = {"robot_description": flight.required_robot()}
     if flight.target is not None:
-        described = encode("std_msgs/msg/String", {"data": flight.target.urdf})
-        yield _Stream(TOPICS["target/robot_description"], zero, [described])
-    shape = scenario.goal.joint_positions
-    if shape is not None:
+        robots["target/robot_description"] = flight.target
+    for name, robot in robots.items():
+        yield _Stream.of(TOPICS[name], [(0, encode(TOPICS[name].type, {"data": robot.urdf}))])
+
+
+def _goal_streams(flight: Flight) -> Iterator[_Stream]:
+    """Yield the goals as the client of a mission sends them: before the first state."""
+    scenario = flight.scenario
+    world, goal = scenario.plant.world_frame, scenario.goal
+    if goal.joint_positions is not None:
         topic = TOPICS["goal_joint_states"]
-        message = encode(topic.type, {"name": flight.joint_names, "position": shape})
-        yield _Stream(topic, zero, [message])
-    goals = {"goal_pose": scenario.goal, "end_effector/goal_pose": scenario.end_effector_goal}
-    for each in scenario.goal.end_effectors:
-        goals[goal_topic(each.link or DEFAULT_END_EFFECTOR)] = each.as_goal()
-    for name, goal in goals.items():
-        if goal is not None and goal.base:
-            yield _Stream(topic_named(name), zero, [goal_message(goal, world, stamp_ns=1)])
-    yield from _command_streams(flight)
-    yield from _plan_streams(flight, world)
-    named = {"planner/status": PlannerStatus, "controller/status": ControllerStatus}
-    for name, kind in named.items():
-        found = [(time, status) for time, status in flight.statuses if isinstance(status, kind)]
-        if found:
-            node = "/planner" if kind is PlannerStatus else "/coordinated_control"
-            messages = [
-                StatusRecord(node, status.state.level, status.message, status.to_values()).encoded()
-                for _, status in found
-            ]
-            times = np.array([time for time, _ in found], dtype=np.int64)
-            yield _Stream(TOPICS[name], times, messages)
-    times = np.array([round((e.time_s or 0.0) * SECOND) for e in flight.events], dtype=np.int64)
-    events = [
-        StatusRecord("", event.level, event.message, event.to_values(None)).encoded()
-        for event in flight.events
-    ]
-    yield _Stream(TOPICS["events"], times, events)
+        values = {"name": flight.joint_names, "position": goal.joint_positions}
+        yield _Stream.of(topic, [(0, encode(topic.type, values))])
+    poses = {"goal_pose": goal if goal.base else None}
+    poses["end_effector/goal_pose"] = scenario.end_effector_goal
+    for each in goal.end_effectors:
+        link = each.link or DEFAULT_END_EFFECTOR
+        if each.waypoints is None:
+            poses[goal_topic(link)] = each.as_goal()
+        else:
+            message = given_path_message(each.path_values, world, _GOAL_STAMP_NS)
+            topic = topic_named(path_topic(link))
+            yield _Stream.of(topic, [(0, message)], _GOAL_STAMP_NS)
+    for name, aim in poses.items():
+        if aim is not None:
+            message = goal_message(aim, world, _GOAL_STAMP_NS)
+            yield _Stream.of(topic_named(name), [(0, message)], _GOAL_STAMP_NS)
 
 
 def _command_streams(flight: Flight) -> Iterator[_Stream]:
-    period = round(flight.control_period * SECOND)
+    period = flight.scenario.plant.period_ns
     velocity = flight.scenario.plant.actuation == "velocity"
     for name, commands in flight.commands.items():
         stamps, kind = commands.tick * period, TOPICS[name].type
@@ -203,22 +378,67 @@ def _command_streams(flight: Flight) -> Iterator[_Stream]:
             values = {"position": zeros, "velocity": zeros, "effort": zeros}
             values["name"] = flight.joint_names
             path = "velocity" if velocity or name == "joint_reference" else "effort"
-        if len(stamps) and commands.values.shape[1]:
-            columns = {path: commands.values}
-            yield _Stream(
-                TOPICS[name], stamps, stamped_copies(encode(kind, values), kind, stamps, columns)
+        n = commands.values.shape[1]
+        columns = {path: commands.values} if n else {}
+        if n and commands.setpoints is not None:
+            columns |= {
+                "position": commands.setpoints[:, :n],
+                "velocity": commands.setpoints[:, n:],
+            }
+        yield _stamped_stream(TOPICS[name], stamps, encode(kind, values), columns)
+
+
+def _plan_streams(flight: Flight) -> Iterator[_Stream]:
+    robot, world = flight.required_robot(), flight.scenario.plant.world_frame
+    schedules = flight.schedules
+    makers: dict[str, Callable[[int, GaitSchedule], bytes]] = {
+        "gait_schedule": lambda time, plan: trajectory_message(plan, time, robot.base_link),
+        "planned_path": lambda time, plan: path_message(plan.path, time, world),
+        "markers": lambda time, plan: goal_markers(plan.goal, plan.path, robot, world),
+    }
+    for name, make in makers.items():
+        yield _Stream.of(TOPICS[name], [(time, make(time, plan)) for time, plan in schedules])
+
+
+def _status_streams(flight: Flight) -> Iterator[_Stream]:
+    """Yield statuses, events and diagnostics."""
+    yield _Stream.of(
+        TOPICS["plant/status"],
+        (
+            (time, StatusRecord("/plant", each.level, each.message, each.to_values()).encoded())
+            for time, each in flight.plant_statuses
+        ),
+    )
+    for node, (name, _) in STATUS_TOPICS.items():
+        kind = PlannerStatus if node == "planner" else ControllerStatus
+        yield _Stream.of(
+            TOPICS[name],
+            (
+                (time, StatusRecord(f"/{node}", *_status_fields(status)).encoded())
+                for time, status in flight.statuses
+                if isinstance(status, kind)
+            ),
+        )
+    yield _Stream.of(
+        TOPICS["events"],
+        (
+            (
+                round((each.time_s or 0.0) * SECOND),
+                StatusRecord(
+                    each.node and f"/{each.node}", each.level, each.message, each.to_values(None)
+                ).encoded(),
             )
+            for each in flight.events
+        ),
+    )
+    yield _Stream.of(
+        TOPICS["/diagnostics"],
+        ((time, encode_diagnostics(records, time)) for time, records in flight.diagnostics),
+    )
 
 
-def _plan_streams(flight: Flight, world: str) -> Iterator[_Stream]:
-    if not flight.schedules:
-        return
-    times = np.array([time for time, _ in flight.schedules], dtype=np.int64)
-    base = flight.required_robot().base_link
-    plans = [trajectory_message(schedule, time, base) for time, schedule in flight.schedules]
-    paths = [path_message(schedule.path, time, world) for time, schedule in flight.schedules]
-    yield _Stream(TOPICS["gait_schedule"], times, plans)
-    yield _Stream(TOPICS["planned_path"], times, paths)
+def _status_fields(status: Status) -> tuple[int, str, dict[str, str]]:
+    return status.state.level, status.message, status.to_values()
 
 
 _MEASURED_STATE_TOPICS = ("odom", "joint_states")

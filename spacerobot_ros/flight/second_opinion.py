@@ -13,10 +13,13 @@ import numpy as np
 import numpy.typing as npt
 
 from spacerobot_ros.model.description import Array
+from spacerobot_ros.model.grasp import RobotMotion
 from spacerobot_ros.model.rotations import attitude_error
 from spacerobot_ros.simulation.actuators import PlantWithFaults
 from spacerobot_ros.simulation.effort_plant import EffortPlant
-from spacerobot_ros.simulation.mujoco_engine import EFFORT_STEP, VELOCITY_STEP, MujocoEngine
+from spacerobot_ros.simulation.loads import PlantLoads
+from spacerobot_ros.simulation.mujoco_model import import_mujoco
+from spacerobot_ros.simulation.mujoco_plant import DEFAULT_INTEGRATION_STEP, MujocoPlant
 from spacerobot_ros.simulation.plant import Plant, WrappedPlant
 
 AGREEMENT_TOLERANCE = 1e-8
@@ -81,13 +84,15 @@ class EngineFlight:
         while isinstance(dynamics, WrappedPlant):
             dynamics = dynamics.plant
         self._effort_plant = dynamics if isinstance(dynamics, EffortPlant) else None
-        self._engine = MujocoEngine(plant.robot.description, plant.pose, plant.q)
-        self._engine.move(plant.twist, plant.qdot)
-        self._momenta = plant.expected_momenta.copy()
+        actuation = "effort" if self._effort_plant is not None else "velocity"
+        self._engine = MujocoPlant(plant.robot, period, actuation=actuation, contacts=False)
+        self._engine.go_on(RobotMotion(plant.pose, plant.twist, plant.q, plant.qdot))
+        self._loads = PlantLoads(plant.robot)
+        self._engine.load(self._loads)
         self._stopped = plant.limit_counts["stroke"].copy()
         self._faults = plant.active
         self._first = plant.tick
-        self._poses, self._shapes = [self._engine.pose], [self._engine.q]
+        self._poses, self._shapes = [self._engine.pose.copy()], [self._engine.q.copy()]
         self._until = ""
 
     def fly_next_tick(self) -> None:
@@ -95,18 +100,17 @@ class EngineFlight:
         if self._until:
             return
         plant, loads = self._effort_plant, self._plant.loads
-        self._engine.load(None if loads is None else loads.last)
+        if loads is not None:
+            self._loads.vector[:] = loads.last
         if plant is None:
-            self._momenta = self._engine.step_under_velocities(
-                self._plant.qdot, self._momenta, self._period
-            )
+            self._engine.step(self._plant.qdot)
         elif reason := self._unknown_force():
             self._until = f"{reason} at {self._plant.time:.9g} s, which the engine does not model"
             return
         else:
-            self._engine.step_under_efforts(plant.effort, plant.wrench, self._period)
-        self._poses.append(self._engine.pose)
-        self._shapes.append(self._engine.q)
+            self._engine.step(plant.effort, plant.wrench)
+        self._poses.append(self._engine.pose.copy())
+        self._shapes.append(self._engine.q.copy())
 
     def _unknown_force(self) -> str:
         """Return a clause on a force in the last tick that the commands do not have; or none."""
@@ -144,10 +148,9 @@ class EngineFlight:
         )
         bend = np.abs(np.array(self._shapes)[rows] - shapes[known]).max(axis=1, initial=0.0)
         worst = int(np.argmax(np.maximum(np.maximum(place, turn), bend)))
-        step = VELOCITY_STEP if self._effort_plant is None else EFFORT_STEP
         return EngineComparison(
-            engine=self._engine.name,
-            integrator=f"Runge-Kutta 4 with steps of at most {step:g} s",
+            engine=f"MuJoCo {import_mujoco().__version__}",
+            integrator=f"Runge-Kutta 4 with steps of at most {DEFAULT_INTEGRATION_STEP:g} s",
             ticks=len(rows) - 1,
             position=float(place.max()),
             attitude=float(turn.max()),

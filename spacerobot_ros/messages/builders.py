@@ -228,6 +228,18 @@ def goal_message(goal: Goal, frame: str, stamp_ns: int = 0) -> bytes:
     )
 
 
+def given_path_message(poses: Array, frame: str, stamp_ns: int) -> bytes:
+    """Return a path of poses (K, 7), or of positions (K, 3), as nav_msgs/Path.
+
+    Positions alone have quaternions of zeros.
+    """
+    numbers = np.zeros((len(poses), 7))
+    numbers[:, : poses.shape[1]] = poses
+    header = {"header": {"stamp": stamp_ns, "frame_id": frame}}
+    columns = {"pose.position.x": numbers}
+    return encode_list("nav_msgs/msg/Path", header, "poses", header, columns)
+
+
 def trajectory_message(schedule: GaitSchedule, stamp_ns: int, frame: str) -> bytes:
     """Return a schedule as trajectory_msgs/JointTrajectory.
 

@@ -36,11 +36,20 @@ class StatusRecord:
     values: Mapping[str, str] = field(default_factory=dict)
     hardware_id: str = ""
 
+    @property
+    def fields(self) -> dict[str, Any]:
+        """The fields of the message by their names."""
+        return {
+            "level": self.level,
+            "name": self.name,
+            "message": self.message,
+            "hardware_id": self.hardware_id,
+            "values": [{"key": key, "value": value} for key, value in self.values.items()],
+        }
+
     def encoded(self) -> bytes:
         """Return the serialised message."""
-        pairs = [{"key": key, "value": value} for key, value in self.values.items()]
-        fields = {"level": self.level, "name": self.name, "message": self.message}
-        return encode(STATUS, {**fields, "hardware_id": self.hardware_id, "values": pairs})
+        return encode(STATUS, self.fields)
 
 
 def key_values(pairs: Iterable[Any]) -> dict[str, str]:

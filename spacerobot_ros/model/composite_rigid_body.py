@@ -1,7 +1,7 @@
 """Fast forward dynamics: composite rigid bodies, the base eliminated by hand.
 
-The same ``z0ddot`` as :func:`spacerobot_ros.model.dynamics.forward_dynamics` (paper 4, eq. 19) at
-44 to 84 % of the operations, by the robot. Spatial vectors as in Featherstone, Rigid Body Dynamics
+The ``z0ddot`` of paper 4, eq. (19), at 44 to 84 % of the operations that its barycentric vectors
+take, by the robot. Spatial vectors as in Featherstone, Rigid Body Dynamics
 Algorithms (2008), angular part first: motions ``[omega; v]`` and forces ``[n; f]``. All are in base
 components at one common point, the system's centre of mass, so that no body needs a transform and
 the inertia of the whole system is ``diag(D, M 1)``.

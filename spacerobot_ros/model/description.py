@@ -14,6 +14,9 @@ from spacerobot_ros.errors import RobotDescriptionError
 from spacerobot_ros.model.rotations import Array as Array
 from spacerobot_ros.model.rotations import matrix_about_axis
 
+_PARALLEL_TOLERANCE = 1e-6
+"""Sine of the largest angle between axes that count as parallel."""
+
 DEFAULT_END_EFFECTOR = "end_effector"
 """Default name of the link that is the end-effector."""
 
@@ -385,3 +388,29 @@ def weld_links(
             "of them, and connect the others to the robot."
         )
     return bodies, frames
+
+
+def plane_normal(description: RobotDescription) -> Array | None:
+    """Return the unit normal (3,), base components, of the plane a robot moves in; None: spatial.
+
+    A robot is planar if it has a joint that turns, the axes of all such joints are parallel, and
+    those of all prismatic joints are perpendicular to them. Its bodies then move in parallel
+    planes of the base.
+    """
+    normal: Array | None = None
+    rotations = [np.eye(3)]
+    slides = []
+    for body in description.bodies[1:]:
+        assert body.joint is not None
+        # All turns are about the one normal, or the robot is spatial: the shape q = 0 tells both.
+        rotations.append(rotations[body.parent] @ body.origin.R)
+        axis = rotations[-1] @ body.joint.axis
+        if body.joint.kind is JointKind.PRISMATIC:
+            slides.append(axis)
+        elif normal is None:
+            normal = axis
+        elif np.linalg.norm(np.cross(normal, axis)) > _PARALLEL_TOLERANCE:
+            return None
+    if normal is None or any(abs(normal @ slide) > _PARALLEL_TOLERANCE for slide in slides):
+        return None
+    return normal

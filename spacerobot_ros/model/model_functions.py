@@ -32,13 +32,10 @@ from spacerobot_ros.model.composite_rigid_body import (
 )
 from spacerobot_ros.model.description import Array, RobotDescription
 from spacerobot_ros.model.dynamics import (
-    barycentric_inertia,
     base_twist,
     bias,
     connection,
     curvature,
-    forward_dynamics,
-    generalised_forces,
     momentum_of_bodies,
     point_jacobian,
 )
@@ -152,7 +149,6 @@ class ModelFunctions:
             "inertia_matrix": lambda: self._shape_function("inertia_matrix", self._inertia.H_plus),
             "bias": self._bias,
             "forward_dynamics": self._forward_dynamics,
-            "dynamics": self._dynamics,
             "shape_equations": lambda: shape_equations(self._kin),
             "flight_step": self._flight_step,
             "holding_step": lambda: self._flight_step(holding=True),
@@ -227,20 +223,10 @@ class ModelFunctions:
     def _forward_dynamics(self) -> ca.Function:
         state = self._state_symbols("v_cm_B")
         _, *velocities = state.values()
-        wrench, tau = ca.SX.sym("wrench_B", 6), ca.SX.sym("tau", self.n)
-        forces = generalised_forces(self._kin, wrench, tau)
-        inertia = barycentric_inertia(self._kin)
-        acceleration = forward_dynamics(inertia, bias(self._kin, *velocities), forces)
-        inputs = {**state, "wrench_B": wrench, "tau": tau}
-        return self._dense_model_function("forward_dynamics", inputs, {"z0ddot": acceleration})
-
-    def _dynamics(self) -> ca.Function:
-        """Return the forward dynamics by composite rigid bodies, with fewer operations."""
-        state = self._state_symbols("v_cm_B")
-        _, *velocities = state.values()
         forces = {"wrench_B": ca.SX.sym("wrench_B", 6), "tau": ca.SX.sym("tau", self.n)}
         acceleration = composite_dynamics(self._kin, *velocities, *forces.values())
-        return self._dense_model_function("dynamics", {**state, **forces}, {"z0ddot": acceleration})
+        inputs = {**state, **forces}
+        return self._dense_model_function("forward_dynamics", inputs, {"z0ddot": acceleration})
 
     def _flight_step(self, *, holding: bool = False, loaded: bool = False) -> ca.Function:
         rate = state_rate(self._kin, holding=holding, loaded=loaded)

@@ -34,7 +34,7 @@ from spacerobot_ros.messages.readers import (
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.urdf import parse_robot
 from spacerobot_ros.nodes.common.commander import CommanderNode
-from spacerobot_ros.nodes.common.node import LATCHED, described_robot
+from spacerobot_ros.nodes.common.node import LATCHED, STREAM, described_robot
 from spacerobot_ros.nodes.common.process import run_node
 from spacerobot_ros.nodes.common.watchdog import HEARTBEAT_QOS, HeartbeatState, Role
 from spacerobot_ros.nodes.common.watchdog import TOPIC as HEARTBEAT
@@ -80,13 +80,14 @@ class CoordinatedControlNode(CommanderNode):
         self.create_subscription(
             String, "target/robot_description", self._on_target_description, LATCHED
         )
-        self.take_raw(Odometry, TARGET_ODOMETRY, self._on_target)
+        self.create_subscription(Odometry, TARGET_ODOMETRY, self._on_target, STREAM, raw=True)
         self.subscribe_to_goals("goal_pose")
         self.subscribe_to_goals("end_effector/goal_pose", END_EFFECTOR)
         if self.config.watchdog_timeout:
             self.create_subscription(DiagnosticStatus, HEARTBEAT, self._on_heartbeat, HEARTBEAT_QOS)
         for kind, topic in ((JointState, JOINT_REFERENCE), (Odometry, BASE_REFERENCE)):
-            self._inputs[topic] = self.take_raw(kind, topic, partial(self._on_reference, topic))
+            take = partial(self._on_reference, topic)
+            self._inputs[topic] = self.create_subscription(kind, topic, take, STREAM, raw=True)
 
     def start_message(self) -> str:
         """Return a log message with robot, law and goal topic."""

@@ -20,13 +20,13 @@ from spacerobot_ros.commanding.goal_follower import Status
 from spacerobot_ros.commanding.planner import PlannerCommander
 from spacerobot_ros.errors import PlanningError
 from spacerobot_ros.messages.builders import path_message, trajectory_message
+from spacerobot_ros.messages.markers import goal_markers
 from spacerobot_ros.messages.readers import joint_template
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import DEFAULT_END_EFFECTOR, Array
 from spacerobot_ros.nodes.common.commander import CommanderNode
 from spacerobot_ros.nodes.common.messages import (
     end_effector_goal,
-    goal_markers,
     path_poses,
     shape_of,
 )
@@ -236,7 +236,7 @@ class PlannerNode(CommanderNode):
     def publish_status(self, status: Status) -> None:
         """Publish and log a status of the goal."""
         super().publish_status(status)
-        self.log_about_goals("warning" if status.state.level else "info", status.message)
+        self.log("warning" if status.state.level else "info", status.message)
 
     def publish_start(self, start: ScheduleStart) -> None:
         """Publish a schedule, its path and its goal, in a thread if planning runs in a thread."""

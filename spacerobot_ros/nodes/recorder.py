@@ -5,13 +5,11 @@ from __future__ import annotations
 import json
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar
 
-import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from numpy.typing import NDArray
 from rclpy.clock import Clock as RosClock
 from rclpy.clock import ClockType
 from rclpy.event_handler import SubscriptionEventCallbacks
@@ -23,8 +21,6 @@ from rosgraph_msgs.msg import Clock
 from spacerobot_ros.bag import (
     LATCHED,
     BagWriter,
-    Derived,
-    FirstTime,
     QosProfile,
     Recording,
     RecordingState,
@@ -45,14 +41,15 @@ from spacerobot_ros.messages.builders import (
     RobotTransforms,
     StateFrames,
 )
+from spacerobot_ros.messages.diagnostics import diagnostic_name
 from spacerobot_ros.messages.readers import read_text
 from spacerobot_ros.model.description import RobotDescription
 from spacerobot_ros.model.urdf import parse_robot
-from spacerobot_ros.nodes.common.messages import diagnostic_name, diagnostic_status, message_class
+from spacerobot_ros.nodes.common.messages import diagnostic_status, message_class
 from spacerobot_ros.nodes.common.node import STREAM, FlightNode
 from spacerobot_ros.nodes.common.process import run_node
 from spacerobot_ros.nodes.common.ros_parameters import RemoteParameters
-from spacerobot_ros.nodes.common.streams import RawCallback, StreamListeners
+from spacerobot_ros.nodes.common.streams import RawCallback
 from spacerobot_ros.nodes.common.watchdog import Role
 from spacerobot_ros.times import HEADER_STAMP, SECOND, first_time_ns, set_stamp
 from spacerobot_ros.topics import TOPICS_NOT_RECORDED
@@ -111,7 +108,6 @@ class RecorderNode(FlightNode):
     """The present recording, or the last one."""
 
     def __init__(self, name: str = "recorder", **kwargs: Any) -> None:
-        self._taps = StreamListeners()
         self._stamps = _StampReader()
         self._parameter_requests: dict[str, RemoteParameters | None] = {}
         """Names of the parameter records that are in the bag or requested from nodes."""
@@ -149,7 +145,6 @@ class RecorderNode(FlightNode):
                 lambda: frames[0] in self._recorded,
                 map(self.resolve_topic_name, ("odom", "joint_states", _DESCRIPTION_TOPIC)),
             )
-            self.recording.derive = self._transforms.derive
         self._recorded: set[str] = set()
         self._unreadable_topics: set[str] = set()
         self._diagnostics: Publisher | None = None
@@ -212,7 +207,6 @@ class RecorderNode(FlightNode):
         RecordingError
             The disk refused the rest of the data.
         """
-        self._taps.release()
         for question in filter(None, self._parameter_requests.values()):
             question.close()
         if self.recording is not None:
@@ -220,16 +214,7 @@ class RecorderNode(FlightNode):
             path, count = self.recording.writer.path, self.recording.messages
             self.get_logger().info(f"{count} messages are recorded in {path}.")
 
-    # -- for the composer of the nodes --------------------------------------------------------
-
-    def watch(self, nodes: Iterable[FlightNode]) -> None:
-        """Record topics directly from the streams of nodes in this process and executor.
-
-        To be called before the recorder is configured. Messages are then recorded in the order of
-        their publication, and a plant's commands as the plant received them. Other topics are
-        subscribed, and so are topics that a node outside publishes too.
-        """
-        self._taps.nodes = [*nodes, self]
+    # -- what it has ---------------------------------------------------------------------------
 
     @property
     def topics(self) -> set[str]:
@@ -262,11 +247,6 @@ class RecorderNode(FlightNode):
         recording = self.recording
         if recording is None or recording.state is RecordingState.CLOSED:
             return
-        for topic in self._taps.release_incomplete(self.count_publishers):
-            if topic in self._recorded:
-                self._recorded.remove(topic)
-            else:
-                self._follow_clock(recording)
         for topic, types in self.get_topic_names_and_types():
             known = topic in self._recorded or topic in self._unreadable_topics
             if not known and self._is_chosen(topic, types[0]):
@@ -334,8 +314,7 @@ class RecorderNode(FlightNode):
                 continue
             self._topics_without_owner.discard(topic)
             full = f"{owner.node_namespace.rstrip('/')}/{owner.node_name}"
-            watched = {node.get_fully_qualified_name() for node in self._taps.nodes}
-            if record not in self._parameter_requests and full not in watched:
+            if record not in self._parameter_requests:
                 self._parameter_requests[record] = RemoteParameters(self, full)
 
     def _follow_clock(self, recording: Recording) -> None:
@@ -344,11 +323,8 @@ class RecorderNode(FlightNode):
         def on_clock(raw: bytes) -> None:
             recording.set_clock(first_time_ns(raw))
 
-        topic = self._clock_topic
-        if not self._taps.tap(topic, on_clock, self.count_publishers(topic)):
-            self.create_subscription(
-                Clock, topic, on_clock, QoSProfile(depth=_QUEUE_DEPTH), raw=True
-            )
+        qos = QoSProfile(depth=_QUEUE_DEPTH)
+        self.create_subscription(Clock, self._clock_topic, on_clock, qos, raw=True)
 
     def _record(self, recording: Recording, topic: str, type_name: str) -> None:
         publishers = self.get_publishers_info_by_topic(topic)
@@ -366,15 +342,13 @@ class RecorderNode(FlightNode):
         self._request_parameters(topic, publishers[0])
         listener = None
         if self._transforms is not None:
-            listener = self._transforms.listener(topic, channel)
+            listener = self._transforms.listener(topic)
         take = _recording_callback(
             recording, self._stamps, topic, kind, channel, self._clock_topic, listener
         )
         qos = _subscribed_qos(offered)
         if qos.durability == DurabilityPolicy.TRANSIENT_LOCAL:
             recording.latched[channel] = None
-        if self._taps.tap(topic, take, len(offered)):
-            return
         # Latched topics keep their last message: one that is replaced in transit is not lost.
         events = None if channel in recording.latched else loss_events(recording, topic)
         self.create_subscription(kind, topic, take, qos, event_callbacks=events, raw=True)
@@ -469,7 +443,6 @@ class _RecordedTransforms:
         self._period_ns = round(period * SECOND)
         callbacks = self._on_odom, self._on_joint_states, self._on_description
         self._callbacks = dict(zip(sources, callbacks, strict=True))
-        self._channels = dict.fromkeys(self._callbacks, -1)
         self._odom, self._joint_states = b"", b""
         self._last_ns, self._next_ns = 0, 0
         self._description: RobotDescription | None = None
@@ -477,67 +450,9 @@ class _RecordedTransforms:
         self._frames: RobotTransforms | None = None
         self._channel = -1
 
-    def listener(self, topic: str, channel: int) -> RawCallback | None:
-        """Return the callback of every message of a topic that is recorded one by one."""
-        if topic in self._callbacks:
-            self._channels[topic] = channel
+    def listener(self, topic: str) -> RawCallback | None:
+        """Return the callback of every message of a topic, if there is one."""
         return self._callbacks.get(topic)
-
-    def derive(
-        self, channels: NDArray[np.intp], messages: Sequence[bytes], times: NDArray[np.int64]
-    ) -> list[Derived]:
-        """Return the messages that listeners derive from messages that are written together."""
-        of_odom, of_joints, _ = self._channels.values()
-        odoms, joints = (
-            _last_chosen_indices(channels == channel) for channel in (of_odom, of_joints)
-        )
-        latest = self._odom, self._joint_states
-        if odoms[-1] >= 0:
-            self._odom = messages[odoms[-1]]
-        if joints[-1] >= 0:
-            self._joint_states = messages[joints[-1]]
-        if self._state is None or not self._recording.running or self._is_published():
-            return []
-        of_state = np.flatnonzero((channels == of_odom) | (channels == of_joints))
-        odoms, joints = odoms[of_state], joints[of_state]
-        odom_ns, joints_ns = (
-            np.where(places >= 0, times[places], first_time_ns(before) if before else -1)
-            for places, before in zip((odoms, joints), latest, strict=True)
-        )
-        whole = np.flatnonzero((odom_ns == joints_ns) & (odom_ns >= 0))
-        static: list[Derived] = []
-        after, poses, positions, due = [], [], [], []
-        for k in self._due(whole, odom_ns):
-            odom = latest[0] if odoms[k] < 0 else messages[odoms[k]]
-            state = latest[1] if joints[k] < 0 else messages[joints[k]]
-            frames = self._frames
-            if self._read_state(odom, state, int(odom_ns[k])):
-                if frames is None:
-                    static = self._static_messages(int(odom_ns[k]), int(of_state[k]))
-                after.append(int(of_state[k]))
-                due.append(int(odom_ns[k]))
-                poses.append(self._state.pose)
-                positions.append(self._state.q.copy())
-        if not due or self._frames is None:
-            return []
-        made = self._frames.messages(np.array(due), np.array(poses), np.array(positions))
-        return static + [
-            Derived(place, self._channel, message, time_ns)
-            for place, message, time_ns in zip(after, made, due, strict=True)
-        ]
-
-    def _due(self, states: NDArray[np.intp], times: NDArray[np.int64]) -> Iterator[int]:
-        """Yield the states whose transforms are due; the caller writes them."""
-        k = 0
-        ordered = bool(np.all(np.diff(times[states]) >= 0))
-        while k < len(states):
-            if self._last_ns <= times[states[k]] < self._next_ns:
-                # No state before the next time is due, unless time goes back.
-                due = np.searchsorted(times[states], self._next_ns) if ordered else k + 1
-                k = max(int(due), k + 1)
-                continue
-            yield int(states[k])
-            k += 1
 
     def _on_odom(self, raw: bytes) -> None:
         self._odom = raw
@@ -568,10 +483,10 @@ class _RecordedTransforms:
         if not self._read_state(self._odom, self._joint_states, time_ns):
             return
         assert self._frames is not None
-        static = self._static_messages(time_ns) if new else []
+        if new:
+            self._write_static(self._frames, time_ns)
         message = self._frames.message(time_ns, state.pose, state.q)
-        for each in [*static, Derived(0, self._channel, message, time_ns)]:
-            self._recording.record(each.channel, each.message, each.published_ns)
+        self._recording.record(self._channel, message, time_ns)
 
     def _read_state(self, odom: bytes, joints: bytes, time_ns: int) -> bool:
         """Take a state whose transforms are due; return whether it is one of the robot."""
@@ -593,19 +508,12 @@ class _RecordedTransforms:
         self._last_ns, self._next_ns = time_ns, time_ns + self._period_ns
         return True
 
-    def _static_messages(self, time_ns: int, after: int = 0) -> list[Derived]:
-        """Return the message of the fixed links, if there are any."""
-        assert self._frames is not None
-        static = self._frames.static_message(time_ns)
-        if static is None:
-            return []
-        channel = self._recording.writer.add_topic(self._topics[1], TRANSFORM_TYPE, LATCHED)
-        return [Derived(after, channel, static, time_ns)]
-
-
-def _last_chosen_indices(chosen: NDArray[np.bool_]) -> NDArray[np.intp]:
-    """Return for each index the last chosen index up to it; -1: none."""
-    return np.maximum.accumulate(np.where(chosen, np.arange(len(chosen)), -1))
+    def _write_static(self, frames: RobotTransforms, time_ns: int) -> None:
+        """Write the message of the fixed links, if there are any."""
+        static = frames.static_message(time_ns)
+        if static is not None:
+            channel = self._recording.writer.add_topic(self._topics[1], TRANSFORM_TYPE, LATCHED)
+            self._recording.record(channel, static, time_ns)
 
 
 class _StampReader:
@@ -634,7 +542,7 @@ def _recording_callback(
 ) -> RawCallback:
     """Return the callback of a topic's messages: the clock sets the time of all others.
 
-    ``listener`` is called after each message that is recorded alone.
+    ``listener`` is called after each message.
     """
     record, time_of = recording.record, stamps.time_ns
     urdf_name = f"{topic.strip('/').replace('/', '.')}.urdf"
@@ -658,12 +566,8 @@ def _recording_callback(
     if topic.endswith(f"/{_DESCRIPTION_TOPIC}") and topic != clock:
         return _record_and_listen(on_description, listener)
     header = next(iter(kind.get_fields_and_field_types().values()), "")
-    first_time, take = FirstTime.NONE, on_other
-    if topic == clock:
-        first_time, take = FirstTime.CLOCK, on_clock
-    elif header == "std_msgs/Header":
-        first_time, take = FirstTime.STAMP, on_stamped
-    return recording.collector(channel, first_time, _record_and_listen(take, listener))
+    take = on_stamped if header == "std_msgs/Header" else on_other
+    return _record_and_listen(on_clock if topic == clock else take, listener)
 
 
 def _record_and_listen(record: RawCallback, listener: RawCallback | None) -> RawCallback:

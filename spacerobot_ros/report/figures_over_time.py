@@ -103,7 +103,7 @@ def draw_whole_flight(
         axes.hlines(value, start, end, color=colours[index], ls=(0, DASHES), lw=1.2, zorder=3)
     if group.goals:
         keys.append(legend_entry(SECONDARY_COLOUR, "goal", DASHES))
-    later = [status.time for status in flight.executing[1:]]
+    later = [time for time, _ in flight.executing[1:]]
     if len(later) > _MAX_MARKED_SCHEDULES:
         later = []
     for time in later:
@@ -172,7 +172,7 @@ def time_figure(
     if len(heights) != len(rows) * len(groups):
         heights = heights * len(groups)
     right = room_for([name for group in groups for name in group.names])
-    lane = EVENT_STRIP_HEIGHT if flight.events else 0.0
+    lane = EVENT_STRIP_HEIGHT if flight.timed_events else 0.0
     left = max([0.72, *(room_for(group.names) + 0.1 for group in groups if group.rows)])
     figure, panels = sheet(rows * len(groups), heights, left=left, right=right, lane=lane)
     share = min(1.0, 4 / len(groups))
@@ -185,9 +185,9 @@ def time_figure(
             first, last = (axes for row in below for axes in row)
             dense.append(_draw_before_cycles(first, group, cycles))
             _draw_last_cycles(last, group, cycles)
-    if flight.events:
+    if flight.timed_events:
         for axes in (each for row in panels for each in row):
-            draw_events(axes, flight.events)
+            draw_events(axes, flight.timed_events)
     if any(group.goals for group in groups):
         caption += "; dashed, the goal"
     if any(group.limits and group.limit_name == LIMIT for group in groups):
@@ -200,7 +200,7 @@ def time_figure(
             f"the part before them, and {_close_up_text(cycles)}."
         )
     aside += f" {BAND_CAPTION}" if any(dense) else ""
-    aside += f" {EVENTS_CAPTION}" if flight.events else ""
+    aside += f" {EVENTS_CAPTION}" if flight.timed_events else ""
     caption += aside
     return ReportFigure(name, heading, caption, figure, groups, aside)
 
@@ -424,7 +424,7 @@ def rates_figure(flight: FlightReport) -> ReportFigure | str:
     names, cycles = flight.joint_names, flight.cycles
     height = 1.0 if len(names) <= 4 else 0.75
     widths = [1.0] if cycles is None else [2.2, 1.0]
-    lane = EVENT_STRIP_HEIGHT if flight.events else 0.0
+    lane = EVENT_STRIP_HEIGHT if flight.timed_events else 0.0
     bottom = 0.5 + lane
     figure, panels = sheet([widths] * len(names), [height] * len(names), gap=0.36, bottom=bottom)
     dense, groups = [], []
@@ -464,15 +464,15 @@ def rates_figure(flight: FlightReport) -> ReportFigure | str:
     figure.align_ylabels([row[0] for row in panels])
     if cycles is not None:
         panels[0][1].set_title(f"last {SHOWN_CYCLES} cycles")
-    if flight.events:
+    if flight.timed_events:
         for axes in panels[-1]:
-            draw_events(axes, flight.events)
+            draw_events(axes, flight.timed_events)
     caption = "Velocity of each joint; dotted, its limit in the URDF, where that is in range."
     aside = ""
     if cycles is not None:
         aside += f" Right: the last {SHOWN_CYCLES} of {cycles.count} cycles, to the same scale."
     aside += f" {BAND_CAPTION}" if any(dense) else ""
-    aside += f" {EVENTS_CAPTION}" if flight.events else ""
+    aside += f" {EVENTS_CAPTION}" if flight.timed_events else ""
     caption += aside
     return ReportFigure("velocities", "Joint velocities", caption, figure, groups, aside)
 
@@ -560,7 +560,7 @@ def thrusters_figure(flight: FlightReport) -> ReportFigure | str | None:
     tints = [colour(k) for k in range(len(used))]
     label, unit = "thrusters", "share of each tick that they are on"
     groups = [TraceGroup(duty, [short(names[k]) for k in used], label, unit, tints, rows=True)]
-    impulse, propellant = flight.impulse, flight.propellant
+    impulse, propellant = flight.impulse, flight.series.get("propellant")
     groups.append(TraceGroup(impulse, ["impulse"], "impulse given", "N s", [PALETTE[0]]))
     caption = "Share of each tick that each thruster was on; below, the impulse of all of them"
     if propellant is not None:
@@ -574,15 +574,15 @@ def thrusters_figure(flight: FlightReport) -> ReportFigure | str | None:
 
 def momentum_figure(flight: FlightReport) -> ReportFigure | str:
     """Change of the total momenta, and the kinetic energy."""
-    if not len(flight.momentum):
+    if not len(flight.unexplained_momentum):
         return "The bag holds no momentum."
-    if len(flight.momentum) < 2:
+    if len(flight.unexplained_momentum) < 2:
         return ONE_STATE_TEXT
-    time, balance = flight.momentum.time, flight.momentum.values
+    time, balance = flight.unexplained_momentum.time, flight.unexplained_momentum.values
     changes = np.column_stack(
         [np.linalg.norm(balance[:, k : k + 3] - balance[0, k : k + 3], axis=1) for k in (0, 3)]
     )
-    bottom = 0.5 + (EVENT_STRIP_HEIGHT if flight.events else 0.0)
+    bottom = 0.5 + (EVENT_STRIP_HEIGHT if flight.timed_events else 0.0)
     figure, ((above,), (below,)) = sheet([[1.0], [1.0]], [1.6, 1.1], bottom=bottom)
     floor, top = log_range(changes, _MOMENTUM_DECADES)
     above.set_yscale("log")
@@ -611,8 +611,8 @@ def momentum_figure(flight: FlightReport) -> ReportFigure | str:
     below.set_title("kinetic energy")
     below.set_ylabel("J")
     set_time(below, 0.0, flight.end)
-    if flight.events:
-        draw_events(below, flight.events)
+    if flight.timed_events:
+        draw_events(below, flight.timed_events)
     largest_of = (
         ", the largest in each slice of time" if len(time) > 2 * LARGEST_VALUE_SLICES else ""
     )
@@ -623,7 +623,7 @@ def momentum_figure(flight: FlightReport) -> ReportFigure | str:
         "edge. Bottom: kinetic energy."
     )
     aside = f" {BAND_CAPTION}" if dense else ""
-    aside += f" {EVENTS_CAPTION}" if flight.events else ""
+    aside += f" {EVENTS_CAPTION}" if flight.timed_events else ""
     caption += aside
     groups = [
         TraceGroup(
@@ -739,7 +739,7 @@ def errors_figure(flight: FlightReport) -> ReportFigure | str | None:
     )
     limits: tuple[tuple[Literal["position", "attitude"], str], ...]
     limits = (("position", "m"), ("attitude", "rad"))
-    known = [(flight.flight.tolerance(part), unit) for part, unit in limits]
+    known = [(flight.tolerance(part), unit) for part, unit in limits]
     if within := ", ".join(f"{value:.3g} {unit}" for value, unit in known if value is not None):
         caption += f"; tolerance of distance and angle: {within}"
     return time_figure(flight, "errors", "Output errors", caption, groups)
@@ -759,7 +759,7 @@ def _base_errors_figure(flight: FlightReport, errors: Signal) -> ReportFigure | 
     """Distance and angle of the base, as far as the method controls it, from errors (N, 6)."""
     groups = []
     for k, (part, *_) in enumerate(_ERROR_PARTS):
-        if len(errors) and part not in flight.flight.not_controlled:
+        if len(errors) and part not in flight.not_controlled:
             norms = np.linalg.norm(errors.values[:, 3 * k : 3 * k + 3], axis=1)
             signal = Signal(errors.time, norms[:, np.newaxis])
             groups.append(_error_group(flight, signal, part, "base", colour(0)))
@@ -769,7 +769,7 @@ def _base_errors_figure(flight: FlightReport, errors: Signal) -> ReportFigure | 
         "Distance and angle of the base from its goal, on logarithmic axes; smaller values lie on "
         "the lower edge; dotted, the tolerance"
     )
-    if left_out := [part for part, *_ in _ERROR_PARTS if part in flight.flight.not_controlled]:
+    if left_out := [part for part, *_ in _ERROR_PARTS if part in flight.not_controlled]:
         caption += f"; the {' and '.join(left_out)} is not controlled"
     return time_figure(flight, "errors", "Errors of the base", caption, groups)
 
@@ -783,7 +783,7 @@ def _error_group(
 ) -> TraceGroup:
     """Return the panel of a distance or an angle (N, 1) with its tolerance."""
     _, quantity, unit = next(each for each in _ERROR_PARTS if each[0] == part)
-    tolerance = flight.flight.tolerance(part)
+    tolerance = flight.tolerance(part)
     return TraceGroup(
         signal,
         [quantity],
@@ -811,7 +811,7 @@ def link_errors_figure(flight: FlightReport) -> ReportFigure | str | None:
         "that counts, on logarithmic axes; smaller values lie on the lower edge; dotted, the "
         "tolerance"
     )
-    if flight.goal is None:
+    if flight.base_goal is None:
         caption += "; the base is not controlled"
     return time_figure(flight, "link_errors", "Errors of end-effectors", caption, groups)
 

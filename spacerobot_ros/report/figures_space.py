@@ -83,7 +83,7 @@ def configurations_figure(flight: FlightReport) -> ReportFigure | str:
         caption += " The target is drawn where it is, free or held."
     if flight.obstacles:
         caption += " Obstacles have the shapes by which distances are measured."
-    if flight.goal is not None:
+    if flight.base_goal is not None:
         caption += " Dashed in the last, the base link at the goal."
     caption += flight.missing_meshes
     return ReportFigure("configurations", "Configurations", caption, figure)
@@ -165,10 +165,10 @@ def draw_goal_and_path(axes: Axes, flight: FlightReport, view: View) -> list[Lin
         dense = len(path) > 2 * TRACE_TIME_SLICES
         axes.plot(flat[:, 0], flat[:, 1], color=TEXT_COLOUR, lw=0.8, zorder=5, rasterized=dense)
         keys.append(legend_entry(TEXT_COLOUR, "path of the base"))
-    if flight.goal is not None and flight.drawn is not None:
+    if flight.base_goal is not None and flight.drawn is not None:
         # Without a goal of the position, the ghost shows the attitude alone.
-        r = flight.goal.position if flight.position_counts else path[-1]
-        pose = Pose(matrix_from_quaternion(flight.goal.quaternion), r)
+        r = flight.base_goal.position if flight.position_counts else path[-1]
+        pose = Pose(matrix_from_quaternion(flight.base_goal.quaternion), r)
         for line in flight.drawn.base_outlines(pose):
             flat = view(line)
             axes.plot(flat[:, 0], flat[:, 1], color=GHOST_COLOUR, lw=0.9, ls=(0, DASHES), zorder=6)
@@ -198,8 +198,8 @@ def path_figure(flight: FlightReport, beside: Sequence[FlightReport] = ()) -> Re
     if len(flight.position) < 2 and not beside:
         return ONE_STATE_TEXT
     goals = []
-    if flight.goal is not None and flight.position_counts:
-        goals.append(flight.goal.position)
+    if flight.base_goal is not None and flight.position_counts:
+        goals.append(flight.base_goal.position)
     goals += [sent.goal.position for sent in flight.tool_goals[-1:]]
     goals += [goal.position for goal in flight.link_goals.values()]
     # Beside the reach of an arm, the path of a base without thrust would be a dot.
@@ -386,7 +386,7 @@ def cycles_figure(flight: FlightReport) -> ReportFigure | None:
     number = np.arange(len(ends))
     factor, unit = angle_unit()
     attitude = factor * flight.attitude.values[ends]
-    goal = flight.goal
+    goal = flight.base_goal
     figure, panels = sheet([[1.0], [1.0]] if goal else [[1.0]], [2.0, 1.3] if goal else [2.0])
     above = panels[0][0]
     dots = "." if len(ends) <= 60 else ""

@@ -1,9 +1,9 @@
-"""A flight as a report shows it: its signals since its first state, its goals, its robot."""
+"""A flight and its bag as a report shows them, times in s since the first state."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 
 from spacerobot_ros.collision.geometry import obstacle_visuals
-from spacerobot_ros.control.status import CommandReport, ControllerStatus
+from spacerobot_ros.commanding.goal_follower import Status
+from spacerobot_ros.control.status import ControllerStatus
 from spacerobot_ros.errors import MeshError
 from spacerobot_ros.flight.captures import (
     BUDGET_PARTS,
@@ -26,9 +27,9 @@ from spacerobot_ros.flight.reading import (
     namespaces,
     open_flight_bag,
     read_flight,
+    since,
 )
 from spacerobot_ros.measures import flown_time
-from spacerobot_ros.model import RobotDescription
 from spacerobot_ros.model.description import DEFAULT_END_EFFECTOR, Array, Joint, Pose, Shape
 from spacerobot_ros.model.kinematics import ForwardKinematics
 from spacerobot_ros.model.meshes import TriangleMesh
@@ -56,68 +57,6 @@ _MAX_LINK_ERROR_STATES = 2000
 
 
 @dataclass(frozen=True)
-class TimedStatus:
-    """A recorded status of the planner or the controller.
-
-    Attributes
-    ----------
-    time
-        Time of the report, s.
-    content
-        The status; of a status of another package its message alone.
-    """
-
-    time: float
-    content: PlannerStatus | ControllerStatus | str
-
-    @property
-    def report(self) -> PlannerStatus | ControllerStatus | None:
-        """The typed status; None for a status of another package."""
-        return None if isinstance(self.content, str) else self.content
-
-    @property
-    def sentence(self) -> str:
-        """Sentence of the status for the user."""
-        return self.content if isinstance(self.content, str) else self.content.message
-
-    @property
-    def state(self) -> str:
-        """State of planner or controller; empty if unknown."""
-        return self.report.state.value if self.report is not None else ""
-
-    @property
-    def executing(self) -> bool:
-        """Whether the status reports the start of a schedule."""
-        return self.state == PlannerState.EXECUTING.value
-
-    @property
-    def method(self) -> str:
-        """Gait method of the schedule that begins, or control law."""
-        match self.report:
-            case PlannerStatus(method=method):
-                return method
-            case ControllerStatus(command=CommandReport(law=law)):
-                return law
-            case _:
-                return ""
-
-    @property
-    def outputs(self) -> frozenset[str]:
-        """Names of the outputs whose errors a controller reports."""
-        match self.report:
-            case ControllerStatus(command=CommandReport(errors=errors)):
-                return frozenset(errors)
-            case _:
-                return frozenset()
-
-    def note(self, name: str) -> list[float]:
-        """Return a note of the planning method as numbers; empty without the note."""
-        notes = self.report.notes if isinstance(self.report, PlannerStatus) else {}
-        value = notes.get(name, "")
-        return [] if isinstance(value, str) else np.atleast_1d(value).tolist()
-
-
-@dataclass(frozen=True)
 class GoalSpan:
     """A goal and when it was flown to, ``start`` to ``end`` in s."""
 
@@ -142,56 +81,53 @@ class LinkErrors:
     angle: Signal
 
 
-@dataclass(frozen=True)
-class FlightReport:
-    """A flight as a report shows it, times in s since its first state; missing signals are empty.
+@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
+class FlightReport(Flight):
+    """A flight and its bag, times in s since the first state; missing signals are empty.
 
     Attributes
     ----------
-    bag, flight
-        The bag, and the flight that was read from it.
-    position, quaternion
-        True pose of the base link in the world: (N, 3) m, and (N, 4).
-    events
+    bag
+        The bag that the flight was read from.
+    timed_events
         The events that figures show; none in bags of earlier versions.
     meshes
         Triangles of the meshes that the bag carries, by their URIs.
     """
 
     bag: FlightBag
-    flight: Flight
-    position: Signal
-    quaternion: Array
-    events: list[FlightEvent] = field(default_factory=list)
+    timed_events: list[FlightEvent] = field(default_factory=list)
     meshes: dict[str, TriangleMesh] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, bag: FlightBag) -> FlightReport:
-        """Read the flight of a bag.
+    def of(cls, bag: FlightBag, flight: Flight | None = None) -> FlightReport:
+        """Return the report of a bag, whose flight is read unless it is given.
 
         Raises
         ------
         RecordingError
             A message is damaged.
         """
-        flight = read_flight(bag)
-        base = _shift_time(flight.signal("pose"), bag.began)
+        flight = since(flight or read_flight(bag), bag.began)
+        attachments = bag.parts[0].bag.attachments
         return cls(
+            **{each.name: getattr(flight, each.name) for each in fields(flight)},
             bag=bag,
-            flight=flight,
-            position=Signal(base.time, base.values[:, :3]),
-            quaternion=base.values[:, 3:],
-            events=timed_events(bag.events(), bag.began, stamped=bag.stamped),
-            meshes=meshes_from_attachments(flight.robot, bag.parts[0].bag.attachments)
-            if flight.robot
-            else {},
+            timed_events=timed_events(bag.events(), bag.began, stamped=bag.stamped),
+            meshes=meshes_from_attachments(flight.robot, attachments) if flight.robot else {},
         )
 
     # -- signals ------------------------------------------------------------------------------
 
-    def signal(self, name: str) -> Signal:
-        """Return a quantity of the flight over the time since its first state."""
-        return _shift_time(self.flight.signal(name), self.bag.began)
+    @cached_property
+    def position(self) -> Signal:
+        """True position of the base link in the world (N, 3), m."""
+        return Signal(self.time, self.pose[:, :3])
+
+    @property
+    def quaternion(self) -> Array:
+        """True attitude of the base link in the world (N, 4)."""
+        return self.pose[:, 3:]
 
     @cached_property
     def attitude(self) -> Signal:
@@ -209,7 +145,7 @@ class FlightReport:
         return self.signal("qdot")
 
     @cached_property
-    def momentum(self) -> Signal:
+    def unexplained_momentum(self) -> Signal:
         """Momenta and energy (N, 7), without the momenta that the thrusters have put in."""
         balance, expected = self.signal("momentum"), self.signal("expected_momenta")
         if len(expected) != len(balance) or not len(balance):
@@ -228,11 +164,10 @@ class FlightReport:
         RobotDescriptionError
             The described robot has no positive inertia.
         """
-        robot, captured = self.robot, self.flight.capture.get("captured", False)
+        robot, captured = self.robot, self.capture.get("captured", False)
         if robot is None or not (robot.wheel_names or captured):
             return Signal.empty(len(BUDGET_PARTS))
-        found = momentum_budget_over_time(self.flight, _MAX_BUDGET_STATES)
-        return _shift_time(found, self.bag.began)
+        return momentum_budget_over_time(self, _MAX_BUDGET_STATES)
 
     @cached_property
     def tool(self) -> Signal:
@@ -272,34 +207,18 @@ class FlightReport:
     # -- the bag and the robot ----------------------------------------------------------------
 
     @property
-    def file_name(self) -> str:
-        """Name of the bag."""
-        return self.bag.path.name
-
-    @property
     def other_robots(self) -> list[str]:
         """Namespaces of the other robots in the bag."""
         others = namespaces(self.bag.parts[0].bag)
         return [name or "/" for name in others if name != self.bag.namespace]
-
-    @property
-    def robot(self) -> RobotDescription | None:
-        """The robot; None where the bag has no description of it."""
-        return self.flight.robot
-
-    @cached_property
-    def joint_names(self) -> list[str]:
-        """The joints, in the order of columns."""
-        return self.bag.names("joint_states")
 
     @cached_property
     def clearance(self) -> FlightClearance | None:
         """The smallest distance between links, by the meshes that the bag carries; None where the
         plant did not measure it, or there are no states.
         """
-        if self.robot is None or not self.flight.measures_clearance:
+        if self.robot is None or not self.measures_clearance:
             return None
-
         shape, pose = self.shape, self.signal("pose")
         return FlightClearance.of(
             self.robot,
@@ -321,11 +240,6 @@ class FlightReport:
         return () if self.robot is None else obstacle_visuals(self.robot.world, self._carried_mesh)
 
     @property
-    def target(self) -> RobotDescription | None:
-        """The body that the robot captures; None: there is none."""
-        return self.flight.target
-
-    @property
     def target_pose(self) -> Signal:
         """True pose of the target (M, 7): position, m, and quaternion; empty without one."""
         if self.target is None:
@@ -335,55 +249,64 @@ class FlightReport:
     # -- names --------------------------------------------------------------------
 
     @property
-    def scenario(self) -> str:
-        """Name of the scenario, or of the bag."""
-        return self.flight.scenario.name
-
-    @property
     def label(self) -> str:
         """Short name among several flights: that of the file and of the method."""
-        return f"{Path(self.file_name).stem} ({self.method})" if self.method else self.file_name
+        path, method = self.bag.path, self.flown_method
+        return f"{path.stem} ({method})" if method else path.name
 
     @property
-    def method(self) -> str:
+    def flown_method(self) -> str:
         """Gait method: of the first schedule, or the planner's parameter; else the control law."""
-        named = (status.method for status in self.statuses if status.method)
+        named = (method for _, status in self.reports if (method := _method_of(status)))
         return next(named, str(self.parameter("planner", "method") or ""))
 
     def parameter(self, node: str, name: str) -> Any:
         """Return a parameter of a node; None if the bag does not hold it."""
-        return self.flight.scenario.in_file.get(node, {}).get(name)
+        return self.scenario.in_file.get(node, {}).get(name)
 
     # -- reports and goals ------------------------------------------------------------------------
 
     @property
     def end(self) -> float:
         """Time of the last sample or status, s."""
-        signals = (self.position, self.shape, self.momentum)
+        signals = (self.position, self.shape, self.signal("momentum"))
         times = [float(signal.time[-1]) for signal in signals if len(signal)]
-        return max([0.0, *times, *(status.time for status in self.statuses)])
+        return max([0.0, *times, *(time for time, _ in self.timed_statuses)])
 
     @cached_property
-    def statuses(self) -> list[TimedStatus]:
-        """Statuses of the planner, or else of the controller."""
+    def timed_statuses(self) -> list[tuple[float, Status | str]]:
+        """Statuses of the planner, or else of the controller, with their times, s.
+
+        A status of another package is its message alone.
+        """
         for commander in COMMANDERS:
             found = [
-                TimedStatus(time_ns / SECOND - self.bag.began, status)
+                (time_ns / SECOND - self.bag.began, status)
                 for time_ns, status in self.bag.statuses(commander)
             ]
             if found:
                 return found
         return []
 
+    @cached_property
+    def reports(self) -> list[tuple[float, Status]]:
+        """The statuses of this package among :attr:`timed_statuses`."""
+        return [(time, each) for time, each in self.timed_statuses if not isinstance(each, str)]
+
     @property
-    def executing(self) -> list[TimedStatus]:
-        """One status for each schedule that was flown."""
-        return [status for status in self.statuses if status.executing]
+    def executing(self) -> list[tuple[float, PlannerStatus]]:
+        """The report of the start of each schedule that was flown."""
+        return [
+            (time, each)
+            for time, each in self.reports
+            if isinstance(each, PlannerStatus) and each.state is PlannerState.EXECUTING
+        ]
 
     @cached_property
     def outputs(self) -> frozenset[str]:
         """Names of the controller's outputs; none where a planner has the goals."""
-        return frozenset[str]().union(*(status.outputs for status in self.statuses))
+        reports = (each for _, each in self.reports if isinstance(each, ControllerStatus))
+        return frozenset(name for each in reports if each.command for name in each.command.errors)
 
     @cached_property
     def targets(self) -> list[GoalSpan]:
@@ -392,25 +315,22 @@ class FlightReport:
 
     @cached_property
     def _all_targets(self) -> list[GoalSpan]:
-        sent = self.flight.goals
         found = [
-            (status.time, goal)
-            for status in self.executing
-            if status.report is not None and (goal := reported_goal(status.report, sent))
+            (time, goal)
+            for time, status in self.executing
+            if (goal := reported_goal(status, self.goals))
         ]
-        return self._targets_until_next(found or self._timed_goals(sent))
+        return self._targets_until_next(found or _timed_goals(self.goals))
 
     @property
-    def goal(self) -> Goal | None:
+    def base_goal(self) -> Goal | None:
         """The goal of the base that counts at the end; None: there is none, or the base is free."""
-        goal = self.flight.goal
-        return goal if goal is not None and goal.base else None
+        return self.goal if self.goal is not None and self.goal.base else None
 
     @cached_property
     def link_goals(self) -> dict[str, EndEffectorGoal]:
         """The goals of links that count at the end, of a planner."""
-        goal = self.flight.goal
-        return {} if goal is None else {each.link: each for each in goal.end_effectors}
+        return {} if self.goal is None else {each.link: each for each in self.goal.end_effectors}
 
     @cached_property
     def link_errors(self) -> dict[str, LinkErrors]:
@@ -441,8 +361,7 @@ class FlightReport:
         if self.robot is None or self.hidden_links_text or not links:
             return {}
         rows, kinematics = self.samples(_MAX_LINK_ERROR_STATES), ForwardKinematics(self.robot)
-        base = np.hstack([self.position.values[rows], self.quaternion[rows]])
-        R_WL, r_WL = kinematics.poses_in_world(base, self.joints[rows])
+        R_WL, r_WL = kinematics.poses_in_world(self.pose[rows], self.joints[rows])
         numbers = {link: k for k, link in enumerate(kinematics.links) if link in links}
         return {link: (R_WL[:, k], r_WL[:, k]) for link, k in numbers.items()}
 
@@ -466,15 +385,12 @@ class FlightReport:
     def tool_goals(self) -> tuple[SentGoal, ...]:
         """Goals of the end-effector of a controller."""
         # A planner takes goals of the link `end_effector` on the same topic, and reports them.
-        return () if DEFAULT_END_EFFECTOR in self.link_goals else self.flight.end_effector_goals
+        return () if DEFAULT_END_EFFECTOR in self.link_goals else self.end_effector_goals
 
     @property
     def tool_targets(self) -> list[GoalSpan]:
         """Goals of the end-effector, each until the next."""
-        return self._targets_until_next(self._timed_goals(self.tool_goals))
-
-    def _timed_goals(self, goals: Sequence[SentGoal]) -> list[tuple[float, Goal]]:
-        return [(sent.time - self.bag.began, sent.goal) for sent in goals]
+        return self._targets_until_next(_timed_goals(self.tool_goals))
 
     def _targets_until_next(self, goals: list[tuple[float, Goal]]) -> list[GoalSpan]:
         ends = [*(time for time, _ in goals), self.end][1:]
@@ -489,7 +405,7 @@ class FlightReport:
     @property
     def position_counts(self) -> bool:
         """Whether the method controls the position of the base."""
-        return "position" not in self.flight.not_controlled
+        return "position" not in self.not_controlled
 
     def controls(self, part: str) -> list[int]:
         """Components x, y, z, rx, ry, rz (0..5) of ``base`` or ``end_effector`` under control.
@@ -504,7 +420,7 @@ class FlightReport:
     @property
     def measured_error(self) -> PoseError | None:
         """Error of the last measured pose to the goal, where sensors err."""
-        return pose_error(self.signal("measured_pose"), self.goal)
+        return pose_error(self.signal("measured_pose"), self.base_goal)
 
     def goal_rotvec(self, goal: Goal) -> Array:
         """Attitude of a goal (3,), rad, with the number of turns nearest to the last attitude."""
@@ -512,21 +428,17 @@ class FlightReport:
         return nearest_rotvec(rotvec, self.attitude.values[-1]) if len(self.attitude) else rotvec
 
     @property
-    def manoeuvre_time(self) -> float | None:
+    def time_flown(self) -> float | None:
         """Time flown for the last goal, s, see :func:`~spacerobot_ros.measures.flown_time`."""
-        return flown_time(self._reports, self.end)
+        return flown_time(self.reports, self.end)
 
     @property
     def time_to_end(self) -> float | None:
         """Time from the first schedule for the last goal to its end, s, with the waits in between;
         None where no schedule was flown.
         """
-        planned = [(time, each) for time, each in self._reports if isinstance(each, PlannerStatus)]
+        planned = [(time, each) for time, each in self.reports if isinstance(each, PlannerStatus)]
         return time_to_end(planned, self.end)
-
-    @property
-    def _reports(self) -> list[tuple[float, PlannerStatus | ControllerStatus]]:
-        return [(s.time, s.report) for s in self.statuses if s.report is not None]
 
     @cached_property
     def drawn(self) -> SolidRobot | None:
@@ -622,9 +534,9 @@ class FlightReport:
     @property
     def repeats_cycles(self) -> bool:
         """Whether a method flew that repeats cycles, or one that is not known; no law does."""
-        if any(isinstance(status.report, ControllerStatus) for status in self.statuses):
+        if any(isinstance(status, ControllerStatus) for _, status in self.reports):
             return False
-        flown = {status.method for status in self.executing if status.method}
+        flown = {status.method for _, status in self.executing if status.method}
         return not flown or any(
             name not in METHODS or METHODS[name].repeats_cycles for name in flown
         )
@@ -634,7 +546,7 @@ class FlightReport:
         """The equal cycles with which the longest schedule ends; None: there are none."""
         if not self.repeats_cycles:
             return None
-        starts = [0.0, *(status.time for status in self.executing)]
+        starts = [0.0, *(time for time, _ in self.executing)]
         spans = list(zip(starts, [*starts[1:], self.end], strict=True))
         start, end = max(spans, key=lambda span: span[1] - span[0])
         return find_cycles(self.rates.between(start, end))
@@ -644,24 +556,11 @@ class FlightReport:
         """Time from one recorded pose to the next, s; 0 with one or none."""
         return float(np.median(np.diff(self.position.time))) if len(self.position) > 1 else 0.0
 
-    @property
-    def drift(self) -> tuple[float, float]:
-        """Largest changes of linear and angular momentum without thrust, kg m/s and kg m^2/s."""
-        linear, angular = self.flight.momentum_drift.tolist()
-        return linear, angular
-
     @cached_property
     def impulse(self) -> Signal:
         """Impulse that all thrusters together have given (N, 1), N s."""
         thrust = self.signal("thruster_force")
         return impulse(thrust, np.ones(thrust.width))
-
-    @property
-    def propellant(self) -> Signal | None:
-        """Propellant that the thrusters have used (N, 1), kg; None where their specific impulses
-        are not in the bag.
-        """
-        return self.signal("propellant") if "propellant" in self.flight.series else None
 
     @cached_property
     def wheel_columns(self) -> tuple[int, ...]:
@@ -678,6 +577,17 @@ class FlightReport:
         """The joint of that name in the robot description."""
         joints = self.robot.movable_joints if self.robot is not None else ()
         return next((joint for joint in joints if joint.name == name), None)
+
+
+def _method_of(status: Status) -> str:
+    """Return the gait method of the schedule that begins, or the control law; empty: none."""
+    if isinstance(status, PlannerStatus):
+        return status.method
+    return status.command.law if status.command is not None else ""
+
+
+def _timed_goals(goals: Sequence[SentGoal]) -> list[tuple[float, Goal]]:
+    return [(sent.time, sent.goal) for sent in goals]
 
 
 def _joined(parts: Sequence[Signal]) -> Signal:

@@ -65,9 +65,9 @@ def page(
 ) -> str:
     """Return the whole page; flights ``beside`` this one get a row in a table."""
     charts = charts_of(flight, figures)
-    name, description = flight.scenario, flight.flight.scenario.description
+    name, description = flight.scenario.name, flight.scenario.description
     robot_name = "" if flight.robot is None else flight.robot.name
-    title = ", ".join(filter(None, (name, flight.method, robot_name)))
+    title = ", ".join(filter(None, (name, flight.flown_method, robot_name)))
     body = [
         "<header>",
         f"<h1>{escape(name)}</h1>",
@@ -80,7 +80,7 @@ def page(
         player.markup,
         *_numbers_html(flight),
         *_published_html(flight),
-        *_events_html(flight.events),
+        *_events_html(flight.timed_events),
         "<h2>Figures</h2>",
         _CHART_HELP if charts.data else "",
         *_figures_html(figures),
@@ -91,8 +91,8 @@ def page(
 
 def _facts_html(flight: FlightReport) -> str:
     found = []
-    if flight.method:
-        found.append(f"method {flight.method}")
+    if flight.flown_method:
+        found.append(f"method {flight.flown_method}")
     if flight.robot is not None:
         count = len(flight.robot.joint_names)
         joints = "1 joint" if count == 1 else f"{count} joints"
@@ -105,18 +105,19 @@ def _facts_html(flight: FlightReport) -> str:
 
 
 def _outcome_html(flight: FlightReport) -> str:
-    if not flight.statuses:
+    if not flight.timed_statuses:
         return (
             '<p class="outcome">The bag holds no status of a planner or a controller '
             "(planner/status, controller/status).</p>"
         )
-    last, verdict = flight.statuses[-1], flight.flight.verdict
-    word, sentence, tone = last.state.capitalize(), last.sentence, last.state
-    if last.executing:
+    (_, last), verdict = flight.timed_statuses[-1], flight.verdict
+    tone = "" if isinstance(last, str) else last.state.value
+    word, sentence = tone.capitalize(), last if isinstance(last, str) else last.message
+    if tone == "executing":
         sentence += " The recording ends before the outcome is known."
-    if last.state in ("reached", "failed"):
+    if tone in ("reached", "failed"):
         word, sentence = verdict.word, verdict.sentence
-    if last.state == "reached" and not verdict.complete:
+    if tone == "reached" and not verdict.complete:
         tone += " partly"
     state = f"<b>{escape(word)}</b>" if word else ""
     return f'<p class="outcome {escape(tone)}">{state}{unbroken(sentence)}</p>'
@@ -127,10 +128,10 @@ def _runs_html(flight: FlightReport, beside: Sequence[FlightReport]) -> list[str
         return []
     flights = [flight, *beside]
     parts = ["<h2>Runs side by side</h2>", _table_html("runs", runs_table(flights))]
-    files = [each.file_name for each in flights]
+    files = [each.bag.path.name for each in flights]
     if goals := different_goals(flights):
         parts += ["<h3>Goals that differ</h3>", table("goals", ("Goal", *files), goals)]
-    if rows := different_parameters([each.flight.scenario for each in flights]):
+    if rows := different_parameters([each.scenario for each in flights]):
         head = ("Parameter", *files)
         parts += ["<h3>Parameters that differ</h3>", table("different", head, rows)]
     return parts
@@ -139,7 +140,7 @@ def _runs_html(flight: FlightReport, beside: Sequence[FlightReport]) -> list[str
 def _numbers_html(flight: FlightReport) -> list[str]:
     result, joints = result_table(flight), joint_table(flight)
     parts = ["<h2>Numbers of the run</h2>"]
-    if flight.flight.goal is None:
+    if flight.goal is None:
         parts.append('<p class="missing">The bag holds no goal pose.</p>')
     if result.rows:
         parts.append(table("numbers", (), result.rows))
@@ -224,7 +225,9 @@ def _parameters_html(flight: FlightReport) -> list[str]:
 def _footer_text(flight: FlightReport) -> str:
     version = flight.bag.metadata.get("spacerobot", {}).get("version", "")
     by = f", recorded by spacerobot_ros {version}" if version else ""
-    return f"Made from the bag {flight.file_name} alone: {flight.bag.message_count} messages{by}."
+    return (
+        f"Made from the bag {flight.bag.path.name} alone: {flight.bag.message_count} messages{by}."
+    )
 
 
 # -- charts -------------------------------------------------------------------------------------
@@ -256,7 +259,7 @@ def _chart_events(flight: FlightReport) -> list[dict[str, Any]]:
     """Return the events of a flight; the last of several of one kind and time counts them."""
     found = []
     together: dict[tuple[float, EventKind], list[str]] = {}
-    for each in sorted(flight.events, key=lambda each: each.time)[:_MAX_CHART_EVENTS]:
+    for each in sorted(flight.timed_events, key=lambda each: each.time)[:_MAX_CHART_EVENTS]:
         sentences = together.setdefault((each.time, each.event.kind), [])
         text = f"{each.text} (+{len(sentences)})" if sentences else each.text
         sentences.append(each.event.message)

@@ -17,6 +17,7 @@ from matplotlib.colors import BoundaryNorm, Normalize, TwoSlopeNorm
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch, Wedge
 
+from spacerobot_ros.flight.trials import PlanEvaluation, PlanningProblem
 from spacerobot_ros.model.description import Array, JointKind
 from spacerobot_ros.model.rotations import rotvec_from_quaternion, rotvecs_from_quaternions
 from spacerobot_ros.planning.analysis import Analysis
@@ -41,7 +42,6 @@ from spacerobot_ros.report.figures import (
     set_time,
     sheet,
 )
-from spacerobot_ros.simulation.trials import PlanEvaluation, PlanningProblem
 
 _FINE_GRID, _COARSE_GRID = 61, 37
 """Points a side of a map, of robots with up to three joints and with more."""

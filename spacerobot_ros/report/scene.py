@@ -524,9 +524,9 @@ def _path_commands(flight: FlightReport) -> list[Command]:
 def _goal_commands(flight: FlightReport, robot: RobotDescription, radius: float) -> list[Command]:
     """The base at its last goal and a mark at the end-effector's."""
     commands: list[Command] = []
-    if flight.goal is not None and flight.controls("base"):
+    if flight.base_goal is not None and flight.controls("base"):
         matrix = matrix_of(
-            Pose(matrix_from_quaternion(flight.goal.quaternion), _ghost_position(flight))
+            Pose(matrix_from_quaternion(flight.base_goal.quaternion), _ghost_position(flight))
         )
         commands.append(set_transform(f"{WORLD}/goal", matrix))
         visuals = visuals_of(robot, flight.meshes, _faces_per_mesh(flight.meshes) // 4)
@@ -557,8 +557,8 @@ def _goal_commands(flight: FlightReport, robot: RobotDescription, radius: float)
 
 def _ghost_position(flight: FlightReport) -> Array:
     """Return the position of the ghost: the goal, or the last one if only attitude is a goal."""
-    assert flight.goal is not None
-    return flight.goal.position if flight.position_counts else flight.position.values[-1]
+    assert flight.base_goal is not None
+    return flight.base_goal.position if flight.position_counts else flight.position.values[-1]
 
 
 def _time_spans(flight: FlightReport) -> list[tuple[str, float, float]]:

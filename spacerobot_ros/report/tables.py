@@ -36,7 +36,7 @@ class Table:
 def headline(flight: FlightReport) -> list[tuple[str, str, str]]:
     """Return label, value and note of each headline number."""
     rows: list[tuple[str, str, str]] = []
-    error, tool, sensed = flight.flight.error, flight.tool_error, flight.measured_error
+    error, tool, sensed = flight.error, flight.tool_error, flight.measured_error
     if error is not None:
         measured = "" if sensed is None else f"measured: {sensed.distance:.3g} m"
         near = f"{error.distance:.3g} m", measured
@@ -54,23 +54,23 @@ def headline(flight: FlightReport) -> list[tuple[str, str, str]]:
         turn = f"{tool.angle:.3g} rad" if turned else ""
         note = _end_effector_note(flight, turn)
         rows.append(("End-effector error", f"{tool.distance:.3g} m", note))
-    for link, left in flight.flight.end_effector_errors.items():
+    for link, left in flight.end_effector_errors.items():
         turn = f"{left.angle:.3g} rad" if flight.link_goals[link].quaternion is not None else ""
         rows.append(
             (f"Error of {link}", f"{left.distance:.3g} m", _end_effector_note(flight, turn))
         )
-    if flight.manoeuvre_time is not None:
-        rows.append(("Manoeuvre", f"{flight.manoeuvre_time:.6g} s", _time_to_end_text(flight)))
-    if flight.method:
-        rows.append(("Method", flight.method, ""))
-    if len(flight.momentum) > 1:
-        linear, angular = flight.drift
+    if flight.time_flown is not None:
+        rows.append(("Manoeuvre", f"{flight.time_flown:.6g} s", _time_to_end_text(flight)))
+    if flight.flown_method:
+        rows.append(("Method", flight.flown_method, ""))
+    if len(flight.unexplained_momentum) > 1:
+        linear, angular = flight.momentum_drift.tolist()
         values = f"{linear:.1e} kg m/s", f"angular {angular:.1e} kg m²/s"
         rows.append((_momentum_label(flight), *values))
-    if (propellant := flight.flight.propellant) is not None:
+    if (propellant := flight.propellant) is not None:
         rows.append(("Propellant", f"{1e3 * propellant:.3g} g", ""))
-    if capture := flight.flight.capture:
-        about = flight.flight.capture_measures
+    if capture := flight.capture:
+        about = flight.capture_measures
         done = f"at {about.time:.4g} s" if capture["captured"] else "no"
         nearest = "" if math.isnan(about.distance) else f"{about.distance:.3g} m from the grapple"
         rows.append(("Target captured", done, nearest))
@@ -93,14 +93,14 @@ def _error_with_tolerance(
     flight: FlightReport, part: Literal["position", "attitude"], error: str, note: str
 ) -> tuple[str, str]:
     """Return value and note of an error with its tolerance, or that it is not controlled."""
-    if part in flight.flight.not_controlled:
+    if part in flight.not_controlled:
         return "not controlled", f"{error} from the goal"
     tolerance = _tolerance_text(flight, part, "m" if part == "position" else "rad").strip(" ()")
     return error, "; ".join(filter(None, (note, tolerance)))
 
 
 def _momentum_label(flight: FlightReport) -> str:
-    return "Momentum not explained by thrusters" if flight.flight.has_thrust else "Momentum drift"
+    return "Momentum not explained by thrusters" if flight.has_thrust else "Momentum drift"
 
 
 def runs_table(flights: Sequence[FlightReport]) -> Table:
@@ -108,7 +108,7 @@ def runs_table(flights: Sequence[FlightReport]) -> Table:
     found = [{label: value for label, value, _ in headline(flight)} for flight in flights]
     labels = list(dict.fromkeys(label for values in found for label in values))
     rows = [
-        (flight.file_name, *(values.get(label, _NO_VALUE) for label in labels))
+        (flight.bag.path.name, *(values.get(label, _NO_VALUE) for label in labels))
         for flight, values in zip(flights, found, strict=True)
     ]
     return Table(("Bag", *labels), rows)
@@ -117,8 +117,8 @@ def runs_table(flights: Sequence[FlightReport]) -> Table:
 def result_table(flight: FlightReport) -> Table:
     """Return goal, final state, errors, times and momentum drift, as far as the bag has them."""
     rows: list[tuple[str, ...]] = []
-    error = flight.flight.error
-    last = flight.statuses[-1].state if flight.statuses else ""
+    error = flight.error
+    last = flight.reports[-1][1].state.value if flight.reports else ""
     refused = " (refused)" if last == "refused" and not flight.executing else ""
     for part, text in _base_goal_texts(flight).items():
         pose = part != _FREE_BASE
@@ -135,7 +135,7 @@ def result_table(flight: FlightReport) -> Table:
             ("attitude", "rad", angle),
         ):
             text = f"{left}{_tolerance_text(flight, part, unit)}"
-            if part in flight.flight.not_controlled:
+            if part in flight.not_controlled:
                 text = f"not controlled; {left} from the goal"
             rows.append((f"{part.capitalize()} error", text))
     if (sensed := flight.measured_error) is not None:
@@ -144,17 +144,17 @@ def result_table(flight: FlightReport) -> Table:
     if flight.tool_error is not None:
         rows += _tool_rows(flight, flight.tool_error)
     rows += _link_rows(flight)
-    if flight.manoeuvre_time is not None:
-        rows.append(("Manoeuvre time", f"{flight.manoeuvre_time:.6g} s{_schedules_text(flight)}"))
+    if flight.time_flown is not None:
+        rows.append(("Manoeuvre time", f"{flight.time_flown:.6g} s{_schedules_text(flight)}"))
         if to_end := _time_to_end_text(flight):
             rows.append(("First schedule to the end", to_end.partition(" from ")[0]))
     if len(flight.position):
         rows.append(("Recorded", _recorded_text(flight)))
-    if len(flight.momentum) > 1:
-        linear, angular = flight.drift
+    if len(flight.unexplained_momentum) > 1:
+        linear, angular = flight.momentum_drift.tolist()
         drifts = f"linear {linear:.3g} kg m/s, angular {angular:.3g} kg m²/s"
         rows.append((_momentum_label(flight), drifts))
-    if (propellant := flight.flight.propellant) is not None:
+    if (propellant := flight.propellant) is not None:
         rows.append(("Propellant", f"{1e3 * propellant:.4g} g"))
     rows += _payload_rows(flight)
     if (clearance := flight.clearance) is not None:
@@ -169,7 +169,7 @@ _FREE_BASE = "of the base"
 
 def _base_goal_texts(flight: FlightReport) -> dict[str, str]:
     """Return the goal of the base by its parts, as texts; empty: there is none."""
-    goal = flight.goal
+    goal = flight.base_goal
     if goal is None:
         return {_FREE_BASE: "not controlled"} if flight.link_goals else {}
     if not flight.controls("base") and flight.outputs:
@@ -200,7 +200,7 @@ def different_goals(flights: Sequence[FlightReport]) -> list[tuple[str, ...]]:
 def _payload_rows(flight: FlightReport) -> list[tuple[str, ...]]:
     """Return the estimated parameters of each body that the robot held."""
     try:
-        estimates = payload_estimates(flight.flight)
+        estimates = payload_estimates(flight)
     except SpaceRobotError as error:
         return [("Held body, estimated", str(error))]
     return [("Held body, estimated", payload_text(each)) for each in estimates]
@@ -244,7 +244,7 @@ def _tool_rows(flight: FlightReport, error: PoseError) -> list[tuple[str, ...]]:
 def _link_rows(flight: FlightReport) -> list[tuple[str, ...]]:
     """Return goal, final position and errors of each link that has a goal at the end."""
     rows: list[tuple[str, ...]] = []
-    errors = flight.flight.end_effector_errors
+    errors = flight.end_effector_errors
     for link, goal in flight.link_goals.items():
         rows.append((f"Goal of {link}", _link_goal_text(goal)))
         if link not in errors:
@@ -302,10 +302,10 @@ def joint_table(flight: FlightReport) -> Table | None:
 
 def published_table(flight: FlightReport) -> Table | None:
     """Return published figures beside those of this flight; None if the scenario has none."""
-    if not flight.flight.scenario.published:
+    if not flight.scenario.published:
         return None
     rows = []
-    for row in flight.flight.scenario.published:
+    for row in flight.scenario.published:
         measured, source = _measured_values(flight, row)
         ours = _NO_VALUE
         if measured:
@@ -327,14 +327,16 @@ def _measured_values(flight: FlightReport, row: Published) -> tuple[list[float],
         figures["final_joint_positions"] = flight.shape.values[-1]
     if len(flight.rates):
         figures["peak_joint_velocities"] = np.abs(flight.rates.values).max(axis=0)
-    if (error := flight.flight.error) is not None:
+    if (error := flight.error) is not None:
         figures["position_error_m"] = [error.distance]
         figures["attitude_error_rad"] = [error.angle]
-    if (time := flight.manoeuvre_time) is not None:
+    if (time := flight.time_flown) is not None:
         figures["manoeuvre_time_s"] = [time]
     if row.quantity in figures:
         return [float(x) for x in figures[row.quantity]], "flight"
-    numbers = flight.executing[0].note(row.quantity) if flight.executing else []
+    notes = flight.executing[0][1].notes if flight.executing else {}
+    value = notes.get(row.quantity, "")
+    numbers: list[float] = [] if isinstance(value, str) else np.atleast_1d(value).tolist()
     return numbers, "planner" if numbers else ""
 
 
@@ -359,7 +361,7 @@ def _format_attitude(rotvec: Iterable[float]) -> str:
 
 
 def _tolerance_text(flight: FlightReport, part: str, unit: str) -> str:
-    value = flight.flight.tolerance("position" if part == "position" else "attitude")
+    value = flight.tolerance("position" if part == "position" else "attitude")
     return "" if value is None else f" (tolerance {value:.3g} {unit})"
 
 
@@ -370,7 +372,7 @@ def _schedules_text(flight: FlightReport) -> str:
 
 def _time_to_end_text(flight: FlightReport) -> str:
     """Return the time to the end if it differs from that of the schedules; else nothing."""
-    whole, flown = flight.time_to_end, flight.manoeuvre_time
+    whole, flown = flight.time_to_end, flight.time_flown
     if whole is None or flown is None or abs(whole - flown) < _EQUAL_TIME_TICKS * flight.tick:
         return ""
     return f"{whole:.6g} s from the first schedule to the end"

@@ -189,7 +189,7 @@ def write_figures(
         )
     flight = read_report(bag, namespace)
     if not events:
-        flight = replace(flight, events=[])
+        flight = replace(flight, timed_events=[])
     made: dict[str, Path | str] = {}
     with drawing(width / 25.4, "paper", style, degrees=degrees, lettered=True):
         for name in only or [name for name in FIGURES if name not in ("position", "attitude")]:
@@ -258,6 +258,6 @@ def _overview_figure(flight: FlightReport) -> Figure:
         view = view_of(flight)
         draw_robot(axes, robot, robot.corner_points(), view)
         legend_above(axes, draw_goal_and_path(axes, flight, view))
-    title = ": ".join(filter(None, (flight.scenario, flight.flight.scenario.description)))
+    title = ": ".join(filter(None, (flight.scenario.name, flight.scenario.description)))
     figure.text(0.1 / WIDTH, 1 - 0.24 / up, title, size=10.5, weight="bold")
     return figure

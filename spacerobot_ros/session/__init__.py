@@ -1,1 +1,1 @@
-"""Sessions: scenarios flown by a stack of ROS nodes, in one process or in several."""
+"""Sessions: scenarios flown without ROS, or by nodes that have a process each."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Collection, Sequence
-from typing import Any
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticStatus
@@ -26,7 +25,6 @@ from spacerobot_ros.model.description import DEFAULT_END_EFFECTOR
 from spacerobot_ros.nodes.common.messages import goal_message, path_message, shape_message
 from spacerobot_ros.nodes.common.node import LATCHED, STREAM
 from spacerobot_ros.nodes.common.process import spin_until
-from spacerobot_ros.nodes.common.streams import AnnouncedPublisher
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.execution.goal_file import GoalIds
 from spacerobot_ros.planning.execution.status import PlannerStatus
@@ -57,8 +55,6 @@ class MissionClient:
         Links that there will be goals for; empty name: the default end-effector.
     paths
         Those of them whose goals are paths.
-    on_end
-        Called, within the callback, when the goal is decided or no longer followed.
     name, namespace, context
         Name, namespace and rclpy context of the node.
     """
@@ -72,7 +68,6 @@ class MissionClient:
         joint_names: Callable[[], Sequence[str]] | None = None,
         end_effectors: Sequence[str] = (),
         paths: Collection[str] = (),
-        on_end: Callable[[], None] = lambda: None,
         name: str = "mission_client",
         namespace: str = "",
         context: rclpy.Context | None = None,
@@ -84,14 +79,14 @@ class MissionClient:
         """Message of the last status that another goal is not the subject of; empty before."""
         self._done = rclpy.task.Future(executor=None)
         self._frame, self._now = world_frame, now
-        self._joint_names, self._on_end = joint_names, on_end
+        self._joint_names = joint_names
         self._sent = 0
         self._follower = GoalFollower()
-        self._goal_topic = self._publisher(PoseStamped, "goal_pose")
+        self._goal_topic = self.node.create_publisher(PoseStamped, "goal_pose", STREAM)
         self._sends: list[Publisher] = [self._goal_topic]
         self._shape_topic: Publisher | None = None
         if joint_names is not None:
-            self._shape_topic = self._publisher(JointState, "goal_joint_states")
+            self._shape_topic = self.node.create_publisher(JointState, "goal_joint_states", STREAM)
             self._sends.append(self._shape_topic)
         self._end_effector_topics = {
             link: self._make_publisher(link, path=link in paths) for link in end_effectors
@@ -109,11 +104,8 @@ class MissionClient:
         """Return the publisher of goals of a link: of paths, or of poses."""
         name = link or DEFAULT_END_EFFECTOR
         if path:
-            return self._publisher(Path, path_topic(name))
-        return self._publisher(PoseStamped, goal_topic(name))
-
-    def _publisher(self, kind: type[Any], topic: str) -> Publisher:
-        return self.node.create_publisher(kind, topic, STREAM, publisher_class=AnnouncedPublisher)
+            return self.node.create_publisher(Path, path_topic(name), STREAM)
+        return self.node.create_publisher(PoseStamped, goal_topic(name), STREAM)
 
     @property
     def goal_id(self) -> str | None:
@@ -237,8 +229,6 @@ class MissionClient:
 
     def _end(self, outcome: Outcome) -> None:
         if not self._done.done():
-            # The run ends in this callback, so that it ends at the same tick every time.
-            self._on_end()
             self._done.set_result(outcome)
 
     def _on_event(self, received: DiagnosticStatus) -> None:

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from spacerobot_ros.errors import PlanningError
+from spacerobot_ros.flight.trials import PlanningProblem
 from spacerobot_ros.model import RobotDescription, SpaceRobot
 from spacerobot_ros.model.description import Array, Joint
 from spacerobot_ros.model.meshes import mesh_file
@@ -19,7 +20,6 @@ from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.methods.optimal.goal_specification import BaseRotations
 from spacerobot_ros.simulation import InitialState
-from spacerobot_ros.simulation.trials import PlanningProblem
 
 _LARGEST_FIRST_ROTATION = math.radians(5.0)
 """Largest turn of the base in the first scenario of a robot, rad."""

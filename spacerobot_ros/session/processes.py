@@ -13,19 +13,22 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import yaml
 from diagnostic_msgs.msg import DiagnosticStatus
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
 from rclpy.client import Client
+from rclpy.exceptions import InvalidNamespaceException
 from rclpy.experimental import EventsExecutor
 from rclpy.publisher import Publisher
+from rclpy.validate_namespace import validate_namespace
 from rosgraph_msgs.msg import Clock
 from std_srvs.srv import Trigger
 
-from spacerobot_ros.errors import SpaceRobotError
+from spacerobot_ros.bag import free_name
+from spacerobot_ros.errors import ParameterError, SpaceRobotError
 from spacerobot_ros.events import Event, EventKind
 from spacerobot_ros.measures import Outcome
 from spacerobot_ros.model.shared_parameters import robot_of
@@ -33,13 +36,15 @@ from spacerobot_ros.nodes import NODE_TYPES
 from spacerobot_ros.nodes.common.messages import diagnostic_status
 from spacerobot_ros.nodes.common.node import STREAM
 from spacerobot_ros.nodes.common.process import FASTDDS_FILE_VARIABLES
-from spacerobot_ros.nodes.common.streams import MatchedEndpoints
+from spacerobot_ros.nodes.common.streams import MatchedEndpoints, topics_without_all_matches
 from spacerobot_ros.planning import Goal
+from spacerobot_ros.planning.core.goal import POSE
 from spacerobot_ros.planning.execution.status import PlannerStatistics
 from spacerobot_ros.scenario import COMMANDERS, Kill, Scenario
-from spacerobot_ros.session.stack import Stack, namespace_arguments
+from spacerobot_ros.session.mission_client import MissionClient
 from spacerobot_ros.termination import end_child, start_child
 from spacerobot_ros.times import SECOND, stamp_to_ns
+from spacerobot_ros.topics import GLOBAL_TOPICS, TOPICS_NOT_RECORDED
 
 _LONGEST_START = 60.0
 """Longest wait for the start of all nodes, wall s."""
@@ -83,17 +88,44 @@ _CHILD_MODULE = "spacerobot_ros.session.child"
 """Module that runs a node until this process ends."""
 
 
-class MultiProcessStack(Stack):
+def namespace_arguments(namespace: str) -> list[str]:
+    """Return the ROS arguments that put a node, its clock and its frames into a namespace."""
+    if not namespace:
+        return []
+    moved = [word for topic in GLOBAL_TOPICS for word in ("-r", f"{topic}:={topic[1:]}")]
+    return ["-r", f"__ns:={namespace}", *moved]
+
+
+def checked_namespace(name: str) -> str:
+    """Return a namespace as ROS writes it, with a slash before it; empty for none.
+
+    Raises
+    ------
+    ParameterError
+        ROS takes no such name.
+    """
+    namespace = f"/{name.strip('/')}" if name.strip("/") else ""
+    try:
+        validate_namespace(namespace or "/")
+    except InvalidNamespaceException as error:
+        raise ParameterError(f"The namespace '{name}' is not valid in ROS: {error}.") from error
+    return namespace
+
+
+class MultiProcessStack:
     """The node processes of a scenario, and the client of their mission in this process.
 
     The node processes end with this process, even if it is killed. In lockstep every run is equal:
-    nothing begins
-    before all nodes have met, and the goal is there before the first state.
+    nothing begins before all nodes have met, and the goal is there before the first state.
 
     Parameters
     ----------
-    scenario, bag, namespace
-        As of every stack.
+    scenario
+        The scenario to run.
+    bag
+        File to record into; None records nothing.
+    namespace
+        Of all nodes and topics, the clock and the frames among them; empty for none.
     restarts
         How often a minute each planner or controller that dies is started again; it then goes on
         with its goal.
@@ -102,11 +134,11 @@ class MultiProcessStack(Stack):
 
     Raises
     ------
+    ParameterError
+        A parameter or the namespace is refused, or the scenario kills nodes in lockstep.
     SpaceRobotError
         A node ended at its start; the message is the last error that it wrote.
     """
-
-    can_kill: ClassVar[bool] = True
 
     def __init__(
         self,
@@ -117,7 +149,17 @@ class MultiProcessStack(Stack):
         restarts: int = 0,
         show: Callable[[str], None] = lambda line: None,
     ) -> None:
-        super().__init__(scenario, bag, namespace)
+        self.namespace = checked_namespace(namespace)
+        _require_flyable(scenario)
+        self.scenario = scenario
+        self.when_exists = scenario.parameters("recorder").get("when_exists", "refuse")
+        """Reaction to an existing bag of this name; by default it is refused."""
+        self.bag = free_name(bag) if bag is not None and self.when_exists == "next" else bag
+        recorder = () if bag is None else ("recorder",)
+        self.names = ("plant", *scenario.commanders, *recorder)
+        """Names of the nodes, in the order of their start."""
+        for name in self.names:
+            scenario.config(name)  # Invalid parameters are refused before any node runs.
         self._restarts, self._show = RestartLimit(restarts), show
         self._timeline = KillTimeline(scenario.kills)
         self._time_ns = 0
@@ -130,7 +172,17 @@ class MultiProcessStack(Stack):
             names = robot.joint_names if robot is not None else ()
             if robot is not None:
                 scenario.require_shape_of(robot)
-        self._make_client(None if names is None else lambda: names)
+        # A planner decides goals; without one the controller does.
+        decider = scenario.commanders[0]
+        self.client = MissionClient(
+            decider,
+            scenario.config(decider).world_frame,
+            lambda: self.time_ns,
+            joint_names=None if names is None else lambda: names,
+            end_effectors=scenario.end_effectors,
+            paths=scenario.goal.links_with_paths,
+            namespace=self.namespace,
+        )
         node = self.client.node
         self._events: Publisher | None = None
         if restarts:
@@ -158,7 +210,9 @@ class MultiProcessStack(Stack):
 
     def launch(self, name: str, **parameters: Any) -> None:
         """Start one node of the scenario, for the first time or again, with more parameters."""
-        overrides = self.parameters(name)
+        overrides: dict[str, Any] = dict(self.scenario.parameters(name))
+        if name == "planner" and self.scenario.lockstep:
+            overrides["plan_in_background"] = False  # Known before the plant says so.
         if name == "recorder":
             overrides |= {"bag": str(self.bag), "when_exists": self.when_exists}
             record = Path(self._folder.name, "scenario.json")
@@ -215,6 +269,32 @@ class MultiProcessStack(Stack):
             self.client.send(goal, self.scenario.end_effector_goal)
             self.client.await_delivery()
         self._change_states(Transition.TRANSITION_ACTIVATE, ["plant"])
+
+    def spin(self, look: Callable[[], bool]) -> None:
+        """Run until the goal is decided, or until ``look``, called five times a second, is true.
+
+        Raises
+        ------
+        SpaceRobotError
+            A node has ended by itself, or a commander with a goal has failed; the bag is complete.
+        """
+
+        def on_look() -> bool:
+            self._supervise()
+            failures = self.client.failures
+            for name in self.scenario.commanders if self.client.goal_id else ():
+                if name in failures:
+                    raise SpaceRobotError(failures[name])
+            return look()
+
+        try:
+            self.client.follow(self.executor, on_look)
+            if self.client.outcome is Outcome.ABORTED:
+                on_look()  # A commander that fails aborts its goal.
+        except SpaceRobotError:
+            with suppress(SpaceRobotError):
+                self.finish()
+            raise
 
     def finish(self) -> None:
         """Stop time, then end all nodes; the recorder ends last and completes the bag.
@@ -316,16 +396,26 @@ class MultiProcessStack(Stack):
         self._clock_seen = time.monotonic()
 
     def _connected(self) -> bool:
-        """Ask every node for its connections; return whether all endpoints are matched."""
+        """Ask every node for its connections; return whether all are matched and recorded."""
         requests = {name: Trigger.Request() for name in self.names}
         answers = self._call_services(self._get_connections, requests)
         nodes = {
             name: MatchedEndpoints.from_json(answer.message) for name, answer in answers.items()
         }
         self._spin_for(_CONNECTION_CHECK_PERIOD)
-        recorder = nodes.get("recorder")
-        recorded = () if recorder is None else dict(recorder.subscriptions)
-        return self._all_connected(nodes, recorded)
+        client = MatchedEndpoints.of(self.client.node)
+        if topics_without_all_matches([*nodes.values(), client]):
+            return False
+        recorder = nodes.pop("recorder", None)
+        if recorder is None:
+            return True
+        published = {topic for each in (client, *nodes.values()) for topic, _ in each.publishers}
+        chosen = self.scenario.config("recorder").topics.split()
+        if chosen:
+            published &= {self.client.node.resolve_topic_name(topic) for topic in chosen}
+        else:
+            published = {topic for topic in published if not topic.endswith(TOPICS_NOT_RECORDED)}
+        return published <= dict(recorder.subscriptions).keys()
 
     def _change_states(self, transition: int, names: Sequence[str]) -> None:
         request = ChangeState.Request(transition=Transition(id=transition))
@@ -384,6 +474,27 @@ class MultiProcessStack(Stack):
             if time.monotonic() > deadline:
                 raise _ServiceTimeoutError(f"Timed out after {patience:g} s waiting for {what}.")
             self.executor.spin_once(timeout_sec=0.02)
+
+
+def _require_flyable(scenario: Scenario) -> None:
+    """Refuse what nodes cannot fly.
+
+    Raises
+    ------
+    ParameterError
+        The scenario kills nodes in lockstep, or its goals cannot be sent.
+    """
+    if scenario.kills and scenario.lockstep:
+        raise ParameterError(
+            f"The scenario '{scenario.name}' kills nodes on the way: fly it with --nodes and "
+            "--realtime."
+        )
+    goal = scenario.goal
+    if goal.end_effectors and goal.base not in (frozenset(), POSE):
+        raise ParameterError(
+            "Goals of end-effectors are sent with the whole pose of the base or with none: "
+            "give --goal, or leave the attitude of the base out."
+        )
 
 
 _NO_ERROR_TEXT = "it wrote no error."

@@ -1,45 +1,21 @@
-"""Runs stacks: to the goal of a scenario, or until they are stopped; sends goals to stacks."""
+"""Flies scenarios to their goals and records bags: by the loop without ROS, or by nodes."""
 
 from __future__ import annotations
 
 import math
-import os
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
-from dataclasses import dataclass, replace
-from functools import partial
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import rclpy
-from rclpy.experimental import EventsExecutor
-from rclpy.logging import get_logger_effective_level, set_logger_level
-from rosgraph_msgs.msg import Clock
-
-from spacerobot_ros.errors import SpaceRobotError
-from spacerobot_ros.flight.reading import (
-    open_flight_bag,
-    read_flight,
-    require_states,
-    with_propellant,
-)
-from spacerobot_ros.measures import Outcome
-from spacerobot_ros.model.description import DEFAULT_END_EFFECTOR
-from spacerobot_ros.nodes.common.process import (
-    FASTDDS_FILE_VARIABLES,
-    start_ros,
-    use_loopback_discovery,
-    use_private_discovery,
-)
-from spacerobot_ros.planning import Goal
+from spacerobot_ros.bag import BagWriter, free_name
+from spacerobot_ros.errors import SpaceRobotError, describe_exception
+from spacerobot_ros.flight.lockstep import LockstepFlight, Robots, require_flyable
+from spacerobot_ros.flight.saved import open_bag, write_flight
 from spacerobot_ros.scenario import Scenario
-from spacerobot_ros.session.mission_client import MissionClient
-from spacerobot_ros.session.processes import MultiProcessStack
-from spacerobot_ros.session.stack import InProcessStack, Stack, checked_namespace
 from spacerobot_ros.termination import graceful_shutdown
-from spacerobot_ros.times import SECOND, stamp_to_ns
-from spacerobot_ros.topics import goal_topic, path_topic
 
 Progress = Callable[[float, float], None]
 """Function called with simulated time and the end time of the present schedule, s."""
@@ -65,83 +41,18 @@ class RunResult:
     """Earlier name of :attr:`message`."""
 
 
-_ONE_PROCESS_SETTINGS = Path(__file__).with_name("one_process.xml")
-"""Fast DDS settings with which readers hear a writer of their process however late they come.
-
-Within a process, a reader takes all that a writer sent before for lost messages. With more of them
-than its limit of samples, 5000, a reliable reader gets nothing.
-"""
-
-
-@contextmanager
-def ros(*, private: bool, one_process: bool = False) -> Iterator[None]:
-    """Initialise rclpy without its signal handlers; discovery is private or on loopback.
-
-    Parameters
-    ----------
-    private
-        Whether discovery is private.
-    one_process
-        Whether nodes are to hear each other within this process.
-
-    Raises
-    ------
-    SpaceRobotError
-        ROS does not start: an environment variable is refused.
-    """
-    (use_private_discovery if private else use_loopback_discovery)()
-    level = get_logger_effective_level("")
-    quiet = ["--ros-args", "--log-level", "WARN"]
-    settings: tuple[str, ...] = ()
-    if one_process and not any(os.environ.get(name) for name in FASTDDS_FILE_VARIABLES):
-        settings = FASTDDS_FILE_VARIABLES
-        os.environ.update(dict.fromkeys(settings, str(_ONE_PROCESS_SETTINGS)))
-    try:
-        start_ros(quiet)
-        yield
-    finally:
-        for name in settings:
-            del os.environ[name]
-        rclpy.try_shutdown()
-        # The level is the process's: it would hold for nodes that are made after the run.
-        set_logger_level("", level)
-
-
-def make_stack(
-    scenario: Scenario,
-    bag: Path | None,
-    *,
-    processes: bool,
-    namespace: str = "",
-    restarts: int = 0,
-    show: Callable[[str], None] = lambda line: None,
-) -> Stack:
-    """Return the stack of a scenario, in this process or with a process for each node.
-
-    ``restarts`` and ``show`` are those of :class:`MultiProcessStack`.
-
-    Raises
-    ------
-    SpaceRobotError
-        A parameter or the robot is refused, or a node does not start.
-    """
-    if processes:
-        return MultiProcessStack(scenario, bag, namespace, restarts=restarts, show=show)
-    return InProcessStack(scenario, bag, namespace)
-
-
 def run_scenario(
     scenario: Scenario,
     bag: Path,
     progress: Progress | None = None,
     *,
-    processes: bool = False,
+    nodes: bool = False,
     longest: float = math.inf,
 ) -> RunResult:
-    """Fly a scenario from its initial state to its goal, in this process.
+    """Fly a scenario from its initial state to its goal, and record a bag.
 
-    ``processes`` gives each node a process of its own instead. A flight of ``longest`` s of
-    simulated time and more is interrupted at one of the looks at it, five a second of wall time.
+    It is flown by the loop without ROS, or with ``nodes`` by the nodes, a process each. A flight of
+    ``longest`` s of simulated time is interrupted.
 
     SIGINT, SIGTERM and SIGHUP end the flight early; the flight until then is recorded and summed
     up. Before the flight they act as in any other program.
@@ -149,222 +60,52 @@ def run_scenario(
     Raises
     ------
     SpaceRobotError
-        A parameter, the robot or the recording is refused.
+        A parameter, the robot or the recording is refused, or only nodes can fly the scenario.
     """
-    private = not processes and scenario.lockstep
-    with ros(private=private, one_process=not processes):
-        stack = make_stack(scenario, bag, processes=processes)
+
+    def report(now: float, end: float) -> None:
+        if progress is not None:
+            limit = 0.0
+            if "coordinated_control" in scenario.commanders:
+                limit = scenario.controller.time_limit
+            with suppress(OSError):  # A closed terminal must not end the flight.
+                progress(now, end or limit)
+
+    if nodes:
+        from spacerobot_ros.session.live import fly_by_nodes  # This import loads ROS.
+
+        return RunResult(fly_by_nodes(scenario, bag, report, longest))
+    require_flyable(scenario)
+    flight = LockstepFlight(scenario, Robots.of(scenario))
+    if scenario.parameters("recorder").get("when_exists") == "next":
+        bag = free_name(bag)
+    writer = open_bag(scenario, bag)
+    with graceful_shutdown(flight.interrupt) as stopped:
+
+        def look(now: float, end: float) -> bool:
+            report(now, end)
+            return stopped()
+
+        return RunResult(_fly_and_write(flight, writer, look, longest))
+
+
+def _fly_and_write(
+    flight: LockstepFlight,
+    writer: BagWriter,
+    look: Callable[[float, float], bool],
+    longest: float,
+) -> dict[str, Any]:
+    """Fly, write the flight, also one that ends by an error, and return the summary."""
+    with writer:
+        began = time.perf_counter()
         try:
-            with graceful_shutdown(stack.interrupt) as stopped:
-                began = time.perf_counter()
-                stack.start(scenario.goal)
-                time_limit = 0.0
-                if "coordinated_control" in scenario.commanders:
-                    time_limit = scenario.controller.time_limit
-
-                def look() -> bool:
-                    if progress is not None:
-                        with suppress(OSError):  # A closed terminal must not end the flight.
-                            progress(stack.time_ns / SECOND, stack.client.ends_at or time_limit)
-                    return stopped() or stack.time_ns / SECOND >= longest
-
-                stack.spin(look)
-                wall_time = time.perf_counter() - began
-                if progress is not None and not stopped():
-                    flown = stack.time_ns / SECOND
-                    progress(flown, flown)
-                stack.finish()
-                return RunResult(_summary(stack, wall_time))
-        finally:
-            stack.close()
-
-
-def _summary(stack: Stack, wall_time: float) -> dict[str, Any]:
-    """Return the measures of a finished flight, from its bag and from the mission client."""
-    scenario, client = stack.scenario, stack.client
-    assert stack.bag is not None
-    bag = open_flight_bag(stack.bag)
-    flight = read_flight(bag)
-    require_states(bag, flight)
-    outcome, message = client.outcome or Outcome.INTERRUPTED, client.message
-    if outcome is Outcome.INTERRUPTED:
-        message = f"Interrupted after {flight.duration:.6g} s of simulated time."
-    flight = replace(
-        flight,
-        scenario=scenario,
-        outcome=outcome,
-        message=message,
-        goal=scenario.goal,
-        end_effector_goal=scenario.end_effector_goal,
-        status=client.status,
-        gait=client.gait,
-        plan_time=stack.statistics.plan_time_s,
-        wall_time=wall_time,
-    )
-    flight = with_propellant(flight, scenario.plant.thrusters, bag.names("thrusters"))
-    recorded = {"messages_recorded": bag.message_count, "bag": str(bag.path)}
-    return {**flight.summary(), **recorded}
-
-
-# -- stacks that run until they are stopped, goals from outside ---------------------------------
-
-_LONGEST_DISCOVERY = 10.0
-"""Longest wall time until a commander is discovered, s."""
-
-_LONGEST_STATUS_WAIT = 1.0
-"""Wall time to wait for the status of earlier goals, which is no answer to the new one, s."""
-
-_CHECK_PERIOD = 0.1
-
-
-class _StatusPrinter:
-    """Shows each new status message that a client receives."""
-
-    def __init__(self, client: MissionClient, show: Callable[[str], None]) -> None:
-        self._client, self._show, self._shown = client, show, ""
-
-    def show(self) -> None:
-        """Show the message of the last status if it is new."""
-        if self._client.message != self._shown:
-            self._shown = self._client.message
-            with suppress(OSError):  # A closed terminal must not stop the robot.
-                self._show(self._shown)
-
-
-def run_until_stopped(
-    scenario: Scenario,
-    bag: Path | None,
-    show: Callable[[str], None],
-    *,
-    processes: bool,
-    namespace: str = "",
-    restarts: int = 0,
-    supervise: Callable[[], None] = lambda: None,
-) -> Path | None:
-    """Run the nodes of a scenario in real time until SIGINT, SIGTERM or SIGHUP; goals by topic.
-
-    With ``processes``, planner and controller are started again when they die, each at most
-    ``restarts`` times a minute. ``supervise`` is called five times a second.
-
-    Returns the bag, whose name is another one where that was taken and ``when_exists`` is next.
-
-    Raises
-    ------
-    SpaceRobotError
-        A node cannot start, or has ended by itself.
-    """
-    with ros(private=False, one_process=not processes):
-        stack = make_stack(
-            scenario, bag, processes=processes, namespace=namespace, restarts=restarts, show=show
-        )
-        try:
-            with graceful_shutdown(stack.interrupt) as stopped:
-                stack.start(None)
-                with suppress(OSError):
-                    topic = f"{stack.namespace}/goal_pose" if stack.namespace else "goal_pose"
-                    show(f"{scenario.name} is up; goals on '{topic}', Ctrl-C ends it.")
-                statuses = _StatusPrinter(stack.client, show)
-
-                def look() -> bool:
-                    statuses.show()
-                    supervise()
-                    return stopped()
-
-                stack.spin(look)
-                stack.finish()
-                return stack.bag
-        finally:
-            stack.close()
-
-
-def send_goal(
-    goal: Goal, show: Callable[[str], None], *, namespace: str, timeout: float
-) -> Outcome:
-    """Send one goal pose, show its statuses, and return its outcome.
-
-    ``timeout`` is wall time in s, 0: for ever. A commander is looked for no longer than that, and
-    for ten seconds at most.
-
-    Raises
-    ------
-    SpaceRobotError
-        No commander takes goals, or ROS takes no such namespace.
-    """
-    namespace = checked_namespace(namespace)
-    with ros(private=False):
-        executor = EventsExecutor()
-        clocks = {"own": 0, "global": 0}
-
-        def on_clock(message: Clock, which: str) -> None:
-            clocks[which] = stamp_to_ns(message.clock)
-
-        clients = [
-            MissionClient(
-                decider,
-                "",
-                lambda: clocks["own"] or clocks["global"] or time.time_ns(),
-                namespace=namespace,
-                name=f"goal_{decider}",
-                end_effectors=[each.link for each in goal.end_effectors],
-                paths=goal.links_with_paths,
-                # An empty message resets the joint positions that an earlier goal required.
-                joint_names=tuple if decider == "planner" else None,
-            )
-            for decider in ("planner", "coordinated_control")
-        ]
-        # In a namespace the stack may have its own clock, by a remap.
-        node = clients[0].node
-        for topic, which in {"/clock": "global", node.resolve_topic_name("clock"): "own"}.items():
-            node.create_subscription(Clock, topic, partial(on_clock, which=which), 10)
-        try:
-            for each in clients:
-                executor.add_node(each.node)
-            client = _find_goal_commander(
-                clients, executor, min(timeout or _LONGEST_DISCOVERY, _LONGEST_DISCOVERY), goal
-            )
-            with graceful_shutdown() as stopped:
-                client.send(goal)
-                began, statuses = time.monotonic(), _StatusPrinter(client, show)
-
-                def look() -> bool:
-                    statuses.show()
-                    late = timeout > 0 and time.monotonic() - began > timeout
-                    return stopped() or late
-
-                outcome = client.follow(executor, look, _CHECK_PERIOD)
-                statuses.show()
-                return outcome
-        finally:
-            for each in clients:
-                each.node.destroy_node()
-            executor.shutdown()
-
-
-def _find_goal_commander(
-    clients: list[MissionClient], executor: EventsExecutor, patience: float, goal: Goal
-) -> MissionClient:
-    """Return the client that listens to the planner, or to the controller if there is none."""
-    deadline = time.monotonic() + patience
-    while time.monotonic() < deadline:
-        executor.spin_once(timeout_sec=0.05)
-        for client in clients:
-            if client.is_connected() and client.has_goal_commander():
-                latest = time.monotonic() + _LONGEST_STATUS_WAIT
-                while client.status is None and time.monotonic() < latest:
-                    executor.spin_once(timeout_sec=0.05)
-                # Other subscribers may have been discovered in the meantime.
-                while not client.is_connected() and time.monotonic() < deadline:
-                    executor.spin_once(timeout_sec=0.05)
-                return client
-    links = [
-        (path_topic if each.link in goal.links_with_paths else goal_topic)(
-            each.link or DEFAULT_END_EFFECTOR
-        )
-        for each in goal.end_effectors
-    ]
-    topics = " and ".join(f"'{topic}'" for topic in ("goal_pose", *links))
-    listed = "; the planner's parameter end_effectors lists other links" if links else ""
-    raise SpaceRobotError(
-        f"No commander takes goals on {topics} after {patience:g} s: start a planner or a "
-        f"controller, `spacerobot up SCENARIO`, in the same ROS domain and namespace{listed}."
-    )
+            flown = flight.fly(look, longest)
+        except Exception as error:
+            message = f"The flight has failed at {flight.time:g} s: {describe_exception(error)}."
+            write_flight(flight.until_now(time.perf_counter() - began, message), writer)
+            if isinstance(error, SpaceRobotError):
+                raise
+            raise SpaceRobotError(message) from error
+        write_flight(flown, writer)
+    recorded = {"messages_recorded": writer.messages_written, "bag": str(writer.path)}
+    return {**flown.summary(), **recorded}

@@ -17,8 +17,12 @@ from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.nodes.common.process import use_loopback_discovery
 from spacerobot_ros.nodes.viewer import node
 from spacerobot_ros.parameters import Value
-from spacerobot_ros.session.processes import RestartLimit, end_message, node_arguments
-from spacerobot_ros.session.stack import checked_namespace
+from spacerobot_ros.session.processes import (
+    RestartLimit,
+    checked_namespace,
+    end_message,
+    node_arguments,
+)
 from spacerobot_ros.termination import end_child, start_child
 from spacerobot_ros.viewer.server import require_viser
 

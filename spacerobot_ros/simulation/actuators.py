@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from spacerobot_ros.control.thrusters import ThrusterModulator, ThrusterTable, find_thrusters
 from spacerobot_ros.errors import CommandError, ParameterError
 from spacerobot_ros.model import SpaceRobot, integration
 from spacerobot_ros.model.description import Array, RobotDescription
+from spacerobot_ros.model.thrusters import ThrusterModulator, ThrusterTable, find_thrusters
 from spacerobot_ros.simulation import effort_plant
 from spacerobot_ros.simulation.capture import CapturePlant, Target, capture_in, load_target
 from spacerobot_ros.simulation.config import PlantConfig

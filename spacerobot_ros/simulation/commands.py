@@ -13,7 +13,6 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
-from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -65,7 +64,7 @@ class Reason(str, Enum):
     """Stamped before the command that is in force."""
     BEYOND_LIMITS = "beyond_limits"
     SECOND_COMMANDER = "second_commander"
-    """Another commander has answered the same state, or two publishers alternate."""
+    """Another commander has answered the same state."""
     LATCHED = "latched"
     """A fault is latched: nothing moves until it is rearmed."""
 
@@ -169,10 +168,6 @@ class CommandSource:
         Whether a lockstep plant waits for its commands.
     commanders
         Known number of publishers of the topic.
-    senders
-        Identifies the publisher of the last message.
-    sender
-        Publisher of the command in force.
     """
 
     def __init__(
@@ -180,13 +175,10 @@ class CommandSource:
         topic: str,
         quantity: Quantity,
         limits: Array,
-        senders: PublisherTracker | None = None,
         kept: npt.NDArray[np.int64] | None = None,
     ) -> None:
         self.topic, self.quantity, self.limits = topic, quantity, limits
         self.kept = np.zeros(0, dtype=np.int64) if kept is None else kept
-        self.senders = senders or PublisherTracker(SECOND)
-        self.sender: int | None = None
         self.command: Array = np.zeros(len(limits))
         self.stamp_ns: float = NO_STAMP
         self.arrived = self.resting = False
@@ -205,7 +197,6 @@ class CommandSource:
         """Put a command into force."""
         self.command[:] = values
         self.stamp_ns = stamp_ns
-        self.sender = self.senders.current
         self.arrived = True
         self.resting = False
 
@@ -228,18 +219,14 @@ class CommandValidator:
 
     def __init__(self, plant: Plant, config: PlantConfig) -> None:
         robot = plant.robot
-        silence_ns = round((config.command_timeout or _START_TIME) * SECOND)
-        joints = partial(CommandSource, "joint_commands", senders=PublisherTracker(silence_ns))
         kept = ReactionWheels.of(robot.description).index
-        self.sources = [joints("velocity", robot.velocity_limit, kept=kept)]
+        self.sources = [CommandSource("joint_commands", "velocity", robot.velocity_limit, kept)]
         """Sources in the order of the arguments of a step: the joints' first."""
         self._brakes: _JointBrakes | None = None
         if config.actuation == "effort":
             self.sources = [
-                joints("effort", robot.effort_limit),
-                CommandSource(
-                    "base_wrench", "wrench", np.full(6, np.inf), PublisherTracker(silence_ns)
-                ),
+                CommandSource("joint_commands", "effort", robot.effort_limit),
+                CommandSource("base_wrench", "wrench", np.full(6, np.inf)),
             ]
             # Velocity servos stop at once; motors have to brake.
             self._brakes = _JointBrakes(plant, config.control_period)
@@ -438,8 +425,6 @@ class CommandValidator:
         self, source: CommandSource, stamp_ns: int, now_ns: int
     ) -> Refusal | None:
         """Return the refusal of a command whose stamp is unsuitable in real time, or None."""
-        if source.senders.multiple_publishers and self._one_commander:
-            return Refusal(Reason.SECOND_COMMANDER, "two publishers alternate on the topic")
         age = (now_ns - stamp_ns) / SECOND
         if self._timeout and age > self._timeout:
             return Refusal(Reason.STALE, f"it is {age:.3g} s old")
@@ -456,12 +441,10 @@ class CommandValidator:
         if late > 0:
             return Refusal(Reason.OUT_OF_ORDER, f"it is {late:.3g} s older than the one in force")
         if late == 0 and source.commanders > 1 and self._one_commander:
-            senders = source.senders
-            if senders.current is None or senders.current != source.sender:
-                return Refusal(
-                    Reason.SECOND_COMMANDER,
-                    f"the same state was answered before, and {source.commanders} nodes command",
-                )
+            return Refusal(
+                Reason.SECOND_COMMANDER,
+                f"the same state was answered before, and {source.commanders} nodes command",
+            )
         return None
 
     def _refuse(self, source: CommandSource, refusal: Refusal, now_ns: int) -> Refusal:
@@ -501,90 +484,25 @@ class _JointBrakes:
     """
 
     def __init__(self, plant: Plant, control_period: float) -> None:
-        # Plants with servos need no law.
-        from spacerobot_ros.control.laws.computed_torque import ComputedTorqueLaw
-        from spacerobot_ros.control.laws.law import Gains
-
         robot: SpaceRobot = plant.robot
-        rate = min(_BRAKING_RATE, _MAX_RATE_PER_TICK / control_period)
+        self._rate = min(_BRAKING_RATE, _MAX_RATE_PER_TICK / control_period)
         self._braked: slice | npt.NDArray[np.int64] = slice(None)
         self._efforts = np.zeros(robot.n)
         if robot.description.wheel_names:
             wheels = ReactionWheels.of(robot.description)
             robot, self._braked = robot.derived(wheels.gyrostat), wheels.other
-        outputs = ComputedTorqueLaw.default_outputs(robot, "")
-        # The reference is always the present shape, so only the damping acts.
-        self._law = ComputedTorqueLaw(robot, outputs, Gains.uniform(1.0, rate)) if robot.n else None
+        self._inertia, self._bias = robot.buffered("inertia_matrix"), robot.buffered("bias")
         self._plant = plant
 
     def efforts(self) -> Array:
-        """Return the efforts (n,) of the next tick, N or N m, before limits."""
-        from spacerobot_ros.control.state import ControlState, JointReference, Reference
+        """Return the efforts (n,) of the next tick, N or N m, before limits.
 
-        plant = self._plant
-        if self._law is None:
-            return self._efforts
-        q, qdot = plant.q[self._braked], plant.qdot[self._braked]
-        state = ControlState(
-            plant.pose[:3], plant.pose[3:], plant.twist[:3], plant.twist[3:], q, qdot
-        )
-        tau = self._law.command(state, Reference(joints=JointReference.at_rest(q))).tau
-        self._efforts[self._braked] = tau
+        The rows of the joints in ``H+ z0ddot + C+ = Q`` (paper 4, eq. 19), with those of the base
+        inserted.
+        """
+        q, qdot = self._plant.q[self._braked], self._plant.qdot[self._braked]
+        (H,), (C,) = self._inertia(q), self._bias(q, np.zeros(3), self._plant.twist[3:], qdot)
+        qddot = -self._rate * qdot
+        omega_dot = -np.linalg.solve(H[3:6, 3:6], H[3:6, 6:] @ qddot + C[3:6])
+        self._efforts[self._braked] = H[6:, 6:] @ qddot + H[6:, 3:6] @ omega_dot + C[6:]
         return self._efforts
-
-
-_MIN_MISSING_NUMBER = 2**63
-"""Smallest number that stands for a missing sequence number; real numbers are smaller."""
-
-_MAX_PUBLISHERS = 100
-"""Largest number of remembered publishers."""
-
-
-class PublisherTracker:
-    """Identifies the publishers of one topic by their sequence numbers.
-
-    A publisher numbers its messages consecutively, so a message belongs to the publisher whose last
-    message has the number before. Any other number is that of a new or restarted publisher. A
-    publisher that sends again after another one, within the silence, shares the topic with it; one
-    that has taken over for good does not.
-
-    Parameters
-    ----------
-    silence_ns
-        Simulated time without a message after which a publisher counts as replaced, ns.
-
-    Attributes
-    ----------
-    current
-        Index of the publisher of the last message; None: the middleware has no sequence numbers.
-    multiple_publishers
-        Whether that publisher and another one alternate.
-    """
-
-    def __init__(self, silence_ns: int) -> None:
-        self.current: int | None = None
-        self.multiple_publishers = False
-        self._silence = silence_ns
-        self._next = -1
-        self._heard = 0
-        self._publishers = 0
-        self._others: dict[int, tuple[int, int]] = {}
-        """Index and last time (ns) of replaced publishers, by their next sequence number."""
-
-    def note(self, number: int, now_ns: int) -> None:
-        """Take the sequence number of a message that arrives at a simulated time (ns)."""
-        if number == self._next:
-            self._next, self._heard, self.multiple_publishers = number + 1, now_ns, False
-            return
-        if not 0 < number < _MIN_MISSING_NUMBER:
-            self.current = None
-            return
-        if self.current is not None:
-            self._others[self._next] = self.current, self._heard
-        publisher, heard = self._others.pop(number, (0, 0))
-        self.multiple_publishers = bool(publisher) and now_ns - heard <= self._silence
-        if not publisher:
-            self._publishers = publisher = self._publishers + 1
-        if len(self._others) > _MAX_PUBLISHERS:
-            del self._others[next(iter(self._others))]
-        self.current, self._next, self._heard = publisher, number + 1, now_ns

@@ -288,8 +288,7 @@ class PlantConfig(WatchdogConfig, RobotConfig):
     )
     second_commander: str = parameter(
         "refuse",
-        "realtime: a second answer to the same state from another commander, and two commanders "
-        "that alternate",
+        "realtime: a second answer to one state while several nodes publish commands",
         choices=("refuse", "accept"),
     )
     latched_faults: str = parameter(
@@ -448,9 +447,11 @@ class PlantConfig(WatchdogConfig, RobotConfig):
     @property
     def clearance_ticks(self) -> int:
         """Ticks from one clearance to the next in lockstep; 0: none."""
-        if not self.clearance_period:
-            return 0
-        return max(1, round(self.clearance_period * SECOND / self.period_ns))
+        return self.ticks_of(self.clearance_period)
+
+    def ticks_of(self, period: float) -> int:
+        """Return the ticks of a period in s, at least one; 0: the period is 0."""
+        return max(1, round(period * SECOND / self.period_ns)) if period else 0
 
     @property
     def control_period(self) -> float:

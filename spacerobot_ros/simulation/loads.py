@@ -11,7 +11,7 @@ import numpy as np
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.compilation import BufferedFunction
-from spacerobot_ros.model.description import Array, Inertia, Pose
+from spacerobot_ros.model.description import Array, Inertia, Pose, plane_normal
 from spacerobot_ros.model.external_loads import LoadLayout, mean_motion_at
 from spacerobot_ros.model.grasp import BodyMotion
 from spacerobot_ros.model.rotations import matrix_from_quaternion, unit_quaternion
@@ -96,8 +96,6 @@ class Surroundings:
         """
         if not self.on_table:
             return
-        from spacerobot_ros.control.outputs import plane_normal  # Few robots are on a table.
-
         normal = plane_normal(robot.description)
         if normal is None:
             raise ParameterError(

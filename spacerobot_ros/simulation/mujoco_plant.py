@@ -12,57 +12,48 @@ give at most the efforts that the limits of the URDF allow: a joint that meets a
 
 from __future__ import annotations
 
+from threading import Lock
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from spacerobot_ros.collision import CollisionGeometry, Solid
-from spacerobot_ros.collision.geometry import solids_of
 from spacerobot_ros.errors import CommandError, ParameterError, SpaceRobotError
 from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.model.description import Array, Inertia, RobotDescription
+from spacerobot_ros.model.description import Array, RobotDescription
 from spacerobot_ros.model.grasp import BodyMotion, RobotMotion, combined_momenta
 from spacerobot_ros.model.integration import count_steps
 from spacerobot_ros.model.rotations import (
     cross,
     matrix_from_quaternion,
     quaternion_from_matrix,
-    quaternion_from_rotvec,
-    quaternion_inverse,
-    quaternion_multiply,
-    rotvec_from_quaternion,
 )
 from spacerobot_ros.simulation.capture import CapturePlant, Target, capturing_link
 from spacerobot_ros.simulation.config import PlantConfig, TargetConfig
 from spacerobot_ros.simulation.loads import PlantLoads
-from spacerobot_ros.simulation.mujoco_engine import (
+from spacerobot_ros.simulation.mujoco_model import (
+    TARGET,
     MujocoLoads,
-    add_motors,
-    compiled_model,
+    build_model,
     import_mujoco,
     joint_addresses,
-    mujoco_spec,
 )
 from spacerobot_ros.simulation.plant import Counts, Flags, InitialState
 
 DEFAULT_INTEGRATION_STEP = 0.001
 """Longest Runge-Kutta step, s."""
 
-_CONTACT_TIME_CONSTANT = 2.0
-"""Time constant of contacts, stops and welds, in steps: the least that MuJoCo recommends."""
-
 _STOP_DISTANCE = 1e-4
 """Distance from its limit, m or rad, at which a joint counts as stopped: stops are soft."""
 
-_STEPS_PER_IMPULSE_SUM = 5
-"""Integration steps over which the impulse of a wrench is added up at once."""
+_SHARES = (1 / 6, 2 / 6, 2 / 6, 1 / 6)
+"""Shares of the stages of Runge-Kutta 4 in a step."""
 
-_TARGET = "target/"
-"""Before the names of the target's bodies and shapes."""
+_CONTROL_CALLBACK = Lock()
+"""MuJoCo has one callback in a process: plants in threads take turns."""
 
-_OBSTACLE = "obstacle/"
-"""Before the names of the shapes of obstacles."""
+_RIGID = 1e15
+"""Inertia of a motor, kg or kg m^2, whose rate nothing changes."""
 
 
 class MujocoPlant:
@@ -90,6 +81,9 @@ class MujocoPlant:
         ``velocity`` or ``effort``, as the parameter.
     target
         The target, and the link that captures it; None: there is none.
+    contacts
+        Whether there are contacts, joint stops and locks. Without them the model is as MuJoCo reads
+        the URDF, and joints under velocity commands keep their rates exactly.
 
     Raises
     ------
@@ -110,6 +104,7 @@ class MujocoPlant:
         *,
         actuation: str = "effort",
         target: tuple[MujocoTarget, str] | None = None,
+        contacts: bool = True,
     ) -> None:
         self.robot, self.control_period = robot, control_period
         self.initial = initial or InitialState()
@@ -117,9 +112,15 @@ class MujocoPlant:
         self._velocity = actuation == "velocity"
         self._mujoco = mujoco = import_mujoco()
         self._target = target[0] if target else None
-        spec, shapes = _specification(mujoco, robot.description, target)
-        self._model = model = compiled_model(spec, robot.description)
-        _set_options(mujoco, model, control_period / self._steps)
+        self._contacts = contacts
+        model, shapes = build_model(
+            mujoco,
+            robot.description,
+            (target[0].description, target[1]) if target else None,
+            control_period / self._steps,
+            contacts=contacts,
+        )
+        self._model = model
         self._data = mujoco.MjData(model)
         self._q, self._qdot = joint_addresses(model, robot.description)
         self._link_poses = robot.buffered("link_poses")
@@ -127,9 +128,9 @@ class MujocoPlant:
         self._root = int(model.body(robot.base_link).id)
         self._target_body = -1
         if self._target is not None:
-            root = f"{_TARGET}{self._target.description.base_link}"
+            root = f"{TARGET}{self._target.description.base_link}"
             self._target_body = int(model.body(root).id)
-            links = [f"{_TARGET}{name}" for name in self._target.description.frames]
+            links = [f"{TARGET}{name}" for name in self._target.description.frames]
             self._applied_to_target = MujocoLoads(mujoco, model, self._data, links)
         self._locks = [model.equality(f"lock {name}").id for name in robot.joint_names]
         self._target_shapes = [model.geom(name).id for name in shapes]
@@ -153,6 +154,7 @@ class MujocoPlant:
         """Rates that the servos aim at, from the last tick on."""
         self._held: Flags = np.zeros(n, dtype=np.bool_)
         self._loads: PlantLoads | None = None
+        self._loaded, self._stage = False, 0
         self.reset()
 
     # -- the plant ----------------------------------------------------------------------------
@@ -183,14 +185,17 @@ class MujocoPlant:
         self.hold(self._held)
         self._update()
 
-    def go_on(self, motion: RobotMotion, target: BodyMotion, *, welded: bool) -> None:
+    def go_on(
+        self, motion: RobotMotion, target: BodyMotion | None = None, *, welded: bool = False
+    ) -> None:
         """Go on from these motions of robot and target, which are welded together or not."""
         data = self._data
         data.qpos[:3], data.qpos[3:7] = motion.pose[:3], np.roll(motion.pose[3:], 1)
         data.qpos[self._q], data.qvel[self._qdot] = motion.q, motion.qdot
         data.qvel[:3], data.qvel[3:6] = motion.R_WB @ motion.twist[:3], motion.twist[3:]
         self._aim[:] = motion.qdot
-        self._place_target(target)
+        if target is not None:
+            self._place_target(target)
         self._update()
         if welded:
             self.weld()
@@ -224,18 +229,22 @@ class MujocoPlant:
         pushed = np.broadcast_to(np.asarray(wrench, dtype=float), (6,))
         if not (np.all(np.isfinite(wanted)) and np.all(np.isfinite(pushed))):
             raise CommandError(f"A command is not finite: {[*wanted.tolist(), *pushed.tolist()]}.")
-        loaded = self._loads is not None and self._loads.has_loads
-        if not loaded:
-            self._data.xfrc_applied[:] = 0.0
+        self._loaded = self._loads is not None and self._loads.has_loads
+        self._data.xfrc_applied[:] = 0.0
+        if self._loads is not None:
+            self._data.time = self._loads.time
         self._data.ctrl[:6] = self.wrench[:] = pushed
         if self._velocity:
             realised = np.clip(wanted, -robot.velocity_limit, robot.velocity_limit)
-            self._step_to_rates(realised, loaded=loaded)
+            if self._contacts:
+                self._step_to_rates(realised)
+            else:
+                self._step_at_rates(realised)
         else:
             lowest, highest = self._effort_bounds()
             realised = np.clip(wanted, lowest, highest)
             self._data.ctrl[6:] = self.effort[:] = realised
-            self._step_under_efforts(loaded=loaded)
+            self._advance(self._steps)
         if not np.all(np.isfinite(self._data.qpos)):
             raise SpaceRobotError(
                 "The motion is no longer finite: the commands drive the robot too fast for the "
@@ -278,7 +287,7 @@ class MujocoPlant:
     @property
     def target_motion(self) -> BodyMotion:
         """The present motion of the target's root link."""
-        joint, data = self._model.joint(f"{_TARGET}free"), self._data
+        joint, data = self._model.joint(f"{TARGET}free"), self._data
         at, rate = int(joint.qposadr[0]), int(joint.dofadr[0])
         R = matrix_from_quaternion(np.roll(data.qpos[at + 3 : at + 7], -1))
         omega = R @ data.qvel[rate + 3 : rate + 6]
@@ -287,7 +296,7 @@ class MujocoPlant:
         )
 
     def _place_target(self, motion: BodyMotion) -> None:
-        joint, data = self._model.joint(f"{_TARGET}free"), self._data
+        joint, data = self._model.joint(f"{TARGET}free"), self._data
         at, rate = int(joint.qposadr[0]), int(joint.dofadr[0])
         data.qpos[at : at + 3] = motion.r_WT
         data.qpos[at + 3 : at + 7] = np.roll(quaternion_from_matrix(motion.R_WT), 1)
@@ -310,23 +319,49 @@ class MujocoPlant:
         )
         return np.where(slowest, 0.0, -limit), np.where(fastest, 0.0, limit)
 
-    def _step_under_efforts(self, *, loaded: bool) -> None:
-        """Advance a tick under the present controls."""
-        if not loaded and not self.wrench.any():
-            self._mujoco.mj_step(self._model, self._data, self._steps)
-            return
-        at_once = 1 if loaded else _STEPS_PER_IMPULSE_SUM
-        for step in range(0, self._steps, at_once):
-            count = min(at_once, self._steps - step)
-            if loaded:
-                self._apply_loads(step)
-            before = self._system()
-            self._mujoco.mj_step(self._model, self._data, count)
-            if self.wrench.any():
-                self._mujoco.mj_fwdPosition(self._model, self._data)
-                self._add_impulse(before, count * self._model.opt.timestep)
+    def _advance(self, steps: int) -> None:
+        """Take integration steps under the present controls and loads."""
+        mujoco = self._mujoco
+        with _CONTROL_CALLBACK:
+            if self._loaded or self.wrench.any():
+                mujoco.set_mjcb_control(self._push)
+                self._stage = 0
+            try:
+                mujoco.mj_step(self._model, self._data, steps)
+            finally:
+                mujoco.set_mjcb_control(None)
 
-    def _step_to_rates(self, rates: Array, *, loaded: bool) -> None:
+    def _push(self, *_: Any) -> None:
+        """Apply the loads at a stage of a step; add the impulse to the expected momenta."""
+        data, loads = self._data, self._loads
+        data.xfrc_applied[:] = 0.0
+        center = self._center()
+        R_WB = matrix_from_quaternion(np.roll(data.qpos[3:7], -1))
+        force, torque = R_WB @ self.wrench[:3], R_WB @ self.wrench[3:]
+        rates = np.append(force, torque + cross(data.qpos[:3] - center, force))
+        if self._loaded and loads is not None:
+            self._applied.apply(loads.vector, data.time)
+            rates += self._applied.momentum_rates(center)
+            if self._target is not None and self._target.loads is not None:
+                self._applied_to_target.apply(self._target.loads.vector, data.time)
+                if self.holds_target:
+                    rates += self._applied_to_target.momentum_rates(center)
+        self.expected_momenta += self._model.opt.timestep * _SHARES[self._stage] * rates
+        self._stage = (self._stage + 1) % len(_SHARES)
+
+    def _step_at_rates(self, rates: Array) -> None:
+        """Advance a tick in free motion at these joint rates (n,); no momentum changes by them."""
+        model, data = self._model, self._data
+        M = np.zeros((model.nv, model.nv))
+        self._mujoco.mj_fullM(model, data, M)
+        change = rates - data.qvel[self._qdot]
+        data.qvel[:6] -= np.linalg.solve(M[:6, :6], M[:6, self._qdot] @ change)
+        data.qvel[self._qdot] = rates
+        model.dof_armature[self._qdot] = _RIGID
+        self._advance(self._steps)
+        model.dof_armature[self._qdot] = 0.0
+
+    def _step_to_rates(self, rates: Array) -> None:
         """Advance a tick in which servos bring the joints to these rates (n,)."""
         model, data, mujoco, robot = self._model, self._data, self._mujoco, self.robot
         h, T = model.opt.timestep, self.control_period
@@ -339,8 +374,6 @@ class MujocoPlant:
         for step in range(self._steps):
             mujoco.mj_fwdPosition(model, data)
             mujoco.mj_fwdVelocity(model, data)
-            if loaded:
-                self._apply_loads(step)
             mujoco.mj_fullM(model, data, M)
             H, bias = M[np.ix_(own, own)], data.qfrc_bias[own]
             # The base is pushed by nothing but the reaction of the joints.
@@ -353,49 +386,8 @@ class MujocoPlant:
             limit = robot.effort_limit
             data.ctrl[6:] = commanded + np.clip(regulated, -limit, limit)
             total += data.ctrl[6:]
-            mujoco.mj_step(model, data)
+            self._advance(1)
         self.effort[:] = total / self._steps
-
-    def _apply_loads(self, step: int) -> None:
-        """Apply the loads at the beginning of a step of the tick to all bodies, and add their
-        impulse to the expected momenta.
-        """
-        assert self._loads is not None
-        h = self._model.opt.timestep
-        self._mujoco.mj_fwdPosition(self._model, self._data)
-        self._mujoco.mj_fwdVelocity(self._model, self._data)
-        self._data.xfrc_applied[:] = 0.0
-        time, center = self._loads.time + step * h, self._center()
-        self._applied.apply(self._loads.vector, time)
-        self.expected_momenta += h * self._applied.momentum_rates(center)
-        if self._target is not None and self._target.loads is not None:
-            self._applied_to_target.apply(self._target.loads.vector, time)
-            if self.holds_target:
-                self.expected_momenta += h * self._applied_to_target.momentum_rates(center)
-
-    def _add_impulse(self, before: tuple[Array, Array], duration: float) -> None:
-        """Add the impulse of the wrench since a state to the expected momenta (Simpson)."""
-        (arm, quaternion), (arm_after, quaternion_after) = before, self._system()
-        turn = rotvec_from_quaternion(
-            quaternion_multiply(quaternion_inverse(quaternion), quaternion_after)
-        )
-        middle = quaternion_multiply(quaternion, quaternion_from_rotvec(turn / 2))
-        for share, attitude, at in (
-            (1 / 6, quaternion, arm),
-            (4 / 6, middle, (arm + arm_after) / 2),
-            (1 / 6, quaternion_after, arm_after),
-        ):
-            R = matrix_from_quaternion(attitude)
-            force, torque = R @ self.wrench[:3], R @ self.wrench[3:]
-            self.expected_momenta[:3] += share * duration * force
-            self.expected_momenta[3:] += share * duration * (torque + cross(at, force))
-
-    def _system(self) -> tuple[Array, Array]:
-        """Return the position of the base from the centre of mass of what moves together (3,), in
-        W, and the quaternion of the base.
-        """
-        data = self._data
-        return data.qpos[:3] - self._center(), np.roll(data.qpos[3:7], -1)
 
     def _center(self) -> Array:
         """Return the centre of mass (3,) of what moves together."""
@@ -523,138 +515,6 @@ class MujocoCapturePlant(CapturePlant):
 
     def _body(self) -> BodyMotion:
         return self._engine.target_motion
-
-
-# -- MuJoCo's model -----------------------------------------------------------------------------
-
-
-def _specification(
-    mujoco: Any, robot: RobotDescription, target: tuple[MujocoTarget, str] | None
-) -> tuple[Any, list[str]]:
-    """Return the specification of robot, obstacles and target, and the names of the target's
-    shapes.
-    """
-    spec = mujoco_spec(mujoco, robot)
-    add_motors(mujoco, spec, robot)
-    _set_masses(spec, robot)
-    geometry = CollisionGeometry(robot)
-    names = [
-        _add_shape(mujoco, spec, solid, f"{_OBSTACLE if solid.is_obstacle else ''}{index}")
-        for index, solid in enumerate(geometry.solids)
-    ]
-    pairs = [(names[i], names[j]) for i, j in geometry.pairs]
-    shapes: list[str] = []
-    if target is not None:
-        body, link = target
-        _add_target(mujoco, spec, body.description)
-        solids, _ = solids_of(body.description)
-        shapes = [
-            _add_shape(mujoco, spec, solid, f"{_TARGET}{index}", _TARGET)
-            for index, solid in enumerate(solids)
-        ]
-        hand = robot.frames[link][0]
-        for name, solid in zip(names, geometry.solids, strict=True):
-            if solid.body != hand:
-                pairs += [(name, shape) for shape in shapes]
-            else:
-                # Not by pairs, which could not be switched off while the hand holds the target.
-                spec.geom(name).contype = 1
-        for shape in shapes:
-            spec.geom(shape).conaffinity = 1
-        grasp = spec.add_equality(
-            name="grasp",
-            type=mujoco.mjtEq.mjEQ_WELD,
-            objtype=mujoco.mjtObj.mjOBJ_BODY,
-            name1=link,
-            name2=f"{_TARGET}{body.description.base_link}",
-            active=False,
-        )
-        grasp.data[10] = 1.0  # Torque counts as much as force.
-    for first, second in pairs:
-        spec.add_pair(geomname1=first, geomname2=second)
-    for name in robot.joint_names:
-        spec.add_equality(
-            name=f"lock {name}",
-            type=mujoco.mjtEq.mjEQ_JOINT,
-            objtype=mujoco.mjtObj.mjOBJ_JOINT,
-            name1=name,
-            active=False,
-        )
-    return spec, shapes
-
-
-def _set_masses(spec: Any, robot: RobotDescription) -> None:
-    """Give each rigid body the mass properties of the description, which may not be its URDF's."""
-    bodies = {body.name: body.inertia for body in robot.bodies}
-    for link in robot.links:
-        body, inertia = spec.body(link.name), bodies.get(link.name)
-        body.explicitinertial = True
-        body.mass = 0.0 if inertia is None else inertia.mass
-        if inertia is not None:
-            _set_inertia(body, inertia)
-
-
-def _set_inertia(body: Any, inertia: Inertia) -> None:
-    moments, axes = np.linalg.eigh(inertia.about_com)
-    axes = axes * np.linalg.det(axes)
-    body.mass, body.ipos = inertia.mass, inertia.com
-    body.fullinertia = np.full(6, np.nan)  # Not given.
-    body.inertia, body.iquat = moments, np.roll(quaternion_from_matrix(axes), 1)
-
-
-def _add_target(mujoco: Any, spec: Any, target: RobotDescription) -> None:
-    body = spec.worldbody.add_body(name=f"{_TARGET}{target.base_link}")
-    joint = body.add_freejoint()
-    joint.name = f"{_TARGET}free"
-    body.explicitinertial = True
-    _set_inertia(body, target.bodies[0].inertia)
-    for name, (_, pose) in target.frames.items():
-        if name != target.base_link:
-            body.add_body(
-                name=f"{_TARGET}{name}",
-                pos=pose.r,
-                quat=np.roll(quaternion_from_matrix(pose.R), 1),
-            )
-
-
-def _add_shape(mujoco: Any, spec: Any, solid: Solid, name: str, prefix: str = "") -> str:
-    """Add a solid to its body, without mass, and return the name of its geometry."""
-    body = spec.worldbody if solid.is_obstacle else spec.body(f"{prefix}{solid.link}")
-    kinds, size = mujoco.mjtGeom, solid.shape.size
-    # Pairs that push are named one by one.
-    about: dict[str, Any] = {"name": name, "mass": 0.0, "contype": 0, "conaffinity": 0}
-    if solid.vertices is not None:
-        spec.add_mesh(name=name, uservert=solid.vertices.ravel().tolist())
-        body.add_geom(type=kinds.mjGEOM_MESH, meshname=name, **about)
-        return name
-    kind, numbers = {
-        "box": (kinds.mjGEOM_BOX, [length / 2 for length in size]),
-        "sphere": (kinds.mjGEOM_SPHERE, [size[0], 0.0, 0.0]),
-        "cylinder": (kinds.mjGEOM_CYLINDER, [size[0], size[-1] / 2, 0.0]),
-        "capsule": (kinds.mjGEOM_CAPSULE, [size[0], size[-1] / 2, 0.0]),
-    }[solid.shape.kind]
-    pose = solid.shape.pose
-    body.add_geom(
-        type=kind,
-        size=numbers,
-        pos=pose.r,
-        quat=np.roll(quaternion_from_matrix(pose.R), 1),
-        **about,
-    )
-    return name
-
-
-def _set_options(mujoco: Any, model: Any, step: float) -> None:
-    """Have a model integrate by Runge-Kutta 4 with steps of ``step`` s, with contacts alone."""
-    for flag in ("GRAVITY", "SENSOR", "SPRING", "DAMPER", "FRICTIONLOSS", "ISLAND", "AUTORESET"):
-        model.opt.disableflags |= int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{flag}"))
-    model.opt.integrator = mujoco.mjtIntegrator.mjINT_RK4
-    model.opt.timestep = step
-    # The plant clips efforts itself; servos exceed the limits where commanded rates jump.
-    model.jnt_actfrclimited[:] = 0
-    stiff = [_CONTACT_TIME_CONSTANT * step, 1.0]
-    for soft in (model.eq_solref, model.jnt_solref, model.pair_solref):
-        soft[:] = stiff
 
 
 def build_mujoco_plant(

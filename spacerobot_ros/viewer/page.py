@@ -15,10 +15,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from spacerobot_ros.control.thrusters import ThrusterTable
 from spacerobot_ros.errors import GoalError, ParameterError
 from spacerobot_ros.model.description import Array, RobotDescription
 from spacerobot_ros.model.kinematics import ForwardKinematics
+from spacerobot_ros.model.thrusters import ThrusterTable
 from spacerobot_ros.planning.core.goal import Tolerance
 from spacerobot_ros.planning.execution.goal_file import BASE_GOAL_KEY
 from spacerobot_ros.simulation.faults import FAULT_KINDS, FaultTargets

@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from spacerobot_ros.collision.geometry import collision_visuals, obstacle_visuals
-from spacerobot_ros.control.thrusters import ThrusterTable
 from spacerobot_ros.model.description import Array, RobotDescription
 from spacerobot_ros.model.kinematics import ForwardKinematics, joints_outward
+from spacerobot_ros.model.thrusters import ThrusterTable
 from spacerobot_ros.model.visuals import Visual, meshes_from_files, visuals_of
 
 if TYPE_CHECKING:

@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-import ctypes
 import dataclasses
 import itertools
-import subprocess
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-import spacerobot_ros.batch
 from spacerobot_ros.batch import (
     BatchResult,
     ControlledGoals,
@@ -30,12 +26,6 @@ from spacerobot_ros.control.goal_monitor import GoalMonitor
 from spacerobot_ros.control.laws.law import GainPair, Gains
 from spacerobot_ros.control.limits import MotionLimits
 from spacerobot_ros.control.state import ControlState
-from spacerobot_ros.control.thrusters import (
-    ThrusterAllocation,
-    ThrusterTable,
-    thruster_table,
-    thrusters_of_urdf,
-)
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.model import SpaceRobot, load_robot
 from spacerobot_ros.model.compilation import cxx_compiler
@@ -196,41 +186,6 @@ def test_the_servicer_is_controlled_in_lanes() -> None:
     assert np.abs(here.q[:, -1] - shape).max() > 0.001
 
 
-def thrusters(robot: SpaceRobot, force: float) -> ThrusterTable:
-    """Return two thrusters at each of the eight corners of a cube on the base."""
-    entries: list[dict[str, Any]] = []
-    for corner in itertools.product((-0.4, 0.4), repeat=3):
-        for axis in (0, 1):
-            direction = [0.0, 0.0, 0.0]
-            direction[axis] = -corner[axis]
-            named = {"name": f"thruster_{len(entries)}", "position": list(corner)}
-            entries.append({**named, "direction": direction, "force": force, "isp": 220.0})
-    return thruster_table([{**each, "min_on_time": 0.01} for each in entries], robot.description)
-
-
-@needs_compiler
-@pytest.mark.slow
-@pytest.mark.parametrize("force", [40.0, 8.0])
-def test_thrusters_in_lanes_are_fired_as_by_the_modulator(force: float) -> None:
-    """Until rounding decides about a pulse; the weak ones are at their limit at once."""
-    flights = controlled(
-        *("planar_manipulator", SHAPE),
-        ticks=25,
-        noise=0.0,
-        profile="step",
-        gains=Gains.uniform(1000.0, 60.0),
-        max_force=10.0,
-    )
-    flights = dataclasses.replace(flights, thrusters=thrusters(flights.robot, force))
-    here, there = fly_lanes(flights), fly_one_by_one(flights)
-    assert "lanes" in here.engine
-    for name in (*NUMBERS, "propellant"):
-        one, two = getattr(here, name), getattr(there, name)
-        np.testing.assert_allclose(one, two, rtol=1e-9, atol=1e-9, err_msg=name)
-    assert there.propellant.min() > 0
-    assert bool(here.fallback_ticks.any()) == (force < 10.0)
-
-
 @needs_compiler
 @pytest.mark.slow
 def test_the_noise_of_a_flight_is_that_of_its_seed() -> None:
@@ -348,64 +303,3 @@ def test_the_function_of_lanes_is_the_controller_and_its_monitor(
     assert decisions[4:29] == [Decision.NONE] * 20 + [Decision.REACHED] * 5
     assert decisions[-1] is Decision.LOST
     assert memory[1:].max() >= 3
-
-
-# -- the allocation in C++ and that of the package give the same levels for the same cases -------
-
-
-SOURCE = Path(spacerobot_ros.batch.__file__).with_name("thrusters.hpp")
-SERVICER = thrusters_of_urdf(load_robot(share_directory() / "urdf" / "servicer.urdf"))
-
-
-class CompiledAllocation:
-    """``allocate_levels`` of ``thrusters.hpp``, for the problem of an allocation."""
-
-    def __init__(self, allocation: ThrusterAllocation, count: int, folder: Path) -> None:
-        compiler = cxx_compiler()
-        assert compiler is not None
-        main = folder / "allocation.cpp"
-        main.write_text(
-            f"#include <math.h>\n#include <algorithm>\n#define THRUSTERS {count}\n"
-            f'#include "{SOURCE}"\n'
-        )
-        library = folder / "allocation.so"
-        command = [compiler, "-O2", "-std=c++17", "-ffp-contract=off", "-shared", "-fPIC"]
-        subprocess.run([*command, str(main), "-o", str(library)], check=True, timeout=120)
-        self._allocate = ctypes.CDLL(str(library)).allocate_levels
-        self._count = count
-        matrix, weights = allocation.problem
-        self._matrix, self._weights = np.ascontiguousarray(matrix.T), weights
-
-    def __call__(self, impulse: Array, most: Array) -> Array | None:
-        """Return the levels; None where the driver would ask Python."""
-        levels = np.zeros(self._count)
-        arrays = self._matrix, self._weights, impulse, most, levels
-        found = self._allocate(*(ctypes.c_void_p(array.ctypes.data) for array in arrays))
-        return levels if found else None
-
-
-@pytest.mark.skipif(cxx_compiler() is None, reason="there is no C++ compiler")
-@pytest.mark.parametrize("count", [24, 9])
-def test_both_allocations_agree_on_random_cases(count: int, tmp_path: Path) -> None:
-    rng = np.random.default_rng(count)
-    wrenches, cost = SERVICER.wrenches, SERVICER.mass_flow * rng.uniform(0.99, 1.01, 24)
-    if count < 24:  # Random ones: most corrections are too large for the compiled one.
-        force, place = rng.normal(size=(2, count, 3))
-        wrenches, cost = np.vstack([force.T, np.cross(place, force).T]), rng.uniform(1, 2, count)
-    allocation = ThrusterAllocation(wrenches, cost)
-    compiled = CompiledAllocation(allocation, count, tmp_path)
-    given, passed_on = 0, 0
-    for _ in range(400):
-        levels = 0.02 * rng.uniform(size=count) * rng.integers(0, 2, count)
-        outside = rng.normal(size=6) * rng.choice([0.0, 0.01])
-        impulse, most = wrenches @ levels + outside, rng.uniform(0.012, 0.05, count)
-        found = compiled(impulse, most)
-        if found is None:
-            passed_on += 1
-            continue
-        given += 1
-        expected = allocation.allocate(impulse, most).levels
-        np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-12)
-    assert given > (100 if count == 24 else 8)
-    assert passed_on > 10
-    assert not compiled(np.zeros(6), np.ones(count)).any()  # type: ignore[union-attr]

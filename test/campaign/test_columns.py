@@ -196,11 +196,11 @@ def test_what_a_flight_does_not_have_is_no_number(tmp_path: Path) -> None:
     made = campaign(flights=2)
     dataset = Dataset(tmp_path / "dataset")
     dataset.begin(made)
-    dataset.add([Row.of_error(Draws(made)[0], ValueError("no\n  way"), "ros")])
+    dataset.add([Row.of_error(Draws(made)[0], ValueError("no\n  way"), "flights")])
     dataset.close()
     (row,) = dataset.table().to_pylist()
     assert (row["outcome"], row["reason"]) == ("error", "ValueError: no way")
-    assert (row["engine"], row["passed"]) == ("ros", False)
+    assert (row["engine"], row["passed"]) == ("flights", False)
     assert row["position_error_m"] is None
     assert math.isnan(row["wall_time_s"])
 

@@ -397,9 +397,9 @@ def started(*words: str | bytes, **variables: str) -> subprocess.CompletedProces
 @pytest.mark.parametrize(
     ("words", "domain"),
     [
-        (("run", "sliding_masses"), "abc"),
+        (("run", "sliding_masses", "--nodes"), "abc"),
         pytest.param(("goal", "0", "0", "0"), "999", marks=pytest.mark.slow),
-        pytest.param(("run", "sliding_masses"), "-1", marks=pytest.mark.slow),
+        pytest.param(("run", "sliding_masses", "--nodes"), "-1", marks=pytest.mark.slow),
         pytest.param(("goal", "0", "0", "0"), "1.5", marks=pytest.mark.slow),
     ],
 )

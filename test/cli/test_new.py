@@ -12,6 +12,7 @@ from support.command_line import CliRunner
 from support.oracles import PinocchioOracle
 
 from spacerobot_ros.cli.main import main
+from spacerobot_ros.flight.trials import PlanningProblem, try_method
 from spacerobot_ros.model import SpaceRobot, load_robot, parse_robot
 from spacerobot_ros.model.description import JointLimits
 from spacerobot_ros.planning import Goal
@@ -27,7 +28,6 @@ from spacerobot_ros.session.own_robot import (
     urdf_remarks,
 )
 from spacerobot_ros.simulation import InitialState
-from spacerobot_ros.simulation.trials import PlanningProblem, try_method
 
 
 @pytest.fixture
@@ -46,7 +46,7 @@ def test_a_new_robot_gets_a_scenario_that_reaches_its_goal(robot: Path) -> None:
     assert result.exit_code == 0, result.output
     assert result.output.splitlines()[-1] == "  spacerobot run mine.yaml"
     scenario = load_scenario("mine.yaml")
-    problem = scenario.problem()
+    problem = PlanningProblem.of(scenario)
     turned = Rotation.from_quat(problem.goal.quaternion).as_rotvec()
     assert np.degrees(np.linalg.norm(turned)) == pytest.approx(5.0)
     assert try_method(problem, scenario.planner.method).reached
@@ -67,7 +67,7 @@ def test_no_scenario_is_overwritten(robot: Path) -> None:
     result = CliRunner().invoke(main, ["new", str(robot), "--out", "mine.yaml"])
     assert result.exit_code == 0, result.output
     assert Path("mine.yaml").read_text("utf-8") == "of the user"
-    assert load_scenario("mine-1.yaml").problem().robot.n == 2
+    assert PlanningProblem.of(load_scenario("mine-1.yaml")).robot.n == 2
 
 
 def test_a_robot_that_cannot_turn_its_base_is_told_so(robot: Path) -> None:
@@ -233,7 +233,7 @@ def test_a_scenario_file_says_its_goal_in_degrees_and_is_read_as_it_was_meant(
         40.0,
     )
     assert (read.planner.attitude_tolerance, read.planner.position_tolerance) == (0.004, 0.03)
-    assert read.problem().initial.joint_positions == pytest.approx([0.25, -0.5])
+    assert PlanningProblem.of(read).initial.joint_positions == pytest.approx([0.25, -0.5])
     assert read.goal.joint_positions is None
 
 

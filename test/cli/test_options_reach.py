@@ -17,8 +17,9 @@ import spacerobot_ros.cli.flights as flights
 import spacerobot_ros.nodes
 import spacerobot_ros.nodes.common.process as process
 import spacerobot_ros.report
-import spacerobot_ros.session.run as session
+import spacerobot_ros.session.live as session
 from spacerobot_ros.cli.main import main
+from spacerobot_ros.flight.trials import PlanningProblem
 from spacerobot_ros.measures import Outcome
 from spacerobot_ros.scenario import load_scenario
 
@@ -74,7 +75,7 @@ def test_the_attitude_of_a_scenario_is_given_in_degrees(
 
     monkeypatch.setattr(type(scenario), "with_goal", noted)
     call(command, "arm_attitude", "--goal-rpy-deg", *RPY)
-    attitude = Rotation.from_quat(found[0].problem().goal.quaternion)
+    attitude = Rotation.from_quat(PlanningProblem.of(found[0]).goal.quaternion)
     assert (attitude.inv() * attitude_of_rpy()).magnitude() < 1e-12
 
 
@@ -204,9 +205,7 @@ def test_options_of_a_stack_that_stays_up(
         return bag
 
     monkeypatch.setattr(session, "run_until_stopped", run_until_stopped)
-    line = (
-        "up planar_chain --rate 2.5 --bag b.mcap --processes --namespace left --view --restarts 5"
-    )
+    line = "up planar_chain --rate 2.5 --bag b.mcap --namespace left --view --restarts 5"
     result = call(*line.split(), "--set", "planner.tick_rate=12.5")
     assert result.output.split() == ["bag", "b.mcap"]
     assert call("up", "planar_chain").exit_code == 0
@@ -216,12 +215,13 @@ def test_options_of_a_stack_that_stays_up(
     assert given.parameters("planner")["tick_rate"] == 12.5
     assert (bag, none) == (Path("b.mcap"), None)
     assert named.pop("supervise")() == 5
-    assert named == {"processes": True, "namespace": "left", "restarts": 5}
+    assert named == {"namespace": "left", "restarts": 5}
     assert by_default.pop("supervise")() is None
-    assert by_default == {"processes": False, "namespace": "", "restarts": 0}
-    assert call("up", "planar_chain", "--processes").exit_code == 0
-    assert kept[-1][2]["restarts"] == 3
-    assert views == [(True, "left"), (False, ""), (False, "")]
+    assert by_default == {"namespace": "", "restarts": 3}
+    # Stacks that stay up are always of the nodes.
+    for word in ("--nodes", "--processes"):
+        assert call("up", "planar_chain", word).exit_code == 0
+    assert views == [(True, "left"), *[(False, "")] * 3]
 
 
 # -- bags ---------------------------------------------------------------------------------------

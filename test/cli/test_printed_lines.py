@@ -11,6 +11,7 @@ import re
 import shlex
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -23,12 +24,12 @@ from spacerobot_ros.cli.options import numbers
 from spacerobot_ros.collision import CollisionGeometry
 from spacerobot_ros.errors import PlanningError
 from spacerobot_ros.flight.second_opinion import EngineComparison
+from spacerobot_ros.flight.trials import PlanEvaluation, PlanningProblem
 from spacerobot_ros.flight.verification import Difference, Verification
 from spacerobot_ros.model import load_robot
 from spacerobot_ros.planning import METHODS, BasePath, GaitSchedule, Goal, PoseError
 from spacerobot_ros.resources import robot_file
 from spacerobot_ros.session.run import RunResult
-from spacerobot_ros.simulation.trials import MethodRecord, PlanEvaluation, PlanningProblem
 
 SUMMARY: dict[str, Any] = {
     "scenario": "sliding_masses",
@@ -282,20 +283,18 @@ def test_what_the_command_line_changes_reaches_the_flight(
 
     taken: list[Any] = []
 
-    def fly(
-        scenario: Any, bag: Path, progress: Any, *, processes: bool, longest: float
-    ) -> RunResult:
-        taken[:] = [scenario, bag, processes, longest]
+    def fly(scenario: Any, bag: Path, progress: Any, *, nodes: bool, longest: float) -> RunResult:
+        taken[:] = [scenario, bag, nodes, longest]
         return RunResult(SUMMARY)
 
     monkeypatch.setattr(flights, "run_scenario", fly)
     monkeypatch.chdir(tmp_path)
     runner = CliRunner()
     runner.invoke(main, ["run", "sliding_masses"])
-    scenario, bag, processes, longest = taken
-    assert (str(bag), processes, scenario.lockstep) == ("out/sliding_masses.mcap", False, True)
+    scenario, bag, nodes, longest = taken
+    assert (str(bag), nodes, scenario.lockstep) == ("out/sliding_masses.mcap", False, True)
     assert longest == float("inf")
-    words = ["--goal", *"0120001", "--goal-rotvec", "0", "0", "1", "--realtime", "--processes"]
+    words = ["--goal", *"0120001", "--goal-rotvec", "0", "0", "1", "--realtime"]
     words += [
         "--longest",
         "7.5",
@@ -307,8 +306,8 @@ def test_what_the_command_line_changes_reaches_the_flight(
         "lie_bracket",
     ]
     runner.invoke(main, ["run", "sliding_masses", *words])
-    scenario, bag, processes, longest = taken
-    assert (str(bag), processes, longest) == ("b.mcap", True, 7.5)
+    scenario, bag, nodes, longest = taken
+    assert (str(bag), nodes, longest) == ("b.mcap", True, 7.5)
     assert scenario.plant.time_mode == "realtime"
     assert scenario.plant.real_time_factor == 1.0
     assert scenario.plant.tick_rate == 50.0
@@ -318,6 +317,10 @@ def test_what_the_command_line_changes_reaches_the_flight(
     assert scenario.goal.position.tolist() == [0.0, 1.0, 2.0]
     half = math.sin(0.5), math.cos(0.5)
     assert scenario.goal.quaternion == pytest.approx([0.0, 0.0, *half])
+    for word in ("--nodes", "--processes"):
+        runner.invoke(main, ["run", "sliding_masses", word])
+        scenario, _, nodes, _ = taken
+        assert (nodes, scenario.lockstep) == (True, True)
     runner.invoke(main, ["run", "sliding_masses", "--realtime", "2.5"])
     assert taken[0].plant.real_time_factor == 2.5
     # What is set goes before what real time brings with it.
@@ -357,7 +360,7 @@ def trial(problem: PlanningProblem, name: str, reached: bool = True) -> PlanEval
 
 def plan(patch: pytest.MonkeyPatch, reached: bool, *words: str) -> Result:
     """Run the command with plans that come to the trial above."""
-    from spacerobot_ros.simulation import trials
+    from spacerobot_ros.flight import trials
 
     patch.setenv("SPACEROBOT_COMPILE", "0")
     patch.setattr(trials, "try_method", lambda problem, name: trial(problem, name, reached))
@@ -439,7 +442,7 @@ def test_the_json_of_a_plan(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> 
 def test_a_comparison_has_a_row_for_each_method(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    from spacerobot_ros.simulation import trials
+    from spacerobot_ros.flight import trials
 
     def compare(problem: PlanningProblem) -> dict[str, PlanEvaluation | PlanningError]:
         refusal = PlanningError("It has no slider.")
@@ -471,7 +474,7 @@ def test_a_comparison_has_a_row_for_each_method(
 def test_random_goals_that_are_missed_are_exit_1(
     monkeypatch: pytest.MonkeyPatch, missed: int, missed_beside: int, code: int
 ) -> None:
-    from spacerobot_ros.simulation import trials
+    from spacerobot_ros.flight import trials
 
     tried: list[Any] = []
 
@@ -483,14 +486,21 @@ def test_random_goals_that_are_missed_are_exit_1(
 
     def try_goals(
         problem: PlanningProblem, goals: list[Goal], methods: list[str], show: Any
-    ) -> list[MethodRecord]:
+    ) -> dict[str, list[PlanEvaluation | PlanningError]]:
         tried.append(methods)
-        times = {"durations": [4.0, 1.0, 2.0], "plan_times": [0.1, 0.5, 0.2]}
-        refused = ["Too far.", "Too near.", "Too far."]
-        return [
-            MethodRecord(methods[0], 5, missed, refused, **times),
-            MethodRecord(methods[1], 0, missed_beside, [], [], []),
-        ]
+        like = trial(problem, methods[0])
+
+        def flown(duration: float, plan_time: float, *, reached: bool) -> PlanEvaluation:
+            piece: Any = SimpleNamespace(duration=duration)
+            return replace(like, pieces=[piece], plan_time=plan_time, reached=reached)
+
+        times = ((4.0, 0.1), (1.0, 0.5), (2.0, 0.2), (4.0, 0.2), (1.0, 0.2))
+        met = [flown(*each, reached=True) for each in times]
+        refused = [PlanningError(text) for text in ("Too far.", "Too near.", "Too far.")]
+        return {
+            methods[0]: [*met, *refused, *missed * [flown(2.0, 0.2, reached=False)]],
+            methods[1]: [flown(1.0, 0.1, reached=False) for _ in range(missed_beside)],
+        }
 
     monkeypatch.setattr(trials, "random_goals", random_goals)
     monkeypatch.setattr(trials, "try_goals", try_goals)
@@ -505,7 +515,8 @@ def test_random_goals_that_are_missed_are_exit_1(
     ]
     counts = [str(n) for n in (5 + missed + 3, 5, missed, 3)]
     assert first.split() == ["square_path", *counts, "1", "2", "4", "0.2", "0.5"]
-    assert second.split() == ["optimal", str(missed_beside), "0", str(missed_beside), "0"]
+    assert second.split()[:5] == ["optimal", str(missed_beside), "0", str(missed_beside), "0"]
+    assert len(second.split()) == (10 if missed_beside else 5)
     assert reasons == ["square_path refused: Too far.", "square_path refused: Too near."]
 
 
@@ -614,7 +625,7 @@ def test_only_a_goal_that_is_reached_is_exit_0(
     monkeypatch: pytest.MonkeyPatch, outcome: str, code: int
 ) -> None:
     from spacerobot_ros.measures import Outcome
-    from spacerobot_ros.session import run
+    from spacerobot_ros.session import live
 
     sent: list[Any] = []
 
@@ -623,7 +634,7 @@ def test_only_a_goal_that_is_reached_is_exit_0(
         show("A sentence.")
         return Outcome(outcome)
 
-    monkeypatch.setattr(run, "send_goal", send)
+    monkeypatch.setattr(live, "send_goal", send)
     runner = CliRunner()
     words = ["--namespace", "/a", "--timeout", "7"]
     result = runner.invoke(main, ["goal", "1", "-2", "3", *words])

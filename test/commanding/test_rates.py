@@ -53,8 +53,6 @@ class Host:
     def log(self, level: str, message: str) -> None:
         self.lines.append((level, message))
 
-    log_about_goals = log
-
     def has_publisher(self, topic: str) -> bool:
         return topic == "odom"
 

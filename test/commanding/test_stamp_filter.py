@@ -116,24 +116,12 @@ def test_a_restarted_plant_is_believed_when_nothing_contradicts_it(at: float) ->
     while (believed := listener.look()) is None:
         looks += 1
         listener.wall += 0.1
-        assert looks < 5
-    assert looks >= 2
+        assert looks < 8
+    assert looks >= 4
     assert believed == (message("odom", at), message("joint_states", at))
     assert listener.joints(at + PERIOD)
     assert not listener.joints(listener.time + PERIOD)
     assert listener.times.ignored == 0
-
-
-def test_a_node_that_stood_still_itself_believes_no_other_time() -> None:
-    listener = Listener()
-    listener.states(20)
-    assert not listener.joints(1e6)
-    # Its own callbacks, the look among them, come late and at once; the plant's states after them.
-    listener.wall += 3.0
-    assert listener.look() is None
-    listener.time += PERIOD
-    assert listener.joints(listener.time)
-    assert listener.look() is None
 
 
 @pytest.mark.parametrize("rate", [0.5, 5.0, 200.0])
@@ -172,38 +160,14 @@ def test_the_rate_of_a_driver_with_jitter_and_losses_is_that_of_most_states() ->
     assert listener.times.rate == 20.0
 
 
-@pytest.mark.parametrize("step", [0.001, 0.0123456789, 2.0])
-def test_bad_states_between_good_ones_do_not_change_the_rate(step: float) -> None:
-    listener = Listener()
-    for _ in range(5):
-        listener.wall += step
-        listener.time += step
-        assert listener.joints(listener.time)
-        assert listener.joints(listener.time + step / 2)
-        listener.times.undo_last()
-    assert listener.times.rate == pytest.approx(1 / step, rel=1e-6)
-
-
 def test_the_first_state_is_believed_whatever_its_stamp() -> None:
     listener = Listener()
     assert listener.odom(1e6)
     assert listener.joints(1e6)
     # If it was not the plant's, the plant's are believed when it does not come again.
     assert not listener.joints(10.0)
-    listener.wall += 0.25
-    assert listener.look() is None
+    listener.wall += 0.5
     assert listener.look() is not None
-
-
-def test_a_state_of_another_robot_tells_nothing_about_the_time() -> None:
-    listener = Listener()
-    assert listener.joints(1e6)
-    listener.times.undo_last()
-    listener.states(10)
-    assert listener.joints(listener.time + PERIOD)
-    listener.times.undo_last()
-    listener.states(10)
-    assert listener.times.ignored == 0
 
 
 class Exact:
@@ -241,35 +205,25 @@ def test_stamps_are_plausible_up_to_the_bounds_of_a_step_and_of_losses(
         (odom_from, False, True),
         (odom_from - 1, False, False),
     ):
-        assert exact.times.would_accept(exact.now + ahead) is plausible
+        assert exact.times.is_present(exact.now + ahead) is plausible
         assert exact.times.accepts_odom(exact.now + ahead, "odom") is of_odom
 
 
-@pytest.mark.parametrize(("pace", "doubt"), [(1.0, 0.25), (0.5, 0.5), (4.0, 0.2), (100.0, 0.2)])
-def test_a_jump_is_believed_after_four_states_and_a_fifth_of_a_second(
-    pace: float, doubt: float
-) -> None:
+@pytest.mark.parametrize("pace", [0.5, 1.0, 100.0])
+def test_a_jump_is_believed_after_half_a_second(pace: float) -> None:
     exact = Exact(pace)
     stamp = exact.now + 8 * SECOND
     assert exact.times.accepted_jump() is None
     assert not exact.times.accepts_odom(stamp, "odom")
     assert not exact.times.accepts_joints(stamp, "joints")
     begin = exact.wall
-    for share in (0.25, 0.5, 0.75, 0.9375):
-        exact.wall = begin + share * doubt
+    for wall in (0.125, 0.25, 0.4375):
+        exact.wall = begin + wall
         assert exact.times.accepted_jump() is None
-    exact.wall = begin + doubt + 1e-9
+    exact.wall = begin + 0.5
     assert exact.times.accepted_jump() == (Stamped(stamp, "odom"), Stamped(stamp, "joints"))
     assert (exact.now, exact.times.ignored) == (stamp, 0)
     assert exact.times.accepted_jump() is None
-
-
-def test_a_jump_is_not_believed_at_the_first_look_after_a_standstill() -> None:
-    exact = Exact()
-    exact.times.accepts_joints(exact.now + 8 * SECOND, "joints")
-    exact.wall += 60.0
-    looks = [exact.times.accepted_jump() is not None for _ in range(3)]
-    assert looks == [False, True, False]
 
 
 def test_ignored_messages_are_named_with_their_distance_in_time() -> None:

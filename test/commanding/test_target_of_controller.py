@@ -59,8 +59,6 @@ class Rig:
     def log(self, level: str, message: str) -> None:
         pass
 
-    log_about_goals = log
-
     def has_publisher(self, topic: str) -> bool:
         return topic in self.publishers
 

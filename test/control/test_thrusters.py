@@ -14,14 +14,14 @@ from hypothesis import strategies as st
 from scipy.optimize import linprog, lsq_linear
 from support.oracles import Array
 
-from spacerobot_ros.control.thrusters import (
+from spacerobot_ros.errors import ParameterError, RobotDescriptionError
+from spacerobot_ros.model.thrusters import (
     ThrusterAllocation,
     ThrusterModulator,
     ThrusterTable,
     load_thrusters,
     thrusters_of_urdf,
 )
-from spacerobot_ros.errors import ParameterError, RobotDescriptionError
 from spacerobot_ros.model.urdf import load_robot, parse_robot
 from spacerobot_ros.resources import share_directory
 

@@ -22,8 +22,8 @@ HELD_BY_TESTS = [
     ),
     (
         "docs/campaigns.md",
-        "`rerun` repeats through ROS within 1e-9",
-        "campaign/test_running.py::test_rows_flown_again_through_ros_are_the_same",
+        "`rerun` repeats within 1e-9",
+        "campaign/test_running.py::test_rows_flown_again_are_the_same",
     ),
     (
         "docs/campaigns.md",

@@ -27,7 +27,6 @@ def test_from_a_goal_pose_to_a_command(harness: Harness) -> None:
     assert walk.left_out() == set()
 
 
-@pytest.mark.usefixtures("own_domain")
 def test_from_a_scenario_to_a_bag(tmp_path: Path) -> None:
     from spacerobot_ros.scenario import load_scenario
     from spacerobot_ros.session.run import run_scenario

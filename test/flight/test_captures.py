@@ -249,10 +249,10 @@ def test_a_report_has_a_card_of_the_capture() -> None:
     report = FlightReport.of(open_flight_bag(BAGS / "capture.mcap"))
     cards = {label: (value, note) for label, value, note in headline(report)}
     value, note = cards["Target captured"]
-    (time,) = [each.time_s for each in report.flight.events if each.kind is EventKind.CAPTURED]
+    (time,) = [each.time_s for each in report.events if each.kind is EventKind.CAPTURED]
     assert value == f"at {time:.4g} s"
     assert float(note.split(" m from the grapple")[0]) < 0.02
-    report = replace(report, flight=replace(report.flight, events=()))
+    report = replace(report, events=())
     assert ("Target captured", "no") in {card[:2] for card in headline(report)}
     without = FlightReport.of(open_flight_bag(BAGS / "servicer.mcap"))
     assert "Target captured" not in {label for label, _, _ in headline(without)}

@@ -126,7 +126,7 @@ def test_its_bag_and_its_report_show_the_contacts(through: Flight, tmp_path: Pat
     again = read_run(tmp_path / "through.mcap")
     assert again.measures.clearance == pytest.approx(through.measures.clearance, abs=1e-9)
     report = read_report(tmp_path / "through.mcap")
-    shown = [each.text for each in report.events if each.event.kind is EventKind.CONTACT]
+    shown = [each.text for each in report.timed_events if each.event.kind is EventKind.CONTACT]
     assert shown == [
         f"contact: {pair}" for pair in ("mass_2, mass_3", "mass_1, mass_2", "mass_1, mass_3")
     ]
@@ -164,7 +164,7 @@ def test_the_nodes_report_what_a_flight_without_ros_does(
     through: Flight, tmp_path: Path, ros_domain: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("ROS_DOMAIN_ID", str(ros_domain))
-    summary = run_scenario(through.scenario, tmp_path / "ros.mcap").summary
+    summary = run_scenario(through.scenario, tmp_path / "ros.mcap", nodes=True).summary
     assert summary["clearance_m"] == pytest.approx(through.measures.clearance, abs=1e-9)
     through.save(tmp_path / "alone.mcap")
     said = []

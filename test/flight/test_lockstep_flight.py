@@ -16,7 +16,8 @@ from spacerobot_ros.flight.lockstep import fly_scenario
 from spacerobot_ros.flight.reading import read_run, recorded_scenario
 from spacerobot_ros.flight.verification import verify_bag
 from spacerobot_ros.measures import Outcome
-from spacerobot_ros.scenario import Scenario, load_scenario
+from spacerobot_ros.planning.core.goal import EndEffectorGoal
+from spacerobot_ros.scenario import Scenario, load_scenario, scenario_or_robot
 from spacerobot_ros.session.run import run_scenario
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -106,13 +107,14 @@ def test_a_flight_is_the_one_through_the_nodes(
 ) -> None:
     """To the last bit: plans, corrections, lost poses, noise, faults, stuck joints."""
     scenario = load_scenario(name).with_settings(settings)
-    run_scenario(scenario, tmp_path / "ros.mcap")
+    run_scenario(scenario, tmp_path / "ros.mcap", nodes=True)
     through_ros, flight = read_run(tmp_path / "ros.mcap"), fly_scenario(scenario)
     assert flight.outcome is outcome
     assert_same(flight, through_ros)
     assert flight.sentence == through_ros.sentence
-    told = [(event.kind, event.message) for event in flight.events if event.goal_id]
-    assert told == [(e.kind, e.message) for e in through_ros.events if e.goal_id]
+    # Events of different nodes are recorded in any order.
+    told = sorted((event.kind, event.message) for event in flight.events if event.goal_id)
+    assert told == sorted((e.kind, e.message) for e in through_ros.events if e.goal_id)
 
 
 def chain(**settings: Any) -> Scenario:
@@ -139,6 +141,44 @@ def test_what_is_saved_is_verified_and_read_back(tmp_path: Path) -> None:
     assert [e.message for e in read.events] == [e.message for e in flight.events]
     with pytest.raises(RecordingError, match="exists"):
         flight.save(tmp_path / "saved.mcap")
+
+
+def test_the_bag_of_a_flight_has_what_nodes_publish_beside_states(tmp_path: Path) -> None:
+    """Frames, markers, statuses and diagnostics, at their periods; the pose is lost for a while."""
+    scenario = load_scenario("faults/stuck_slider").with_settings(
+        ["plant.faults=[sensor_dropout odom at 0.45 until 0.75, sensor_noise position 0.01 at 1]"]
+    )
+    scenario = scenario.with_overrides("plant", {"marker_period": 0.5, "diagnostics_period": 1.0})
+    flight = fly_scenario(scenario, longest=2.0)
+    flight.save(tmp_path / "saved.mcap")
+    bag = read_bag(tmp_path / "saved.mcap")
+    tenths = [100_000_000 * k for k in range(21)]
+    assert bag["/tf"].time_ns.tolist() == [each for each in tenths if not 0.4e9 < each < 0.8e9]
+    of_robot, of_plan = [500_000_000 * k for k in range(5)], [0]
+    assert sorted(bag["/markers"].time_ns.tolist()) == sorted([*of_robot, *of_plan])
+    states = [message.values[0].value for _, message in bag["/plant/status"].messages()]
+    assert (states[0], states[-1], set(states[1:-1])) == ("inactive", "inactive", {"running"})
+    names = [status.name for _, array in bag["/diagnostics"].messages() for status in array.status]
+    assert {"plant: momentum", "planner: states", "planner: goal"} <= set(names)
+    assert names.count("plant: momentum") == 3
+    covariances = bag["/odom"].table(["pose.covariance"], 36)[:, 0]
+    assert set(covariances) == {0.0, 1e-4}
+    reporters = {message.name for _, message in bag["/events"].messages()}
+    assert reporters == {"/plant", "/planner"}
+    assert {"/gait_schedule", "/planned_path", "/robot_description"} <= set(bag.topics)
+
+
+def test_the_path_of_an_end_effector_is_in_the_bag_of_its_flight(tmp_path: Path) -> None:
+    way = [[1.5, 0.7, 1.3], [1.3, 0.9, 0.8]]
+    scenario = scenario_or_robot("three_joint_arm").with_overrides(
+        "plant", {"initial_joint_positions": [0.4, -0.9, 1.1]}
+    )
+    scenario = scenario.with_end_effectors([EndEffectorGoal.along("", way)])
+    fly_scenario(scenario, longest=0.1).save(tmp_path / "saved.mcap")
+    ((_, message),) = read_bag(tmp_path / "saved.mcap")["/end_effector/path"].messages()
+    places = [each.pose.position for each in message.poses]
+    assert [[each.x, each.y, each.z] for each in places] == way
+    assert not any(each.pose.orientation.w for each in message.poses)
 
 
 @pytest.mark.slow

@@ -13,6 +13,7 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from spacerobot_ros.errors import GoalError, ParameterError
+from spacerobot_ros.flight.trials import PlanningProblem
 from spacerobot_ros.nodes import NODE_TYPES
 from spacerobot_ros.resources import robot_file, share_directory
 from spacerobot_ros.scenario import (
@@ -190,7 +191,7 @@ def test_a_robot_beside_its_scenario_is_found_and_integers_go_with_floats(tmp_pa
         "utf-8",
     )
     scenario = load_scenario(str(file))
-    assert scenario.problem().robot.n == 2
+    assert PlanningProblem.of(scenario).robot.n == 2
     assert scenario.goal.position.tolist() == [0.0, 0.0, 0.0], "unless it is given"
     given = scenario.parameters("plant")
     assert given["robot"] == str(tmp_path / "mine.urdf")

@@ -18,10 +18,10 @@ from hypothesis import strategies as st
 from rclpy.parameter import Parameter as RosParameter
 from support.fuzzing import FINITE, MODEST, NUMBERS, TEXTS, VALUES, attempt, damaged, fuzz
 
-from spacerobot_ros.control.thrusters import load_thrusters, thrusters_of_urdf
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import RobotDescription
+from spacerobot_ros.model.thrusters import load_thrusters, thrusters_of_urdf
 from spacerobot_ros.model.urdf import load_robot, parse_robot
 from spacerobot_ros.nodes import NODE_TYPES, ReplayNode
 from spacerobot_ros.nodes.common.node import AUTOSTART, FlightNode

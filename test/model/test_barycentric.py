@@ -18,11 +18,11 @@ from support.oracles import (
     assert_agrees,
     random_motion,
 )
+from support.oracles.barycentric import barycentric_vectors
 from support.random_robots import random_chain_urdf, random_robot_urdf
 
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.model import RobotDescription, SpaceRobot, parse_robot
-from spacerobot_ros.model.dynamics import barycentric_vectors
 from spacerobot_ros.model.external_loads import (
     EARTH_GRAVITATION,
     EARTH_RADIUS,

@@ -9,11 +9,11 @@ import casadi as ca
 import numpy as np
 import pytest
 from support.oracles import Array, Motion, PinocchioOracle, assert_agrees, random_motion
+from support.oracles.barycentric import barycentric_inertia
 from support.random_robots import random_robot_urdf
 
 from spacerobot_ros.model import SpaceRobot, parse_robot
 from spacerobot_ros.model.composite_rigid_body import composites
-from spacerobot_ros.model.dynamics import barycentric_inertia
 from spacerobot_ros.model.kinematics import ForwardKinematics, tree_kinematics
 from spacerobot_ros.model.rotations import matrix_from_quaternion
 

@@ -73,7 +73,6 @@ def test_numbers_given_as_an_argument_are_those_compiled_in(seed: int) -> None:
         "connection": (q,),
         "bias": (q, v, omega, qdot),
         "forward_dynamics": (q, v, omega, qdot, wrench, qddot),
-        "dynamics": (q, v, omega, qdot, wrench, qddot),
         "joint_efforts": (q, qdot, qddot),
         "momentum": (quaternion, q, v, omega, qdot),
         "base_twist": (quaternion, q, qdot, v, omega),

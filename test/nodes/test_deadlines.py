@@ -10,8 +10,8 @@ from rclpy.lifecycle import TransitionCallbackReturn
 from sensor_msgs.msg import JointState
 from support.ros_harness import DEEP, Harness
 
+from spacerobot_ros.messages.diagnostics import timing_record
 from spacerobot_ros.nodes import PlantNode
-from spacerobot_ros.nodes.plant.publisher import timing_status
 from spacerobot_ros.simulation.time_modes import RealTime
 
 MS = 1_000_000
@@ -30,9 +30,9 @@ def test_what_is_late_is_counted_with_the_worst() -> None:
     # The states of 10, 20, 30 ms are to be answered by 20, 30, 40 ms.
     for now, stamp in ((19, 10), (33, 20), (47, 30)):
         time.count_command(now * MS, stamp * MS)
-    status = timing_status("plant: timing", time)
-    assert status.level == DiagnosticStatus.WARN
-    assert values(status) == {
+    status = timing_record("/plant", "robot", time)
+    assert status.level == 1
+    assert status.values == {
         "tick_rate_Hz": "55.5556",
         "ticks": "3",
         "ticks_late": "1",
@@ -42,7 +42,7 @@ def test_what_is_late_is_counted_with_the_worst() -> None:
         "worst_command_ms": "7.000",
         "command_age_s": "0",
     }
-    assert timing_status("plant: timing", time).level == DiagnosticStatus.OK, "nothing new is late"
+    assert timing_record("/plant", "robot", time).level == 0, "nothing new is late"
 
 
 def test_a_command_in_force_counts_once() -> None:

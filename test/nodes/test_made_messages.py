@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -10,23 +11,36 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Path
 from rclpy.serialization import deserialize_message
 from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import JointState
 from support.ros_harness import nanoseconds
-from visualization_msgs.msg import Marker
+from visualization_msgs.msg import Marker, MarkerArray
 
 from spacerobot_ros.errors import PlanningError
 from spacerobot_ros.messages.builders import path_message
+from spacerobot_ros.messages.diagnostics import (
+    PlantDiagnostics,
+    encode_diagnostics,
+    timing_record,
+)
+from spacerobot_ros.messages.layout import encode
+from spacerobot_ros.messages.markers import (
+    MARKER_ARRAY,
+    RobotMarkers,
+    goal_markers,
+    shape_marker,
+)
 from spacerobot_ros.model import SpaceRobot, load_robot, parse_robot
 from spacerobot_ros.model.description import Pose, Shape
 from spacerobot_ros.model.rotations import matrix_from_quaternion
 from spacerobot_ros.model.urdf import parse_world
 from spacerobot_ros.model.world import with_world
-from spacerobot_ros.nodes.common.messages import goal_markers, goal_of, shape_marker, shape_of
-from spacerobot_ros.nodes.plant.publisher import LinkMarkers, PlantReport, timing_status
+from spacerobot_ros.nodes.common.messages import goal_of, shape_of
+from spacerobot_ros.nodes.plant.publisher import PlantReport
 from spacerobot_ros.planning import BasePath, Goal
 from spacerobot_ros.resources import robot_file
 from spacerobot_ros.simulation.actuators import build_plant
@@ -34,6 +48,12 @@ from spacerobot_ros.simulation.commands import CommandValidator
 from spacerobot_ros.simulation.config import PlantConfig
 
 RED = (0.9, 0.1, 0.2, 0.7)
+
+
+def markers_of(raw: bytes | None) -> list[Marker]:
+    assert raw is not None
+    found: list[Marker] = deserialize_message(raw, MarkerArray).markers
+    return found
 
 
 def shape(kind: str, size: tuple[float, ...], resource: str = "") -> Shape:
@@ -53,7 +73,8 @@ def shape(kind: str, size: tuple[float, ...], resource: str = "") -> Shape:
 def test_shapes_have_their_sizes(
     kind: str, size: tuple[float, ...], marker: int, scale: tuple[float, ...]
 ) -> None:
-    found = shape_marker(shape(kind, size, "package://a/b.stl"), "map", "a_link", 7)
+    drawn = shape_marker(shape(kind, size, "package://a/b.stl"), "map", "a_link", 7)
+    (found,) = markers_of(encode(MARKER_ARRAY, {"markers": [drawn]}))
     assert (found.type, found.action, found.ns, found.id) == (marker, Marker.ADD, "a_link", 7)
     assert found.header.frame_id == "map"
     assert (found.scale.x, found.scale.y, found.scale.z) == scale
@@ -117,7 +138,7 @@ def test_the_goal_is_a_ghost_of_the_base_and_the_path_a_line(name: str) -> None:
     robot = load_robot(robot_file(name))
     # The order of the links in a file says nothing: the base is the root of the tree.
     robot = replace(robot, links=robot.links[::-1])
-    *ghosts, line, given = goal_markers(GOAL, PATH, robot, "map").markers
+    *ghosts, line, given = markers_of(goal_markers(GOAL, PATH, robot, "map"))
     assert (given.ns, given.id, given.action) == ("given_path", 0, Marker.DELETE)
     expected = [homogeneous(GOAL) @ each for each in base_visuals(robot.urdf)]
     assert expected
@@ -187,9 +208,6 @@ class FakeNode:
         self.published: list[Any] = []
         self.logged: list[str] = []
 
-    def create_publisher(self, *_: Any) -> Any:
-        return SimpleNamespace(publish=self.published.append)
-
     def send_raw(self, *_: Any) -> Any:
         return SimpleNamespace(take=self.published.append)
 
@@ -214,15 +232,15 @@ class Diagnosed:
         self.commands = CommandValidator(self.plant, config)
         node: Any = self.node
         self.report = PlantReport(node, self.plant, self.commands, None)
+        self.diagnostics = PlantDiagnostics("/a/plant", self.plant, self.commands)
 
-    def status(self, part: str, time_ns: int = 0) -> tuple[bytes, str, dict[str, str]]:
-        """Publish, and return level, sentence and values of a part."""
-        self.report.publish(time_ns)
-        (found,) = (s for s in self.node.published[-1].status if s.name == f"a/plant: {part}")
-        return found.level, found.message, {pair.key: pair.value for pair in found.values}
+    def status(self, part: str) -> tuple[int, str, Mapping[str, str]]:
+        """Return level, sentence and values of a part."""
+        (found,) = (s for s in self.diagnostics.records() if s.name == f"a/plant: {part}")
+        return found.level, found.message, found.values
 
 
-OK, WARN, ERROR = b"\0", b"\1", b"\2"
+OK, WARN, ERROR = 0, 1, 2
 
 
 @pytest.fixture
@@ -235,10 +253,15 @@ def test_margins_are_to_the_nearer_limit(diagnosed: Diagnosed) -> None:
     robot = diagnosed.plant.robot
     diagnosed.plant.q[:] = robot.lower + np.array([0.25, 1.0, 0.0])
     diagnosed.plant.q[2] = robot.upper[2] - 0.125
-    level, _, values = diagnosed.status("strokes", 12_500_000_000)
+    level, _, values = diagnosed.status("strokes")
     assert level == OK
     assert values == {"slider_1": "0.25", "slider_2": "1", "slider_3": "0.125"}
-    assert nanoseconds(diagnosed.node.published[-1].header.stamp) == 12_500_000_000
+    raw = encode_diagnostics(diagnosed.diagnostics.records(), 12_500_000_000)
+    message = deserialize_message(raw, DiagnosticArray)
+    assert nanoseconds(message.header.stamp) == 12_500_000_000
+    (status,) = (each for each in message.status if each.name == "a/plant: strokes")
+    assert (status.level, status.hardware_id) == (DiagnosticStatus.OK, "sliding_masses")
+    assert {pair.key: pair.value for pair in status.values} == values
 
 
 def test_a_change_of_momentum_that_nothing_explains_is_an_error(diagnosed: Diagnosed) -> None:
@@ -284,10 +307,9 @@ def test_what_thrusters_could_not_give_is_a_warning_once(diagnosed: Diagnosed) -
         pulses=np.array([3, 0, 4]),
         table=SimpleNamespace(names=["a", "b", "c"]),
     )
-    status = diagnosed.report._thruster_status(thrusters)
-    values = {pair.key: pair.value for pair in status.values}
+    status = diagnosed.diagnostics.of_thrusters(thrusters)
     assert (status.level, status.message) == (WARN, "the wanted wrench is beyond them")
-    assert values == {
+    assert status.values == {
         "propellant_kg": "0.0123456789",
         "pulses": "7",
         "unmet_ticks": "2",
@@ -297,10 +319,10 @@ def test_what_thrusters_could_not_give_is_a_warning_once(diagnosed: Diagnosed) -
         "pulses.b": "0",
         "pulses.c": "4",
     }
-    again = diagnosed.report._thruster_status(thrusters)
+    again = diagnosed.diagnostics.of_thrusters(thrusters)
     assert (again.level, again.message) == (OK, "the wanted wrench is given")
     thrusters.missing = "torque about z"
-    last = diagnosed.report._thruster_status(thrusters)
+    last = diagnosed.diagnostics.of_thrusters(thrusters)
     assert (last.level, last.message) == (WARN, "they cannot give torque about z")
 
 
@@ -334,9 +356,10 @@ def test_times_are_in_milliseconds() -> None:
         worse=True,
     )
     real_time: Any = SimpleNamespace(report=lambda: timing)
-    status = timing_status("a: timing", real_time)
+    status = timing_record("/a", "robot", real_time)
+    assert (status.name, status.hardware_id) == ("a: timing", "robot")
     assert (status.level, status.message) == (WARN, "deadlines were missed")
-    assert {pair.key: pair.value for pair in status.values} == {
+    assert status.values == {
         "tick_rate_Hz": "99.5",
         "ticks": "1000",
         "ticks_late": "3",
@@ -347,7 +370,7 @@ def test_times_are_in_milliseconds() -> None:
         "command_age_s": "0.04",
     }
     timing.worse = False
-    assert timing_status("a: timing", real_time).level == OK
+    assert timing_record("/a", "robot", real_time).level == OK
 
 
 URDF = """<robot name="r"><link name="base"><inertial><mass value="1"/>
@@ -364,24 +387,14 @@ URDF = """<robot name="r"><link name="base"><inertial><mass value="1"/>
 
 def test_shapes_are_drawn_where_they_are() -> None:
     """Base at (1, 2, 3), turned by 90 deg about z; the joint turned by 90 deg more."""
-    from rclpy.serialization import deserialize_message
-    from visualization_msgs.msg import MarkerArray
-
     c = math.sqrt(0.5)
     quarter = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     pose = np.array([1.0, 2.0, 3.0, 0.0, 0.0, c, c])
     np.testing.assert_allclose(matrix_from_quaternion(pose[3:]), quarter, atol=1e-15)
-    plant: Any = SimpleNamespace(
-        capturing=None,
-        robot=SimpleNamespace(description=parse_robot(URDF)),
-        pose=pose,
-        link_R=np.hstack([np.eye(3), quarter]),
-        link_r=np.array([[0.0, 0.0], [0.0, 0.0], [0.0, 2.0]]),
-    )
-    node: Any = FakeNode()
-    LinkMarkers(node, plant, "map").publish(7_250_000_000)
-    (raw,) = node.published
-    box, arm = deserialize_message(raw, MarkerArray).markers
+    link_R = np.hstack([np.eye(3), quarter])
+    link_r = np.array([[0.0, 0.0], [0.0, 0.0], [0.0, 2.0]])
+    markers = RobotMarkers(parse_robot(URDF), None, "map")
+    box, arm = markers_of(markers.message(7_250_000_000, pose, link_R, link_r, None))
     assert (box.ns, arm.ns, box.id, arm.id) == ("base", "arm", 0, 1)
     assert {m.header.frame_id for m in (box, arm)} == {"map"}
     assert {nanoseconds(m.header.stamp) for m in (box, arm)} == {7_250_000_000}
@@ -395,9 +408,6 @@ def test_shapes_are_drawn_where_they_are() -> None:
 
 
 def test_obstacles_are_drawn_where_they_rest() -> None:
-    from rclpy.serialization import deserialize_message
-    from visualization_msgs.msg import MarkerArray
-
     world = parse_world(
         '<robot name="w"><link name="w"/><link name="post"><collision>'
         '<origin xyz="0.5 0 0"/><geometry><box size="1 2 3"/></geometry></collision></link>'
@@ -406,16 +416,9 @@ def test_obstacles_are_drawn_where_they_rest() -> None:
     )
     robot = with_world(parse_robot(URDF), world)
     for pose in ([1.0, 2.0, 3.0, 0.0, 0.0, 0.6, 0.8], [0.0, 0.0, 0.0, 0.6, 0.0, 0.0, 0.8]):
-        plant: Any = SimpleNamespace(
-            capturing=None,
-            robot=SimpleNamespace(description=robot),
-            pose=np.array(pose),
-            link_R=np.hstack([np.eye(3), np.eye(3)]),
-            link_r=np.zeros((3, 2)),
-        )
-        node: Any = FakeNode()
-        LinkMarkers(node, plant, "map").publish(7_250_000_000)
-        *_, post = deserialize_message(node.published[0], MarkerArray).markers
+        markers = RobotMarkers(robot, None, "map")
+        base, link_R = np.array(pose), np.hstack([np.eye(3), np.eye(3)])
+        *_, post = markers_of(markers.message(7, base, link_R, np.zeros((3, 2)), None))
         assert (post.ns, post.id, post.header.frame_id) == ("post", 2, "map")
         assert numbers(post.pose) == pytest.approx(
             [1.0, -1.5, 4.0, 0, 0, math.sqrt(0.5), math.sqrt(0.5)]
@@ -424,9 +427,6 @@ def test_obstacles_are_drawn_where_they_rest() -> None:
 
 
 def test_obstacles_that_are_gone_are_erased() -> None:
-    from rclpy.serialization import deserialize_message
-    from visualization_msgs.msg import MarkerArray
-
     def world(*names: str) -> str:
         shape = '<collision><geometry><sphere radius="0.2"/></geometry></collision>'
         links = "".join(f'<link name="{name}">{shape}</link>' for name in names)
@@ -436,22 +436,14 @@ def test_obstacles_that_are_gone_are_erased() -> None:
         )
         return f'<robot name="w"><link name="w"/>{links}{joints}</robot>'
 
-    plant: Any = SimpleNamespace(
-        capturing=None,
-        robot=SimpleNamespace(
-            description=with_world(parse_robot(URDF), parse_world(world("post")))
-        ),
-        pose=np.array([1.0, 2.0, 3.0, 0.0, 0.0, 0.6, 0.8]),
-        link_R=np.hstack([np.eye(3), np.eye(3)]),
-        link_r=np.zeros((3, 2)),
-    )
-    node: Any = FakeNode()
-    markers = LinkMarkers(node, plant, "map")
+    robot = with_world(parse_robot(URDF), parse_world(world("post")))
+    markers = RobotMarkers(robot, None, "map")
+    pose = np.array([1.0, 2.0, 3.0, 0.0, 0.0, 0.6, 0.8])
+    link_R, link_r = np.hstack([np.eye(3), np.eye(3)]), np.zeros((3, 2))
     drawn = []
     for there in (None, parse_world(world("post", "ball")), None, parse_world(world("ball"))):
         markers.use_obstacles(there)
-        markers.publish(7)
-        found = deserialize_message(node.published[-1], MarkerArray).markers
+        found = markers_of(markers.message(7, pose, link_R, link_r, None))
         drawn.append([(each.ns, each.id, each.action) for each in found[2:]])
     assert drawn == [
         [("post", 2, Marker.DELETE)],

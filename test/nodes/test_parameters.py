@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import MappingProxyType
@@ -242,3 +243,23 @@ def test_what_was_given_is_found_however_rclpy_keeps_it(
     values = declare(node, declared)
     assert values == {"rate": 20.0, "left": 2.5, "names": ("a", "b")}
     assert [node.get_parameter(name).value for name in values] == [20.0, 2.5, ["a", "b"]]
+
+
+def test_descriptions_have_units_ranges_and_choices(harness: Harness) -> None:
+    node = harness.add(Node("any", **construction(harness.context, {})))
+    declare(
+        node,
+        [
+            Declaration("rate", 2.5, "Hz", "It is.", minimum=0.5),
+            Declaration("count", 2, minimum=1, maximum=9),
+            Declaration("mode", "fast", choices=("fast", "slow")),
+        ],
+    )
+    rate, count, mode = map(node.describe_parameter, ("rate", "count", "mode"))
+    assert rate.description == "It is. [Hz]"
+    (span,) = rate.floating_point_range
+    assert (span.from_value, span.to_value) == (0.5, sys.float_info.max)
+    (whole,) = count.integer_range
+    assert (whole.from_value, whole.to_value) == (1, 9)
+    assert mode.additional_constraints == "one of: fast, slow"
+    assert not [*mode.integer_range, *mode.floating_point_range, *rate.integer_range]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,9 +12,6 @@ from support.planner_flight import HERE, NEAR, TURNED, Flight, Place, goal_at, s
 from support.plant_rig import SLIDERS, TICK_NS
 from support.ros_harness import Harness
 from support.sentences import assert_one_sentence
-
-from spacerobot_ros.nodes.common import commander
-from spacerobot_ros.nodes.common.commander import BURST
 
 pytestmark = pytest.mark.usefixtures("one_plant")
 
@@ -127,22 +123,3 @@ def test_a_refused_goal_does_not_disturb_the_one_that_is_flown(harness: Harness,
     assert flight.states == ["idle", "executing", "refused", "reached"]
     assert max(flight.error_to(NEAR)) <= 1e-3
     assert len(flight.probe.messages["gait_schedule"]) == 1
-
-
-def test_goals_that_pour_in_leave_the_log_short(
-    harness: Harness, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(commander, "time", SimpleNamespace(monotonic=lambda: 100.0))
-    flight, written = Flight(harness), list[str]()
-    monkeypatch.setattr(
-        flight.planner,
-        "log",
-        lambda level, message: written.append(message) if level != "debug" else None,
-    )
-    flight.start()
-    for k in range(BURST):
-        # Each goal has three lines: it has come, is planned, and is refused.
-        flight.decide(([1e9 + k, 0.0, 0.0], [0.0, 0.0, 0.0]))
-    # Before the goals the node has said that it waits for one.
-    assert len(written) == BURST - 1
-    assert "Planned in" in "".join(written)

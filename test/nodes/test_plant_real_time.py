@@ -9,10 +9,13 @@ import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.lifecycle import TransitionCallbackReturn
+from sensor_msgs.msg import JointState
 from support.bad_commands import BAD_COMMANDS
 from support.plant_rig import TICK, TICK_NS, Rig
 from support.ros_harness import Harness, nanoseconds
 from support.sentences import assert_one_sentence
+
+from spacerobot_ros.nodes import PlantNode
 
 REALTIME = {"time_mode": "realtime", "real_time_factor": 10.0, "command_timeout": 1.0}
 
@@ -203,3 +206,12 @@ def test_a_paused_plant_goes_on_to_report(harness: Harness, mode: str) -> None:
     assert shown.level == DiagnosticStatus.ERROR
     assert "stopped on request" in shown.message
     assert rig.probe.count("joint_states") == states, "time stands still"
+
+
+def test_commanders_of_a_remapped_topic_are_counted(harness: Harness) -> None:
+    remapped = ["--ros-args", "-r", "joint_commands:=/arm/commands"]
+    plant = harness.make(PlantNode, {"robot": "sliding_masses", **REALTIME}, cli_args=remapped)
+    harness.spin_until(lambda: "no node publishes" in plant.status.message, "that nobody commands")
+    harness.matched(harness.probe({}).create_publisher(JointState, "/arm/commands", 10))
+    harness.spin_until(lambda: "no node publishes" not in plant.status.message, "the commander")
+    assert plant.status.reason == "no_command"

@@ -21,7 +21,7 @@ from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.events import Event, EventKind
 from spacerobot_ros.nodes import PlantNode
 from spacerobot_ros.nodes.common import process
-from spacerobot_ros.nodes.common.process import run_node, start_ros, use_private_discovery
+from spacerobot_ros.nodes.common.process import run_node, start_ros
 from spacerobot_ros.nodes.replay import _publisher_qos
 from spacerobot_ros.termination import Terminated
 
@@ -58,15 +58,13 @@ def variables(monkeypatch: pytest.MonkeyPatch) -> Callable[..., dict[str, str]]:
 
 
 @pytest.mark.parametrize("own", [None, *DISCOVERY, "ROS_DOMAIN_ID"])
-def test_discovery_is_as_narrow_as_can_be_unless_the_user_chose(
+def test_discovery_is_on_this_machine_unless_the_user_chose(
     variables: Callable[..., dict[str, str]], own: str | None
 ) -> None:
     given = {} if own is None else {own: "7"}
     kept = {name: text for name, text in given.items() if name in DISCOVERY}
     local = kept or {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
     assert variables(process.use_loopback_discovery, **given) == local
-    private = local if given else {"ROS_AUTOMATIC_DISCOVERY_RANGE": "OFF"}
-    assert variables(use_private_discovery, **given) == private
 
 
 @pytest.mark.parametrize(

@@ -21,7 +21,6 @@ from support.made_bags import joint_states
 from spacerobot_ros.bag import BagWriter, QosProfile, Recording
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.nodes import recorder
-from spacerobot_ros.nodes.common.streams import RawInput, RawStream, StreamListeners
 
 RELIABLE, BEST_EFFORT = ReliabilityPolicy.RELIABLE, ReliabilityPolicy.BEST_EFFORT
 LATCHED, VOLATILE = DurabilityPolicy.TRANSIENT_LOCAL, DurabilityPolicy.VOLATILE
@@ -56,48 +55,6 @@ def test_a_bag_says_what_was_offered() -> None:
     found = recorder._recorded_qos(qos)
     assert (found.history, found.depth) == ("keep_last", 7)
     assert (found.reliability, found.durability) == ("best_effort", "transient_local")
-
-
-class Heard:
-    """A stream of a node, and what a listener hears of it."""
-
-    def __init__(self, kind: type[RawStream] = RawStream) -> None:
-        self.taken: list[bytes] = []
-        self.stream = RawStream("/a", self.taken.append)
-        self.stream.__class__ = kind
-
-
-def taps_of(*streams: RawStream) -> Any:
-    taps = StreamListeners()
-    taps.nodes = [SimpleNamespace(raw_streams=[stream]) for stream in streams]
-    return taps
-
-
-def test_streams_are_tapped_where_nothing_can_escape() -> None:
-    first, second, input_ = Heard(), Heard(), Heard(RawInput)
-    listened: list[bytes] = []
-    # A third publisher is in no node of this process.
-    assert not taps_of(first.stream, second.stream).tap("/a", listened.append, 3)
-    assert not taps_of(first.stream).tap("/b", listened.append, 1)
-    taps = taps_of(first.stream, second.stream)
-    assert taps.tap("/a", listened.append, 2)
-    first.stream.take(b"1")
-    second.stream.take(b"2")
-    assert (listened, first.taken, second.taken) == ([b"1", b"2"], [b"1"], [b"2"])
-    # One more publisher: from now on some may escape.
-    assert taps.release_incomplete(lambda topic: 2) == []
-    assert taps.release_incomplete(lambda topic: 3) == ["/a"]
-    first.stream.take(b"3")
-    assert listened == [b"1", b"2"]
-    # What a node receives has every publisher's.
-    taps = taps_of(first.stream, input_.stream)
-    assert taps.tap("/a", listened.append, 5)
-    first.stream.take(b"4")
-    input_.stream.take(b"5")
-    assert listened == [b"1", b"2", b"5"]
-    taps.release()
-    input_.stream.take(b"6")
-    assert listened == [b"1", b"2", b"5"]
 
 
 def test_messages_carry_the_clock_and_their_stamps(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from types import SimpleNamespace
@@ -10,7 +11,7 @@ from typing import Any
 import numpy as np
 import pinocchio
 import pytest
-from geometry_msgs.msg import TransformStamped
+from geometry_msgs.msg import Point, Quaternion, TransformStamped
 from nav_msgs.msg import Odometry
 from rclpy.serialization import serialize_message
 from rosbags.typesys import Stores, get_typestore
@@ -27,7 +28,7 @@ from spacerobot_ros.model.kinematics import ForwardKinematics
 from spacerobot_ros.model.rotations import compose_poses, matrix_from_quaternion
 from spacerobot_ros.model.urdf import load_robot
 from spacerobot_ros.nodes import PlantNode, RecorderNode
-from spacerobot_ros.nodes.common.messages import KnownFrames
+from spacerobot_ros.nodes.common.messages import KnownFrames, pose_array
 from spacerobot_ros.nodes.plant import publisher
 from spacerobot_ros.nodes.plant.publisher import TransformPublisher
 from spacerobot_ros.resources import resource_names, robot_file
@@ -84,7 +85,6 @@ def record_states(
     node = harness.make(PlantNode, values, autostart=False)
     node.require_transition(node.trigger_configure)
     recorder = harness.make(RecorderNode, {"bag": str(bag), **recorded}, autostart=False)
-    recorder.watch([node])
     recorder.start()
     harness.spin_until(lambda: {"/odom", "/joint_states", "/robot_description"} <= recorder.topics)
     node.require_transition(node.trigger_activate)
@@ -235,6 +235,23 @@ def test_chains_of_frames_end_in_the_world_or_nowhere() -> None:
     assert frames.pose("moon", "world", own) is None
     aside = compose_poses(up, np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]))
     assert aside == pytest.approx([0, 1, 1, 0, 0, half, half])
+
+
+@pytest.mark.parametrize(
+    ("quaternion", "found"),
+    [
+        ([0.0, 0.0, 0.0, 2.0], [0.0, 0.0, 0.0, 1.0]),
+        ([0.0, 3.0, 0.0, 4.0], [0.0, 0.6, 0.0, 0.8]),
+        ([0.0, 0.0, 0.5e-6, 0.0], None),
+        ([0.0, math.inf, 0.0, 1.0], None),
+    ],
+)
+def test_poses_of_messages_have_quaternions_of_norm_one(
+    quaternion: list[float], found: list[float] | None
+) -> None:
+    x, y, z, w = quaternion
+    pose = pose_array(Point(x=1.0, y=-2.0, z=3.0), Quaternion(x=x, y=y, z=z, w=w))
+    assert pose == (None if found is None else pytest.approx([1.0, -2.0, 3.0, *found]))
 
 
 def test_the_topic_has_the_frames_of_odom(harness: Harness) -> None:

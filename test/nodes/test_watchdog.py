@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import casadi as ca
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from rclpy.node import Node
 from support.planner_flight import NEAR, PLANNER, Flight, values_of
 from support.ros_harness import Harness
 
@@ -18,8 +16,6 @@ from spacerobot_ros.model.compilation import c_compiler, compiled
 from spacerobot_ros.nodes import RecorderNode
 from spacerobot_ros.nodes.common.watchdog import (
     HeartbeatState,
-    Liveness,
-    Role,
     SilenceReport,
     Watchdog,
 )
@@ -124,6 +120,10 @@ class Watched(Flight):
             if values_of(message)["event"] in kinds
         ]
 
+    def pulses(self, name: str) -> list[str]:
+        """Return the states in the heartbeats of a node."""
+        return [m.message for m in self.doctor.messages["heartbeat"] if m.name == name]
+
     def diagnosed(self, name: str) -> list[DiagnosticStatus]:
         return [
             status
@@ -138,25 +138,6 @@ class Watched(Flight):
         began = time.monotonic()
         self.harness.spin_until(lambda: self.events("node_silent"), "the silence", timeout=5.0)
         return time.monotonic() - began
-
-
-def test_a_look_that_is_due_when_the_node_is_stopped_is_no_failure(harness: Harness) -> None:
-    node = harness.add(Node("watching", context=harness.context))
-    due: list[Callable[[], None]] = []
-    create = node.create_timer
-
-    def create_timer(period: float, act: Callable[[], None], **clock: Any) -> Any:
-        due.append(act)
-        return create(period, act, **clock)
-
-    node.create_timer = create_timer
-    liveness = Liveness(node, Role.PLANT, [Role.COMMANDER], lambda silence: None)
-    liveness.configure(1.0)
-    liveness.begin()
-    liveness.end()
-    assert due
-    for act in due:  # The executor had taken them up before they were destroyed.
-        act()
 
 
 def test_a_silent_planner_is_noticed_by_the_plant_and_is_back(harness: Harness) -> None:
@@ -231,36 +212,12 @@ def test_nodes_that_end_or_rest_in_order_are_not_missed(harness: Harness) -> Non
     assert states[-1] == ("/plant", "inactive")
 
 
-@pytest.mark.slow
-def test_a_planner_that_plans_is_busy_and_not_silent(
-    harness: Harness, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A plan that is made at once keeps the planner from its heartbeats, and here nobody else."""
-    flight = Watched(harness)
-    plan = flight.planner.commander.executive._worker.plan  # type: ignore[union-attr]
-
-    def slow(*given: Any) -> Any:
-        end = time.monotonic() + 1.2
-        flight.plant._liveness._watchdog._looked = time.monotonic()  # type: ignore[union-attr]
-        while time.monotonic() < end:
-            # Another process would look meanwhile.
-            flight.plant._liveness._look()
-            flight.plant._liveness._watchdog.hear("/planner", heard[-1])  # type: ignore[union-attr]
-        return plan(*given)
-
-    heard = ["active"]
-    beat = flight.planner._liveness._publish
-
-    def publish(pulse: HeartbeatState) -> None:
-        heard.append(pulse.value)
-        beat(pulse)
-
-    monkeypatch.setattr(flight.planner._liveness, "_publish", publish)
-    monkeypatch.setattr(flight.planner.commander.executive._worker, "plan", slow)  # type: ignore[union-attr]
+def test_a_planner_says_when_it_plans(harness: Harness) -> None:
+    flight = Watched(harness, planner={**PLANNER, "plan_in_background": False})
     flight.send(NEAR)
     flight.wait("executing")
-    at = heard.index("busy")
-    assert heard[at : at + 2] == ["busy", "active"]
+    harness.spin_until(lambda: "busy" in flight.pulses("/planner"), "that it is busy")
+    harness.spin_until(lambda: flight.pulses("/planner")[-1] == "active", "that it is not any more")
     assert flight.events("node_silent") == []
 
 
@@ -274,16 +231,14 @@ def test_an_active_node_that_compiles_is_busy_and_not_silent(
     monkeypatch.setenv("SPACEROBOT_CACHE_DIR", str(tmp_path))
     monkeypatch.delenv("SPACEROBOT_COMPILE", raising=False)
     flight = Watched(harness)
-    heard: list[str] = []
-
-    def publish(pulse: HeartbeatState) -> None:
-        heard.append(pulse.value)
-
-    monkeypatch.setattr(flight.planner._liveness, "_publish", publish)
+    harness.executor.remove_node(flight.planner)  # Its timer says nothing meanwhile.
+    before = len(flight.pulses("/planner"))
     x = ca.SX.sym("x", 3)
     with flight.planner.long_work():
         compiled(ca.Function("watched_sine", [x], [ca.sin(1.7 * x)]))
-    assert heard == ["busy", "busy", "busy", "active"], "not active before the whole work is done"
     flight.planner.trigger_deactivate()
     compiled(ca.Function("watched_cosine", [x], [ca.cos(1.7 * x)]))
-    assert heard[4:] == ["inactive"]
+    harness.spin_until(lambda: "inactive" in flight.pulses("/planner"), "its end")
+    # It is not active before the whole work is done.
+    expected = ["busy", "busy", "busy", "active", "inactive"]
+    assert flight.pulses("/planner")[before:][-5:] == expected

@@ -14,6 +14,7 @@ import pytest
 from spacerobot_ros.collision import CollisionGeometry
 from spacerobot_ros.collision.nearest import Approach
 from spacerobot_ros.errors import ParameterError, PlanningError, Proof, UnreachableError
+from spacerobot_ros.flight.trials import PlanningProblem
 from spacerobot_ros.model import SpaceRobot, load_robot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.shared_parameters import robot_of
@@ -41,7 +42,6 @@ from spacerobot_ros.planning.methods.optimal.problem import (
 from spacerobot_ros.planning.methods.remaining_joints import RemainingJointsGait
 from spacerobot_ros.resources import robot_file
 from spacerobot_ros.simulation import InitialState
-from spacerobot_ros.simulation.trials import PlanningProblem
 
 TOLERANCE = Tolerance(1e-6, 1e-6, 1e-6)
 QUICK: dict[str, Any] = {"answers": 1, "intervals": 40, "cache": 0}

@@ -18,6 +18,7 @@ from support.planner_phases import executing, resting, stub_of
 
 from spacerobot_ros.collision.planes import PlaneDistance
 from spacerobot_ros.errors import ParameterError, PlanningError, Proof, UnreachableError
+from spacerobot_ros.flight.trials import PlanningProblem
 from spacerobot_ros.model import RobotDescription, SpaceRobot
 from spacerobot_ros.model.description import Array, Pose
 from spacerobot_ros.model.urdf import load_world, parse_world
@@ -195,7 +196,7 @@ def test_a_clearance_of_zero_is_a_centimetre_among_obstacles(arm: SpaceRobot) ->
 def test_the_world_of_a_scenario_is_that_of_plant_and_planner(tmp_path: Path) -> None:
     scenario = load_scenario("strut")
     assert scenario.plant.world == scenario.planner.world == str(STRUT)
-    world = scenario.problem().robot.description.world
+    world = PlanningProblem.of(scenario).robot.description.world
     assert world is not None
     assert world.name == "strut"
     text = scenario.path.read_text("utf-8")

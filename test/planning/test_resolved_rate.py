@@ -15,6 +15,7 @@ from support.hand_motion import end_of_motion
 from support.planner_loop import Loop
 
 from spacerobot_ros.errors import ParameterError, PlanningError, Proof, UnreachableError
+from spacerobot_ros.flight.trials import PlanningProblem, compare
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.planning import GaitSchedule, Goal, RobotState, Tolerance, build_method, plan
 from spacerobot_ros.planning.analysis import analyze
@@ -26,7 +27,6 @@ from spacerobot_ros.planning.execution.status import PlannerState
 from spacerobot_ros.planning.methods.registry import method_options
 from spacerobot_ros.planning.methods.resolved_rate import ResolvedRateGait
 from spacerobot_ros.simulation import InitialState
-from spacerobot_ros.simulation.trials import compare
 
 Array = npt.NDArray[np.float64]
 Pose = tuple[Array, Rotation]
@@ -350,7 +350,7 @@ def test_it_is_compared_for_goals_of_end_effectors_alone() -> None:
     from spacerobot_ros.scenario import load_scenario
 
     quick = {"optimal.answers": 1, "optimal.intervals": 20, "optimal.cache": 0}
-    problem = load_scenario("planar_chain").with_overrides("planner", quick).problem()
+    problem = PlanningProblem.of(load_scenario("planar_chain").with_overrides("planner", quick))
     assert "resolved_rate" not in compare(problem)
     robot = robot_of("planar_chain")
     found = analyze(robot)

@@ -52,11 +52,11 @@ def window(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
 @pytest.mark.parametrize("name", scenario_names())
 def test_the_report_shows_what_happened(name: str, tmp_path: Path, window: Browser) -> None:
     scenario = load_scenario(name)
-    processes = bool(scenario.kills)
-    if processes:
+    nodes = bool(scenario.kills)
+    if nodes:
         scenario = scenario.in_real_time(4.0)
     bag, page = tmp_path / "flight.mcap", tmp_path / "flight.html"
-    summary = run_scenario(scenario, bag, processes=processes).summary
+    summary = run_scenario(scenario, bag, nodes=nodes).summary
     bag = Path(summary["bag"])
     began = time.process_time()
     write_report(bag, page)
@@ -66,13 +66,13 @@ def test_the_report_shows_what_happened(name: str, tmp_path: Path, window: Brows
     assert size < LARGEST
     flight = read_report(bag)
     # Terminal, JSON and report say the same.
-    assert flight.manoeuvre_time == pytest.approx(summary["manoeuvre_time_s"], abs=1e-6)
-    error = flight.flight.error
+    assert flight.time_flown == pytest.approx(summary["manoeuvre_time_s"], abs=1e-6)
+    error = flight.error
     assert (error is None) is (not scenario.goal.base)
     if error is not None:
         assert error.distance == pytest.approx(summary["position_error_m"], rel=1e-9, abs=1e-12)
         assert error.angle == pytest.approx(summary["attitude_error_rad"], rel=1e-9, abs=1e-12)
-    kinds = {each.event.kind for each in flight.events}
+    kinds = {each.event.kind for each in flight.timed_events}
     for width in (1280, 390):
         window.complaints.clear()
         window.requests.clear()

@@ -26,7 +26,7 @@ from spacerobot_ros.measures import Outcome
 from spacerobot_ros.nodes.common.node import STREAM
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.scenario import load_scenario
-from spacerobot_ros.session.run import ros
+from spacerobot_ros.session.live import ros
 
 pytestmark = pytest.mark.slow
 
@@ -61,7 +61,7 @@ def flight(ros_domain: int, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> 
         .with_overrides("plant", {"tick_rate": 1 / TICK})
         .with_overrides("coordinated_control", control)
     )
-    with ros(private=False):
+    with ros():
         flight = Flight(tmp_path, scenario)
         try:
             yield flight

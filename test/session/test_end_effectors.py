@@ -16,11 +16,10 @@ from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.flight.reading import read_run
 from spacerobot_ros.measures import Outcome
 from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.planning.core.goal import POSE, Controlled, EndEffectorGoal
+from spacerobot_ros.planning.core.goal import EndEffectorGoal
 from spacerobot_ros.resources import robot_file
 from spacerobot_ros.scenario import Scenario, load_scenario, scenario_or_robot, scenario_text
 from spacerobot_ros.session.run import run_scenario
-from spacerobot_ros.session.stack import Stack
 
 QUICK = {"optimal.answers": 1, "optimal.intervals": 20, "optimal.cache": 0}
 
@@ -127,14 +126,15 @@ def test_a_scenario_may_have_paths_of_end_effectors(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_path_is_flown_by_nodes_and_in_the_bag(tmp_path: Path) -> None:
-    """`run` sends it as a path; the hand passes its corner, by the poses of the bag."""
+@pytest.mark.parametrize("nodes", [False, True])
+def test_a_path_is_flown_and_in_the_bag(tmp_path: Path, nodes: bool) -> None:
+    """Nodes are sent it as a path; the hand passes its corner, by the poses of the bag."""
     way = [[1.5, 0.7, 1.3], [1.3, 0.9, 0.8]]
     robot = scenario_or_robot("three_joint_arm").with_overrides(
         "plant", {"initial_joint_positions": [0.4, -0.9, 1.1]}
     )
     scenario = robot.with_end_effectors([EndEffectorGoal.along("", way)])
-    result = run_scenario(scenario, bag=tmp_path / "path.mcap")
+    result = run_scenario(scenario, tmp_path / "path.mcap", nodes=nodes)
     assert result.succeeded
     series = read_bag(tmp_path / "path.mcap")["/end_effector_pose"]
     places = series.table([f"pose.position.{axis}" for axis in "xyz"], 3)
@@ -182,14 +182,4 @@ def test_a_part_of_the_base_is_not_sent_with_an_end_effector(tmp_path: Path) -> 
     aim = EndEffectorGoal.checked("link_7", [0.4, 0.1, 0.8])
     scenario = load_scenario("reach").with_end_effectors([aim], frozenset({"attitude"}))
     with pytest.raises(ParameterError, match="whole pose of the base or with none"):
-        run_scenario(scenario, tmp_path / "run.mcap")
-
-
-@pytest.mark.parametrize("base", [frozenset(), POSE])
-def test_end_effectors_are_sent_with_the_whole_pose_of_the_base_and_with_none(
-    base: frozenset[Controlled],
-) -> None:
-    aim = EndEffectorGoal.checked("link_7", [0.4, 0.1, 0.8])
-    scenario = load_scenario("reach").with_end_effectors([aim], base)
-    made = type("Unstarted", (Stack,), dict.fromkeys(Stack.__abstractmethods__))
-    assert made(scenario, None).names == ("plant", "planner")
+        run_scenario(scenario, tmp_path / "run.mcap", nodes=True)

@@ -77,7 +77,7 @@ def test_a_scenario_ends_as_documented_and_can_be_flown_again(name: str, tmp_pat
 @pytest.mark.slow
 def test_killed_nodes_go_on_to_the_goal(tmp_path: Path) -> None:
     scenario = load_scenario(f"faults/{KILLED}").in_real_time(4.0)
-    result = run_scenario(scenario, tmp_path / "run.mcap", processes=True)
+    result = run_scenario(scenario, tmp_path / "run.mcap", nodes=True)
     assert result.succeeded, result.message
     bag = read_bag(tmp_path / "run.mcap")
     end = [bag["/odom"].field(f"pose.pose.position.{x}")[-1] for x in "xyz"]
@@ -104,7 +104,7 @@ def test_nodes_that_are_killed_between_capture_and_goal_go_on_with_the_held_body
         .with_overrides("coordinated_control", {"tick_rate": 50.0, "settle_time": 8.0})
         .with_overrides("recorder", {"flush_period": 0.1})
     )
-    result = run_scenario(scenario, tmp_path / "run.mcap", processes=True)
+    result = run_scenario(scenario, tmp_path / "run.mcap", nodes=True)
     assert result.succeeded, result.message
     bag = read_bag(tmp_path / "run.mcap")
     momenta, expected = (
@@ -117,12 +117,13 @@ def test_nodes_that_are_killed_between_capture_and_goal_go_on_with_the_held_body
     np.testing.assert_allclose(momenta[-count:], expected[-count:], rtol=0, atol=1e-12)
 
 
-def test_kills_need_processes_in_real_time(tmp_path: Path) -> None:
+@pytest.mark.parametrize("nodes", [False, True])
+def test_kills_need_nodes_in_real_time(tmp_path: Path, nodes: bool) -> None:
     scenario = load_scenario(f"faults/{KILLED}")
-    for processes in (False, True):
-        with pytest.raises(ParameterError) as caught:
-            run_scenario(scenario, tmp_path / "run.mcap", processes=processes)
-        assert_one_sentence(str(caught.value), "--processes", "--realtime")
+    with pytest.raises(ParameterError) as caught:
+        run_scenario(scenario, tmp_path / "run.mcap", nodes=nodes)
+    assert_one_sentence(str(caught.value), "kills nodes on the way", "--nodes", "--realtime")
+    assert not (tmp_path / "run.mcap").exists()
 
 
 @pytest.mark.parametrize(

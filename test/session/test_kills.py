@@ -22,8 +22,8 @@ from spacerobot_ros.bag import Bag
 from spacerobot_ros.measures import Outcome
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.scenario import Scenario, load_scenario
+from spacerobot_ros.session.live import ros
 from spacerobot_ros.session.processes import MultiProcessStack
-from spacerobot_ros.session.run import ros
 
 pytestmark = pytest.mark.slow
 
@@ -57,7 +57,7 @@ def flight(
     request: pytest.FixtureRequest,
 ) -> Iterator[Flight]:
     monkeypatch.setenv("ROS_DOMAIN_ID", str(ros_domain))
-    with ros(private=False):
+    with ros():
         commands_end = request.node.callspec.params.get("name") != "recorder"
         timeout = TIMEOUT if commands_end else PACE * LATE
         flight = Flight(tmp_path, scenario(tmp_path), timeout)

@@ -1,4 +1,4 @@
-"""Stacks of several processes, and stacks that stay up, through the command."""
+"""Flights by the nodes, and stacks that stay up, through the command."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def test_each_node_in_a_process_of_its_own_flies_the_same_manoeuvre(
     spacerobot: Command, tmp_path: Path
 ) -> None:
     results = []
-    for name, words in (("one", ()), ("many", ("--processes",))):
+    for name, words in (("one", ()), ("many", ("--nodes",))):
         json_file = tmp_path / f"{name}.json"
         run = spacerobot(
             *("run", "planar_chain", *words, "--bag", f"{name}.mcap", "--json", str(json_file)),
@@ -82,6 +82,8 @@ def robot(spacerobot: Command) -> Iterator[WarmProcess]:
     """Sliding masses that are up, twenty times as fast as real time."""
     words = ("up", "sliding_masses", "--rate", "20", "--bag", "up.mcap", *GAIT)
     with spacerobot.start(*words) as process:
+        assert process.stdout is not None
+        assert any("is up" in line for line in iter(process.stdout.readline, ""))
         yield process
 
 

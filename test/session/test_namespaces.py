@@ -10,16 +10,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import rclpy
 
 from spacerobot_ros.bag import read_bag
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.flight.verification import verify_bag
-from spacerobot_ros.measures import Outcome
 from spacerobot_ros.planning import Goal
-from spacerobot_ros.scenario import load_scenario
-from spacerobot_ros.session.run import send_goal
-from spacerobot_ros.session.stack import InProcessStack, checked_namespace
+from spacerobot_ros.session.live import send_goal
+from spacerobot_ros.session.processes import checked_namespace
 
 ROOT = Path(__file__).parents[2]
 COMMAND = (sys.executable, "-m", "spacerobot_ros.cli.main")
@@ -32,35 +29,15 @@ PATIENCE = 120.0
 
 
 @pytest.mark.slow
-def test_a_stack_in_a_namespace_has_a_clock_and_a_bag_of_its_own(
-    ros_context: rclpy.Context, tmp_path: Path
-) -> None:
-    scenario = load_scenario("planar_chain")
-    stack = InProcessStack(scenario, tmp_path / "a.mcap", "/fleet/one/", context=ros_context)
-    try:
-        stack.start(scenario.goal)
-        stack.spin(lambda: False)
-        stack.finish()
-        assert stack.client.outcome is Outcome.REACHED
-    finally:
-        stack.close()
-    bag = read_bag(tmp_path / "a.mcap")
-    outside = {topic for topic in bag.topics if not topic.startswith("/fleet/one/")}
-    assert outside <= {"/diagnostics"}
-    assert {"/fleet/one/clock", "/fleet/one/tf", "/fleet/one/odom"} <= set(bag.topics)
-    assert verify_bag(tmp_path / "a.mcap").difference is None
-
-
-@pytest.mark.slow
 def test_two_stacks_of_the_command_fly_side_by_side(ros_domain: int, tmp_path: Path) -> None:
-    """One in a process, one in many; each takes its own goal and records its own topics."""
+    """Each takes its own goal and records its own topics; the bag of each is verified."""
     environment = {**os.environ, "ROS_DOMAIN_ID": str(ros_domain), "PYTHONPATH": str(ROOT)}
-    flown = {"one": ("0.05", ()), "two": ("-0.04", ("--processes",))}
+    flown = {"one": "0.05", "two": "-0.04"}
     started = {
         name: subprocess.Popen(
             [
                 *(*COMMAND, "up", "sliding_masses", "--rate", "20", "--bag", f"{name}.mcap"),
-                *("--namespace", name, *words, *GAIT),
+                *("--namespace", name, *GAIT),
             ],
             env=environment,
             cwd=tmp_path,
@@ -69,10 +46,10 @@ def test_two_stacks_of_the_command_fly_side_by_side(ros_domain: int, tmp_path: P
             text=True,
             start_new_session=True,
         )
-        for name, (_, words) in flown.items()
+        for name in flown
     }
     try:
-        for name, (x, _) in flown.items():
+        for name, x in flown.items():
             sent = subprocess.run(
                 [*COMMAND, "goal", x, "0", "0", "--namespace", name, "--timeout", "60"],
                 env=environment,
@@ -93,10 +70,12 @@ def test_two_stacks_of_the_command_fly_side_by_side(ros_domain: int, tmp_path: P
             if process.poll() is None:
                 os.killpg(process.pid, signal.SIGKILL)
             process.wait(PATIENCE)
-    for name, (x, _) in flown.items():
+    for name, x in flown.items():
         bag = read_bag(tmp_path / f"{name}.mcap")
         outside = {topic for topic in bag.topics if not topic.startswith(f"/{name}/")}
         assert outside <= {"/diagnostics"}
+        assert {f"/{name}/clock", f"/{name}/tf", f"/{name}/odom"} <= set(bag.topics)
+        assert verify_bag(tmp_path / f"{name}.mcap").difference is None
         end = bag[f"/{name}/odom"].field("pose.pose.position.x")[-1]
         assert abs(end - float(x)) < 1e-3
         # One clock: time goes on in steps of one tick, and never back.

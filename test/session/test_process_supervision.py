@@ -11,7 +11,7 @@ import signal
 import time
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -28,8 +28,8 @@ from spacerobot_ros.measures import Outcome
 from spacerobot_ros.planning.execution.status import PlannerStatistics
 from spacerobot_ros.scenario import Scenario, load_scenario
 from spacerobot_ros.session import processes
+from spacerobot_ros.session.live import ros
 from spacerobot_ros.session.processes import MultiProcessStack
-from spacerobot_ros.session.run import ros
 
 KILLED = "faults/killed_nodes"
 """A scenario with a planner, of which nodes are killed."""
@@ -88,7 +88,7 @@ def record(own_domain: None, monkeypatch: pytest.MonkeyPatch) -> Iterator[Record
     monkeypatch.setattr(
         MultiProcessStack, "_spin_for", lambda stack, s: record.done.append(("spin", s))
     )
-    with ros(private=True):
+    with ros():
         yield record
 
 
@@ -552,47 +552,3 @@ def test_each_node_is_asked_once_it_is_there_and_all_answers_are_awaited() -> No
     assert [services[name].asked for name in services] == [["Q"], ["P"], []]
     both = "planner, plant"
     assert waited == [(f"the {both}", 60.0), (f"an answer of the {both}", 60.0)]
-
-
-@pytest.mark.parametrize("recorder", [False, True])
-def test_every_node_tells_its_connections(recorder: bool) -> None:
-    names = ("plant", "recorder") if recorder else ("plant",)
-    text = json.dumps([[["/odom", 2]], [["/clock", 1], ["/b", 3]]])
-    seen: list[Any] = []
-    stack: Any = SimpleNamespace(
-        names=names,
-        _get_connections="services",
-        _call_services=lambda services, requests: {
-            name: SimpleNamespace(message=text) for name in requests
-        },
-        _spin_for=lambda seconds: seen.append(seconds),
-        _all_connected=lambda nodes, recorded: seen.append((sorted(nodes), list(recorded))),
-    )
-    _CONNECTED(stack)
-    assert seen == [0.05, (sorted(names), ["/clock", "/b"] if recorder else [])]
-
-
-_CONNECTED = MultiProcessStack._connected
-"""The method itself: the nodes of other tests are all connected."""
-
-
-def test_the_shape_of_a_goal_is_one_of_the_robot(
-    make: Callable[..., MultiProcessStack], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    asked: list[Any] = []
-    make_client = MultiProcessStack._make_client
-
-    def keep(stack: MultiProcessStack, names: Any) -> None:
-        asked.append(names and names())
-        make_client(stack, names)
-
-    monkeypatch.setattr(MultiProcessStack, "_make_client", keep)
-    monkeypatch.setattr(Scenario, "require_shape_of", lambda scenario, robot: asked.append(robot))
-    shaped = load_scenario("planar_chain")
-    assert shaped.goal.joint_positions is not None
-    plain = replace(shaped, goal=replace(shaped.goal, joint_positions=None))
-    robot = SimpleNamespace(joint_names=("a", "b"))
-    for scenario, known in ((plain, robot), (shaped, robot), (shaped, None)):
-        monkeypatch.setattr(processes, "robot_of", lambda config, known=known: known)
-        assert make(scenario, bag=None).time_ns == 0
-    assert asked == [None, robot, ("a", "b"), ()]

@@ -1,4 +1,4 @@
-"""Whole runs in one process: what they record, that they repeat, what they sum up."""
+"""Whole runs: what they record, that they repeat, what they sum up."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
-from rclpy.logging import LoggingSeverity, get_logger_effective_level
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
 from spacerobot_ros.bag import iterate_raw, read_bag
 from spacerobot_ros.cli.options import write_json
-from spacerobot_ros.errors import ParameterError, SpaceRobotError
+from spacerobot_ros.errors import ParameterError, RecordingError, SpaceRobotError
 from spacerobot_ros.planning import Goal
+from spacerobot_ros.planning.core.progress import report_progress
 from spacerobot_ros.planning.execution.executive import Executive
 from spacerobot_ros.scenario import Scenario, load_scenario
 from spacerobot_ros.session.run import RunResult, run_scenario
@@ -32,11 +32,6 @@ SHORT = {
     "lie_bracket.cycle_period": 1.0,
     "lie_bracket.cycles": 0,
 }
-
-
-@pytest.fixture(autouse=True)
-def own_domain(ros_domain: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("ROS_DOMAIN_ID", str(ros_domain))
 
 
 def short(**settings: Any) -> Scenario:
@@ -96,12 +91,6 @@ def test_summary_is_what_the_bag_says(result: RunResult, tmp_path: Path) -> None
     assert summary["ticks"] == round(summary["sim_time_s"] * 20)
     assert summary["sim_time_s"] == pytest.approx(summary["manoeuvre_time_s"])
     assert {"plan_time_s", "wall_time_s", "ticks_per_s", "real_time_factor"} <= set(summary)
-
-
-def test_loggers_of_a_run_are_not_quiet_for_the_next_nodes(result: RunResult) -> None:
-    assert result.succeeded
-    for name in ("plant", "planner"):
-        assert get_logger_effective_level(name) is LoggingSeverity.INFO
 
 
 def test_momentum_against_the_momentum_in_motion(result: RunResult) -> None:
@@ -241,6 +230,26 @@ def test_interrupted_run_leaves_a_complete_bag(tmp_path: Path) -> None:
     assert read_bag(tmp_path / "run.mcap").message_count("/odom") == result.summary["ticks"] + 1
 
 
+def test_a_plan_that_is_being_made_is_interrupted(tmp_path: Path) -> None:
+    """The signal comes from the search's own progress."""
+    scenario = load_scenario("sliding_masses").with_overrides("planner", {"optimal.cache": 0})
+    with report_progress(lambda progress: os.kill(os.getpid(), signal.SIGINT), lambda line: None):
+        result = run_scenario(scenario, tmp_path / "run.mcap")
+    assert result.summary["state"] == "interrupted"
+    assert result.message == "Interrupted after 0 s of simulated time."
+    assert read_bag(tmp_path / "run.mcap").message_count("/odom") == 1
+
+
+def test_a_run_takes_the_next_name_if_its_recorder_is_to(tmp_path: Path) -> None:
+    bag = tmp_path / "run.mcap"
+    bag.write_bytes(b"earlier")
+    with pytest.raises(RecordingError, match="exists"):
+        run_scenario(short(), bag)
+    following = short().with_overrides("recorder", {"when_exists": "next"})
+    assert run_scenario(following, bag, longest=1.0).summary["bag"] == str(tmp_path / "run-1.mcap")
+    assert bag.read_bytes() == b"earlier"
+
+
 @pytest.mark.parametrize(
     ("node", "setting", "sentence"),
     [
@@ -280,7 +289,7 @@ def test_the_published_manoeuvre(tmp_path: Path) -> None:
 def test_a_run_whose_commander_fails_ends_with_the_reason_and_a_whole_bag(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: Exception
 ) -> None:
-    """In lockstep the plant would wait for its command for ever."""
+    """The bag has the states and commands until then."""
     update, states = Executive.update, iter(range(1000))
 
     def failing(self: Executive, measured: Any) -> Any:
@@ -289,7 +298,7 @@ def test_a_run_whose_commander_fails_ends_with_the_reason_and_a_whole_bag(
         return update(self, measured)
 
     monkeypatch.setattr(Executive, "update", failing)
-    with pytest.raises(SpaceRobotError, match=rf"'planner' has failed.*{type(error).__name__}"):
+    with pytest.raises(SpaceRobotError, match=rf"has failed at 2 s: {type(error).__name__}"):
         run_scenario(short(), tmp_path / "run.mcap")
     bag = read_bag(tmp_path / "run.mcap")
     with AnyReader([bag.path]) as reader:

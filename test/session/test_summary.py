@@ -14,8 +14,8 @@ from support.made_bags import array, joint_states, made_bag, odometry, pose
 
 from spacerobot_ros.bag import BagWriter, iterate_raw
 from spacerobot_ros.control.status import CommandReport, ControllerState, ControllerStatus
-from spacerobot_ros.control.thrusters import find_thrusters
 from spacerobot_ros.measures import Outcome
+from spacerobot_ros.model.thrusters import find_thrusters
 from spacerobot_ros.model.urdf import parse_robot
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.execution.status import (
@@ -25,7 +25,7 @@ from spacerobot_ros.planning.execution.status import (
 )
 from spacerobot_ros.resources import share_directory
 from spacerobot_ros.scenario import Scenario, load_scenario
-from spacerobot_ros.session import run
+from spacerobot_ros.session import live
 
 HALF = math.sin(0.05), math.cos(0.05)
 """Of a quaternion that turns by 0.1 rad."""
@@ -85,7 +85,7 @@ def summary(path: Path, wall_time: float = 0.5, **options: Any) -> dict[str, Any
             say("/diagnostics", DiagnosticArray(), 9.0)
     flown = Flown(scenario, path, options.pop("client", Client()), PlannerStatistics(0.75, 2, 100))
     assert not options
-    return run._summary(flown, wall_time)  # type: ignore[arg-type]
+    return live._summary(flown, wall_time)  # type: ignore[arg-type]
 
 
 def _pose(goal: Goal) -> list[float]:
@@ -138,7 +138,7 @@ def test_a_flight_whose_bag_was_split_is_summed_up_as_a_whole(tmp_path: Path) ->
     scenario = load_scenario("sliding_masses").with_goal(_pose(GOAL))
     path = tmp_path / "split.mcap"
     flown = Flown(scenario, path, Client(), PlannerStatistics(0.75, 2, 100))
-    found = run._summary(flown, 0.5)  # type: ignore[arg-type]
+    found = live._summary(flown, 0.5)  # type: ignore[arg-type]
     assert found["bag"] == str(tmp_path / "split_0.mcap")
     assert {**found, "bag": whole["bag"]} == whole
 

@@ -8,6 +8,7 @@ parts that are missing.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
@@ -97,6 +98,7 @@ def _report(
         message_count=1234,
         names=lambda topic: named[topic],
         messages=lambda topic: [(0, path(points)) for points in planned],
+        events=lambda: [],
         statuses=lambda node: [(round(1e9 * t), each) for t, each in statuses.get(node, ())],
         signal=lambda topic, _, width: (
             over_time(topics[topic]) if topic in topics else Signal.empty(width)
@@ -123,9 +125,8 @@ def _report(
         status=told[-1] if told else None,
         gait=next((each for each in told if isinstance(each, PlannerStatus) and each.method), None),
     )
-    pose = flight.signal("pose")
-    position = Signal(pose.time - BEGAN, pose.values[:, :3])
-    report = FlightReport(bag, flight, position, pose.values[:, 3:], list(events))
+    report = replace(FlightReport.of(bag, flight), timed_events=list(events))
+    position = report.position
     least = np.inf if clearance is None else float(clearance.min())
     vars(report)["clearance"] = (
         clearance

@@ -13,9 +13,9 @@ from support.page_elements import Server
 
 from spacerobot_ros.bag.playback import ReplayStatus
 from spacerobot_ros.control.status import ControllerState, ControllerStatus
-from spacerobot_ros.control.thrusters import find_thrusters
 from spacerobot_ros.model import load_robot
 from spacerobot_ros.model.description import RobotDescription
+from spacerobot_ros.model.thrusters import find_thrusters
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus
 from spacerobot_ros.resources import robot_file

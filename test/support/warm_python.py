@@ -72,7 +72,7 @@ def _import_everything() -> None:
         warnings.simplefilter("ignore")
         for name in (
             *("matplotlib.pyplot", "scipy.optimize", "spacerobot_ros.nodes"),
-            *("spacerobot_ros.session.run", "spacerobot_ros.session.processes"),
+            *("spacerobot_ros.session.live", "spacerobot_ros.session.processes"),
             "spacerobot_ros.report",
             "spacerobot_ros.flight.verification",
         ):

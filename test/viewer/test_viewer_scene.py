@@ -15,11 +15,11 @@ from support.urdf_text import without_collisions
 
 from spacerobot_ros.collision.geometry import collision_visuals
 from spacerobot_ros.control.status import CommandReport, ControllerState, ControllerStatus
-from spacerobot_ros.control.thrusters import find_thrusters
 from spacerobot_ros.model import load_robot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.kinematics import ForwardKinematics
 from spacerobot_ros.model.rotations import matrix_from_quaternion
+from spacerobot_ros.model.thrusters import find_thrusters
 from spacerobot_ros.model.urdf import parse_robot, parse_world
 from spacerobot_ros.model.world import with_world
 from spacerobot_ros.planning import Goal

@@ -1,7 +1,4 @@
-"""Base class of the nodes that command a plant: it converts the messages of a commander.
-
-Of lines about goals that pour in, its log has the last one of each period.
-"""
+"""Base class of the nodes that command a plant: it converts the messages of a commander."""
 
 from __future__ import annotations
 
@@ -10,15 +7,13 @@ import time
 from abc import abstractmethod
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry, Path
 from rclpy.clock import Clock, ClockType
 from rclpy.event_handler import SubscriptionEventCallbacks
-from rclpy.lifecycle import LifecycleNode
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
 from sensor_msgs.msg import JointState
@@ -31,33 +26,31 @@ from spacerobot_ros.commanding.plant_state import Stamped
 from spacerobot_ros.control.config import ControllerConfig
 from spacerobot_ros.errors import CommandError, SpaceRobotError
 from spacerobot_ros.messages.builders import StateFrames, robot_frames
+from spacerobot_ros.messages.diagnostics import encode_diagnostics, state_diagnostics
 from spacerobot_ros.messages.readers import MessageDecoder
-from spacerobot_ros.messages.statuses import read_status
+from spacerobot_ros.messages.statuses import StatusRecord, read_status
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.shared_parameters import robot_from_text, robot_of
 from spacerobot_ros.nodes.common.fly_to import GoalActions, Surroundings
 from spacerobot_ros.nodes.common.messages import (
     KnownFrames,
-    diagnostic_name,
-    diagnostic_status,
     goal_description,
     goal_of,
 )
 from spacerobot_ros.nodes.common.node import BEST_EFFORT, LATCHED, STREAM, FlightNode
-from spacerobot_ros.nodes.common.streams import RawInput, with_information
 from spacerobot_ros.nodes.common.watchdog import Role, SilenceReport
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.execution.goal_file import BASE_GOAL_KEY
 from spacerobot_ros.simulation.status import PlantStatus
-from spacerobot_ros.times import SECOND, first_time_ns, set_stamp
+from spacerobot_ros.times import SECOND, first_time_ns
 
 _WAITING_STATE_CHECK_PERIOD = 0.1
 """Wall time between two checks of postponed state messages, s."""
 
-_FOREIGN_STATUS_LOG_PERIOD = 5.0
-"""Least wall time between log lines about foreign publishers of plant/status, s."""
+_STATUS_LOG_PERIOD = 5.0
+"""Least wall time between log lines about statuses of the plant that do not count, s."""
 
 _LONGEST_DIAGNOSTICS_PERIOD = 1.0
 """Longest wall time between diagnostics in runs that need not be repeatable, s."""
@@ -91,7 +84,6 @@ class CommanderNode(FlightNode):
     def prepare(self) -> None:
         """Create an inactive commander, and the servers of actions."""
         self.commander = self.make_commander()
-        self._goal_lines = LogRateLimiter()
         self._goal_actions = GoalActions(self)
 
     @abstractmethod
@@ -109,16 +101,16 @@ class CommanderNode(FlightNode):
         self.commander, config = self.make_commander(), self.config
         self._status_topic = self.create_publisher(DiagnosticStatus, status_topic, LATCHED)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", STREAM)
-        self._last_status: DiagnosticStatus | None = None
+        self._last_status: StatusRecord | None = None
         self._diagnostics_period_ns = (config.diagnostics_period or math.inf) * SECOND
         self._diagnosed_ns, self._diagnosed = 0, time.monotonic()
         self._known_frames = KnownFrames(self)
-        self._last_complaint, self._statuses = -math.inf, None
+        self._statuses = None
         self._subscribe_plant_status()
         self._best_effort = config.state_reliability == "best_effort"
         self._unheard = ""
         """Name of a state topic with a publisher whose QoS the subscription does not match."""
-        self._inputs: dict[str, RawInput] = {}
+        self._inputs: dict[str, Subscription] = {}
         """Messages of states and references by their topics."""
         self._subscribe_states()
         self.create_timer(
@@ -192,9 +184,9 @@ class CommanderNode(FlightNode):
 
     def publish_status(self, status: Status) -> None:
         """Publish a status of the goal."""
-        name, level = self.get_fully_qualified_name(), bytes([status.state.level])
-        self._last_status = diagnostic_status(name, level, status.message, status.to_values())
-        self._status_topic.publish(self._last_status)
+        name, level = self.get_fully_qualified_name(), status.state.level
+        self._last_status = StatusRecord(name, level, status.message, status.to_values())
+        self._status_topic.publish(self._last_status.encoded())
 
     def log(self, level: LogLevel, message: str) -> None:
         """Write a line into the log."""
@@ -210,26 +202,30 @@ class CommanderNode(FlightNode):
             case "error":
                 logger.error(message)
 
-    def log_about_goals(self, level: LogLevel, message: str) -> None:
-        """Log a line about a goal; where many goals arrive, one line a second."""
-        self._write(self._goal_lines.offer(time.monotonic(), Line(level, message)))
-
-    def _write(self, line: Line | None) -> None:
-        if line is not None:
-            self.log(line.level, line.message)
-
     def has_publisher(self, topic: str) -> bool:
         """Whether a publisher of a topic of the state, or of a reference, is connected."""
-        return self._inputs[topic].has_publisher
+        return bool(self._inputs[topic].get_publisher_count())
 
     def waiting_states(self) -> tuple[list[Stamped], list[Stamped]]:
-        """Return the messages that wait in the subscriptions of odom and joint_states."""
-        odoms = self._inputs["odom"].waiting()
-        joints = map(self._joined, self._inputs["joint_states"].waiting())
+        """Return the messages that wait in the subscriptions of odom and joint_states.
+
+        Where no joints wait, nor are skipped, odom comes in its own order.
+        """
+        joints = [*map(self._joined, self._waiting("joint_states"))]
+        odoms = self._waiting("odom") if joints else []
         return (
             [Stamped(first_time_ns(raw), raw) for raw in odoms],
             [Stamped(first_time_ns(raw), raw) for raw in joints if raw is not None],
         )
+
+    def _waiting(self, topic: str) -> list[bytes]:
+        """Take and return the messages that wait in a subscription."""
+        found: list[bytes] = []
+        handle, kind = self._inputs[topic].handle, self._inputs[topic].msg_type
+        with handle:
+            while (taken := handle.take_message(kind, True)) is not None:
+                found.append(taken[0])
+        return found
 
     # -- inputs -------------------------------------------------------------------------------
 
@@ -256,7 +252,7 @@ class CommanderNode(FlightNode):
         accepted = self.commander.receive_goal(key, stamp.sec, stamp.nanosec, read)
         if accepted is not None:
             line = goal_description(part, accepted.goal_id, message, accepted.goal)
-            self.log_about_goals("info", line)
+            self.get_logger().info(line)
 
     def read_goal(self, key: str, message: PoseStamped) -> Goal:
         """Return the goal of a message for the base or another part of the robot.
@@ -298,61 +294,45 @@ class CommanderNode(FlightNode):
         """Subscribe anew to plant/status, whose present publishers first send their last status."""
         if self._statuses is not None:
             self.destroy_subscription(self._statuses)
-        self._status_number: int | None = None
-        """Sequence number of the plant's last status; None: any number is accepted next."""
         self._doubted = False
-        """Whether a status was received that another node may have published."""
-        receive = self.guarded(self._on_plant_status, "a message on 'plant/status'")
-        # The callback is guarded already, and rclpy inspects its signature.
-        self._statuses = LifecycleNode.create_subscription(
-            self,
+        """Whether a publisher of statuses that may not have been the plant has been heard."""
+        self._statuses = self.create_subscription(
             DiagnosticStatus,
             "plant/status",
-            with_information(lambda message, information: receive(message, information)),
+            self._on_plant_status,
             _STATUS_QOS,
+            event_callbacks=SubscriptionEventCallbacks(matched=self._on_status_publisher),
         )
 
-    def _on_plant_status(self, message: DiagnosticStatus, information: Any) -> None:
-        """React to a status of the plant that publishes odom.
+    def _on_status_publisher(self, matches: Any) -> None:
+        """Doubt what was heard from a publisher of plant/status that has left others behind."""
+        self._doubted |= matches.total_count > matches.current_count > 0
 
-        Messages do not name their publisher. A status counts while nobody else publishes any, and
-        only with the number after the last one: otherwise it is taken again from the publishers
-        that are there then. So tests, tools and plants of other stacks stop no goal.
-        """
-        number = information["publication_sequence_number"] or 0
-        last, foreign = self._status_number, self._other_status_publishers()
-        if foreign:
+    def _on_plant_status(self, message: DiagnosticStatus) -> None:
+        """React to a status of the plant, unless another node publishes statuses, too."""
+        if self._has_foreign_statuses():
             self._doubted = True
-            now = time.monotonic()
-            if now - self._last_complaint > _FOREIGN_STATUS_LOG_PERIOD:
-                self._last_complaint = now
-                self.log(
-                    "error",
-                    f"plant/status: {', '.join(foreign)} publishes it beside the plant; no status "
-                    "counts until only the plant does.",
-                )
+            self.get_logger().warning(
+                "plant/status: more nodes publish it than odom; no status counts until only the "
+                "plant does.",
+                throttle_duration_sec=_STATUS_LOG_PERIOD,
+            )
             return
-        if last is not None and number and number != last + 1:
-            self._subscribe_plant_status()
-            return
-        self._status_number = number
         record = read_status(message)
         try:
             status = PlantStatus.from_values(record.values, record.message)
         except SpaceRobotError as error:
-            self.get_logger().warning(f"plant/status: {error}", throttle_duration_sec=5.0)
+            self.get_logger().warning(
+                f"plant/status: {error}", throttle_duration_sec=_STATUS_LOG_PERIOD
+            )
             return
         self.commander.receive_plant_status(status, record.name or "plant")
 
-    def _other_status_publishers(self) -> list[str]:
-        """Return nodes that publish plant/status but not odom; empty if no node publishes odom."""
-        found = []
-        for topic in ("plant/status", "odom"):
-            endpoints = self.get_publishers_info_by_topic(self.resolve_topic_name(topic))
-            names = {f"{each.node_namespace.rstrip('/')}/{each.node_name}" for each in endpoints}
-            found.append({name for name in names if "_UNKNOWN_" not in name})
-        statuses, odoms = found
-        return sorted(statuses - odoms) if odoms else []
+    def _has_foreign_statuses(self) -> bool:
+        """Whether more nodes publish plant/status than odom, as every plant publishes both."""
+        topics = map(self.resolve_topic_name, ("plant/status", "odom"))
+        statuses, odoms = map(self.count_publishers, topics)
+        return bool(statuses > odoms > 0)
 
     def _on_odom(self, raw: bytes) -> None:
         self.commander.receive_odom(first_time_ns(raw), raw)
@@ -389,11 +369,12 @@ class CommanderNode(FlightNode):
             def on_incompatible(_: Any, topic: str = topic) -> None:
                 self._unheard = topic
 
-            self._inputs[topic] = self.take_raw(
+            self._inputs[topic] = self.create_subscription(
                 kind,
                 topic,
                 callback,
-                qos=BEST_EFFORT if self._best_effort else STREAM,
+                BEST_EFFORT if self._best_effort else STREAM,
+                raw=True,
                 event_callbacks=(
                     SubscriptionEventCallbacks(incompatible_qos=on_incompatible) if auto else None
                 ),
@@ -406,26 +387,24 @@ class CommanderNode(FlightNode):
         )
         self._unheard, self._best_effort = "", True
         for topic in ("odom", "joint_states"):
-            self._inputs[topic].subscribe(BEST_EFFORT)
+            self.destroy_subscription(self._inputs[topic])
+        self._subscribe_states()
 
     def _process_waiting_messages(self) -> None:
         """Process waiting statuses, and a postponed state once its time is accepted."""
         assert self._statuses is not None
-        self._write(self._goal_lines.due(time.monotonic()))
         commander, handle = self.commander, self._statuses.handle
         # A busy executor may lose a callback.
         with handle:
             while (taken := handle.take_message(DiagnosticStatus, False)) is not None:
-                self._on_plant_status(*taken)
-        if self._doubted and not self._other_status_publishers():
+                self._on_plant_status(taken[0])
+        if self._doubted and not self._has_foreign_statuses():
             self._subscribe_plant_status()
         if self._unheard:
             self._resubscribe_best_effort()
         ignored = commander.take_accepted_jump()
         if ignored or (
-            # A repeatable run depends on simulated time only.
-            self.events_have_wall_time
-            and self.config.diagnostics_period
+            self.config.diagnostics_period
             and self.is_active
             and time.monotonic() - self._diagnosed >= _LONGEST_DIAGNOSTICS_PERIOD
         ):
@@ -434,85 +413,16 @@ class CommanderNode(FlightNode):
     def _publish_diagnostics(self, warning: str = "") -> None:
         """Publish the commander's status and the number of ignored states, or a warning."""
         robot, stamps = self.commander.robot, self.commander.stamps
-        full = self.get_fully_qualified_name()
-        hardware = robot.description.name if robot is not None else ""
-        missing = self.commander.missing
-        level = DiagnosticStatus.WARN if warning or missing else DiagnosticStatus.OK
-        values = {"ignored": stamps.ignored}
+        ignored: dict[str, object] = {"ignored": stamps.ignored}
         if self._decoder is not None:
-            values |= {f"ignored: {what}": count for what, count in self._decoder.ignored.items()}
-        message = warning or (f"waiting for {missing}" if missing else "states are answered")
-        name = diagnostic_name(full, "states")
-        states = diagnostic_status(name, level, message, values, hardware)
-        array, last = DiagnosticArray(status=[states]), self._last_status
-        if last is not None and not warning:
-            array.status.append(
-                DiagnosticStatus(
-                    level=last.level,
-                    name=diagnostic_name(full, "goal"),
-                    message=last.message,
-                    hardware_id=hardware,
-                    values=last.values,
-                )
-            )
+            ignored |= {f"ignored: {what}": count for what, count in self._decoder.ignored.items()}
+        records = state_diagnostics(
+            self.get_fully_qualified_name(),
+            robot.description.name if robot is not None else "",
+            ignored,
+            self._last_status,
+            warning=warning,
+            missing=self.commander.missing,
+        )
         self._diagnosed_ns, self._diagnosed = stamps.now_ns, time.monotonic()
-        set_stamp(array.header.stamp, stamps.now_ns)
-        self._diagnostics.publish(array)
-
-
-# -- lines of the log -----------------------------------------------------------------------------
-
-BURST = 20
-"""Lines that pass at once after a quiet time: those of a goal with its corrections."""
-
-PERIOD = 1.0
-"""Time per line once the burst is used up, s."""
-
-
-@dataclass(frozen=True)
-class Line:
-    """Severity and text of one line."""
-
-    level: Literal["debug", "info", "warning", "error"]
-    message: str
-
-
-class LogRateLimiter:
-    """Passes a burst of log lines at once, and then one line in each period.
-
-    A line that has to wait is replaced by the next one; the line that passes at last tells how
-    many were left out. So the log ends with the last line, whatever came before.
-    """
-
-    def __init__(self) -> None:
-        self._free, self._counted_s = float(BURST), 0.0
-        self._waiting: Line | None = None
-        self._left_out = 0
-
-    def offer(self, now_s: float, line: Line) -> Line | None:
-        """Return the line to write now; None if the line waits.
-
-        Parameters
-        ----------
-        now_s
-            Wall time, s.
-        line
-            The new line.
-        """
-        if self._waiting is not None:
-            self._left_out += 1
-        self._waiting = line
-        return self.due(now_s)
-
-    def due(self, now_s: float) -> Line | None:
-        """Return the waiting line once it may be written."""
-        self._free = min(BURST, self._free + (now_s - self._counted_s) / PERIOD)
-        self._counted_s = now_s
-        line, count = self._waiting, self._left_out
-        if line is None or self._free < 1.0:
-            return None
-        self._free -= 1.0
-        self._waiting, self._left_out = None, 0
-        if not count:
-            return line
-        return replace(line, message=f"{line.message} ({count} line(s) about goals left out.)")
+        self._diagnostics.publish(encode_diagnostics(records, stamps.now_ns))

@@ -5,42 +5,32 @@ from __future__ import annotations
 import importlib
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
-from geometry_msgs.msg import Point, PoseStamped, TransformStamped
+from geometry_msgs.msg import PoseStamped, TransformStamped
 from nav_msgs.msg import Path
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
 from rclpy.type_support import check_for_type_support
 from sensor_msgs.msg import JointState
-from visualization_msgs.msg import Marker, MarkerArray
 
 from spacerobot_ros.errors import PlanningError, RecordingError, SpaceRobotError, printable
 from spacerobot_ros.messages.builders import STATIC_TRANSFORMS, TRANSFORM_TYPE, TRANSFORMS
 from spacerobot_ros.messages.definitions import message_module
-from spacerobot_ros.model.description import Array, Pose, RobotDescription, Shape
+from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.rotations import (
     compose_poses,
     matrix_from_quaternion,
-    quaternion_from_matrix,
     quaternion_multiply,
 )
 from spacerobot_ros.times import SECOND, set_stamp
 
 if TYPE_CHECKING:
-    from spacerobot_ros.planning import BasePath, Goal
+    from spacerobot_ros.planning import Goal
     from spacerobot_ros.planning.core.goal import EndEffectorGoal
 
-_MARKER_TYPES = {
-    "box": Marker.CUBE,
-    "cylinder": Marker.CYLINDER,
-    "sphere": Marker.SPHERE,
-    "capsule": Marker.TRIANGLE_LIST,
-    "mesh": Marker.MESH_RESOURCE,
-}
 _MAX_KEPT_TRANSFORMS, _MAX_KEPT_STATIC_TRANSFORMS = 200, 100
 """Numbers of kept messages of /tf and of /tf_static: some seconds of several publishers."""
 
@@ -84,14 +74,6 @@ def interface_class(module: str, name: str) -> Any | None:
     return kind
 
 
-def diagnostic_name(node: str, part: str) -> str:
-    """Return the name of a part of a node in /diagnostics, as diagnostic_updater forms it.
-
-    Aggregators match the beginning of names, and make folders of them: no slash comes first.
-    """
-    return f"{node.removeprefix('/')}: {part}"
-
-
 def diagnostic_status(
     name: str, level: bytes, message: str, values: Mapping[str, object], hardware_id: str = ""
 ) -> DiagnosticStatus:
@@ -103,65 +85,6 @@ def diagnostic_status(
         hardware_id=hardware_id,
         values=[KeyValue(key=key, value=str(value)) for key, value in values.items()],
     )
-
-
-def shape_marker(shape: Shape, frame: str, namespace: str, number: int) -> Marker:
-    """Return the marker of a URDF visual, its pose left open."""
-    marker = Marker(ns=namespace, id=number, type=_MARKER_TYPES[shape.kind], action=Marker.ADD)
-    marker.header.frame_id = frame
-    size = shape.size
-    if shape.kind == "cylinder":
-        size = (2 * size[0], 2 * size[0], size[1])
-    elif shape.kind == "sphere":
-        size = (2 * size[0],) * 3
-    elif shape.kind == "capsule":
-        from spacerobot_ros.model.visuals import solid_mesh  # Few shapes are capsules.
-
-        size, mesh = (1.0, 1.0, 1.0), solid_mesh(replace(shape, pose=Pose()))
-        corners = mesh.vertices[mesh.faces].reshape(-1, 3).tolist()
-        marker.points = [Point(x=x, y=y, z=z) for x, y, z in corners]
-    marker.scale.x, marker.scale.y, marker.scale.z = (float(x) for x in size)
-    marker.color.r, marker.color.g, marker.color.b, marker.color.a = (float(x) for x in shape.rgba)
-    marker.mesh_resource = shape.resource
-    return marker
-
-
-def goal_markers(goal: Goal, path: BasePath, robot: RobotDescription, frame: str) -> MarkerArray:
-    """Return markers of the base at its goal, of the planned path of the base as a line, and of
-    the path that an end-effector is given.
-
-    The ghost has the visuals of the base link and of the links that are fixed to it.
-    """
-    markers: list[Marker] = []
-    base = Pose(matrix_from_quaternion(goal.quaternion), goal.position)
-    visuals = [(link, shape) for link in robot.links for shape in link.shapes]
-    for link, shape in visuals:
-        body, link_pose = robot.frames[link.name]
-        if body != 0:
-            continue
-        marker = shape_marker(shape, frame, "goal", len(markers))
-        marker.color.a = 0.25
-        placed = base @ link_pose @ shape.pose
-        set_pose(marker.pose, placed.r, quaternion_from_matrix(placed.R))
-        markers.append(marker)
-    markers.append(_line_marker("planned_path", len(markers), path.position, frame))
-    given = [each.path_values for each in goal.end_effectors if each.waypoints is not None]
-    if given:
-        markers.append(_line_marker("given_path", 0, given[0][:, :3], frame))
-    else:  # One of an earlier goal is erased.
-        markers.append(Marker(ns="given_path", action=Marker.DELETE))
-    return MarkerArray(markers=markers)
-
-
-def _line_marker(namespace: str, number: int, places: Array, frame: str) -> Marker:
-    """Return the marker of a line through places (K, 3)."""
-    line = Marker(ns=namespace, id=number, type=Marker.LINE_STRIP, action=Marker.ADD)
-    line.header.frame_id = frame
-    line.scale.x = 0.005
-    line.color.r, line.color.g, line.color.b, line.color.a = 0.95, 0.6, 0.1, 1.0
-    line.pose.orientation.w = 1.0
-    line.points = [Point(x=x, y=y, z=z) for x, y, z in places.tolist()]
-    return line
 
 
 def goal_message(goal: Goal, frame: str, time_ns: int) -> PoseStamped:

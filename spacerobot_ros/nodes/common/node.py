@@ -7,7 +7,6 @@ import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
-from pathlib import Path
 from typing import Any, ClassVar
 
 from diagnostic_msgs.msg import DiagnosticStatus
@@ -15,7 +14,6 @@ from lifecycle_msgs.msg import State
 from lifecycle_msgs.srv import ChangeState
 from rcl_interfaces.msg import SetParametersResult
 from rclpy._rclpy_pybind11 import RCLError
-from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.exceptions import InvalidHandle
 from rclpy.experimental import EventsExecutor
 from rclpy.lifecycle import LifecycleNode, TransitionCallbackReturn
@@ -28,18 +26,14 @@ from rclpy.subscription import Subscription
 from rclpy.timer import Timer
 from std_srvs.srv import Trigger
 
-from spacerobot_ros.errors import ParameterError, SpaceRobotError
+from spacerobot_ros.errors import ParameterError, SpaceRobotError, describe_exception
 from spacerobot_ros.events import Event, EventKind
 from spacerobot_ros.messages.statuses import StatusRecord
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.nodes.common.ros_parameters import declare, fix, typed
 from spacerobot_ros.nodes.common.streams import (
-    AnnouncedPublisher,
     MatchedEndpoints,
-    RawCallback,
-    RawInput,
     RawOutput,
-    RawStream,
 )
 from spacerobot_ros.nodes.common.watchdog import Liveness, Role, SilenceReport
 from spacerobot_ros.parameters import Parameter, Value, configured, declared, values_of
@@ -104,22 +98,13 @@ class FlightNode(LifecycleNode):
     """Roles of the nodes whose silence this node reports."""
 
     def __init__(self, name: str, *, autostart: bool | None = None, **kwargs: Any) -> None:
-        self._timers_alive: dict[int, list[bool]] = {}
         super().__init__(name, **kwargs)
         self.fault: SpaceRobotError | None = None
         self.on_end: Callable[[int], None] = lambda code: None
         """Function that a finished node calls with its exit code."""
-        self.raw_streams: list[RawStream] = []
-        """Serialised streams of the node that a recorder takes, from configuration to cleanup."""
-        self.raw_inputs: list[RawInput] = []
-        """Serialised messages that the node receives, likewise."""
-        self.before_cleanup: Callable[[], None] = lambda: None
-        """Function that is called before the streams of the node end."""
         self._failure, self._destroyed = "", False
         self._liveness = Liveness(self, self.role, self.depends_on, self.on_silence)
         self._event_stream = self.send_raw(DiagnosticStatus, "events")
-        self.events_have_wall_time = True
-        """Whether wall time may influence published values; False in repeatable runs."""
         self._raising = False
         self._guard_transitions()
         try:
@@ -131,7 +116,6 @@ class FlightNode(LifecycleNode):
             self.add_on_set_parameters_callback(self._on_set_parameters)
             self.create_service(Trigger, "~/connections", self._on_connections)
             self.prepare()
-            self._permanent_streams = list(self.raw_streams)
             self._permanent = set(self._entities())
             if self._autostart if autostart is None else autostart:
                 self.start()
@@ -170,56 +154,13 @@ class FlightNode(LifecycleNode):
     def send_raw(self, kind: type[Any], topic: str, qos: QoSProfile = STREAM) -> RawOutput:
         """Return a new stream whose ``take`` publishes serialised messages."""
         latched = qos.durability == DurabilityPolicy.TRANSIENT_LOCAL
-        stream = RawOutput(self.create_publisher(kind, topic, qos), latched=latched)
-        self.raw_streams.append(stream)
-        return stream
-
-    def take_raw(
-        self,
-        kind: type[Any],
-        topic: str,
-        callback: RawCallback,
-        *,
-        qos: QoSProfile = STREAM,
-        number: Callable[[int], None] | None = None,
-        event_callbacks: SubscriptionEventCallbacks | None = None,
-    ) -> RawInput:
-        """Subscribe to serialised messages and return their stream.
-
-        Parameters
-        ----------
-        kind, topic
-            Type of the messages and name of the topic.
-        callback
-            Called with each message.
-        qos, event_callbacks
-            Quality of service and event callbacks of the subscription.
-        number
-            Called before with the number that its publisher has given to the message, if wanted.
-        """
-        # The stream guards its callback already: one call less for each message.
-        subscribe = super().create_subscription
-
-        def create(receive: Callable[..., None], qos: QoSProfile) -> Subscription:
-            return subscribe(kind, topic, receive, qos, raw=True, event_callbacks=event_callbacks)
-
-        stream = RawInput(
-            self.resolve_topic_name(topic),
-            callback,
-            create=create,
-            destroy=self.destroy_subscription,
-            qos=qos,
-            on_error=lambda error: self._fail(f"a message on '{topic}'", error),
-            number=number,
-        )
-        self.raw_inputs.append(stream)
-        return stream
+        return RawOutput(self.create_publisher(kind, topic, qos), latched=latched)
 
     def report_event(self, event: Event) -> None:
         """Publish an event of this node; an event without a time gets the node's time."""
         if event.time_s is None:
             event = replace(event, time_s=self.simulated_time_s)
-        values = event.to_values(time.time() if self.events_have_wall_time else None)
+        values = event.to_values(time.time())
         name = self.get_fully_qualified_name()
         self._event_stream.take(StatusRecord(name, event.level, event.message, values).encoded())
 
@@ -229,11 +170,6 @@ class FlightNode(LifecycleNode):
         return None
 
     # -- callbacks ----------------------------------------------------------------------------
-
-    def create_publisher(self, msg_type: Any, topic: str, *args: Any, **kwargs: Any) -> Publisher:
-        """Return a new publisher, which announces each publication."""
-        kwargs.setdefault("publisher_class", AnnouncedPublisher)
-        return super().create_publisher(msg_type, topic, *args, **kwargs)
 
     def create_subscription(
         self, msg_type: Any, topic: str, callback: Callable[..., Any], *args: Any, **kwargs: Any
@@ -246,21 +182,15 @@ class FlightNode(LifecycleNode):
         self, timer_period_sec: float, callback: Callable[[], Any], *args: Any, **kwargs: Any
     ) -> Timer:
         """Create a timer with a callback whose exceptions end in :meth:`on_failure`."""
-        guarded, alive = self.guarded(callback, "a timer"), [True]
+        guarded = self.guarded(callback, "a timer")
 
         def fire() -> None:
             # The executor may still have a destroyed timer in its queue.
-            if alive[0]:
+            if timer in self.timers:
                 guarded()
 
         timer = super().create_timer(timer_period_sec, fire, *args, **kwargs)
-        self._timers_alive[id(timer)] = alive
         return timer
-
-    def destroy_timer(self, timer: Timer) -> bool:
-        """Destroy a timer: its callback runs no more."""
-        self._timers_alive.pop(id(timer), [True])[0] = False
-        return bool(super().destroy_timer(timer))
 
     def create_service(
         self, srv_type: Any, srv_name: str, callback: Callable[..., Any], *args: Any, **kwargs: Any
@@ -297,9 +227,7 @@ class FlightNode(LifecycleNode):
         if isinstance(error, SpaceRobotError):
             message = str(error)
         else:
-            message = (
-                f"Node '{self.get_name()}' has failed at {what}: {_describe_exception(error)}."
-            )
+            message = f"Node '{self.get_name()}' has failed at {what}: {describe_exception(error)}."
         if message == self._failure:
             return  # The failure is reported already, and may recur with every message.
         self._report_failure(message, error)
@@ -308,7 +236,7 @@ class FlightNode(LifecycleNode):
                 self.trigger_deactivate()
         except Exception as second:  # A second failure must not cause a third one.
             self.get_logger().error(
-                f"Node '{self.get_name()}' cannot stop: {_describe_exception(second)}."
+                f"Node '{self.get_name()}' cannot stop: {describe_exception(second)}."
             )
         self.fault = SpaceRobotError(message)
 
@@ -318,7 +246,7 @@ class FlightNode(LifecycleNode):
         try:
             self.on_failure(message, error)
         except Exception as second:
-            self.get_logger().error(f"Node '{self.get_name()}': {_describe_exception(second)}.")
+            self.get_logger().error(f"Node '{self.get_name()}': {describe_exception(second)}.")
         self.report_event(Event(EventKind.FAILED, message, level=2))
 
     @property
@@ -338,35 +266,19 @@ class FlightNode(LifecycleNode):
         loaded again sets every one.
         """
         try:
-            changes = self._changes(parameter_list)
+            given = typed(self._parameters_declared, parameter_list)
+            changes = [each for each in given if not self._has_value(each)]
+            self._require_changeable(changes)
         except ParameterError as error:
             return SetParametersResult(successful=False, reason=str(error))
         if not changes:
             return SetParametersResult(successful=True)
         return super().set_parameters_atomically(changes)
 
-    def _changes(self, given: list[RosParameter]) -> list[RosParameter]:
-        """Return the parameters whose values differ from the present ones, in declared types.
-
-        Raises
-        ------
-        ParameterError
-            A value is refused, or the parameter is constant now.
-        """
-        changes = [each for each in given if not self._has_value(each)]
-        self._require_changeable(changes)
-        return typed(self._parameters_declared, changes)
-
     def _has_value(self, given: RosParameter) -> bool:
         """Whether a parameter has this value already."""
-        if not self.has_parameter(given.name):
-            return False
-        try:
-            (wanted,) = typed(self._parameters_declared, [given])
-        except ParameterError:
-            return False
-        present = self.get_parameter(given.name)
-        return present.type_ == wanted.type_ and present.value == wanted.value
+        present = self.get_parameter_or(given.name)
+        return bool(present.type_ == given.type_ and present.value == given.value)
 
     @property
     def is_active(self) -> bool:
@@ -513,7 +425,7 @@ class FlightNode(LifecycleNode):
             return TransitionCallbackReturn.FAILURE
         except Exception as error:
             # rclpy drops exceptions of transitions, so they are logged here.
-            message = f"Node '{self.get_name()}' has failed: {_describe_exception(error)}."
+            message = f"Node '{self.get_name()}' has failed: {describe_exception(error)}."
             self.fault = SpaceRobotError(message)
             self.get_logger().debug(traceback.format_exc())
             self._report_failure(message, error)
@@ -555,9 +467,6 @@ class FlightNode(LifecycleNode):
     def _destroy_configured(self) -> None:
         """Destroy the entities of configure; the services of every ROS node stay."""
         self._set_parameters_read_only(fixed=False)
-        self.before_cleanup()
-        self.raw_streams[:] = self._permanent_streams
-        self.raw_inputs.clear()
         destroy = {
             Timer: self.destroy_timer,
             Subscription: self.destroy_subscription,
@@ -608,11 +517,3 @@ def described_robot(robot: SpaceRobot | None) -> str:
         return "the robot that robot_description will bring"
     mass = robot.description.total_mass
     return f"'{robot.description.name}' ({robot.n} joint(s), {mass:.4g} kg)"
-
-
-def _describe_exception(error: BaseException) -> str:
-    """Return type, text and source line of an unexpected exception."""
-    frames = traceback.extract_tb(error.__traceback__)
-    place = f" ({Path(frames[-1].filename).name}, line {frames[-1].lineno})" if frames else ""
-    text = " ".join(str(error).split()).rstrip(".")
-    return f"{type(error).__name__}{': ' if text else ''}{text}{place}"

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import fcntl
 import gc
+import itertools
 import logging
 import os
 import sys
+import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import rclpy
@@ -33,6 +37,9 @@ FASTDDS_FILE_VARIABLES = ("FASTDDS_DEFAULT_PROFILES_FILE", "FASTRTPS_DEFAULT_PRO
 """Environment variables with the settings file of Fast DDS: new and old name."""
 
 _TRANSPORT_CHOICES = ("FASTDDS_BUILTIN_TRANSPORTS", *FASTDDS_FILE_VARIABLES)
+
+_turn = itertools.count(os.getpid())
+"""Two tests of one process do not follow each other in one domain."""
 
 _SHARED_MEMORY = Path("/dev/shm")
 
@@ -71,14 +78,28 @@ def _use_sockets_without_shared_memory() -> None:
         )
 
 
-def use_private_discovery() -> None:
-    """Keep discovery in this process unless the user chose a range or a domain.
+@contextmanager
+def free_domain() -> Iterator[int]:
+    """Hold a ROS domain that nobody else on this machine holds so; yield its number.
 
-    Two lockstep stacks that receive each other's messages would refuse each other's commands.
+    Raises
+    ------
+    SpaceRobotError
+        All domains are held.
     """
-    if not any(os.environ.get(name) for name in (*_DISCOVERY_CHOICES, "ROS_DOMAIN_ID")):
-        os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "OFF"
-    use_loopback_discovery()
+    folder = Path(tempfile.gettempdir()) / f"spacerobot_ros_domains_{os.getuid()}"
+    folder.mkdir(exist_ok=True)
+    for _ in range(101):  # Higher domains take ports that Linux hands out to others.
+        domain = 1 + next(_turn) % 101
+        with (folder / str(domain)).open("w") as lock:
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                continue
+            # The lock goes with the file that is closed, and with a process that is killed.
+            yield domain
+            return
+    raise SpaceRobotError("Every ROS domain from 1 to 101 is held by another test.")
 
 
 def run_node(factory: Callable[[], FlightNode], arguments: list[str] | None = None) -> int:

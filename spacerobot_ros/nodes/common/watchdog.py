@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
@@ -14,9 +15,10 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.timer import Timer
 
+from spacerobot_ros.messages.diagnostics import diagnostic_name
 from spacerobot_ros.messages.statuses import read_status
 from spacerobot_ros.model.compilation import compilation_contexts
-from spacerobot_ros.nodes.common.messages import diagnostic_name, diagnostic_status
+from spacerobot_ros.nodes.common.messages import diagnostic_status
 
 TOPIC = "heartbeat"
 
@@ -98,42 +100,36 @@ class Watchdog:
     def __init__(self, timeout: float, clock: Callable[[], float] = time.monotonic) -> None:
         self._timeout, self._clock = timeout, clock
         self._heard: dict[str, float] = {}
-        """Time of the last received or excused heartbeat by node, s."""
-        self._busy: set[str] = set()
+        """Time of the last received or excused heartbeat by node, s; infinite: it is busy."""
         self.silent: dict[str, float] = {}
         """Time of the last heartbeat by silent node, s."""
         self._looked = clock()
 
     def hear(self, name: str, pulse: str) -> SilenceReport | None:
         """Process a heartbeat; return the end of a silence, None if the node was not silent."""
-        now = self._clock()
-        back = None
-        if name in self.silent:
-            back = SilenceReport(name, now - self.silent.pop(name), over=True)
-        self._busy.discard(name)
-        if pulse == HeartbeatState.BUSY.value:
-            self._busy.add(name)
-        if pulse in (HeartbeatState.ACTIVE.value, HeartbeatState.BUSY.value):
-            self._heard[name] = now
-        else:
-            self._heard.pop(name, None)
-        return back
+        now, since = self._clock(), self.silent.pop(name, None)
+        match pulse:
+            case HeartbeatState.ACTIVE.value:
+                self._heard[name] = now
+            case HeartbeatState.BUSY.value:
+                self._heard[name] = math.inf
+            case _:
+                self._heard.pop(name, None)
+        return None if since is None else SilenceReport(name, now - since, over=True)
 
     def look(self) -> list[SilenceReport]:
         """Return the nodes that have become silent since the last call."""
         now = self._clock()
         if now - self._looked > _SUSPENSION_TIME:
-            for name in self._heard:
-                self._heard[name] = now
+            self._heard = {name: max(heard, now) for name, heard in self._heard.items()}
         self._looked = now
-        lost = [
-            SilenceReport(name, now - heard)
+        lost = {
+            name: heard
             for name, heard in self._heard.items()
-            if name not in self.silent and name not in self._busy and now - heard > self._timeout
-        ]
-        for silence in lost:
-            self.silent[silence.name] = self._heard[silence.name]
-        return lost
+            if now - heard > self._timeout and name not in self.silent
+        }
+        self.silent |= lost
+        return [SilenceReport(name, now - heard) for name, heard in lost.items()]
 
 
 class Liveness:
@@ -142,7 +138,7 @@ class Liveness:
     Parameters
     ----------
     node
-        The node that sends them.
+        The node that sends them; its timers run no more once they are destroyed.
     role
         Its role.
     depends_on
@@ -158,13 +154,15 @@ class Liveness:
         depends_on: Iterable[Role],
         on_silence: Callable[[SilenceReport], None],
     ) -> None:
-        self._node, self._role, self._on_silence = node, role, on_silence
+        self._node, self._on_silence = node, on_silence
+        self._role = "" if role is None else role.value
         self._publisher = node.create_publisher(DiagnosticStatus, TOPIC, HEARTBEAT_QOS)
-        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._timers: list[Timer] = []
+        """The timers of an active node."""
         self._watched = {each.value for each in depends_on}
-        self._timeout = 0.0
         self._watchdog: Watchdog | None = None
+        """The watchdog of an active node that watches others."""
+        self._timeout = 0.0
         self._busy = 0
         """Number of computations under way that may take long."""
 
@@ -173,9 +171,8 @@ class Liveness:
 
         ``timeout``: see :class:`Watchdog`; 0: nothing is watched.
         """
-        self._timeout = timeout
+        self._timeout, node = timeout, self._node
         if self._watched and timeout:
-            node = self._node
             node.create_subscription(DiagnosticStatus, TOPIC, self._on_heartbeat, HEARTBEAT_QOS)
             self._diagnostics = node.create_publisher(
                 DiagnosticArray, "/diagnostics", HEARTBEAT_QOS
@@ -183,72 +180,59 @@ class Liveness:
 
     def begin(self) -> None:
         """Start to send heartbeats and to watch those of other nodes."""
-        self._end_timers()
         # Compiling a function on its first call counts as a long computation.
         compilation_contexts.append(self.busy)
-        node = self._node
-        beat = node.create_timer(HEARTBEAT_PERIOD, self.beat, clock=self._steady)
-        self._timers.append(beat)
+        steady, create = Clock(clock_type=ClockType.STEADY_TIME), self._node.create_timer
+        self._timers = [create(HEARTBEAT_PERIOD, self._beat, clock=steady)]
         if self._watched and self._timeout:
-            self._watchdog = Watchdog(self._timeout)
-            self._timers.append(
-                node.create_timer(_SILENCE_CHECK_PERIOD, self._look, clock=self._steady)
-            )
-            self._next_report = 0.0
-        self.beat()
+            self._watchdog, self._next_report = Watchdog(self._timeout), 0.0
+            self._timers.append(create(_SILENCE_CHECK_PERIOD, self._look, clock=steady))
+        self._beat()
 
     def end(self) -> None:
-        """Announce the end of this node's heartbeats."""
-        if self._timers:
-            self._end_timers()
-            self._watchdog = None
-            with suppress(Exception):  # The ROS context may be shut down already.
-                self._publish(HeartbeatState.INACTIVE)
-
-    def beat(self) -> None:
-        """Send a heartbeat if the node is active."""
-        if self._timers:
-            self._publish(HeartbeatState.BUSY if self._busy else HeartbeatState.ACTIVE)
+        """Announce the end of this node's heartbeats, if it was active."""
+        if not self._timers:
+            return
+        compilation_contexts.remove(self.busy)
+        for timer in self._timers:
+            self._node.destroy_timer(timer)
+        self._timers, self._watchdog = [], None
+        with suppress(Exception):  # The ROS context may be shut down already.
+            self._publish(HeartbeatState.INACTIVE)
 
     @contextmanager
     def busy(self) -> Iterator[None]:
         """Tell the watchdogs of other nodes that a computation may take long."""
         self._busy += 1
-        self.beat()
+        self._beat()
         try:
             yield
         finally:
             self._busy -= 1
-            self.beat()
+            self._beat()
+
+    def _beat(self) -> None:
+        """Send a heartbeat if the node is active."""
+        if self._timers:
+            self._publish(HeartbeatState.BUSY if self._busy else HeartbeatState.ACTIVE)
 
     def _publish(self, pulse: HeartbeatState) -> None:
-        name, role = self._node.get_fully_qualified_name(), self._role
+        name = self._node.get_fully_qualified_name()
         self._publisher.publish(
-            DiagnosticStatus(
-                name=name, message=pulse.value, hardware_id="" if role is None else role.value
-            )
+            DiagnosticStatus(name=name, message=pulse.value, hardware_id=self._role)
         )
-
-    def _end_timers(self) -> None:
-        if self.busy in compilation_contexts:
-            compilation_contexts.remove(self.busy)
-        for timer in self._timers:
-            self._node.destroy_timer(timer)
-        self._timers.clear()
 
     def _on_heartbeat(self, received: DiagnosticStatus) -> None:
         watchdog, message = self._watchdog, read_status(received)
-        if watchdog is None or message.hardware_id not in self._watched:
-            return
-        if message.name == self._node.get_fully_qualified_name():
+        own = message.name == self._node.get_fully_qualified_name()
+        if watchdog is None or own or message.hardware_id not in self._watched:
             return
         back = watchdog.hear(message.name, message.message)
         if back is not None:
             self._report([back])
 
     def _look(self) -> None:
-        if self._watchdog is None:
-            return  # The executor still calls a timer that is destroyed when it is due.
+        assert self._watchdog is not None
         lost = self._watchdog.look()
         if lost or (self._watchdog.silent and time.monotonic() >= self._next_report):
             self._report(lost)
@@ -257,18 +241,17 @@ class Liveness:
         """Report changes to the node, and publish diagnostics about silent nodes."""
         for silence in news:
             self._on_silence(silence)
-        watchdog, node = self._watchdog, self._node
-        if watchdog is None:
+        if self._watchdog is None:
             return  # The node has reacted by stopping.
         self._next_report = time.monotonic() + _REPORT_PERIOD
-        silent = sorted(watchdog.silent)
+        silent = sorted(self._watchdog.silent)
         values = dict.fromkeys(silent, "silent")
         values.update({each.name: "back" for each in news if each.over})
         status = diagnostic_status(
-            diagnostic_name(node.get_fully_qualified_name(), "watchdog"),
+            diagnostic_name(self._node.get_fully_qualified_name(), "watchdog"),
             DiagnosticStatus.ERROR if silent else DiagnosticStatus.OK,
             f"silent: {', '.join(silent)}" if silent else "all nodes send heartbeats",
             values,
-            "" if self._role is None else self._role.value,
+            self._role,
         )
         self._diagnostics.publish(DiagnosticArray(status=[status]))

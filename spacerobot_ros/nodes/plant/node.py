@@ -78,9 +78,6 @@ _LONGEST_MARKER_PERIOD, _LONGEST_FRAME_PERIOD, _LONGEST_CLEARANCE_PERIOD = 0.5, 
 _CARRIED = {"velocity": "velocities", "effort": "efforts", "auto": "velocities or efforts"}
 """What commands carry, by the parameter ``actuation``."""
 
-# Module names are faster than enum members, which are looked up for every command.
-_RUNNING, _PAUSED, _RESTING = PlantState.RUNNING, PlantState.PAUSED, PlantState.RESTING
-
 
 class PlantNode(FlightNode):
     """Integrates the momentum-conserving model and publishes the topics of a real robot.
@@ -154,7 +151,7 @@ class PlantNode(FlightNode):
         if self._undecided:
             under_efforts = config.decided("effort")
             self._under_efforts = build_plant(robot, under_efforts)
-            # Derive the law of its brakes now: between two ticks, the plant would be late.
+            # Make the equations of its brakes now: between two ticks, the plant would be late.
             CommandValidator(self._under_efforts, under_efforts)
         last = self._last_state(robot)
         self._tick = 0 if last is None else round(last.time_ns / self._period_ns)
@@ -184,7 +181,7 @@ class PlantNode(FlightNode):
         self._tf_ticks = 0
         if self._transforms.publishes:
             self._tf_ticks = self._ticks_for_viewers(config.tf_period, _LONGEST_FRAME_PERIOD)
-        self._report_ticks = self._ticks(config.diagnostics_period)
+        self._report_ticks = config.ticks_of(config.diagnostics_period)
         self._clearance_ticks = self._ticks_for_viewers(
             config.clearance_period, _LONGEST_CLEARANCE_PERIOD
         )
@@ -197,15 +194,9 @@ class PlantNode(FlightNode):
         """The text on the topic obstacles; None: the robot has its own."""
         self.create_subscription(String, "obstacles", self._on_obstacles, LATCHED)
         for topic in (*self._readers, *(["base_wrench"] if self._undecided else [])):
-            stream = self.take_raw(
-                message_class(TOPICS[topic].type),
-                topic,
-                partial(self._on_command, topic),
-                # In lockstep the first command of a tick counts, whichever node publishes it.
-                number=None if self._real_time is None else partial(self._on_number, topic),
-            )
-            # Commands are recorded as the plant receives them.
-            self.raw_streams.append(stream)
+            kind = message_class(TOPICS[topic].type)
+            take = partial(self._on_command, topic)
+            self.create_subscription(kind, topic, take, STREAM, raw=True)
         for topic, inject in (
             ("fault_injection", lambda text: self.plant.inject(text)),
             ("disturbance_injection", lambda text: self.plant.disturb(text)),
@@ -351,8 +342,7 @@ class PlantNode(FlightNode):
         """Bring the joints to rest, because the commanders end as well."""
         if self._active is not PlantState.RUNNING or self._real_time is None:
             return
-        for stream in self.raw_inputs:
-            stream.take = lambda raw: None
+        self._readers, self._undecided = {}, False  # No command counts any more.
         self._commands.rest()
         self._publish_changed_status()
         end, began = time.monotonic() + _LONGEST_REST, self._tick
@@ -477,14 +467,11 @@ class PlantNode(FlightNode):
         if self._steady.now().nanoseconds - self._reported_ns >= _REPORT_PERIOD_NS:
             self._publish_report()
 
-    def _ticks(self, seconds: float) -> int:
-        return max(1, round(seconds * SECOND / self._period_ns)) if seconds else 0
-
     def _ticks_for_viewers(self, seconds: float, longest_wall: float) -> int:
         """Return the ticks of a period, which real time shortens for viewers."""
         if self._real_time is not None and seconds:
             seconds = min(seconds, longest_wall * self.config.real_time_factor)
-        return self._ticks(seconds)
+        return self.config.ticks_of(seconds)
 
     def _on_wall_tick(self) -> None:
         real_time = self._real_time
@@ -525,18 +512,13 @@ class PlantNode(FlightNode):
 
     def _count_commanders(self) -> None:
         for source in self._commands.sources:
-            source.commanders = self.count_publishers(source.topic)
+            # Names to count by are not remapped.
+            source.commanders = self.count_publishers(self.resolve_topic_name(source.topic))
 
     # -- commands -----------------------------------------------------------------------------
 
-    def _on_number(self, topic: str, number: int) -> None:
-        """Note the number of the next message on a topic of commands."""
-        reader = self._readers.get(topic)
-        if reader is not None:
-            reader.source.senders.note(number, self._tick * self._period_ns)
-
     def _on_command(self, topic: str, raw: bytes) -> None:
-        if self._active is not _RUNNING and self._active is not _PAUSED:
+        if not self._is_running_or_paused:
             return
         if self._undecided:
             self._decide_actuation(topic, raw)
@@ -548,7 +530,7 @@ class PlantNode(FlightNode):
             self._report.refused(reader.source, refusal)
             if refusal.latches:
                 self._publish_changed_status()
-        elif self.status.state is _RESTING:
+        elif self.status.state is PlantState.RESTING:
             self._publish_changed_status()
         if self._real_time is None:
             self._step_if_complete()
@@ -557,7 +539,7 @@ class PlantNode(FlightNode):
             self._real_time.count_command(now, reader.source.stamp_ns)
 
     def _step_if_complete(self) -> None:
-        if self._active is _RUNNING and self._commands.complete:
+        if self._active is PlantState.RUNNING and self._commands.complete:
             self._step()
 
     def _on_injection(self, inject: Callable[[str], None], message: String) -> None:

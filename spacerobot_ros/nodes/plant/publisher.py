@@ -8,10 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.duration import Duration
-from rclpy.node import Node
-from rclpy.serialization import serialize_message
 from std_msgs.msg import String
-from visualization_msgs.msg import Marker, MarkerArray
+from visualization_msgs.msg import MarkerArray
 
 from spacerobot_ros.messages.builders import (
     STATIC_TRANSFORMS,
@@ -19,39 +17,26 @@ from spacerobot_ros.messages.builders import (
     RobotTransforms,
     state_message,
 )
+from spacerobot_ros.messages.diagnostics import PlantDiagnostics, encode_diagnostics
+from spacerobot_ros.messages.markers import RobotMarkers
 from spacerobot_ros.messages.readers import MessageTemplate
 from spacerobot_ros.messages.statuses import StatusRecord
 from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.model.description import Pose, RobotDescription
-from spacerobot_ros.model.kinematics import LinkPlacement
-from spacerobot_ros.model.rotations import matrix_from_quaternion, quaternion_from_matrix
-from spacerobot_ros.nodes.common.messages import (
-    diagnostic_name,
-    diagnostic_status,
-    message_class,
-    set_pose,
-    shape_marker,
-    transform_class,
-)
-from spacerobot_ros.nodes.common.node import LATCHED, STREAM, FlightNode
+from spacerobot_ros.model.description import RobotDescription
+from spacerobot_ros.nodes.common.messages import message_class, transform_class
+from spacerobot_ros.nodes.common.node import LATCHED, FlightNode
 from spacerobot_ros.nodes.common.streams import RawOutput
-from spacerobot_ros.simulation.actuators import PlantWithFaults, ThrusterPlant, thrusters_in
+from spacerobot_ros.simulation.actuators import PlantWithFaults, thrusters_in
 from spacerobot_ros.simulation.commands import CommandSource, CommandValidator, Refusal
 from spacerobot_ros.simulation.config import PlantConfig
 from spacerobot_ros.simulation.plant import Plant
 from spacerobot_ros.simulation.sensors import ReportedState
 from spacerobot_ros.simulation.time_modes import RealTime
-from spacerobot_ros.times import SECOND, set_stamp, stamp_bytes
+from spacerobot_ros.times import SECOND, stamp_bytes
 from spacerobot_ros.topics import TOPICS, Topic, pose_topic
 
 if TYPE_CHECKING:
     from spacerobot_ros.simulation.clearance import ClearanceMonitor
-
-PROPELLANT_KEY = "propellant_kg"
-"""Diagnostics key of the propellant used."""
-
-_MOMENTUM_ROUNDING = 1e-9
-"""Largest momentum change by rounding, divided by the mass, m/s and m^2/s."""
 
 _LOG_PERIOD = 5.0
 """Wall time between two log lines of one kind, s."""
@@ -59,15 +44,9 @@ _LOG_PERIOD = 5.0
 _RESTING_SHARE = 0.01
 """Share of its effort limit that a joint which rests on its stop may push."""
 
-_MILLISECONDS = 1e3
-
-_OK, _WARN, _ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
-
 
 class PlantReport:
     """Writes logs and diagnostics of one plant.
-
-    A level is a warning when its counters have moved since the last diagnostics.
 
     Parameters
     ----------
@@ -81,29 +60,28 @@ class PlantReport:
 
     def __init__(
         self,
-        node: Node,
+        node: FlightNode,
         plant: PlantWithFaults,
         commands: CommandValidator,
         real_time: RealTime | None,
     ) -> None:
-        self._node, self._real_time = node, real_time
-        self.observe(commands, plant)
-        self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", STREAM)
-        self._command_timeouts = 0
-        self._last_refusal = ""
-        self._reported = self._counters()
-        self._unmet_reported = 0
-        if self._thrusters is not None and self._thrusters.missing:
-            node.get_logger().warning(f"The thrusters cannot give {self._thrusters.missing}.")
+        self._node, self._commands, self._plant = node, commands, plant
+        name = node.get_fully_qualified_name()
+        self._diagnostics = PlantDiagnostics(name, plant, commands, real_time)
+        self._stream = node.send_raw(DiagnosticArray, "/diagnostics")
+        thrusters = thrusters_in(plant)
+        if thrusters is not None and thrusters.missing:
+            node.get_logger().warning(f"The thrusters cannot give {thrusters.missing}.")
 
     def observe(self, commands: CommandValidator, plant: PlantWithFaults) -> None:
         """Report on these from now on."""
-        self._commands, self._plant, self._thrusters = commands, plant, thrusters_in(plant)
+        self._commands, self._plant = commands, plant
+        self._diagnostics.observe(commands, plant)
 
     def refused(self, source: CommandSource, refusal: Refusal) -> None:
         """Log a refused command, which its validator has counted."""
-        self._last_refusal = f"A command on '{source.topic}' was refused: {refusal.clause}."
-        self._node.get_logger().warning(self._last_refusal, throttle_duration_sec=_LOG_PERIOD)
+        sentence = self._diagnostics.note_refusal(source, refusal)
+        self._node.get_logger().warning(sentence, throttle_duration_sec=_LOG_PERIOD)
         if refusal.latches:
             self.latched()
 
@@ -115,7 +93,7 @@ class PlantReport:
 
     def timed_out(self, source: CommandSource, timeout: float) -> None:
         """Log that a commander's commands have ceased."""
-        self._command_timeouts += 1
+        self._diagnostics.command_timeouts += 1
         self._node.get_logger().warning(
             f"No command on '{source.topic}' for {timeout:g} s: its actuators are brought to rest.",
             throttle_duration_sec=_LOG_PERIOD,
@@ -143,168 +121,8 @@ class PlantReport:
 
     def publish(self, time_ns: int) -> None:
         """Publish the diagnostics."""
-        before, self._reported = self._reported, self._counters()
-        refused, limited = (now != then for now, then in zip(self._reported, before, strict=True))
-        array = DiagnosticArray()
-        set_stamp(array.header.stamp, time_ns)
-        array.status = [
-            self._command_status(refused=refused),
-            self._actuator_status(limited=limited),
-            self._margin_status(),
-            self._momentum_status(),
-            self._fault_status(),
-        ]
-        if self._thrusters is not None:
-            array.status.append(self._thruster_status(self._thrusters))
-        if self._real_time is not None:
-            array.status.append(timing_status(self._name("timing"), self._real_time))
-        for status in array.status:
-            status.hardware_id = self._plant.robot.description.name
-        self._publisher.publish(array)
+        self._stream.take(encode_diagnostics(self._diagnostics.records(), time_ns))
 
-    def _name(self, part: str) -> str:
-        return diagnostic_name(self._node.get_fully_qualified_name(), part)
-
-    @property
-    def _ticks_lost(self) -> int:
-        return self._real_time.ticks_lost if self._real_time is not None else 0
-
-    def _counters(self) -> tuple[tuple[int, ...], tuple[int, ...]]:
-        """Return the counters that determine the levels of command and actuator diagnostics."""
-        limits = self._plant.limit_counts.values()
-        return (
-            (self._commands.counts.total(), self._command_timeouts, self._ticks_lost),
-            tuple(int(n) for counts in limits for n in counts),
-        )
-
-    def _command_status(self, *, refused: bool) -> DiagnosticStatus:
-        commands = self._commands
-        level, message = _WARN if refused else _OK, "commands arrive"
-        if not commands.in_force:
-            message = "no command is in force"
-        if commands.fault:
-            level = _ERROR
-            message = f"Nothing moves until '~/rearm' is called: {commands.fault}."
-        elif refused and self._last_refusal:
-            message = self._last_refusal
-        return diagnostic_status(
-            self._name("commands"),
-            level,
-            message,
-            {
-                "refused": commands.counts.total(),
-                **{f"refused.{reason.value}": n for reason, n in commands.counts.items()},
-                "latched_fault": commands.fault,
-                "timeouts": self._command_timeouts,
-                "deadlines_missed": self._ticks_lost,
-            },
-        )
-
-    def _actuator_status(self, *, limited: bool) -> DiagnosticStatus:
-        return diagnostic_status(
-            self._name("actuators"),
-            _WARN if limited else _OK,
-            "limits of the URDF hold joints back" if limited else "within limits",
-            {
-                f"{what}_limited.{joint}": count
-                for what, counts in self._plant.limit_counts.items()
-                for joint, count in zip(self._plant.robot.joint_names, counts, strict=True)
-            },
-        )
-
-    def _margin_status(self) -> DiagnosticStatus:
-        robot, q = self._plant.robot, self._plant.q
-        margins = np.minimum(q - robot.lower, robot.upper - q)
-        return diagnostic_status(
-            self._name("strokes"),
-            _OK,
-            "how far each joint is from the nearer of its limits, m or rad",
-            {
-                joint: f"{margin:.6g}"
-                for joint, margin in zip(robot.joint_names, margins, strict=True)
-            },
-        )
-
-    def _momentum_status(self) -> DiagnosticStatus:
-        plant = self._plant
-        change = plant.momentum[:6] - plant.expected_momenta
-        linear, angular = np.linalg.norm(change[:3]), np.linalg.norm(change[3:])
-        # The threshold exceeds rounding errors of bodies that move at up to 1 m/s.
-        leaks = max(linear, angular) > _MOMENTUM_ROUNDING * plant.robot.total_mass
-        return diagnostic_status(
-            self._name("momentum"),
-            _ERROR if leaks else _OK,
-            "momentum changes that no thruster accounts for"
-            if leaks
-            else "momentum is accounted for",
-            {
-                "linear_change": f"{linear:.3e}",
-                "angular_change": f"{angular:.3e}",
-                "kinetic_energy_J": f"{plant.momentum[6]:.6e}",
-            },
-        )
-
-    def _fault_status(self) -> DiagnosticStatus:
-        active = [str(each) for each in self._plant.injected]
-        faults, disturbances = (
-            [str(each) for each in given]
-            for given in (self._plant.active, self._plant.disturbances)
-        )
-        return diagnostic_status(
-            self._name("faults"),
-            _WARN if active else _OK,
-            f"injected: {'; '.join(active)}" if active else "no fault is injected",
-            {f"fault_{i}": fault for i, fault in enumerate(faults, 1)}
-            | {f"disturbance_{i}": each for i, each in enumerate(disturbances, 1)},
-        )
-
-    def _thruster_status(self, thrusters: ThrusterPlant) -> DiagnosticStatus:
-        """Return propellant, pulses and unmet wrenches; a warning for new unmet wrenches."""
-        unmet = thrusters.unmet_ticks > self._unmet_reported
-        self._unmet_reported = thrusters.unmet_ticks
-        sentences = [f"they cannot give {thrusters.missing}"] if thrusters.missing else []
-        if unmet:
-            sentences.append("the wanted wrench is beyond them")
-        force, torque = np.linalg.norm(thrusters.unmet[:3]), np.linalg.norm(thrusters.unmet[3:])
-        return diagnostic_status(
-            self._name("thrusters"),
-            _WARN if sentences else _OK,
-            "; ".join(sentences) or "the wanted wrench is given",
-            {
-                PROPELLANT_KEY: f"{thrusters.propellant:.9g}",
-                "pulses": int(thrusters.pulses.sum()),
-                "unmet_ticks": thrusters.unmet_ticks,
-                "unmet_force_N": f"{force:.6g}",
-                "unmet_torque_Nm": f"{torque:.6g}",
-                **{
-                    f"pulses.{name}": count
-                    for name, count in zip(thrusters.table.names, thrusters.pulses, strict=True)
-                },
-            },
-        )
-
-
-def timing_status(name: str, real_time: RealTime) -> DiagnosticStatus:
-    """Return the delays of the plant's ticks and of its commander's answers as diagnostics."""
-    timing = real_time.report()
-    return diagnostic_status(
-        name,
-        _WARN if timing.worse else _OK,
-        "deadlines were missed" if timing.worse else "in time",
-        {
-            "tick_rate_Hz": f"{timing.tick_rate:.6g}",
-            "ticks": timing.ticks,
-            "ticks_late": timing.ticks_late,
-            "worst_tick_ms": f"{timing.worst_tick * _MILLISECONDS:.3f}",
-            "commands": timing.commands,
-            "commands_late": timing.commands_late,
-            "worst_command_ms": f"{timing.worst_command * _MILLISECONDS:.3f}",
-            "command_age_s": f"{timing.command_age:.6g}",
-        },
-    )
-
-
-MARKER_ARRAY_TYPE = "visualization_msgs/msg/MarkerArray"
 
 _TARGET = "target/odom"
 
@@ -546,72 +364,23 @@ class ClearancePublisher:
 
 
 class LinkMarkers:
-    """Publishes all visuals of a robot and of its target as one marker array in the world frame.
-
-    With poses in the world frame a viewer needs no transforms.
-    """
+    """Publishes all visuals of a robot, of its target and of obstacles as one marker array."""
 
     def __init__(self, node: FlightNode, plant: PlantWithFaults, world_frame: str) -> None:
-        self._plant, self._world_frame = plant, world_frame
+        self._plant, robot = plant, plant.robot.description
+        target = None if plant.capturing is None else plant.capturing.target.description
         self._stream = node.send_raw(MarkerArray, "markers")
-        self._drawn: set[tuple[str, int]] = set()
-        """Namespaces and numbers of all markers so far."""
-        self.use_obstacles(plant.robot.description.world)
+        self._markers = RobotMarkers(robot, target, world_frame)
+        self.use_obstacles = self._markers.use_obstacles
 
     def observe(self, plant: PlantWithFaults) -> None:
         """Draw another plant of the same robot from now on."""
         self._plant = plant
 
-    def use_obstacles(self, world: RobotDescription | None) -> None:
-        """Draw other obstacles from now on; None: none."""
-        plant, world_frame = self._plant, self._world_frame
-        self._poses: list[tuple[int, Pose]] = []
-        markers: list[Marker] = []
-        for index, link in enumerate(plant.robot.description.links):
-            for shape in link.shapes:
-                markers.append(shape_marker(shape, world_frame, link.name, len(markers)))
-                self._poses.append((index, shape.pose))
-        self._of_target: list[Pose] = []
-        """Poses of the visuals of the target in the frame of its root link."""
-        if plant.capturing is not None:
-            target = plant.capturing.target.description
-            for link in target.links:
-                for shape in link.shapes:
-                    markers.append(shape_marker(shape, world_frame, link.name, len(markers)))
-                    self._of_target.append(target.frames[link.name][1] @ shape.pose)
-        if world is not None:
-            for link in world.links:
-                for shape in link.shapes or link.collisions:
-                    marker = shape_marker(shape, world_frame, link.name, len(markers))
-                    at = world.frames[link.name][1] @ shape.pose
-                    set_pose(marker.pose, at.r, quaternion_from_matrix(at.R))
-                    markers.append(marker)
-        present = {(marker.ns, marker.id) for marker in markers}
-        for ns, number in sorted(self._drawn - present):
-            markers.append(Marker(ns=ns, id=number, action=Marker.DELETE))
-        self._drawn |= present
-        self._template = MessageTemplate(
-            MARKER_ARRAY_TYPE, serialize_message(MarkerArray(markers=markers))
-        )
-        self._targets = [
-            self._template.floats(f"markers[{i}].pose.position.x", 7)
-            for i in range(len(self._poses) + len(self._of_target))
-        ]
-        self._placement = LinkPlacement(len(plant.robot.description.links), self._poses)
-
     def publish(self, time_ns: int) -> None:
         """Publish the markers of all visuals at their present poses."""
-        if not self._targets:
-            return
         plant = self._plant
-        count = len(self._poses)
-        self._placement.update(plant.pose, plant.link_R, plant.link_r)
-        for placed, target in zip(self._placement.poses, self._targets[:count], strict=True):
-            target[:] = placed
-        if plant.capturing is not None:
-            of_target = plant.capturing.target_pose
-            at = Pose(matrix_from_quaternion(of_target[3:]), of_target[:3])
-            for pose, target in zip(self._of_target, self._targets[count:], strict=True):
-                shape = at @ pose
-                target[:3], target[3:] = shape.r, quaternion_from_matrix(shape.R)
-        self._stream.take(self._template.serialised(stamp_bytes(time_ns)))
+        target = None if plant.capturing is None else plant.capturing.target_pose
+        message = self._markers.message(time_ns, plant.pose, plant.link_R, plant.link_r, target)
+        if message is not None:
+            self._stream.take(message)

@@ -23,11 +23,11 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64, String
 from std_srvs.srv import SetBool, Trigger
 
-from spacerobot_ros.control.thrusters import ThrusterTable, find_thrusters
 from spacerobot_ros.errors import SpaceRobotError, printable
 from spacerobot_ros.events import Event, EventKind
 from spacerobot_ros.messages.statuses import read_status
 from spacerobot_ros.model.description import DEFAULT_END_EFFECTOR, RobotDescription
+from spacerobot_ros.model.thrusters import ThrusterTable, find_thrusters
 from spacerobot_ros.model.urdf import parse_robot
 from spacerobot_ros.model.world import obstacles_from_topic
 from spacerobot_ros.nodes.common.messages import goal_message, shape_message

@@ -6,7 +6,7 @@ import numpy as np
 from support.random_actions.expectations import SECOND, Goals, Situation, State
 from support.random_actions.setups import Setup
 
-from spacerobot_ros.control.thrusters import find_thrusters
+from spacerobot_ros.model.thrusters import find_thrusters
 from spacerobot_ros.simulation.status import PlantState
 
 

@@ -344,8 +344,9 @@ class PathClearing(Generic[H]):
         return path, held
 
     def _approaches(self, path: Trajectory) -> tuple[list[Approach], H | None]:
-        """Return the pairs that come too near along a path, as held commands if there are any."""
-        if self.hold is None:
-            return self.kept.approaches_of(path), None
+        """Return the pairs that come too near along a path, or else along its held commands."""
+        near = self.kept.approaches_of(path)
+        if near or self.hold is None:
+            return near, None
         held = self.hold(path)
         return self.kept.approaches(held.positions, held.quaternions), held

@@ -152,8 +152,9 @@ _MAX_RATE_EXCESS, _RATE_RESERVE = 1.1, 1.002
 """Largest excess of the base rate of held commands over its bound at which they are made slower, as
 the bound is imposed at the steps of a solution alone, and the factor of that excess."""
 
-_CLEARING_TIME_FACTOR_IN_MOTION = 1.4
-"""As ``_CLEARING_TIME_FACTOR``, in motion, where joints run on farther in long intervals."""
+_CLEARING_TIME_FACTORS_IN_MOTION = (1.4, 2.5)
+"""As ``_CLEARING_TIME_FACTOR``, in motion, one after the other: joints run on farther in long
+intervals, but slow ones need the time."""
 
 _MIN_TICKS_IN_MOTION = 4
 """Control periods that a manoeuvre in motion takes at least."""
@@ -923,38 +924,46 @@ class MotionSearch:
             coarser, boundary.center is not None, TOLERANCE, (), drifting=boundary.drifts
         )
         stop = StopRule(options.iterations, cancellation)
-        candidates: list[Trajectory] = []
-        starts, rejection = 0, _NO_PATH_FOUND
-        guesses = self._guesses(boundary, limits, coarse, motion.remaining)
-        for guess in itertools.islice(guesses, options.starts):
-            starts += 1
-            if options.duration > 0:
-                candidates.append(guess)
-            else:
-                solution = self._find_fastest(coarse, boundary, limits, guess, stop, options)
-                candidates += [] if solution is None else [solution]
-            cancellation.raise_if_requested()
-            if len(candidates) >= options.answers or _durations_agree(candidates):
-                break
         # The remaining motion is short, so a coarse grid is fine enough.
         finer = coarser if options.answers == 1 else intervals
-        for candidate in sorted(candidates, key=lambda each: each.duration)[
-            :_MAX_REFINED_SOLUTIONS_IN_MOTION
-        ]:
-            try:
-                held = self._keep_clear(
-                    finer, boundary, limits, candidate, motion, options, stop, kept
-                )
-                attitudes = quaternion_multiply(quaternion, held.quaternions)
-                self._constraints.check(held.positions, attitudes, self._period)
-            except UnusableCandidateError as reason:
-                rejection = str(reason)
-                continue
-            finally:
+        candidates: list[Trajectory] = []
+        tried: list[float] = []
+        starts, rejection = 0, _NO_PATH_FOUND
+        guesses = itertools.islice(
+            self._guesses(boundary, limits, coarse, motion.remaining), options.starts
+        )
+        while True:
+            for guess in guesses:
+                starts += 1
+                if options.duration > 0:
+                    candidates.append(guess)
+                else:
+                    solution = self._find_fastest(coarse, boundary, limits, guess, stop, options)
+                    candidates += [] if solution is None else [solution]
                 cancellation.raise_if_requested()
-            duration = (len(held.positions) - 1) * self._period
-            durations = [each.duration for each in candidates]
-            return Manoeuvre(held, duration, candidate, starts, durations)
+                if len(candidates) >= options.answers or _durations_agree(candidates) or tried:
+                    break
+            else:
+                if tried or not candidates:
+                    break
+            for candidate in _fastest_others(candidates, tried):
+                tried.append(candidate.duration)
+                try:
+                    held = self._keep_clear(
+                        finer, boundary, limits, candidate, motion, options, stop, kept
+                    )
+                    attitudes = quaternion_multiply(quaternion, held.quaternions)
+                    self._constraints.check(held.positions, attitudes, self._period)
+                except UnusableCandidateError as reason:
+                    rejection = str(reason)
+                    continue
+                finally:
+                    cancellation.raise_if_requested()
+                duration = (len(held.positions) - 1) * self._period
+                durations = [each.duration for each in candidates]
+                return Manoeuvre(held, duration, candidate, starts, durations)
+            if kept is None:
+                break
         raise NotFoundError(
             f"No manoeuvre to the goal that begins in motion was found from {starts} start(s): "
             f"{rejection}."
@@ -1018,12 +1027,20 @@ class MotionSearch:
 
         clearing = PathClearing(kept, limits, solve, self._period, hold)
         if options.duration > 0:
-            path, clear = clearing.clear(path, duration)
-        else:
-            slower = path.stretched(_CLEARING_TIME_FACTOR_IN_MOTION)
+            _, clear = clearing.clear(path, duration)
+            assert clear is not None
+            return clear
+        for factor in _CLEARING_TIME_FACTORS_IN_MOTION:
+            slower = path.stretched(factor)
             lacking = boundary.velocity - slower.velocities[0]
             slower = guesses.with_initial_velocity(slower, lacking, limits)
-            path, clear = clearing.shorten(*clearing.clear(slower, slower.duration))
+            try:
+                _, clear = clearing.shorten(*clearing.clear(slower, slower.duration))
+            except UnusableCandidateError:
+                if factor == _CLEARING_TIME_FACTORS_IN_MOTION[-1]:
+                    raise
+                continue
+            break
         assert clear is not None
         return clear
 
@@ -1138,6 +1155,18 @@ def _build_guesses(
     curvature = robot.function("curvature", compile=False)
     L_0 = boundary.angular_momentum if boundary.drifts else None
     return InitialGuesses(solver.turn, curvature, solver.intervals, L_0)
+
+
+def _fastest_others(found: Sequence[Trajectory], tried: Sequence[float]) -> list[Trajectory]:
+    """Return the fastest trajectories, of those that are the same one, and none of ``tried``
+    durations, s.
+    """
+    chosen: list[Trajectory] = []
+    for each in sorted(found, key=lambda one: one.duration):
+        known = [*tried, *(one.duration for one in chosen)]
+        if all(abs(each.duration - other) > _SAME_COST_TOLERANCE * other for other in known):
+            chosen.append(each)
+    return chosen[:_MAX_REFINED_SOLUTIONS_IN_MOTION]
 
 
 def _durations_agree(found: list[Trajectory]) -> bool:

@@ -19,13 +19,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import casadi as ca
 import numpy as np
 import numpy.typing as npt
 
 from spacerobot_ros.errors import ParameterError, RobotDescriptionError, SpaceRobotError
 from spacerobot_ros.files import load_yaml
-from spacerobot_ros.model.compilation import BufferedFunction, dense_function
 from spacerobot_ros.model.description import Array, Pose, RobotDescription
 from spacerobot_ros.model.rotations import matrix_from_rpy
 
@@ -314,9 +312,6 @@ class ThrusterAllocation:
     :class:`spacerobot_ros.control.ActuatorLimits`. For a wrench outside the cone of the thrusters
     the nearest wrench in the cone is allocated, with torques weighted by the mean lever.
 
-    SIMD lanes have the active-set solver once more in C++ (``batch/thrusters.hpp``), because its
-    steps differ from lane to lane; test/batch holds both to the same random cases.
-
     Parameters
     ----------
     wrenches
@@ -349,13 +344,6 @@ class ThrusterAllocation:
         self._usable = usable
         self._columns = self._matrix[:, usable]
         self._extended = np.vstack([self._columns, COST_WEIGHT * self._cost[usable]])
-
-    @property
-    def problem(self) -> tuple[Array, Array]:
-        """The least-squares problem of a wrench: the matrix (7, m) of the levels, with the cost in
-        the last row, and the weights (6,) of the wrench on the right-hand side.
-        """
-        return self._extended, self._weights
 
     def allocate(self, wanted: Array, most: Array) -> Allocation:
         """Return levels (m,), each within ``most`` (m,), for a wrench ``wanted`` (6,), or for the
@@ -402,11 +390,10 @@ class ThrusterModulator:
 
     Sigma-delta modulation with shortest pulses. ``pending_impulse`` grows by the wanted wrench
     times the period and shrinks by the impulses of the pulses fired. It is allocated anew in every
-    period, so that opposite contributions cancel; :func:`pulse_function` turns the allocated
-    on-times into pulses. The pending impulse is therefore at most one shortest pulse of each
-    thruster: with ``t`` that time and ``h`` the period, ``allocation <= t + h - (remaining part of
-    a shortest pulse)`` holds in every period if the wanted wrench is within the thrust. A wrench
-    beyond the thrust is dropped, not compensated for later.
+    period, so that opposite contributions cancel. The pending impulse is therefore at most one
+    shortest pulse of each thruster: with ``t`` that time and ``h`` the period, ``allocation <= t +
+    h - (remaining part of a shortest pulse)`` holds in every period if the wanted wrench is within
+    the thrust. A wrench beyond the thrust is dropped, not compensated for later.
 
     Within a period a valve opens and closes at any time; a pulse begins with a period.
 
@@ -435,8 +422,10 @@ class ThrusterModulator:
         tie_break = 1.0 + TIE_BREAK * np.sin(np.arange(1.0, count + 1.0) ** 2)
         self.allocation = ThrusterAllocation(self._wrenches, table.mass_flow * tie_break)
         """How wrenches are distributed over the thrusters."""
-        self._pulses = BufferedFunction(pulse_function(count))
-        self._pulses.inputs[3][:], self._pulses.inputs[4][:] = self._shortest, control_period
+        self._remaining = np.zeros(count)
+        """Remaining parts of shortest pulses (m,), s."""
+        self._open = np.zeros(count, dtype=np.bool_)
+        """Whether each thruster (m,) is open between the last period and the next one."""
         self._excluded: list[str] = []
         for name in excluded:
             self.exclude(name)
@@ -477,8 +466,8 @@ class ThrusterModulator:
         """Close all thrusters and drop the pending impulse; the counts go on."""
         self.pending_impulse = np.zeros(6)
         """Impulse (6,) that was wanted and has not been fired yet, N s, N m s."""
-        _, self._remaining, self._open, *_ = self._pulses.inputs
-        self._remaining[:] = self._open[:] = 0.0
+        self._remaining[:] = 0.0
+        self._open[:] = False
         self.unmet[:] = 0.0
         self.begun[:] = False
 
@@ -498,62 +487,27 @@ class ThrusterModulator:
         shares = self.allocation.allocate(wanted, self._shortest + h - self._remaining)
         self.unmet[:] = (wanted - shares.achieved) / h
         self.unmet_periods += bool(np.any(np.abs(self.unmet) > _MIN_UNMET_WRENCH))
-        self._pulses.inputs[0][:] = shares.levels
-        self._pulses.evaluate()
-        on_time, added, remaining, opened, begun = self._pulses.outputs
-        self._remaining[:], self._open[:], self.begun[:] = remaining, opened, begun
+        on_time, added = self._pulses(shares.levels)
         self.pending_impulse = shares.achieved - self._wrenches @ added
         self.pulses += self.begun
         self.on_time += on_time
-        return on_time.copy()
+        return on_time
 
+    def _pulses(self, levels: Array) -> tuple[Array, Array]:
+        """Return the on-times (m,) of a period, and the parts of ``levels`` that pulses take, s.
 
-PULSE_INPUTS = ("levels", "remaining", "open", "shortest", "h")
-"""Arguments of :func:`pulse_function`."""
-
-PULSE_OUTPUTS = ("on_time", "added", "next_remaining", "next_open", "begun")
-"""Results of :func:`pulse_function`."""
-
-
-def pulse_function(count: int) -> ca.Function:
-    """Return the pulses of a control period as a function of numbers or, in lanes, of symbols.
-
-    A closed thruster opens if its level is a whole shortest pulse; an open one stays open as long
-    as it has a level. It takes :data:`PULSE_INPUTS` and gives :data:`PULSE_OUTPUTS`, (count,) each:
-
-    ``levels``
-        Allocated on-times, s.
-    ``remaining``, ``next_remaining``
-        Remaining parts of shortest pulses before and after the period, s.
-    ``open``, ``next_open``
-        Whether each thruster is open at the beginning and at the end of the period.
-    ``shortest``, ``h``
-        Shortest pulses, s, and the control period, a scalar, s.
-    ``on_time``, ``added``
-        On-times in the period, and the parts of ``levels`` that pulses now take, s.
-    ``begun``
-        Whether a pulse begins.
-    """
-    sizes = (count, count, count, count, 1)
-    inputs = [ca.SX.sym(name, size) for name, size in zip(PULSE_INPUTS, sizes, strict=True)]
-    levels, remaining, opened, shortest, h = inputs
-    levels = ca.if_else(levels > _ROUNDING * h, levels, 0.0)
-    whole = ca.logic_and(levels > 0.0, levels >= (1.0 - _ROUNDING) * shortest)
-    begun = ca.logic_and(ca.logic_not(opened), whole)
-    longer = ca.fmin(levels, ca.fmax(h - remaining, 0.0))
-    new = ca.if_else(begun, ca.fmax(ca.fmin(levels, h), shortest), 0.0)
-    added = ca.if_else(opened, longer, new)
-    on_time = ca.fmin(remaining + added, h)
-    rest = remaining + added - on_time
-    results = (
-        on_time,
-        added,
-        ca.if_else(rest <= _ROUNDING * h, 0.0, rest),
-        on_time >= (1.0 - _ROUNDING) * h,
-        begun,
-    )
-    return dense_function(
-        "pulses",
-        dict(zip(PULSE_INPUTS, inputs, strict=True)),
-        dict(zip(PULSE_OUTPUTS, results, strict=True)),
-    )
+        A closed thruster opens if its level is a whole shortest pulse; an open one stays open as
+        long as it has a level.
+        """
+        h, remaining = self._control_period, self._remaining
+        levels = np.where(levels > _ROUNDING * h, levels, 0.0)
+        whole = (levels > 0.0) & (levels >= (1.0 - _ROUNDING) * self._shortest)
+        self.begun[:] = ~self._open & whole
+        longer = np.minimum(levels, np.maximum(h - remaining, 0.0))
+        new = np.where(self.begun, np.maximum(np.minimum(levels, h), self._shortest), 0.0)
+        added = np.where(self._open, longer, new)
+        on_time = np.minimum(remaining + added, h)
+        rest = remaining + added - on_time
+        self._remaining[:] = np.where(rest <= _ROUNDING * h, 0.0, rest)
+        self._open[:] = on_time >= (1.0 - _ROUNDING) * h
+        return on_time, added

@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from spacerobot_ros.errors import ParameterError, PlanningError, SpaceRobotError
-from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.model import SpaceRobot, load_robot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.rotations import quaternion_from_rotvec, quaternion_multiply
 from spacerobot_ros.planning import (
@@ -28,6 +28,8 @@ from spacerobot_ros.planning.core.clearance import Clearance
 from spacerobot_ros.planning.core.goal import Controlled
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.methods.optimal.goal_specification import BaseRotations
+from spacerobot_ros.resources import robot_file
+from spacerobot_ros.scenario import Scenario
 from spacerobot_ros.simulation.plant import InitialState
 from spacerobot_ros.simulation.velocity_plant import VelocityPlant
 
@@ -59,6 +61,27 @@ class PlanningProblem:
     initial: InitialState
     goal: Goal
     config: PlannerConfig
+
+    @classmethod
+    def of(cls, scenario: Scenario) -> PlanningProblem:
+        """Return the planning problem of a scenario, for the goal of its base.
+
+        Raises
+        ------
+        ParameterError
+            The scenario names no robot, or a parameter is refused.
+        GoalError
+            The shape of the goal is of another robot.
+        """
+        plant, planner = scenario.plant, scenario.planner
+        name = planner.robot or plant.robot
+        if not name:
+            raise ParameterError(f"The scenario '{scenario.name}' names no robot; see plant.robot.")
+        described = planner.described(plant.described(load_robot(robot_file(name))))
+        robot = SpaceRobot(described)
+        scenario.require_shape_of(robot)
+        goal = scenario.goal.for_robot(robot.description)
+        return cls(scenario.name, robot, InitialState.of(plant), goal, planner)
 
     @property
     def control_period(self) -> float:
@@ -218,22 +241,6 @@ def fastest(plans: Mapping[str, PlanEvaluation | SpaceRobotError]) -> PlanEvalua
     return min(reached, key=lambda plan: plan.duration, default=None)
 
 
-@dataclass
-class MethodRecord:
-    """Results of a method for random goals.
-
-    ``reached`` and ``missed`` count the flights, ``refused`` has the messages of goals that could
-    not be planned, ``durations`` and ``plan_times`` (s) are those of all flights.
-    """
-
-    method: str
-    reached: int = 0
-    missed: int = 0
-    refused: list[str] = field(default_factory=list)
-    durations: list[float] = field(default_factory=list)
-    plan_times: list[float] = field(default_factory=list)
-
-
 def random_goals(problem: PlanningProblem, count: int, distance: float, angle: float) -> list[Goal]:
     """Return goals within ``distance`` (m) and ``angle`` (rad) of the start, with a fixed seed.
 
@@ -270,8 +277,11 @@ def try_goals(
     goals: Sequence[Goal],
     methods: Sequence[str],
     show: Callable[[str], None] = lambda line: None,
-) -> list[MethodRecord]:
-    """Plan every goal by every method, fly the plans in the plant, and count the results."""
+) -> dict[str, list[PlanEvaluation | PlanningError]]:
+    """Plan every goal by every method, and return the results by method, in the order of the goals.
+
+    ``show`` takes a line about each.
+    """
     tight = replace(
         problem.config,
         position_tolerance=_RANDOM_GOAL_TOLERANCE,
@@ -280,21 +290,18 @@ def try_goals(
     )
     problem = replace(problem, config=tight)
     built = {name: problem.method(name) for name in methods}
-    records = [MethodRecord(name) for name in methods]
+    results: dict[str, list[PlanEvaluation | PlanningError]] = {name: [] for name in methods}
     for number, goal in enumerate(goals, 1):
-        for record in records:
+        for name, found in results.items():
             try:
-                trial = try_method(replace(problem, goal=goal), record.method, built[record.method])
+                trial = try_method(replace(problem, goal=goal), name, built[name])
             except PlanningError as refusal:
-                record.refused.append(str(refusal))
-                show(f"goal {number}, {record.method}: {refusal}")
+                found.append(refusal)
+                show(f"goal {number}, {name}: {refusal}")
                 continue
-            record.reached += trial.reached
-            record.missed += not trial.reached
-            record.durations.append(trial.duration)
-            record.plan_times.append(trial.plan_time)
+            found.append(trial)
             show(
-                f"goal {number}, {record.method}: {trial.duration:.6g} s, "
+                f"goal {number}, {name}: {trial.duration:.6g} s, "
                 f"{trial.error.angle:.2g} rad and {trial.error.distance:.2g} m off"
             )
-    return records
+    return results

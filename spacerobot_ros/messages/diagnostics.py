@@ -1,0 +1,285 @@
+"""Diagnostics of a plant and of its commanders: the records of diagnostic_msgs/DiagnosticArray."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from spacerobot_ros.messages.layout import encode
+from spacerobot_ros.messages.statuses import StatusRecord
+from spacerobot_ros.simulation.actuators import PlantWithFaults, ThrusterPlant, thrusters_in
+from spacerobot_ros.simulation.commands import CommandSource, CommandValidator, Refusal
+from spacerobot_ros.simulation.time_modes import RealTime
+from spacerobot_ros.times import LATEST_NS
+
+PROPELLANT_KEY = "propellant_kg"
+"""Key of the propellant used."""
+
+_MOMENTUM_ROUNDING = 1e-9
+"""Largest momentum change by rounding, divided by the mass, m/s and m^2/s."""
+
+_MILLISECONDS = 1e3
+
+_OK, _WARN, _ERROR = 0, 1, 2
+
+
+def diagnostic_name(node: str, part: str) -> str:
+    """Return the name of a part of a node in /diagnostics, as diagnostic_updater forms it.
+
+    Aggregators match the beginning of names, and make folders of them: no slash comes first.
+    """
+    return f"{node.removeprefix('/')}: {part}"
+
+
+def encode_diagnostics(records: Sequence[StatusRecord], time_ns: int) -> bytes:
+    """Return records of one time as a serialised DiagnosticArray."""
+    status = [record.fields for record in records]
+    return encode(
+        "diagnostic_msgs/msg/DiagnosticArray",
+        {"header": {"stamp": min(time_ns, LATEST_NS)}, "status": status},
+    )
+
+
+def state_diagnostics(
+    node: str,
+    robot: str,
+    ignored: Mapping[str, object],
+    last: StatusRecord | None,
+    *,
+    warning: str = "",
+    missing: str = "",
+) -> list[StatusRecord]:
+    """Return the diagnostics of a commander: how it answers states, and the state of its goal.
+
+    Parameters
+    ----------
+    node, robot
+        Full name of the node, and name of its robot.
+    ignored
+        Numbers of ignored states, or parts of states, by key.
+    last
+        The status that was published last; None: none was.
+    warning
+        A warning, which is published instead of the status; empty: none.
+    missing
+        What the commander waits for, as a clause; empty: nothing.
+    """
+    level = _WARN if warning or missing else _OK
+    message = warning or (f"waiting for {missing}" if missing else "states are answered")
+    records = [_record(diagnostic_name(node, "states"), level, message, ignored, robot)]
+    if last is not None and not warning:
+        name = diagnostic_name(node, "goal")
+        records.append(_record(name, last.level, last.message, last.values, robot))
+    return records
+
+
+def _record(
+    name: str, level: int, message: str, values: Mapping[str, object], robot: str
+) -> StatusRecord:
+    texts = {key: str(value) for key, value in values.items()}
+    return StatusRecord(name, level, message, texts, robot)
+
+
+class PlantDiagnostics:
+    """The diagnostics of one plant.
+
+    A level is a warning when its counters have moved since the last diagnostics.
+
+    Parameters
+    ----------
+    node
+        Full name of the plant's node.
+    plant, commands
+        Sources of the diagnostics.
+    real_time
+        Clock of a plant in real time; None in lockstep.
+    """
+
+    def __init__(
+        self,
+        node: str,
+        plant: PlantWithFaults,
+        commands: CommandValidator,
+        real_time: RealTime | None = None,
+    ) -> None:
+        self._node, self._real_time = node, real_time
+        self.observe(commands, plant)
+        self.command_timeouts = 0
+        """How often commands have ceased, counted by the owner."""
+        self._last_refusal = ""
+        self._reported = self._counters()
+        self._unmet_reported = 0
+
+    def observe(self, commands: CommandValidator, plant: PlantWithFaults) -> None:
+        """Report on these from now on."""
+        self._commands, self._plant, self._thrusters = commands, plant, thrusters_in(plant)
+
+    def note_refusal(self, source: CommandSource, refusal: Refusal) -> str:
+        """Take note of a refused command, which its validator has counted; return a sentence."""
+        self._last_refusal = f"A command on '{source.topic}' was refused: {refusal.clause}."
+        return self._last_refusal
+
+    def records(self) -> list[StatusRecord]:
+        """Return the present diagnostics."""
+        before, self._reported = self._reported, self._counters()
+        refused, limited = (now != then for now, then in zip(self._reported, before, strict=True))
+        found = [
+            self._of_commands(refused=refused),
+            self._of_actuators(limited=limited),
+            self._of_strokes(),
+            self._of_momentum(),
+            self._of_faults(),
+        ]
+        if self._thrusters is not None:
+            found.append(self.of_thrusters(self._thrusters))
+        if self._real_time is not None:
+            found.append(
+                timing_record(self._node, self._plant.robot.description.name, self._real_time)
+            )
+        return found
+
+    def _record(
+        self, part: str, level: int, message: str, values: Mapping[str, object]
+    ) -> StatusRecord:
+        name, robot = diagnostic_name(self._node, part), self._plant.robot.description.name
+        return _record(name, level, message, values, robot)
+
+    @property
+    def _ticks_lost(self) -> int:
+        return self._real_time.ticks_lost if self._real_time is not None else 0
+
+    def _counters(self) -> tuple[tuple[int, ...], tuple[int, ...]]:
+        """Return the counters that determine the levels of command and actuator diagnostics."""
+        limits = self._plant.limit_counts.values()
+        return (
+            (self._commands.counts.total(), self.command_timeouts, self._ticks_lost),
+            tuple(int(n) for counts in limits for n in counts),
+        )
+
+    def _of_commands(self, *, refused: bool) -> StatusRecord:
+        commands = self._commands
+        level, message = _WARN if refused else _OK, "commands arrive"
+        if not commands.in_force:
+            message = "no command is in force"
+        if commands.fault:
+            level = _ERROR
+            message = f"Nothing moves until '~/rearm' is called: {commands.fault}."
+        elif refused and self._last_refusal:
+            message = self._last_refusal
+        return self._record(
+            "commands",
+            level,
+            message,
+            {
+                "refused": commands.counts.total(),
+                **{f"refused.{reason.value}": n for reason, n in commands.counts.items()},
+                "latched_fault": commands.fault,
+                "timeouts": self.command_timeouts,
+                "deadlines_missed": self._ticks_lost,
+            },
+        )
+
+    def _of_actuators(self, *, limited: bool) -> StatusRecord:
+        return self._record(
+            "actuators",
+            _WARN if limited else _OK,
+            "limits of the URDF hold joints back" if limited else "within limits",
+            {
+                f"{what}_limited.{joint}": count
+                for what, counts in self._plant.limit_counts.items()
+                for joint, count in zip(self._plant.robot.joint_names, counts, strict=True)
+            },
+        )
+
+    def _of_strokes(self) -> StatusRecord:
+        robot, q = self._plant.robot, self._plant.q
+        margins = np.minimum(q - robot.lower, robot.upper - q)
+        return self._record(
+            "strokes",
+            _OK,
+            "how far each joint is from the nearer of its limits, m or rad",
+            {
+                joint: f"{margin:.6g}"
+                for joint, margin in zip(robot.joint_names, margins, strict=True)
+            },
+        )
+
+    def _of_momentum(self) -> StatusRecord:
+        plant = self._plant
+        change = plant.momentum[:6] - plant.expected_momenta
+        linear, angular = np.linalg.norm(change[:3]), np.linalg.norm(change[3:])
+        # The threshold exceeds rounding errors of bodies that move at up to 1 m/s.
+        leaks = max(linear, angular) > _MOMENTUM_ROUNDING * plant.robot.total_mass
+        return self._record(
+            "momentum",
+            _ERROR if leaks else _OK,
+            "momentum changes that no thruster accounts for"
+            if leaks
+            else "momentum is accounted for",
+            {
+                "linear_change": f"{linear:.3e}",
+                "angular_change": f"{angular:.3e}",
+                "kinetic_energy_J": f"{plant.momentum[6]:.6e}",
+            },
+        )
+
+    def _of_faults(self) -> StatusRecord:
+        active = [str(each) for each in self._plant.injected]
+        faults, disturbances = (
+            [str(each) for each in given]
+            for given in (self._plant.active, self._plant.disturbances)
+        )
+        return self._record(
+            "faults",
+            _WARN if active else _OK,
+            f"injected: {'; '.join(active)}" if active else "no fault is injected",
+            {f"fault_{i}": fault for i, fault in enumerate(faults, 1)}
+            | {f"disturbance_{i}": each for i, each in enumerate(disturbances, 1)},
+        )
+
+    def of_thrusters(self, thrusters: ThrusterPlant) -> StatusRecord:
+        """Return propellant, pulses and unmet wrenches; a warning for new unmet wrenches."""
+        unmet = thrusters.unmet_ticks > self._unmet_reported
+        self._unmet_reported = thrusters.unmet_ticks
+        sentences = [f"they cannot give {thrusters.missing}"] if thrusters.missing else []
+        if unmet:
+            sentences.append("the wanted wrench is beyond them")
+        force, torque = np.linalg.norm(thrusters.unmet[:3]), np.linalg.norm(thrusters.unmet[3:])
+        return self._record(
+            "thrusters",
+            _WARN if sentences else _OK,
+            "; ".join(sentences) or "the wanted wrench is given",
+            {
+                PROPELLANT_KEY: f"{thrusters.propellant:.9g}",
+                "pulses": int(thrusters.pulses.sum()),
+                "unmet_ticks": thrusters.unmet_ticks,
+                "unmet_force_N": f"{force:.6g}",
+                "unmet_torque_Nm": f"{torque:.6g}",
+                **{
+                    f"pulses.{name}": count
+                    for name, count in zip(thrusters.table.names, thrusters.pulses, strict=True)
+                },
+            },
+        )
+
+
+def timing_record(node: str, robot: str, real_time: RealTime) -> StatusRecord:
+    """Return the delays of a plant's ticks and of its commander's answers."""
+    timing = real_time.report()
+    return _record(
+        diagnostic_name(node, "timing"),
+        _WARN if timing.worse else _OK,
+        "deadlines were missed" if timing.worse else "in time",
+        {
+            "tick_rate_Hz": f"{timing.tick_rate:.6g}",
+            "ticks": timing.ticks,
+            "ticks_late": timing.ticks_late,
+            "worst_tick_ms": f"{timing.worst_tick * _MILLISECONDS:.3f}",
+            "commands": timing.commands,
+            "commands_late": timing.commands_late,
+            "worst_command_ms": f"{timing.worst_command * _MILLISECONDS:.3f}",
+            "command_age_s": f"{timing.command_age:.6g}",
+        },
+        robot,
+    )

@@ -1,0 +1,308 @@
+"""MuJoCo's model of a robot with obstacles and a target, and external loads on its bodies."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+
+from spacerobot_ros.collision import CollisionGeometry, Solid
+from spacerobot_ros.collision.geometry import solids_of
+from spacerobot_ros.errors import RobotDescriptionError
+from spacerobot_ros.lazy import optional_module
+from spacerobot_ros.model.description import Array, Inertia, RobotDescription
+from spacerobot_ros.model.external_loads import LoadLayout
+from spacerobot_ros.model.rotations import cross, matrix_from_quaternion, quaternion_from_matrix
+
+TARGET = "target/"
+"""Before the names of the target's bodies and shapes."""
+
+_OBSTACLE = "obstacle/"
+"""Before the names of the shapes of obstacles."""
+
+_CONTACT_TIME_CONSTANT = 2.0
+"""Time constant of contacts, stops and welds, in steps: the least that MuJoCo recommends."""
+
+_MIN_INERTIA = 1e-12
+"""Smallest principal inertia, kg m^2: MuJoCo takes no point masses."""
+
+
+def import_mujoco() -> Any:
+    """Return the module of MuJoCo; see :func:`.optional_module`."""
+    return optional_module("mujoco", "mujoco", "Flights in MuJoCo need")
+
+
+def robot_spec(mujoco: Any, description: RobotDescription) -> Any:
+    """Return MuJoCo's specification of a robot whose base is free; its shapes are left out.
+
+    Raises
+    ------
+    RobotDescriptionError
+        MuJoCo refuses the robot, or a joint follows another one.
+    """
+    if description.has_mimic_joints:
+        raise RobotDescriptionError(
+            f"Robot '{description.name}' has joints that follow others (<mimic>), which MuJoCo "
+            "does not read from a URDF."
+        )
+    root = ElementTree.fromstring(description.urdf)
+    for link in root.iter("link"):
+        for shape in [*link.findall("visual"), *link.findall("collision")]:
+            link.remove(shape)  # MuJoCo would look for the files of meshes.
+    try:
+        spec = mujoco.MjSpec.from_string(ElementTree.tostring(root, encoding="unicode"))
+    except ValueError as error:
+        raise _refused(description, error) from error
+    spec.compiler.boundinertia = _MIN_INERTIA
+    spec.compiler.fusestatic = False  # Loads act on links without mass, too.
+    spec.worldbody.first_body().add_freejoint()
+    return spec
+
+
+def _add_motors(mujoco: Any, spec: Any, description: RobotDescription) -> None:
+    """Add actuators to a specification: six for the wrench on the base in B, one for each joint."""
+    # The wrench turns with the base, at every stage of every step.
+    spec.worldbody.first_body().add_site(name="wrench")
+    for axis in np.eye(6):
+        spec.add_actuator(trntype=mujoco.mjtTrn.mjTRN_SITE, target="wrench", gear=axis.tolist())
+    for name in description.joint_names:
+        spec.add_actuator(trntype=mujoco.mjtTrn.mjTRN_JOINT, target=name)
+
+
+def joint_addresses(model: Any, description: RobotDescription) -> tuple[list[int], list[int]]:
+    """Return the indices of the joints, by the order of the robot, in ``qpos`` and in ``qvel``."""
+    joints = [model.joint(name) for name in description.joint_names]
+    return [int(each.qposadr[0]) for each in joints], [int(each.dofadr[0]) for each in joints]
+
+
+def _refused(description: RobotDescription, error: ValueError) -> RobotDescriptionError:
+    reason = str(error).removesuffix(".")
+    return RobotDescriptionError(f"MuJoCo refuses robot '{description.name}': {reason}.")
+
+
+def build_model(
+    mujoco: Any,
+    robot: RobotDescription,
+    target: tuple[RobotDescription, str] | None,
+    step: float,
+    *,
+    contacts: bool = True,
+) -> tuple[Any, list[str]]:
+    """Return MuJoCo's model of robot, obstacles and target, and the names of the target's shapes.
+
+    Parameters
+    ----------
+    mujoco
+        The module.
+    robot
+        The robot.
+    target
+        The target, and the link that captures it; None: there is none.
+    step
+        Step of its Runge-Kutta 4, s.
+    contacts
+        Whether bodies push each other, joints stop, and the masses are those of the description,
+        which may differ from the URDF; else the robot is in free motion, as MuJoCo reads the URDF.
+
+    Raises
+    ------
+    RobotDescriptionError
+        MuJoCo refuses the robot, or a joint follows another one.
+    """
+    spec, shapes = robot_spec(mujoco, robot), list[str]()
+    _add_motors(mujoco, spec, robot)
+    for name in robot.joint_names:
+        spec.add_equality(
+            name=f"lock {name}",
+            type=mujoco.mjtEq.mjEQ_JOINT,
+            objtype=mujoco.mjtObj.mjOBJ_JOINT,
+            name1=name,
+            active=False,
+        )
+    if contacts:
+        _set_masses(spec, robot)
+        shapes = _add_contacts(mujoco, spec, robot, target)
+    try:
+        model = spec.compile()
+    except ValueError as error:
+        raise _refused(robot, error) from error
+    _set_options(mujoco, model, step)
+    if not contacts:
+        model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
+    return model, shapes
+
+
+def _add_contacts(
+    mujoco: Any,
+    spec: Any,
+    robot: RobotDescription,
+    target: tuple[RobotDescription, str] | None,
+) -> list[str]:
+    """Add shapes and the target; return the names of the target's shapes."""
+    geometry = CollisionGeometry(robot)
+    names = [
+        _add_shape(mujoco, spec, solid, f"{_OBSTACLE if solid.is_obstacle else ''}{index}")
+        for index, solid in enumerate(geometry.solids)
+    ]
+    pairs = [(names[i], names[j]) for i, j in geometry.pairs]
+    shapes: list[str] = []
+    if target is not None:
+        body, link = target
+        _add_target(mujoco, spec, body)
+        solids, _ = solids_of(body)
+        shapes = [
+            _add_shape(mujoco, spec, solid, f"{TARGET}{index}", TARGET)
+            for index, solid in enumerate(solids)
+        ]
+        hand = robot.frames[link][0]
+        for name, solid in zip(names, geometry.solids, strict=True):
+            if solid.body != hand:
+                pairs += [(name, shape) for shape in shapes]
+            else:
+                # Not by pairs, which could not be switched off while the hand holds the target.
+                spec.geom(name).contype = 1
+        for shape in shapes:
+            spec.geom(shape).conaffinity = 1
+        grasp = spec.add_equality(
+            name="grasp",
+            type=mujoco.mjtEq.mjEQ_WELD,
+            objtype=mujoco.mjtObj.mjOBJ_BODY,
+            name1=link,
+            name2=f"{TARGET}{body.base_link}",
+            active=False,
+        )
+        grasp.data[10] = 1.0  # Torque counts as much as force.
+    for first, second in pairs:
+        spec.add_pair(geomname1=first, geomname2=second)
+    return shapes
+
+
+def _set_masses(spec: Any, robot: RobotDescription) -> None:
+    """Give each rigid body the mass properties of the description, which may not be its URDF's."""
+    bodies = {body.name: body.inertia for body in robot.bodies}
+    for link in robot.links:
+        body, inertia = spec.body(link.name), bodies.get(link.name)
+        body.explicitinertial = True
+        body.mass = 0.0 if inertia is None else inertia.mass
+        if inertia is not None:
+            _set_inertia(body, inertia)
+
+
+def _set_inertia(body: Any, inertia: Inertia) -> None:
+    moments, axes = np.linalg.eigh(inertia.about_com)
+    axes = axes * np.linalg.det(axes)
+    body.mass, body.ipos = inertia.mass, inertia.com
+    body.fullinertia = np.full(6, np.nan)  # Not given.
+    body.inertia, body.iquat = moments, np.roll(quaternion_from_matrix(axes), 1)
+
+
+def _add_target(mujoco: Any, spec: Any, target: RobotDescription) -> None:
+    body = spec.worldbody.add_body(name=f"{TARGET}{target.base_link}")
+    joint = body.add_freejoint()
+    joint.name = f"{TARGET}free"
+    body.explicitinertial = True
+    _set_inertia(body, target.bodies[0].inertia)
+    for name, (_, pose) in target.frames.items():
+        if name != target.base_link:
+            body.add_body(
+                name=f"{TARGET}{name}",
+                pos=pose.r,
+                quat=np.roll(quaternion_from_matrix(pose.R), 1),
+            )
+
+
+def _add_shape(mujoco: Any, spec: Any, solid: Solid, name: str, prefix: str = "") -> str:
+    """Add a solid to its body, without mass, and return the name of its geometry."""
+    body = spec.worldbody if solid.is_obstacle else spec.body(f"{prefix}{solid.link}")
+    kinds, size = mujoco.mjtGeom, solid.shape.size
+    # Pairs that push are named one by one.
+    about: dict[str, Any] = {"name": name, "mass": 0.0, "contype": 0, "conaffinity": 0}
+    if solid.vertices is not None:
+        spec.add_mesh(name=name, uservert=solid.vertices.ravel().tolist())
+        body.add_geom(type=kinds.mjGEOM_MESH, meshname=name, **about)
+        return name
+    kind, numbers = {
+        "box": (kinds.mjGEOM_BOX, [length / 2 for length in size]),
+        "sphere": (kinds.mjGEOM_SPHERE, [size[0], 0.0, 0.0]),
+        "cylinder": (kinds.mjGEOM_CYLINDER, [size[0], size[-1] / 2, 0.0]),
+        "capsule": (kinds.mjGEOM_CAPSULE, [size[0], size[-1] / 2, 0.0]),
+    }[solid.shape.kind]
+    pose = solid.shape.pose
+    body.add_geom(
+        type=kind,
+        size=numbers,
+        pos=pose.r,
+        quat=np.roll(quaternion_from_matrix(pose.R), 1),
+        **about,
+    )
+    return name
+
+
+def _set_options(mujoco: Any, model: Any, step: float) -> None:
+    """Have a model integrate by Runge-Kutta 4 with steps of ``step`` s, with contacts alone."""
+    for flag in ("GRAVITY", "SENSOR", "SPRING", "DAMPER", "FRICTIONLOSS", "ISLAND", "AUTORESET"):
+        model.opt.disableflags |= int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{flag}"))
+    model.opt.integrator = mujoco.mjtIntegrator.mjINT_RK4
+    model.opt.timestep = step
+    # The plant clips efforts itself; servos exceed the limits where commanded rates jump.
+    model.jnt_actfrclimited[:] = 0
+    stiff = [_CONTACT_TIME_CONSTANT * step, 1.0]
+    for soft in (model.eq_solref, model.jnt_solref, model.pair_solref):
+        soft[:] = stiff
+
+
+class MujocoLoads:
+    """External loads on the bodies of a robot in MuJoCo, by :mod:`.model.external_loads`.
+
+    Parameters
+    ----------
+    mujoco
+        The module.
+    model, data
+        MuJoCo's model and state.
+    links
+        Names of the robot's links.
+    """
+
+    def __init__(self, mujoco: Any, model: Any, data: Any, links: Sequence[str]) -> None:
+        self._mujoco, self._model, self._data = mujoco, model, data
+        self._layout = LoadLayout(len(links))
+        self.bodies = np.array([model.body(name).id for name in links])
+        """Indices of the links' bodies."""
+
+    def apply(self, vector: Array, time: float) -> None:
+        """Apply the loads of a vector at a time, s, to all bodies where they are and as they move.
+
+        Poses and velocities of the bodies must belong to MuJoCo's present state.
+        """
+        model, data, layout = self._model, self._data, self._layout
+        in_link = vector[layout.in_link].reshape(-1, 6)
+        in_world = vector[layout.in_world].reshape(-1, 6)
+        (n,), (friction,) = vector[layout.mean_motion], vector[layout.friction]
+        R_WO, gravity_W = matrix_from_quaternion(vector[layout.quaternion_WO]), layout.gravity_W
+        outward = R_WO @ np.array([math.cos(n * time), math.sin(n * time), 0.0])
+        velocity = np.zeros(6)
+        for row, body in enumerate(self.bodies):
+            r, m = data.xipos[body], model.body_mass[body]
+            R, axes = data.xmat[body].reshape(3, 3), data.ximat[body].reshape(3, 3)
+            inertia = (axes * model.body_inertia[body]) @ axes.T
+            self._mujoco.mj_objectVelocity(
+                model, data, self._mujoco.mjtObj.mjOBJ_BODY, body, velocity, 0
+            )
+            force = R @ in_link[row, :3] + in_world[row, :3]
+            torque = R @ in_link[row, 3:] + in_world[row, 3:]
+            torque = torque + cross(data.xpos[body] - r, force)
+            force = force + m * (vector[gravity_W] + n**2 * (3 * outward * (outward @ r) - r))
+            force -= friction * m * velocity[3:]
+            torque += 3 * n**2 * cross(outward, inertia @ outward)
+            torque -= friction * (inertia @ velocity[:3])
+            data.xfrc_applied[body] = np.concatenate([force, torque])
+
+    def momentum_rates(self, center: Array) -> Array:
+        """Return force over moment (6,) about a centre (3,) of the loads last applied, in W."""
+        F, T = self._data.xfrc_applied[self.bodies].T.reshape(2, 3, -1)
+        arms = self._data.xipos[self.bodies] - center
+        return np.append(F.sum(axis=1), T.sum(axis=1) + cross(arms, F.T).sum(axis=0))

@@ -1,0 +1,171 @@
+"""Nodes of this package, and your own, in one executor: for a pytest of your own."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
+from typing import Any, NamedTuple
+
+import numpy.typing as npt
+import rclpy
+from rclpy.clock import Clock, ClockType
+from rclpy.experimental import EventsExecutor
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+
+from spacerobot_ros.errors import SpaceRobotError
+from spacerobot_ros.measures import Outcome
+from spacerobot_ros.nodes import NODE_TYPES, FlightNode
+from spacerobot_ros.nodes.common.process import free_domain, use_loopback_discovery
+from spacerobot_ros.nodes.common.streams import MatchedEndpoints, topics_without_all_matches
+from spacerobot_ros.planning import Goal
+from spacerobot_ros.scenario import scenario_or_robot
+from spacerobot_ros.session.mission_client import MissionClient
+
+__all__ = ["Arrival", "Stack"]
+
+
+class Arrival(NamedTuple):
+    """The end of a goal: its outcome, and the commander's sentence about it."""
+
+    outcome: Outcome
+    message: str
+
+    @property
+    def reached(self) -> bool:
+        """Whether the goal was reached within tolerance."""
+        return self.outcome is Outcome.REACHED
+
+
+class Stack:
+    """Nodes in one executor, in lockstep, in a ROS domain of their own; a context manager.
+
+    The plant begins with the first goal, when all nodes have met. Time goes on while nodes spin.
+
+    Parameters
+    ----------
+    robot
+        Robot or scenario (a name or a file) whose parameters the nodes have.
+    nodes
+        Names of nodes of this package, and functions or classes that return a node of your own in
+        the rclpy context that they are given.
+    parameters
+        Further parameters by node: ``{"planner": {"method": "lie_bracket"}}``.
+    timeout
+        Longest wall time of a wait, s.
+
+    Attributes
+    ----------
+    nodes
+        The nodes by their names; ``executor``, ``context`` and ``domain`` are those of all.
+    """
+
+    def __init__(
+        self,
+        robot: str,
+        nodes: Sequence[str | Callable[[rclpy.Context], Node]] = ("plant", "planner"),
+        parameters: Mapping[str, Mapping[str, Any]] = {},
+        timeout: float = 60.0,
+    ) -> None:
+        scenario = scenario_or_robot(robot).with_overrides("plant", {"time_mode": "lockstep"})
+        for name, values in parameters.items():
+            scenario = scenario.with_overrides(name, values)
+        self._world, self._timeout, self._sent = scenario.plant.world_frame, timeout, 0
+        self.nodes: dict[str, Node] = {}
+        with ExitStack() as closing:
+            self.domain = closing.enter_context(free_domain())
+            use_loopback_discovery()
+            self.context = rclpy.Context()
+            rclpy.init(args=[], context=self.context, domain_id=self.domain)
+            closing.callback(rclpy.try_shutdown, context=self.context)
+            self.executor = EventsExecutor(context=self.context)
+            closing.callback(self.executor.shutdown)
+            for each in nodes:
+                if isinstance(each, str):
+                    own = scenario.parameters(each)
+                    given = [Parameter(key, value=value) for key, value in own.items()]
+                    options = {"parameter_overrides": given, "context": self.context}
+                    node: Node = NODE_TYPES[each](each, autostart=False, **options)
+                else:
+                    node = each(self.context)
+                closing.callback(node.destroy_node)
+                self.nodes[node.get_name()] = node
+                self.executor.add_node(node)
+            for node in self._flight_nodes:
+                node.require_transition(node.trigger_configure)
+            self.close = closing.pop_all().close
+
+    def __enter__(self) -> Stack:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+    def fly_to(
+        self,
+        goal: Goal | None = None,
+        *,
+        x: float = 0.0,
+        y: float = 0.0,
+        z: float = 0.0,
+        rotvec: npt.ArrayLike = (0.0, 0.0, 0.0),
+    ) -> Arrival:
+        """Send a goal and spin until the planner, or else the controller, has decided it.
+
+        ``goal`` is any goal; None: the base at ``x``, ``y``, ``z`` (m), turned by ``rotvec`` (rad).
+        Raises :class:`.SpaceRobotError` if a node fails, or time is up.
+        """
+        goal = Goal.from_rotvec([x, y, z], rotvec) if goal is None else goal
+        controls = "coordinated_control" in self.nodes and "planner" not in self.nodes
+        self._sent += 1
+        client = MissionClient(
+            "coordinated_control" if controls else "planner",
+            self._world,
+            lambda: getattr(self.nodes.get("plant"), "time_ns", 0) + self._sent,
+            end_effectors=[each.link for each in goal.end_effectors],
+            paths=goal.links_with_paths,
+            name=f"mission_client_{self._sent}",
+            context=self.context,
+        )
+        self.executor.add_node(client.node)
+        everyone = [*self.nodes.values(), client.node]
+        try:
+            self.spin_until(
+                lambda: not topics_without_all_matches(map(MatchedEndpoints.of, everyone))
+            )
+            # Messages that a callback publishes are delivered in their order: the goal comes first.
+            clock = Clock(clock_type=ClockType.STEADY_TIME)
+            timer = client.node.create_timer(1e-3, lambda: self._launch(client, goal), clock=clock)
+            self.spin_until(lambda: client.goal_id is not None)
+            client.node.destroy_timer(timer)
+            self.spin_until(lambda: client.outcome is not None)
+            return Arrival(client.outcome or Outcome.INTERRUPTED, client.message)
+        finally:
+            self.executor.remove_node(client.node)
+            client.node.destroy_node()
+
+    def _launch(self, client: MissionClient, goal: Goal) -> None:
+        """Send a goal, once; nodes that are not active are activated, the plant after the goal."""
+        asleep = [node for node in self._flight_nodes if not node.is_active]
+        for node in sorted(asleep, key=lambda node: node.get_name() == "plant"):
+            if node.get_name() == "plant":
+                client.send(goal)
+            node.require_transition(node.trigger_activate)
+        if client.goal_id is None:
+            client.send(goal)
+
+    def spin_until(self, condition: Callable[[], bool]) -> None:
+        """Spin until a condition is true; raises SpaceRobotError if a node fails or time is up."""
+        end = time.monotonic() + self._timeout
+        while not condition():
+            for node in self._flight_nodes:
+                if node.fault is not None:
+                    raise node.fault
+            if time.monotonic() > end:
+                raise SpaceRobotError(f"This took more than {self._timeout:g} s of wall time.")
+            self.executor.spin_once(timeout_sec=0.05)
+
+    @property
+    def _flight_nodes(self) -> list[FlightNode]:
+        return [node for node in self.nodes.values() if isinstance(node, FlightNode)]

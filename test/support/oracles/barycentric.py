@@ -1,0 +1,138 @@
+"""Inertia and dynamics by the barycentric vectors of paper 4, eqs (1) to (3) and (14) to (21).
+
+The paper writes barycentric vectors for a chain of revolute joints. Here they stand for any tree:
+the vector from the mass centre of body i to its joint *towards body k* takes the place of the
+paper's ``r_i`` (k outboard) and ``l_i`` (k inboard). A prismatic joint makes that vector grow along
+its axis, which adds the slide terms below; without prismatic joints they vanish and the paper's
+formulas remain.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import casadi as ca
+
+from spacerobot_ros.model.composite_rigid_body import inertia_matrix
+from spacerobot_ros.model.dynamics import bias, point_jacobian, solve_positive_definite
+from spacerobot_ros.model.kinematics import TreeKinematics
+
+
+@dataclass(frozen=True)
+class BarycentricInertia:
+    """Blocks of ``H+`` (eq. 15) in base components.
+
+    ``D`` (3, 3) system inertia about the system's centre of mass, ``D_q`` (3, n), ``D_qq``
+    (n, n); ``v[i][k]`` are the barycentric vectors, each (3,).
+    """
+
+    mass: float | ca.SX
+    D: ca.SX
+    D_q: ca.SX
+    D_qq: ca.SX
+    v: tuple[tuple[ca.SX, ...], ...]
+
+    @property
+    def H_plus(self) -> ca.SX:
+        """The inertia matrix (6 + n, 6 + n) of ``[v_cm; omega; qdot]``, eq. (15)."""
+        return inertia_matrix(self.mass, self.D, self.D_q, self.D_qq)
+
+
+def barycentric_vectors(kin: TreeKinematics) -> tuple[tuple[ca.SX, ...], ...]:
+    """Return ``v[i][k]``, eqs (3a) and (3b): ``rho_k = sum_i v[i][k]`` is the mass centre of body k
+    from that of the system, base components.
+    """
+    bodies = range(kin.moving_body_count + 1)
+    M = kin.total_mass
+    outboard = [set(kin.outboard(k)) for k in bodies]
+    # towards[i][j]: vector from the mass centre of i to its joint with neighbour j, and the mass
+    # beyond that joint.
+    towards: list[dict[int, tuple[ca.SX, float | ca.SX]]] = [{} for _ in bodies]
+    for k in bodies[1:]:
+        i = kin.parent(k)
+        beyond = sum(kin.mass(b) for b in outboard[k])
+        towards[i][k] = (kin.p[k] - kin.com[i], beyond)
+        towards[k][i] = (kin.p[k] - kin.com[k], M - beyond)
+    c = [sum((d * (m / M) for d, m in towards[i].values()), ca.SX(3, 1)) for i in bodies]
+
+    def next_body(i: int, k: int) -> int:
+        if k not in outboard[i]:
+            return kin.parent(i)
+        return next(j for j in towards[i] if j != kin.parent(i) and k in outboard[j])
+
+    return tuple(
+        tuple(-c[i] if i == k else towards[i][next_body(i, k)][0] - c[i] for k in bodies)
+        for i in bodies
+    )
+
+
+def barycentric_inertia(kin: TreeKinematics) -> BarycentricInertia:
+    """Return the blocks of ``H+`` (eqs 14-17), with the slide terms of prismatic joints."""
+    n, M = kin.moving_body_count, kin.total_mass
+    bodies = range(n + 1)
+    v = barycentric_vectors(kin)
+    one = ca.SX.eye(3)
+
+    # Eq. (17): D_ij couples the rotations of bodies i and j.
+    D_ij: dict[tuple[int, int], ca.SX] = {}
+    for i in bodies:
+        D_ii = kin.inertia[i]
+        for k in bodies:
+            D_ii = D_ii + kin.mass(k) * (ca.dot(v[i][k], v[i][k]) * one - v[i][k] @ v[i][k].T)
+        D_ij[i, i] = D_ii
+        for j in range(i):
+            D_ij[i, j] = -M * (ca.dot(v[j][i], v[i][j]) * one - v[j][i] @ v[i][j].T)
+            D_ij[j, i] = D_ij[i, j].T
+
+    # E_ij couples the rotation of body i and the slide j: sum_k m_k v_ik x ds_k/dq_j, where
+    # sum_k m_k v_ik = 0 leaves only the bodies that the slide carries.
+    outboard = [kin.outboard(j) for j in bodies]
+    slides = [j for j in bodies[1:] if not kin.is_revolute(j)]
+    turns = [j for j in bodies[1:] if kin.is_revolute(j)]
+    E = {
+        (i, j): ca.cross(
+            sum((kin.mass(k) * v[i][k] for k in outboard[j]), ca.SX(3, 1)), kin.axis[j]
+        )
+        for i in bodies
+        for j in slides
+    }
+
+    # Eqs (16a, 16b). Joint j turns every body it carries, so F_i' D_ij F_j is summed over the
+    # bodies beyond each joint (column[j][i]) before its axis is applied.
+    D = sum((D_ij[i, j] for i in bodies for j in bodies), ca.SX(3, 3))
+    column = {
+        (i, b): sum((D_ij[i, j] for j in outboard[b]), ca.SX(3, 3)) @ kin.axis[b]
+        for i in bodies
+        for b in turns
+    } | {(i, b): E[i, b] for i in bodies for b in slides}
+    D_q = ca.SX(3, n)
+    D_qq = ca.SX(n, n)
+    for b in bodies[1:]:
+        D_q[:, b - 1] = sum((column[i, b] for i in bodies), ca.SX(3, 1))
+        for a in turns:
+            moment = sum((column[i, b] for i in outboard[a]), ca.SX(3, 1))
+            D_qq[a - 1, b - 1] = ca.dot(kin.axis[a], moment)
+            D_qq[b - 1, a - 1] = D_qq[a - 1, b - 1]
+    for a in slides:
+        for b in slides:
+            carried = [sum(kin.mass(k) for k in outboard[j]) for j in (a, b)]
+            shared = sum(kin.mass(k) for k in set(outboard[a]) & set(outboard[b]))
+            reduced = shared - carried[0] * carried[1] / M
+            D_qq[a - 1, b - 1] = reduced * ca.dot(kin.axis[a], kin.axis[b])
+    D_q, D_qq = kin.gather(D_q.T).T, kin.gather(kin.gather(D_qq).T)
+    return BarycentricInertia(M, D, D_q, D_qq, v)
+
+
+def forward_dynamics(kin: TreeKinematics) -> ca.Function:
+    """Return ``z0ddot = H+^-1 (Q - C+)`` (6 + n,), eqs (18), (19) and (21).
+
+    It takes ``q, v_cm_B, omega_WB_B, qdot``, a wrench on the base at its origin, and joint efforts.
+    """
+    sizes = {"v": 3, "omega": 3, "qdot": kin.n, "wrench_B": 6, "tau": kin.n}
+    symbols = [ca.SX.sym(name, size) for name, size in sizes.items()]
+    *velocities, wrench_B, tau = symbols
+    J_base, inertia = point_jacobian(kin, kin.robot.base_link), barycentric_inertia(kin)
+    force = J_base.T @ wrench_B + ca.vertcat(ca.SX(6, 1), tau) - bias(kin, *velocities)
+    H = ca.blockcat([[inertia.D, inertia.D_q], [inertia.D_q.T, inertia.D_qq]])
+    z0ddot = ca.vertcat(force[:3] / inertia.mass, solve_positive_definite(H, force[3:]))
+    return ca.Function("barycentric", [kin.q, *symbols], [z0ddot])
