@@ -69,6 +69,8 @@ class Stack:
         timeout: float = 60.0,
     ) -> None:
         scenario = scenario_or_robot(robot).with_overrides("plant", {"time_mode": "lockstep"})
+        # Before the plant tells its time mode, the planner would let it go on during a first plan.
+        scenario = scenario.with_overrides("planner", {"plan_in_background": False})
         for name, values in parameters.items():
             scenario = scenario.with_overrides(name, values)
         self._world, self._timeout, self._sent = scenario.plant.world_frame, timeout, 0

@@ -19,7 +19,7 @@ from spacerobot_ros.planning import Goal
 from spacerobot_ros.testing import Stack
 
 ROOT = Path(__file__).parents[2]
-QUICK = {"planner": {"method": "lie_bracket"}}
+QUICK = {"planner": {"method": "optimal"}}
 
 
 class Recorder(rclpy.node.Node):
