@@ -103,12 +103,6 @@ passage: $(STAMP)/test ## change every parameter in a flight: it reaches the qua
 expected: $(STAMP)/test ## write what the tests expect of parameters and plans anew, where a change is wanted
 	PYTHONPATH=.:test $(BIN)/python3 -m support.expected
 
-MUTANTS := 400
-.PHONY: mutants
-mutants: $(STAMP)/mutants ## put random errors into the whole package; see out/mutants; MUTANTS=400 SEED=[another each time]
-	PYTHONPATH=.:test nice $(BIN)/python3 test/mutation/run.py --sample $(MUTANTS) --at-least 15 \
-	    $(if $(filter command line,$(origin SEED)),--seed $(SEED))
-
 .PHONY: hostile-bags
 hostile-bags: $(STAMP)/test ## read bags that were made to harm their reader, each in a process of its own
 	$(BIN)/python3 -m pytest -m 'slow or not slow' -rP test/bag/test_hostile_bags.py
@@ -129,27 +123,27 @@ servicing-campaign: $(STAMP)/test ## fly DRAWS draws of the campaign servicing; 
 CLEAR_GOALS ?= 50
 .PHONY: clear-plans
 clear-plans: $(STAMP)/test ## plan CLEAR_GOALS random goals each of six robots with and without clearance, and list distances
-	SPACEROBOT_CLEAR_GOALS=$(CLEAR_GOALS) $(BIN)/python3 -m pytest -q -s -m slow test/planning/test_clear_plans.py
+	SPACEROBOT_CLEAR_GOALS=$(CLEAR_GOALS) $(BIN)/python3 -m pytest -q -s -m slow test/planning/test_many_plans.py -k "random_goals or clearance_costs"
 
 DRIFTING_CASES ?= 7
 .PHONY: drifting-plans
 drifting-plans: $(STAMP)/test ## plan DRIFTING_CASES random cases each of three robots and three drifts, flown by Pinocchio, and list durations
-	SPACEROBOT_DRIFTING_CASES=$(DRIFTING_CASES) $(BIN)/python3 -m pytest -q -s -m slow test/planning/test_drifting_plans.py
+	SPACEROBOT_DRIFTING_CASES=$(DRIFTING_CASES) $(BIN)/python3 -m pytest -q -s -m slow test/planning/test_drift.py -k robots_that_drift_are_planned_for
 
 FLOWN_TIMES ?= 10
 .PHONY: flown-times
 flown-times: $(STAMP)/test ## compare the times of FLOWN_TIMES plans each of ten robots with those of the solutions
-	SPACEROBOT_FLOWN_TIMES=$(FLOWN_TIMES) $(BIN)/python3 -m pytest -q -s -m slow test/planning/test_flown_times.py
+	SPACEROBOT_FLOWN_TIMES=$(FLOWN_TIMES) $(BIN)/python3 -m pytest -q -s -m slow test/planning/test_many_plans.py -k flown_times
 
 LONG_SEARCHES ?= 12
 .PHONY: long-searches
 long-searches: $(STAMP)/test ## compare the durations of LONG_SEARCHES plans each of three robots, with a position or a shape, with those of searches from 60 guesses
-	SPACEROBOT_LONG_SEARCHES=$(LONG_SEARCHES) $(BIN)/python3 -m pytest -q -s -m slow test/planning/test_long_searches.py
+	SPACEROBOT_LONG_SEARCHES=$(LONG_SEARCHES) $(BIN)/python3 -m pytest -q -s -m slow test/planning/test_many_plans.py -k long_searches
 
 CLEAR_FLIGHTS ?= 100
 .PHONY: clear-flights
 clear-flights: $(STAMP)/test ## fly CLEAR_FLIGHTS draws each of four robots with noise, wrong masses and corrections, and list the smallest distances
-	SPACEROBOT_CLEAR_FLIGHTS=$(CLEAR_FLIGHTS) $(BIN)/python3 -m pytest -q -s -m slow test/planning/test_clear_flights.py
+	SPACEROBOT_CLEAR_FLIGHTS=$(CLEAR_FLIGHTS) $(BIN)/python3 -m pytest -q -s -m slow test/planning/test_many_plans.py -k flights_with_errors
 
 COUNT ?= 2000
 SEED ?= 1
@@ -283,13 +277,12 @@ $(STAMP)/venv:
 
 $(STAMP)/demo: EXTRAS := jazzy,viewer,collision
 $(STAMP)/test: EXTRAS := jazzy,test
-$(STAMP)/mutants: EXTRAS := jazzy,test,mutants
 $(STAMP)/bench: EXTRAS := jazzy,campaign,bench
 $(STAMP)/docs: EXTRAS := jazzy,docs
 
 # A changed declaration or a new stamp: the package with its dependencies. Changed sources: the
 # package alone. What is left in build/lib would be installed again, deleted files too.
-$(STAMP)/demo $(STAMP)/test $(STAMP)/mutants $(STAMP)/bench $(STAMP)/docs: $(DECLARATION) $(SOURCES) | $(STAMP)/venv
+$(STAMP)/demo $(STAMP)/test $(STAMP)/bench $(STAMP)/docs: $(DECLARATION) $(SOURCES) | $(STAMP)/venv
 	@rm -rf build/lib
 	@echo "Installing spacerobot_ros[$(EXTRAS)] into $(VENV)$(if $(ALL), (once; a minute or two)) ..."
 	@$(PIP) install --no-build-isolation \

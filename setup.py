@@ -147,6 +147,5 @@ setup(
             "types-PyYAML",
         ],
         "bench": ["psutil", "pytest>=8", "pytest-benchmark>=5"],
-        "mutants": ["cosmic_ray>=8.4", "coverage>=7"],
     },
 )

@@ -44,16 +44,7 @@ from spacerobot_ros.files import (
 from spacerobot_ros.flight.trials import PlanningProblem
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.parameters import (
-    Parameter,
-    configured,
-    declared,
-    group,
-    parameter,
-    reconfigured,
-    registered,
     replaced,
-    require_known,
-    values_of,
 )
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.execution.config import PlannerConfig
@@ -279,59 +270,6 @@ def test_a_cache_gives_what_was_stored_under_a_key(
 # -- parameters -----------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class Options:
-    speed: float = parameter(2.0, "Speed.", unit="m/s", minimum=0.5, maximum=4.0)
-    count: int = parameter(3, "Count.", minimum=1)
-    on: bool = parameter(False, "On.")
-
-
-@dataclass(frozen=True)
-class Inner:
-    names: tuple[str, ...] = parameter((), "Names.", texts=True)
-    vector: tuple[float, ...] = parameter((), "Vector.", length=3, minimum=-1.0)
-
-
-REGISTRY = {"one": SimpleNamespace(Options=Options)}
-
-
-@dataclass(frozen=True)
-class Config:
-    mode: str = parameter("a", "Mode.", choices=("a", "b"), read_only=False)
-    inner: Inner = group(Inner())
-    methods: dict[str, Any] = registered(REGISTRY)  # noqa: RUF009
-
-
-def test_declarations_have_full_names_and_defaults() -> None:
-    found = {each.name: each for each in declared(Config)}
-    assert list(found) == [
-        *("mode", "inner.names", "inner.vector", "one.speed", "one.count", "one.on"),
-    ]
-    assert found["one.speed"] == Parameter(
-        "one.speed", 2.0, "m/s", "Speed.", 0.5, 4.0, read_only=True
-    )
-    plain = Parameter("a", 1.0)
-    assert (plain.unit, plain.description, plain.choices, plain.length) == ("", "", (), None)
-    assert (plain.minimum, plain.maximum) == (-math.inf, math.inf)
-    assert (plain.read_only, plain.texts, plain.of_joints) == (True, False, False)
-    assert found["mode"].read_only is False
-    changed = configured(Config, {"one.count": 5, "inner.vector": [1, 2, 3]})
-    assert values_of(changed) == {
-        "mode": "a",
-        "inner.names": (),
-        "inner.vector": (1.0, 2.0, 3.0),
-        "one.speed": 2.0,
-        "one.count": 5,
-        "one.on": False,
-    }
-    assert {each.name: each.default for each in declared(changed)} == values_of(changed)
-    again = reconfigured(changed, {"mode": "b"})
-    assert (again.mode, again.inner, again.methods) == ("b", changed.inner, changed.methods)
-    assert reconfigured(changed, {"nothing": 1}) is changed
-    other = reconfigured(changed, {"one.on": True})
-    assert values_of(other) == {**values_of(changed), "one.on": True}
-
-
 def test_a_copy_with_other_fields_is_checked_and_knows_nothing_of_the_first() -> None:
     @dataclass(frozen=True)
     class Limited:
@@ -356,65 +294,6 @@ def test_a_copy_with_other_fields_is_checked_and_knows_nothing_of_the_first() ->
     assert first == Limited(1.0)
     with pytest.raises(ValueError, match=r"3.0 is above 2.0"):
         replaced(first, low=3.0)
-
-
-def test_unknown_names_are_refused_in_alphabetical_order() -> None:
-    require_known("it", Config, ["mode", "one.on"])
-    with pytest.raises(ParameterError) as refused:
-        require_known("method 'a'", Config, ["mode", "z", "b"])
-    assert str(refused.value) == "method 'a' has no option 'b'."
-
-
-@pytest.mark.parametrize(
-    ("name", "value", "found"),
-    [
-        ("one.speed", 0.5, 0.5),
-        ("one.speed", 4, 4.0),
-        ("one.speed", np.float32(1.5), 1.5),
-        ("one.count", 1, 1),
-        ("one.count", 2.0, 2),
-        ("one.count", 2**63 - 1, 2**63 - 1),
-        ("one.on", True, True),
-        ("mode", "b", "b"),
-        ("inner.vector", (), ()),
-        ("inner.vector", [-1, 0, 1], (-1.0, 0.0, 1.0)),
-        ("inner.names", " a ; b\nc;", ("a", "b", "c")),
-        ("inner.names", ["a ", ""], ("a",)),
-    ],
-)
-def test_values_are_converted(name: str, value: Any, found: Any) -> None:
-    made = values_of(configured(Config, {name: value}))[name]
-    assert made == found
-    assert type(made) is type(found)
-
-
-@pytest.mark.parametrize(
-    ("name", "value", "expected"),
-    [
-        ("one.speed", 0.49, "0.49; it must be a number from 0.5 to 4 (m/s)."),
-        ("one.speed", 4.01, "4.01; it must be a number from 0.5 to 4 (m/s)."),
-        ("one.speed", math.inf, "inf; it must be a finite number (m/s)."),
-        ("one.speed", True, "True; it must be a number (m/s)."),
-        ("one.speed", "fast", "'fast'; it must be a number (m/s)."),
-        ("one.count", 0, "0; it must be a number of at least 1."),
-        ("one.count", 1.5, "1.5; it must be a whole number."),
-        ("one.count", 2**63, "9.223372036854776e+18; it must be a whole number of 64 bits."),
-        ("one.on", 1, "1; it must be true or false."),
-        ("mode", "c", "'c'; it must be one of a, b."),
-        ("mode", "c" * 70, f"'{'c' * 60}'; it must be one of a, b."),
-        ("mode", 1, "1; it must be a text."),
-        ("inner.vector", [1, 2], "[1, 2]; it must be a list of 3 numbers."),
-        ("inner.vector", [1, 2, -1.5], "[1, 2, -1.5]; it must be finite numbers of at least -1."),
-        ("inner.vector", [1, 2, math.nan], "[1, 2, nan]; it must be finite numbers of at least -1"),
-        ("inner.vector", 3, "3; it must be a list of numbers."),
-        ("inner.names", [1], "[1]; it must be a list of texts."),
-        ("inner.names", 3, "3; it must be a list of texts."),
-    ],
-)
-def test_values_that_are_refused(name: str, value: Any, expected: str) -> None:
-    with pytest.raises(ParameterError) as refused:
-        configured(Config, {name: value})
-    assert str(refused.value).startswith(f"Parameter '{name}' is {expected}")
 
 
 # -- resources ------------------------------------------------------------------------------------

@@ -1,11 +1,10 @@
-"""Coordinated control in lanes is that of the controller, tick by tick in the plant."""
+"""Coordinated control in lanes is that of the controller, and so is its allocation."""
 
 from __future__ import annotations
 
 import dataclasses
 import itertools
-from types import SimpleNamespace
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,14 +19,12 @@ from spacerobot_ros.batch import (
     SensorErrors,
     fly_lanes,
     fly_one_by_one,
-    scalar,
 )
 from spacerobot_ros.batch.controlling import BatchController
 from spacerobot_ros.control.config import ControllerConfig
 from spacerobot_ros.control.goal_monitor import GoalMonitor
 from spacerobot_ros.control.laws.law import GainPair, Gains
 from spacerobot_ros.control.limits import MotionLimits
-from spacerobot_ros.control.outputs import OutputDistance
 from spacerobot_ros.control.state import ControlState
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.model import SpaceRobot, load_robot
@@ -306,83 +303,3 @@ def test_the_function_of_lanes_is_the_controller_and_its_monitor(
     assert decisions[4:29] == [Decision.NONE] * 20 + [Decision.REACHED] * 5
     assert decisions[-1] is Decision.LOST
     assert memory[1:].max() >= 3
-
-
-@pytest.mark.parametrize("until_decided", [True, False])
-def test_a_flight_ends_a_tick_after_the_decision_or_holds_its_goal(
-    monkeypatch: pytest.MonkeyPatch, until_decided: bool
-) -> None:
-    """With a stand-in for the controller: efforts by tick, and a decision at tick 2."""
-    monkeypatch.setenv("SPACEROBOT_COMPILE", "0")
-    flights = controlled("planar_manipulator", SHAPE, ticks=5, count=3)
-    config = cast(Any, flights.program).config
-    program = ControlledGoals(config, base=BASE, ends_when_decided=until_decided)
-    flights = dataclasses.replace(flights, program=program, sensors=None)
-    seen: list[tuple[Any, ...]] = []
-
-    class Stub:
-        def begin_flight(self, row: int, state: ControlState) -> tuple[Any, Array]:
-            seen.append(("begin", row, state.r_WB[0]))
-            return SimpleNamespace(goal="goal"), np.array([0.5, 0.25])
-
-        def command(self, tick: int, state: ControlState) -> list[Array]:
-            seen.append(("command", tick, float(state.qdot[0])))
-            wrench = np.array([3.0, -4.0, 0.0, 0.0, 0.0, 0.5 * (tick + 1)])
-            return [np.array([0.1, -0.2]) * (tick + 1), wrench]
-
-        def decide(self, monitor: Any, tick: int, qdot: Array, bounds: Array) -> Decision:
-            assert (bounds.tolist(), len(qdot)) == ([0.5, 0.25], 2)
-            return {2: Decision.FAILED, 3: Decision.REACHED}.get(tick, Decision.NONE)
-
-        def distance(self, state: ControlState, goal: Any) -> OutputDistance:
-            assert goal == "goal"
-            return OutputDistance(state.q[0], 0.25, 0.125)
-
-    result = BatchResult.empty(flights)
-    scalar._fly_row(flights, 1, result, cast(Any, Stub()))
-    ticks = 3 if until_decided else 5
-    assert [each[:2] for each in seen] == [("begin", 1), *(("command", k) for k in range(ticks))]
-    assert seen[0][2] == pytest.approx(flights.initial_states.position[1, 0])
-    assert (result.decision[1], result.decision_tick[1]) == (Decision.FAILED, 2)
-    assert result.end_tick.tolist() == [5, ticks, 5]
-    np.testing.assert_allclose(result.peak_wrench[1], [5.0, 0.5 * ticks])
-    # Of every tick of 10 ms the force of 5 N, and torques of 0.5, 1, 1.5 N m and so on.
-    np.testing.assert_allclose(result.impulse[1], [0.05 * ticks, 0.005 * sum(range(ticks + 1))])
-    np.testing.assert_allclose(result.peak_effort[1], [0.1 * ticks, 0.2 * ticks])
-    plant = scalar.plant_of(flights, 1)
-    shapes, rates = [plant.q.copy()], []
-    for k in range(1, ticks + 1):
-        plant.step(np.array([0.1, -0.2]) * k, np.array([3.0, -4.0, 0.0, 0.0, 0.0, 0.5 * k]))
-        shapes.append(plant.q.copy())
-        rates.append(np.abs(plant.qdot))
-    np.testing.assert_array_equal(result.lowest[1], np.min(shapes, axis=0))
-    np.testing.assert_array_equal(result.highest[1], np.max(shapes, axis=0))
-    np.testing.assert_array_equal(result.peak_rate[1], np.max(rates, axis=0))
-    np.testing.assert_array_equal(result.end_state[1, :2], shapes[-1])
-    assert result.decision_distance[1].tolist() == [shapes[2][0], 0.25, 0.125]
-    # The wrench is all that changes the momenta.
-    assert result.momentum_drift[1].max() < 1e-12
-    assert np.abs(result.end_state[1, -7:-4]).max() > 0.01
-    np.testing.assert_array_equal(np.isnan(result.q[1]).all(axis=1), [False, False, until_decided])
-    assert np.isnan(result.end_state[[0, 2]]).all()
-
-
-def test_what_has_no_function_is_not_flown_in_lanes(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("SPACEROBOT_COMPILE", "0")
-    flights = controlled("planar_manipulator", SHAPE, ticks=5, count=3)
-    control = BatchController.of(flights)
-    gains = dataclasses.replace(Gains.uniform(4.0, 4.0), base_position=GainPair(4.0, 4.0, 0.5))
-    control.program = dataclasses.replace(control.program, gains=(Gains.uniform(4.0, 4.0), gains))
-    with pytest.raises(ParameterError) as refusal:
-        control.function()
-    assert str(refusal.value) == (
-        "Controllers with integral gains (ki) are not flown in lanes; engine 'flights' flies them."
-    )
-    control.program = dataclasses.replace(control.program, gains=())
-    assert control._gains(2) == control._config.gains
-    monkeypatch.setattr(type(control.law), "fixed_inputs", None)
-    with pytest.raises(ParameterError) as refusal:
-        control.function()
-    assert str(refusal.value) == (
-        f"The law '{control.law.name}' with these options is not flown in lanes."
-    )

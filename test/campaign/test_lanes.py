@@ -275,3 +275,73 @@ def test_the_engine_is_chosen_and_says_why_it_cannot() -> None:
         assert select_engine(other, "auto").name == "flights"
     for given in ({"plant.sensors.joint_noise": 1e-3}, {"planner.averaging": 3}):
         assert select_engine(campaign(set=given), "auto").name == "flights"
+
+
+SHARED = "is dispersed, and all lanes share it"
+
+
+@pytest.mark.parametrize(
+    ("given", "reason"),
+    [
+        ({"planner.averaging": 1}, ""),
+        ({"planner.drift_position": 0.1}, "the planner averages states, or watches the path"),
+        ({"planner.drift_attitude": 0.1}, "the planner averages states, or watches the path"),
+        ({"planner.output": "reference"}, "the planner plans again on the way"),
+        ({"plant.sensors.joint_bias": [0, 0, 0.1]}, "the joints are measured with errors"),
+        ({"plant.sensors.joint_bias": [0, 0, 0.0]}, ""),
+    ],
+)
+def test_what_lanes_do_not_fly_of_a_planner(given: dict[str, Any], reason: str) -> None:
+    refusal = LanesEngine().refusal(campaign(set=given))
+    assert refusal.startswith(reason) if reason else not refusal
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        *("plant.integration_step", "planner.tick_rate", "planner.averaging", "planner.shape_gain"),
+        *("planner.drift_position", "planner.max_corrections", "planner.replan_period"),
+    ],
+)
+def test_what_all_lanes_share_is_not_dispersed(name: str) -> None:
+    made = campaign(disperse={name: {"uniform": [1.0, 2.0]}})
+    assert LanesEngine().refusal(made) == f"'{name}' {SHARED}"
+
+
+@pytest.mark.parametrize(
+    ("given", "reason"),
+    [
+        ({}, ""),
+        ({"plant.beyond_limits": "refuse"}, "the plant refuses commands beyond limits"),
+        (
+            {"coordinated_control.tasks": "detumble"},
+            "its controller has tasks before goals, which engine 'flights' does",
+        ),
+        (
+            {"coordinated_control.law": "transposed_jacobian"},
+            "",
+        ),
+    ],
+)
+def test_what_lanes_do_not_fly_of_a_controller(given: dict[str, Any], reason: str) -> None:
+    assert LanesEngine().refusal(controlled(set=given)) == reason
+
+
+@pytest.mark.parametrize(
+    ("corrections", "longest", "outcome", "fallback"),
+    [
+        (0, 300.0, "failed", ""),
+        (3, 300.0, "failed", "needed corrections"),
+        (0, 1.0, "interrupted", "took longer than the campaign allows"),
+    ],
+)
+def test_what_a_first_schedule_does_not_decide_is_left_to_the_planner(
+    corrections: int, longest: float, outcome: str, fallback: str
+) -> None:
+    """The tolerance is smaller than what noise and gaits of first order leave."""
+    tight = {"planner.position_tolerance": 1e-9, "planner.attitude_tolerance": 1e-9}
+    given = {**tight, "planner.max_corrections": corrections}
+    made = campaign(disperse=DISPERSED, flights=2, set=given, longest=longest)
+    rows = flown(LanesEngine(), made)
+    assert {row.outcome for row in rows.values()} == {outcome}
+    assert {row.fallback for row in rows.values()} == {fallback}

@@ -7,7 +7,6 @@ import math
 import sys
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -15,16 +14,13 @@ import pytest
 from scipy import stats
 from support.campaigns import campaign
 
-from spacerobot_ros.campaign import dataset as datasets
 from spacerobot_ros.campaign import draws as sampling
-from spacerobot_ros.campaign import report as reports
 from spacerobot_ros.campaign import running as reruns
 from spacerobot_ros.campaign.config import Criterion, Distribution, load_campaign, meets_criterion
 from spacerobot_ros.campaign.dataset import Dataset, self_contained
 from spacerobot_ros.campaign.draws import Draw, Draws, drawn_flight, drawn_flights, sobol_problem
-from spacerobot_ros.campaign.report import Results, figure_with_axes
 from spacerobot_ros.campaign.rows import Row
-from spacerobot_ros.campaign.running import Progress, Rerun, largest_deviation, run_campaign
+from spacerobot_ros.campaign.running import Progress, Rerun, largest_deviation
 from spacerobot_ros.campaign.statistics import (
     Influence,
     PairedDifference,
@@ -37,8 +33,7 @@ from spacerobot_ros.campaign.statistics import (
     sobol_indices,
 )
 from spacerobot_ros.campaign.targets import DrawnFlight
-from spacerobot_ros.errors import ParameterError, RecordingError, SpaceRobotError
-from spacerobot_ros.measures import Outcome
+from spacerobot_ros.errors import ParameterError, SpaceRobotError
 
 running: Any = reruns
 MADE = campaign(flights=6, disperse={"mass.mass_1": {"uniform": [0.5, 1.0]}})
@@ -84,30 +79,6 @@ def test_percentiles_are_of_finite_values() -> None:
     values = np.array([math.nan, *range(101), math.inf])
     assert percentiles(values) == [5.0, 50.0, 95.0, 99.0]
     assert all(math.isnan(x) for x in percentiles(np.array([math.nan])))
-
-
-def test_what_is_said_of_an_influence() -> None:
-    plain = Influence("mass", "error_m", -0.456, 0.01, 0.4, 0.02)
-    assert str(plain) == "mass of error_m: -0.46"
-    assert plain.strength == 0.456
-    away = replace(plain, distance_correlation=-0.5)
-    assert str(away) == "mass of error_m: -0.50 with its distance from the median"
-    assert away.strength == 0.5
-    whole = replace(away, first_order_index=(0.125, 0.01), total_order_index=(0.375, 0.02))
-    assert str(whole) == "mass of error_m: total Sobol index 0.38"
-    assert whole.strength == 0.375
-    bare = Influence("a", "b", 0.25, 0.5)
-    assert (
-        bare.distance_correlation,
-        bare.distance_p_value,
-        bare.first_order_index,
-        bare.total_order_index,
-    ) == (
-        0.0,
-        1.0,
-        None,
-        None,
-    )
 
 
 @pytest.mark.parametrize(
@@ -340,27 +311,6 @@ def test_samplers_are_those_of_scipy(sampler: str) -> None:
     np.testing.assert_allclose(found, expected * [2.0, 1.0] + [1.0, 0.0], atol=1e-11)
 
 
-def test_saltelli_samples_have_the_seed_of_the_campaign(monkeypatch: pytest.MonkeyPatch) -> None:
-    asked: list[Any] = []
-
-    def sample(problem: Any, base: int, **given: Any) -> Any:
-        asked.append((problem["num_vars"], base, given))
-        return np.full((12, 2), 0.5)
-
-    monkeypatch.setattr(sampling, "import_salib", lambda name: SimpleNamespace(sample=sample))
-    values = {f"mass.mass_{k}": {"uniform": [1.0, 2.0]} for k in (1, 2)}
-    seed = int(np.random.SeedSequence(7).generate_state(1)[0]) // 2
-    for flights, base in ((8, 2), (15, 2), (16, 4), (31, 4), (35, 8)):
-        made = campaign(flights=flights, seed=7, sampler="saltelli", disperse=values)
-        assert len(Draws(made)) == 12
-        assert asked[-1] == (2, base, {"calc_second_order": False, "seed": seed})
-    with pytest.raises(ParameterError) as refused:
-        Draws(campaign(flights=7, sampler="saltelli", disperse=values))
-    assert str(refused.value) == (
-        "the sampler 'saltelli' needs at least 8 flights for 2 dispersion(s)."
-    )
-
-
 def test_a_draw_changes_its_flight() -> None:
     flight = drawn_flight(MADE, Draw(3, 17, {"mass.mass_1": 1.25}))
     assert flight.seeded_scenario.plant.sensors.seed == 17
@@ -424,15 +374,6 @@ def test_draws_that_are_made_together_are_those_made_alone() -> None:
         assert flight.inertial.vector.tobytes() == alone.inertial.vector.tobytes()
 
 
-def test_draws_share_a_scenario_that_they_leave() -> None:
-    """What differs from one to the next, seeds and masses, is beside it."""
-    flights = [
-        drawn for _, drawn in drawn_flights(MADE, Draws(MADE), DrawnFlight.of(MADE.scenario))
-    ]
-    assert {id(flight.scenario) for flight in flights} == {id(MADE.scenario)}  # type: ignore[union-attr]
-    assert len({flight.seed for flight in flights}) == len(MADE.dispersions) * 6  # type: ignore[union-attr]
-
-
 def test_a_seed_that_is_dispersed_is_that_of_the_flight() -> None:
     made = campaign(disperse={"plant.sensors.seed": {"choice": [41]}})
     flight = drawn_flight(made, Draws(made)[0])
@@ -455,92 +396,6 @@ def test_a_package_that_is_missing_is_named(monkeypatch: pytest.MonkeyPatch) -> 
 def test_progress_has_a_time_left() -> None:
     assert Progress(30, 100, 3.5, 10.0).seconds_left == 20.0
     assert Progress(30, 100, 0.0, 10.0).seconds_left == math.inf
-
-
-def test_a_campaign_is_flown_by_the_engine_and_the_workers_that_it_is_given(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    asked: list[Any] = []
-
-    def select(made: Any, name: str) -> Any:
-        asked.append(name)
-        return SimpleNamespace(name="lanes")
-
-    class Opened:
-        def __init__(self, cluster: Any, flights: int) -> None:
-            self.given = cluster.workers, cluster.scheduler, flights
-
-        def __enter__(self) -> Any:
-            return self.given
-
-        def __exit__(self, *of: object) -> None:
-            asked.append("closed")
-
-    def fly(made: Any, draws: Any, numbers: Any, engine: str, workers: Any, stopped: Any) -> Any:
-        asked.append((list(numbers), engine, workers))
-        yield []
-        for first in (0, 3):
-            yield [Row(draws[n], "reached", ".") for n in numbers[first : first + 3]]
-
-    now = iter([100.0, 101.0, 102.0, 104.0, 104.0])
-    monkeypatch.setattr(running, "time", SimpleNamespace(monotonic=lambda: next(now)))
-    monkeypatch.setattr(running, "select_engine", select)
-    monkeypatch.setattr(running, "open_workers", Opened)
-    monkeypatch.setattr(running, "_fly_rows", fly)
-    dataset = Dataset(tmp_path)
-    dataset.begin(MADE)
-    dataset.add([Row(Draws(MADE)[1], "reached", ".")])
-    dataset.close()
-    seen: list[Progress] = []
-    cluster = running.Cluster(workers=3)
-    end = run_campaign(MADE, tmp_path, cluster=cluster, show=seen.append)
-    assert asked == ["auto", ([0, 2, 3, 4, 5], "lanes", (3, "", 5)), "closed"]
-    assert [
-        (each.flown, each.total, each.flights_per_second, each.seconds) for each in [*seen, end]
-    ] == [
-        (1, 6, 0.0, 1.0),
-        (4, 6, 1.5, 2.0),
-        (6, 6, 1.25, 4.0),
-        (6, 6, 1.25, 4.0),
-    ]
-    assert Dataset(tmp_path).flown_numbers() == set(range(6))
-    # What is flown takes no workers, and this process needs none.
-    now = iter([1.0] * 99)
-    asked.clear()
-    named = replace(MADE, engine="flights")
-    for options in ({}, {"engine": "lanes"}, {"cluster": running.Cluster(scheduler="tcp://x")}):
-        run_campaign(named, tmp_path, **options)
-    assert asked[::2] == ["flights", "lanes", "flights"]
-    assert {workers for _, _, workers in asked[1::2]} == {None}
-    asked.clear()
-    run_campaign(replace(named, flights=9), tmp_path / "b", cluster=running.Cluster(0, "tcp://x"))
-    assert asked[1][2] == (0, "tcp://x", 9)
-
-
-@pytest.mark.parametrize(("workers", "numbers"), [(None, [1, 2]), ("workers", [1, 2]), (None, [])])
-def test_rows_are_flown_here_or_by_workers(
-    workers: Any, numbers: list[int], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    draws = Draws(MADE)
-
-    class Distributor:
-        def __init__(self, *given: Any) -> None:
-            assert given[:4] == ("workers", MADE, draws, "lanes")
-
-        def rows(self, of: list[int]) -> Any:
-            yield [], of
-
-    def fly(engine: Any, made: Any, given: Any, stopped: Any) -> Any:
-        assert engine == "engine lanes"
-        for draw in given:
-            yield draw.number
-
-    monkeypatch.setattr(running, "TaskDistributor", Distributor)
-    monkeypatch.setattr(running, "engine_by_name", lambda name: f"engine {name}")
-    monkeypatch.setattr(running, "fly_all", fly)
-    found: Any = list(running._fly_rows(MADE, draws, numbers, "lanes", workers, bool))
-    expected: Any = [([], numbers)] if workers else [[number] for number in numbers]
-    assert found == expected
 
 
 DRAWN = Draw(7, 123, {"mass": 1.23456789, "planner.method": "optimal"})
@@ -611,40 +466,6 @@ def test_a_stored_flight_has_its_metrics(tmp_path: Path) -> None:
 # -- datasets -------------------------------------------------------------------------------------
 
 
-def test_rows_are_written_after_two_thousand_or_five_seconds(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    now = [50.0]
-    monkeypatch.setattr(datasets.time, "monotonic", lambda: now[0])  # type: ignore[attr-defined]
-    dataset = Dataset(tmp_path)
-    dataset.begin(MADE)
-    row = Row(Draws(MADE)[0], "reached", ".")
-
-    def files() -> int:
-        return len(list((tmp_path / "flights").glob("part-*.parquet")))
-
-    dataset.add([row])
-    now[0] = 55.0
-    dataset.add([])
-    assert files() == 0
-    now[0] = 55.5
-    dataset.add([])
-    assert files() == 1
-    now[0] = 60.5
-    dataset.add([row] * 1999)
-    assert files() == 1
-    dataset.add([row])
-    assert files() == 2
-    now[0] = 70.0
-    dataset.add([])
-    assert files() == 2
-    dataset.add([row])
-    assert files() == 3
-    dataset.close()
-    names = sorted(path.name for path in (tmp_path / "flights").iterdir())
-    assert names == [f"part-{k:06d}.parquet" for k in range(3)]
-
-
 def test_the_files_of_a_dataset(tmp_path: Path) -> None:
     dataset = Dataset(tmp_path)
     assert dataset.begin(replace(MADE, description="D")) == set()
@@ -702,141 +523,3 @@ def test_robots_that_are_files_travel_with_a_campaign(tmp_path: Path) -> None:
     assert (sent.planner.robot, sent.planner.robot_description) == ("", "")
     both = campaign(set={"plant.robot": str(file), "planner.robot": str(file)})
     assert self_contained(both).scenario.planner.robot_description == sent.plant.robot_description
-
-
-# -- reports --------------------------------------------------------------------------------------
-
-
-def results(outcomes: list[str], **columns: Any) -> Results:
-    count = len(outcomes)
-    usual = {name: np.full(count, math.nan) for name in reports._MAIN_METRICS}
-    found = {"outcome": outcomes, "passed": np.ones(count), **usual, **columns}
-    return Results(MADE, Path("folder"), np.arange(float(count)), found, 9)
-
-
-@pytest.mark.parametrize(
-    ("numbers", "sentence"),
-    [
-        ([0, 1, 2], ""),
-        ([0, 2], "1 draw is not flown yet although later ones are, mostly because they take"),
-        ([1, 4], "3 draws are not flown yet although later ones are, mostly because they take"),
-        ([], ""),
-    ],
-)
-def test_missing_flights_are_counted(numbers: list[int], sentence: str) -> None:
-    found = replace(results(["reached"]), flight_numbers=np.array(numbers, float))
-    assert found.incompleteness_warning.startswith(sentence)
-    assert bool(found.incompleteness_warning) is bool(sentence)
-
-
-def test_the_worst_flights_are_ten() -> None:
-    """Those that failed, then those that did not pass, then by the distance from a bound."""
-    errors = np.array([0.5, 0.1, 0.9, 0.3, math.nan, 0.2, 0.7, 0.4, 0.6, 0.8, 0.05, 0.15])
-    outcomes = ["reached"] * 12
-    outcomes[1] = "failed"
-    passed = np.ones(12)
-    passed[[1, 3]] = 0.0
-    found = results(outcomes, passed=passed, position_error_m=errors)
-    # Without criteria by the position error.
-    assert found.worst_rows() == [1, 3, 2, 9, 6, 8, 0, 7, 5, 11]
-    bound = Criterion("position_error_m", 0.08, 1.0)
-    made = replace(MADE, criteria=(bound,))
-    assert replace(found, campaign=made).worst_rows()[:5] == [1, 3, 4, 10, 11]
-    # The spread is that of the values: two criteria are weighed by it.
-    both = replace(
-        MADE, criteria=(Criterion("position_error_m", maximum=1.0), Criterion("x_m", maximum=30.0))
-    )
-    wide = replace(found, campaign=both, columns={**found.columns, "x_m": 100.0 * errors[::-1]})
-    assert wide.worst_rows()[:3] == [1, 3, 4]
-    equal = replace(
-        found, campaign=made, columns={**found.columns, "position_error_m": np.ones(12)}
-    )
-    assert equal.worst_rows()[:4] == [1, 3, 0, 2]
-
-
-def test_shown_metrics_are_those_with_criteria_and_the_main_ones() -> None:
-    found = results(
-        ["reached"] * 2,
-        duration_s=np.array([1.0, math.nan]),
-        attitude_error_rad=np.array([0.5, 0.25]),
-        position_error_m=np.array([math.nan, 0.125]),
-    )
-    criteria = (Criterion("duration_s"), Criterion("attitude_error_rad", maximum=0.3))
-    found = replace(found, campaign=replace(MADE, criteria=criteria))
-    assert found.shown_metrics == ["duration_s", "attitude_error_rad", "position_error_m"]
-    assert list(found.metrics()) == found.shown_metrics
-    met = found.share_meeting(criteria[1])
-    assert (met.count, met.total) == (1, 2)
-    assert found.success_share.count == 2
-
-
-@pytest.mark.parametrize(
-    ("count", "across", "rows", "hidden"), [(1, 3, 1, 2), (3, 3, 1, 0), (4, 3, 2, 2), (5, 2, 3, 1)]
-)
-def test_figures_have_as_many_axes_as_are_wanted(
-    count: int, across: int, rows: int, hidden: int
-) -> None:
-    figure, axes = figure_with_axes(count, across, 2.5)
-    assert figure.get_size_inches().tolist() == pytest.approx([9.6, 2.5 * rows + 0.2])
-    assert len(axes) == count
-    assert [each.get_visible() for each in figure.axes] == [True] * count + [False] * hidden
-    assert figure_with_axes(1, 1)[0].get_size_inches()[1] == pytest.approx(2.4)
-
-
-def test_sobol_indices_stand_in_the_table_of_drivers() -> None:
-    found = [
-        Influence("a", "m", 0.5, 0.01, 0.25, 0.02, (0.125, 0.03), (0.375, 0.04)),
-        Influence("b", "m", -0.25, 0.5),
-    ]
-    text = reports._sensitivity_section(results(["reached"]), found)
-    assert "<td>0.125 ± 0.030</td><td>0.375 ± 0.040</td></tr>" in text
-    assert text.count("<td></td><td></td></tr>") == 1
-    assert "Sobol, first order" in text
-    assert "The sampler 'saltelli' adds" not in text
-    plain = reports._sensitivity_section(results(["reached"]), found[1:] * 16)
-    assert "Sobol, first order" not in plain
-    assert "The sampler &#x27;saltelli&#x27; adds Sobol indices." in plain
-    assert plain.count("<tr>") == 16
-    assert "No drawn number varies" in reports._sensitivity_section(results(["reached"]), [])
-
-
-def test_indices_are_computed_of_whole_saltelli_samples(monkeypatch: pytest.MonkeyPatch) -> None:
-    found = replace(
-        results(["reached"] * 9, position_error_m=np.arange(9.0)),
-        columns={
-            **results(["reached"] * 9, position_error_m=np.arange(9.0) ** 2).columns,
-            "draw.mass.mass_1": np.arange(9.0),
-        },
-    )
-    monkeypatch.setattr(
-        reports, "sobol_indices", lambda names, x: dict.fromkeys(names, (0.1, 0.2, 0.3, 0.4))
-    )
-    assert [each.total_order_index for each in found.influences()] == [None]
-    whole = replace(found, campaign=replace(MADE, sampler="saltelli"))
-    (each,) = whole.influences()
-    assert (each.first_order_index, each.total_order_index) == ((0.1, 0.2), (0.3, 0.4))
-    short = replace(whole, planned_flights=10)
-    assert [each.total_order_index for each in short.influences()] == [None]
-
-
-def test_a_campaign_without_dispersions_says_so() -> None:
-    assert reports._dispersions_section(replace(MADE, dispersions=())) == (
-        '<p class="missing">No dispersions: flights differ in their noise only.</p>'
-    )
-
-
-def test_a_row_of_an_error() -> None:
-    draw = Draw(1, 2, {})
-    refused = Row.of_error(draw, SpaceRobotError("No\n robot."), "lanes")
-    assert (refused.outcome, refused.reason, refused.engine) == (
-        "error",
-        str(SpaceRobotError("No\n robot.")),
-        "lanes",
-    )
-    other = Row.of_error(draw, KeyError("a\n  b"), "lanes")
-    assert other.reason.startswith("KeyError: ")
-    assert (other.passed, other.metrics, other.fallback) == (False, {}, "")
-    assert math.isnan(other.wall_time)
-    assert math.isnan(other.plan_time)
-    assert isinstance(RecordingError("a"), SpaceRobotError)
-    assert Outcome.REACHED.value == "reached"

@@ -1,29 +1,32 @@
-"""Statistics of campaigns against known results, and the pages that show them, in a browser."""
+"""Reports of campaigns: numbers, and pages that show them, in a browser."""
 
 from __future__ import annotations
 
 import math
 import re
+import resource
+import subprocess
+import sys
 from collections.abc import Callable
-from dataclasses import replace
 from html import unescape
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as arrow
+import pyarrow.parquet as parquet
 import pytest
-from matplotlib.figure import Figure
 from scipy import stats
 from support.campaigns import campaign
 from support.chromium import browser, chromium
 
-from spacerobot_ros.campaign import report
 from spacerobot_ros.campaign.comparing import write_comparison
 from spacerobot_ros.campaign.config import Campaign, passes_criteria
 from spacerobot_ros.campaign.dataset import Dataset
 from spacerobot_ros.campaign.draws import Draw, Draws
-from spacerobot_ros.campaign.report import PASSED_COLOUR, Results, write_campaign_report
+from spacerobot_ros.campaign.report import PASSED_COLOUR, Columns, Results, write_campaign_report
 from spacerobot_ros.campaign.rows import Row
+from spacerobot_ros.campaign.running import run_campaign
 from spacerobot_ros.errors import ParameterError
 
 NAMES = ("com.base_link.x", "com.base_link.y", "com.base_link.z")
@@ -267,38 +270,6 @@ def test_two_designs_are_compared_draw_by_draw(tmp_path: Path) -> None:
         write_comparison((one, four), tmp_path / "no.html")
 
 
-@pytest.mark.parametrize("count", [1, 10, 11, 24, 10_000])
-def test_counts_below_the_convergence_are_plain_numbers(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, count: int
-) -> None:
-    """As figures do not read formulas, a label such as 2 times a power of ten would be one."""
-    labels: list[str] = []
-
-    def seen(figure: Figure, name: str, caption: str) -> str:
-        figure.draw_without_rendering()
-        for axes in figure.axes:
-            texts = [*axes.get_xticklabels(), *axes.get_xticklabels(minor=True)]
-            low, high = axes.get_xlim()
-            labels.extend(
-                text.get_text() for text in texts if low <= text.get_position()[0] <= high
-            )
-        return ""
-
-    few = campaign(disperse=MASSES, flights=min(count, 24), seed=8, criteria=CRITERIA)
-    results = Results.of(filled(tmp_path, few, bowl))
-    many = np.resize(np.arange(len(results)), count)
-    columns = {
-        name: values[many] if isinstance(values, np.ndarray) else values
-        for name, values in results.columns.items()
-    }
-    monkeypatch.setattr(report, "picture_part", seen)
-    results = replace(results, columns=columns, flight_numbers=many.astype(float))
-    # Of ten flights or fewer there is one point, which shows no convergence.
-    assert (report._convergence_section(results) == []) is (count <= 10)
-    assert any(labels) is (count > 10)
-    assert all(re.fullmatch(r"\d*", label) for label in labels), labels
-
-
 def test_messages_are_counted_by_outcome_without_their_numbers(tmp_path: Path) -> None:
     made = campaign(disperse=MASSES, flights=9)
     reasons = [
@@ -367,3 +338,73 @@ def test_the_pages_open_without_a_complaint_and_need_nothing_else(tmp_path: Path
     assert "3 flights needed corrections and used engine 'flights'" in words
     worst = max(Draws(made), key=bowl).number
     assert f"spacerobot campaign rerun '{one}' {worst}" in words
+
+
+# -- the report of a million flights: its numbers, and the memory that it takes ------------------
+
+
+DISPERSIONS = {
+    "mass.*": {"norm": {"loc": 1.0, "scale": 0.03}},
+    "plant.sensors.position_noise": {"uniform": [0.0, 0.001]},
+}
+BYTES = 1e9
+FLIGHTS, COPIES = 500, 2000
+
+
+def multiply(folder: Path, copies: int) -> None:
+    """Write the rows of a dataset many times, with numbers and messages of their own, in an order
+    that is not that of the numbers.
+    """
+    table = Dataset(folder).table()
+    count = table.num_rows
+    numbers, reasons = (table[name].to_pylist() for name in ("flight", "reason"))
+    for part in (folder / "flights").glob("*.parquet"):
+        part.unlink()
+    for copy in range(copies):
+        own = {
+            "flight": [number + (copies - 1 - copy) * count for number in numbers],
+            "reason": [f"{text} {copy}.{k}" for k, text in enumerate(reasons)],
+        }
+        made = table
+        for name, values in own.items():
+            place, kind = table.column_names.index(name), table.schema.field(name).type
+            made = made.set_column(place, name, arrow.array(values, type=kind))
+        parquet.write_table(made, folder / "flights" / f"part-{copy:06d}.parquet")
+
+
+def test_columns_are_in_the_order_of_the_flights_and_read_where_they_are_needed(
+    tmp_path: Path,
+) -> None:
+    run_campaign(campaign(disperse=DISPERSIONS, flights=7, seed=3), tmp_path)
+    multiply(tmp_path, 3)
+    columns = Columns(Dataset(tmp_path))
+    assert [*columns] == ["flight"]
+    np.testing.assert_array_equal(columns["flight"], np.arange(21.0))
+    table = Dataset(tmp_path).table()
+    for name in ("draw.mass.mass_2", "duration_s", "passed"):
+        np.testing.assert_array_equal(columns[name], np.array(table[name], dtype=float))
+    for name in ("outcome", "reason", "fallback"):
+        assert columns[name] == table[name].to_pylist()
+    assert columns.get("no_column") is None
+    # Reasons are read again, not kept.
+    assert {*columns} == {"flight", "draw.mass.mass_2", "duration_s", "passed", "outcome"} | {
+        "fallback"
+    }
+    messages, forms = Results.of(tmp_path).messages
+    assert len(messages) == 21
+    assert all("…" in form for form in forms.values())
+
+
+@pytest.mark.slow
+def test_a_million_flights_are_reported_in_a_gigabyte(tmp_path: Path) -> None:
+    run_campaign(campaign(disperse=DISPERSIONS, flights=FLIGHTS, seed=3), tmp_path)
+    multiply(tmp_path, COPIES)
+    command = (
+        "import sys; from spacerobot_ros.cli import start; sys.argv[0] = 'spacerobot'; start()"
+    )
+    arguments = [sys.executable, "-c", command, "campaign", "report", str(tmp_path)]
+    ended = subprocess.run(arguments, capture_output=True, text=True, check=True)
+    peak = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss * 1024
+    print(f"{peak / 1e9:.2f} GB", flush=True)
+    assert re.search(r"of 1000000;", ended.stdout), ended.stdout
+    assert peak <= BYTES

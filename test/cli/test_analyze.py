@@ -185,7 +185,6 @@ def test_workspaces_need_a_link(tmp_path: Path) -> None:
     assert not picture.with_name("a_workspaces.png").exists()
 
 
-@pytest.mark.slow
 def test_the_workspaces_of_a_named_link(tmp_path: Path) -> None:
     named, lines, _ = analyzed(tmp_path, "planar_chain", "--end-effector", "segment_2")
     (only,) = named["workspaces"]  # Its joints have no limits.

@@ -1,15 +1,26 @@
-"""The command line: exit codes, sentences, options."""
+"""The command line: exit codes, sentences, options, help, and what is imported."""
 
 from __future__ import annotations
 
 import json
+import os
+import subprocess
+import sys
 from pathlib import Path
 
+import click
 import pytest
+import yaml
+from sensor_msgs.msg import JointState
+from support.altered_bags import altered
 from support.command_line import CliRunner, Result
+from support.sentences import assert_one_sentence
 
-from spacerobot_ros.cli.main import main
+from spacerobot_ros.cli.campaign import campaign_command
+from spacerobot_ros.cli.main import COMMANDS, CommandGroup, main
 from spacerobot_ros.errors import ParameterError
+from spacerobot_ros.files import load_yaml
+from spacerobot_ros.resources import share_directory
 from spacerobot_ros.scenario import load_scenario, parse_setting, scenario_names
 
 QUICK = [
@@ -25,6 +36,7 @@ QUICK = [
 @pytest.fixture(autouse=True)
 def own_domain(ros_domain: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("ROS_DOMAIN_ID", str(ros_domain))
+    monkeypatch.setenv("SPACEROBOT_COMPILE", "0")
     # The events executor asks for the file behind standard error, which a captured one lacks.
     monkeypatch.setattr("faulthandler.enable", lambda: None)
 
@@ -153,3 +165,346 @@ def test_settings(text: str, value: object) -> None:
 def test_bad_settings(text: str) -> None:
     with pytest.raises(ParameterError):
         parse_setting(text)
+
+
+# -- `run` and `plan` end with the same code for the same goal: 1 out of reach, 2 bad input ------
+
+
+SLIDING = ("sliding_masses", "--method", "lie_bracket")
+
+
+@pytest.mark.parametrize("command", ["run", "plan"])
+@pytest.mark.parametrize(
+    ("words", "code"),
+    [
+        ((*SLIDING, "--goal", *"9000001"), 1),
+        ((*SLIDING, "--goal", *"0000000"), 2),
+        ((*SLIDING, "--goal", "nan", *"000001"), 2),
+        ((*SLIDING, "--goal-rotvec", "inf", "0", "0"), 2),
+        (("sliding_masses", "--method", "magic"), 2),
+        (("sliding_masses", "--set", "planner.method=magic"), 2),
+        ((*SLIDING, "--set", "planner.lie_bracket.t2=1"), 2),
+        ((*SLIDING, "--set", "planner.tick_rte=1"), 2),
+        ((*SLIDING, "--set", "planner.lie_bracket.t1=soon"), 2),
+        ((*SLIDING, "--set", "moon.phase=1"), 2),
+        ((*SLIDING, "--set", "plant.initial_joint_positions=[1, 2]"), 2),
+        (("arm_attitude", "--method", "lie_bracket"), 1),
+    ],
+)
+def test_the_same_code_by_both(
+    command: str, words: tuple[str, ...], code: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    result = CliRunner().invoke(main, [command, *words])
+    assert result.exit_code == code, result.output
+    assert "Traceback" not in result.output
+
+
+@pytest.mark.parametrize("command", ["run", "plan"])
+@pytest.mark.parametrize(
+    ("section", "values", "sentence"),
+    [
+        ("scenario", {"goal_joint_positions": [0.1, 0.2]}, "The goal shape has 2 joint position"),
+        ("planner", {"tick_rte": 20.0}, "Node 'planner' has no parameter 'tick_rte'"),
+        ("planner", {"lie_bracket": {"t2": 1.0}}, "no parameter 'lie_bracket.t2'"),
+        ("plant", {"tick_rate": "fast"}, "Parameter 'tick_rate' is 'fast'"),
+    ],
+)
+def test_what_a_file_has_wrong_is_bad_input(
+    command: str,
+    section: str,
+    values: dict[str, object],
+    sentence: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    content = yaml.safe_load(load_scenario("sliding_masses").path.read_text("utf-8"))
+    key = section if section == "scenario" else f"/**/{section}"
+    content[key]["ros__parameters"] |= values
+    Path("mine.yaml").write_text(yaml.safe_dump(content), "utf-8")
+    result = CliRunner().invoke(main, [command, "mine.yaml"])
+    assert result.exit_code == 2, result.output
+    assert sentence in result.output
+    assert len(result.output.strip().splitlines()) == 1
+
+
+# -- help texts of the command line --------------------------------------------------------------
+
+
+def commands() -> dict[str, click.Command]:
+    """Return every command by its words."""
+    group, context = CommandGroup(), click.Context(main, **main.context_settings)
+    found = {name: group.get_command(context, name) for name in COMMANDS}
+    return {
+        **{name: each for name, each in found.items() if each is not None},
+        **{f"campaign {name}": each for name, each in campaign_command.commands.items()},
+    }
+
+
+def test_every_option_says_what_it_does() -> None:
+    options = {
+        f"{words} {option.opts[0]}": option
+        for words, each in commands().items()
+        for option in each.params
+        if isinstance(option, click.Option)
+    }
+    assert len(options) > 60
+    assert [name for name, option in options.items() if not option.help] == []
+    # Each sentence stands for itself: the option before it may be looked at on another day.
+    assert [name for name, option in options.items() if (option.help or "").startswith(".")] == []
+
+
+@pytest.mark.parametrize("words", [[], ["campaign"]])
+def test_the_list_of_commands_has_whole_sentences(words: list[str]) -> None:
+    listed = CliRunner().invoke(main, [*words, "--help"]).output.partition("Commands:\n")[2]
+    assert listed
+    for line in listed.splitlines():
+        assert line.endswith("."), line
+        assert not line.endswith("..."), line
+
+
+@pytest.mark.parametrize("word", ["-h", "--help"])
+def test_the_help_of_campaigns_is_that_of_all_their_commands(word: str) -> None:
+    shown = CliRunner().invoke(main, ["campaign", word]).output
+    assert all(f"\n  {name} " in shown for name in ("fly", "report", "rerun"))
+
+
+# -- what the command and the package load: little, until it is needed ---------------------------
+
+
+LIBRARIES = ("numpy", "casadi", "scipy", "matplotlib", "rclpy", "yaml", "rosbags", "mcap")
+
+
+def loaded(code: str) -> set[str]:
+    """Return the modules that a fresh interpreter has loaded after some code."""
+    report = "import sys; sys.stderr.write(' '.join(sys.modules))"
+    run = subprocess.run(
+        [sys.executable, "-c", f"{code}\n{report}"], capture_output=True, text=True, check=True
+    )
+    return set(run.stderr.split())
+
+
+@pytest.mark.parametrize("words", [["--help"], ["-h"], ["--version"], ["up", "--help"]])
+def test_help_loads_no_library(words: list[str]) -> None:
+    code = f"from spacerobot_ros.cli.main import main\nmain({words!r}, standalone_mode=False)"
+    modules = loaded(code)
+    assert "spacerobot_ros.cli.main" in modules
+    assert not modules.intersection(LIBRARIES)
+
+
+def test_the_package_loads_neither_scipy_nor_matplotlib() -> None:
+    assert not loaded("import spacerobot_ros").intersection(LIBRARIES)
+
+
+def test_planning_loads_neither_scipy_nor_matplotlib_nor_ros() -> None:
+    modules = loaded("import spacerobot_ros\nspacerobot_ros.plan")
+    assert "spacerobot_ros.planning.api" in modules
+    assert not modules.intersection({"matplotlib", "rclpy", "scipy"})
+
+
+def test_every_command_is_listed_and_has_help() -> None:
+    listed = CliRunner().invoke(main, ["--help"])
+    assert listed.exit_code == 0
+    _, _, table = listed.output.partition("Commands:\n")
+    names = tuple(line.split()[0] for line in table.splitlines())
+    assert names == tuple(sorted(COMMANDS))
+    for name in COMMANDS:
+        shown = CliRunner().invoke(main, [name, "--help"], prog_name="spacerobot")
+        assert shown.exit_code == 0
+        assert shown.output.startswith(f"Usage: spacerobot {name} ")
+
+
+def test_methods_and_laws_are_offered_by_name() -> None:
+    shown = CliRunner().invoke(main, ["run", "--help"]).output
+    assert "[area_loop|auto|computed_torque|lie_bracket|" in shown
+    refused = CliRunner().invoke(main, ["plan", "planar_chain", "--method", "magic"])
+    assert refused.exit_code == 2
+    assert "'magic' is not one of" in refused.output
+    missing = CliRunner().invoke(main, ["nothing"])
+    assert missing.exit_code == 2
+    assert "No such command 'nothing'" in missing.output
+
+
+# -- bad input of every kind ends a command with one sentence and exit code 2 --------------------
+
+
+ROOT = Path(__file__).resolve().parents[2]
+
+LAUGHS = "a: &a [1, 2]\n" + "".join(
+    f"{chr(98 + n)}: &{chr(98 + n)} [{', '.join(9 * [f'*{chr(97 + n)}'])}]\n" for n in range(20)
+)
+"""Some 1e19 values in 1 kB."""
+
+LADDER = "a0: &a0 {b: 1}\n" + "".join(f"a{n}: &a{n} {{b: *a{n - 1}}}\n" for n in range(1, 2000))
+"""Nested two thousand times, with two levels on a line."""
+
+HARMFUL = {
+    "nested": "scenario: " + 10_000 * "[",
+    "alias of itself": "scenario: &a {ros__parameters: *a}",
+    "aliases": LAUGHS,
+    "ladder": LADDER,
+    "date": "a: 2024-99-99",
+    "number": "a: " + 5000 * "9",
+    "long": "a: " + 1_000_001 * "x",
+}
+READING_COMMANDS = ("plan", "run")
+"""They read scenarios as `campaign fly` reads its file, by one function."""
+
+REASONS = {
+    "nested": "nested too deeply",
+    "alias of itself": "more than 100000 values",
+    "aliases": "more than 100000 values",
+    "ladder": "more than 100000 values",
+    "date": "month must be in",
+    "number": "integer string conversion",
+    "long": "more than 1000000 characters",
+}
+
+
+@pytest.mark.parametrize("name", HARMFUL)
+@pytest.mark.parametrize(
+    "words",
+    [("campaign", "fly"), *(pytest.param((w,), marks=pytest.mark.slow) for w in READING_COMMANDS)],
+)
+def test_harmful_yaml_is_one_sentence(words: tuple[str, ...], name: str, tmp_path: Path) -> None:
+    file = tmp_path / "harmful.yaml"
+    file.write_text(HARMFUL[name], "utf-8")
+    result = CliRunner().invoke(main, [*words, str(file)])
+    assert result.exit_code == 2, result.output
+    assert_one_sentence(result.stderr, str(file))
+    if name != "number" or sys.version_info >= (3, 11):
+        assert REASONS[name] in result.stderr
+
+
+def test_anchors_and_merged_mappings_are_read() -> None:
+    text = "common: &c {rate: 20, names: [a, b]}\nfirst: {<<: *c, rate: 10}\nsecond: *c\n"
+    content = load_yaml(text)
+    assert content["first"] == {"rate": 10, "names": ["a", "b"]}
+    assert content["second"] == {"rate": 20, "names": ["a", "b"]}
+    assert load_yaml("") is None
+    assert load_yaml("[1, 2.5, x, null]") == [1, 2.5, "x", None]
+
+
+def started(*words: str | bytes, **variables: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "spacerobot_ros", *words]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), **variables}
+    return subprocess.run(
+        command, env=environment, capture_output=True, text=True, timeout=120, check=False
+    )
+
+
+@pytest.mark.parametrize(
+    ("words", "domain"),
+    [
+        (("run", "sliding_masses", "--nodes"), "abc"),
+        pytest.param(("goal", "0", "0", "0"), "999", marks=pytest.mark.slow),
+        pytest.param(("run", "sliding_masses", "--nodes"), "-1", marks=pytest.mark.slow),
+        pytest.param(("goal", "0", "0", "0"), "1.5", marks=pytest.mark.slow),
+    ],
+)
+def test_a_domain_that_is_none_is_one_sentence(words: tuple[str, ...], domain: str) -> None:
+    ended = started(*words, ROS_DOMAIN_ID=domain)
+    assert ended.returncode == 2, ended.stderr
+    assert_one_sentence(ended.stderr, f"ROS_DOMAIN_ID is '{domain}'", "0 to 232")
+
+
+@pytest.mark.parametrize("option", ["--bag", "--report"])
+def test_a_dash_is_no_file_to_write(option: str) -> None:
+    ended = started("run", "sliding_masses", option, "-")
+    assert ended.returncode == 2
+    assert f"Invalid value for '{option}': '-' stands for no file" in ended.stderr
+    assert not Path("-").exists()
+
+
+@pytest.mark.parametrize("option", ["--bag", "--json", "--report"])
+def test_a_path_that_is_no_text_is_refused(option: str) -> None:
+    ended = started("run", "sliding_masses", option, b"out/\xff")
+    assert ended.returncode == 2
+    assert "bytes that are not UTF-8" in ended.stderr
+    assert "Traceback" not in ended.stderr
+
+
+# -- findings of `analyze`, plans and flights as lines, from results made by hand ----------------
+
+
+# -- flights --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (
+            ["run", "sliding_masses", "--view"],
+            "--view needs --realtime: a flight in lockstep is over soon.",
+        ),
+        (
+            ["goal", "1", "2", "3", "--goal-rotvec", *"001", "--goal-rpy-deg", *"001"],
+            "The attitude is given twice, in radians and in degrees.",
+        ),
+        (
+            ["goal", "--goal-rotvec", *"001", "--end-effector-position", *"123"],
+            "An attitude of the base is sent with its position X Y Z.",
+        ),
+        (["goal", "1", "2"], "A goal is X Y Z, or X Y Z QX QY QZ QW."),
+        (["goal"], "A goal is X Y Z, or X Y Z QX QY QZ QW."),
+    ],
+)
+def test_goals_and_flights_that_are_refused(words: list[str], sentence: str) -> None:
+    result = CliRunner().invoke(main, words)
+    assert result.exit_code == 2
+    assert sentence in " ".join(result.stderr.split())
+
+
+@pytest.mark.parametrize(
+    "words", [("campaign", "fly"), ("campaign", "fly", "a.yaml", "--compare", "b.yaml", "c.yaml")]
+)
+def test_a_campaign_is_of_one_file_or_two(words: tuple[str, ...]) -> None:
+    result = CliRunner().invoke(main, list(words))
+    assert result.exit_code == 2
+    assert result.stderr == "Give the FILE of a campaign, or two after --compare, not both.\n"
+
+
+# -- the commands about bags, as people call them: output and exit codes -------------------------
+
+
+BAG = share_directory() / "bags" / "sliding_masses.mcap"
+
+
+def faster(message: JointState) -> JointState:
+    message.velocity[0] += 0.01
+    return message
+
+
+def test_verify_says_that_a_bag_is_what_its_commands_make() -> None:
+    result = CliRunner().invoke(main, ["verify", str(BAG)])
+    assert result.exit_code == 0
+    assert "flown again 340 ticks, 34 s" in result.output
+    assert "verified" in result.output
+
+
+def test_verify_names_the_first_difference(tmp_path: Path) -> None:
+    bag = altered(BAG, tmp_path / "b.mcap", "/joint_commands", 100, faster)
+    result = CliRunner().invoke(main, ["verify", str(bag)])
+    assert result.exit_code == 1
+    assert_one_sentence(
+        result.stderr, "/joint_states at 10.1 s", "position of slider_1", "by its commands"
+    )
+    lenient = CliRunner().invoke(main, ["verify", str(bag), "--tolerance", "1"])
+    assert lenient.exit_code == 0
+
+
+@pytest.mark.parametrize("command", ["verify", "replay", "salvage", "report"])
+def test_a_bag_that_is_not_there_is_one_sentence(command: str) -> None:
+    result = CliRunner().invoke(main, [command, "nowhere.mcap"])
+    assert result.exit_code == 2
+    assert_one_sentence(result.stderr, "There is no bag at nowhere.mcap")
+
+
+def test_replay_has_the_options_of_its_node() -> None:
+    result = CliRunner().invoke(main, ["replay", str(BAG), "--rate", "0"])
+    assert result.exit_code == 2
+    assert_one_sentence(result.stderr, "'rate'")
+    result = CliRunner().invoke(main, ["replay", str(BAG), "--remap", "/odom=/b"])
+    assert result.exit_code == 2
+    assert_one_sentence(result.stderr, "'/odom=/b'", "'old:=new'")

@@ -324,9 +324,9 @@ def test_what_the_command_line_changes_reaches_the_flight(
     runner.invoke(main, ["run", "sliding_masses", "--realtime", "2.5"])
     assert taken[0].plant.real_time_factor == 2.5
     # What is set goes before what real time brings with it.
-    words = ["--realtime", "--set", "planner.plan_in_background=false"]
+    words = ["--realtime", "--set", "recorder.diagnostics_period=3.0"]
     runner.invoke(main, ["run", "sliding_masses", *words])
-    assert taken[0].planner.plan_in_background is False
+    assert taken[0].config("recorder").diagnostics_period == 3.0
     runner.invoke(main, ["run", "servicer", "--method", "transposed_jacobian"])
     assert taken[0].controller.law == "transposed_jacobian"
 

@@ -1,13 +1,19 @@
-"""Nearest approaches along held commands against dense samples."""
+"""Nearest approaches along commands, beside bodies that spin, and bounds by rounded boxes."""
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from spacerobot_ros.collision import CollisionGeometry, PathCheck
-from spacerobot_ros.model import load_robot, parse_robot
-from spacerobot_ros.model.description import Array
+from spacerobot_ros.collision.rounded_box import RoundedBox, separation
+from spacerobot_ros.model import RobotDescription, load_robot, parse_robot
+from spacerobot_ros.model.description import Array, Pose, Shape
+from spacerobot_ros.model.rotations import matrix_from_rpy
 from spacerobot_ros.resources import robot_file
 
 
@@ -78,3 +84,205 @@ def test_a_single_shape_is_a_path() -> None:
     (found,) = check.approaches(np.zeros((1, 2)), np.array([0.05]))
     assert found.distance == pytest.approx(0.03, abs=1e-6)
     assert check.approaches(np.ones((1, 2)), np.array([0.05])) == []
+
+
+# -- bodies of revolution that spin in place, such as reaction wheels, come no nearer to ---------
+
+
+INERTIA = (
+    '<inertial><mass value="2"/><inertia ixx="1" iyy="1" izz="2" ixy="0" ixz="0" iyz="0"/>'
+    "</inertial>"
+)
+
+
+def robot(origin: str = "0 0 0.2", rpy: str = "0 0 0", shape: str = "") -> RobotDescription:
+    """Return a disc that turns about z of its joint, beside a post on a slider."""
+    shape = shape or '<cylinder radius="0.3" length="0.1"/>'
+    return parse_robot(
+        f"""<robot name="spinner">
+<link name="base">{INERTIA}</link>
+<link name="disc">{INERTIA}<collision><origin xyz="{origin}" rpy="{rpy}"/><geometry>{shape}
+</geometry></collision></link>
+<link name="post">{INERTIA}<collision><geometry><sphere radius="0.1"/></geometry></collision></link>
+<joint name="spin" type="continuous"><parent link="base"/><child link="disc"/>
+<origin xyz="0.4 0 0"/><axis xyz="0 0 1"/><limit velocity="9" effort="1"/></joint>
+<joint name="slide" type="prismatic"><parent link="base"/><child link="post"/>
+<origin xyz="1.0 0 0.2"/><axis xyz="0 1 0"/>
+<limit lower="-2" upper="2" velocity="9" effort="1"/></joint></robot>"""
+    )
+
+
+@pytest.mark.parametrize(
+    ("changes", "reach"),
+    [
+        ({}, 0.0),
+        ({"shape": '<sphere radius="0.3"/>', "rpy": "0.4 0.3 0"}, 0.0),
+        ({"rpy": "0.2 0 0"}, 0.3),
+        ({"origin": "0.05 0 0.2"}, 0.3),
+        ({"shape": '<box size="0.5 0.5 0.1"/>'}, 0.3),
+    ],
+)
+def test_only_what_leaves_its_place_can_come_nearer(changes: dict[str, str], reach: float) -> None:
+    geometry = CollisionGeometry(robot(**changes))
+    ((spin, slide),), _ = geometry.largest_lever_arms(np.array([[0.0, 0.3], [50.0, -0.2]]))
+    assert slide == 1.0
+    assert spin == 0.0 if reach == 0.0 else spin > reach
+
+
+def test_a_joint_that_moves_both_bodies_brings_none_nearer() -> None:
+    """The disc spins in place, and the arm on it goes round with it."""
+    arm = parse_robot(
+        f"""<robot name="turret">
+<link name="base">{INERTIA}</link>
+<link name="disc">{INERTIA}<collision><geometry><cylinder radius="0.3" length="0.1"/></geometry>
+</collision></link>
+<link name="upper">{INERTIA}</link>
+<link name="tip">{INERTIA}<collision><geometry><sphere radius="0.1"/></geometry></collision></link>
+<joint name="turn" type="continuous"><parent link="base"/><child link="disc"/><axis xyz="0 0 1"/>
+<limit velocity="9" effort="1"/></joint>
+<joint name="lift" type="revolute"><parent link="disc"/><child link="upper"/>
+<origin xyz="0.2 0 0.3"/><axis xyz="0 1 0"/><limit lower="-1" upper="1" velocity="9" effort="1"/>
+</joint>
+<joint name="bend" type="revolute"><parent link="upper"/><child link="tip"/>
+<origin xyz="0.5 0 0"/><axis xyz="0 1 0"/><limit lower="-1" upper="1" velocity="9" effort="1"/>
+</joint></robot>"""
+    )
+    geometry = CollisionGeometry(arm)
+    ((turn, lift, bend),), _ = geometry.largest_lever_arms(np.zeros((1, 3)))
+    assert turn == 0.0
+    assert lift > 0.5
+    assert bend == 0.0, "a ball about its joint stays where it is"
+
+
+def test_the_nearest_approach_beside_a_fast_wheel_is_found_at_once(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    geometry = CollisionGeometry(robot())
+    ticks = np.arange(41)
+    path = np.column_stack([300.0 * ticks, np.linspace(-1.1, 1.5, 41)])
+    asked: list[int] = []
+    distances = geometry.distances
+
+    def counted(pair: int, poses: object) -> object:
+        found = distances(pair, poses)  # type: ignore[arg-type]
+        asked.append(len(found))
+        return found
+
+    monkeypatch.setattr(geometry, "distances", counted)
+    nearest = PathCheck(geometry).nearest(path)
+    assert nearest is not None
+    # Between disc and post along x, 0.6 m apart: their radii are 0.3 m and 0.1 m.
+    assert nearest.distance == pytest.approx(0.2, abs=1e-3)
+    assert sum(asked) < 400
+
+
+# -- bounds by rounded boxes against distances by coal and by geometry ---------------------------
+
+
+coal = pytest.importorskip("coal")
+
+Triple = tuple[float, float, float]
+Form = tuple[str, tuple[float, ...]]
+
+SIZES = st.floats(0.02, 1.5)
+PLACES = st.tuples(*[st.floats(-2.0, 2.0)] * 3)
+TURNS = st.tuples(*[st.floats(-3.0, 3.0)] * 3)
+SHAPES = st.one_of(
+    st.tuples(st.just("box"), st.tuples(SIZES, SIZES, SIZES)),
+    st.tuples(st.just("sphere"), st.tuples(SIZES)),
+    st.tuples(st.just("cylinder"), st.tuples(SIZES, SIZES)),
+)
+OFFSET = Pose(matrix_from_rpy([0.3, -0.7, 1.1]), np.array([0.2, -0.1, 0.4]))
+
+
+def exact(kind: str, size: tuple[float, ...]) -> object:
+    return {"box": coal.Box, "sphere": coal.Sphere, "cylinder": coal.Cylinder}[kind](*size)
+
+
+def coal_distance(one: object, at: Pose, other: object, there: Pose) -> float:
+    poses = [coal.Transform3s(pose.R, pose.r) for pose in (at, there)]
+    return float(
+        coal.distance(one, poses[0], other, poses[1], coal.DistanceRequest(), coal.DistanceResult())
+    )
+
+
+def bound(one: RoundedBox, at: Pose, other: RoundedBox, there: Pose) -> float:
+    R_1, r_1, R_2, r_2 = (x[np.newaxis] for x in (at.R, at.r, there.R, there.r))
+    return float(separation(one, R_1, r_1, other, R_2, r_2)[0])
+
+
+@settings(max_examples=150, deadline=None)
+@given(SHAPES, SHAPES, PLACES, TURNS)
+def test_the_bound_is_not_above_the_exact_distance(
+    one: Form, other: Form, place: Triple, turn: Triple
+) -> None:
+    shapes = [Shape(kind, size, OFFSET) for kind, size in (one, other)]
+    link = Pose(matrix_from_rpy(turn), np.array(place))
+    found = bound(RoundedBox.around(shapes[0]), Pose(), RoundedBox.around(shapes[1]), link)
+    true = coal_distance(exact(*one), OFFSET, exact(*other), link @ OFFSET)
+    # Depths of coal are those of an iteration.
+    assert found <= max(true, 0.0) + 1e-5
+
+
+@pytest.mark.slow
+@settings(max_examples=150, deadline=None)
+@given(st.tuples(SIZES, SIZES, SIZES), st.tuples(SIZES, SIZES, SIZES), PLACES, TURNS)
+def test_the_bound_of_boxes_that_are_apart_is_their_distance(
+    one: Triple, other: Triple, place: Triple, turn: Triple
+) -> None:
+    boxes = [RoundedBox(OFFSET, np.array(size) / 2) for size in (one, other)]
+    link = Pose(matrix_from_rpy(turn), np.array(place))
+    true = coal_distance(coal.Box(*one), OFFSET, coal.Box(*other), link @ OFFSET)
+    found = bound(boxes[0], Pose(), boxes[1], link)
+    assert found <= max(true, 0.0) + 1e-5
+    if true > 0.05:
+        assert found == pytest.approx(true, rel=0.05)
+
+
+def test_capsules_at_right_angles_are_as_far_as_their_lines() -> None:
+    one = RoundedBox(Pose(), np.array([0.5, 0.0, 0.0]), 0.1)
+    other = RoundedBox(Pose(), np.array([0.0, 0.7, 0.0]), 0.2)
+    assert bound(one, Pose(), other, Pose(r=np.array([0.3, 0.4, 0.9]))) == pytest.approx(0.6)
+    # Beyond the end of the first: a corner of a triangle with sides 0.4 and 0.9.
+    beyond = bound(one, Pose(), other, Pose(r=np.array([0.9, 0.1, -0.9])))
+    assert beyond == pytest.approx(math.hypot(0.4, 0.9) - 0.3)
+
+
+def test_the_bound_of_overlapping_boxes_is_minus_their_depth() -> None:
+    one = RoundedBox(Pose(), np.array([1.0, 2.0, 3.0]))
+    other = RoundedBox(Pose(), np.array([0.5, 0.4, 0.3]))
+    assert bound(one, Pose(), other, Pose(r=np.array([1.3, 0.2, 0.1]))) == pytest.approx(-0.2)
+
+
+def test_a_capsule_is_its_own_bound() -> None:
+    radius, length = 0.2, 0.6
+    box = RoundedBox.around(Shape("capsule", (radius, length), OFFSET))
+    assert box.volume == pytest.approx(math.pi * radius**2 * (length + 4 / 3 * radius))
+    # End to end, its balls are 0.9 m apart.
+    along = Pose(r=OFFSET.R @ [0.0, 0.0, 0.9 + length])
+    assert bound(box, Pose(), box, along) == pytest.approx(0.9 - 2 * radius)
+
+
+def test_edges_that_cross_overlap_by_their_heights() -> None:
+    """Beams that lie on their edges, one across the other at 30 degrees."""
+    rest = Pose(matrix_from_rpy([math.pi / 4, 0.0, 0.0]))
+    beam = RoundedBox(rest, np.array([2.0, 0.1, 0.1]))
+    height = 0.1 * math.sqrt(2)
+    for depth in (0.01, 0.03):
+        above = Pose(matrix_from_rpy([0, 0, math.pi / 6]), np.array([0, 0, 2 * height - depth]))
+        assert bound(beam, Pose(), beam, above) == pytest.approx(-depth)
+
+
+@pytest.mark.parametrize("squash", [(1.0, 1.0, 1.0), (0.05, 0.05, 1.0), (1.0, 0.4, 0.0)])
+def test_a_mesh_is_enclosed(squash: tuple[float, float, float]) -> None:
+    rng = np.random.default_rng(5)
+    points: Array = rng.normal(size=(40, 3)) * squash @ OFFSET.R.T + OFFSET.r
+    box = RoundedBox.around(Shape("mesh", (1.0, 1.0, 1.0), OFFSET), points)
+    local = (points - box.pose.r) @ box.pose.R
+    outside = np.linalg.norm(np.maximum(np.abs(local) - box.half, 0.0), axis=1)
+    assert outside.max() <= box.radius + 1e-12
+    ball = np.linalg.norm(points - box.pose.r, axis=1).max()
+    assert ball <= box.bounding_radius + 1e-12
+    # As small as a box along the axes that the points were drawn along.
+    plain = np.prod(np.ptp((points - OFFSET.r) @ OFFSET.R, axis=0))
+    assert box.volume <= plain + 1e-12

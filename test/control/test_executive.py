@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 from support.executive_loop import (
     AIM,
     KD,
@@ -28,6 +29,7 @@ from support.executive_loop import (
 from support.sentences import assert_one_sentence
 
 from spacerobot_ros.control import (
+    ControlState,
     Gains,
     JointReference,
     PoseReference,
@@ -35,12 +37,15 @@ from spacerobot_ros.control import (
 )
 from spacerobot_ros.control.config import ControllerConfig
 from spacerobot_ros.control.controller import build_controller
+from spacerobot_ros.control.executive import GOAL_KEYS, ControlExecutive
 from spacerobot_ros.control.reference import HeldVelocityReference
 from spacerobot_ros.control.status import CommandReport, ControllerState, ControllerStatus
 from spacerobot_ros.errors import ParameterError, PlanningError, SpaceRobotError
+from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.parameters import configured
 from spacerobot_ros.planning import Goal
-from spacerobot_ros.planning.execution.goal_file import IdentifiedGoal
+from spacerobot_ros.planning.execution.goal_file import GoalFile, IdentifiedGoal
+from spacerobot_ros.resources import robot_file
 
 # -- goals ------------------------------------------------------------------------------------
 
@@ -557,3 +562,28 @@ def test_a_jump_of_time_is_no_progress_of_a_goal(ticks: int) -> None:
     assert loop.state == "tracking"
     loop.answer(3)
     assert loop.state == "reached"
+
+
+def test_force_and_torque_that_thrusters_cannot_give_are_reported_apart() -> None:
+    robot = SpaceRobot.from_file(robot_file("three_joint_arm"))
+    turned = Goal(np.array([0.3, -0.2, 0.1]), Rotation.from_rotvec([0.5, -0.3, 0.2]).as_quat())
+    rest = ControlState.at_rest(np.zeros(3), UPRIGHT, np.zeros(3))
+    wrenches, statuses = list[Any](), list[ControllerStatus]()
+    for limits in ({}, {"max_force": 0.5, "max_torque": 0.25}):
+        config = configured(
+            ControllerConfig,
+            {"status_period": 0.01, "profile": "step", "tick_rate": 100.0, **limits},
+        )
+        executive = ControlExecutive(
+            build_controller(robot, config), config, statuses.append, GoalFile("", GOAL_KEYS)
+        )
+        executive.submit("base", IdentifiedGoal(turned))
+        result = executive.command(0.01, rest, rest.q, rest.qdot, None)
+        executive.evaluate(0.01, result)
+        wrenches.append(result.realised.wrench_B)
+    lost, report = wrenches[0] - wrenches[1], statuses[-1].command
+    assert report is not None
+    assert np.linalg.norm(wrenches[1][:3]) == pytest.approx(0.5)
+    assert report.lost_force_N == pytest.approx(np.linalg.norm(lost[:3]))
+    assert report.lost_torque_Nm == pytest.approx(np.linalg.norm(lost[3:]))
+    assert abs(lost[3]) > 1e-3

@@ -27,7 +27,6 @@ from spacerobot_ros.control.limits import (
     JointRateLimits,
     LimitCheck,
     Saturated,
-    _affordable_push_share,
 )
 from spacerobot_ros.control.status import ControllerStatus
 from spacerobot_ros.events import Event, EventKind
@@ -528,21 +527,3 @@ def test_a_reference_at_rest_does_not_change_with_the_arrays_of_a_state() -> Non
         part += 0.1
     for part, expected in zip(parts, before, strict=True):
         np.testing.assert_array_equal(part, expected)
-
-
-@pytest.mark.parametrize(
-    ("wanted", "pushed", "share"),
-    [
-        ([0.0, 10.0], [400.0, 0.0], 0.5),
-        ([-100.0, 10.0], [300.0, 0.0], 1 / 3),
-        # The first motor cannot do its part, whatever the push; or each would need another push.
-        ([250.0, 0.0], [0.0, 100.0], 0.0),
-        ([300.0, -300.0], [200.0, 200.0], 0.0),
-    ],
-)
-def test_the_largest_share_of_a_push_that_motors_bear(
-    wanted: list[float], pushed: list[float], share: float
-) -> None:
-    """``abs(wanted - share * pushed) <= effort`` for all, of 200 and 50 N m."""
-    found = _affordable_push_share(np.array(wanted), np.array(pushed), np.array([200.0, 50.0]))
-    assert found == pytest.approx(share)

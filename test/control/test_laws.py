@@ -1,4 +1,4 @@
-"""What all laws have in common: references, gains, options, attitudes, compiled code."""
+"""The laws: what they have in common, their formulas, and their behaviour at singularities."""
 
 from __future__ import annotations
 
@@ -13,6 +13,8 @@ from control.flights import (
     INVERTIBLE,
     PLANAR_GAINS,
     PLANAR_GOAL,
+    Array,
+    Flight,
     fly,
     law_of,
     load,
@@ -20,18 +22,25 @@ from control.flights import (
     plant_of,
     pose,
     random_state,
+    scaled_robot,
 )
 from control.servicer_motion import (
     GAINS,
+    KD,
+    KP,
     POSES,
+    OutputMotion,
     random_reference,
+    rates,
     well_conditioned_state,
 )
+from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 from support.random_robots import random_chain_urdf
 
 from spacerobot_ros.control import (
     LAWS,
+    Actuation,
     ControlLaw,
     ControlState,
     GainPair,
@@ -254,13 +263,255 @@ def test_gains_are_bounded_so_that_commands_are_numbers(law: str) -> None:
         assert np.isfinite(part.tau).all()
 
 
-def test_an_error_that_is_no_number_is_no_small_share() -> None:
-    law = law_of("transposed_jacobian", load("planar_manipulator"), PLANAR_GAINS)
-    bounds = np.linspace(0.5, 1.5, law._out["error"].size)
-    law._out["error"][:] = -0.25 * bounds
-    law._out["error"][1] = 0.75 * bounds[1]
-    assert law.largest_error_share(bounds) == pytest.approx(0.75)
-    for place in (0, 1, -1):
-        law._out["error"][:] = 0.1
-        law._out["error"][place] = np.nan
-        assert np.isnan(law.largest_error_share(bounds))
+# -- the laws against Pinocchio's accelerations and against the paper's own formulas -------------
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_model_based_law_gives_the_error_dynamics(seed: int) -> None:
+    """Eq. (28), spatial: ``eddot + Kd edot + Kp e = 0``."""
+    rng = np.random.default_rng(seed)
+    robot = load("servicer")
+    state, reference = well_conditioned_state(rng), random_reference(rng)
+    law = LAWS["model_based"](robot, POSES, GAINS)
+    motion = OutputMotion(robot, state, law.command(state, reference))
+    velocity, acceleration = rates(reference)
+    e, edot = motion.error(reference), velocity - motion.velocity
+    np.testing.assert_allclose(
+        acceleration - motion.acceleration + KD * edot + KP * e, 0.0, atol=1e-9
+    )
+    np.testing.assert_allclose(law.error, e, atol=1e-12)
+    np.testing.assert_allclose(law.error_rate, edot, atol=1e-12)
+    assert not law.status.singular
+    assert law.status.damping == 0.0
+
+
+class PaperMatrices:
+    """The paper's matrices of the servicer, in numpy, from H+, C+ and J+ alone."""
+
+    def __init__(self, state: ControlState) -> None:
+        robot = load("servicer")
+        R = Rotation.from_quat(state.quaternion_WB).as_matrix()
+        self._of_base = robot.jacobian(robot.base_link, state.q)
+        self.J_q = np.vstack([self._of_base, np.eye(12)[6:]])
+        twist = np.concatenate([state.v_WB_B, state.omega_WB_B, state.qdot])
+        self.z0dot = np.linalg.solve(self.J_q, twist)
+        self.H = robot.inertia_matrix(state.q)
+        self.C = robot.bias(state.q, self.z0dot[:3], state.omega_WB_B, state.qdot)
+        in_base = np.vstack([self._of_base, robot.jacobian(END_EFFECTOR, state.q)])
+        self.J_z = block_diag(R, R, R, R) @ in_base
+
+
+def paper_actuation(Q: Array, matrices: PaperMatrices) -> Array:
+    """Invert eq. (21)."""
+    return np.asarray(np.linalg.solve(matrices.J_q.T, Q))
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_laws_are_the_printed_ones(seed: int) -> None:
+    """Eqs (24), (25), (27), (29) and (30), with ``J_z^-1``, for a square J_z."""
+    rng = np.random.default_rng(100 + seed)
+    robot = load("servicer")
+    state, reference = well_conditioned_state(rng), random_reference(rng)
+    at = PaperMatrices(state)
+    step = 1e-6
+
+    def moved(time: float) -> PaperMatrices:
+        turn = Rotation.from_quat(state.quaternion_WB) * Rotation.from_rotvec(
+            time * state.omega_WB_B
+        )
+        return PaperMatrices(
+            replace(state, quaternion_WB=turn.as_quat(), q=state.q + time * state.qdot)
+        )
+
+    J_z_dot = (moved(step).J_z - moved(-step).J_z) / (2 * step)
+    motion = OutputMotion(robot, state, Actuation(np.zeros(6), np.zeros(6)))
+    velocity, acceleration = rates(reference)
+    e, edot = motion.error(reference), velocity - motion.velocity
+
+    J_inverse = np.linalg.inv(at.J_z)
+    H_tilde = J_inverse.T @ at.H @ J_inverse
+    C_tilde = J_inverse.T @ at.C - H_tilde @ J_z_dot @ at.z0dot
+    Q_27 = at.J_z.T @ (H_tilde @ (KP * e + KD * edot + acceleration) + C_tilde)
+    Q_29 = at.J_z.T @ (KP * e + KD * edot)
+    for name, Q, tolerance in (("model_based", Q_27, 1e-7), ("transposed_jacobian", Q_29, 1e-12)):
+        command = LAWS[name](robot, POSES, GAINS).command(state, reference)
+        expected = paper_actuation(Q, at)
+        found = np.concatenate([command.wrench_B, command.tau])
+        np.testing.assert_allclose(
+            found, expected, atol=tolerance * float(np.linalg.norm(expected))
+        )
+
+
+def test_masses_cancel_from_the_transposed_jacobian() -> None:
+    rng = np.random.default_rng(9)
+    state, reference = well_conditioned_state(rng), random_reference(rng)
+    true = load("servicer")
+    wrong = scaled_robot(true, lambda: float(rng.uniform(0.5, 2.0)))
+    commands = [
+        LAWS["transposed_jacobian"](robot, POSES, GAINS).command(state, reference)
+        for robot in (true, wrong)
+    ]
+    np.testing.assert_allclose(commands[0].wrench_B, commands[1].wrench_B, atol=1e-10)
+    np.testing.assert_allclose(commands[0].tau, commands[1].tau, atol=1e-10)
+
+
+def test_status_has_the_smallest_singular_value() -> None:
+    rng = np.random.default_rng(12)
+    state, reference = well_conditioned_state(rng), random_reference(rng)
+    expected = np.linalg.svd(PaperMatrices(state).J_z, compute_uv=False)[-1]
+    for name in INVERTIBLE:
+        law = LAWS[name](load("servicer"), POSES, GAINS)
+        law.command(state, reference)
+        assert law.status.smallest_singular_value == pytest.approx(expected, rel=1e-9)
+
+
+def test_eq_12_has_the_third_angle_in_its_second_column() -> None:
+    """``omega = S d(Theta)/dt`` of the 321 sequence; the paper prints the first angle there."""
+    first, second, third = angles = np.array([0.4, -0.3, 1.1])
+
+    def rotation(angles: Array) -> Array:
+        return np.asarray(Rotation.from_euler("ZYX", angles[::-1]).as_matrix())
+
+    step, columns = 1e-6, []
+    for axis in np.eye(3):
+        rate = (rotation(angles + step * axis) - rotation(angles - step * axis)) / (2 * step)
+        spin = rate @ rotation(angles).T
+        columns.append([spin[2, 1], spin[0, 2], spin[1, 0]])
+    S = np.array(columns).T
+    np.testing.assert_allclose(S[:, 1], [-np.sin(third), np.cos(third), 0.0], atol=1e-9)
+    roll = [np.cos(second) * np.cos(third), np.cos(second) * np.sin(third), -np.sin(second)]
+    np.testing.assert_allclose(S[:, 0], roll, atol=1e-9)
+    assert np.abs(S[:, 1] - [-np.sin(first), np.cos(first), 0.0]).max() > 0.4
+
+
+# -- arms stretched out or folded (paper 4: sin q2 = 0), and goals out of reach ------------------
+
+
+LEVEL = np.array([0.0, 0.0, 0.0, 1.0])
+GOAL = Reference(pose([0, 0, 0]), pose([1.5, 1.2, 0]))
+
+
+def stretched(elbow: float) -> ControlState:
+    return ControlState.at_rest(np.zeros(3), LEVEL, np.array([0.3, elbow]))
+
+
+def size(law: ControlLaw, elbow: float) -> float:
+    """Return the length of the command (SI) with the elbow at an angle."""
+    actuation = law.command(stretched(elbow), GOAL)
+    return float(np.linalg.norm(np.concatenate([actuation.wrench_B, actuation.tau])))
+
+
+@pytest.mark.parametrize("elbow", [0.0, np.pi, -np.pi, 1e-12, 1e-6, 1e-3, -0.05])
+def test_singular_arm(elbow: float) -> None:
+    robot = load("planar_manipulator")
+    transposed, model_based = (law_of(name, robot, PLANAR_GAINS) for name in INVERTIBLE)
+    # No more than the errors ask for: it inverts nothing.
+    assert size(transposed, elbow) < 300.0
+    assert transposed.status.damping == 0.0
+    assert size(model_based, elbow) < 1000.0
+    smallest = model_based.status.smallest_singular_value
+    assert model_based.status.damping == pytest.approx(np.sqrt(0.1**2 - smallest**2))
+    for law in (transposed, model_based):
+        assert law.status.singular
+        assert law.status.smallest_singular_value < 0.02
+
+
+def test_eq_27_as_printed_fails_at_a_singularity() -> None:
+    """Its ``Htilde = J_z^-T H+ J_z^-1`` has no bound there, so neither has the command."""
+    robot = load("planar_manipulator")
+    law = law_of("transposed_jacobian", robot, PLANAR_GAINS)
+    H = robot.inertia_matrix(np.array([0.3, 1.0]))[np.ix_([0, 1, 5, 6, 7], [0, 1, 5, 6, 7])]
+    sizes = []
+    for elbow in (1.0, 1e-3, 1e-6):
+        law.command(stretched(elbow), GOAL)
+        inverse = np.linalg.inv(law._out["J_z"][:, [0, 1, 5, 6, 7]])
+        sizes.append(float(np.linalg.norm(H @ inverse @ law.error)))
+    assert sizes[2] > 900.0 * sizes[1] > 900.0 * 50.0 * sizes[0]
+
+
+def test_damping_sets_in_smoothly() -> None:
+    """The command has no jump at the threshold, and without damping it explodes."""
+    robot = load("planar_manipulator")
+    law = law_of("model_based", robot, PLANAR_GAINS)
+    sizes, dampings = [], []
+    for elbow in np.linspace(0.25, 0.4, 61):
+        sizes.append(size(law, elbow))
+        dampings.append(law.status.damping)
+        assert law.status.singular == (law.status.damping > 0)
+    assert np.abs(np.diff(sizes)).max() < 0.02 * max(sizes)
+    assert dampings[0] > 0.0
+    assert dampings[-1] == 0.0
+    undamped = law_of("model_based", robot, PLANAR_GAINS, singular_value_threshold=1e-6)
+    assert size(undamped, 1e-5) > 1e5 > 100 * size(law, 1e-5)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", INVERTIBLE)
+@pytest.mark.parametrize("elbow", [0.0, 0.05])
+def test_flight_out_of_a_singularity(name: str, elbow: float) -> None:
+    robot = load("planar_manipulator")
+    law = law_of(name, robot, PLANAR_GAINS)
+    flight = fly(plant_of(robot, stretched(elbow)), law, lambda _: GOAL, 15.0, rate=50.0, every=10)
+    assert flight.statuses[0].singular
+    assert not flight.statuses[-1].singular
+    assert np.abs(flight.errors[-1]).max() < 1e-3
+
+
+def out_of_reach(name: str) -> Flight:
+    """Hold the base while the end-effector is wanted a metre beyond the stretched arm."""
+    robot = load("planar_manipulator")
+    goal = Reference(pose([0, 0, 0]), pose([3.5, 1, 0]))
+    law = law_of(name, robot, PLANAR_GAINS)
+    return fly(plant_of(robot, stretched(0.8)), law, lambda _: goal, 20.0, rate=100.0, every=5)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", INVERTIBLE)
+def test_goal_out_of_reach_is_approached_and_held_quietly(name: str) -> None:
+    flight = out_of_reach(name)
+    last = flight.states[-1]
+    rates = np.concatenate([last.v_WB_B, last.omega_WB_B, last.qdot])
+    assert np.abs(rates).max() < 0.05
+    assert abs(last.q[1]) < 0.02, "the arm is stretched"
+    # What is left is shared: the forces on base and end-effector cancel, as the paper says of
+    # trajectories that are not feasible.
+    error = flight.errors[-1]
+    np.testing.assert_allclose(error[:2], -error[3:], atol=0.01)
+    assert flight.statuses[-1].singular
+    peak = max(np.abs([*a.wrench_B, *a.tau]).max() for a in flight.actuations)
+    assert peak < 200.0
+
+
+@pytest.mark.parametrize("name", INVERTIBLE)
+def test_wrist_singularity_of_the_spatial_arm(name: str) -> None:
+    """A straight wrist: two joint axes in line."""
+    robot = load("servicer")
+    gains = Gains.uniform(1.0, 2.0)
+    q = np.array([0.2, -1.2, 2.0, 0.3, 0.0, -0.4])
+    start = ControlState.at_rest(np.zeros(3), LEVEL, q)
+    law = law_of(name, robot, gains)
+    present = Reference.present(robot, start, END_EFFECTOR)
+    assert present.end_effector is not None
+    goal = Reference(
+        pose([0.1, 0.1, 0.0], [0.0, 0.1, 0.1]),
+        pose(present.end_effector.position + 0.1, [0.3, 0.4, 0.2]),
+    )
+    actuation = law.command(start, goal)
+    assert law.status.singular
+    assert law.status.smallest_singular_value < 1e-12
+    assert np.abs(np.concatenate([actuation.wrench_B, actuation.tau])).max() < 500.0
+
+
+def test_far_from_singularities_the_command_takes_one_evaluation(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    law = law_of("model_based", load("planar_manipulator"), PLANAR_GAINS)
+
+    def damped(*_: object) -> None:
+        raise AssertionError("the singular values are computed for every command")
+
+    monkeypatch.setattr(type(law), "_damped_actuation", damped)
+    law.command(stretched(1.5), GOAL)
+    assert not law.status.singular
+    with pytest.raises(AssertionError, match="singular values"):
+        law.command(stretched(0.01), GOAL)

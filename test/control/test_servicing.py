@@ -389,3 +389,19 @@ def test_rest_is_what_the_parameters_say() -> None:
     assert loop.status.task == "detumble"
     loop.answer(2)
     assert loop.status.task == ""
+
+
+@pytest.mark.parametrize(("clearance", "state"), [(0.0, "tracking"), (0.02, "holding")])
+def test_an_approach_keeps_its_clearance_from_the_target_or_is_refused(
+    clearance: float, state: str
+) -> None:
+    ball = '<collision><geometry><sphere radius="0.5"/></geometry></collision></link>'
+    loop = Meeting(**{"target.clearance": clearance})
+    round_block = parse_robot(URDF.replace("</inertial></link>", f"</inertial>{ball}"))
+    loop.executive.servicing.target.describe(round_block, "handle")
+    loop.answer(2)
+    loop.aim(base=goal_at(AIM, "5"))
+    loop.answer(3)
+    assert loop.state == state
+    refused = "link 'end_effector' would touch 'block' of the target"
+    assert any(refused in said.message for said in loop.statuses) == bool(clearance)

@@ -1,10 +1,11 @@
-"""Errors at rest under a constant wrench, and the integral term that removes them."""
+"""Errors that stay: integral gains, automatic gains, and stalls with their cause."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 from typing import Any
 
+import casadi as ca
 import numpy as np
 import numpy.typing as npt
 import pytest
@@ -19,24 +20,26 @@ from control.flights import (
 )
 from control.servicer_motion import GAINS, KP, well_conditioned_state
 from scipy.spatial.transform import Rotation
+from support.executive_loop import AIM, PERIOD, TIP, ExecutiveLoop, goal_at
+from support.executive_loop import KP as STEP_KP
 from support.oracles import PinocchioOracle, assert_agrees
+from support.sentences import assert_one_sentence
 
-from spacerobot_ros.control import ControlLaw, ControlState, GainPair, Gains, Reference
+from spacerobot_ros.control import LAWS, ControlLaw, ControlState, GainPair, Gains, Reference
 from spacerobot_ros.control.config import ControllerConfig
 from spacerobot_ros.control.controller import build_controller
 from spacerobot_ros.control.steady_state import steady_errors
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.flight.api import fly
+from spacerobot_ros.parameters import configured
+from spacerobot_ros.planning import Goal
+from spacerobot_ros.planning.execution.goal_file import IdentifiedGoal
 from spacerobot_ros.simulation import EffortPlant, InitialState
 from spacerobot_ros.simulation.loads import PlantLoads
 
 Array = npt.NDArray[np.float64]
 
 PUSH = np.array([0.6, -0.8, 0.3, 0.2, -0.1, 0.4])
-
-
-def at_rest(state: ControlState) -> ControlState:
-    return ControlState.at_rest(state.r_WB, state.quaternion_WB, state.q)
 
 
 @pytest.mark.parametrize("name", INVERTIBLE)
@@ -290,3 +293,270 @@ def test_the_papers_robot_flies_into_its_steady_state(law: str, ki: float) -> No
     if not ki:
         expected = 0.0333333 if law == "transposed_jacobian" else 0.000773
         assert np.linalg.norm(controller.error[:2]) == pytest.approx(expected, rel=0.05)
+
+
+# -- gains that nobody sets: they follow the masses, the shape and the control period ------------
+
+
+FASTEST = 1.0
+"""Natural frequency of errors under automatic gains, if the control period permits, rad/s."""
+
+
+def accelerations(law: ControlLaw, state: ControlState, reference: Reference) -> Array:
+    """Return the accelerations of the outputs under a command from rest, by the plant."""
+    actuation, step = law.command(state, reference), 1e-4
+    plant = EffortPlant(law.robot, step, InitialState(state.r_WB, state.quaternion_WB, state.q))
+    plant.step(actuation.tau, actuation.wrench_B)
+    moved = ControlState(
+        plant.pose[:3], plant.pose[3:], plant.twist[:3], plant.twist[3:], plant.q, plant.qdot
+    )
+    law.command(moved, reference)
+    return np.asarray(-law.error_rate / step)
+
+
+@pytest.mark.parametrize("name", [*LAWS])
+def test_from_rest_errors_are_accelerated_towards_zero_by_their_stiffness(name: str) -> None:
+    robot, state = load("planar_manipulator"), planar_start()
+    law = law_of(name, robot, Gains())
+    present = Reference.present(robot, state, "end_effector")
+    assert present.base is not None
+    assert present.end_effector is not None
+    assert present.joints is not None
+    reference = Reference(
+        replace(present.base, position=present.base.position + np.array([0.03, -0.02, 0.0])),
+        replace(
+            present.end_effector,
+            position=present.end_effector.position + np.array([0.0, 0.05, 0.0]),
+        ),
+        replace(present.joints, q=present.joints.q + np.array([0.04, -0.03])),
+    )
+    found = accelerations(law, state, reference)
+    law.command(state, reference)
+    wanted = FASTEST**2 * law.error
+    # The mass matrix of a law that commands forces is damped a little.
+    np.testing.assert_allclose(found, wanted, atol=0.1 * np.abs(wanted).max())
+
+
+@pytest.mark.parametrize("name", [*LAWS])
+@pytest.mark.parametrize(("rate", "damping"), [(1.0, 0.4), (5.0, 2.0), (200.0, 2.0)])
+def test_slow_controllers_have_low_gains(name: str, rate: float, damping: float) -> None:
+    config = configured(ControllerConfig, {"law": name, "tick_rate": rate})
+    law = build_controller(load("planar_manipulator"), config).law
+    kp, kd = law.gain_diagonals
+    np.testing.assert_allclose(kd, damping)
+    np.testing.assert_allclose(kp, damping**2 / 4, err_msg="critical damping")
+
+
+def test_at_a_singularity_commands_stay_bounded() -> None:
+    robot = load("planar_manipulator")
+    law = law_of("transposed_jacobian", robot, Gains())
+    state = ControlState.at_rest(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(2))
+    present = Reference.present(robot, state, "end_effector")
+    assert present.end_effector is not None
+    out = replace(
+        present.end_effector, position=present.end_effector.position + np.array([1.0, 0.0, 0.0])
+    )
+    command = law.command(state, Reference(present.base, out))
+    assert law.status.singular
+    # No actuator moves it there. A force that gives the whole robot this acceleration is 47 N.
+    assert np.linalg.norm(command.wrench_B) + np.linalg.norm(command.tau) < 47.0
+
+
+def automatic_gains(*groups: str) -> dict[str, Any]:
+    return {f"gains.{group}.{name}": 0.0 for group in groups for name in ("kp", "kd")}
+
+
+def test_gains_become_automatic_in_flight_and_back() -> None:
+    loop = ExecutiveLoop()
+    loop.aim(base=goal_at(AIM))
+    given = np.concatenate(loop.answer())
+    loop.configure(gains=Gains())
+    automatic = np.concatenate(loop.answer())
+    assert np.linalg.norm(automatic - given) > 1.0
+    fresh = ExecutiveLoop(**automatic_gains(*vars(Gains())))
+    fresh.aim(base=goal_at(AIM))
+    np.testing.assert_allclose(automatic, np.concatenate(fresh.answer()), rtol=1e-9)
+    loop.configure(gains=Gains.uniform(STEP_KP, 2 * STEP_KP))
+    np.testing.assert_allclose(np.concatenate(loop.answer()), given, rtol=1e-9, atol=1e-9)
+
+
+def test_a_group_with_gains_keeps_them() -> None:
+    """At rest the force on the base is the sum of those on both poses."""
+    others = [group for group in vars(Gains()) if group != "base_position"]
+    loop = ExecutiveLoop(**automatic_gains(*others))
+    loop.aim(base=goal_at(AIM))
+    np.testing.assert_allclose(loop.answer()[0][:3], STEP_KP * AIM, rtol=1e-9, atol=1e-9)
+
+
+class _Spring(ControlLaw):
+    """A law that pulls the base, as somebody else may write it."""
+
+    name = "spring"
+    gain_units = ("N/m", "N s/m")
+
+    def _results(self, symbols: dict[str, ca.SX]) -> dict[str, ca.SX]:
+        z1 = self.outputs
+        pull = symbols["kp"] * z1.error + symbols["kd"] * z1.error_rate
+        return {"actuation": (z1.J_z @ z1.J_q_inverse).T @ pull}
+
+
+def test_a_law_without_automatic_gains_says_which_it_needs() -> None:
+    robot = load("planar_manipulator")
+    outputs = _Spring.default_outputs(robot, "end_effector")
+    with pytest.raises(ParameterError) as refused:
+        _Spring(robot, outputs, replace(Gains.uniform(1.0, 2.0), base_attitude=GainPair(1.0)))
+    assert_one_sentence(str(refused.value), "The law 'spring' has no automatic gains")
+    _Spring(robot, outputs, Gains.uniform(1.0, 2.0))
+
+
+def test_a_robot_without_joints_is_controlled() -> None:
+    urdf = """<robot name="cube"><link name="hull"><inertial><mass value="16"/>
+      <inertia ixx="0.18" iyy="0.18" izz="0.18" ixy="0" ixz="0" iyz="0"/></inertial></link>
+      </robot>"""
+    robot = type(load("planar_manipulator")).from_urdf(urdf)
+    controller = build_controller(robot, ControllerConfig(profile="step"))
+    state = ControlState.at_rest(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(0))
+    controller.set_goals(0.0, state, base=pose([0.5, 0.0, -0.25], [0.0, 0.1, 0.0]))
+    unseen = controller.command(0.0, None, state.q, state.qdot).realised
+    np.testing.assert_array_equal(unseen.wrench_B, np.zeros(6))
+    result = controller.command(0.0, state, state.q, state.qdot).realised
+    wanted = [*(16 * np.array([0.5, 0.0, -0.25])), 0.0, 0.18 * 0.1, 0.0]
+    np.testing.assert_allclose(result.wrench_B, np.array(wanted) / 1.02, rtol=1e-6, atol=1e-12)
+
+
+# -- robots that come no nearer to their goals: said, with the cause, and taken back -------------
+
+
+SECONDS = round(1 / PERIOD)
+
+
+def aimed(**settings: Any) -> ExecutiveLoop:
+    loop = ExecutiveLoop(**settings)
+    loop.answer()
+    move(loop, AIM, "7")
+    return loop
+
+
+def move(loop: ExecutiveLoop, by: Array, goal_id: str) -> None:
+    """Give goals to the base and to the end-effector, which is carried along."""
+    loop.aim(base=goal_at(by, goal_id), end_effector=goal_at(TIP + by, goal_id))
+
+
+def wait_for_stall(loop: ExecutiveLoop, longest: float = 40.0) -> float:
+    """Show states until the robot is stalled; return the simulated time that it takes, s."""
+    began = loop.tick
+    while loop.state != "stalled":
+        assert (loop.tick - began) * PERIOD < longest, loop.status.message
+        loop.answer(10)
+    assert loop.status.state.level == 1
+    return (loop.tick - began) * PERIOD
+
+
+def test_a_robot_that_does_not_move_is_stalled_until_it_moves() -> None:
+    loop = aimed()
+    assert wait_for_stall(loop) < 25.0
+    message = loop.status.message
+    assert_one_sentence(message, "Stalled 0.559 m, 0 rad from the reference: its errors no longer")
+    assert loop.status.goal_id == "7"
+    assert loop.executive.unfinished_goals == {"7"}
+    assert [event.kind.value for event in loop.events] == ["goal_accepted"], "it is no decision"
+    loop.answer(5 * SECONDS)
+    assert loop.state == "stalled"
+    for share in np.linspace(0.0, 0.8, 30 * SECONDS):
+        loop.place = share * AIM
+        loop.answer()
+    assert loop.state == "tracking"
+    assert loop.status.message.startswith("Flying to the goal; ")
+
+
+def test_a_new_goal_is_not_stalled_from_the_beginning() -> None:
+    loop = aimed()
+    wait_for_stall(loop)
+    move(loop, -AIM, "8")
+    loop.answer()
+    assert (loop.state, loop.status.goal_id) == ("tracking", "8")
+    wait_for_stall(loop)
+
+
+def test_within_the_tolerances_nothing_is_stalled() -> None:
+    loop = aimed(position_tolerance=1.0, settle_time=1000.0)
+    loop.answer(40 * SECONDS)
+    assert loop.state == "tracking"
+
+
+def test_errors_that_shrink_slowly_are_no_stall() -> None:
+    loop = aimed()
+    for tick in range(60 * SECONDS):
+        loop.place = (1 - np.exp(-tick * PERIOD / 30.0)) * AIM
+        loop.answer()
+        assert loop.state == "tracking"
+
+
+def test_a_robot_that_starts_slowly_is_not_stalled() -> None:
+    """With 1 mm/s^2, it makes 2 % of its way in 4.7 s at first, and more and more."""
+    loop = aimed(max_force=0.05)
+    for tick in range(25 * SECONDS):
+        loop.place = 0.5 * 0.001 * (tick * PERIOD) ** 2 * AIM / np.linalg.norm(AIM)
+        loop.answer()
+        assert loop.state == "tracking"
+
+
+def test_limits_that_hold_the_robot_back_are_named() -> None:
+    loop = aimed(max_force=1.0)
+    wait_for_stall(loop)
+    assert loop.status.message.endswith(": the force of the thrusters is at its limit.")
+    loop = ExecutiveLoop(max_torque=0.01, base_outputs="x y rz", end_effector_outputs="")
+    turned = np.array([0.0, 0.0, np.sin(0.1), np.cos(0.1)])
+    loop.aim(base=IdentifiedGoal(Goal(np.zeros(3), turned), "turned"))
+    loop.answer()
+    wait_for_stall(loop)
+    assert loop.status.message.endswith(": the torque on the base is at its limit.")
+
+
+def test_a_failure_names_the_cause() -> None:
+    loop = aimed(max_force=1.0, time_limit=40.0)
+    wait_for_stall(loop)
+    loop.answer(41 * SECONDS)
+    assert loop.state == "failed"
+    message = (
+        "The goal is not reached in time, as the force of the thrusters is at its limit: 0.559"
+    )
+    assert_one_sentence(loop.status.message, message)
+
+
+def test_a_robot_that_stays_behind_its_reference_is_stalled_on_the_way() -> None:
+    loop = ExecutiveLoop(profile="quintic")
+    loop.answer()
+    move(loop, np.array([10.0, 0.0, 0.0]), "far")
+    loop.answer()
+    ends = loop.executive.controller.reference_ends
+    assert ends is not None
+    assert wait_for_stall(loop, ends) < 0.8 * ends
+    assert not loop.executive.controller.reference_at_rest(loop.tick * PERIOD)
+
+
+def test_a_robot_that_is_behind_and_follows_is_not_stalled_on_the_way() -> None:
+    loop = ExecutiveLoop(profile="quintic")
+    loop.answer()
+    move(loop, np.array([2.0, 0.0, 0.0]), "far")
+    loop.answer()
+    controller = loop.executive.controller
+    while not controller.reference_at_rest(loop.tick * PERIOD):
+        late = controller.profile.at(loop.tick * PERIOD - 4.0).base if controller.profile else None
+        assert late is not None
+        loop.place = late.position
+        loop.answer()
+        assert loop.state == "tracking"
+
+
+def test_before_a_first_measurement_a_controller_waits() -> None:
+    loop = ExecutiveLoop()
+    loop.answer(measured=False)
+    assert (loop.state, loop.status.state.level) == ("waiting", 0)
+    assert_one_sentence(loop.status.message, "Waiting for states on 'odom'")
+    loop.answer()
+    assert loop.state == "holding"
+    assert_one_sentence(loop.status.message, "Waiting for a goal; holding, 0 m")
+    loop.executive.reset()
+    loop.answer(measured=False)
+    assert loop.state == "waiting"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -15,8 +14,6 @@ from support.sentences import assert_one_sentence
 from spacerobot_ros.collision import ObstaclePair
 from spacerobot_ros.control import approach
 from spacerobot_ros.control.approach import NearestLinks, TargetClearance
-from spacerobot_ros.control.config import ControllerConfig
-from spacerobot_ros.control.servicing import ApproachTask, MeasuredTarget
 from spacerobot_ros.control.target_motion import (
     FrameMotion,
     PathInWorld,
@@ -25,7 +22,6 @@ from spacerobot_ros.control.target_motion import (
 )
 from spacerobot_ros.model import parse_robot
 from spacerobot_ros.model.description import Array, Pose
-from spacerobot_ros.parameters import configured
 
 WEIGHT = (
     '<inertial><mass value="2"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/>'
@@ -222,22 +218,3 @@ def test_a_path_in_the_world_joins_motion_and_standoff() -> None:
     after = path.at([T + 1.0])
     np.testing.assert_allclose(after.x[0], OPTIONS.standoff)
     np.testing.assert_allclose(after.xdot[0], 0.0)
-
-
-def test_the_clearance_of_a_controller_is_its_parameter() -> None:
-    body = parse_robot(BODY)
-    measured = MeasuredTarget()
-    law = SimpleNamespace(
-        robot=SimpleNamespace(description=parse_robot(ROBOT)),
-        outputs=SimpleNamespace(selection=SimpleNamespace(end_effector_link="hand")),
-    )
-    controller: Any = SimpleNamespace(law=law)
-    for least in (0.03, 0.0):
-        config = configured(ControllerConfig, {"target.clearance": least})
-        made = ApproachTask(measured, config)
-        assert made._clearance(controller) is None
-        measured.describe(body, "ring")
-        found = made._clearance(controller)
-        assert (found.min_distance if found else 0.0) == least
-        measured.body = None
-    assert ControllerConfig().target.clearance == 0.02

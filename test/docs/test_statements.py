@@ -18,7 +18,7 @@ HELD_BY_TESTS = [
     (
         "docs/records.md",
         "each of the thirteen scenarios without faults",
-        "verification/test_reference_bags.py::test_every_scenario_has_a_bag_and_they_are_small",
+        "verification/test_second_opinion.py::test_every_scenario_has_a_bag_and_they_are_small",
     ),
     (
         "docs/campaigns.md",
@@ -33,12 +33,12 @@ HELD_BY_TESTS = [
     (
         "docs/theory/coordinated_control.md",
         "15.3 mm; 3e-10 m from the line through the true start",
-        "control/test_paper_example.py::test_end_effector_path_is_a_straight_line",
+        "control/test_computed_torque.py::test_end_effector_path_is_a_straight_line",
     ),
     (
         "docs/theory/coordinated_control.md",
         "As printed, (27) does fail there",
-        "control/test_singularity.py::test_eq_27_as_printed_fails_at_a_singularity",
+        "control/test_laws.py::test_eq_27_as_printed_fails_at_a_singularity",
     ),
     (
         "docs/theory/square_path.md",
@@ -61,7 +61,7 @@ HELD_BY_TESTS = [
     (
         "docs/theory/coordinated_control.md",
         "The paper prints $\\theta_1$ there.",
-        "control/test_equations.py::test_eq_12_has_the_third_angle_in_its_second_column",
+        "control/test_laws.py::test_eq_12_has_the_third_angle_in_its_second_column",
     ),
 ]
 """Page, statement, and the test that holds it."""

@@ -1,4 +1,4 @@
-"""Barycentric vectors (paper 4, eqs 1-3) and the energy of the inertia they give (eq. 14)."""
+"""Barycentric vectors and numbers of papers, and motion in orbit."""
 
 from __future__ import annotations
 
@@ -8,6 +8,9 @@ from pathlib import Path
 import casadi as ca
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.integrate import solve_ivp
 from support.oracles import (
     Array,
     MujocoOracle,
@@ -18,7 +21,15 @@ from support.oracles import (
 from support.oracles.barycentric import barycentric_vectors
 from support.random_robots import random_chain_urdf, random_robot_urdf
 
+from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.model import RobotDescription, SpaceRobot, parse_robot
+from spacerobot_ros.model.external_loads import (
+    EARTH_GRAVITATION,
+    EARTH_RADIUS,
+    mean_motion_at,
+    relative_acceleration,
+    relative_motion,
+)
 from spacerobot_ros.model.kinematics import tree_kinematics
 
 SEEDS = range(50, 54)
@@ -138,3 +149,222 @@ def test_energy_of_the_inertia_matrix(seed: int) -> None:
 
 def test_energy_of_the_compiled_inertia_matrix(compiled_code: Path) -> None:
     assert_energy_is_that_of_the_bodies(51)
+
+
+# -- numbers of papers 2 to 4 (paper 1: ``test_curvature``), and the robots in ``urdf/`` ---------
+
+
+URDF = Path(__file__).parents[2] / "urdf"
+ROBOTS = ("planar_chain", "planar_manipulator", "sliding_masses", "three_joint_arm")
+
+
+def load(name: str) -> SpaceRobot:
+    return SpaceRobot.from_file(URDF / f"{name}.urdf")
+
+
+# -- the robots -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_robot_is_physically_valid(name: str) -> None:
+    robot = load(name)
+    assert robot.description.name == name
+    assert robot.base_link == "base_link"
+    for link in robot.description.links:
+        moments = np.linalg.eigvalsh(link.inertia.about_com)
+        assert moments[2] <= moments[0] + moments[1] + 1e-12, link.name
+        assert link.shapes or link.name == "end_effector"
+    assert np.all(np.isfinite(robot.velocity_limit) & (robot.velocity_limit > 0))
+    assert np.all(np.isfinite(robot.effort_limit) & (robot.effort_limit > 0))
+    assert np.all(robot.lower < robot.upper)
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_robot_has_the_connection_of_pinocchio(name: str) -> None:
+    robot = load(name)
+    oracle = PinocchioOracle((URDF / f"{name}.urdf").read_text("utf-8"), robot.joint_names)
+    for q in np.random.default_rng(40).uniform(-1.5, 1.5, (5, robot.n)):
+        assert_agrees(robot.connection(q), oracle.connection(q))
+
+
+# -- paper 2: a three-joint arm turns the spacecraft ------------------------------------------
+
+
+def test_curvature_of_the_representative_arm_is_well_conditioned() -> None:
+    K = load("three_joint_arm").curvature(np.radians([0.0, -45.0, 90.0]))
+    M = np.column_stack([K[3:, 0, 1], K[3:, 1, 2], K[3:, 2, 0]])
+    assert round(float(np.linalg.cond(M)), 2) == 3.60
+
+
+# -- paper 3: a planar chain ------------------------------------------------------------------
+
+
+def closed_forms(psi: Array) -> Array:
+    """Return ``s = (N_1, N_2) / D``, section IV as printed."""
+    one, two, both = np.cos(psi[0]), np.cos(psi[1]), np.cos(psi[0] + psi[1])
+    N_1 = 17.5 + 7.5 * one + 10.5 * two + 2.5 * both
+    N_2 = 3.75 + 5.25 * two + 2.5 * both
+    D = 32.5 + 15 * one + 10.5 * two + 5 * both
+    return np.array([N_1, N_2]) / D
+
+
+@pytest.mark.parametrize("psi", np.random.default_rng(41).uniform(-np.pi, np.pi, (8, 2)))
+def test_connection_of_the_planar_chain_is_the_printed_one(psi: Array) -> None:
+    robot = load("planar_chain")
+    A = robot.connection(psi)
+    # theta1dot = -s' psidot, about z and nothing else.
+    assert_agrees(A[5], closed_forms(psi))
+    assert_agrees(A[2:5], np.zeros((3, 2)))
+    # The base's centre of mass is its origin: the system's stays where it is.
+    oracle = PinocchioOracle(robot.description.urdf, robot.joint_names)
+    assert_agrees(A, oracle.connection(psi))
+
+
+def test_compiled_connection_of_the_planar_chain(compiled_code: Path) -> None:
+    robot, psi = load("planar_chain"), np.array([2.0, -1.0])
+    assert_agrees(robot.connection(psi)[5], closed_forms(psi))
+    assert robot.function("connection").class_name() == "External"
+
+
+@pytest.mark.parametrize(
+    ("psi", "height"),
+    [
+        (np.array([5 * np.pi / 6, 2 * np.pi / 3]), 0.5357),
+        (np.array([2 * np.pi / 3, 5 * np.pi / 6]), 0.3003),
+        (np.radians([153.0, 121.0]), 0.5376),
+        (np.radians([-153.0, -121.0]), -0.5376),
+    ],
+)
+def test_phase_density_of_the_planar_chain(psi: Array, height: float) -> None:
+    step = 1e-5
+    e_1, e_2 = step * np.eye(2)
+    H = (
+        (closed_forms(psi + e_1) - closed_forms(psi - e_1))[1]
+        - (closed_forms(psi + e_2) - closed_forms(psi - e_2))[0]
+    ) / (2 * step)
+    assert round(float(H), 4) == height
+    K = load("planar_chain").curvature(psi)[:, 0, 1]
+    # In a plane rotations commute, and the curvature is the phase density alone: the base turns by
+    # minus the integral of s' dpsi.
+    assert_agrees(K[5], -H, tolerance=1e-8)
+    assert_agrees(K[2:5], np.zeros(3))
+
+
+# -- paper 4: spacecraft and manipulator ------------------------------------------------------
+
+
+def test_start_of_the_planar_manipulator() -> None:
+    robot = load("planar_manipulator")
+    theta, q = np.radians(21.0), np.radians([-58.0, 60.3])
+    R_WB = np.array(
+        [
+            [np.cos(theta), -np.sin(theta), 0.0],
+            [np.sin(theta), np.cos(theta), 0.0],
+            [0.0, 0.0, 1.0],
+        ]
+    )
+    # The system's centre of mass is the origin of the world.
+    spacecraft = -R_WB @ robot.center_of_mass(q)
+    end_effector = spacecraft + R_WB @ robot.link_pose("end_effector", q)[1]
+    assert np.round(spacecraft, 5).tolist() == [-0.18380, 0.02471, 0.0]
+    assert np.round(end_effector, 5).tolist() == [2.00008, -0.00237, 0.0]
+
+
+def test_table_of_the_planar_manipulator() -> None:
+    robot = load("planar_manipulator")
+    bodies = robot.description.bodies
+    assert [body.inertia.mass for body in bodies] == [40.0, 4.0, 3.0]
+    assert [body.inertia.about_com[2, 2] for body in bodies] == [6.667, 0.333, 0.250]
+    # Stretched out: spacecraft, its end, the joints and the end-effector half a metre from each
+    # centre of mass.
+    for link, x in (("link_1", 0.5), ("link_2", 1.5), ("end_effector", 2.5)):
+        assert_agrees(robot.link_pose(link, [0.0, 0.0])[1], [x, 0.0, 0.0])
+    for body in bodies[1:]:
+        assert body.inertia.com.tolist() == [0.5, 0.0, 0.0]
+
+
+# -- relative motion on a circular orbit, against integrations of two bodies ---------------------
+
+
+R0, V0 = np.array([3.0, -7.0, 2.0]), np.array([0.02, -0.01, 0.015])
+
+
+def test_the_period_of_low_and_geosynchronous_orbits() -> None:
+    assert 2 * np.pi / mean_motion_at(400e3) == pytest.approx(5553.6, abs=0.1)
+    assert 2 * np.pi / mean_motion_at(35786e3) == pytest.approx(86164.0, abs=1.0)
+
+
+@pytest.mark.parametrize("n", [0.0011, 0.7])
+def test_the_solution_solves_the_equations(n: float) -> None:
+    def rate(_: float, x: Array) -> Array:
+        return np.concatenate([x[3:], relative_acceleration(n, x[:3], x[3:])])
+
+    times = np.array([0.3, 1.1, 5.0]) / n
+    flown = solve_ivp(rate, (0.0, times[-1]), [*R0, *V0], t_eval=times, rtol=1e-12, atol=1e-12)
+    r, v = relative_motion(n, R0, V0, times)
+    np.testing.assert_allclose(r, flown.y[:3].T, rtol=1e-8, atol=1e-8)
+    np.testing.assert_allclose(v, flown.y[3:].T, rtol=1e-8, atol=1e-8)
+    one, _ = relative_motion(n, R0, V0, float(times[1]))
+    np.testing.assert_array_equal(one, r[1])
+
+
+def test_two_bodies_in_an_inverse_square_field_part_like_this() -> None:
+    """To first order in the distance over the radius of the orbit: 6800 km against 10 m."""
+    radius = EARTH_RADIUS + 400e3
+    n = mean_motion_at(400e3)
+    circle = np.array([radius, 0.0, 0.0]), np.array([0.0, radius * n, 0.0])
+    spin = np.array([0.0, 0.0, n])
+
+    def rate(_: float, x: Array) -> Array:
+        return np.concatenate([x[3:], -EARTH_GRAVITATION * x[:3] / np.linalg.norm(x[:3]) ** 3])
+
+    def flown(r: Array, v: Array, t: float) -> Array:
+        return np.asarray(solve_ivp(rate, (0.0, t), [*r, *v], rtol=1e-13, atol=1e-9).y[:, -1])
+
+    t = 900.0
+    other = flown(circle[0] + R0, circle[1] + V0 + np.cross(spin, R0), t)
+    c, s = np.cos(n * t), np.sin(n * t)
+    R_IO = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    apart = (other - flown(*circle, t)).reshape(2, 3) @ R_IO
+    r, v = relative_motion(n, R0, V0, t)
+    np.testing.assert_allclose(r, apart[0], atol=1e-4)
+    np.testing.assert_allclose(v, apart[1] - np.cross(spin, apart[0]), atol=1e-6)
+
+
+@given(st.floats(1e-4, 2.0), st.floats(0.0, 3.0), st.floats(0.0, 3.0))
+def test_motions_follow_each_other(n: float, first: float, second: float) -> None:
+    halfway = relative_motion(n, R0, V0, first / n)
+    r, v = relative_motion(n, *halfway, second / n)
+    whole_r, whole_v = relative_motion(n, R0, V0, (first + second) / n)
+    np.testing.assert_allclose(r, whole_r, rtol=1e-9, atol=1e-9 * (1 + 0.02 / n))
+    np.testing.assert_allclose(v, whole_v, rtol=1e-9, atol=1e-9)
+
+
+def test_without_an_orbit_bodies_go_straight() -> None:
+    r, v = relative_motion(0.0, R0, V0, [0.0, 2.0])
+    np.testing.assert_allclose(r, [R0, R0 + 2 * V0], rtol=1e-15)
+    np.testing.assert_allclose(v, [V0, V0], rtol=1e-15)
+    near, _ = relative_motion(1e-7, R0, V0, 2.0)
+    np.testing.assert_allclose(near, r[1], rtol=1e-6)
+
+
+def test_accelerations_of_many_states_have_their_shape() -> None:
+    found = relative_acceleration(0.5, [R0, 2 * R0], [V0, V0])
+    np.testing.assert_allclose(found[0], [0.75 * 3.0 - 0.01, -0.02, -0.25 * 2.0])
+    np.testing.assert_allclose(found[1], [0.75 * 6.0 - 0.01, -0.02, -0.25 * 4.0])
+
+
+@pytest.mark.parametrize("n", [-0.1, np.nan, np.inf])
+def test_a_bad_mean_motion_is_refused(n: float) -> None:
+    with pytest.raises(ParameterError) as refused:
+        relative_motion(n, R0, V0, 1.0)
+    assert str(refused.value) == f"The mean motion is {n:g} rad/s; it must be finite and from 0."
+
+
+@pytest.mark.parametrize("bad", [(R0 * np.nan, V0, 1.0), (R0, V0 * np.inf, 1.0), (R0, V0, np.nan)])
+def test_bad_numbers_are_refused(bad: tuple[Array, Array, float]) -> None:
+    with pytest.raises(ParameterError) as refused:
+        relative_motion(0.1, *bad)
+    assert str(refused.value) == (
+        "Position, velocity and times of a relative motion must be finite."
+    )

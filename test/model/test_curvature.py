@@ -1,4 +1,4 @@
-"""Curvature of the connection: against finite differences, loops of the shape, and paper 1."""
+"""Curvature, derivatives of the momentum, and rates that leave the base still."""
 
 from __future__ import annotations
 
@@ -6,16 +6,23 @@ from functools import cache
 from itertools import pairwise
 from pathlib import Path
 
+import casadi as ca
 import numpy as np
 import numpy.typing as npt
+import pinocchio as pin
 import pytest
 from scipy.integrate import solve_ivp
 from scipy.linalg import logm
 from scipy.spatial.transform import Rotation
+from support.branched_robot import branched_robot
 from support.oracles import Array, PinocchioOracle, assert_agrees
 from support.random_robots import random_robot_urdf
+from support.slow import some_fast
 
 from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.model.description import Inertia
+from spacerobot_ros.model.grasp import Payload
+from spacerobot_ros.resources import robot_file
 
 SLIDING_MASSES = Path(__file__).parents[2] / "urdf" / "sliding_masses.urdf"
 SEEDS = range(20, 24)
@@ -266,3 +273,109 @@ def test_brackets_and_connection_of_sliders_with_offsets(seed: int) -> None:
         2, 0, 1
     )
     assert_agrees(robot.lie_brackets(z), expected)
+
+
+# -- derivatives of the angular momentum in closed form against those by CasADi ------------------
+
+
+def compare(robot: SpaceRobot, seed: int) -> None:
+    q, qdot = ca.SX.sym("q", robot.n), ca.SX.sym("qdot", robot.n)
+    omega, eta = ca.SX.sym("omega", 3), ca.SX.sym("eta", 3)
+    D, D_q = robot.function("locked_inertia", compile=False)(q)
+    momentum = D @ omega + D_q @ qdot
+    weighted = ca.dot(eta, momentum)
+    slope = ca.gradient(weighted, q)
+    wanted = [
+        ca.jacobian(momentum, q),
+        *(ca.jacobian(slope, x) for x in (q, qdot, omega)),
+    ]
+    symbols = [q, omega, qdot, eta]
+    of_casadi = ca.Function("of_casadi", symbols, [ca.densify(x) for x in wanted])
+    ours = robot.function("momentum_derivatives", compile=False)
+    rng = np.random.default_rng(seed)
+    for _ in range(3):
+        at = [rng.uniform(-1.5, 1.5, x.numel()) for x in symbols]
+        for found, expected in zip(ours(*at), of_casadi(*at), strict=True):
+            assert found.shape == expected.shape
+            scale = np.abs(expected.full()).max()
+            assert scale > 1e-3
+            assert found.full() == pytest.approx(expected.full(), abs=1e-13 * scale)
+
+
+def test_branches_sliders_and_joints_that_follow(tmp_path: Path) -> None:
+    description = branched_robot(tmp_path)
+    assert description.has_mimic_joints
+    compare(SpaceRobot(description), 2)
+
+
+@pytest.mark.parametrize("name", some_fast(["seven_joint_arm", "quadruped"]))
+def test_robots_of_the_package(name: str) -> None:
+    compare(SpaceRobot.from_file(robot_file(name)), 4)
+
+
+# -- joint rates that leave the base still, against Pinocchio, alone and with a captured ---------
+
+
+BODY = Inertia(
+    23.0,
+    np.array([0.3, -0.2, 0.4]),
+    Rotation.from_euler("xyz", [0.4, -0.7, 1.1]).as_matrix()
+    @ np.diag([2.1, 3.9, 5.4])
+    @ Rotation.from_euler("xyz", [0.4, -0.7, 1.1]).as_matrix().T,
+)
+SHAPE = np.array([0.3, -0.7, 0.5, 1.1, -0.4, 0.8, -0.6])
+
+
+def base_rate(robot: SpaceRobot, held: Inertia | None, q: Array, qdot: Array) -> Array:
+    """The angular velocity of the base at zero momentum, by Pinocchio's inertia matrix."""
+    model = pin.buildModelFromXML(robot.description.urdf, pin.JointModelFreeFlyer())
+    model.armature = np.zeros(model.nv)
+    if held is not None:
+        wrist = model.frames[model.getFrameId("link_7", pin.FrameType.BODY)]
+        inertia = pin.Inertia(held.mass, held.com, held.about_com)
+        model.appendBodyToJoint(wrist.parentJoint, inertia, wrist.placement)
+    columns = [model.joints[model.getJointId(name)].idx_v for name in robot.joint_names]
+    at, rates = pin.neutral(model), np.zeros(model.nv)
+    at[[column + 1 for column in columns]], rates[columns] = q, qdot
+    H = np.triu(pin.crba(model, model.createData(), at))
+    H += np.triu(H, 1).T
+    return np.asarray(-np.linalg.solve(H[:6, :6], H[:6, 6:] @ rates[6:])[3:])
+
+
+@pytest.fixture(scope="module")
+def arm() -> SpaceRobot:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("SPACEROBOT_COMPILE", "0")
+        return SpaceRobot.from_file(robot_file("seven_joint_arm"))
+
+
+@pytest.mark.parametrize("held", [None, BODY], ids=["alone", "after a capture"])
+def test_the_base_is_still_while_the_joints_move(
+    arm: SpaceRobot, held: Inertia | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("SPACEROBOT_COMPILE", "0")
+    robot = arm if held is None else Payload("link_7", held).attached_to(arm)
+    q, wanted = SHAPE.copy(), np.array([0.5, -0.2, 0.4, 0.3, -0.6, 0.2, 0.7])
+    for _ in range(6):
+        N = robot.reaction_null_space(q)
+        assert N.shape == (7, 4)
+        np.testing.assert_allclose(N.T @ N, np.eye(4), atol=1e-12)
+        rates = N @ (N.T @ wanted)
+        assert np.linalg.norm(rates) > 0.2
+        assert np.linalg.norm(base_rate(robot, held, q, rates)) < 1e-9
+        # The wanted rates themselves turn it, and so do those for the other robot.
+        assert np.linalg.norm(base_rate(robot, held, q, wanted)) > 1e-2
+        other = BODY if held is None else None
+        assert np.linalg.norm(base_rate(robot, other, q, rates)) > 1e-3
+        q = q + 0.2 * rates
+
+
+@pytest.mark.parametrize(
+    ("name", "joints", "free"), [("planar_manipulator", 2, 1), ("three_joint_arm", 3, 1)]
+)
+def test_the_dimension_is_that_of_the_joints_beyond_the_independent_turns(
+    name: str, joints: int, free: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("SPACEROBOT_COMPILE", "0")
+    robot = SpaceRobot.from_file(robot_file(name))
+    assert robot.reaction_null_space(np.array([0.4, -0.9, 1.1])[:joints]).shape == (joints, free)

@@ -1,4 +1,4 @@
-"""What a URDF is read as, and what is refused, with a sentence that names the culprit."""
+"""What a URDF is read as, what is refused, and which obstacles a text is."""
 
 from __future__ import annotations
 
@@ -7,12 +7,21 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 import pytest
+from support.crossing import URDF
 from support.oracles import PinocchioOracle, assert_agrees
 from support.random_robots import random_robot_urdf
 
-from spacerobot_ros.errors import RobotDescriptionError
+from spacerobot_ros.errors import ParameterError, RobotDescriptionError
 from spacerobot_ros.model import SpaceRobot, load_robot, parse_robot
 from spacerobot_ros.model.description import JointKind, Shape
+from spacerobot_ros.model.shared_parameters import RobotConfig, robot_of
+from spacerobot_ros.model.urdf import load_world, parse_world
+from spacerobot_ros.model.world import (
+    links_with_shapes,
+    obstacles_from_topic,
+    with_world,
+)
+from spacerobot_ros.resources import robot_file, share_directory
 
 BODY = """
   <inertial><mass value="2"/>
@@ -271,3 +280,112 @@ def test_compiled_robot_with_welded_links(compiled_code: Path) -> None:
         found.center_of_mass(q), PinocchioOracle(urdf, found.joint_names).center_of_mass(q)
     )
     assert found.function("center_of_mass").class_name() == "External"
+
+
+# -- obstacles in the world: URDF files without moving joints, carried by the text of a ----------
+
+
+BALL = '<collision><geometry><sphere radius="0.3"/></geometry></collision>'
+WORLD = f"""<?xml version="1.0"?>
+<robot name="station"><link name="frame"/><link name="mast">{BALL}</link><link name="tip"/>
+<joint name="a" type="fixed"><parent link="frame"/><child link="mast"/>
+<origin xyz="1 2 3" rpy="0 0 1.5707963267948966"/></joint>
+<joint name="b" type="fixed"><parent link="mast"/><child link="tip"/><origin xyz="1 0 0"/></joint>
+</robot>"""
+
+
+def test_the_text_of_a_robot_carries_its_world() -> None:
+    world = parse_world(WORLD)
+    assert [link.name for link in world.links] == ["frame", "mast", "tip"]
+    assert world.frames["tip"][1].r == pytest.approx([1, 3, 3])
+    robot = with_world(with_world(parse_robot(URDF), parse_world(WORLD)), world)
+    again = parse_robot(robot.urdf)
+    assert robot.urdf.count("<world>") == 1
+    assert again.world is not None
+    assert again.world.name == "station"
+    assert again.joint_names == parse_robot(URDF).joint_names
+    assert np.array_equal(again.world.frames["mast"][1].R, world.frames["mast"][1].R)
+    assert again.with_locked({"x": 0.1}).world is again.world
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (('name="b" type="fixed"', 'name="b" type="continuous"'), "joint 'b' is continuous"),
+        ((BALL, ""), "The world 'station' has no obstacle"),
+        (("</robot>", ""), "is no XML"),
+    ],
+)
+def test_a_world_that_is_none_is_refused(change: tuple[str, str], message: str) -> None:
+    with pytest.raises(RobotDescriptionError, match=message):
+        parse_world(WORLD.replace(*change))
+
+
+def test_a_node_has_the_world_of_its_parameter(tmp_path: Path) -> None:
+    file = tmp_path / "station.urdf"
+    file.write_text(WORLD, "utf-8")
+    robot = robot_of(RobotConfig(robot_description=URDF, world=str(file)))
+    assert robot is not None
+    assert robot.description.world is not None
+    with pytest.raises(ParameterError, match=r"Parameter 'world' is refused: .* cannot be read"):
+        robot_of(RobotConfig(robot_description=URDF, world=str(tmp_path / "none.urdf")))
+
+
+def test_the_package_has_a_world() -> None:
+    world = load_world(share_directory() / "config" / "worlds" / "strut.urdf")
+    assert [link.name for link in world.links if link.collisions] == ["strut"]
+
+
+# -- obstacles in texts from topics, and robots among others than so far -------------------------
+
+
+BALL_AND_POST = (
+    '<robot name="w"><link name="w"/><link name="ball"><collision><geometry><sphere radius="0.3"/>'
+    '</geometry></collision></link><link name="post"><visual><geometry><box size="1 2 3"/>'
+    '</geometry></visual></link><joint name="a" type="fixed"><parent link="w"/>'
+    '<child link="ball"/></joint><joint name="b" type="fixed"><parent link="ball"/>'
+    '<child link="post"/></joint></robot>'
+)
+
+
+def test_a_text_is_obstacles_and_an_empty_one_is_none() -> None:
+    world = obstacles_from_topic(BALL_AND_POST)
+    assert world is not None
+    assert links_with_shapes(world) == ["ball", "post"]
+    for empty in ("", " \n"):
+        assert obstacles_from_topic(empty) is None
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (
+            BALL_AND_POST.replace('"a" type="fixed"', '"a" type="continuous"'),
+            "joint 'a' is (floating|continuous): give it",
+        ),
+        ('<robot name="w"><link name="w"/></robot>', "The world 'w' has no obstacle"),
+        ("<robot", "is no XML"),
+        (
+            BALL_AND_POST.replace("</robot>", f"<world>{BALL}</world></robot>"),
+            "^Obstacles are not among others: leave the element <world> out",
+        ),
+        (BALL_AND_POST.replace("0.3", "${radius}"), "radius"),
+    ],
+)
+def test_other_texts_are_refused(text: str, message: str) -> None:
+    with pytest.raises(RobotDescriptionError, match=message):
+        obstacles_from_topic(text)
+
+
+def test_a_robot_is_among_the_obstacles_that_came_last() -> None:
+    robot = load_robot(robot_file("planar_chain"))
+    before = with_world(robot, parse_world(BALL_AND_POST.replace("ball", "stone")))
+    other = with_world(before, parse_world(BALL_AND_POST))
+    assert other.world is not None
+    carried = parse_robot(other.urdf).world
+    assert carried is not None
+    assert links_with_shapes(carried) == ["ball", "post"]
+    free = with_world(other, None)
+    assert free.world is None
+    assert parse_robot(free.urdf).world is None
+    assert "<world" not in free.urdf

@@ -19,7 +19,7 @@ from nodes.test_end_effector_goals import (
     flight_of,
     flown_to,
 )
-from planning.test_pose_path import distance_from
+from planning.test_given_paths import distance_from
 from scipy.spatial.transform import Rotation
 from support.hand_motion import end_of_motion
 from support.planner_flight import Flight, values_of

@@ -12,9 +12,10 @@ import numpy.typing as npt
 import pytest
 
 from spacerobot_ros.collision import CollisionGeometry
+from spacerobot_ros.collision.nearest import Approach
 from spacerobot_ros.errors import ParameterError, PlanningError, Proof, UnreachableError
 from spacerobot_ros.flight.trials import PlanningProblem
-from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.model import SpaceRobot, load_robot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.shared_parameters import robot_of
 from spacerobot_ros.planning import (
@@ -29,8 +30,15 @@ from spacerobot_ros.planning import (
 )
 from spacerobot_ros.planning.core.clearance import Clearance
 from spacerobot_ros.planning.core.method import InitialMotion
+from spacerobot_ros.planning.core.prediction import BasePrediction
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.methods.optimal import OptimalGait
+from spacerobot_ros.planning.methods.optimal.kept_distances import DistanceLibrary
+from spacerobot_ros.planning.methods.optimal.problem import (
+    BoundaryConditions,
+    MotionLimits,
+    Trajectory,
+)
 from spacerobot_ros.planning.methods.remaining_joints import RemainingJointsGait
 from spacerobot_ros.resources import robot_file
 from spacerobot_ros.simulation import InitialState
@@ -71,7 +79,6 @@ def nearest_of(geometry: CollisionGeometry, positions: Array) -> float:
     return min(float(geometry.distances(p, poses).min()) for p in range(len(geometry.pairs)))
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("distance", [0.03, pytest.param(0.01, marks=pytest.mark.slow)])
 def test_optimal_goes_round_a_contact(arm: SpaceRobot, distance: float) -> None:
     goal = (0.09, -0.26, -0.21), np.zeros(3)
@@ -86,6 +93,13 @@ def test_optimal_goes_round_a_contact(arm: SpaceRobot, distance: float) -> None:
     assert error < 1e-9
 
 
+def test_where_no_clear_way_is_fast_enough_the_fastest_is_named(arm: SpaceRobot) -> None:
+    few: dict[str, Any] = {**QUICK, "starts": 4, "intervals": 12, "control_period": 0.1}
+    turn, start = (0.09, -0.26, -0.21), np.zeros(3)
+    with pytest.raises(PlanningError, match=r"= 4\.5 s: the fastest that was found takes 5"):
+        plan(arm, rotvec=turn, start=start, clearance=0.03, longest=4.5, **few)
+
+
 def test_a_plan_that_is_clear_stays_the_same(arm: SpaceRobot) -> None:
     goal = (0.27, 0.17, -0.05), np.zeros(3)
     plain = planned(arm, "optimal", *goal, None, **QUICK)
@@ -93,7 +107,6 @@ def test_a_plan_that_is_clear_stays_the_same(arm: SpaceRobot) -> None:
     assert np.array_equal(plain.positions, clear.positions)
 
 
-@pytest.mark.slow
 def test_a_plan_in_motion_keeps_clear(arm: SpaceRobot) -> None:
     goal = (0.09, -0.26, -0.21), np.zeros(3)
     clearance = Clearance(arm.description, 0.01)
@@ -232,3 +245,38 @@ def test_the_clearance_of_the_planner_is_kept(arm: SpaceRobot) -> None:
     state = RobotState(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(3))
     with pytest.raises(PlanningError, match=r"planner\.clearance = 0\.6 m"):
         problem.method("optimal").plan(PlanRequest(state, goal, TOLERANCE))
+
+
+def test_a_clear_path_keeps_to_the_planes_between_its_links() -> None:
+    """Planes are where the path has its links, however little more than the clearance that is."""
+    robot = SpaceRobot(load_robot(robot_file("servicer")))
+    away, near = np.array([0.0, -1.4, 0.5, 0, 0, 0]), np.array([0.0, 0.6, 0.5, 0, 0, 0])
+    geometry = Clearance(robot.description, 0.0).geometry
+    closest = geometry.nearest(near)
+    assert closest is not None
+    distance, pair = closest[:2]
+    library = DistanceLibrary(
+        Clearance(robot.description, distance - 1e-4), robot, BasePrediction(robot, 0.05, 0.01)
+    )
+    no_turn = np.array([0.0, 0.0, 0.0, 1.0])
+    boundary = BoundaryConditions(away, no_turn, near, near)
+    kept = library.begin(boundary, turn_is_known=True)
+    s = np.linspace(0.0, 1.0, 41)[:, np.newaxis]
+    path = Trajectory(
+        0.05,
+        away + s * (near - away),
+        np.tile((near - away) / 2.0, (41, 1)),
+        np.tile(no_turn, (41, 1)),
+    )
+    assert not kept.approaches_of(path)
+    kept.add([Approach(geometry.links_of(pair), pair, distance, 40, near)])
+    still = MotionLimits(robot.lower, robot.upper, np.ones(6), np.ones(6))
+    planes = kept.within(still, path).distances.reshape(-1, 7)
+    shapes, _ = kept.along(path)
+    distances, own = library.planes(boundary, pair, geometry.poses(shapes))
+    np.testing.assert_allclose(
+        planes[:, [0, 1, 2, 4, 5, 6]], own[:, [0, 1, 2, 4, 5, 6]], atol=1e-12
+    )
+    asked = planes[:, 3] - own[:, 3]
+    assert np.all(asked <= distances + 1e-12)
+    assert np.ptp(asked) > 1e-3, "far from each other links have the room of all"

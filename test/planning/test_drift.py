@@ -1,29 +1,42 @@
-"""Plans of ``optimal`` at momentum that is not zero, and the functions behind them."""
+"""Plans of robots with momentum: from drifting bases, and made while the base drifts."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+import os
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import pytest
 from planning.drifting import END_ERROR, angle_between, flown_by_pinocchio
 from planning.test_optimal import ARM_START, FOLDER
-from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
+from support.planner_loop import TICK, TICK_NS, Loop, StubMethod, goal_at
 from support.planners import planner_of
 
-from spacerobot_ros.errors import NotFoundError, ParameterError, PlanningError
+from spacerobot_ros.errors import NotFoundError, ParameterError, PlanningError, UnreachableError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
-from spacerobot_ros.model.rotations import attitude_error, matrices_from_quaternions
+from spacerobot_ros.model.rotations import (
+    attitude_error,
+    matrices_from_quaternions,
+    quaternion_from_rotvec,
+    quaternion_multiply,
+    rotvec_from_quaternion,
+)
 from spacerobot_ros.planning import GaitSchedule, Goal, RobotState, plan
+from spacerobot_ros.planning.core.cancellation import NEVER, Cancellation
 from spacerobot_ros.planning.core.goal import EndEffectorGoal, Tolerance
 from spacerobot_ros.planning.core.joint_efforts import JointEfforts
+from spacerobot_ros.planning.core.method import PlanRequest
 from spacerobot_ros.planning.core.prediction import BasePrediction
+from spacerobot_ros.planning.execution.status import PlannerState
 from spacerobot_ros.planning.methods.optimal.held_commands import DriftVariation
-from spacerobot_ros.planning.methods.optimal.method import OptimalGait, _PlanResult
 from spacerobot_ros.planning.methods.optimal.problem import BoundaryConditions
+from spacerobot_ros.resources import robot_file
+from spacerobot_ros.simulation import InitialState
 
 ATTITUDE = Rotation.from_rotvec([0.4, -0.3, 0.7]).as_quat()
 NO_TURN = np.array([0.0, 0.0, 0.0, 1.0])
@@ -170,108 +183,35 @@ def test_shape_and_position_of_a_base_that_coasts_are_refused() -> None:
         )
 
 
-@pytest.mark.slow
-def test_a_base_that_coasts_is_at_its_goal_when_the_plan_ends() -> None:
+@pytest.mark.parametrize("asked", [{}, {"duration": 2.0}])
+def test_a_base_that_coasts_is_at_its_goal_when_the_plan_ends(asked: dict[str, float]) -> None:
     momentum = [0.3, -0.2, 0.1]
-    schedule = plan("sliding_masses", position=(0.1, 0.05, 0), linear_momentum=momentum, cache=0)
+    few = {**QUICK, "starts": 4, "intervals": 20, **asked}
+    schedule = plan("sliding_masses", position=(0.1, 0.05, 0), linear_momentum=momentum, **few)
     state = RobotState(np.zeros(3), NO_TURN, np.zeros(3), np.array(momentum))
     r_WB, quaternion = flown_by_pinocchio("sliding_masses", schedule, state)
     np.testing.assert_allclose(r_WB, [0.1, 0.05, 0.0], atol=END_ERROR)
     assert angle_between(quaternion, NO_TURN) < END_ERROR
+    assert schedule.duration == pytest.approx(asked.get("duration", schedule.duration))
 
 
-@pytest.mark.slow
-def test_joints_rest_until_the_drift_leads_past_the_goal(
-    arm: SpaceRobot, monkeypatch: pytest.MonkeyPatch
+def test_where_nothing_is_found_the_passes_of_a_drifting_goal_are_tried_before(
+    arm: SpaceRobot,
 ) -> None:
-    """Nothing is found at the start and at the closest pass; the next one is met."""
-    asked: list[Any] = []
-    moves = ARM_START + np.outer(np.linspace(0.0, 1.0, 31) ** 2, [0.2, -0.3, 0.1])
-
-    def search(self: OptimalGait, request: Any, boundary: Any, *others: Any) -> _PlanResult:
-        asked.append((request.state, boundary, others[1].longest, *others[3:]))
-        # The start; then by turns at zero momentum, and with that of the robot.
-        if len(asked) == 1:
-            raise NotFoundError("Nothing was found.")
-        if len(asked) == 3:
-            raise PlanningError("Links are in contact.")
-        manoeuvre: Any = None
-        return _PlanResult(manoeuvre, moves, {"starts": 2.0})
-
-    monkeypatch.setattr(OptimalGait, "_begin_now", search)
+    """So few iterations find nothing: neither at once nor where the drift leads past the goal."""
     goal = (Rotation.from_quat(ATTITUDE) * TURN).as_rotvec()
-    found = plan(arm, rotvec=goal, start=START, base_position=2, longest=300.0, **QUICK)
-    omega = arm.base_twist(ATTITUDE, ARM_START, np.zeros(3), L_W=START.angular_momentum)[1]
-    rate, h = np.linalg.norm(omega), found.control_period
-    assert len(asked) == 5
-    begins, free, first, free_again, second = asked
-    assert begins[2:] == (pytest.approx(np.radians(40.0) / rate), 8)
-    for still, drifting in ((free, first), (free_again, second)):
-        assert not still[1].angular_momentum.any()
-        assert still[2] == 300.0
-        assert drifting[2:4] == (pytest.approx(2.5 * 30 * h), 3)
-        # The guess is the way at zero momentum, to where the goal is seen from the pass.
-        np.testing.assert_array_equal(drifting[4].shapes, moves[np.newaxis])
-        np.testing.assert_array_equal(drifting[4].turns, still[1].turn[np.newaxis])
-        seen = Rotation.from_quat(still[0].quaternion).inv() * Rotation.from_rotvec(goal)
-        assert angle_between(still[1].turn, seen.as_quat()) < 1e-9
-        # The manoeuvre would end at the pass.
-        L_W = Rotation.from_quat(drifting[0].quaternion).apply(drifting[1].angular_momentum)
-        np.testing.assert_allclose(L_W, START.angular_momentum, atol=1e-12)
-    resting_time = found.notes["coasting_time"]
-    assert isinstance(resting_time, float)
-    rests = round(resting_time / h)
-    np.testing.assert_array_equal(found.positions[: rests + 1], np.tile(ARM_START, (rests + 1, 1)))
-    np.testing.assert_array_equal(found.positions[rests:], moves)
-    assert found.notes["starts"] == 2.0
-    rested = attitude_with_joints_at_rest(arm, START, rests * h)
-    assert angle_between(second[0].quaternion, rested) < 1e-6
-    # Where the joints rested, the base is at the pass a manoeuvre later.
-    resting = attitude_with_joints_at_rest(arm, START, rests * h + 30 * h)
-    assert angle_between(free_again[0].quaternion, resting) < 1e-6
-    r_WB, quaternion = flown_by_pinocchio("three_joint_arm", found, START)
-    assert angle_between(quaternion, found.path.quaternion[-1]) < END_ERROR
-    np.testing.assert_allclose(r_WB, found.path.position[-1], atol=END_ERROR)
+    never = {**QUICK, "intervals": 20, "iterations": 2, "starts": 2}
+    with pytest.raises(NotFoundError, match=r"was found from 2 start\(s\).* It is proved"):
+        plan(arm, rotvec=goal, start=START, base_position=2, **never)
 
 
-def attitude_with_joints_at_rest(
-    robot: SpaceRobot, state: RobotState, duration: float
-) -> np.ndarray:
-    """Return the attitude (4,) after a time, by Euler's equations of one rigid body."""
-    inverse = np.linalg.inv(robot.inertia_matrix(state.q)[3:6, 3:6])
-
-    def rate(_: float, x: np.ndarray) -> np.ndarray:
-        R = Rotation.from_quat(x).as_matrix()
-        wx, wy, wz = inverse @ R.T @ state.angular_momentum
-        Omega = np.array([[0, wz, -wy, wx], [-wz, 0, wx, wy], [wy, -wx, 0, wz], [-wx, -wy, -wz, 0]])
-        return np.asarray(Omega @ x / 2)
-
-    flown = solve_ivp(rate, (0.0, duration), state.quaternion, rtol=1e-10, atol=1e-12)
-    return np.asarray(flown.y[:, -1])
-
-
-def test_a_goal_that_is_never_in_reach_has_the_refusal_of_the_whole_search(
-    arm: SpaceRobot, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    calls = []
-
-    def never(*asked: Any) -> Any:
-        calls.append(asked)
-        raise NotFoundError(f"Nothing was found by search {len(calls)}.")
-
-    monkeypatch.setattr(OptimalGait, "_begin_now", never)
-    goal = (Rotation.from_quat(ATTITUDE) * TURN).as_rotvec()
-    with pytest.raises(NotFoundError, match=r"by search \d+"):
-        plan(arm, rotvec=goal, start=START, base_position=2, longest=9.0, **QUICK)
-    few = len(calls)
-    with pytest.raises(NotFoundError) as refusal:
-        plan(arm, rotvec=goal, start=START, base_position=2, **QUICK)
-    assert str(refusal.value).startswith(f"Nothing was found by search {len(calls)}. It is proved")
-    omega = arm.base_twist(ATTITUDE, ARM_START, np.zeros(3), L_W=START.angular_momentum)[1]
-    assert calls[-1][4].longest == pytest.approx(8 * np.pi / np.linalg.norm(omega))
-    assert len(calls[-1]) == 6, "it is not to end early"
-    # All goals' passes in four turns of the base, without an end before.
-    assert len(calls) - few > few >= 2
+def test_a_base_that_coasts_turns_where_its_position_does_not_count() -> None:
+    few = {**QUICK, "starts": 2, "intervals": 20}
+    turn: dict[str, Any] = {"rotvec": (0.0, 0.0, 0.3), "base_position": 2}
+    still = plan("planar_chain", **turn, **few)
+    coasting = plan("planar_chain", **turn, linear_momentum=[0.3, -0.2, 0.0], **few)
+    np.testing.assert_allclose(coasting.positions, still.positions, atol=1e-9)
+    assert coasting.path.position[-1] @ [0.3, -0.2, 0.0] > still.path.position[-1] @ [0.3, -0.2, 0]
 
 
 @pytest.mark.parametrize("kind", ["linear_momentum", "angular_momentum"])
@@ -292,3 +232,196 @@ def test_a_momentum_counts_where_a_method_for_robots_at_rest_refuses_it(
         counts.append(refused)
     assert counts == sorted(counts)
     assert len(set(counts)) == 2
+
+
+# -- plans in the background for robots that drift: each begins where the base is by then --------
+
+
+VELOCITY = np.array([0.004, -0.003, 0.002])
+"""Of the centre of mass, m/s: in 2 s it moves ten times as far as the tolerance."""
+
+GOAL = ([0.04, -0.03, 0.02], [0.0, 0.0, 0.0])
+
+
+class Coasting(StubMethod):
+    """Slides the base relative to a centre of mass that coasts."""
+
+    def plan(self, request: PlanRequest, cancellation: Cancellation = NEVER) -> GaitSchedule:
+        velocity = request.state.linear_momentum / self.robot.total_mass
+        there = request.goal.position - velocity * self.ticks * TICK
+        moved = replace(request, goal=replace(request.goal, position=there))
+        schedule = super().plan(moved, cancellation)
+        path = schedule.path
+        drifted = path.position + np.outer(path.time, velocity)
+        return replace(schedule, goal=request.goal, path=replace(path, position=drifted))
+
+
+def loop_of(**parameters: object) -> Loop:
+    mass = Coasting().robot.total_mass
+    momentum = InitialState(linear_momentum=VELOCITY * mass)
+    given = {"max_corrections": 0, "position_tolerance": 8e-4, **parameters}
+    return Loop(given, method=Coasting(20), initial=momentum, held=True)
+
+
+def test_a_plan_begins_with_a_rest_while_which_it_is_made() -> None:
+    loop = loop_of()
+    loop.tick(3)
+    loop.propose_goal(goal_at(GOAL))
+    loop.tick(18)
+    loop.held.release()
+    status = loop.until(PlannerState.REACHED, PlannerState.FAILED)
+    assert status.state is PlannerState.REACHED, status.message
+    (start,) = loop.starts
+    assert start.stamp_ns == 3 * TICK_NS
+    rests = 40
+    positions = start.schedule.positions
+    np.testing.assert_array_equal(positions[: rests + 1], np.tile(positions[0], (rests + 1, 1)))
+    assert np.abs(positions[rests + 1] - positions[0]).max() > 0
+    assert not any(loop.speeds[: 3 + rests])
+    assert loop.speeds[3 + rests] > 0
+    ahead = loop.plant.pose[:3] - goal_at(GOAL).position
+    assert np.linalg.norm(ahead) < 8e-4
+
+
+@pytest.mark.parametrize("late", [41, 67])
+def test_a_plan_that_comes_too_late_is_made_again(late: int) -> None:
+    loop = loop_of()
+    loop.propose_goal(goal_at(GOAL))
+    loop.tick(late + 1)
+    loop.held.release()
+    loop.tick(2)
+    assert loop.states == []
+    (told,) = [each for each in loop.notices if "made again" in each]
+    assert f"The plan came {(late + 1) * TICK - 2.0:.3g} s after its start" in told
+    loop.held.release()
+    status = loop.until(PlannerState.REACHED, PlannerState.FAILED)
+    assert status.state is PlannerState.REACHED, status.message
+    (start,) = loop.starts
+    assert start.stamp_ns == 0
+    # Twice the time that planning took.
+    assert len(start.schedule.positions) - 1 - 20 == 2 * (late + 1)
+    assert np.linalg.norm(loop.plant.pose[:3] - goal_at(GOAL).position) < 8e-4
+
+
+def test_planning_that_takes_too_long_is_refused() -> None:
+    loop = loop_of()
+    loop.propose_goal(goal_at(GOAL))
+    loop.tick(601 * 20)
+    loop.held.release()
+    loop.tick(2)
+    status = loop.statuses[-1]
+    assert status.state is PlannerState.REFUSED
+    assert "601 s of planning were not enough" in status.message
+
+
+def test_a_correction_begins_with_a_rest_too() -> None:
+    loop = loop_of(max_corrections=1)
+    method = loop.held._method
+    assert isinstance(method, Coasting)
+    method.overshoot = 0.2
+    loop.propose_goal(goal_at(GOAL))
+    loop.tick(2)
+    loop.held.release()
+    for _ in range(200):
+        loop.tick()
+        if len(loop.held.tasks) == 2:
+            break
+    method.overshoot = 0.0
+    loop.tick(11)
+    loop.held.release()
+    status = loop.until(PlannerState.REACHED, PlannerState.FAILED)
+    assert status.state is PlannerState.REACHED, status.message
+    second = loop.starts[1].schedule
+    np.testing.assert_array_equal(second.positions[40], second.positions[0])
+    assert len(second.positions) == 61
+
+
+def test_a_robot_at_rest_begins_at_once() -> None:
+    loop = Loop(method=StubMethod(), held=True)
+    loop.propose_goal(goal_at(GOAL))
+    loop.tick(7)
+    loop.held.release()
+    loop.until(PlannerState.REACHED)
+    (start,) = loop.starts
+    assert (start.schedule.ticks, start.stamp_ns) == (8, 7 * TICK_NS)
+
+
+# -- random cases of robots that drift: most are planned, and Pinocchio ends where plans ---------
+
+
+CASES = int(os.environ.get("SPACEROBOT_DRIFTING_CASES", "1"))
+"""Cases of each robot and drift."""
+
+ROBOTS = ("three_joint_arm", "seven_joint_arm", "servicer")
+
+LEAST_PLANNED = {3.0: 0.95, 10.0: 0.95, 30.0: 0.80}
+"""Least share of planned cases by the drift over the manoeuvre, deg."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """A start that drifts and a goal, from which a robot at rest takes ``at_rest`` s, CPU ``cpu``
+    s."""
+
+    robot: SpaceRobot
+    state: RobotState
+    rotvec: np.ndarray
+    at_rest: float
+    cpu: float
+
+
+def cases(name: str, drift: float, count: int) -> Iterator[Case]:
+    robot = SpaceRobot.from_file(robot_file(name))
+    rng = np.random.default_rng([ROBOTS.index(name), round(drift), 2026])
+    low, high = np.maximum(robot.lower, -0.6), np.minimum(robot.upper, 0.6)
+    found = 0
+    while found < count:
+        q, quaternion = rng.uniform(low, high), quaternion_from_rotvec(rng.normal(size=3))
+        turn, about = rng.normal(size=(2, 3))
+        turn *= rng.uniform(0.05, 0.5) / np.linalg.norm(turn)
+        goal = quaternion_from_rotvec(turn)
+        p = rng.normal(size=3) * 0.01 * robot.total_mass
+        rotvec = rotvec_from_quaternion(quaternion_multiply(quaternion, goal))
+        rest = RobotState(rng.normal(size=3), quaternion, q)
+        began = time.process_time()
+        try:
+            schedule = plan(robot, rotvec=rotvec, start=rest, cache=0, base_position=2)
+        except PlanningError:
+            continue
+        cpu = time.process_time() - began
+        omega = about / np.linalg.norm(about) * np.radians(drift) / schedule.duration
+        L = robot.momentum(quaternion, q, np.zeros(3), omega, np.zeros(robot.n))[1]
+        state = RobotState(rest.position, quaternion, q, p, L)
+        found += 1
+        yield Case(robot, state, rotvec, schedule.duration, cpu)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("drift", LEAST_PLANNED)
+def test_robots_that_drift_are_planned_for(drift: float) -> None:
+    planned, count = 0, 0
+    for name in ROBOTS:
+        for case in cases(name, drift, CASES):
+            count += 1
+            began = time.process_time()
+            try:
+                schedule = plan(
+                    case.robot, rotvec=case.rotvec, start=case.state, cache=0, base_position=2
+                )
+            except (NotFoundError, UnreachableError) as refusal:
+                print(f"{name}, {drift:g} deg: {refusal}", flush=True)
+                continue
+            cpu = time.process_time() - began
+            r_WB, quaternion = flown_by_pinocchio(name, schedule, case.state)
+            off = angle_between(quaternion, schedule.path.quaternion[-1])
+            missed = angle_between(quaternion, quaternion_from_rotvec(case.rotvec))
+            print(
+                f"{name}, {drift:g} deg: {schedule.duration:.4g} s, {case.at_rest:.4g} s at rest; "
+                f"CPU {cpu:.3g} s, {case.cpu:.3g} s at rest; off by {off:.1e} rad",
+                flush=True,
+            )
+            assert max(off, missed) < END_ERROR
+            np.testing.assert_allclose(r_WB, schedule.path.position[-1], atol=END_ERROR)
+            planned += 1
+    print(f"{drift:g} deg: planned {planned} of {count}", flush=True)
+    assert planned >= LEAST_PLANNED[drift] * count - (CASES < 7)

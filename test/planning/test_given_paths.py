@@ -1,16 +1,18 @@
-"""Given paths of an end-effector with the base free, held against Pinocchio's momentum."""
+"""Given paths of an end-effector with the base free, and the polylines that they are."""
 
 from __future__ import annotations
 
 from dataclasses import replace
-from types import SimpleNamespace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import pytest
-from planning.test_pose_path import distance_from
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from planning.test_resolved_rate import ARM, ATTITUDE, PERIOD, PLACE, poses, robot_of
+from scipy.spatial.transform import Rotation, Slerp
 
 from spacerobot_ros.errors import GoalError, PlanningError
 from spacerobot_ros.planning import Goal, RobotState, Tolerance, build_method, plan
@@ -19,11 +21,176 @@ from spacerobot_ros.planning.core.method import PlanRequest
 from spacerobot_ros.planning.core.schedule import GaitSchedule
 from spacerobot_ros.planning.execution.goal_file import GoalFile, IdentifiedGoal
 from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus, waypoint_counts
-from spacerobot_ros.planning.methods.registry import METHODS, method_options
-from spacerobot_ros.planning.methods.remaining_joints import RemainingJointsGait, _RemainingProgress
-from spacerobot_ros.planning.methods.resolved_rate import JointPath, PathProgress, ResolvedRateGait
+from spacerobot_ros.planning.methods.pose_path import PosePath, RoundedPath
+from spacerobot_ros.planning.methods.registry import method_options
+from spacerobot_ros.planning.methods.resolved_rate import PathProgress
 
 Array = npt.NDArray[np.float64]
+
+STILL = np.array([0.0, 0.0, 0.0, 1.0])
+CORNER = np.array([[1.0, -2.0, 0.5], [1.0, -1.6, 0.8], [1.3, -1.6, 0.8], [1.3, -1.2, 0.4]])
+TURNS = Rotation.from_rotvec([[0.1, 0.2, 0.3], [0.4, 0.2, 0.3], [0.4, 0.1, -0.2], [0.4, 0.1, -0.2]])
+
+
+def at_rest(points: Any) -> PosePath:
+    places = np.asarray(points, dtype=float)
+    return PosePath.from_poses(places, np.tile(STILL, (len(places), 1)))
+
+
+def turning() -> PosePath:
+    return PosePath.from_poses(CORNER, TURNS.as_quat())
+
+
+def distance_from(lines: Array, place: Array) -> float:
+    """Return the distance of a place (3,) from a polyline (K, 3), m."""
+    found = []
+    for a, b in pairwise(lines):
+        share = np.clip((place - a) @ (b - a) / ((b - a) @ (b - a)), 0.0, 1.0)
+        found.append(np.linalg.norm(a + share * (b - a) - place))
+    return float(min(found))
+
+
+# -- lines --------------------------------------------------------------------------------------
+
+
+def test_lengths_are_metres_and_radians_together() -> None:
+    path = turning()
+    turned = [(TURNS[k + 1] * TURNS[k].inv()).as_rotvec() for k in range(3)]
+    np.testing.assert_allclose(path.turns, turned, atol=1e-12)
+    np.testing.assert_allclose(path.chords, np.diff(CORNER, axis=0))
+    expected: Any = [0.5 + np.linalg.norm(turned[0]), 0.3 + np.linalg.norm(turned[1]), 0.4 * 2**0.5]
+    np.testing.assert_allclose(path.lengths, expected, atol=1e-12)
+    np.testing.assert_allclose(path.lengths_at_poses, [0.0, *np.cumsum(expected)], atol=1e-12)
+
+
+def test_equal_poses_in_succession_are_one() -> None:
+    path = at_rest([[0, 0, 1], [0, 0, 1], [0, 2, 1], [0, 2, 1 + 5e-11], [0, 0, 1]])
+    np.testing.assert_array_equal(path.positions[:, 1], [0, 2, 0])
+    turned = PosePath.from_poses(CORNER[[0, 0]], TURNS.as_quat()[:2])
+    assert len(turned.positions) == 2
+
+
+def test_the_rest_of_a_path_begins_within_a_line() -> None:
+    path = turning()
+    rest = path.remaining_after(path.lengths_at_poses[1] + 0.25 * path.lengths[1])
+    np.testing.assert_allclose(rest.positions[0], [1.075, -1.6, 0.8], atol=1e-12)
+    np.testing.assert_allclose(rest.positions[1:], CORNER[2:])
+    wanted = Slerp([0.0, 1.0], TURNS[1:3])(0.25)
+    assert (wanted.inv() * Rotation.from_quat(rest.quaternions[0])).magnitude() < 1e-12
+    assert len(path.remaining_after(path.lengths_at_poses[2]).positions) == 2
+    for beyond in (path.lengths_at_poses[-1], 99.0):
+        end = path.remaining_after(beyond)
+        np.testing.assert_allclose(end.positions, CORNER[3:], atol=1e-12)
+    np.testing.assert_allclose(path.remaining_after(-1.0).positions, CORNER)
+    assert end.remaining_after(3.0) is end
+
+
+# -- fewer poses --------------------------------------------------------------------------------
+
+
+def test_poses_on_a_line_are_left_out_and_corners_stay() -> None:
+    share = np.linspace(0, 1, 11)[:, np.newaxis]
+    points = np.vstack([CORNER[0] + share * (CORNER[1] - CORNER[0]), CORNER[2:]])
+    np.testing.assert_allclose(at_rest(points).simplified(0.0).positions, CORNER, atol=1e-12)
+    bent = at_rest([[0, 0, 0], [1, 0.01, 0], [2, 0, 0]])
+    assert len(bent.simplified(0.0099).positions) == 3
+    assert len(bent.simplified(0.0101).positions) == 2
+
+
+def test_attitudes_and_ways_back_count_as_corners() -> None:
+    there_and_back = at_rest([[0, 0, 0], [1, 0, 0], [0.5, 0, 0]])
+    assert len(there_and_back.simplified(0.1).positions) == 3
+    turned = Rotation.from_rotvec([[0, 0, 0], [0, 0, 0.3], [0, 0, 0.2]]).as_quat()
+    path = PosePath.from_poses(np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0]]), turned)
+    # Halfway in metres and radians together the line has turned by 0.13 rad.
+    assert len(path.simplified(0.15).positions) == 3
+    assert len(path.simplified(0.25).positions) == 2
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.floats(0.01, 0.3))
+def test_simplified_paths_keep_near_all_poses(seed: int, tolerance: float) -> None:
+    points = np.random.default_rng(seed).normal(size=(20, 3)).cumsum(axis=0) * 0.1
+    lines = at_rest(points).simplified(tolerance).positions
+    assert max(distance_from(lines, each) for each in points) <= tolerance + 1e-12
+    np.testing.assert_array_equal(lines[[0, -1]], points[[0, -1]])
+
+
+def test_too_many_corners_are_refused() -> None:
+    zigzag = np.zeros((503, 3))
+    zigzag[:, 0], zigzag[1::2, 1] = np.arange(503), 1.0
+    with pytest.raises(
+        PlanningError, match=r"^The path has more than 500 corners: give fewer poses"
+    ):
+        at_rest(zigzag).simplified(0.1)
+    assert len(at_rest(zigzag[:502]).simplified(0.1).positions) == 502
+
+
+# -- stops --------------------------------------------------------------------------------------
+
+
+def test_the_motion_stops_at_sharp_corners_and_without_a_tolerance_at_all() -> None:
+    path = at_rest([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0.4, 0.1, 0], [0.4, 0.1, 2]])
+    # Corners of 90, 124 and 90 degrees.
+    assert [len(x.positions) for x in path.split_at_reversals(0.01)] == [3, 3]
+    np.testing.assert_array_equal(
+        [x.positions[0] for x in path.split_at_reversals(0.01)], [[0, 0, 0], [1, 1, 0]]
+    )
+    assert [len(x.positions) for x in path.split_at_reversals(0.0)] == [2] * 4
+    gentle = at_rest([[0, 0, 0], [1, 0, 0], [0.51, 0.85, 0]])  # 119.95 degrees.
+    assert [len(x.positions) for x in gentle.split_at_reversals(0.01)] == [3]
+
+
+# -- rounded ways -------------------------------------------------------------------------------
+
+
+def test_a_blend_is_a_parabola_between_both_lines() -> None:
+    path, tolerance = at_rest(CORNER[:3]), 0.03
+    way = RoundedPath(path, tolerance, before=0.2, whole=7.0)
+    d, total = 4 * tolerance, 0.8
+    to, on = np.array([0.0, 0.8, 0.6]), np.array([1.0, 0.0, 0.0])
+    for s in (0.1, 0.5 - d, 0.45, 0.5, 0.57, 0.5 + d, 0.8):
+        t = np.clip((s - 0.5 + d) / (2 * d), 0.0, 1.0)
+        place = 0.5 * to - d * (1 - t) ** 2 * to + d * t**2 * on
+        if s < 0.5 - d:
+            place = s * to
+        if s > 0.5 + d:
+            place = 0.5 * to + (s - 0.5) * on
+        np.testing.assert_allclose(way.displacement(s / total), place, atol=1e-12)
+    np.testing.assert_allclose(
+        way.curvature_breaks * total, 0.5 + d * np.linspace(-1, 1, 5), atol=1e-12
+    )
+    assert way.length == pytest.approx(0.8)
+    assert (way.total_length, way.is_straight) == (7.0, False)
+    assert way.travelled_length(0.5) == pytest.approx(0.6)
+    assert RoundedPath(at_rest(CORNER[:2]), 0.1).is_straight
+    assert RoundedPath(at_rest(CORNER[:2]), 0.1).total_length == pytest.approx(0.5)
+    # Blends meet halfway on a short line.
+    narrow = RoundedPath(path, 0.05)
+    np.testing.assert_allclose(narrow.curvature_breaks[[0, -1]] * total, [0.35, 0.65], atol=1e-12)
+
+
+@pytest.mark.parametrize("tolerance", [0.01, 0.2])
+def test_rates_are_derivatives_and_corners_are_rounded(tolerance: float) -> None:
+    path = turning()
+    way, h = RoundedPath(path, tolerance), 1e-6
+    shares = np.concatenate([np.linspace(0.003, 0.997, 40), way.curvature_breaks])
+    for share in shares:
+        slope = (way.displacement(share + h) - way.displacement(share - h)) / (2 * h)
+        np.testing.assert_allclose(way.displacement_derivative(share), slope, atol=1e-3)
+        ends = [Rotation.from_quat(way.rotation(share + x)) for x in (-h, h)]
+        spin = (ends[1] * ends[0].inv()).as_rotvec() / (2 * h)
+        np.testing.assert_allclose(way.rotation_derivative(share), spin, atol=1e-3)
+    off = [distance_from(CORNER - CORNER[0], way.displacement(share)) for share in shares]
+    assert max(off) <= tolerance
+    np.testing.assert_allclose(way.displacement(1.0), CORNER[3] - CORNER[0], atol=1e-12)
+    ended = Rotation.from_quat(way.rotation(1.0)) * TURNS[0]
+    assert (ended.inv() * TURNS[3]).magnitude() < 1e-12
+    np.testing.assert_allclose(way.rotation(0.0), STILL, atol=1e-15)
+
+
+# -- given paths of an end-effector with the base free, held against Pinocchio's momentum --------
+
 
 HAND = "end_effector"
 WAY = np.array([[0.05, 0.0, 0.02], [0.12, -0.1, 0.03], [0.02, -0.06, 0.1]])
@@ -97,36 +264,6 @@ def test_the_hand_rests_at_a_sharp_corner_and_goes_on(start: Array, flown: GaitS
     assert min(there) < 1e-8
 
 
-def test_a_plan_in_between_goes_on_along_the_rest_of_the_path(
-    start: Array, flown: GaitSchedule
-) -> None:
-    method, goal = method_of(corner_tolerance=0.02), flown.goal
-    progress = flown.progress
-    assert isinstance(progress, PathProgress)
-    assert len(progress.travelled_lengths) == len(flown.positions)
-    assert progress.travelled_lengths[0] == 0.0
-    assert progress.travelled_lengths[-1] == pytest.approx(progress.route.lengths_at_poses[-1])
-    assert np.all(np.diff(progress.travelled_lengths) >= -1e-9)
-    corner = progress.route.lengths_at_poses[2] + 0.02
-    tick = int(np.searchsorted(progress.travelled_lengths, corner))
-    # Braking came before the schedule: its shapes do not count.
-    braked = replace(flown, positions=np.vstack([[9.0, 9.0, 9.0], flown.positions]))
-    r, _ = poses("three_joint_arm", flown.positions[: tick + 1], HAND)[HAND]
-    state = RobotState(r - start + PLACE, ATTITUDE.as_quat(), flown.positions[tick] + 1e-4)
-    request = PlanRequest(state, goal, NEAR, correction=True, previous=braked)
-    route = method._route(request, 0.01)
-    assert len(route.positions) == 3
-    done = progress.route.remaining_after(progress.travelled_lengths[tick]).positions
-    np.testing.assert_allclose(route.positions[1:], done, atol=1e-12)
-    np.testing.assert_allclose(route.positions[-1], start + WAY[-1], atol=1e-12)
-    at_end = replace(request, state=replace(state, q=flown.positions[-1]))
-    assert len(method._route(at_end, 0.01).positions) == 2
-    # Without an earlier schedule a correction goes straight.
-    assert len(method._route(replace(request, previous=None), 0.01).positions) == 2
-    first = method._route(PlanRequest(STATE, goal, NEAR), 0.0)
-    np.testing.assert_allclose(first.positions, np.vstack([start, start + WAY]), atol=1e-9)
-
-
 def test_a_hand_at_the_end_of_its_rest_stays(start: Array) -> None:
     aim = EndEffectorGoal.along(HAND, [start, start])
     goal = Goal.of_end_effectors([aim]).for_robot(robot_of("three_joint_arm").description)
@@ -141,21 +278,6 @@ def test_auto_takes_the_method_that_follows_paths(start: Array) -> None:
 
 
 # -- refusals -----------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("name", sorted(set(METHODS) - {"resolved_rate", "auto"}))
-def test_other_methods_name_the_one_that_follows_paths(name: str) -> None:
-    method: Any = SimpleNamespace(name=name)
-    goal = Goal.of_end_effectors([EndEffectorGoal.along("hand", [[1, 2, 3], [1, 2, 4]])])
-    with pytest.raises(PlanningError) as refusal:
-        METHODS[name]._require_no_path(method, goal)
-    assert str(refusal.value) == (
-        f"{name} does not follow paths, and 'hand' is to follow one: resolved_rate does."
-    )
-    assert not METHODS[name].follows_paths
-    METHODS[name]._require_no_path(
-        method, Goal.of_end_effectors([replace(goal.end_effectors[0], waypoints=None)])
-    )
 
 
 @pytest.mark.parametrize("name", ["optimal", "area_loop"])
@@ -194,43 +316,6 @@ def test_one_end_effector_follows_a_path_and_the_base_is_free() -> None:
 def test_paths_that_are_none_are_refused(path: Any, message: str) -> None:
     with pytest.raises(GoalError, match=message):
         EndEffectorGoal.along("hand", path)
-
-
-# -- contacts -----------------------------------------------------------------------------------
-
-
-def contact(beyond: float, obstacle: tuple[int, str] | None = None, *, last: int = 9) -> Any:
-    """Return the last place of a path of ten shapes whose joint comes too near beyond a value."""
-    shapes = np.arange(last + 1.0)[:, np.newaxis]
-    path = JointPath(
-        shapes[:, 0], shapes, np.tile([0.0, 0, 0, 1], (last + 1, 1)), *[shapes[:, 0]] * 2
-    )
-    asked: list[int] = []
-
-    def too_near(found: Array, base: Array, *, at_ticks: bool) -> str:
-        assert (len(base), at_ticks) == (len(found), False)
-        asked.append(len(found))
-        return f"links touch at {found[-1, 0]:g}" if found[-1, 0] > beyond else ""
-
-    method: Any = SimpleNamespace(_base_poses=lambda state, q, X: X, _too_near=too_near)
-    state: Any = SimpleNamespace(quaternion=np.array([0.0, 0.6, 0.0, 0.8]))
-    return ResolvedRateGait._find_contact(method, state, path, obstacle), asked
-
-
-def test_a_contact_on_the_way_ends_it_just_before() -> None:
-    assert contact(6.5)[0] == (6, "On the way links touch at 7.")
-    assert contact(0.0)[0] == (0, "On the way links touch at 1.")
-    assert contact(8.0)[0] == (8, "On the way links touch at 9.")
-    assert contact(9.0)[0] is None
-    _, asked = contact(6.5)
-    assert asked[0] == 10
-    assert len(asked) <= 5
-
-
-def test_the_first_of_a_contact_and_another_obstacle_counts() -> None:
-    assert contact(6.5, (4, "a limit"))[0] == (4, "a limit")
-    assert contact(2.5, (4, "a limit"))[0] == (2, "On the way links touch at 3.")
-    assert contact(-1.0, (0, "a limit"))[0] == (0, "a limit")
 
 
 # -- one place ----------------------------------------------------------------------------------
@@ -302,23 +387,6 @@ def test_a_path_is_followed_until_shortly_before_a_limit(start: Array) -> None:
     request = PlanRequest(state, schedule.goal, NEAR, correction=True, previous=schedule)
     with pytest.raises(PlanningError, match=r"optimal may reach"):
         method.plan(request)
-
-
-def test_without_stuck_joints_the_rest_of_the_path_is_planned(flown: GaitSchedule) -> None:
-    method: Any = SimpleNamespace(
-        _names=["auto"], _is_stuck=np.array([False, True, False]), _stuck={"shoulder_pitch": 0.2}
-    )
-    names, previous = RemainingJointsGait._methods_to_try(method, flown)
-    assert names == ["auto"]
-    assert previous is not None
-    assert previous.progress is flown.progress
-    np.testing.assert_array_equal(previous.positions, flown.positions[:, [0, 2]])
-    again = replace(
-        flown, progress=_RemainingProgress(frozenset({"elbow"}), "auto", flown.progress)
-    )
-    assert RemainingJointsGait._methods_to_try(method, again)[1] is not None
-    other = replace(flown, progress=_RemainingProgress(frozenset({"elbow"}), "auto", None))
-    assert RemainingJointsGait._methods_to_try(method, other) == (["auto"], None)
 
 
 def test_a_goal_with_a_path_is_displaced_with_its_waypoints() -> None:

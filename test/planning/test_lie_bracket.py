@@ -1,30 +1,39 @@
-"""The gait of random sliding masses: predictions against another integration."""
+"""The gait of sliding masses: predictions against another integration, paper 1, and limits."""
 
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import pytest
-from planning.sliding_robots import SlidingRobot, paper_robot
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from planning.sliding_robots import Slider, SlidingRobot, paper_robot, random_sliding_robot
 from scipy.spatial.transform import Rotation
 from support.planners import planner_of
+from support.planning_refusals import refusal_in
 from support.slides_and_turns import (
     PERIOD,
     TIGHT,
+    URDF,
     check_prediction,
     goal_at,
     misses,
     note,
     origin,
     planner,
+    pose_for_shape,
     random_case,
     state_at,
 )
 
+from spacerobot_ros.errors import PlanningError
 from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.planning import Goal, Tolerance
+from spacerobot_ros.planning import METHODS, GaitSchedule, Goal, RobotState, Tolerance
+from spacerobot_ros.planning.methods.lie_bracket import LieBracketGait
 
 Array = npt.NDArray[np.float64]
 
@@ -208,3 +217,298 @@ def test_a_goal_of_position_alone_is_a_slide_and_what_it_turned() -> None:
     assert schedule.ticks == round(5.0 / PERIOD)
     assert note(schedule, "cycles") == 0.0
     np.testing.assert_allclose(schedule.positions[-1], [-0.8, 0.0, 0.0], atol=1e-12)
+
+
+# -- the gait of sliding masses: strokes and rates are kept, or the goal is refused --------------
+
+
+NEAR = goal_at([0.05, 0.02, -0.03], Rotation.from_rotvec([0.01, 0.02, 0.03]))
+
+
+def refusal_of(robot: SlidingRobot, state: RobotState, goal: Goal, **options: Any) -> str:
+    return refusal_in(lambda: planner(robot, **options).plan(state, goal))
+
+
+# -- limits -----------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+@settings(derandomize=True, deadline=None, max_examples=15)
+@given(
+    seed=st.integers(0, 10_000),
+    sliders=st.integers(3, 5),
+    rate=st.sampled_from([0.02, 0.1, 0.7]),
+    reach=st.sampled_from([0.3, 1.0, 2.5]),
+    angle=st.sampled_from([0.0, 0.1, 1.0]),
+    n1=st.sampled_from([1, 10]),
+)
+def test_a_schedule_keeps_strokes_and_rates_or_there_is_none(
+    seed: int, sliders: int, rate: float, reach: float, angle: float, n1: int
+) -> None:
+    rng = np.random.default_rng(seed)
+    robot = random_sliding_robot(rng, sliders)
+    strokes = [(-reach, float(rng.uniform(0.5, 1.0) * reach)) for _ in robot.sliders]
+    robot = replace(
+        robot,
+        sliders=tuple(
+            replace(s, stroke=stroke, rate=float(rate * rng.uniform(0.5, 1.0)))
+            for s, stroke in zip(robot.sliders, strokes, strict=True)
+        ),
+    )
+    lower, upper = np.array(strokes).T
+    limits = np.array([s.rate for s in robot.sliders])
+    state = state_at(np.zeros(3), Rotation.identity(), rng.uniform(lower, upper))
+    turn = Rotation.from_rotvec(angle * rng.normal(size=3))
+    goal = pose_for_shape(robot, state, rng.uniform(1.1 * lower, 1.1 * upper), turn)
+    schedule, refusal = None, ""
+    try:
+        method = planner(robot, Tolerance(1e-3, 1e-3), n1=n1, longest=2000.0)
+        schedule = method.plan(state, goal)
+    except PlanningError as error:
+        refusal = str(error)
+    if schedule is None:
+        assert "stroke" in refusal
+        return
+    assert np.all(schedule.positions >= lower - 1e-12)
+    assert np.all(schedule.positions <= upper + 1e-12)
+    assert np.all(np.abs(schedule.velocities) <= limits * (1 + 1e-9))
+    np.testing.assert_array_equal(schedule.positions[0], state.q)
+    # Nobody jumps: what the velocities carry is what the positions say.
+    carried = schedule.positions[0] + np.cumsum(schedule.velocities, axis=0) * PERIOD
+    np.testing.assert_allclose(carried, schedule.positions[1:], atol=1e-8)
+
+
+def test_a_slow_servo_stretches_the_slide() -> None:
+    robot = paper_robot(rate=0.05)
+    goal = goal_at([0.1, 0.0, 0.0], Rotation.identity())
+    schedule = planner(robot).plan(origin(), goal)
+    # 0.8 m at a mean of half the peak rate of 0.05 m/s.
+    assert schedule.duration == pytest.approx(32.0, abs=PERIOD)
+    position, attitude = check_prediction(robot, origin(), schedule)
+    assert max(misses(goal, position, attitude)) <= 1e-5
+
+
+def test_the_speed_that_is_told_is_that_of_the_stretched_slide() -> None:
+    goal = goal_at([0.1, 0.0, 0.0], Rotation.identity())
+    schedule = planner(paper_robot(rate=0.05)).plan(origin(), goal)
+    # v = c sin^2: c is the peak.
+    peak = np.abs(schedule.velocities[:, 0]).max()
+    assert abs(note(schedule, "c")[0]) == pytest.approx(peak, rel=1e-3)
+
+
+def test_a_servo_that_does_not_move_is_refused() -> None:
+    goal = goal_at([0.1, 0.0, 0.0], Rotation.identity())
+    assert "'s1'" in refusal_of(paper_robot(rate=0.0), origin(), goal)
+
+
+def test_a_slide_that_takes_too_long_is_refused_with_the_time() -> None:
+    # 0.8 m at a mean of 5 mm/s.
+    goal = goal_at([0.1, 0.0, 0.0], Rotation.identity())
+    assert "100 s" in refusal_of(paper_robot(rate=0.01), origin(), goal, longest=100.0)
+
+
+def test_a_fourth_slider_takes_what_the_others_have_no_stroke_for() -> None:
+    # Two slots along x. Alone, or in equal shares, the first cannot do it.
+    axes = np.vstack([np.eye(3), [[1.0, 0.0, 0.0]]])
+    sliders = tuple(
+        Slider(2.0, axis, np.array([0.0, 0.1 * k, 0.1]), stroke=stroke)
+        for k, (axis, stroke) in enumerate(
+            zip(axes, [(-0.2, 0.2), (-2.5, 2.5), (-2.5, 2.5), (-2.5, 2.5)], strict=True)
+        )
+    )
+    robot = SlidingRobot(10.0, np.diag([1.0, 1.5, 1.5]), np.zeros(3), sliders)
+    # 0.1 m of 18 kg is 0.9 m of 2 kg.
+    goal = goal_at([-0.1, 0.0, 0.0], Rotation.identity())
+    method = planner(robot).method
+    assert isinstance(method, LieBracketGait)
+    z_f = method.final_shape(origin(4), goal)
+    assert z_f[0] + z_f[3] == pytest.approx(0.9, abs=1e-9)
+    assert -0.2 <= z_f[0] <= 0.2
+    np.testing.assert_allclose(z_f[1:3], 0.0, atol=1e-9)
+
+
+def test_a_shape_at_the_end_of_a_stroke_is_reached_without_a_turn() -> None:
+    # 2.5 m of 2 kg is 0.3125 m of 16 kg; a mass through the centre turns nothing.
+    goal = goal_at([-0.3125, 0.0, 0.0], Rotation.identity())
+    schedule = planner(paper_robot()).plan(origin(), goal)
+    np.testing.assert_allclose(schedule.positions[-1], [2.5, 0.0, 0.0], atol=1e-12)
+    assert schedule.positions.max() <= 2.5
+
+
+# -- refusals ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("count", [0, 1, 2])
+def test_fewer_than_three_sliders_are_refused(count: int) -> None:
+    robot = paper_robot()
+    robot = replace(robot, sliders=robot.sliders[:count])
+    text = refusal_of(robot, origin(count), NEAR)
+    assert "three sliders" in text
+    assert f"{count} slider" in text
+
+
+@pytest.mark.parametrize("count", [3, 5])
+def test_slots_in_one_plane_are_refused(count: int) -> None:
+    rng = np.random.default_rng(7)
+    plane = np.linalg.qr(rng.normal(size=(3, 3)))[0][:, :2]
+    sliders = tuple(
+        Slider(2.0, plane @ (v / np.linalg.norm(v)), rng.uniform(-0.3, 0.3, 3))
+        for v in rng.normal(size=(count, 2))
+    )
+    robot = SlidingRobot(10.0, np.diag([1.0, 1.5, 1.5]), np.zeros(3), sliders)
+    text = refusal_of(robot, origin(count), NEAR)
+    assert "linearly independent" in text
+    assert f"{count} slider(s) of rank 2" in text
+
+
+@pytest.mark.parametrize(("axis", "sign"), [(0, 1), (1, -1), (2, 1)])
+def test_a_goal_beyond_stroke_names_joint_and_stroke(axis: int, sign: int) -> None:
+    # 0.35 m of 16 kg is 2.8 m of 2 kg, the other way.
+    position = -0.35 * sign * np.eye(3)[axis]
+    text = refusal_of(paper_robot(), origin(), goal_at(position, Rotation.identity()))
+    assert "beyond stroke" in text
+    assert f"'s{axis + 1}'" in text
+    assert f"at {2.8 * sign:.4g} m" in text
+    assert "[-2.5, 2.5] m" in text
+
+
+def test_a_turn_without_room_for_the_masses_is_refused() -> None:
+    # The final shape is at the very end of a stroke.
+    goal = pose_for_shape(
+        paper_robot(), origin(), np.array([2.5, 0.0, 0.0]), Rotation.from_rotvec([0, 0, 0.1])
+    )
+    text = refusal_of(paper_robot(), origin(), goal)
+    assert "stroke" in text
+
+
+def test_a_turn_that_takes_too_long_is_refused_with_the_time() -> None:
+    goal = goal_at([0.0, 0.0, 0.0], Rotation.from_rotvec([0.4, 0.0, 0.0]))
+    text = refusal_of(paper_robot(), origin(), goal, longest=20.0)
+    assert "20 s" in text
+
+
+@pytest.mark.parametrize(
+    ("momentum", "shown"),
+    [
+        ({"linear_momentum": np.array([0.0, 3e-3, 4e-3])}, "0.005 kg m/s"),
+        ({"angular_momentum": np.array([0.0, -2e-3, 0.0])}, "0.002 kg m^2/s"),
+    ],
+)
+def test_a_drifting_robot_is_refused(momentum: dict[str, Array], shown: str) -> None:
+    text = refusal_of(paper_robot(), replace(origin(), **momentum), NEAR)
+    assert "drifts" in text
+    assert shown in text
+
+
+def test_a_slider_that_is_not_used_may_have_no_rate_and_no_room() -> None:
+    """A fourth one that neither the slide nor the turn moves: it rests at the end of its stroke."""
+    fourth = Slider(0.5, np.array([0.6, 0.8, 0.0]), np.zeros(3), stroke=(-1.0, 0.0), rate=0.0)
+    robot = paper_robot()
+    robot = replace(robot, sliders=(*robot.sliders, fourth))
+    state = state_at(np.zeros(3), Rotation.identity(), np.zeros(4))
+    goal = goal_at([0.0, 0.0, 0.0], Rotation.from_rotvec([0.01, 0.0, -0.02]))
+    schedule = planner(robot, Tolerance(1e-3, 1e-3)).plan(state, goal)
+    assert np.all(schedule.positions[:, 3] == 0.0)
+    assert np.ptp(schedule.positions[:, :3]) > 0.01
+
+
+# -- the gait of sliding masses: paper 1's manoeuvre and its numbers -----------------------------
+
+
+PAPER_GOAL = goal_at([0.3, -0.25, 0.1], Rotation.from_rotvec([0.5, -0.15, 0.1]))
+# a22 = 0.8 and a31 = 8.125, as ratios to the balanced amplitudes at the paper's alpha.
+PAPER_OPTIONS = {
+    "t1": 100.0,
+    "n1": 10,
+    "cycle_period": 3.0,
+    "cycles": 1600,
+    "a22_ratio": 0.8 / np.sqrt(2 * 0.84377 / np.pi),
+    "a31_ratio": 8.125 / np.sqrt(np.hypot(61.0928, 18.8194) / np.pi),
+}
+
+
+@pytest.fixture(scope="module")
+def paper_gait() -> GaitSchedule:
+    """Return the manoeuvre of 4900 s, at a tolerance that admits the first order."""
+    method = planner_of(
+        "lie_bracket", SpaceRobot.from_file(URDF), PERIOD, Tolerance(0.02, 0.06), **PAPER_OPTIONS
+    )
+    return method.plan(origin(), PAPER_GOAL)
+
+
+def test_the_symbols_of_the_paper_are_recomputed(paper_gait: GaitSchedule) -> None:
+    assert METHODS["lie_bracket"] is LieBracketGait
+    np.testing.assert_allclose(note(paper_gait, "zf"), [-2.378408, 1.687252, -1.377082], atol=1e-6)
+    np.testing.assert_allclose(note(paper_gait, "c"), [-0.047568, 0.033745, -0.027542], atol=1e-6)
+    # In the paper's sign convention; the printed 0.8438 lacks its sign.
+    np.testing.assert_allclose(note(paper_gait, "alpha"), [-0.84377, -61.0928, -18.8194], rtol=1e-5)
+    assert note(paper_gait, "cycles") == 1600
+    np.testing.assert_allclose(note(paper_gait, "amplitudes")[3:], [0.8, 8.125], rtol=1e-5)
+
+
+def test_the_manoeuvre_of_the_paper_takes_4900_s(paper_gait: GaitSchedule) -> None:
+    assert paper_gait.ticks == 98_000
+    assert paper_gait.duration == pytest.approx(4900.0)
+    assert paper_gait.positions.shape == (98_001, 3)
+    # Within the peaks of the printed controls, which are not held for ticks.
+    rates = np.abs(paper_gait.velocities).max(axis=0)
+    np.testing.assert_allclose(rates, [0.0647, 0.1871, 0.6550], rtol=0.03)
+    reach = np.abs(paper_gait.positions).max(axis=0)
+    np.testing.assert_allclose(reach, [2.419, 1.687, 1.648], atol=5e-3)
+
+
+def test_the_manoeuvre_of_the_paper_ends_where_its_controls_end(paper_gait: GaitSchedule) -> None:
+    position, quaternion = paper_gait.path.position[-1], paper_gait.path.quaternion[-1]
+    attitude = Rotation.from_quat(quaternion)
+    np.testing.assert_allclose(position, [0.30135, -0.25412, 0.08435], atol=0.002)
+    np.testing.assert_allclose(attitude.as_rotvec(), [0.55055, -0.14255, 0.09554], atol=0.002)
+    _, angle = misses(PAPER_GOAL, position, attitude)
+    assert np.degrees(angle) == pytest.approx(2.93, abs=0.02)
+
+
+def test_the_manoeuvre_of_the_paper_integrated_otherwise(paper_gait: GaitSchedule) -> None:
+    robot, shapes = paper_robot(), paper_gait.positions
+    # 100 s of slide, and one cycle of 60 ticks 1600 times over.
+    slide, cycles = shapes[:2001], shapes[2000:]
+    one = cycles[:61]
+    np.testing.assert_array_equal(cycles[:-1].reshape(1600, 60, 3)[1:], [one[:-1]] * 1599)
+    before = robot.attitudes(slide, PERIOD, Rotation.identity())[-1]
+    turn = robot.attitudes(one, PERIOD, Rotation.identity())[-1]
+    after = before * Rotation.from_rotvec(1600 * turn.as_rotvec())
+    predicted = Rotation.from_quat(paper_gait.path.quaternion[-1])
+    assert (predicted.inv() * after).magnitude() < 1e-8
+    end = -after.apply(robot.center_of_mass(shapes[-1]))
+    np.testing.assert_allclose(paper_gait.path.position[-1], end, atol=1e-8)
+
+
+def test_a_tighter_tolerance_refines_the_manoeuvre_of_the_paper() -> None:
+    method = planner_of(
+        "lie_bracket", SpaceRobot.from_file(URDF), PERIOD, Tolerance(1e-4, 1e-5), **PAPER_OPTIONS
+    )
+    schedule = method.plan(origin(), PAPER_GOAL)
+    assert schedule.ticks == 98_000
+    end = Rotation.from_quat(schedule.path.quaternion[-1])
+    distance, angle = misses(PAPER_GOAL, schedule.path.position[-1], end)
+    assert angle <= 1e-5
+    assert distance <= 1e-4
+
+
+def test_a_correction_asks_for_little(paper_gait: GaitSchedule) -> None:
+    method = planner_of(
+        "lie_bracket", SpaceRobot.from_file(URDF), PERIOD, Tolerance(1e-3, 1e-3), **PAPER_OPTIONS
+    )
+    end = Rotation.from_quat(paper_gait.path.quaternion[-1])
+    state = state_at(paper_gait.path.position[-1], end, paper_gait.positions[-1])
+    correction = method.plan(state, PAPER_GOAL, correction=True)
+    # 0.05 rad of the 0.54 that the paper's 1600 cycles turn.
+    assert correction.duration < 0.3 * paper_gait.duration
+    first, second = (np.ptp(s.positions[2000:], axis=0) for s in (paper_gait, correction))
+    assert note(correction, "cycles") < 1600
+    assert np.all(second < 2.0 * np.maximum(first, 0.1))
+    distance, angle = misses(
+        PAPER_GOAL,
+        correction.path.position[-1],
+        Rotation.from_quat(correction.path.quaternion[-1]),
+    )
+    assert distance <= 1e-3
+    assert angle <= 1e-3

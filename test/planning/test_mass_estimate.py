@@ -1,6 +1,9 @@
-"""What the motion of a base tells of masses, held against robots that weigh otherwise."""
+"""What flights tell of masses, of the time to the end, and of progress."""
 
 from __future__ import annotations
+
+import io
+import logging
 
 import numpy as np
 import numpy.typing as npt
@@ -8,14 +11,20 @@ import pytest
 from scipy.spatial.transform import Rotation
 from support.planner_loop import TICK, robot_of
 
+from spacerobot_ros import plan
+from spacerobot_ros.cli.terminal import Display, display
+from spacerobot_ros.errors import PlanningError
 from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.model.compilation import ANNOUNCEMENT_ATTRIBUTE
 from spacerobot_ros.planning import BasePath, GaitSchedule, Goal, RobotState
 from spacerobot_ros.planning.core.prediction import BasePrediction
+from spacerobot_ros.planning.core.progress import SearchProgress, log_progress, report_progress
 from spacerobot_ros.planning.execution.path_deviation import (
     MassEstimate,
     PathDeviation,
     PathSensitivity,
 )
+from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus, time_to_end
 
 Array = npt.NDArray[np.float64]
 
@@ -166,3 +175,156 @@ def test_a_jump_of_what_is_measured_tells_nothing_of_masses(name: str, step: lis
     following = follow(60, jump_at=60)
     end = Rotation.from_quat(following.expected_end(59)[1])
     assert (Rotation.from_quat(path.quaternion[-1]).inv() * end).magnitude() < 1e-3
+
+
+# -- how long a goal was flown to, from what its planner has reported ----------------------------
+
+
+HERE, THERE = (0.0,) * 6 + (1.0,), (1.0,) + (0.0,) * 5 + (1.0,)
+
+
+def said(
+    time: float, state: str, goal_id: str = "", goal: tuple[float, ...] = ()
+) -> tuple[float, PlannerStatus]:
+    return time, PlannerStatus(PlannerState(state), goal_id=goal_id, goal=goal)
+
+
+def test_it_counts_from_the_first_schedule_for_the_last_goal() -> None:
+    flown = [
+        said(0.0, "idle"),
+        said(1.0, "executing", "a", HERE),
+        said(4.0, "reached", "a", HERE),
+        said(5.0, "planning", "b", THERE),
+        said(7.0, "executing", "b", THERE),
+        said(8.0, "planning", "b"),
+        said(9.0, "executing", "b", THERE),
+    ]
+    assert time_to_end(flown, 12.5) == 5.5
+    refused = said(10.0, "refused", "c", HERE)
+    assert time_to_end([*flown, refused], 12.5) == 5.5, "which is another goal's"
+    assert time_to_end([*flown, refused, said(11.0, "aborted", "b")], 12.5) == 4.0
+    # The same goal again is another one.
+    again = [*flown, said(13.0, "reached", "b", THERE), said(20.0, "executing", "d", THERE)]
+    assert time_to_end(again, 21.0) == 1.0
+
+
+def test_a_goal_that_was_refused_in_between_ends_nothing() -> None:
+    flown = [
+        said(1.0, "executing", "a", HERE),
+        said(3.0, "planning", "b"),
+        said(3.5, "refused", "b", THERE),
+        said(6.0, "planning", "a"),
+        said(7.0, "executing", "a", HERE),
+        said(9.0, "aborted", "a"),
+    ]
+    assert time_to_end(flown, 12.0) == 8.0
+    # One that was flown in between does.
+    flown[2] = said(3.5, "executing", "b", THERE)
+    assert time_to_end(flown, 12.0) == 2.0
+    # So does the refusal of the same pose: what follows is another attempt.
+    flown[2] = said(3.5, "refused", "b", HERE)
+    assert time_to_end(flown, 12.0) == 2.0
+
+
+def test_it_goes_on_where_a_planner_was_started_again() -> None:
+    flown = [
+        said(0.25, "executing", "a", HERE),
+        said(40.5, "planning", "a"),
+        said(46.5, "executing", "a", HERE),
+        said(49.0, "aborted", "a"),
+    ]
+    assert time_to_end(flown, 60.0) == 48.75
+
+
+def test_bags_of_earlier_versions_have_no_ids() -> None:
+    flown = [said(0.0, "executing", goal=HERE), said(2.0, "executing", goal=THERE)]
+    assert time_to_end(flown, 5.0) == 3.0
+    assert time_to_end([said(1.0, "executing", goal=THERE), *flown[1:]], 5.0) == 4.0
+
+
+def test_without_a_schedule_there_is_none() -> None:
+    assert time_to_end([said(0.0, "idle"), said(1.0, "refused", "a")], 5.0) is None
+
+
+# -- what a search reports of itself on the way, and what the command line shows of it -----------
+
+
+_LOG = logging.getLogger("spacerobot_ros.planning.somewhere")
+
+
+class Terminal(io.StringIO):
+    """What is written to a terminal."""
+
+    def isatty(self) -> bool:
+        return True
+
+
+def test_a_search_reports_every_start_and_the_best_so_far() -> None:
+    seen: list[SearchProgress] = []
+    with report_progress(seen.append):
+        gait = plan(
+            "sliding_masses", position=(0.2, -0.1, 0.05), rotvec=(0.1, 0.0, 0.1), starts=3,
+            answers=3, agreeing=0, intervals=16, control_period=0.1, cache=0,
+        )  # fmt: skip
+    starts = [each.starts for each in seen]
+    assert starts[:3] == [1, 2, 3]
+    assert starts == sorted(starts)
+    assert all(each.max_starts >= each.starts for each in seen)
+    best = [each.best_s for each in seen]
+    assert best == sorted(best, reverse=True), "it is the best so far"
+    # Held commands take a whole number of periods, and bring the gait to the goal exactly.
+    assert gait.duration == pytest.approx(best[-1], rel=0.25)
+    count = len(seen)
+    with pytest.raises(PlanningError):
+        plan("sliding_masses", position=(9.0, 0.0, 0.0), starts=1)
+    assert len(seen) == count, "nothing is report_progress afterwards"
+
+
+def test_listening_changes_nothing_for_others() -> None:
+    package = logging.getLogger("spacerobot_ros")
+    before, handlers = package.level, list(package.handlers)
+    sentences: list[str] = []
+    with report_progress(lambda progress: None, sentences.append):
+        _LOG.info("something")
+        _LOG.info("It takes long.", extra={ANNOUNCEMENT_ATTRIBUTE: True})
+        log_progress(_LOG, SearchProgress(1, 2), "start 1")
+    assert sentences == ["It takes long."]
+    assert (package.level, package.handlers) == (before, handlers)
+
+
+def test_what_is_shown_of_a_search_and_of_a_flight(monkeypatch: pytest.MonkeyPatch) -> None:
+    terminal = Terminal()
+    monkeypatch.setattr("sys.stderr", terminal)
+    shown = Display("arm", visible=True)
+    shown.show_line("Compiling.")
+    shown.search(SearchProgress(1, 8))
+    shown.search(SearchProgress(8, 8, 12.34567))
+    shown.fly(0.0, 0.0)
+    shown.fly(5.0, 20.0)
+    shown.search(SearchProgress(1, 8))
+    shown.fly(20.0, 20.0)
+    shown.close()
+    text = terminal.getvalue()
+    assert text.startswith("Compiling.\n")
+    assert "start 1 of at most 8, none found yet" in text
+    assert "start 8 of at most 8, best 12.35 s" in text
+    assert "5.0 of 20.0 s" in text
+    assert text.index("planning arm") < text.index("flying arm")
+    assert "planning" not in text[text.index("flying arm") :], "corrections disturb no flight"
+    assert "20.0 of 20.0 s" in text
+
+
+def test_nobody_is_shown_anything_where_nobody_looks(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with display("arm") as shown:
+        log_progress(_LOG, SearchProgress(1, 2), "start 1")
+        shown.show_line("Compiling.")
+        shown.search(SearchProgress(1, 2))
+        shown.fly(1.0, 2.0)
+    assert capsys.readouterr() == ("", "")
+    terminal = Terminal()
+    monkeypatch.setattr("sys.stderr", terminal)
+    with display("arm"):
+        log_progress(_LOG, SearchProgress(1, 2), "start 1")
+    assert "start 1 of at most 2" in terminal.getvalue()

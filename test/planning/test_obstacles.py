@@ -1,16 +1,22 @@
-"""Plans keep clear of obstacles in the world; the distances are those of coal and of balls."""
+"""Plans keep clear of obstacles, those that come in flight too."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
+import casadi as ca
 import coal
 import numpy as np
 import numpy.typing as npt
 import pytest
-from scipy.spatial.transform import Rotation
+from scipy.spatial.transform import Rotation, Slerp
+from support.planner_loop import TICK, Loop
+from support.planner_phases import executing, resting, stub_of
 
+from spacerobot_ros.collision.planes import PlaneDistance
 from spacerobot_ros.errors import ParameterError, PlanningError, Proof, UnreachableError
 from spacerobot_ros.flight.trials import PlanningProblem
 from spacerobot_ros.model import RobotDescription, SpaceRobot
@@ -19,6 +25,12 @@ from spacerobot_ros.model.urdf import load_world, parse_world
 from spacerobot_ros.model.world import with_world
 from spacerobot_ros.planning import GaitSchedule, RobotState, plan
 from spacerobot_ros.planning.core.clearance import Clearance
+from spacerobot_ros.planning.core.schedule import BasePath
+from spacerobot_ros.planning.execution.config import PlannerConfig
+from spacerobot_ros.planning.execution.executive import Phase
+from spacerobot_ros.planning.execution.status import PlannerState
+from spacerobot_ros.planning.execution.worker import PlanningWorker
+from spacerobot_ros.planning.methods.optimal.transcription import _distance_block
 from spacerobot_ros.resources import robot_file, share_directory
 from spacerobot_ros.scenario import load_scenario
 
@@ -195,3 +207,170 @@ def test_the_world_of_a_scenario_is_that_of_plant_and_planner(tmp_path: Path) ->
     file.write_text(text.replace("worlds/strut.urdf", str(robot_file("free_flyer"))), "utf-8")
     with pytest.raises(ParameterError, match='give it type="fixed"'):
         load_scenario(str(file))
+
+
+# -- obstacles that come while a planner flies: which commands are looked at, and what is --------
+
+
+BALL = (
+    '<robot name="w"><link name="w"/><link name="ball"><collision><geometry><sphere radius="0.3"/>'
+    '</geometry></collision></link><joint name="a" type="fixed"><parent link="w"/>'
+    '<child link="ball"/></joint></robot>'
+)
+
+
+def use(loop: Loop, approaches: Callable[..., Any], *, has_obstacles: bool = True) -> Any:
+    """Let a worker with a made-up clearance take the place of that of a loop."""
+    clearance = SimpleNamespace(
+        has_obstacles=has_obstacles,
+        approaches=approaches,
+        clause=lambda approach, period: (
+            f"link 'a' and obstacle 'b' touch at {approach}, {period:g}"
+        ),
+    )
+    worker: Any = PlanningWorker(loop.plant.robot, loop.config, loop.method)
+    worker.clearance = clearance
+    loop.executive.use_obstacles(lambda: worker)
+    loop._take()
+    return worker
+
+
+def test_the_joints_brake_before_an_obstacle_and_go_on_to_the_goal() -> None:
+    loop = executing(ticks=60, abort_time=0.4)
+    loop.tick(20)
+    use(loop, lambda positions, base: ["here", "there"])
+    said = (
+        f"Link 'a' and obstacle 'b' touch at here, {TICK:g}: the joints brake, and the remaining "
+        "motion is planned again."
+    )
+    status = loop.statuses[-1]
+    assert (status.state, status.message, status.goal_id) == ("executing", said, "goal-1")
+    assert said in loop.notices
+    assert loop.executive.phase is Phase.BRAKING
+    reached = loop.until(PlannerState.REACHED)
+    assert reached.corrections == 0
+    assert len(stub_of(loop).requests) == 2
+    assert not stub_of(loop).requests[-1].correction
+    assert np.abs(np.diff(loop.speeds)).max() < 0.5 * max(loop.speeds)
+
+
+def test_a_goal_behind_an_obstacle_has_failed_with_both_reasons() -> None:
+    loop = executing(ticks=60)
+    loop.tick(20)
+
+    def approaches(positions: Array, base: Any) -> list[str]:
+        raise PlanningError("Link 'a' and obstacle 'b' are 0.001 m apart at the start.")
+
+    use(loop, approaches)
+    assert loop.statuses[-1].message.startswith("Link 'a' and obstacle 'b' are 0.001 m apart at")
+    assert loop.statuses[-1].message.endswith(
+        "start: the joints brake, and the remaining motion is planned again."
+    )
+    stub_of(loop).refusing = True
+    assert "It is too far." in loop.until(PlannerState.FAILED).message
+
+
+# -- parts --------------------------------------------------------------------------------------
+
+
+def test_a_path_of_the_base_is_read_between_its_poses() -> None:
+    turns = Rotation.from_rotvec([[0.0, 0, 0.1], [0.0, 0, 0.3], [0.0, 0.02, 0.3]])
+    quaternions = turns.as_quat() * np.array([[1.0], [-1.0], [1.0]])
+    path = BasePath(np.array([0.0, 1.0, 3.0]), np.eye(3), quaternions)
+    position, quaternion = path.at(np.array([0.25, 1.0, 2.0, 9.0]))
+    wanted_r: Any = [[0.75, 0.25, 0], [0, 1, 0], [0, 0.5, 0.5], [0, 0, 1]]
+    np.testing.assert_allclose(position, wanted_r)
+    wanted = Slerp([0.0, 1.0, 3.0], turns)([0.25, 1.0, 2.0, 3.0])
+    assert (wanted.inv() * Rotation.from_quat(quaternion)).magnitude().max() < 1e-4
+    np.testing.assert_allclose(np.linalg.norm(quaternion, axis=1), 1.0, atol=1e-14)
+
+
+@pytest.mark.parametrize("obstacles", [True, False])
+def test_a_worker_plans_among_the_obstacles_that_it_is_given(*, obstacles: bool) -> None:
+    loop = resting()
+    robot, config = loop.plant.robot, PlannerConfig(clearance=0.0)
+    described = with_world(robot.description, parse_world(BALL)) if obstacles else None
+    worker = PlanningWorker(robot, config, loop.method, described=described)
+    if described is None:
+        assert worker.clearance is None
+    else:
+        assert worker.clearance is not None
+        assert worker.clearance._robot.world is described.world
+        assert worker.clearance.distance == 0.01
+
+
+# -- rows of distances along an interval: the points that they are taken at, and their -----------
+
+
+N = 2
+
+
+def planes_of_links() -> PlaneDistance:
+    q, plane, multiplier = ca.SX.sym("q", N), ca.SX.sym("plane", 7), ca.SX.sym("lambda")
+    d = ca.sin(q[0]) * q[1] * plane[1] + q[0] ** 2 - plane[3]
+    return PlaneDistance(
+        ca.Function("d", [q, plane], [d]),
+        ca.Function("J", [q, plane], [ca.jacobian(d, q)]),
+        ca.Function("H", [q, plane, multiplier], [ca.hessian(multiplier * d, q)[0]]),
+    )
+
+
+def planes_of_obstacles() -> PlaneDistance:
+    y, plane, multiplier = ca.SX.sym("y", N + 4), ca.SX.sym("plane", 7), ca.SX.sym("lambda")
+    d = y[0] * y[3] + ca.cos(y[1]) * y[5] * plane[2] + plane[6] * y[2] * y[4]
+    return PlaneDistance(
+        ca.Function("d", [y, plane], [d]),
+        ca.Function("J", [y, plane], [ca.jacobian(d, y)]),
+        ca.Function("H", [y, plane, multiplier], [ca.hessian(multiplier * d, y)[0]]),
+        is_of_obstacle=True,
+    )
+
+
+H, START = 0.4, np.array([0.3, -0.7])
+V, V_NEXT = np.array([0.5, -0.2]), np.array([-0.1, 0.6])
+X, X_NEXT = np.array([0.1, -0.2, 0.3, 0.9]), np.array([0.2, -0.1, 0.25, 0.92])
+# The variable s of a knot is q + h v / 2.
+LACK = 0.03
+Z = np.concatenate([[H], X, START + H * V / 2, V, X_NEXT, V_NEXT, [LACK]])
+PLANES = np.random.default_rng(5).normal(size=(3, 2, 7))
+ROWS = [planes_of_links(), planes_of_obstacles()]
+
+
+def by_hand(z: np.ndarray) -> np.ndarray:
+    """Return the rows at thirds of an interval in which velocities change linearly."""
+    h, X0, s, v, X1, v1, lack = z[0], z[1:5], z[5:7], z[7:9], z[9:13], z[13:15], z[15]
+    found = []
+    for tau, (first, second) in zip((1 / 3, 2 / 3, 1.0), PLANES, strict=True):
+        t = tau * h
+        q = s - h * v / 2 + v * t + (v1 - v) / h * t**2 / 2
+        y = np.concatenate([q, (1 - tau) * X0 + tau * X1])
+        found.append(np.sin(q[0]) * q[1] * first[1] + q[0] ** 2 - first[3] + lack)
+        of_obstacle = y[0] * y[3] + np.cos(y[1]) * y[5] * second[2] + second[6] * y[2] * y[4]
+        found.append(of_obstacle + lack)
+    return np.array(found)
+
+
+def test_rows_are_those_of_the_shapes_between_the_knots() -> None:
+    block, p = _distance_block(N, ROWS, 3), PLANES.ravel()
+    np.testing.assert_allclose(block.values(Z, p).full().ravel(), by_hand(Z), atol=1e-13)
+    values, J = block.jacobian(Z, p)
+    np.testing.assert_allclose(values.full().ravel(), by_hand(Z), atol=1e-13)
+    step = 1e-6
+    differences = [(by_hand(Z + e) - by_hand(Z - e)) / (2 * step) for e in step * np.eye(len(Z))]
+    np.testing.assert_allclose(J.full(), np.column_stack(differences), atol=1e-8)
+
+
+def test_second_derivatives_are_those_of_differences() -> None:
+    block, p = _distance_block(N, ROWS, 3), PLANES.ravel()
+    multipliers = np.array([0.7, -1.2, 0.4, 2.0, -0.6, 1.1])
+
+    def gradient(z: np.ndarray) -> np.ndarray:
+        return np.asarray(block.jacobian(z, p)[1].full().T @ multipliers)
+
+    step = 1e-6
+    expected = np.column_stack(
+        [(gradient(Z + e) - gradient(Z - e)) / (2 * step) for e in step * np.eye(len(Z))]
+    )
+    upper = block.hessian(Z, p, multipliers).full()
+    np.testing.assert_allclose(np.triu(upper), np.triu(expected), atol=1e-8)
+    assert np.abs(np.tril(upper, -1)).max() == pytest.approx(0.0, abs=1e-12)

@@ -78,7 +78,6 @@ def require_smooth(before: Array, schedule: GaitSchedule) -> None:
     assert (np.abs(np.diff(rates, axis=0)) / PERIOD <= ACCELERATION * (1 + 1e-6)).all()
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("angle", [0.42, -0.1])
 def test_another_goal_is_reached_from_moving_joints_within_the_limits(angle: float) -> None:
     _, state, motion = halfway(first())

@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import io
+import json
+import os
+import re
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -12,15 +17,15 @@ import pytest
 from planning.test_optimal import ARM_START, FOLDER, QUICK, assert_within
 from scipy.spatial.transform import Rotation
 
+from spacerobot_ros import files
 from spacerobot_ros.errors import ParameterError, PlanningError
+from spacerobot_ros.files import Cache
 from spacerobot_ros.model import SpaceRobot, model_functions
 from spacerobot_ros.planning import GaitSchedule, plan
 from spacerobot_ros.planning.methods.optimal import multiple_shooting, search
 from spacerobot_ros.planning.methods.optimal.problem import OptimalOptions, PathConstraints
 from spacerobot_ros.planning.methods.optimal.search import ManoeuvreSearch
 from spacerobot_ros.planning.methods.optimal.transcription import PathInequality, Stages, program
-
-Array = npt.NDArray[np.float64]
 
 EAST = [1.0, 0.0, 0.0]
 SUN = [float(np.cos(0.3)), float(np.sin(0.3)), 0.0]
@@ -61,7 +66,6 @@ def chain(links: int) -> str:
 # -- on the way -------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
 def test_the_base_turns_no_faster_than_it_may(arm: SpaceRobot) -> None:
     turn = [0.2, -0.1, 0.3]
     slow = of_arm(arm, turn, max_base_rate=0.12)
@@ -71,7 +75,6 @@ def test_the_base_turns_no_faster_than_it_may(arm: SpaceRobot) -> None:
     assert reached(slow, turn) <= 1e-6
 
 
-@pytest.mark.slow
 def test_an_axis_stays_out_of_a_cone(arm: SpaceRobot) -> None:
     turn = [0.0, 0.0, 0.6]
 
@@ -85,7 +88,6 @@ def test_an_axis_stays_out_of_a_cone(arm: SpaceRobot) -> None:
     assert reached(away, turn) <= 1e-6
 
 
-@pytest.mark.slow
 def test_joints_stay_out_of_a_box(arm: SpaceRobot) -> None:
     turn, far = [0.2, -0.1, 0.3], 1e9
     assert of_arm(arm, turn).positions[:, 1].max() > 0.0
@@ -93,7 +95,6 @@ def test_joints_stay_out_of_a_box(arm: SpaceRobot) -> None:
     assert of_arm(arm, turn, keep_out=box).positions[:, 1].max() <= -0.7
 
 
-@pytest.mark.slow
 def test_margins_are_kept_but_where_the_goal_is_in_them(arm: SpaceRobot) -> None:
     turn, margin = [0.2, -0.1, 0.3], np.array([2.5, 1.0, 0.0])
     schedule = of_arm(arm, turn, joint_margin=margin.tolist())
@@ -139,7 +140,6 @@ def test_a_search_cut_short_gives_the_best_so_far(arm: SpaceRobot) -> None:
     assert_within(hasty, arm.velocity_limit, arm.velocity_limit / 0.5)
 
 
-@pytest.mark.slow
 def test_a_plan_is_the_same_on_a_busy_machine(
     arm: SpaceRobot, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -270,6 +270,18 @@ def test_bad_options_are_refused(arm: SpaceRobot, options: dict[str, Any], sente
         of_arm(arm, [0, 0, 0.1], **options)
 
 
+def test_joints_without_a_velocity_limit_are_refused_with_the_remedies() -> None:
+    text = (FOLDER / "planar_chain.urdf").read_text("utf-8").replace("revolute", "continuous")
+    free = SpaceRobot.from_urdf(re.sub(r"<limit[^>]*/>", "", text))
+    with pytest.raises(ParameterError) as refusal:
+        plan(free, rotvec=[0, 0, 0.2], **QUICK)
+    assert str(refusal.value) == (
+        "Joint 'pin_1' has no velocity limit, within which optimal plans: give it "
+        '<limit velocity="..." effort="..."/> in the URDF, or optimal.max_velocity.'
+    )
+    assert plan(free, rotvec=[0, 0, 0.2], max_velocity=[0.5, 0.5], **QUICK).ticks > 0
+
+
 def test_a_start_that_breaks_a_constraint_is_refused(arm: SpaceRobot) -> None:
     with pytest.raises(PlanningError, match=r"The start violates .*: the shape enters a box"):
         of_arm(arm, [0, 0, 0.1], keep_out=[-1, -1, 1, 1, 0, 2])
@@ -350,3 +362,121 @@ def test_derivatives_of_the_program_are_those_of_its_functions(arm: SpaceRobot) 
     np.testing.assert_allclose(jac.full(), jacobian.full(), atol=1e-9)
     found = made.hess_lag(at, of, 0.7, by).full()
     np.testing.assert_allclose(found, hessian.full(), rtol=1e-9, atol=1e-8)
+
+
+# -- plans that were kept are flown for the same request, and only if they are whole -------------
+
+
+ASKED: dict[str, Any] = {**QUICK, "cache": 1, "rotvec": [0, 0, 0.3], "joint_positions": [0.4, 0.1]}
+
+
+@pytest.fixture(scope="module")
+def robot() -> SpaceRobot:
+    return SpaceRobot.from_file(FOLDER / "planar_chain.urdf")
+
+
+@pytest.fixture(scope="module")
+def made(robot: SpaceRobot, tmp_path_factory: pytest.TempPathFactory) -> tuple[GaitSchedule, Path]:
+    """Return a plan and the file that it was kept in."""
+    folder = tmp_path_factory.mktemp("made")
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        monkeypatch.setenv("SPACEROBOT_CACHE_DIR", str(folder))
+        schedule = plan(robot, **ASKED)
+    (kept,) = (folder / "plans").iterdir()
+    return schedule, kept
+
+
+@pytest.fixture
+def cache(
+    made: tuple[GaitSchedule, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Cache:
+    """Return a cache of this test's own with that plan; a search for another one fails."""
+    monkeypatch.setenv("SPACEROBOT_CACHE_DIR", str(tmp_path))
+    monkeypatch.setattr(files, "_logged_warnings", set())
+
+    def searching(*arguments: Any, **options: Any) -> None:
+        raise PlanningError("searched")
+
+    monkeypatch.setattr(ManoeuvreSearch, "search", searching)
+    cache = Cache(tmp_path / "plans")
+    cache.folder.mkdir()
+    shutil.copy(made[1], cache.folder)
+    return cache
+
+
+def content_of(path: Path) -> bytes:
+    whole = path.read_bytes()
+    return whole[: whole.rfind(b"\nspacerobot_ros cache")]
+
+
+@pytest.mark.slow
+def test_a_plan_is_flown_again_as_it_was(
+    robot: SpaceRobot, made: tuple[GaitSchedule, Path], cache: Cache
+) -> None:
+    first, again = made[0], plan(robot, **ASKED)
+    np.testing.assert_array_equal(again.positions, first.positions)
+    for part in ("time", "position", "quaternion"):
+        np.testing.assert_array_equal(getattr(again.path, part), getattr(first.path, part))
+    assert again.notes == {**first.notes, "from_cache": 1.0}
+
+
+@pytest.mark.parametrize("bit", [100, 1200, -40])
+def test_one_bit_makes_a_plan_another(
+    bit: int, robot: SpaceRobot, cache: Cache, caplog: pytest.LogCaptureFixture
+) -> None:
+    (kept,) = cache.folder.iterdir()
+    whole = bytearray(kept.read_bytes())
+    whole[bit] ^= 1
+    kept.write_bytes(whole)
+    with pytest.raises(PlanningError, match="searched"):
+        plan(robot, **ASKED)
+    assert "it is damaged" in caplog.text
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"keep_out": [0.05, -10.0, 10.0, 10.0]},
+        {"max_base_rate": 1e-4},
+        {"max_velocity": [0.01, 0.01]},
+        {"rotvec": [0, 0, 0.31]},
+        {"joint_positions": [0.4, 0.2]},
+        {"start": [0.01, 0.0]},
+        {"duration": 100.0},
+    ],
+)
+def test_the_plan_of_another_request_is_not_flown(
+    options: dict[str, Any], robot: SpaceRobot, cache: Cache
+) -> None:
+    assert "from_cache" in plan(robot, **ASKED).notes
+    with pytest.raises(PlanningError, match="searched"):
+        plan(robot, **{**ASKED, **options})
+
+
+def test_a_folder_of_plans_that_others_may_write_is_not_read(
+    robot: SpaceRobot, cache: Cache, caplog: pytest.LogCaptureFixture
+) -> None:
+    cache.folder.chmod(0o777)
+    for _ in range(2):
+        with pytest.raises(PlanningError, match="searched"):
+            plan(robot, **ASKED)
+    (record,) = caplog.records
+    assert f"chmod go-w '{cache.folder}'" in record.getMessage()
+    assert len(list(cache.folder.iterdir())) == 1
+
+
+def test_a_plan_of_an_earlier_version_is_not_asked_for(
+    robot: SpaceRobot, made: tuple[GaitSchedule, Path], cache: Cache
+) -> None:
+    """It has no digest and lies under other names."""
+    (kept,) = cache.folder.iterdir()
+    kept.write_bytes(content_of(made[1]))
+    with pytest.raises(PlanningError, match="searched"):
+        plan(robot, **ASKED)
+
+
+def test_what_is_kept_is_this_users_alone(cache: Cache) -> None:
+    (kept,) = cache.folder.iterdir()
+    facts = kept.stat()
+    assert (facts.st_mode & 0o777, facts.st_uid) == (0o600, os.geteuid())
+    assert json.loads(str(np.load(io.BytesIO(content_of(kept)))["notes"]))["starts"] == 1.0

@@ -1,19 +1,120 @@
-"""Options of the gait methods: unknown ones and numbers out of range are refused by name."""
+"""Goals and options of the gait methods: what they are, and what is refused by name."""
 
 from __future__ import annotations
 
+import itertools
 import math
+import re
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
+import casadi as ca
 import numpy as np
+import numpy.typing as npt
 import pytest
 from support.effort_flights import robot_of
+from support.planner_loop import robot_of as looped_robot
 
-from spacerobot_ros.errors import ParameterError, PlanningError
+from spacerobot_ros.campaign.targets import _list_values
+from spacerobot_ros.errors import GoalError, ParameterError, PlanningError
 from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.parameters import Parameter, declared
-from spacerobot_ros.planning import METHODS, RobotState, Tolerance, plan
-from spacerobot_ros.resources import share_directory
+from spacerobot_ros.model.rotations import quaternion_from_rotvec
+from spacerobot_ros.nodes.common.ros_parameters import _ros_parameter
+from spacerobot_ros.parameters import Parameter, configured, declared, values_of
+from spacerobot_ros.planning import METHODS, Goal, PoseError, RobotState, Tolerance, plan
+from spacerobot_ros.planning.core.goal import EndEffectorGoal
+from spacerobot_ros.planning.methods.geometric_phase import PlanarPhase
+from spacerobot_ros.planning.methods.optimal.joint_efforts import LimitedEfforts
+from spacerobot_ros.planning.methods.optimal.problem import (
+    MotionLimits,
+    OptimalOptions,
+    PathConstraints,
+    Trajectory,
+)
+from spacerobot_ros.planning.methods.remaining_joints import _options_of_remaining
+from spacerobot_ros.resources import robot_file, share_directory
+from spacerobot_ros.scenario import load_scenario
+
+
+def test_methods_say_what_they_control() -> None:
+    assert METHODS["square_path"].controls == {"attitude", "shape"}
+    assert METHODS["lie_bracket"].controls == {"position", "attitude"}
+
+
+def test_a_goal_is_judged_by_what_is_controlled() -> None:
+    goal = Goal.checked([1, 0, 0], quaternion_from_rotvec([0, 0, 0.2]), [0.5, -0.5])
+    here = np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0])
+    error = PoseError.between(*here, goal, np.array([0.5, -0.4]))
+    assert error.distance == 1.0
+    assert error.angle == pytest.approx(0.2)
+    assert error.max_joint_error == pytest.approx(0.1)
+    for parts in itertools.chain.from_iterable(
+        itertools.combinations(("position", "attitude", "shape"), k) for k in range(4)
+    ):
+        controls: Any = frozenset(parts)
+        loose = {"position": 1.1, "attitude": 0.21, "shape": 0.11}
+        assert Tolerance(**loose).admits(error, controls)
+        for part in parts:
+            assert not Tolerance(**{**loose, part: 0.05}).admits(error, controls)
+    # Without a shape in the goal, or measured, no joint is wrong.
+    assert PoseError.between(*here, goal).max_joint_error == 0.0
+    unshaped = replace(goal, joint_positions=None)
+    assert PoseError.between(*here, unshaped, np.ones(2)).max_joint_error == 0.0
+    assert not Tolerance(0.5, 0.21).admits(error)
+
+
+@pytest.mark.parametrize("part", ["position", "attitude", "shape"])
+def test_each_part_of_a_goal_has_a_tolerance_of_its_own(part: str) -> None:
+    names = ["position", "attitude", "shape"]
+    # Each tolerance is once the smallest, once in the middle, once the largest of the three.
+    for turn in range(3):
+        values = np.roll([1e-3, 4e-3, 16e-3], turn)
+        tolerance = Tolerance(**dict(zip(names, values.tolist(), strict=True)))
+        for share, admitted in ((0.99, True), (1.01, False)):
+            by = share * getattr(tolerance, part)
+            error = {name: by * np.array([0.0, 0.0, name == part]) for name in names}
+            remaining = PoseError(error["position"], error["attitude"], error["shape"])
+            assert tolerance.admits(remaining, frozenset({"position", "attitude", "shape"})) is (
+                admitted
+            ), (tolerance, share)
+
+
+@pytest.mark.parametrize(
+    ("position", "quaternion", "mention"),
+    [
+        ([np.nan, 0, 0], [0, 0, 0, 1], "position"),
+        ([0, 0, np.inf], [0, 0, 0, 1], "position"),
+        ([0, 0, 0], [0, 0, np.nan, 1], "orientation"),
+        ([0, 0, 0], [0, 0, 0, 0], "zero quaternion"),
+        ([0, 0], [0, 0, 0, 1], "three numbers"),
+        ([0, 0, 0], [0, 0, 1], "four"),
+    ],
+)
+def test_what_is_no_pose_is_refused(
+    position: list[float], quaternion: list[float], mention: str
+) -> None:
+    with pytest.raises(PlanningError, match=mention):
+        Goal.checked(position, quaternion)
+
+
+@pytest.mark.parametrize("shape", [[0.0, np.nan], [[0.0, 1.0]], 0.5])
+def test_what_is_no_shape_is_refused(shape: npt.ArrayLike) -> None:
+    with pytest.raises(PlanningError, match="goal shape"):
+        Goal.checked([0, 0, 0], [0, 0, 0, 1], shape)
+
+
+def test_a_goal_of_the_end_effector_without_a_name_is_refused_by_that() -> None:
+    with pytest.raises(
+        GoalError, match=r"^The goal of the end-effector is 2 number\(s\); it takes 3"
+    ):
+        EndEffectorGoal.checked("", [1.0, 0.0])
+    with pytest.raises(GoalError, match=r"^The end-effector has 2 goals; it can have one\.$"):
+        Goal.of_end_effectors([EndEffectorGoal.checked("", np.ones(3))] * 2)
+
+
+# -- options of the gait methods: unknown ones and numbers out of range are refused by name ------
+
 
 ARM = (share_directory() / "urdf" / "three_joint_arm.urdf").read_text("utf-8")
 OPTIONED = [name for name, method in METHODS.items() if declared(method.Options)]
@@ -84,3 +185,243 @@ def test_a_goal_shape_may_lie_beyond_a_limit_by_rounding_alone() -> None:
     assert schedule.positions[-1].tolist() == [0.0, 0.4, 0.5]
     with pytest.raises(PlanningError, match=r"'shoulder_pitch' at 0\.41 rad"):
         plan(robot_of(ARM), joint_positions=(0.0, 0.41, 0.5), **loose)
+
+
+# -- options with a number a joint that are given by the names of joints -------------------------
+
+
+NAMED_ARM = SpaceRobot.from_file(robot_file("three_joint_arm"))
+FIRST, SECOND, THIRD = NAMED_ARM.joint_names
+
+
+def option(name: str) -> Parameter:
+    return next(each for each in declared(OptimalOptions) if each.name == name)
+
+
+@pytest.mark.parametrize(
+    ("given", "expected"),
+    [
+        ({"a": 1, "b": 0.25}, ("a:1.0", "b:0.25")),
+        (["a:1", "b: 0.25"], ("a:1.0", "b:0.25")),
+        ("b:0.25; a:1e-3", ("b:0.25", "a:0.001")),
+        (("b:0.25",), ("b:0.25",)),
+        ([0.5, 2], (0.5, 2.0)),
+        (["0.5", "2"], (0.5, 2.0)),
+        ([], ()),
+    ],
+)
+def test_values_by_name_become_texts(given: Any, expected: tuple[Any, ...]) -> None:
+    declaration = option("max_velocity")
+    assert declaration.by_name
+    assert declaration.checked(given) == expected
+    assert declaration.checked(expected) == expected
+
+
+@pytest.mark.parametrize(
+    "given",
+    [["a:1", "2"], ["a:1", 2.0], "text", ["a:x"], {"a": "x"}, {"a": [1]}, ["a:1", "a:2"]],
+)
+def test_other_values_are_refused(given: Any) -> None:
+    with pytest.raises(ParameterError, match="must be a list of numbers"):
+        option("max_velocity").checked(given)
+
+
+def test_the_refusal_of_a_text_names_both_forms() -> None:
+    with pytest.raises(ParameterError, match="numbers, or of texts NAME:VALUE with names of joint"):
+        option("joint_margin").checked("text")
+
+
+@pytest.mark.parametrize("value", [-1.0, 1e10, float("nan")])
+def test_numbers_by_name_keep_their_range(value: float) -> None:
+    with pytest.raises(ParameterError, match=r"finite numbers from 0 to 1e\+09"):
+        option("max_acceleration").checked({"a": value})
+
+
+def test_lists_without_names_of_joints_take_numbers_alone() -> None:
+    assert not option("keep_out").by_name
+    with pytest.raises(ParameterError, match=r"it must be a list of numbers \(m or rad\)\.$"):
+        option("keep_out").checked({"a": 1.0})
+
+
+def test_limits_are_given_by_name_and_others_stay() -> None:
+    slow = {"max_velocity": {THIRD: 0.125}, "max_acceleration": {SECOND: 0.0625, FIRST: 0.5}}
+    limits = MotionLimits.of(NAMED_ARM, configured(OptimalOptions, {**slow, "ramp_time": 0.25}))
+    first, second, _ = NAMED_ARM.velocity_limit
+    assert limits.velocity.tolist() == [first, second, 0.125]
+    assert limits.acceleration.tolist() == [0.5, 0.0625, 0.125 / 0.25]
+
+
+def test_a_faster_velocity_than_that_of_the_robot_is_not_taken() -> None:
+    limits = MotionLimits.of(NAMED_ARM, configured(OptimalOptions, {"max_velocity": {FIRST: 1e3}}))
+    assert limits.velocity.tolist() == NAMED_ARM.velocity_limit.tolist()
+
+
+def test_efforts_are_given_by_name_and_others_stay() -> None:
+    options = configured(OptimalOptions, {"max_effort": {SECOND: 0.375}, "effort_limits": 1})
+    efforts = LimitedEfforts.of(NAMED_ARM, options, 0.05)
+    assert efforts is not None
+    expected = NAMED_ARM.effort_limit.copy()
+    expected[1] = 0.375
+    np.testing.assert_allclose(efforts.limit, 0.85 * expected)
+
+
+@pytest.mark.parametrize("name", ["max_velocity", "max_acceleration"])
+def test_an_unknown_joint_is_refused(name: str) -> None:
+    with pytest.raises(ParameterError) as refusal:
+        MotionLimits.of(
+            NAMED_ARM,
+            configured(OptimalOptions, {name: {f"{FIRST}x": 1.0}}),
+            "planned",
+        )
+    assert str(refusal.value) == (
+        f"planned.{name} names '{FIRST}x', which is no joint of robot 'three_joint_arm'; its "
+        f"joints are {FIRST}, {SECOND}, {THIRD}. Did you mean '{FIRST}'?"
+    )
+
+
+def test_options_of_stuck_joints_are_left_out_by_name() -> None:
+    options = configured(OptimalOptions, {"max_velocity": {THIRD: 0.1, FIRST: 0.2}})
+    kept = _options_of_remaining(options, np.array([True, False, False]), NAMED_ARM.joint_names)
+    assert kept.max_velocity == (f"{THIRD}:0.1",)
+
+
+def test_options_by_name_are_ros_parameters_of_texts() -> None:
+    declaration = option("max_velocity")
+    assert _ros_parameter(declaration, (0.5,)).type_.name == "DOUBLE_ARRAY"
+    named = _ros_parameter(declaration, ("a:0.5",))
+    assert (named.type_.name, named.value) == ("STRING_ARRAY", ["a:0.5"])
+
+
+def test_options_by_name_are_not_dispersed() -> None:
+    scenario = load_scenario("sliding_masses").with_overrides(
+        "planner", {"optimal.max_velocity": {"slider_2": 0.1}}
+    )
+    assert values_of(scenario.planner)["optimal.max_velocity"] == ("slider_2:0.1",)
+    declaration = Parameter("optimal.max_velocity", ())
+    with pytest.raises(ParameterError, match="the list has texts NAME:VALUE: give a number for ea"):
+        _list_values("n", "planner", declaration, scenario)
+
+
+# -- limits of joints, constraints on paths, and initial guesses, as functions of numbers --------
+
+
+IDENTITY = np.array([0.0, 0.0, 0.0, 1.0])
+
+
+@pytest.fixture(scope="module")
+def arm() -> SpaceRobot:
+    return SpaceRobot.from_file(robot_file("three_joint_arm"))
+
+
+# -- limits -------------------------------------------------------------------------------------
+
+
+def test_limits_are_the_robots_narrowed_by_options(arm: SpaceRobot) -> None:
+    own = arm.velocity_limit
+    plain = MotionLimits.of(arm, OptimalOptions(ramp_time=0.25))
+    assert plain.velocity.tolist() == own.tolist()
+    assert plain.acceleration == pytest.approx(own * 4.0)
+    options = OptimalOptions(
+        max_velocity=tuple(own * [0.5, 2.0, 1.0]), max_acceleration=(1.0, 2.0, 3.0)
+    )
+    found = MotionLimits.of(arm, options)
+    assert found.velocity == pytest.approx(own * [0.5, 1.0, 1.0])
+    assert found.acceleration.tolist() == [1.0, 2.0, 3.0]
+    for wrong, words in (
+        ({"max_velocity": (1.0,)}, "1 number(s); robot 'three_joint_arm' has 3 joints ("),
+        ({"max_velocity": (1.0, 0.0, 1.0)}, f"'{arm.joint_names[1]}' is limited to 0 a second"),
+        ({"max_acceleration": (1.0, 0.0, 1.0)}, "and 0 a second squared; area_loop needs"),
+    ):
+        with pytest.raises(ParameterError, match=re.escape(words)):
+            MotionLimits.of(arm, OptimalOptions(**wrong), "area_loop")
+
+
+# -- trajectories -------------------------------------------------------------------------------
+
+
+def parabola(steps: int, acceleration: float, first: float) -> Trajectory:
+    """Return constant acceleration of one joint in steps of half a second."""
+    time = 0.5 * np.arange(steps + 1.0)[:, np.newaxis]
+    shapes = first * time + acceleration * time**2 / 2
+    return Trajectory(0.5, shapes, first + acceleration * time, np.tile(IDENTITY, (steps + 1, 1)))
+
+
+# -- constraints on paths -----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"keep_axis": (0.0, 0.0, 2.0)}, "takes all of optimal.keep_axis, optimal.keep_direction"),
+        ({"keep_angle": 0.5}, "takes all of optimal.keep_axis"),
+        (
+            {"keep_axis": (0.0, 0.0, 0.0), "keep_direction": (1.0, 0.0, 0.0), "keep_angle": 0.5},
+            "optimal.keep_axis is (0.0, 0.0, 0.0); it must be three numbers, not all zero.",
+        ),
+        (
+            {"keep_axis": (1.0, 0.0, 0.0), "keep_direction": (1.0, 0.0), "keep_angle": 0.5},
+            "optimal.keep_direction is (1.0, 0.0); it must be three numbers",
+        ),
+        (
+            {"keep_out": (1.0, 2.0, 3.0)},
+            "has 3 numbers; a box of shapes has 3 lower and 3 upper ones.",
+        ),
+        ({"keep_out": (0.0, 0.0, 0.0, 1.0, 0.0, 1.0)}, "lower bound is not below its upper."),
+        ({"keep_out": (-9e6,) * 3 + (9e6,) * 3}, "holds all shapes of the robot."),
+    ],
+)
+def test_constraints_that_make_no_sense_are_refused(
+    arm: SpaceRobot, options: dict[str, Any], words: str
+) -> None:
+    with pytest.raises(ParameterError, match=re.escape(words)):
+        PathConstraints.of(arm, OptimalOptions(**options))
+
+
+def test_no_constraint_is_none(arm: SpaceRobot) -> None:
+    none = PathConstraints.of(arm, OptimalOptions())
+    assert none.knot_inequality_count == 0
+    assert none.symbolic(ca.SX.sym("q", 3), ca.SX.sym("x", 4), ca.SX.sym("d", 3)).shape[0] == 0
+    none.check(np.zeros((2, 3)), np.tile(IDENTITY, (2, 1)), 0.5)
+    guess = parabola(4, -3.0, 2.0)
+    assert none.slowed(guess) is guess
+
+
+# -- the pages of planning name classes, methods and options that exist --------------------------
+
+
+ROOT = Path(__file__).resolve().parents[2]
+PAGES = [
+    *(ROOT / "docs" / name for name in ("choosing.md", "planner_state_machine.md")),
+    *(
+        ROOT / "docs" / "theory" / f"{name}.md"
+        for name in (
+            "area_loop",
+            "controllability",
+            "lie_bracket",
+            "optimal",
+            "singularities",
+            "square_path",
+        )
+    ),
+]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_classes_that_a_page_names_exist_with_their_methods(page: Path) -> None:
+    text = re.sub(r"^ *```.*?^ *```", "", page.read_text("utf-8"), flags=re.M | re.S)
+    package = "\n".join(path.read_text("utf-8") for path in ROOT.glob("spacerobot_ros/**/*.py"))
+    for name, member in re.findall(r"`([A-Z][a-z]+(?:[A-Z][a-z]+)*)(?:\.(\w+))?[(`]", text):
+        assert re.search(rf"^class {name}\b", package, re.M), name
+        assert not member or re.search(rf"(def {member}\(|^    {member}:)", package, re.M), member
+
+
+@pytest.mark.parametrize("profile", [lambda s: s, lambda s: s**2, lambda s: np.sin(np.pi * s / 2)])
+def test_any_law_of_proportional_joints_turns_the_base_alike_in_step_1(profile: object) -> None:
+    """The turn of paper 3's step 1 is that of the straight line, whatever its legible half is."""
+    assert callable(profile)
+    phase = PlanarPhase(looped_robot("planar_chain"))
+    along = np.asarray(profile(np.linspace(0.0, 1.0, 400)))[:, np.newaxis]
+    shapes = (1 - along) * [np.pi, -np.pi]
+    turn = phase.turns_by_legs(shapes[:-1], shapes[1:]).sum()
+    assert turn == pytest.approx(np.pi / 2 - 0.571293, abs=1e-6)
+    assert abs(np.pi / 2 - turn - 0.39) > 0.1

@@ -20,6 +20,7 @@ from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.planning import GaitSchedule, Goal, RobotState, Tolerance, build_method, plan
 from spacerobot_ros.planning.analysis import analyze
 from spacerobot_ros.planning.core.cancellation import Cancellation, PlanningCancelled
+from spacerobot_ros.planning.core.clearance import Clearance
 from spacerobot_ros.planning.core.goal import EndEffectorGoal
 from spacerobot_ros.planning.core.method import PlanRequest
 from spacerobot_ros.planning.execution.status import PlannerState
@@ -315,6 +316,16 @@ def test_limits_without_a_speed_are_refused_by_the_name_of_the_method() -> None:
         planned("three_joint_arm", ARM, "end_effector", [1, 1, 1], max_velocity=(1.0, 1.0))
     with pytest.raises(ParameterError, match=r"see resolved_rate\.max_acceleration"):
         planned("three_joint_arm", ARM, "end_effector", [1, 1, 1], max_velocity=(1.0, 0.0, 1.0))
+
+
+def test_a_line_into_the_base_ends_where_links_come_too_near() -> None:
+    into: dict[str, Any] = {"start": ARM, "end_effector_position": [0.0, 0.0, 0.0]}
+    asked = {**into, "method": "resolved_rate", "clearance": 0.02}
+    schedule = plan("three_joint_arm", **asked, as_far_as_possible=1)
+    assert str(schedule.notes["stopped"]).startswith("On the way links 'base_link' and 'link_3' ")
+    geometry = Clearance(robot_of("three_joint_arm").description, 0.02).geometry
+    nearest = geometry.nearest_along(schedule.positions)[0]
+    assert 0.02 <= nearest.min() < 0.05
 
 
 def test_a_robot_that_drifts_is_refused_and_a_search_is_cancelled() -> None:

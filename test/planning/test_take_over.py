@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import pytest
 from scipy.spatial.transform import Rotation
 from support.planner_loop import (
@@ -30,8 +29,6 @@ from spacerobot_ros.planning.execution.goal_file import BASE_GOAL_KEY, GoalFile
 from spacerobot_ros.planning.execution.path_deviation import PathDeviation
 from spacerobot_ros.planning.execution.status import PlannerState
 from spacerobot_ros.planning.execution.tracker import TrajectoryTracker
-
-Array = npt.NDArray[np.float64]
 
 OTHER: Place = ([-0.04, 0.0, 0.01], [0.0, 0.0, 0.0])
 FAR: Place = ([50.0, 0.0, 0.0], [0.0, 0.0, 0.0])

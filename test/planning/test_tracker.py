@@ -1,26 +1,34 @@
-"""Schedules tick by tick: what is commanded, how joints brake, when the base is off its path."""
+"""Schedules tick by tick, and where a robot is from several measurements."""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import pytest
 from scipy.spatial.transform import Rotation
-from support.planner_loop import StubMethod, goal_at, robot_of
+from support.effort_flights import robot_of as averaged_robot
+from support.oracles import PinocchioOracle
+from support.planner_loop import TICK, StubMethod, goal_at, robot_of
 
-from spacerobot_ros.planning import GaitSchedule, PlanRequest, RobotState, Tolerance
+from spacerobot_ros.errors import PlanningError
+from spacerobot_ros.planning import GaitSchedule, Goal, PlanRequest, RobotState, Tolerance
 from spacerobot_ros.planning.core.cancellation import Cancellation
+from spacerobot_ros.planning.core.goal import EndEffectorGoal
 from spacerobot_ros.planning.core.schedule import BasePath
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.execution.path_deviation import PathCheck, TrackingError
+from spacerobot_ros.planning.execution.state_average import StateAverage
 from spacerobot_ros.planning.execution.tracker import (
     BrakingFollower,
     ScheduleFollower,
     TrajectoryTracker,
 )
 from spacerobot_ros.planning.execution.worker import PlanningTask, PlanningWorker
+from spacerobot_ros.resources import share_directory
+from spacerobot_ros.simulation import EffortPlant, InitialState
 
 Array = npt.NDArray[np.float64]
 
@@ -300,3 +308,185 @@ def test_a_plan_in_flight_begins_where_the_momenta_bring_the_base_meanwhile() ->
     assert schedule.path.time[-1] == pytest.approx(2.0 + method.ticks * 0.05)
     np.testing.assert_allclose(schedule.path.position[20], at_rest.position, atol=1e-12)
     assert len(schedule.positions) == 20 + method.ticks + 1
+
+
+# -- where a robot is from several measurements, and what momenta they show ----------------------
+
+
+URDF = (share_directory() / "urdf" / "three_joint_arm.urdf").read_text("utf-8")
+Q = np.array([0.2, -0.4, 0.9])
+REST = np.zeros(3)
+STILL = np.zeros(6)
+
+
+def pose(position: float = 0.0, turn: Rotation | None = None) -> np.ndarray:
+    attitude = turn or Rotation.identity()
+    return np.concatenate([[position, 0.0, 0.0], attitude.as_quat()])
+
+
+def test_the_mean_of_noisy_states_is_nearer_by_the_root_of_their_number() -> None:
+    rng, robot = np.random.default_rng(0), averaged_robot(URDF)
+    true = Rotation.from_rotvec([2.0, -1.5, 1.0])
+    single, averaged = [], []
+    for _ in range(60):
+        average = StateAverage(robot, 25)
+        for _ in range(25):
+            assert not average.complete
+            turned = true * Rotation.from_rotvec(rng.normal(0.0, 1e-3, 3))
+            # Either sign of a quaternion is the same attitude.
+            measured = pose(1.0, turned)
+            measured[3:] *= rng.choice([-1.0, 1.0])
+            measured[:3] += rng.normal(0.0, 2e-3, 3)
+            average.add(measured, STILL, Q + rng.normal(0.0, 3e-3, 3), REST)
+        assert average.complete
+        state = average.state()
+        error = (true.inv() * Rotation.from_quat(state.quaternion)).as_rotvec()
+        averaged.append([*(state.position - [1.0, 0.0, 0.0]), *error, *(state.q - Q)])
+        single.append([*(measured[:3] - [1.0, 0.0, 0.0]), *(true.inv() * turned).as_rotvec()])
+    sigma = np.sqrt(np.mean(np.square(averaged).reshape(60, 3, 3), axis=(0, 2)))
+    np.testing.assert_allclose(sigma, np.array([2e-3, 1e-3, 3e-3]) / 5, rtol=0.25)
+    assert np.std(single) > 3 * np.std(averaged)
+
+
+def test_the_mean_of_two_attitudes_is_half_way() -> None:
+    average = StateAverage(averaged_robot(URDF), 2)
+    first = Rotation.from_rotvec([2.0, -1.5, 1.0])
+    for angle in (0.0, 0.02):
+        turned = first * Rotation.from_rotvec([0.0, angle, 0.0])
+        average.add(pose(10 * angle, turned), STILL, Q, REST)
+    state = average.state()
+    half = (first.inv() * Rotation.from_quat(state.quaternion)).as_rotvec()
+    np.testing.assert_allclose(half, [0.0, 0.01, 0.0], atol=1e-12)
+    np.testing.assert_allclose(state.position, [0.1, 0.0, 0.0])
+
+
+def test_momenta_are_those_measured_last_at_rest() -> None:
+    robot = averaged_robot(URDF)
+    average = StateAverage(robot)
+    twist = np.array([0.01, 0.0, -0.02, 0.03, 0.0, 0.01])
+    average.add(pose(), twist, Q, REST)
+    oracle = PinocchioOracle(URDF, robot.joint_names)
+    oracle.set_configuration(Q, np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(3))
+    oracle.move(oracle.base_velocities(twist) + oracle.joint_velocities(REST))
+    p, L, _ = oracle.momentum_W()
+    state = average.state()
+    np.testing.assert_allclose(state.linear_momentum, p, atol=1e-12)
+    np.testing.assert_allclose(state.angular_momentum, L, atol=1e-12)
+    average.restart()
+    assert average.count == 0
+    average.add(pose(), 2 * twist, Q, np.array([0.1, 0.0, 0.0]))
+    moving = average.state()
+    np.testing.assert_array_equal(moving.linear_momentum, state.linear_momentum)
+
+
+def test_before_a_robot_was_at_rest_its_momenta_are_those_in_motion() -> None:
+    robot = averaged_robot(URDF)
+    average = StateAverage(robot)
+    average.add(pose(), np.array([0.01, 0.0, -0.02, 0.03, 0.0, 0.01]), Q, REST)
+    assert np.abs(average.state().angular_momentum).max() > 0.01
+    # It is put elsewhere, where its momenta are others, and its joints move.
+    average.forget()
+    assert average.count == 0
+    p, L = np.array([0.2, -0.1, 0.3]), np.array([0.03, 0.02, -0.01])
+    initial = InitialState(
+        joint_positions=Q, joint_velocities=-Q, linear_momentum=p, angular_momentum=L
+    )
+    plant = EffortPlant(robot, 0.01, initial)
+    assert plant.qdot.any()
+    average.add(plant.pose, plant.twist, plant.q, plant.qdot)
+    state = average.state()
+    np.testing.assert_allclose(state.linear_momentum, p, atol=1e-12)
+    np.testing.assert_allclose(state.angular_momentum, L, atol=1e-12)
+
+
+def test_rates_within_the_tolerance_are_rest_and_larger_ones_are_not() -> None:
+    robot = averaged_robot(URDF)
+    average = StateAverage(robot, 2, rest_tolerance=0.01)
+    average.add(pose(), STILL + 0.012, Q, REST + 0.012)
+    average.add(pose(), STILL + 0.006, Q, REST - 0.006)
+    assert not average.state().linear_momentum.any(), "0.009 on the average"
+    average.restart()
+    average.add(pose(), STILL + 0.02, Q, REST)
+    assert np.linalg.norm(average.state().linear_momentum) > 1.0
+
+
+@pytest.mark.parametrize("part", range(4))
+def test_what_is_not_finite_is_refused(part: int) -> None:
+    parts = [pose(), STILL.copy(), Q.copy(), REST.copy()]
+    parts[part][1] = np.nan
+    average = StateAverage(averaged_robot(URDF), 2)
+    average.add(pose(), STILL, Q, REST)
+    average.add(*parts)
+    with pytest.raises(PlanningError, match="not finite"):
+        average.state()
+
+
+# -- aims of plans for end-effectors, stamps and bounds of a path, and the time that was ---------
+
+
+ARM = robot_of("three_joint_arm")
+SHAPE = np.array([0.2, -0.6, 1.3])
+END = Rotation.from_rotvec([0.2, 0.0, 0.4])
+PLACE = np.array([1.0, 2.0, 3.0])
+BEGIN_NS = 7_000_000_000
+
+
+def checked_path(ticks: int = 20, goal: Goal | None = None, **config: Any) -> PathCheck:
+    """Return the check of a path to :data:`PLACE` with a pose every two ticks."""
+    time = np.linspace(0.0, TICK * ticks, ticks // 2 + 1)
+    places = np.linspace(0.0, 1.0, len(time))[:, np.newaxis] * PLACE
+    path = BasePath(time, places, np.tile(END.as_quat(), (len(time), 1)))
+    shapes = np.tile(SHAPE, (ticks + 1, 1))
+    shapes[:2] += 0.2
+    goal = goal or Goal(PLACE, END.as_quat())
+    schedule = GaitSchedule("stub", ARM.joint_names, TICK, shapes, path, goal)
+    return PathCheck(ARM, schedule, BEGIN_NS, PlannerConfig(**config), average=1)
+
+
+def hand_of_arm() -> tuple[str, np.ndarray, Rotation]:
+    """Return the last link, its position in the world and its attitude at the end of the path."""
+    link = ARM.description.links[-1].name
+    shape = dict(zip(ARM.joint_names, SHAPE.tolist(), strict=True))
+    pose = ARM.description.with_locked(shape).frames[link][1]
+    return link, PLACE + END.as_matrix() @ pose.r, END * Rotation.from_matrix(pose.R)
+
+
+WITHIN = Tolerance(0.5, 0.1)
+
+
+@pytest.mark.parametrize("turned", [True, False])
+@pytest.mark.parametrize(
+    ("share", "angle", "late", "left"),
+    [
+        (0.59, 0.059, False, None),
+        (0.61, 0.02, False, (0.4, 0.02)),
+        (0.3, 0.061, False, (0.3, 0.04)),
+        (0.79, 0.079, True, None),
+        (0.81, 0.081, True, (0.6, 0.06)),
+    ],
+)
+def test_the_aim_for_an_end_effector_leaves_a_share_of_each_tolerance(
+    share: float, angle: float, late: bool, left: tuple[float, float] | None, turned: bool
+) -> None:
+    link, r_WE, R_WE = hand_of_arm()
+    wanted = R_WE * Rotation.from_rotvec([0.0, 0.0, angle])
+    aim_at = r_WE + np.array([0.3, -0.4, 0.0]) * share
+    hand = EndEffectorGoal(link, aim_at, wanted.as_quat() if turned else None)
+    goal = Goal(PLACE, END.as_quat(), None, (hand,), frozenset())
+    check = checked_path(goal=goal)
+    assert check.due(BEGIN_NS)
+    moved = check.shift_goal(goal, WITHIN, frozenset({"end_effectors"}), late=late)
+    if left is None or (not turned and share < 0.6):
+        assert moved is None
+        return
+    assert moved is not None
+    (given,) = moved.end_effectors
+    apart = aim_at - given.position
+    np.testing.assert_allclose(apart, np.array([0.3, -0.4, 0.0]) * left[0], atol=1e-12)
+    assert given.link == link
+    if not turned:
+        assert given.quaternion is None
+        return
+    assert given.quaternion is not None
+    turn = Rotation.from_quat(given.quaternion).inv() * wanted
+    np.testing.assert_allclose(turn.as_rotvec(), [0.0, 0.0, left[1]], atol=1e-9)

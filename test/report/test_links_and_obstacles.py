@@ -1,32 +1,47 @@
-"""Reports of flights with goals of links, and of flights among obstacles."""
+"""Links with goals, obstacles, and several robots in reports."""
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pinocchio as pin
 import pytest
 from scipy.spatial.transform import Rotation
+from support.command_line import CliRunner
+from support.flight_bags import TICK, cyclic_shapes, rates_of, urdf_of
+from support.made_bags import joint_states, made_bag, odometry
+from support.made_bags import pose as pose_at
+from support.sentences import assert_one_sentence
 
+from spacerobot_ros.cli.main import main
 from spacerobot_ros.collision.geometry import obstacle_visuals
 from spacerobot_ros.errors import MeshError
-from spacerobot_ros.flight.flight import SentGoal, goal_at_end, reported_goal
+from spacerobot_ros.flight.flight import SentGoal, Signal, goal_at_end, reported_goal
 from spacerobot_ros.model.description import Array, Shape
 from spacerobot_ros.model.meshes import TriangleMesh
-from spacerobot_ros.model.rotations import rotation_angles
+from spacerobot_ros.model.rotations import quaternion_from_rotvec, rotation_angles
 from spacerobot_ros.model.urdf import parse_world
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.core.goal import POSE, EndEffectorGoal
 from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus
 from spacerobot_ros.report.figures import ReportFigure, TraceGroup, log_range
 from spacerobot_ros.report.figures_over_time import _error_decades, link_errors_figure
-from spacerobot_ros.report.figures_space import configurations_figure, path_figure
+from spacerobot_ros.report.figures_space import (
+    _choose_instants,
+    _signed_area,
+    configurations_figure,
+    path_figure,
+)
 from spacerobot_ros.report.flight import FlightReport, GoalSpan, read_report
 from spacerobot_ros.report.page import _chart_data, _numbers_html
 from spacerobot_ros.report.scene import WORLD, Scene, scene_of
+from spacerobot_ros.report.signals import Cycles, envelope, find_cycles, rotvecs
+from spacerobot_ros.report.solids import Canvas, Edge, Face, View
 from spacerobot_ros.report.tables import headline, result_table
 
 BAGS = Path(__file__).parents[2] / "bags"
@@ -316,3 +331,195 @@ def test_meshes_of_obstacles_are_those_that_a_bag_carries(strut: FlightReport) -
     assert blind.missing_meshes == " Meshes are not drawn. The bag does not carry them."
     (carried,) = replace(blind, meshes={world.links[1].collisions[0].resource: rock}).obstacles
     assert len(carried[0].mesh.faces) == 4
+
+
+# -- reports and figures of a bag with several robots, each in its own namespace -----------------
+
+
+JOINTS = {"/fleet/a": 1, "/fleet/b": 3}
+TOLERANCES = {"/fleet/a": 0.125, "/fleet/b": 0.25}
+
+
+@pytest.fixture
+def bag(tmp_path: Path) -> Path:
+    """Two robots, of one and of three joints, that stand 1 m and 2 m from their goals."""
+    path = tmp_path / "both.mcap"
+    with made_bag(path) as (writer, say):
+        for place, (name, n) in enumerate(JOINTS.items(), 1):
+            values = {"position_tolerance": json.dumps(TOLERANCES[name]), "method": '"optimal"'}
+            writer.add_metadata(f"parameters{name}/planner", values)
+            urdf = urdf_of(n).replace("test_robot", f"robot_{n}").encode()
+            title = f"{name.strip('/').replace('/', '.')}.robot_description.urdf"
+            writer.add_attachment(title, urdf, "application/xml", 0)
+            names = [f"joint_{i}" for i in range(n)]
+            say(f"{name}/goal_pose", pose_at(0.0, 0, 0, 0, 0, 0, 0, 1), 0.0)
+            for k in range(3):
+                time = 0.5 * k
+                at = (float(place), 0, 0, 0, 0, 0, 1)
+                say(f"{name}/odom", odometry(time, *at, *np.zeros(6)), time)
+                zeros = np.zeros(n).tolist()
+                say(f"{name}/joint_states", joint_states(time, names, zeros, zeros), time)
+    return path
+
+
+@pytest.mark.parametrize("name", JOINTS)
+def test_the_robot_that_is_named_is_the_one_that_is_shown(name: str, bag: Path) -> None:
+    for given in (name, name.strip("/")):
+        flight = read_report(bag, given)
+        assert flight.robot is not None
+        assert flight.robot.name == f"robot_{JOINTS[name]}"
+        assert len(flight.joint_names) == JOINTS[name]
+        (other,) = flight.other_robots
+        assert {name, other} == set(JOINTS)
+        distance = 1 + list(JOINTS).index(name)
+        row = ("Position error", f"{distance} m (tolerance {TOLERANCES[name]} m)")
+        assert row in result_table(flight).rows
+    assert read_report(bag).bag.namespace == "/fleet/a"
+
+
+def test_the_page_says_which_robot_it_shows_and_which_it_does_not(
+    bag: Path, tmp_path: Path
+) -> None:
+    page = tmp_path / "b.html"
+    words = ["report", str(bag), "-o", str(page), "--namespace", "fleet/b"]
+    assert CliRunner().invoke(main, words).exit_code == 0
+    text = page.read_text("utf-8")
+    assert "<span>namespace /fleet/b</span><span>the bag also has /fleet/a</span>" in text
+    words = ["figures", str(bag), "--only", "joints", "--format", "svg", "-o", str(tmp_path)]
+    assert CliRunner().invoke(main, [*words, "--namespace", "/fleet/b"]).exit_code == 0
+    assert "joint_2" in (tmp_path / "joints.svg").read_text("utf-8")
+    assert CliRunner().invoke(main, words).exit_code == 0
+    assert "joint_2" not in (tmp_path / "joints.svg").read_text("utf-8")
+
+
+def test_a_namespace_without_a_robot_is_refused(bag: Path, tmp_path: Path) -> None:
+    for command in ("report", "figures"):
+        out = ["-o", str(tmp_path / "none")]
+        result = CliRunner().invoke(main, [command, str(bag), "--namespace", "c", *out])
+        assert result.exit_code == 2
+        assert_one_sentence(result.stderr, "'c'", "/fleet/a, /fleet/b")
+    assert not (tmp_path / "none").exists()
+
+
+@pytest.mark.parametrize("fewer", [["a", "b"], ["a", "b", "z"]])
+def test_joints_are_known_by_their_names_and_not_by_their_places(
+    fewer: list[str], tmp_path: Path
+) -> None:
+    """As from publishers that have another order each, and two that have other joints."""
+    orders = [["a", "b", "c"], ["c", "a", "b"], ["x", "y", "z"], ["b", "c", "a"], fewer]
+    numbers = {"a": 1.0, "b": 2.0, "c": 3.0, "x": 7.0, "y": 8.0, "z": 9.0}
+    path = tmp_path / "b.mcap"
+    with made_bag(path) as (_, say):
+        for k, names in enumerate(orders * 2):
+            time = 0.5 * k
+            position = [numbers[name] + time for name in names]
+            velocity = [10.0 * numbers[name] for name in names]
+            say("/joint_states", joint_states(time, names, position, velocity), time)
+    flight = read_report(path)
+    assert flight.joint_names == ("a", "b", "c")
+    times = [0.0, 0.5, 1.5, 2.5, 3.0, 4.0]
+    assert flight.shape.time.tolist() == times
+    expected = np.array([1.0, 2.0, 3.0]) + np.array(times)[:, np.newaxis]
+    np.testing.assert_array_equal(flight.shape.values, expected)
+    np.testing.assert_array_equal(flight.rates.values, np.tile([10.0, 20.0, 30.0], (6, 1)))
+
+
+# -- what the picture report is made with: arithmetic on time series, and the drawing of ---------
+
+
+def test_what_is_behind_is_hidden() -> None:
+    view = View()
+    right, up = view.paper_axes
+
+    def square(nearness: float, half: float, fill: tuple[float, float, float]) -> Face:
+        corners = [x * right + y * up for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
+        return Face(
+            half * np.array(corners) + nearness * view.viewing_direction,
+            view.viewing_direction,
+            fill,
+        )
+
+    near, far = square(1.0, 0.5, (1.0, 0.0, 0.0)), square(0.0, 1.0, (0.0, 0.0, 1.0))
+    backwards = Face(
+        near.corners + view.viewing_direction, -view.viewing_direction, (0.0, 1.0, 0.0)
+    )
+    behind = Edge(np.array([-right, right]) * 0.9, np.empty((0, 2, 3)), (0.0, 0.0, 0.0))
+    canvas = Canvas(view, np.full(2, -2.0), np.full(2, 2.0), 80)
+    canvas.draw([near, far, backwards], [behind])
+    image = canvas.image()
+    assert image.shape == (80, 80, 4)
+    assert image[40, 40, 0] > 0.5
+    assert image[40, 40, 2] == 0.0
+    far_blue = image[25, 25, 2]
+    assert far_blue > 0.5
+    assert image[39:41, 24, 2].min() < 0.7 * far_blue  # The edge is before the far square.
+    assert not image[5:15].any()
+
+
+def test_rotation_vectors_are_continuous_beyond_half_turns() -> None:
+    angle = np.concatenate([np.linspace(0, 9, 400), np.linspace(9, -9, 800)])
+    expected = angle[:, np.newaxis] * np.array([0.6, 0.0, -0.8])
+    quaternions = np.array([quaternion_from_rotvec(r) for r in expected])
+    quaternions[::7] *= -1  # The same attitudes.
+    np.testing.assert_allclose(rotvecs(quaternions), expected, atol=1e-12)
+
+
+def test_envelopes_hold_every_sample() -> None:
+    rng = np.random.default_rng(1)
+    values = rng.normal(size=(997, 1))
+    time, low, high = envelope(Signal(np.arange(997.0), values), 0, 50)
+    assert (time[0], time[-1]) == (0.0, 996.0)
+    assert (low.min(), high.max()) == (values.min(), values.max())
+    for k, value in enumerate(values[:, 0]):
+        place = min(k * 50 // 996, 49)
+        assert low[place] <= value <= high[place] or low[place - 1] <= value <= high[place - 1]
+
+
+def ticks(values: Array) -> Signal:
+    return Signal(np.linspace(0.0, TICK * (len(values) - 1), len(values)), values)
+
+
+def test_cycles_are_found_where_there_are_some() -> None:
+    shapes = cyclic_shapes(slide=100, cycles=40, period=60)
+    cycles = find_cycles(ticks(rates_of(shapes)))
+    assert cycles is not None
+    assert cycles.period == pytest.approx(60 * TICK)
+    assert cycles.start == pytest.approx(99 * TICK, abs=1.5 * TICK)
+    assert cycles.count == 40
+    ramp = np.linspace(0, 1, 500)[:, np.newaxis] ** 2
+    assert find_cycles(ticks(ramp)) is None
+    noise = np.random.default_rng(2).normal(size=(2000, 3))
+    assert find_cycles(ticks(noise)) is None
+    assert find_cycles(ticks(np.empty((0, 3)))) is None
+
+
+def test_whole_cycles_are_counted_and_the_last_are_at_the_end() -> None:
+    # A sample is missing at the end of a cycle now and then.
+    for end, count in ((8.0, 3), (7.95, 3), (7.5, 2), (9.5, 3)):
+        assert Cycles(2.0, end, 2.0).count == count
+    assert Cycles(2.0, 20.0, 2.0).last(3) == (14.0, 20.0)
+
+
+def test_change_is_since_the_first_sample_of_a_window() -> None:
+    values = np.array([[1.0, -2.0], [4.0, 3.0], [7.0, 5.0]])
+    part = Signal(np.array([0.0, 1.0, 2.0]), values).between(1.0, 2.0).relative_to_first()
+    np.testing.assert_array_equal(part.values, [[0.0, 0.0], [3.0, 2.0]])
+    np.testing.assert_array_equal(part.time, [1.0, 2.0])
+
+
+def test_the_robot_is_drawn_at_six_instants_though_it_rests_at_the_end() -> None:
+    def flight(joints: Array) -> Any:
+        still = Signal(np.linspace(0.0, 1.0, len(joints)), np.zeros((len(joints), 3)))
+        return SimpleNamespace(position=still, attitude=still, joints=joints, cycles=None)
+
+    moving = np.arange(101.0)[:, np.newaxis] * [0.5, -0.25, 0.125]
+    rest = np.repeat(moving[-1:], 40, axis=0)
+    found = _choose_instants(flight(np.vstack([moving, rest])))
+    np.testing.assert_allclose(found, [0, 20, 40, 60, 80, 140], atol=1)
+    assert _choose_instants(flight(rest)) == [39]
+
+
+def test_areas_are_positive_counter_clockwise() -> None:
+    square = np.array([[0.0, 0.0], [2.0, 0.0], [2.0, 3.0], [0.0, 3.0]])
+    assert _signed_area(square[:, 0], square[:, 1]) == pytest.approx(6.0)
+    assert _signed_area(square[::-1, 0], square[::-1, 1]) == pytest.approx(-6.0)

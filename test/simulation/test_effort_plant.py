@@ -1,27 +1,40 @@
-"""The plant under efforts: conservation, work and impulse, MuJoCo, convergence."""
+"""The plant under efforts: limits of motors, and reaction wheels."""
 
 from __future__ import annotations
 
 import itertools
 import math
 from pathlib import Path
+from typing import Any
 
 import casadi as ca
 import numpy as np
 import pytest
 from scipy.integrate import simpson
-from support.effort_flights import random_urdf, robot_of, thrusts, tumbling, without_stops
+from support.effort_flights import (
+    random_urdf,
+    robot_of,
+    thrusts,
+    tumbling,
+    with_effort_limit,
+    without_stops,
+)
 from support.mujoco_flight import MujocoFlight
 from support.oracles import Array, assert_agrees
 from support.random_robots import random_chain_urdf
 from support.slow import some_fast
+from support.wheels import HULL, WHEELS, text, wheeled_robot
 
+from spacerobot_ros.errors import CommandError, ParameterError, SpaceRobotError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.compilation import BufferedFunction, c_compiler
 from spacerobot_ros.model.composite_rigid_body import state_slices
 from spacerobot_ros.model.integration import repeat_step
 from spacerobot_ros.model.rotations import matrix_from_quaternion
+from spacerobot_ros.parameters import configured
 from spacerobot_ros.simulation import EffortPlant, InitialState
+from spacerobot_ros.simulation.commands import CommandValidator
+from spacerobot_ros.simulation.config import PlantConfig
 from spacerobot_ros.simulation.effort_plant import DEFAULT_INTEGRATION_STEP
 
 SERVICER = (Path(__file__).parents[2] / "urdf" / "servicer.urdf").read_text(encoding="utf-8")
@@ -221,3 +234,164 @@ def test_compiled_flight_is_the_interpreted_one(
         compiled.step(effort, wrench)
     np.testing.assert_allclose(compiled.pose, interpreted.pose, rtol=1e-13, atol=1e-15)
     np.testing.assert_allclose(compiled.momentum, interpreted.momentum, rtol=1e-12, atol=1e-14)
+
+
+# -- the plant under efforts: clipped commands, start and reset, refusals ------------------------
+
+
+def test_efforts_are_clipped_and_counted() -> None:
+    urdf = with_effort_limit(random_urdf(0), 0.5)
+    limited, plant = (EffortPlant(robot_of(text), TICK) for text in (urdf, random_urdf(0)))
+    assert limited.step([0.5, -2.0, math.sqrt(2)], [1, 2, 3, 4, 5, 6]) is True
+    assert plant.step([0.5, -0.5, 0.5], [1, 2, 3, 4, 5, 6]) is False
+    assert limited.effort.tolist() == plant.effort.tolist() == [0.5, -0.5, 0.5]
+    assert limited.wrench.tolist() == [1, 2, 3, 4, 5, 6]
+    assert limited.qdot.tolist() == plant.qdot.tolist()
+    assert limited.step([0.0, -2.0, 0.0]) is True
+    assert limited.wrench.tolist() == [0.0] * 6
+    assert limited.effort_limited.tolist() == [0, 2, 1]
+    assert plant.effort_limited.tolist() == [0, 0, 0]
+    assert limited.stroke_limited.tolist() == [0, 0, 0]
+
+
+def test_no_limit_is_none() -> None:
+    urdf = with_effort_limit(random_urdf(0), math.inf)
+    plant = EffortPlant(robot_of(urdf), 1e-4)
+    assert plant.step([1e6, -1e6, 1e6]) is False
+    assert plant.effort.tolist() == [1e6, -1e6, 1e6]
+
+
+def test_reset_brings_the_same_flight_again() -> None:
+    robot = robot_of(random_urdf(2))
+    rng = np.random.default_rng(91)
+    plant = EffortPlant(robot, TICK, tumbling(robot, rng))
+    commands = list(thrusts(rng, robot.n, 20))
+    flights = []
+    for _ in range(2):
+        plant.reset()
+        assert plant.effort.tolist() == [0.0] * robot.n
+        flights.append([plant.pose.tolist()])
+        for effort, wrench in commands:
+            plant.step(effort, wrench)
+            flights[-1].append(plant.pose.tolist() + plant.momentum.tolist())
+    assert flights[0] == flights[1]
+
+
+def test_start_is_as_given() -> None:
+    robot = robot_of(random_urdf(3))
+    start = tumbling(robot, np.random.default_rng(95))
+    plant = EffortPlant(robot, TICK, start)
+    np.testing.assert_allclose(plant.pose[:3], start.position, atol=1e-14)
+    assert plant.q.tolist() == np.asarray(start.joint_positions).tolist()
+    assert plant.qdot.tolist() == np.asarray(start.joint_velocities).tolist()
+    np.testing.assert_allclose(plant.momentum[:3], start.linear_momentum, atol=1e-13)
+    np.testing.assert_allclose(plant.momentum[3:6], start.angular_momentum, atol=1e-13)
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
+def test_commands_that_are_not_finite_are_refused(bad: float) -> None:
+    plant = EffortPlant(robot_of(random_urdf(0)), TICK)
+    plant.step([0.1, 0.2, -0.1], [0.3, 0, 0, 0, 0, 0.1])
+    before = plant.pose.tolist() + plant.momentum.tolist()
+    for effort, wrench in (([0.1, bad, 0.1], np.zeros(6)), (np.zeros(3), [0, 0, bad, 0, 0, 0])):
+        with pytest.raises(CommandError, match="not finite"):
+            plant.step(effort, wrench)
+        assert plant.pose.tolist() + plant.momentum.tolist() == before
+        assert plant.effort.tolist() == [0.0] * 3
+    plant.step([0.1, 0.2, -0.1])
+    assert np.all(np.isfinite(plant.pose))
+    assert plant.effort_limited.tolist() == [0, 0, 0]
+
+
+def test_commands_of_the_wrong_length_are_refused() -> None:
+    plant = EffortPlant(robot_of(random_urdf(0)), TICK)
+    with pytest.raises(ValueError, match="could not broadcast"):
+        plant.step([0.1, 0.2])
+    with pytest.raises(ValueError, match="could not broadcast"):
+        plant.step([0.1, 0.2, 0.3], [1, 2, 3])
+
+
+def test_a_tick_without_limits_is_taken_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Stops are only looked at where a joint touches one: a tick is one compiled function."""
+    plant = EffortPlant(robot_of(random_urdf(0)), TICK)
+    taken: list[Any] = []
+    advance = plant._stops.advance
+
+    def counted(*arguments: Any) -> Any:
+        taken.append(arguments)
+        return advance(*arguments)
+
+    monkeypatch.setattr(plant._stops, "advance", counted)
+    for _ in range(20):
+        assert plant.step([0.01, -0.02, 0.01], [0.1, 0, 0, 0, 0, 0]) is False
+    assert taken == []
+    plant.hold(np.array([False, True, False]))
+    plant.step([0.01, -0.02, 0.01])
+    assert len(taken) == 1
+
+
+def test_motion_beyond_numbers_is_refused_and_undone() -> None:
+    plant = EffortPlant(robot_of(with_effort_limit(random_urdf(0), math.inf)), TICK)
+    before = plant.pose.tolist()
+    with pytest.raises(SpaceRobotError, match="no longer finite"):
+        plant.step([1e200, 1e200, 1e200])
+    assert plant.pose.tolist() == before
+
+
+@pytest.mark.parametrize("value", [0.0, -1.0, math.nan, math.inf])
+def test_durations_must_be_positive(value: float) -> None:
+    robot = robot_of(random_urdf(0))
+    with pytest.raises(ParameterError, match="control period must be positive"):
+        EffortPlant(robot, value)
+    with pytest.raises(ParameterError, match="integration step must be positive"):
+        EffortPlant(robot, TICK, integration_step=value)
+
+
+# -- reaction wheels of a plant under efforts: at their largest rate, at rest, and their ---------
+
+
+SPIN = np.array([199.99, -300.5, 0.0, -20.0])
+
+
+@pytest.fixture(scope="module")
+def plant() -> EffortPlant:
+    return EffortPlant(wheeled_robot(), 0.02, InitialState(joint_velocities=SPIN), 0.01)
+
+
+@pytest.mark.slow
+def test_a_wheel_at_its_largest_rate_gets_no_faster(plant: EffortPlant) -> None:
+    plant.reset()
+    counted = plant.effort_limited.copy()
+    assert plant.step([0.3, -0.2, 0.0, 0.0])
+    np.testing.assert_allclose(plant.effort, [0.3, 0.0, 0.0, 0.0])
+    assert plant.qdot[0] > 200.0, "the torque of a tick is held"
+    assert plant.step([0.3, -0.2, 0.0, -0.5])
+    np.testing.assert_allclose(plant.effort, [0.0, 0.0, 0.0, -0.3])
+    assert (plant.effort_limited - counted).tolist() == [1, 2, 0, 1]
+
+
+@pytest.mark.slow
+def test_a_wheel_at_its_largest_rate_is_braked(plant: EffortPlant) -> None:
+    plant.reset()
+    plant.step([-0.4, 0.4, 0.0, 0.0])
+    np.testing.assert_allclose(plant.effort, [-0.3, 0.2, 0.0, 0.0])
+    assert plant.qdot[0] < 199.9
+    assert plant.qdot[1] > -300.5
+
+
+@pytest.mark.parametrize(
+    ("parts", "moving"), [((), (2,)), ((HULL, *WHEELS[:2]), ())], ids=["arm", "wheels alone"]
+)
+def test_wheels_go_on_spinning_when_joints_are_braked(
+    parts: tuple[str, ...], moving: tuple[int, ...], plant: EffortPlant
+) -> None:
+    if parts:
+        robot = SpaceRobot.from_urdf(text(*parts))
+        plant = EffortPlant(robot, 0.02, InitialState(joint_velocities=SPIN[:2]), 0.01)
+    plant.reset()
+    plant.qdot[list(moving)], plant.twist[:] = 0.1, 0.0
+    validator = CommandValidator(plant, configured(PlantConfig, {"actuation": "effort"}))
+    validator.rest()
+    effort, _ = validator.begin_step()
+    assert np.flatnonzero(effort).tolist() == list(moving)
+    assert all(effort[list(moving)] < 0)

@@ -1,22 +1,29 @@
-"""What imperfect sensors measure: noise, bias, delay, dropout, and nothing else when perfect."""
+"""What imperfect sensors measure of a robot and of a target, and what is reported."""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
+from rclpy.serialization import deserialize_message
 from scipy.spatial.transform import Rotation
+from std_msgs.msg import Float64MultiArray
 from support.effort_flights import robot_of
-from support.oracles import Array
+from support.oracles import Array, PinocchioOracle
 
 from spacerobot_ros.errors import ParameterError
+from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.nodes.plant.publisher import StatePublisher
 from spacerobot_ros.parameters import configured
-from spacerobot_ros.resources import share_directory
+from spacerobot_ros.resources import robot_file, share_directory
 from spacerobot_ros.simulation import InitialState, VelocityPlant
 from spacerobot_ros.simulation.actuators import PlantWithFaults, build_plant
-from spacerobot_ros.simulation.config import PlantConfig, SensorConfig
-from spacerobot_ros.simulation.sensors import Sensors
+from spacerobot_ros.simulation.config import PlantConfig, SensorConfig, TargetSensorConfig
+from spacerobot_ros.simulation.sensors import ReportedState, Sensors, TargetSensors
+from spacerobot_ros.topics import TOPICS, StateField, Topic
 
 TICK = 0.05
 URDF = (share_directory() / "urdf" / "three_joint_arm.urdf").read_text("utf-8")
@@ -242,3 +249,275 @@ def test_actuators_and_sensors_draw_from_different_streams() -> None:
     assert of_actuators.std() == pytest.approx(1.0, abs=0.15)
     assert np.abs(of_actuators[:, None] - of_sensors).min() > 1e-9
     assert abs(np.corrcoef(of_actuators, of_sensors)[0, 1]) < 0.15
+
+
+# -- measurements of a target: each error by itself, as published, and without new ones ----------
+
+
+TARGET_TICK = 0.08
+
+
+class Seen:
+    """What sensors of a target say, tick by tick, beside the truth; None where they say nothing."""
+
+    def __init__(self, ticks: int, seed: int = 5, **errors: Any) -> None:
+        config = configured(TargetSensorConfig, errors)
+        target = SimpleNamespace(target_pose=np.zeros(7), target_twist=np.zeros(6))
+        self.true: list[Array] = []
+        self.measured: list[Array | None] = []
+        for tick in range(ticks):
+            turned = Rotation.from_rotvec([0.3 + 0.01 * tick, -0.5, 0.02 * tick])
+            target.target_pose[:] = [1.0 + 0.1 * tick, -2.0, 0.03 * tick, *turned.as_quat()]
+            target.target_twist[:] = [0.1, -0.2, 0.3 + 0.001 * tick, 0.05, 0.04, -0.06]
+            if not tick:
+                plant: Any = target
+                self.sensors = TargetSensors(plant, config, seed, TARGET_TICK)
+            self.sensors.measure()
+            self.true.append(np.concatenate([target.target_pose, target.target_twist]))
+            said = np.concatenate([self.sensors.pose, self.sensors.twist])
+            self.measured.append(None if self.sensors.missing else said)
+
+    def errors(self) -> Array:
+        """Return the errors of position (W), attitude (T) and twist (N, 12)."""
+        rows = []
+        for true, said in zip(self.true, self.measured, strict=True):
+            assert said is not None
+            turn = Rotation.from_quat(true[3:7]).inv() * Rotation.from_quat(said[3:7])
+            rows.append([*(said[:3] - true[:3]), *turn.as_rotvec(), *(said[7:] - true[7:])])
+        return np.array(rows)
+
+
+def test_sensors_without_errors_are_not_used() -> None:
+    seen = Seen(3)
+    assert not seen.sensors.used
+    assert not seen.sensors.missing
+    # They do not even follow.
+    assert seen.measured[2] is not None
+    np.testing.assert_array_equal(seen.measured[2], seen.true[0])
+
+
+@pytest.mark.parametrize(
+    ("name", "columns", "sigma"),
+    [
+        ("position_noise", slice(0, 3), 0.02),
+        ("attitude_noise", slice(3, 6), 0.01),
+        ("velocity_noise", slice(6, 9), 0.03),
+        ("angular_velocity_noise", slice(9, 12), 0.04),
+    ],
+)
+def test_a_noise_is_that_of_its_quantity_alone(name: str, columns: slice, sigma: float) -> None:
+    error: dict[str, Any] = {name: sigma}
+    seen = Seen(400, **error)
+    assert seen.sensors.used
+    errors = seen.errors()
+    assert errors[:, columns].std(axis=0) == pytest.approx([sigma] * 3, rel=0.15)
+    assert np.abs(errors[:, columns].mean(axis=0)).max() < 0.15 * sigma
+    errors[:, columns] = 0.0
+    np.testing.assert_allclose(errors, 0.0, atol=1e-14)
+
+
+def test_biases_turn_with_the_target() -> None:
+    bias, turn = np.array([0.02, -0.01, 0.03]), np.array([0.004, 0.006, -0.002])
+    seen = Seen(9, position_bias=bias.tolist(), attitude_bias=turn.tolist())
+    for true, error in zip(seen.true, seen.errors(), strict=True):
+        in_world = Rotation.from_quat(true[3:7]).apply(bias)
+        np.testing.assert_allclose(error[:3], in_world, atol=1e-14)
+        np.testing.assert_allclose(error[3:6], turn, atol=1e-14)
+    assert np.ptp(seen.errors()[:, :3], axis=0).max() > 1e-3
+
+
+def test_a_delay_is_a_number_of_ticks_after_a_standstill() -> None:
+    seen = Seen(7, delay=0.17)
+    for tick, said in enumerate(seen.measured):
+        assert said is not None
+        np.testing.assert_allclose(said, seen.true[max(0, tick - 2)], atol=1e-15)
+
+
+def test_a_rate_leaves_whole_ticks_between_measurements() -> None:
+    seen = Seen(9, rate=1 / 0.26)
+    assert [said is not None for said in seen.measured] == [True, False, False] * 3
+    assert all(said is not None for said in Seen(4, rate=50.0).measured)
+
+
+def test_measurements_are_lost_at_random() -> None:
+    seen = Seen(600, loss=0.3, rate=1 / (2 * TARGET_TICK))
+    there = np.array([said is not None for said in seen.measured])
+    assert not there[1::2].any()
+    assert there[::2].mean() == pytest.approx(0.7, abs=0.06)
+    assert not any(said is not None for said in Seen(20, loss=1.0).measured)
+
+
+def test_a_seed_is_a_stream_of_its_own() -> None:
+    noisy: dict[str, Any] = {"position_noise": 1.0, "loss": 0.4}
+    first, again, other = (Seen(30, seed, **noisy) for seed in (5, 5, 6))
+    for one, two in zip(first.measured, again.measured, strict=True):
+        assert (one is None) is (two is None)
+        if one is not None and two is not None:
+            np.testing.assert_array_equal(one, two)
+    assert [x is None for x in first.measured] != [x is None for x in other.measured]
+    # The noise of the target is not that of the robot, nor that of its actuators.
+    error = Seen(1, 5, position_noise=1.0).errors()[0, :3]
+    sequence = np.random.SeedSequence(5)
+    for stream in (np.random.default_rng(5), np.random.default_rng(sequence.spawn(1)[0])):
+        assert np.abs(error[:, None] - stream.standard_normal(50)).min() > 1e-6
+
+
+def test_the_truth_is_published_beside_measurements(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SPACEROBOT_COMPILE", "0")
+    robot = SpaceRobot.from_file(robot_file("planar_manipulator"))
+    block = str(share_directory() / "config" / "targets" / "block.urdf")
+    values: dict[str, Any] = {"target.robot": block, "target.position": [3.0, 1.0, 2.0]}
+    values |= {"target.sensors.position_bias": [0.5, 0.0, 0.0], "target.sensors.rate": 1e-3}
+    config = configured(PlantConfig, values)
+    plant = build_plant(robot, config)
+    reported = ReportedState(plant, config)
+    assert not reported.misses_target
+    reported.update()
+    assert not reported.misses_target
+    topics = [topic.name for topic in reported.topics]
+    assert topics.index("target/odom") + 1 == topics.index("target/odom_true")
+    found = reported.quantities
+    np.testing.assert_allclose(found["target_pose"][:3], [3.5, 1.0, 2.0])
+    assert plant.capturing is not None
+    assert found["true_target_pose"] is plant.capturing.target_pose
+    assert found["true_target_twist"] is plant.capturing.target_twist
+    reported.update()
+    assert reported.misses_target
+
+
+def test_errors_beyond_their_range_are_refused() -> None:
+    for name, value in (("loss", 1.01), ("loss", -0.1), ("delay", 61.0), ("rate", -1.0)):
+        with pytest.raises(ParameterError, match=name):
+            configured(TargetSensorConfig, {name: value})
+
+
+# -- what a plant reports by topic, and that a new topic is an entry in the table and a ----------
+
+
+SLIDERS = SpaceRobot.from_file(robot_file("sliding_masses"))
+ARM = SpaceRobot.from_file(robot_file("three_joint_arm"))
+
+
+def reported(robot: SpaceRobot, **parameters: Any) -> ReportedState:
+    config = PlantConfig(**parameters)
+    return ReportedState(build_plant(robot, config), config)
+
+
+def names(state: ReportedState) -> list[str]:
+    return [topic.name for topic in state.topics]
+
+
+def test_topics_follow_from_the_plant() -> None:
+    perfect = ["base_pose", "momentum", "odom", "joint_states"]
+    assert [n for n in names(reported(SLIDERS)) if n != "end_effector_pose"] == perfect
+    assert "momentum_expected" in names(reported(SLIDERS, actuation="effort"))
+    noisy = names(reported(SLIDERS, sensors=SensorConfig(joint_noise=1e-3)))
+    assert noisy[-4:] == ["odom_true", "joint_states_true", "odom", "joint_states"]
+    with pytest.raises(ParameterError, match="'end_effector_frame' is 'claw'"):
+        reported(SLIDERS, end_effector_frame="claw")
+
+
+def test_the_truth_goes_to_its_own_topics_once_the_sensors_err() -> None:
+    config = PlantConfig()
+    plant = build_plant(ARM, config)
+    state = ReportedState(plant, config)
+    assert not state.update()
+    assert state.quantities["measured_q"] is plant.q
+    plant.inject(f"sensor_bias {ARM.joint_names[0]} 0.5")
+    assert state.update()
+    assert "odom_true" in names(state)
+    assert state.quantities["true_q"] is plant.q
+    assert state.quantities["measured_q"][0] == plant.q[0] + 0.5
+    assert not state.update()
+
+
+def test_the_end_effector_is_where_the_link_is() -> None:
+    link = ARM.link_names[-1]
+    config = PlantConfig(
+        end_effector_frame=link,
+        initial_position=(1.0, 2.0, 3.0),
+        initial_orientation=(0.0, 0.0, 1.0, 1.0),
+    )
+    plant = build_plant(ARM, config)
+    state = ReportedState(plant, config)
+    state.update()
+    in_base = plant.link_r[:, -1]
+    # A quarter turn about z.
+    expected = [1.0 - in_base[1], 2.0 + in_base[0], 3.0 + in_base[2]]
+    np.testing.assert_allclose(state.quantities["end_effector_pose"][:3], expected, atol=1e-12)
+
+
+def test_named_links_are_where_pinocchio_sees_them_in_the_measured_state() -> None:
+    named = ("link_3", "base_link", "link_1")
+    config = PlantConfig(
+        end_effectors=named,
+        initial_position=(1.0, 2.0, 3.0),
+        initial_orientation=(0.1, -0.5, 0.3, 0.8),
+        initial_joint_positions=(0.3, -0.7, 0.5),
+    )
+    plant = build_plant(ARM, config)
+    state = ReportedState(plant, config)
+    oracle = PinocchioOracle(robot_file("three_joint_arm").read_text("utf-8"), ARM.joint_names)
+    for fault in ("clear", f"sensor_bias {ARM.joint_names[1]} 0.4", "sensor_bias position_x 0.7"):
+        plant.inject(fault)
+        plant.step(np.array([0.1, -0.3, 0.2]))
+        state.update()
+        pose, q = state.quantities["measured_pose"], state.quantities["measured_q"]
+        oracle.set_configuration(q, pose[3:], pose[:3])
+        for name in named:
+            R_WE, r_WE = oracle.frame_W(name)
+            published = state.quantities[f"pose_of_{name}"]
+            np.testing.assert_allclose(published[:3], r_WE, atol=1e-12)
+            R = Rotation.from_quat(published[3:]).as_matrix()
+            np.testing.assert_allclose(R, R_WE, atol=1e-12)
+    assert names(state)[:3] == [f"{name}/pose" for name in named]
+    with pytest.raises(ParameterError, match="'end_effectors' names 'claw'"):
+        reported(ARM, end_effectors=("link_1", "claw"))
+    with pytest.raises(ParameterError, match="name each once"):
+        reported(ARM, end_effectors=("link_1", "link_1"))
+
+
+class _Streams:
+    """In place of a node: keeps what is published."""
+
+    def __init__(self) -> None:
+        self.sent: dict[str, list[bytes]] = {}
+
+    def send_raw(self, kind: type[Any], topic: str) -> Any:
+        sent = self.sent.setdefault(topic, [])
+        return type("Output", (), {"take": staticmethod(sent.append), "readers": lambda _: 0})()
+
+    def create_publisher(self, *_: Any) -> None:
+        return None
+
+
+def test_a_new_topic_is_an_entry_in_the_table_and_a_quantity(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    entry = Topic(
+        "energy",
+        "std_msgs/msg/Float64MultiArray",
+        ("plant",),
+        "kinetic energy (J)",
+        state=(StateField("data", "kinetic_energy", array_entry_names=("kinetic_energy",)),),
+    )
+    monkeypatch.setitem(TOPICS, "energy", entry)
+    quantities = ReportedState._quantities
+    monkeypatch.setattr(
+        ReportedState,
+        "_quantities",
+        lambda self: {**quantities(self), "kinetic_energy": self._plant.momentum[6:7]},
+    )
+    config = PlantConfig(angular_momentum=(0.0, 0.0, 2.0))
+    plant = build_plant(SLIDERS, config)
+    state = ReportedState(plant, config)
+    streams: Any = _Streams()
+    publisher = StatePublisher(streams, SLIDERS, state, PlantConfig())
+    publisher.publish(0, all_topics=True)
+    plant.step(np.array([0.1, 0.0, 0.0]))
+    publisher.publish(50_000_000, all_topics=False)
+    messages = [deserialize_message(raw, Float64MultiArray) for raw in streams.sent["energy"]]
+    assert messages[-1].data[0] == plant.momentum[6] > messages[0].data[0] > 0.0
+    assert messages[0].layout.dim[0].label == "kinetic_energy"
+    assert len(streams.sent["base_pose"]) == 1, "not in every tick"
+    assert len(streams.sent["odom"]) == 2

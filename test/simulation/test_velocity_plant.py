@@ -1,18 +1,26 @@
-"""The plant under held joint velocities: conservation, another integration, start and reset."""
+"""The plant under held joint velocities: conservation, another integration, starts, limits."""
 
 from __future__ import annotations
+
+import math
+from functools import cache
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import pytest
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
+from support.oracles import PinocchioOracle
 from support.oracles.oracle import Motion
-from support.velocity_flights import RATE, STROKE, TICK, URDF, Case, sliding_masses
+from support.random_robots import random_robot_urdf
+from support.velocity_flights import RATE, STROKE, TICK, URDF, Case, robot_of, sliding_masses
 
+from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.compilation import c_compiler
-from spacerobot_ros.simulation import InitialState, VelocityPlant
+from spacerobot_ros.simulation import EffortPlant, InitialState, VelocityPlant
+from spacerobot_ros.simulation.config import PlantConfig
 
 Array = npt.NDArray[np.float64]
 
@@ -268,3 +276,169 @@ def test_compiled_it_is_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
             (interpreted.momentum, compiled.momentum),
         ):
             np.testing.assert_allclose(one, other, rtol=1e-12, atol=1e-12)
+
+
+# -- the plant under held joint velocities: rates, strokes, refusals -----------------------------
+
+
+# -- limits -----------------------------------------------------------------------------------
+
+
+def test_a_rate_is_clipped_and_counted_once_a_tick() -> None:
+    plant = sliding_masses()
+    assert plant.step(np.array([0.70001, -0.7, 5.0]))
+    np.testing.assert_array_equal(plant.qdot, [0.7, -0.7, 0.7])
+    np.testing.assert_allclose(plant.q, [0.035, -0.035, 0.035])
+    assert not plant.step(np.array([0.7, 0.0, -0.7]))
+    assert plant.step(np.array([0.0, 0.0, -np.inf]))
+    np.testing.assert_array_equal(plant.velocity_limited, [1, 0, 2])
+    np.testing.assert_array_equal(plant.stroke_limited, [0, 0, 0])
+
+
+def test_a_joint_stops_at_the_end_of_its_stroke_and_comes_back() -> None:
+    plant = sliding_masses(joint_positions=np.array([2.49, -2.5, 0.0]))
+    assert plant.step(np.array([0.7, -0.3, 0.7]))
+    np.testing.assert_allclose(plant.qdot, [0.2, 0.0, 0.7], atol=1e-12)
+    np.testing.assert_allclose(plant.q, [2.5, -2.5, 0.035], rtol=1e-15)
+    np.testing.assert_array_equal(plant.stroke_limited, [1, 1, 0])
+    np.testing.assert_array_equal(plant.velocity_limited, [0, 0, 0])
+    # Too fast and too far at once counts as both.
+    assert plant.step(np.array([1.0, 0.3, 0.0]))
+    np.testing.assert_array_equal(plant.stroke_limited, [2, 1, 0])
+    np.testing.assert_array_equal(plant.velocity_limited, [1, 0, 0])
+    assert plant.qdot[0] == pytest.approx(0.0, abs=1e-12)
+    assert not plant.step(np.array([-0.7, 0.3, 0.0]))
+    np.testing.assert_allclose(plant.q, [2.465, -2.47, 0.035], rtol=1e-14)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_no_joint_ever_leaves_its_limits(seed: int) -> None:
+    case = Case(seed, momentum=False)
+    plant = case.plant()
+    kinds = [j.kind.value for j in case.robot.description.movable_joints]
+    free = np.array([kind == "continuous" for kind in kinds])
+    push = RATE * np.sign(case.command())
+    for tick in range(200):
+        before = plant.q.copy()
+        plant.step(1.2 * push if tick % 2 else push)
+        assert np.all(np.abs(plant.qdot) <= RATE)
+        assert np.all((np.abs(plant.q) <= STROKE + 1e-14) | free)
+        np.testing.assert_allclose(plant.q, before + TICK * plant.qdot, atol=1e-12)
+    np.testing.assert_allclose(plant.q[~free], (STROKE * np.sign(push))[~free], atol=1e-12)
+    assert np.all(np.abs(plant.q[free]) > STROKE)
+    np.testing.assert_array_equal(plant.velocity_limited, 100)
+    assert np.all(plant.stroke_limited[~free] > 0)
+    assert np.all(plant.stroke_limited[free] == 0)
+
+
+# -- refusals ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("period", [0.0, -0.05, np.nan, np.inf])
+def test_a_bad_tick_period_is_refused(period: float) -> None:
+    robot = robot_of((URDF / "sliding_masses.urdf").read_text("utf-8"))
+    with pytest.raises(ParameterError, match="control period"):
+        VelocityPlant(robot, period)
+
+
+@pytest.mark.parametrize(
+    ("initial", "mentions"),
+    [
+        ({"joint_positions": [0.0, 0.0]}, ["2 numbers", "slider_1, slider_2, slider_3"]),
+        ({"joint_positions": [0.0] * 4}, ["4 numbers", "3 joints"]),
+        ({"joint_positions": [0.0, 2.6, 0.0]}, ["'slider_2'", "2.6", "[-2.5, 2.5]"]),
+        ({"joint_positions": [0.0, 0.0, -2.51]}, ["'slider_3'", "-2.51"]),
+        ({"joint_positions": [np.nan, 0.0, 0.0]}, ["joint positions", "nan"]),
+        ({"quaternion": [0.0] * 4}, ["orientation"]),
+        ({"quaternion": [0.0, np.nan, 0.0, 1.0]}, ["orientation"]),
+        ({"position": [0.0, np.inf, 0.0]}, ["position"]),
+        ({"linear_momentum": [np.nan, 0.0, 0.0]}, ["moment"]),
+        ({"angular_momentum": [0.0, 0.0, np.inf]}, ["moment"]),
+    ],
+)
+def test_a_bad_initial_state_is_refused(
+    initial: dict[str, list[float]], mentions: list[str]
+) -> None:
+    with pytest.raises(ParameterError) as refusal:
+        sliding_masses(**{name: np.array(value) for name, value in initial.items()})
+    text = str(refusal.value)
+    assert text.endswith(".")
+    assert "\n" not in text
+    for mention in mentions:
+        assert mention in text
+
+
+# -- where a run starts, and what is refused -----------------------------------------------------
+
+
+TREE = random_robot_urdf(np.random.default_rng(0), joints=3)
+PLANTS = (EffortPlant, VelocityPlant)
+
+
+@cache
+def robot() -> SpaceRobot:
+    return SpaceRobot.from_urdf(TREE)
+
+
+@pytest.mark.parametrize("plant", PLANTS)
+def test_center_of_mass_is_where_it_is_put(plant: Any) -> None:
+    rng = np.random.default_rng(1)
+    center = np.array([1.0, -2.0, 0.5])
+    start = InitialState(
+        quaternion=rng.normal(size=4),
+        joint_positions=rng.uniform(-1, 1, 3),
+        center_of_mass=center,
+    )
+    built = plant(robot(), 0.01, start)
+    oracle = PinocchioOracle(TREE, robot().joint_names)
+    oracle.set_configuration(built.q, built.pose[3:], built.pose[:3])
+    np.testing.assert_allclose(oracle.center_of_mass_W(), center, atol=1e-13)
+
+
+def test_position_given_twice_is_refused() -> None:
+    with pytest.raises(ParameterError, match="given twice"):
+        InitialState(position=np.array([0.0, 0.1, 0.0]), center_of_mass=np.zeros(3))
+    assert InitialState(center_of_mass=np.zeros(3)).center_of_mass is not None
+
+
+def test_joints_under_velocity_commands_start_at_rest() -> None:
+    with pytest.raises(ParameterError, match="start at rest"):
+        VelocityPlant(robot(), 0.01, InitialState(joint_velocities=np.array([0.0, 0.1, 0.0])))
+    plant = VelocityPlant(robot(), 0.01, InitialState(joint_velocities=np.zeros(3)))
+    assert plant.qdot.tolist() == [0.0] * 3
+
+
+@pytest.mark.parametrize("plant", PLANTS)
+@pytest.mark.parametrize(
+    ("given", "sentence"),
+    [
+        ({"joint_positions": np.zeros(2)}, r"joint positions are 2 numbers; robot 'random' has 3"),
+        ({"joint_positions": np.array([0.0, 3.5, 3.5])}, "outside its limits"),
+        ({"joint_positions": np.array([0.0, math.nan, 0.0])}, "positions must be finite"),
+        ({"joint_positions": np.array([math.inf] * 3)}, "positions must be finite"),
+        ({"joint_velocities": np.zeros(4)}, "joint velocities are 4 numbers"),
+        ({"joint_velocities": np.array([0.0, math.inf, 0.0])}, "velocities must be finite"),
+        ({"quaternion": np.zeros(4)}, "initial orientation is refused"),
+        ({"position": np.array([0.0, math.nan, 0.0])}, "initial position must be finite"),
+        ({"center_of_mass": np.array([math.inf, 0.0, 0.0])}, "initial position must be finite"),
+        ({"linear_momentum": np.array([0.0, math.nan, 0.0])}, "initial momenta must be finite"),
+        ({"angular_momentum": np.array([0.0, 0.0, math.inf])}, "initial momenta must be finite"),
+    ],
+    ids=lambda value: next(iter(value)) if isinstance(value, dict) else None,
+)
+def test_refusals(plant: Any, given: dict[str, Any], sentence: str) -> None:
+    with pytest.raises(ParameterError, match=sentence):
+        plant(robot(), 0.01, InitialState(**given))
+
+
+def test_what_a_configuration_leaves_open_is_zero_and_the_identity() -> None:
+    nothing = dict.fromkeys(
+        ("initial_position", "initial_orientation", "linear_momentum", "angular_momentum"), ()
+    )
+    for config in (PlantConfig(), PlantConfig(**nothing)):  # type: ignore[arg-type]
+        start = InitialState.of(config)
+        assert start.position.tolist() == [0.0, 0.0, 0.0]
+        assert start.quaternion.tolist() == [0.0, 0.0, 0.0, 1.0]
+        assert start.linear_momentum.tolist() == [0.0, 0.0, 0.0]
+        assert start.angular_momentum.tolist() == [0.0, 0.0, 0.0]
+        assert start.joint_positions is start.joint_velocities is start.center_of_mass is None

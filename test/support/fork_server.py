@@ -16,7 +16,7 @@ from collections.abc import Mapping, Sequence
 from enum import Enum
 from pathlib import Path
 
-from support.forked import ENDED, NOT_EXCHANGED, WAITED, NotExchangedError
+from support.forked import ENDED, NOT_EXCHANGED, NotExchangedError
 
 _MARK = "SPACEROBOT_FORK"
 """Variable by which processes that a fork leaves behind are found."""
@@ -26,14 +26,6 @@ def environment_of(project: Path, cache: Path) -> dict[str, str]:
     """Return the variables with which the tests of a copy of the project run."""
     paths = os.pathsep.join((str(project), str(project / "test")))
     return os.environ | {"PYTHONPATH": paths, "SPACEROBOT_CACHE_DIR": str(cache)}
-
-
-def limits_of(cpu: float, wall: float) -> tuple[float, float]:
-    """Return the CPU and wall time (s) that a test may take which takes so much without an error.
-
-    Load of the machine does not use CPU time of the test: only an endless loop does.
-    """
-    return 10.0 + 8.0 * cpu, WAITED + 10.0 * wall
 
 
 def write_source(file: Path, source: str) -> None:

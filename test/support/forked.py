@@ -162,11 +162,6 @@ def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
 # -- modules that are imported ----------------------------------------------------------------
 
 
-def can_be_exchanged(before: str, after: str) -> bool:
-    """Whether two texts of a file differ in the bodies of functions only."""
-    return _differing_code(before, after, "") is not None
-
-
 def exchange(
     before: str, after: str, path: str, live: Mapping[CodeType, Sequence[FunctionType]]
 ) -> None:

@@ -6,12 +6,11 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from support.planner_loop import NEAR, Loop, MovingStub, Place, StubMethod
+from support.planner_loop import NEAR, Loop, Place, StubMethod
 
 from spacerobot_ros.planning.execution.executive import (
     Phase,
 )
-from spacerobot_ros.planning.execution.teleoperation import TwistCommand, TwistFrame
 
 FAR: Place = ([50.0, 0.0, 0.0], [0.0, 0.0, 0.0])
 OTHER: Place = ([-0.04, 0.0, 0.01], [0.0, 0.0, 0.0])
@@ -58,53 +57,9 @@ def braking() -> Loop:
     return loop
 
 
-def braking_off_path(**options: Any) -> Loop:
-    """Brake to plan from rest, because the base is off its path."""
-    loop = executing(held=True, ticks=400, wrong_path=0.1, drift_position=1e-3, **options)
-    loop.tick(60)
-    return loop
-
-
-def twisting() -> Loop:
-    """Let a slider follow twists."""
-    loop = resting()
-    loop.tick(3)
-    twist = np.array([0.02, -0.01, 0.015])
-    command = TwistCommand("mass_1", twist, np.zeros(3), TwistFrame.WORLD)
-    loop.executive.propose_twist(command)
-    loop.tick(4)
-    return loop
-
-
 def evaluating(**options: Any) -> Loop:
     """Wait for a second measured state after a schedule."""
     return until(executing(averaging=2, **options), Phase.EVALUATING)
-
-
-def flying_on(*, again: bool = False, **parameters: Any) -> Loop:
-    """Fly while a plan is made that takes over in motion: for another goal, or for this one."""
-    if again:
-        parameters = {"replan_period": 0.2, **parameters}
-    parameters = {"takeover_time": 0.5, **parameters}
-    loop = Loop(parameters, method=MovingStub(80), held=True)
-    stub_of(loop).wrong_path = 0.1
-    loop.propose_goal(NEAR)
-    loop.tick()
-    loop.held.release()
-    loop.tick(5)
-    if not again:
-        loop.propose_goal(OTHER)
-        loop.tick()
-    return until(loop, Phase.REPLANNING)
-
-
-def taking_over(*, again: bool = False, **parameters: Any) -> Loop:
-    """Fly on until the plan that is there takes over."""
-    loop = flying_on(again=again, **parameters)
-    loop.held.release()
-    loop.tick()
-    assert loop.executive.phase is Phase.TAKING_OVER
-    return loop
 
 
 def until(loop: Loop, phase: Phase, *, base: bool = True, ticks: int = 600) -> Loop:

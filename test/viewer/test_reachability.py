@@ -1,4 +1,4 @@
-"""Goals that are checked in the background: against the planner of a stack, cancelled and not."""
+"""Goals that are checked in the background: against the planner of a stack, and by its process."""
 
 from __future__ import annotations
 
@@ -32,8 +32,9 @@ from spacerobot_ros.viewer.reachability import (
     make_question,
     planned_goal,
     planned_links,
+    planner_config,
 )
-from spacerobot_ros.viewer.state import Measured, StackState
+from spacerobot_ros.viewer.state import Measured, Momenta, StackState
 
 URDF = load_robot(robot_file("sliding_masses")).urdf
 ORIGIN = RobotState(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(3))
@@ -226,7 +227,6 @@ def looked(checker: GoalChecker, until: Callable[[GoalCheck], bool]) -> list[Goa
     return found
 
 
-@pytest.mark.slow
 def test_the_last_goal_is_the_one_that_is_answered(checker: GoalChecker) -> None:
     for x in (0.1, 0.2, 9.0, 0.05):
         checker.ask(question(x, 0.0, 0.0))
@@ -287,3 +287,84 @@ def test_the_arm_of_a_controlled_robot_reaches_its_goal_or_not() -> None:
 def _unit(quaternion: Array) -> Array:
     unit: Array = quaternion / np.linalg.norm(quaternion)
     return unit
+
+
+# -- the checks of goals with a stand-in for their process, their time, and the schedules --------
+
+
+ATTITUDE = np.array([0.5, -0.1, 0.7, 0.5]) / np.linalg.norm([0.5, -0.1, 0.7, 0.5])
+PLACE = np.array([0.3, -1.2, 2.0])
+GOAL = Goal.checked([1.0, 2.0, 3.0], ATTITUDE)
+HAND = Goal.checked([1.5, 2.5, 3.5], ATTITUDE)
+
+
+# -- the question -------------------------------------------------------------------------------
+
+
+SERVICER = load_robot(robot_file("servicer"))
+MEASURED = Measured(3.0, np.concatenate([PLACE, ATTITUDE]), *np.arange(18.0).reshape(3, 6))
+PLANNING = StackState(MEASURED, planner=PlannerStatus(PlannerState.IDLE))
+
+
+@pytest.mark.parametrize(
+    ("state", "known", "reason"),
+    [
+        (StackState(), True, "No state received yet."),
+        (replace(PLANNING, absent=frozenset({"planner"})), True, "The planner is offline."),
+        (
+            replace(PLANNING, planner=PlannerStatus(PlannerState.PLANNING)),
+            True,
+            "The planner is busy planning.",
+        ),
+        (PLANNING, False, "The planner's parameters have not been received yet."),
+    ],
+)
+def test_why_no_question_is_asked(state: StackState, known: bool, reason: str) -> None:
+    parameters = {"planner": {"tick_rate": "20.0"}} if known else {"controller": {}}
+    assert make_question(state, {"base": GOAL}, SERVICER, parameters) == reason
+    assert make_question(state, {"base": GOAL}, None, parameters) == "No state received yet."
+
+
+def test_a_question_has_the_measured_state_and_the_momenta() -> None:
+    momenta = Momenta(np.arange(6.0), np.zeros(6), 2.0)
+    parameters = {"planner": {"tick_rate": "20.0"}, "controller": {"law": '"step"'}}
+    for given, expected in ((momenta, np.arange(6.0)), (None, np.zeros(6))):
+        question = make_question(
+            replace(PLANNING, momenta=given), {"base": GOAL}, SERVICER, parameters
+        )
+        assert isinstance(question, GoalQuestion)
+        start = question.state
+        np.testing.assert_array_equal(start.position, PLACE)
+        np.testing.assert_array_equal(start.quaternion, ATTITUDE)
+        np.testing.assert_array_equal(start.q, MEASURED.q)
+        found = np.concatenate([start.linear_momentum, start.angular_momentum])
+        np.testing.assert_array_equal(found, expected)
+        assert (question.urdf, question.parameters) == (SERVICER.urdf, parameters["planner"])
+        assert (question.goal, question.tool, question.link) == (GOAL, None, "")
+
+
+def test_the_question_of_a_controller_is_for_its_end_effector() -> None:
+    state = StackState(MEASURED, momenta=Momenta(np.ones(6), None, 0.0))
+    goals = {"base": GOAL, "end_effector": HAND}
+    question = make_question(state, goals, SERVICER, {})
+    assert isinstance(question, GoalQuestion)
+    assert (question.goal, question.tool, question.link) == (GOAL, HAND, SERVICER.end_effector())
+    elbow = {"controller": {"end_effector_frame": '"forearm"'}, "planner": {"a": "1"}}
+    known = [name for name in SERVICER.frames if name != SERVICER.end_effector()][-1]
+    elbow["controller"]["end_effector_frame"] = f'"{known}"'
+    other = make_question(state, goals, SERVICER, elbow)
+    assert isinstance(other, GoalQuestion)
+    assert (other.link, other.parameters) == (known, {})
+    absent = {"controller": {"end_effector_frame": '"nobody"'}}
+    answer = make_question(state, goals, SERVICER, absent)
+    assert answer == "The end-effector is not a link of the robot."
+
+
+def test_the_robot_of_a_planner_is_that_of_the_page() -> None:
+    texts = {"robot": '"other"', "world": '"strut.urdf"', "robot_description": '"<robot/>"'}
+    config = planner_config(
+        {**texts, "tick_rate": "17.0", "averaging": "null", "no_parameter": "{"}
+    )
+    assert (config.robot, config.world, config.robot_description) == ("", "", "")
+    assert config.tick_rate == 17.0
+    assert config.averaging == type(config)().averaging

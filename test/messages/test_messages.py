@@ -1,24 +1,44 @@
-"""Joint messages taken by name, against a dictionary."""
+"""Messages and what they say: pairs of words, statuses, commands of joints, trajectories."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 import pytest
 from builtin_interfaces.msg import Time
+from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from geometry_msgs.msg import WrenchStamped
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
-from rclpy.serialization import serialize_message
+from mcap.records import Schema
+from mcap_ros2.decoder import DecoderFactory
+from rclpy.serialization import deserialize_message, serialize_message
+from rosbags.typesys import Stores, get_typestore
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Header
+from support.random_messages import few as few_trajectories
+from trajectory_msgs.msg import JointTrajectory
 
-from spacerobot_ros.errors import CommandError
+from spacerobot_ros.bag import message_definition
+from spacerobot_ros.errors import CommandError, SpaceRobotError
+from spacerobot_ros.events import (
+    INTEGER,
+    SECONDS,
+    Event,
+    EventKind,
+    KeyValueField,
+    KeyValueFormat,
+    list_format,
+)
+from spacerobot_ros.messages.builders import trajectory_message
 from spacerobot_ros.messages.readers import CommandReader, JointReader
+from spacerobot_ros.messages.statuses import STATUS, StatusRecord, read_status
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.urdf import load_robot
+from spacerobot_ros.planning import BasePath, GaitSchedule, Goal
 from spacerobot_ros.resources import robot_file
 from spacerobot_ros.simulation.actuators import build_plant
 from spacerobot_ros.simulation.commands import CommandValidator, Reason
@@ -201,3 +221,180 @@ def test_a_wrench_in_another_frame_is_malformed() -> None:
                 assert refusal.reason is Reason.MALFORMED
                 assert f"'{frame}'" in refusal.clause
     assert source.command.tolist() == [0.0, 0.5, 0.0, 0.0, 0.0, 0.0]
+
+
+# -- the key-value pairs of statuses and events: names, order, defaults, and pairs that ----------
+
+
+@dataclass(frozen=True)
+class Sample:
+    count: int
+    time_s: float | None = None
+    words: tuple[str, ...] = ()
+    named: dict[str, int] = field(default_factory=dict)
+    others: dict[str, str] = field(default_factory=dict)
+
+
+FORMAT = KeyValueFormat(
+    "sample",
+    KeyValueField("words", list_format("; "), always=True),
+    KeyValueField("count", INTEGER, key="number"),
+    KeyValueField("time_s", SECONDS),
+    KeyValueField("named", INTEGER, prefix="n."),
+    KeyValueField("others", prefix="", present_with="words"),
+)
+
+
+def test_pairs_have_the_order_of_the_fields_and_leave_defaults_out() -> None:
+    sample = Sample(3, 0.0, ("a b", "c"), {"x": 4, "y": 5}, {"free": "text"})
+    pairs = {"words": "a b; c", "number": "3", "time_s": "0.000000000"}
+    pairs |= {"n.x": "4", "n.y": "5", "free": "text"}
+    assert list(FORMAT.to_values(sample).items()) == list(pairs.items())
+    assert FORMAT.from_values(Sample, pairs) == sample
+    assert FORMAT.to_values(Sample(0, others={"free": "text"})) == {"words": "", "number": "0"}
+    assert FORMAT.from_values(Sample, {"number": "7"}, time_s=2.5) == Sample(7, 2.5)
+
+
+@pytest.mark.parametrize(
+    ("pairs", "named"), [({"words": "a"}, "'number'"), ({"number": "3", "n.x": "1.5"}, "1.5")]
+)
+def test_pairs_that_are_missing_or_unreadable_are_named(pairs: dict[str, str], named: str) -> None:
+    with pytest.raises(SpaceRobotError, match=f"^The values are no sample: .*{named}"):
+        FORMAT.from_values(Sample, pairs)
+
+
+def test_an_event_carries_its_times_first_and_its_facts_last() -> None:
+    event = Event(EventKind.LATCHED, "m", 2, 1.25, "7.5", {"reason": "late", "fault": "x"})
+    pairs = event.to_values(9.5)
+    assert list(pairs) == ["event", "time", "wall_time", "goal_id", "reason", "fault"]
+    assert (pairs["time"], pairs["wall_time"]) == ("1.250000000", "9.500000")
+    assert Event.from_values(pairs, "m", 2) == event
+    assert "time" not in Event(EventKind.RESET, "").to_values(None)
+
+
+# -- statuses as messages: rclpy reads what is encoded, and nothing unprintable is read ----------
+
+
+RECORD = StatusRecord(
+    "/a/planner", 2, "The goal is refused.", {"state": "refused", "goal_id": "1.5"}, "servicer"
+)
+
+
+def test_rclpy_reads_an_encoded_status() -> None:
+    message = deserialize_message(RECORD.encoded(), DiagnosticStatus)
+    assert (message.level, message.name, message.hardware_id) == (b"\2", "/a/planner", "servicer")
+    assert message.message == "The goal is refused."
+    assert message.values == [
+        KeyValue(key="state", value="refused"),
+        KeyValue(key="goal_id", value="1.5"),
+    ]
+
+
+@pytest.mark.parametrize("by", ["rclpy", "rosbags"])
+def test_a_status_of_either_library_is_read(by: str) -> None:
+    raw = RECORD.encoded()
+    if by == "rclpy":
+        message = deserialize_message(raw, DiagnosticStatus)
+    else:
+        message = get_typestore(Stores.ROS2_JAZZY).deserialize_cdr(raw, STATUS)
+    assert read_status(message) == RECORD
+
+
+def test_control_characters_are_not_read() -> None:
+    """Of a terminal: clear the screen, a title, go back in the line, an 8-bit sequence."""
+    hostile = "a\x1b[2Jb\x1b]0;title\x07\rc\x9b31md\n\u202ee"
+    sent = DiagnosticStatus(
+        name=hostile,
+        message=hostile,
+        hardware_id=hostile,
+        values=[KeyValue(key=hostile, value=hostile)],
+    )
+    record = read_status(deserialize_message(serialize_message(sent), DiagnosticStatus))
+    ((key, value),) = record.values.items()
+    for text in (record.name, record.message, record.hardware_id, key, value):
+        assert text.isprintable()
+        assert all(letter in text for letter in "abcde")
+
+
+# -- serialised schedules against rclpy's reading, and against two other readers of CDR ----------
+
+
+@st.composite
+def schedules(draw: Any) -> GaitSchedule:
+    names = draw(st.lists(st.text("abcdefghij", min_size=1, max_size=9), min_size=1, max_size=5))
+    ticks = draw(st.integers(0, 7))
+    rng = np.random.default_rng(draw(st.integers(0, 2**32)))
+    return schedule_of(
+        tuple(names), rng.normal(size=(ticks + 1, len(names))), draw(st.sampled_from([0.05, 0.7]))
+    )
+
+
+def schedule_of(names: tuple[str, ...], positions: Any, period: float) -> GaitSchedule:
+    still = Goal(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]))
+    path = BasePath(np.zeros(1), np.zeros((1, 3)), still.quaternion[np.newaxis])
+    return GaitSchedule("test", names, period, positions, path, still)
+
+
+def check_trajectory(message: Any, schedule: GaitSchedule, stamp_ns: int, frame: str) -> None:
+    """Check a decoded trajectory, whoever has decoded it, against the schedule."""
+    assert message.header.frame_id == frame
+    assert message.header.stamp.sec * 10**9 + message.header.stamp.nanosec == stamp_ns
+    assert tuple(message.joint_names) == schedule.joint_names
+    assert len(message.points) == len(schedule.positions)
+    period_ns = round(schedule.control_period * 1e9)
+    for k, point in enumerate(message.points):
+        np.testing.assert_array_equal(point.positions, schedule.positions[k])
+        held = np.zeros(len(schedule.joint_names))
+        if k < schedule.ticks:
+            held = (schedule.positions[k + 1] - schedule.positions[k]) / schedule.control_period
+        np.testing.assert_array_equal(point.velocities, held)
+        assert len(point.accelerations) == len(point.effort) == 0
+        since = point.time_from_start
+        assert since.sec * 10**9 + since.nanosec == k * period_ns
+        assert 0 <= since.nanosec < 10**9
+
+
+THREE = schedule_of(("slider_1", "slider_2", "slider_3"), np.arange(12.0).reshape(4, 3), 0.05)
+
+
+@settings(few_trajectories, max_examples=80)
+@given(schedules(), st.integers(0, 2**31 * 10**9 - 1), st.text("lmnop", max_size=9))
+@example(THREE, 0, "base_link")
+@example(THREE, 3, "base")
+def test_a_schedule_is_serialised_as_rclpy_would(
+    schedule: GaitSchedule, stamp_ns: int, frame: str
+) -> None:
+    raw = trajectory_message(schedule, stamp_ns, frame)
+    message = deserialize_message(raw, JointTrajectory)
+    check_trajectory(message, schedule, stamp_ns, frame)
+
+
+@pytest.mark.slow
+@few_trajectories
+@given(schedules(), st.integers(0, 2**31 * 10**9 - 1), st.text("lmnop", max_size=9))
+@example(THREE, 0, "base_link")
+def test_other_readers_take_a_serialised_schedule(
+    schedule: GaitSchedule, stamp_ns: int, frame: str
+) -> None:
+    raw = trajectory_message(schedule, stamp_ns, frame)
+    kind = "trajectory_msgs/msg/JointTrajectory"
+    by_rosbags = get_typestore(Stores.ROS2_JAZZY).deserialize_cdr(raw, kind)
+    check_trajectory(by_rosbags, schedule, stamp_ns, frame)
+    schema = Schema(id=1, name=kind, encoding="ros2msg", data=message_definition(kind).encode())
+    decode = DecoderFactory().decoder_for("cdr", schema)
+    assert decode is not None
+    check_trajectory(decode(raw), schedule, stamp_ns, frame)
+
+
+@pytest.mark.slow
+def test_a_long_schedule_is_whole() -> None:
+    # The gait of paper 1 has 98,001 points.
+    rng = np.random.default_rng(4)
+    schedule = schedule_of(("slider_1", "slider_2", "slider_3"), rng.normal(size=(98_001, 3)), 0.05)
+    raw = trajectory_message(schedule, 50_000_000, "base_link")
+    kind = "trajectory_msgs/msg/JointTrajectory"
+    message: Any = get_typestore(Stores.ROS2_JAZZY).deserialize_cdr(raw, kind)
+    assert len(message.points) == 98_001
+    np.testing.assert_array_equal([p.positions for p in message.points], schedule.positions)
+    last = message.points[-1].time_from_start
+    assert (last.sec, last.nanosec) == (4900, 0)

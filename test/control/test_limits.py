@@ -1,0 +1,459 @@
+"""Limits of actuators and of references."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import fields, replace
+from pathlib import Path
+
+import casadi as ca
+import numpy as np
+import pytest
+from control.flights import END_EFFECTOR, load, servicer_start
+from control.flights import pose as flown_pose
+from scipy.spatial.transform import Rotation
+from support.oracles import PinocchioOracle
+
+from spacerobot_ros.control import PROFILES, Actuation, ActuatorLimits, MotionLimits, reference
+from spacerobot_ros.control.reference import HeldVelocityReference, QuinticReference, StepReference
+from spacerobot_ros.control.state import (
+    JointReference,
+    PoseReference,
+    Reference,
+    TargetNotSetError,
+)
+from spacerobot_ros.errors import ParameterError
+from spacerobot_ros.model import SpaceRobot
+
+COMMAND = Actuation(np.array([3.0, 4.0, 12.0, -1.0, 2.0, 2.0]), np.array([5.0, -7.0]))
+
+
+def test_force_and_torque_keep_their_directions() -> None:
+    limits = ActuatorLimits(6.5, 1.5, np.array([6.0, 6.0]))
+    saturated = limits.apply(COMMAND)
+    wrench = saturated.realised.wrench_B
+    np.testing.assert_allclose(wrench[:3], COMMAND.wrench_B[:3] / 2)
+    np.testing.assert_allclose(wrench[3:], COMMAND.wrench_B[3:] / 2)
+    np.testing.assert_array_equal(saturated.realised.tau, [5.0, -6.0])
+    assert saturated.limited
+    np.testing.assert_allclose(saturated.excess.wrench_B, COMMAND.wrench_B - wrench)
+    np.testing.assert_array_equal(saturated.excess.tau, [0.0, -1.0])
+
+
+def test_force_and_torque_are_limited_apart() -> None:
+    saturated = ActuatorLimits(1.3, np.inf, np.full(2, np.inf)).apply(COMMAND)
+    np.testing.assert_allclose(saturated.realised.wrench_B[:3], COMMAND.wrench_B[:3] / 10)
+    np.testing.assert_array_equal(saturated.realised.wrench_B[3:], COMMAND.wrench_B[3:])
+    np.testing.assert_array_equal(saturated.realised.tau, COMMAND.tau)
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_efforts_of_all_joints_beyond_their_limits_are_lowered(sign: float) -> None:
+    limits = ActuatorLimits(np.inf, np.inf, np.array([2.0, 3.0]))
+    saturated = limits.apply(Actuation(np.zeros(6), sign * np.array([2.5, 7.0])))
+    np.testing.assert_array_equal(saturated.realised.tau, [sign * 2.0, sign * 3.0])
+    np.testing.assert_array_equal(saturated.excess.tau, [sign * 0.5, sign * 4.0])
+
+
+@pytest.mark.parametrize("limits", [(13.0, 3.0, 7.0), (np.inf, np.inf, np.inf)])
+def test_what_is_possible_passes(limits: tuple[float, float, float]) -> None:
+    force, torque, effort = limits
+    saturated = ActuatorLimits(force, torque, np.full(2, effort)).apply(COMMAND)
+    np.testing.assert_array_equal(saturated.realised.wrench_B, COMMAND.wrench_B)
+    np.testing.assert_array_equal(saturated.realised.tau, COMMAND.tau)
+    assert not saturated.limited
+
+
+def test_without_thrusters_or_motors() -> None:
+    saturated = ActuatorLimits(0.0, 0.0, np.zeros(2)).apply(COMMAND)
+    np.testing.assert_array_equal(saturated.realised.wrench_B, 0.0)
+    np.testing.assert_array_equal(saturated.realised.tau, 0.0)
+    still = ActuatorLimits(0.0, 0.0, np.zeros(2)).apply(Actuation(np.zeros(6), np.zeros(2)))
+    assert not still.limited
+
+
+@pytest.mark.parametrize(
+    ("force", "torque", "effort", "sentence"),
+    [
+        (-1.0, 1.0, 1.0, "force limit"),
+        (1.0, np.nan, 1.0, "torque limit"),
+        (1.0, 1.0, -1.0, "effort limits"),
+        (1.0, 1.0, np.nan, "effort limits"),
+    ],
+)
+def test_limits_that_are_refused(force: float, torque: float, effort: float, sentence: str) -> None:
+    with pytest.raises(ParameterError, match=sentence):
+        ActuatorLimits(force, torque, np.array([1.0, effort]))
+
+
+# -- references that small thrusters can follow, against Pinocchio's rigid-body inertia ----------
+
+
+URDF = Path(__file__).parents[2] / "urdf" / "servicer.urdf"
+FAST = MotionLimits(1.0, 1e3, 1.0, 1e3)
+REST = np.array([0.0, 0.0, 0.0, 1.0])
+
+
+@pytest.fixture(scope="module")
+def robot() -> SpaceRobot:
+    return SpaceRobot.from_file(URDF)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize(("force", "torque"), [(0.5, 10.0), (5.0, 0.2)])
+def test_a_rigid_robot_is_accelerated_by_half_the_thrust(
+    robot: SpaceRobot, seed: int, force: float, torque: float
+) -> None:
+    rng = np.random.default_rng(seed)
+    q = rng.uniform(-1.5, 1.5, robot.n)
+    limits = ActuatorLimits(force, torque, robot.effort_limit)
+    motion = FAST.within_thruster_limits(limits, robot, q)
+    oracle = PinocchioOracle(robot.description.urdf, robot.joint_names)
+    oracle.place(q, REST, np.zeros(3))
+    M = oracle.own_mass_matrix()[:6, :6]
+    center = oracle.center_of_mass_W()
+    forces, turning, both = [], [], []
+    for _ in range(2000):
+        a, alpha = (x / np.linalg.norm(x) for x in rng.normal(size=(2, 3)))
+        a, alpha = a * motion.acceleration, alpha * motion.angular_acceleration
+        wrench = M @ np.concatenate([a - np.cross(alpha, center), alpha])
+        forces.append(np.linalg.norm(wrench[:3]))
+        both.append(np.linalg.norm(wrench[3:]))
+        about_center = M @ np.concatenate([-np.cross(alpha, center), alpha])
+        turning.append(np.linalg.norm(about_center[3:]))
+    assert max(both) <= torque
+    assert max(turning) == pytest.approx(torque / 2, rel=0.01)
+    lever = np.linalg.norm(center)
+    assert max(forces) == pytest.approx(min(force / 2, torque / 2 / lever), rel=1e-9)
+
+
+def test_strong_thrusters_and_none_at_all_leave_the_limits_as_they_are(robot: SpaceRobot) -> None:
+    motion = MotionLimits()
+    q = np.zeros(robot.n)
+    for force, torque in ((np.inf, np.inf), (1e9, 1e9), (0.0, 0.0)):
+        limits = ActuatorLimits(force, torque, robot.effort_limit)
+        assert motion.within_thruster_limits(limits, robot, q) == motion
+
+
+# -- reference profiles: quintics of poses and joints, held velocities, and their ----------------
+
+
+LIMITS = MotionLimits(0.5, 0.25, 0.75, 0.5, 0.2, 0.1)
+
+
+def pose(position: list[float], rotvec: list[float]) -> PoseReference:
+    return PoseReference(np.array(position), Rotation.from_rotvec(rotvec).as_quat())
+
+
+def joints(*q: float) -> JointReference:
+    return JointReference(np.array(q), np.zeros(len(q)), np.zeros(len(q)))
+
+
+START = Reference(
+    pose([0.1, -0.2, 0.3], [0.2, 0.1, -0.4]),
+    pose([1.0, 0.5, 0.0], [0.0, 0.9, 0.0]),
+    joints(0.3, -1),
+)
+GOAL = Reference(
+    pose([0.6, 0.4, 0.1], [-0.3, 0.5, 0.1]),
+    pose([1.2, 0.9, -0.4], [0.4, 0.3, 0.2]),
+    joints(-0.1, 0),
+)
+
+
+def numbers(found: Reference) -> np.ndarray:
+    parts: list[np.ndarray] = []
+    for each in (found.base, found.end_effector):
+        assert each is not None
+        parts += [each.position, each.quaternion, each.velocity, each.angular_velocity]
+        parts += [each.acceleration, each.angular_acceleration]
+    assert found.joints is not None
+    return np.concatenate([*parts, found.joints.q, found.joints.qdot, found.joints.qddot])
+
+
+def test_a_profile_lasts_as_long_as_its_slowest_part() -> None:
+    made = QuinticReference(START, GOAL, LIMITS)
+    peak, share = 15 / 8, 10 / math.sqrt(3)
+
+    def least(distance: float, speed: float, acceleration: float) -> float:
+        return max(peak * distance / speed, math.sqrt(share * distance / acceleration))
+
+    parts = {
+        "base": least(math.sqrt(0.65), 0.5, 0.25),
+        "end_effector": least(0.6, 0.5, 0.25),
+        "joints": least(1.0, 0.2, 0.1),
+    }
+    for name in ("base", "end_effector"):
+        begin, end = getattr(START, name), getattr(GOAL, name)
+        turn = Rotation.from_quat(begin.quaternion).inv() * Rotation.from_quat(end.quaternion)
+        parts[name] = max(parts[name], least(turn.magnitude(), 0.75, 0.5))
+    assert made.duration == pytest.approx(max(parts.values()))
+    for name, duration in parts.items():
+        kept = {each: None for each in parts if each != name}
+        one = QuinticReference(_without(START, kept), _without(GOAL, kept), LIMITS)
+        assert one.duration == pytest.approx(duration)
+    # Two poses or shapes that are equal need no time.
+    assert QuinticReference(START, START, LIMITS).duration == 0.0
+    assert QuinticReference(Reference(), Reference(), LIMITS).duration == 0.0
+    with pytest.raises(TargetNotSetError, match=r"^The base has a goal, but no pose to start"):
+        QuinticReference(Reference(), GOAL, LIMITS)
+
+
+def _without(given: Reference, parts: dict[str, None]) -> Reference:
+    names = ("base", "end_effector", "joints")
+    return Reference(*(None if name in parts else getattr(given, name) for name in names))
+
+
+def test_a_profile_leads_from_start_to_goal_and_its_rates_are_its_slopes() -> None:
+    made = QuinticReference(START, GOAL, LIMITS)
+    T, h = made.duration, 1e-5
+    np.testing.assert_allclose(numbers(made.at(-1.0)), numbers(START), atol=1e-12)
+    assert made.at(T) is made.goal
+    for t in (0.2 * T, 0.7 * T):
+        before, now, after = made.at(t - h), made.at(t), made.at(t + h)
+        for name in ("base", "end_effector"):
+            a, m, b = (getattr(each, name) for each in (before, now, after))
+            np.testing.assert_allclose(m.velocity, (b.position - a.position) / (2 * h), atol=1e-8)
+            np.testing.assert_allclose(
+                m.acceleration, (b.velocity - a.velocity) / (2 * h), atol=1e-8
+            )
+            turn = Rotation.from_quat(b.quaternion) * Rotation.from_quat(a.quaternion).inv()
+            np.testing.assert_allclose(m.angular_velocity, turn.as_rotvec() / (2 * h), atol=1e-8)
+            np.testing.assert_allclose(
+                m.angular_acceleration,
+                (b.angular_velocity - a.angular_velocity) / (2 * h),
+                atol=1e-8,
+            )
+        a, m, b = before.joints, now.joints, after.joints
+        assert a is not None
+        assert m is not None
+        assert b is not None
+        np.testing.assert_allclose(m.qdot, (b.q - a.q) / (2 * h), atol=1e-8)
+        np.testing.assert_allclose(m.qddot, (b.qdot - a.qdot) / (2 * h), atol=1e-8)
+
+
+@pytest.mark.parametrize("kind", [QuinticReference, StepReference])
+def test_the_expression_of_a_profile_is_the_profile(kind: type) -> None:
+    made = kind(START, GOAL, LIMITS)
+    for base, hand, n in ((True, True, 2), (True, False, 0), (False, True, 2), (False, False, 2)):
+        given = reference.profile_numbers(made, base, hand, n)
+        size = reference.profile_size(base, hand, n)
+        assert len(given) == size == 1 + 25 * (base + hand) + 3 * n
+        symbols, time = ca.SX.sym("p", size), ca.SX.sym("t")
+        expression = reference.profile_expression(symbols, time, base, hand, n)
+        function = ca.Function("f", [symbols, time], [expression])
+        kept = np.repeat([base, hand], 19).tolist() + [n > 0] * 6
+        for t in (-1e4, 0.0, 0.3 * made.duration, 0.999 * made.duration, made.duration, 99.0):
+            found = np.array(function(given, t)).ravel()
+            np.testing.assert_allclose(found, numbers(made.at(t))[kept], atol=1e-12)
+
+
+def test_one_function_evaluates_one_profile_after_the_other() -> None:
+    function = reference.ProfileFunction(True, False, 2)
+    kept = np.repeat([True, False], 19).tolist() + [True] * 6
+    back = QuinticReference(GOAL, START, LIMITS)
+    for made, share in ((QuinticReference(START, GOAL, LIMITS), 0.3), (back, 0.3), (back, 0.8)):
+        time = share * made.duration
+        found = function.at(made, time)
+        assert found is not None
+        np.testing.assert_allclose(found, numbers(made.at(time))[kept], atol=1e-12)
+    without = QuinticReference(START, _without(GOAL, {"joints": None}), LIMITS)
+    assert function.at(without, 0.0) is None
+    assert function.at(back, 0.0) is not None
+
+
+def test_held_velocities_have_their_mean_and_their_jump_at_a_command() -> None:
+    held = HeldVelocityReference(0.25)
+    velocity = np.array([1.0, -2.0])
+    first = held.at_command(np.array([0.5, 0.25]), velocity)
+    assert (first.qdot.tolist(), first.qddot.tolist()) == ([1.0, -2.0], [0.0, 0.0])
+    velocity[:] = 3.0, 1.0
+    second = held.at_command(np.array([0.75, -0.25]), velocity)
+    assert second.q.tolist() == [0.75, -0.25]
+    assert (second.qdot.tolist(), second.qddot.tolist()) == ([2.0, -0.5], [8.0, 12.0])
+    assert first.qdot.tolist() == [1.0, -2.0]
+
+
+# -- references from start to goal ---------------------------------------------------------------
+
+
+SIX_LIMITS = MotionLimits(0.3, 0.2, 0.5, 0.4, 0.6, 0.7)
+STEP = 1e-4
+
+
+def random_pose(rng: np.random.Generator) -> PoseReference:
+    return PoseReference(rng.uniform(-2, 2, 3), Rotation.random(random_state=rng).as_quat())
+
+
+def random_profile(seed: int) -> QuinticReference:
+    rng = np.random.default_rng(seed)
+    start, goal = (
+        Reference(random_pose(rng), random_pose(rng), JointReference.at_rest(rng.uniform(-1, 1, 4)))
+        for _ in range(2)
+    )
+    return QuinticReference(start, goal, SIX_LIMITS)
+
+
+def parts(reference: Reference) -> tuple[PoseReference, PoseReference, JointReference]:
+    assert reference.base is not None
+    assert reference.end_effector is not None
+    assert reference.joints is not None
+    return reference.base, reference.end_effector, reference.joints
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_quintic_goes_from_rest_at_the_start_to_rest_at_the_goal(seed: int) -> None:
+    profile = random_profile(seed)
+    for time, wanted in ((0.0, profile.start), (profile.duration * (1 - 1e-9), profile.goal)):
+        for found, end in zip(parts(profile.at(time))[:2], parts(wanted)[:2], strict=True):
+            np.testing.assert_allclose(found.position, end.position, atol=1e-9)
+            turn = Rotation.from_quat(found.quaternion).inv() * Rotation.from_quat(end.quaternion)
+            assert turn.magnitude() < 1e-9
+            for rate in (found.velocity, found.angular_velocity, found.acceleration):
+                np.testing.assert_allclose(rate, 0.0, atol=1e-7)
+        joints = parts(profile.at(time))[2]
+        np.testing.assert_allclose(joints.q, parts(wanted)[2].q, atol=1e-9)
+        np.testing.assert_allclose(joints.qddot, 0.0, atol=1e-7)
+    assert profile.at(profile.duration) is profile.goal
+    np.testing.assert_array_equal(
+        parts(profile.at(-1.0))[0].position, parts(profile.start)[0].position
+    )
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_velocities_and_accelerations_are_derivatives(seed: int) -> None:
+    profile = random_profile(seed)
+    for fraction in (0.1, 0.5, 0.83):
+        time = fraction * profile.duration
+        before, now, after = (parts(profile.at(time + dt)) for dt in (-STEP, 0.0, STEP))
+        for i in (0, 1):
+            b, n, a = before[i], now[i], after[i]
+            assert isinstance(b, PoseReference)
+            assert isinstance(n, PoseReference)
+            assert isinstance(a, PoseReference)
+            np.testing.assert_allclose(
+                n.velocity, (a.position - b.position) / (2 * STEP), atol=1e-6
+            )
+            turn = Rotation.from_quat(a.quaternion) * Rotation.from_quat(b.quaternion).inv()
+            np.testing.assert_allclose(n.angular_velocity, turn.as_rotvec() / (2 * STEP), atol=1e-6)
+            for value, rate in (
+                ("velocity", n.acceleration),
+                ("angular_velocity", n.angular_acceleration),
+            ):
+                change = getattr(a, value) - getattr(b, value)
+                np.testing.assert_allclose(rate, change / (2 * STEP), atol=1e-6)
+        joints = [found[2] for found in (before, now, after)]
+        np.testing.assert_allclose(
+            joints[1].qdot, (joints[2].q - joints[0].q) / (2 * STEP), atol=1e-6
+        )
+        np.testing.assert_allclose(
+            joints[1].qddot, (joints[2].qdot - joints[0].qdot) / (2 * STEP), atol=1e-6
+        )
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_limits_are_kept_and_one_is_used_up(seed: int) -> None:
+    profile = random_profile(seed)
+    used = []
+    for time in np.linspace(0.0, profile.duration, 1001):
+        base, end_effector, joints = parts(profile.at(float(time)))
+        demands = [
+            *np.abs(joints.qdot) / SIX_LIMITS.joint_speed,
+            *np.abs(joints.qddot) / SIX_LIMITS.joint_acceleration,
+        ]
+        for frame in (base, end_effector):
+            demands += [
+                np.linalg.norm(frame.velocity) / SIX_LIMITS.speed,
+                np.linalg.norm(frame.acceleration) / SIX_LIMITS.acceleration,
+                np.linalg.norm(frame.angular_velocity) / SIX_LIMITS.angular_speed,
+                np.linalg.norm(frame.angular_acceleration) / SIX_LIMITS.angular_acceleration,
+            ]
+        used.append(max(demands))
+    assert 0.999 < max(used) <= 1.0 + 1e-9
+
+
+@pytest.mark.parametrize("group", ["base", "end_effector", "joints"])
+@pytest.mark.parametrize("kind", ["position", "attitude"])
+@pytest.mark.parametrize("bound", ["speed", "acceleration"])
+def test_every_limit_sets_the_pace_where_it_alone_is_small(
+    group: str, kind: str, bound: str
+) -> None:
+    """The duration by hand: a quintic over d has rates up to 15/8 d/T, and 10/sqrt(3) d/T^2."""
+    prefix = "joint_" if group == "joints" else "angular_" if kind == "attitude" else ""
+    wide = {limit.name: 1e3 for limit in fields(MotionLimits)}
+    small = 0.05
+    limits = MotionLimits(**{**wide, prefix + bound: small})
+    # Distance and angle differ, and so do those of base and end-effector.
+    far = {
+        "base": flown_pose([1, 2, -2], [0.6, 0, 0]),
+        "end_effector": flown_pose([0, 5, 0], [0, 0, 0.8]),
+    }
+    still = flown_pose([0, 0, 0])
+    d = {"base": (3.0, 0.6), "end_effector": (5.0, 0.8)}.get(group, (0.7, 0.7))
+    start = Reference(still, still, JointReference.at_rest(np.zeros(2)))
+    goal = replace(start, joints=JointReference.at_rest(np.array([-0.7, 0.2])))
+    if group != "joints":
+        base, end_effector = (far[n] if n == group else still for n in far)
+        goal = Reference(base, end_effector, start.joints)
+    length = d[1] if kind == "attitude" else d[0]
+    wanted = 15 / 8 * length / small
+    if bound == "acceleration":
+        wanted = np.sqrt(10 / np.sqrt(3) * length / small)
+    assert QuinticReference(start, goal, limits).duration == pytest.approx(wanted, rel=1e-12)
+
+
+def test_positions_move_on_a_line_and_attitudes_about_one_axis() -> None:
+    start = Reference(base=flown_pose([1, 2, 3], [0.3, -0.2, 0.1]))
+    goal = Reference(base=flown_pose([2, 0, 3], [-0.4, 0.5, 1.1]))
+    profile = QuinticReference(start, goal, SIX_LIMITS)
+    first = Rotation.from_rotvec([0.3, -0.2, 0.1])
+    whole = Rotation.from_rotvec([-0.4, 0.5, 1.1]) * first.inv()
+    for fraction in (0.2, 0.5, 0.7):
+        base = profile.at(fraction * profile.duration).base
+        assert base is not None
+        s = fraction**3 * (10 - 15 * fraction + 6 * fraction**2)
+        np.testing.assert_allclose(base.position, np.array([1 + s, 2 - 2 * s, 3]), atol=1e-12)
+        turn = Rotation.from_quat(base.quaternion) * first.inv()
+        np.testing.assert_allclose(turn.as_rotvec(), s * whole.as_rotvec(), atol=1e-12)
+
+
+def test_step_is_the_goal_at_once() -> None:
+    start, goal = (
+        Reference(base=flown_pose([0, 0, 0])),
+        Reference(base=flown_pose([1, 0, 0])),
+    )
+    profile = StepReference(start, goal, SIX_LIMITS)
+    assert profile.duration == 0.0
+    assert profile.at(0.0) is goal
+    assert set(PROFILES) == {"step", "quintic"}
+
+
+def test_goal_at_the_start_takes_no_time() -> None:
+    there = Reference(base=flown_pose([1, 2, 3], [0.1, 0.2, 0.3]))
+    profile = QuinticReference(there, there, SIX_LIMITS)
+    assert profile.duration < 1e-6
+    assert profile.at(1e-6) is there
+
+
+def test_what_has_no_goal_is_not_in_the_reference() -> None:
+    robot, start = load("servicer"), servicer_start()
+    present = Reference.present(robot, start, END_EFFECTOR)
+    profile = QuinticReference(present, Reference(base=flown_pose([1, 0, 0])), SIX_LIMITS)
+    reference = profile.at(0.5)
+    assert reference.base is not None
+    assert reference.end_effector is None
+    assert reference.joints is None
+
+
+def test_goal_without_a_start_is_refused() -> None:
+    present = Reference.present(load("servicer"), servicer_start())
+    assert present.end_effector is None
+    with pytest.raises(TargetNotSetError, match="end-effector has a goal"):
+        QuinticReference(present, Reference(end_effector=flown_pose([1, 0, 0])), SIX_LIMITS)
+
+
+@pytest.mark.parametrize("value", [0.0, -1.0, np.nan])
+def test_limits_of_references_that_are_refused(value: float) -> None:
+    with pytest.raises(ParameterError, match="'angular_speed'"):
+        replace(SIX_LIMITS, angular_speed=value)
