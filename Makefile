@@ -67,10 +67,6 @@ test-oldest: ## run the quick tests with the versions of Ubuntu 24.04, in .venv-
 
 OLDEST := click lxml lz4 matplotlib numpy pin pyarrow pyparsing PyYAML scipy zstandard
 
-.PHONY: viewer-test
-viewer-test: $(STAMP)/test ## fly from the viewer's page in Chromium, and look at recordings there
-	$(BIN)/python3 -m pytest -m 'slow or not slow' test/viewer
-
 # The wheel carries axe-core's script; what it depends on is not needed.
 AXE := axe-playwright-python==0.1.8
 $(STAMP)/axe.min.js: | $(STAMP)/test
@@ -79,114 +75,29 @@ $(STAMP)/axe.min.js: | $(STAMP)/test
 	@cp $(STAMP)/axe/axe_playwright_python/axe.min.js $@
 	@rm -rf $(STAMP)/axe $(STAMP)/axe_playwright_python-*.whl
 
-.PHONY: accessibility
-accessibility: $(STAMP)/test $(STAMP)/axe.min.js ## check contrast, names and keys of all pages with axe-core; pictures in out/pages
-	SPACEROBOT_PICTURES=out/pages $(BIN)/python3 -m pytest -m slow -rs test/viewer/test_accessibility.py
-
-.PHONY: page-pictures
-page-pictures: $(STAMP)/test ## drive the live page in flight, desktop and phone, dark and light; pictures in out/pages
-	SPACEROBOT_PICTURES=out/pages $(BIN)/python3 -m pytest -m slow -rs test/viewer/test_page_pictures.py
-
-.PHONY: fuzz
-fuzz: $(STAMP)/test ## try more than ten thousand inputs that nobody would send, and count them
-	SPACEROBOT_FUZZ=long $(BIN)/python3 -m pytest -q test/fuzz
-
 .PHONY: known-errors
 known-errors: $(STAMP)/test ## put each known error into the package; the tests must notice it; ONLY=WORD: some
-	PYTHONPATH=test $(BIN)/python3 -m support.known_errors $(if $(filter-out many,$(ONLY)),"$(ONLY)")
-
-.PHONY: passage
-passage: $(STAMP)/test ## change every parameter in a flight: it reaches the quantities that it is to change, and no others
-	$(BIN)/python3 -m pytest -q -m "slow or not slow" test/passage
+	PYTHONPATH=test $(BIN)/python3 -m support.known_errors $(if $(ONLY),"$(ONLY)")
 
 .PHONY: expected
 expected: $(STAMP)/test ## write what the tests expect of parameters and plans anew, where a change is wanted
 	PYTHONPATH=.:test $(BIN)/python3 -m support.expected
 
-.PHONY: hostile-bags
-hostile-bags: $(STAMP)/test ## read bags that were made to harm their reader, each in a process of its own
-	$(BIN)/python3 -m pytest -m 'slow or not slow' -rP test/bag/test_hostile_bags.py
+STUDIES := $(shell sed -n 's/^\([a-z-]*\):$$/\1/p' test/studies.yaml)
+STUDY := PYTHONPATH=.:test nice $(BIN)/python3 -m support.studies
 
-.PHONY: attacks
-attacks: $(STAMP)/test ## try files and words that were made to harm or mislead, each in a process of its own; see out/attacks.md
-	$(BIN)/python3 -m pytest -q -m "slow or not slow" test/attacks
+.PHONY: studies $(STUDIES)
+studies: $(STAMP)/test ## list the studies of test/studies.yaml: make NAME COUNT=.. SEED=.. ONLY=..
+	@$(STUDY)
 
-.PHONY: reports
-reports: $(STAMP)/test ## fly every scenario, make its report, open it in Chromium at desktop and phone width; pictures in out/reports
-	SPACEROBOT_PICTURES=out/reports $(BIN)/python3 -m pytest -m slow -rP test/report/test_every_report.py
-
-DRAWS ?= 1000
-.PHONY: servicing-campaign
-servicing-campaign: $(STAMP)/test ## fly DRAWS draws of the campaign servicing; goes on where it was ended; see out/servicing-campaign
-	nice $(BIN)/spacerobot campaign examples/campaigns/servicing.yaml --flights $(DRAWS) --out out/servicing-campaign
-
-CLEAR_GOALS ?= 50
-.PHONY: clear-plans
-clear-plans: $(STAMP)/test ## plan CLEAR_GOALS random goals each of six robots with and without clearance, and list distances
-	SPACEROBOT_CLEAR_GOALS=$(CLEAR_GOALS) $(BIN)/python3 -m pytest -q -s -m slow test/planning/test_many_plans.py -k "random_goals or clearance_costs"
-
-DRIFTING_CASES ?= 7
-.PHONY: drifting-plans
-drifting-plans: $(STAMP)/test ## plan DRIFTING_CASES random cases each of three robots and three drifts, flown by Pinocchio, and list durations
-	SPACEROBOT_DRIFTING_CASES=$(DRIFTING_CASES) $(BIN)/python3 -m pytest -q -s -m slow test/planning/test_drift.py -k robots_that_drift_are_planned_for
-
-FLOWN_TIMES ?= 10
-.PHONY: flown-times
-flown-times: $(STAMP)/test ## compare the times of FLOWN_TIMES plans each of ten robots with those of the solutions
-	SPACEROBOT_FLOWN_TIMES=$(FLOWN_TIMES) $(BIN)/python3 -m pytest -q -s -m slow test/planning/test_many_plans.py -k flown_times
-
-LONG_SEARCHES ?= 12
-.PHONY: long-searches
-long-searches: $(STAMP)/test ## compare the durations of LONG_SEARCHES plans each of three robots, with a position or a shape, with those of searches from 60 guesses
-	SPACEROBOT_LONG_SEARCHES=$(LONG_SEARCHES) $(BIN)/python3 -m pytest -q -s -m slow test/planning/test_many_plans.py -k long_searches
-
-CLEAR_FLIGHTS ?= 100
-.PHONY: clear-flights
-clear-flights: $(STAMP)/test ## fly CLEAR_FLIGHTS draws each of four robots with noise, wrong masses and corrections, and list the smallest distances
-	SPACEROBOT_CLEAR_FLIGHTS=$(CLEAR_FLIGHTS) $(BIN)/python3 -m pytest -q -s -m slow test/planning/test_many_plans.py -k flights_with_errors
-
-COUNT ?= 2000
-SEED ?= 1
-ONLY ?= many
-
-.PHONY: actions
-actions: $(STAMP)/test ## do COUNT random actions in lockstep and as many in real time, from SEED
-	SPACEROBOT_ACTIONS=$(COUNT) SPACEROBOT_ACTIONS_SEED=$(SEED) \
-	    $(BIN)/python3 -m pytest -q -s -m slow -k "$(ONLY)" test/nodes/test_random_actions.py
-
-INTERLEAVINGS ?= 200
-.PHONY: action-interleavings
-action-interleavings: $(STAMP)/test ## send goals by actions and topics, abort, cancel, change life, INTERLEAVINGS times from SEED, with interfaces built here
-	SPACEROBOT_INTERLEAVINGS=$(INTERLEAVINGS) SPACEROBOT_INTERLEAVINGS_SEED=$(SEED) \
-	    $(BIN)/python3 -m pytest -q -s -m slow test/packaging/test_real_actions.py
-
-.PHONY: rosdep-keys
-rosdep-keys: $(STAMP)/test ## compare the keys of the manifests with ROSDISTRO, a checkout of ros/rosdistro
-	@test -n "$(ROSDISTRO)" || { echo "name a checkout: make rosdep-keys ROSDISTRO=PATH" >&2; exit 1; }
-	SPACEROBOT_ROSDISTRO=$(ROSDISTRO) $(BIN)/python3 -m pytest -q -s -m "slow or not slow" test/packaging/test_rosdep_keys.py
-
-.PHONY: first-flights
-first-flights: $(STAMP)/test ## fly robots of others from their URDFs to a goal by `spacerobot new`, with minutes taken
-	$(BIN)/python3 -m pytest -q -s -m slow test/cli/test_first_flights.py
-
-GOALS ?= 100
-.PHONY: foreign-robots
-foreign-robots: $(STAMP)/test ## plan GOALS random goals each for robots that are in no paper; goes on where it was ended; ONLY=WORD: some
-	PYTHONPATH=.:test nice $(BIN)/python3 test/foreign_robots/run.py --goals $(GOALS) --only "$(filter-out many,$(ONLY))"
-
-HAND_GOALS ?= 40
-.PHONY: hand-goals
-hand-goals: $(STAMP)/test ## plan HAND_GOALS random goals of end-effectors for each of five robots; Pinocchio checks where they end; ONLY=WORD: some
-	PYTHONPATH=.:test nice $(BIN)/python3 test/planning/hand_goals.py --goals $(HAND_GOALS) --only "$(ONLY)"
-
-.PHONY: campaigns
-campaigns: $(STAMP)/test ## kill workers and campaigns, fly rows again: the slow tests of campaigns and flights
-	$(BIN)/python3 -m pytest -m slow test/campaign test/flight
+accessibility: $(STAMP)/axe.min.js
+$(STUDIES): $(STAMP)/test
+	COUNT="$(COUNT)" SEED="$(SEED)" ONLY="$(ONLY)" ROSDISTRO="$(ROSDISTRO)" $(STUDY) $@
 
 .PHONY: bench
 bench: $(STAMP)/bench ## measure what users wait for, in processor time; AGAINST=PATH: in turns with another checkout; ONLY=WORD: some
 	$(BIN)/python3 -m pytest benchmarks -q --benchmark-columns=median,iqr,rounds --benchmark-sort=fullname \
-	    $(if $(AGAINST),--against $(AGAINST)) $(if $(filter-out many,$(ONLY)),-k "$(ONLY)")
+	    $(if $(AGAINST),--against $(AGAINST)) $(if $(ONLY),-k "$(ONLY)")
 
 .PHONY: real-time
 real-time: $(STAMP)/bench ## fly ten minutes in real time in separate processes, at 100, then 200 and 500 Hz

@@ -12,7 +12,10 @@ from catkin_pkg.package import parse_package
 import spacerobot_ros
 
 ROOT = Path(__file__).resolve().parents[2]
-TARGETS = set(re.findall(r"^([a-z-]+):.*## ", (ROOT / "Makefile").read_text(), re.MULTILINE))
+TARGETS = {
+    *re.findall(r"^([a-z-]+):.*## ", (ROOT / "Makefile").read_text(), re.MULTILINE),
+    *yaml.safe_load((ROOT / "test/studies.yaml").read_text("utf-8")),
+}
 CONTRIBUTING = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
 
 

@@ -32,7 +32,10 @@ WORKFLOWS: dict[str, dict[str, Any]] = {
 }
 SCRIPTS = [ROOT / ".ci" / name for name in ("control_by_manager", "launch_stack", "run")]
 PAGES = [ROOT / "README.md", *sorted(ROOT.glob("docs/**/*.md"))]
-TARGETS = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text("utf-8"), re.MULTILINE))
+TARGETS = {
+    *re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text("utf-8"), re.MULTILINE),
+    *yaml.safe_load((ROOT / "test/studies.yaml").read_text("utf-8")),
+}
 TO_PUBLISH = {
     *("--once", "-w", "--keep-alive", "--rate", "--qos-durability", "--qos-reliability"),
 }
