@@ -35,6 +35,11 @@ def import_mujoco() -> Any:
     return optional_module("mujoco", "mujoco", "Flights in MuJoCo need")
 
 
+def body_name(link: str) -> str:
+    """Return the name of a link's body in MuJoCo, whose own world is called ``world``."""
+    return "link world" if link == "world" else link
+
+
 def robot_spec(mujoco: Any, description: RobotDescription) -> Any:
     """Return MuJoCo's specification of a robot whose base is free; its shapes are left out.
 
@@ -52,6 +57,9 @@ def robot_spec(mujoco: Any, description: RobotDescription) -> Any:
     for link in root.iter("link"):
         for shape in [*link.findall("visual"), *link.findall("collision")]:
             link.remove(shape)  # MuJoCo would look for the files of meshes.
+        link.set("name", body_name(link.get("name", "")))
+    for end in (*root.iter("parent"), *root.iter("child")):
+        end.set("link", body_name(end.get("link", "")))
     try:
         spec = mujoco.MjSpec.from_string(ElementTree.tostring(root, encoding="unicode"))
     except ValueError as error:
@@ -184,7 +192,7 @@ def _set_masses(spec: Any, robot: RobotDescription) -> None:
     """Give each rigid body the mass properties of the description, which may not be its URDF's."""
     bodies = {body.name: body.inertia for body in robot.bodies}
     for link in robot.links:
-        body, inertia = spec.body(link.name), bodies.get(link.name)
+        body, inertia = spec.body(body_name(link.name)), bodies.get(link.name)
         body.explicitinertial = True
         body.mass = 0.0 if inertia is None else inertia.mass
         if inertia is not None:
@@ -216,7 +224,7 @@ def _add_target(mujoco: Any, spec: Any, target: RobotDescription) -> None:
 
 def _add_shape(mujoco: Any, spec: Any, solid: Solid, name: str, prefix: str = "") -> str:
     """Add a solid to its body, without mass, and return the name of its geometry."""
-    body = spec.worldbody if solid.is_obstacle else spec.body(f"{prefix}{solid.link}")
+    body = spec.worldbody if solid.is_obstacle else spec.body(body_name(f"{prefix}{solid.link}"))
     kinds, size = mujoco.mjtGeom, solid.shape.size
     # Pairs that push are named one by one.
     about: dict[str, Any] = {"name": name, "mass": 0.0, "contype": 0, "conaffinity": 0}
@@ -270,7 +278,7 @@ class MujocoLoads:
     def __init__(self, mujoco: Any, model: Any, data: Any, links: Sequence[str]) -> None:
         self._mujoco, self._model, self._data = mujoco, model, data
         self._layout = LoadLayout(len(links))
-        self.bodies = np.array([model.body(name).id for name in links])
+        self.bodies = np.array([model.body(body_name(name)).id for name in links])
         """Indices of the links' bodies."""
 
     def apply(self, vector: Array, time: float) -> None:

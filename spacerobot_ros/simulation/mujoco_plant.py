@@ -34,6 +34,7 @@ from spacerobot_ros.simulation.loads import PlantLoads
 from spacerobot_ros.simulation.mujoco_model import (
     TARGET,
     MujocoLoads,
+    body_name,
     build_model,
     import_mujoco,
     joint_addresses,
@@ -125,7 +126,7 @@ class MujocoPlant:
         self._q, self._qdot = joint_addresses(model, robot.description)
         self._link_poses = robot.buffered("link_poses")
         self._applied = MujocoLoads(mujoco, model, self._data, robot.link_names)
-        self._root = int(model.body(robot.base_link).id)
+        self._root = int(model.body(body_name(robot.base_link)).id)
         self._target_body = -1
         if self._target is not None:
             root = f"{TARGET}{self._target.description.base_link}"
@@ -407,7 +408,8 @@ class MujocoPlant:
         R_WB = matrix_from_quaternion(self.pose[3:])
         self.twist[:3], self.twist[3:] = R_WB.T @ data.qvel[:3], data.qvel[3:6]
         self.q[:], self.qdot[:] = data.qpos[self._q], data.qvel[self._qdot]
-        self.link_R[:], self.link_r[:] = self._link_poses(self.q)
+        link_R, link_r = self._link_poses(self.q)
+        self.link_R[:], self.link_r[:] = link_R, link_r.reshape(3, -1)  # A vector, of one link.
         momenta = self._momenta_of(self._root)
         if self.holds_target:
             target = self._target_body

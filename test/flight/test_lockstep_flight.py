@@ -143,6 +143,46 @@ def test_what_is_saved_is_verified_and_read_back(tmp_path: Path) -> None:
         flight.save(tmp_path / "saved.mcap")
 
 
+HULL = """<link name="{name}">
+  <inertial><origin xyz="0.02 0.01 -0.03"/><mass value="12"/>
+    <inertia ixx="0.2" iyy="0.25" izz="0.3" ixy="0.01" ixz="0" iyz="0"/></inertial>
+  <visual><geometry><box size="0.3 0.2 0.25"/></geometry></visual>
+  <collision><geometry><box size="0.3 0.2 0.25"/></geometry></collision></link>"""
+ARM = """<link name="arm"><inertial><origin xyz="0.1 0 0.02"/><mass value="1.5"/>
+    <inertia ixx="0.01" iyy="0.02" izz="0.02" ixy="0" ixz="0" iyz="0"/></inertial></link>
+  <joint name="elbow" type="revolute"><parent link="world"/><child link="arm"/>
+    <origin xyz="0.2 0.05 0" rpy="0.1 0 0.3"/><axis xyz="0 0 1"/>
+    <limit lower="-2" upper="2" effort="5" velocity="1"/></joint>"""
+
+
+@pytest.mark.parametrize(
+    "links",
+    [
+        pytest.param(HULL.format(name="hull"), id="one link"),
+        pytest.param(HULL.format(name="world") + ARM, id="a root called world"),
+    ],
+)
+def test_robots_of_others_are_flown_saved_and_verified_by_both_engines(
+    links: str, tmp_path: Path
+) -> None:
+    file, bag = tmp_path / "robot.urdf", tmp_path / "robot.mcap"
+    file.write_text(f'<robot name="theirs">{links}</robot>')
+    scenario = tmp_path / "flight.yaml"
+    scenario.write_text(
+        "scenario: {ros__parameters: {goal_position: [0.1, -0.05, 0.02],"
+        " goal_rotvec: [0.1, 0.0, 0.2]}}\n"
+        f"/**/plant: {{ros__parameters: {{robot: {file}, tick_rate: 20.0, actuation: effort}}}}\n"
+        f"/**/coordinated_control: {{ros__parameters: {{robot: {file}, tick_rate: 20.0}}}}\n"
+    )
+    run = run_scenario(load_scenario(str(scenario)), bag)
+    assert run.succeeded, run.message
+    verified = verify_bag(bag, mujoco=True)
+    assert verified.difference is None
+    other = verified.second_opinion
+    assert other is not None
+    assert max(other.position, other.attitude, other.joints) < 1e-10
+
+
 def test_the_bag_of_a_flight_has_what_nodes_publish_beside_states(tmp_path: Path) -> None:
     """Frames, markers, statuses and diagnostics, at their periods; the pose is lost for a while."""
     scenario = load_scenario("faults/stuck_slider").with_settings(
