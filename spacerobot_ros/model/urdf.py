@@ -38,7 +38,11 @@ from spacerobot_ros.model.description import (
 )
 from spacerobot_ros.model.inertial_parameters import TRIANGLE_SLACK
 from spacerobot_ros.model.meshes import mesh_beside, mesh_file, with_mesh_files
-from spacerobot_ros.model.rotations import matrix_from_rpy, rpy_from_matrix
+from spacerobot_ros.model.rotations import (
+    matrix_from_quaternion,
+    matrix_from_rpy,
+    rpy_from_matrix,
+)
 from spacerobot_ros.model.srdf import disabled_pairs, with_srdf
 from spacerobot_ros.model.wheels import require_reaction_wheels
 from spacerobot_ros.resources import suggestion
@@ -320,8 +324,16 @@ def _read_pose(element: Element, where: str) -> Pose:
     origin = element.find("origin")
     if origin is None:
         return Pose()
-    r = _read_numbers(origin, "xyz", "0 0 0", f"the origin of {where}")
-    return Pose(matrix_from_rpy(_read_numbers(origin, "rpy", "0 0 0", f"the origin of {where}")), r)
+    where = f"the origin of {where}"
+    r = _read_numbers(origin, "xyz", "0 0 0", where)
+    quaternion = _read_numbers(origin, "quat_xyzw", "", where)
+    if not quaternion.size:
+        return Pose(matrix_from_rpy(_read_numbers(origin, "rpy", "0 0 0", where)), r)
+    if origin.get("rpy") is not None:
+        raise RobotDescriptionError(f"{where.capitalize()} has 'rpy' and 'quat_xyzw': give one.")
+    if not (length := float(np.linalg.norm(quaternion))):
+        raise RobotDescriptionError(f"'quat_xyzw' in {where} is zero: give a unit quaternion.")
+    return Pose(matrix_from_quaternion(quaternion / length), r)
 
 
 def _read_link(link: Element, colours: dict[str, tuple[float, ...]]) -> Link:
@@ -511,6 +523,10 @@ def _require_common_range(robot: RobotDescription) -> None:
             )
 
 
+_NO_LIMIT = 1e4
+"""Position, m or rad, from which on a limit of a joint stands for none."""
+
+
 def _read_limits(limit: Element | None, kind: JointKind, where: str) -> JointLimits:
     if limit is None:
         if kind in (JointKind.FIXED, JointKind.CONTINUOUS):
@@ -538,6 +554,9 @@ def _read_limits(limit: Element | None, kind: JointKind, where: str) -> JointLim
             f"The lower limit of {where} ({values['lower']}) is not below its upper limit "
             f"({values['upper']}): it could not move; give it a range, or make it fixed."
         )
+    for name in ("lower", "upper"):
+        if abs(values[name]) >= _NO_LIMIT:
+            values[name] = math.copysign(math.inf, values[name])
     return JointLimits(**values)
 
 
@@ -581,6 +600,9 @@ _ELEMENTS_READ = {
 }
 """Tags of the elements to read, by the tag of their parent; other elements are ignored."""
 
+_EXACT_ELEMENTS = ("origin", "mass", "inertia", "axis", "mimic")
+"""Elements whose other attributes are slips: without them, the robot would be another one."""
+
 _GEOMETRIES = ("box", "cylinder", "sphere", "capsule", "mesh")
 _ACCEPTED_GEOMETRIES = [[name] for name in _GEOMETRIES]
 _GEOMETRY_REMEDY = f"a <geometry> with one of {', '.join(_GEOMETRIES)}"
@@ -599,6 +621,7 @@ class _Attribute:
 _ORIGIN_ATTRIBUTES = (
     _Attribute("xyz", 3, "m", needed=False),
     _Attribute("rpy", 3, "rad: roll, pitch and yaw", needed=False),
+    _Attribute("quat_xyzw", 4, "a unit quaternion", needed=False),
 )
 
 _ATTRIBUTES = {
@@ -739,8 +762,14 @@ def _require_element(element: Element, where: str) -> None:
             raise _MalformedError(f"the {owner} has {count} elements <{tag}>", "one of them")
     if element.tag == "geometry":
         _require_geometry(element, where)
-    for attribute in _ATTRIBUTES.get(element.tag, ()):
+    attributes = _ATTRIBUTES.get(element.tag, ())
+    for attribute in attributes:
         _require_attribute(element, attribute, where)
+    known = [attribute.name for attribute in attributes]
+    unknown = set(element.keys()).difference(known)
+    if unknown and element.tag in _EXACT_ELEMENTS:
+        flaw = f"the <{element.tag}> of {where} has '{min(unknown)}', no attribute of it"
+        raise _MalformedError(flaw, f"one of {', '.join(known)}")
     for child_element in element:
         _require_element(child_element, where)
 

@@ -15,7 +15,12 @@ from spacerobot_ros.errors import RobotDescriptionError
 from spacerobot_ros.lazy import optional_module
 from spacerobot_ros.model.description import Array, Inertia, RobotDescription
 from spacerobot_ros.model.external_loads import LoadLayout
-from spacerobot_ros.model.rotations import cross, matrix_from_quaternion, quaternion_from_matrix
+from spacerobot_ros.model.rotations import (
+    cross,
+    matrix_from_quaternion,
+    quaternion_from_matrix,
+    rpy_from_matrix,
+)
 
 TARGET = "target/"
 """Before the names of the target's bodies and shapes."""
@@ -58,6 +63,11 @@ def robot_spec(mujoco: Any, description: RobotDescription) -> Any:
         for shape in [*link.findall("visual"), *link.findall("collision")]:
             link.remove(shape)  # MuJoCo would look for the files of meshes.
         link.set("name", body_name(link.get("name", "")))
+    for origin in root.iter("origin"):
+        if quaternion := origin.attrib.pop("quat_xyzw", ""):  # MuJoCo would not read it.
+            q = np.array(quaternion.split(), dtype=float)
+            rpy = rpy_from_matrix(matrix_from_quaternion(q / np.linalg.norm(q)))
+            origin.set("rpy", " ".join(map(repr, rpy.tolist())))
     for end in (*root.iter("parent"), *root.iter("child")):
         end.set("link", body_name(end.get("link", "")))
     try:

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 import pytest
+from scipy.spatial.transform import Rotation
 from support.crossing import URDF
 from support.oracles import PinocchioOracle, assert_agrees
 from support.random_robots import random_robot_urdf
@@ -190,6 +191,29 @@ def test_limits() -> None:
     assert found.limits("upper").tolist() == [1.0, 1.0, inf, inf]
     assert found.limits("velocity").tolist() == [0.5, 0.5, 0.5, inf]
     assert found.limits("effort").tolist() == [3.0, 3.0, 3.0, inf]
+
+
+def test_limits_of_any_size_stand_for_none() -> None:
+    limit = LIMIT.replace('"-1"', '"-1e16"').replace('"1"', '"1e4"')
+    text = robot(HULL, ARM, joint("turns", "revolute", "Hull", "Arm", limit))
+    found = parse_robot(text)
+    assert (found.limits("lower")[0], found.limits("upper")[0]) == (-np.inf, np.inf)
+
+
+def test_an_attitude_by_a_quaternion_is_that_of_pinocchio() -> None:
+    turned = Rotation.from_rotvec([0.3, -0.7, 0.5])
+    numbers = " ".join(map(str, turned.as_quat()))
+    origin = f'<origin xyz="0.3 0.1 -0.2" quat_xyzw="{numbers}"/>'
+    elbow = joint("elbow", "revolute", "Hull", "Arm", LIMIT + origin)
+    text = robot(HULL, ARM, elbow).replace("<robot", '<robot version="1.1"')
+    (found,) = [each for each in parse_robot(text).bodies if each.joint]
+    (theirs,) = list(pin.buildModelFromXML(text).jointPlacements)[1:]
+    np.testing.assert_allclose(found.origin.R, theirs.rotation, atol=1e-12)
+    np.testing.assert_allclose(found.origin.R, turned.as_matrix(), atol=1e-12)
+    with pytest.raises(RobotDescriptionError, match="has 'rpy' and 'quat_xyzw'"):
+        parse_robot(robot(HULL, ARM, elbow.replace("quat_xyzw", 'rpy="0 0 1" quat_xyzw')))
+    with pytest.raises(RobotDescriptionError, match="has 'rpw', no attribute of it"):
+        parse_robot(robot(HULL, ARM, elbow.replace("quat_xyzw", "rpw")))
 
 
 def test_axis_is_scaled_to_length_one_and_x_by_default() -> None:
