@@ -142,7 +142,6 @@ def test_automatic_gains_in_lanes_are_those_of_the_controller() -> None:
 
 
 @needs_compiler
-@pytest.mark.slow
 def test_what_the_law_cannot_give_in_one_step_is_given_by_the_controller() -> None:
     """Through a singularity, and with joints that are held within a small rate."""
     cases: tuple[dict[str, Any], ...] = (

@@ -87,7 +87,7 @@ class ModelBasedLaw(ControlLaw):
         """The fixed arguments; None with a posture: it is the reference's, or the present one."""
         return None if self.options.posture_stiffness else super().fixed_inputs
 
-    def defined(self, results: Mapping[str, ca.SX]) -> ca.SX:
+    def is_complete(self, results: Mapping[str, ca.SX]) -> ca.SX:
         """Return whether the outputs are far enough from a singularity."""
         return results["margin"] >= self.singular_value_threshold
 
