@@ -287,7 +287,8 @@ class PlannerCommander(Commander):
         self.executive.propose_goal(named)
 
     def _report_waiting_goal(self, goal: IdentifiedGoal, message: str) -> None:
-        status = PlannerStatus(PlannerState.PLANNING, message, goal.goal_id, goal_values(goal.goal))
+        state = PlannerState.WAITING if self.robot is None else PlannerState.PLANNING
+        status = PlannerStatus(state, message, goal.goal_id, goal_values(goal.goal))
         status = replace(
             status,
             end_effector_goals=end_effector_values(goal.goal),
