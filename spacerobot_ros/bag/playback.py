@@ -136,6 +136,7 @@ def renamed_topics(remap: str, topics: Collection[str]) -> dict[str, str]:
                 f"Parameter 'remap' has '{rule}'; write it as 'old:=new', such as "
                 "'/odom:=/replayed/odom'."
             )
+        old = _with_slash(old)
         if old not in topics:
             raise ParameterError(
                 f"Parameter 'remap' renames '{old}', which is not replayed: "
@@ -195,7 +196,7 @@ class Playback:
         end_ns = self._start_ns + round(duration * SECOND) if duration else _LATEST_TIME_NS
         self._end_ns = min(end_ns, _LATEST_TIME_NS)
         self._last_ns = max(min(bag.end_time_ns, self._end_ns), self._start_ns)
-        self.topics = [_replay_topic(bag, name) for name in topics or bag.topics]
+        self.topics = [_replay_topic(bag, _with_slash(name)) for name in topics or bag.topics]
         self._topic_by_channel = {
             number: topic.name for topic in self.topics for number in bag.channel_ids(topic.name)
         }
@@ -352,6 +353,10 @@ class Playback:
             found = self._bag.raw_messages(channel_ids, start_ns, end_ns)
             for channel_id, log_time_ns, _, data in found:
                 yield ReplayMessage(self._topic_by_channel[channel_id], log_time_ns, data)
+
+
+def _with_slash(topic: str) -> str:
+    return topic if topic.startswith("/") else f"/{topic}"
 
 
 def _replay_topic(bag: Bag, name: str) -> ReplayTopic:

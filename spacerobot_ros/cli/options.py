@@ -254,6 +254,8 @@ def _read_path(file: Path) -> list[list[float]]:
         The file cannot be read, or has other text.
     """
     try:
+        if not file.is_file():
+            raise click.BadParameter(f"The path {file} is no regular file.")
         lines = [line.partition("#")[0] for line in file.read_text("utf-8").splitlines()]
         rows = [list(map(float, line.replace(",", " ").split())) for line in lines]
     except (OSError, ValueError) as error:

@@ -501,6 +501,22 @@ def test_a_bag_that_is_not_there_is_one_sentence(command: str) -> None:
     assert_one_sentence(result.stderr, "There is no bag at nowhere.mcap")
 
 
+def test_topics_to_replay_are_named_with_or_without_a_slash() -> None:
+    words = ["--topic", "odom", "--topic", "/joint_states", "--remap", "odom:=/other"]
+    result = CliRunner().invoke(main, ["replay", str(BAG), "--rate", "1000", *words])
+    assert result.exit_code == 0, result.output
+    result = CliRunner().invoke(main, ["replay", str(BAG), "--topic", "nowhere"])
+    assert result.exit_code == 2
+    assert "has no topic /nowhere: it has " in result.stderr
+
+
+def test_a_path_that_never_ends_is_no_path() -> None:
+    words = ["plan", "three_joint_arm", "--end-effector-path", "/dev/zero"]
+    result = CliRunner().invoke(main, words)
+    assert result.exit_code == 2
+    assert "The path /dev/zero is no regular file." in result.output
+
+
 def test_replay_has_the_options_of_its_node() -> None:
     result = CliRunner().invoke(main, ["replay", str(BAG), "--rate", "0"])
     assert result.exit_code == 2
