@@ -81,8 +81,8 @@ class InitialStates:
         return cls(
             np.array(positions, dtype=float).reshape(-1, 3),
             np.array([each.attitude() for each in initial]).reshape(-1, 4),
-            np.array([each.shape(robot) for each in initial]).reshape(-1, robot.n),
-            np.array([each.rates(robot) for each in initial]).reshape(-1, robot.n),
+            np.array([each.shape(robot) for each in initial]).reshape(len(initial), robot.n),
+            np.array([each.rates(robot) for each in initial]).reshape(len(initial), robot.n),
             np.array([each.momenta() for each in initial]).reshape(-1, 6),
             np.array(is_center_of_mass, dtype=np.bool_),
         )
@@ -159,7 +159,7 @@ class SensorErrors:
             np.array(
                 [[*(one.position_bias or zero), *(one.attitude_bias or zero)] for one in each]
             ).reshape(-1, 6),
-            np.array([one.joint_bias or (0.0,) * robot.n for one in each]).reshape(-1, robot.n),
+            np.array([one.joint_bias or (0.0,) * robot.n for one in each]).reshape(len(each), robot.n),
             np.array([one.seed for one in each], dtype=np.int64),
         )
 

@@ -27,11 +27,12 @@ from spacerobot_ros.control.laws.law import GainPair, Gains
 from spacerobot_ros.control.limits import MotionLimits
 from spacerobot_ros.control.state import ControlState
 from spacerobot_ros.errors import ParameterError
-from spacerobot_ros.model import SpaceRobot, load_robot
+from spacerobot_ros.model import SpaceRobot, load_robot, parse_robot
 from spacerobot_ros.model.compilation import cxx_compiler
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.resources import share_directory
 from spacerobot_ros.simulation import InitialState
+from spacerobot_ros.simulation.config import SensorConfig
 
 needs_compiler = pytest.mark.skipif(cxx_compiler() is None, reason="there is no C++ compiler")
 
@@ -86,6 +87,22 @@ def controlled(
         sensors,
         report_ticks=(0, ticks // 2, ticks),
     )
+
+
+CUBE = """<robot name="cube"><link name="hull"><inertial><mass value="12"/>
+  <inertia ixx="0.2" iyy="0.25" izz="0.3" ixy="0" ixz="0" iyz="0"/></inertial></link></robot>"""
+
+
+def test_a_robot_without_joints_has_rows_of_no_joint_in_each_flight() -> None:
+    robot = SpaceRobot(parse_robot(CUBE))
+    starts = InitialStates.of(
+        robot, [InitialState(position=np.array([0.1, 0.2, k])) for k in range(3)]
+    )
+    assert starts.position[:, 2].tolist() == [0.0, 1.0, 2.0]
+    assert starts.q.shape == starts.qdot.shape == (3, 0)
+    sensors = SensorErrors.of(robot, [SensorConfig(seed=k) for k in range(3)])
+    assert sensors.joint_bias.shape == (3, 0)
+    assert sensors.seeds.tolist() == [0, 1, 2]
 
 
 def assert_same(here: BatchResult, there: BatchResult) -> None:
