@@ -442,11 +442,21 @@ def _format_list(names: list[str], most: int = 40) -> str:
     return ", ".join(names[:most]) + more
 
 
+_OTHER_STORAGES = {
+    "*.db3": "convert it to MCAP, by `ros2 bag convert` or `rosbags-convert`",
+    "*.mcap.zstd": "unpack it by `zstd -d`",
+}
+"""What to do with files of bags that are no MCAP files."""
+
+
 def _bag_file(path: str | os.PathLike[str]) -> Path:
     given = Path(path)
     if not given.is_dir():
         return given
     files = sorted(given.glob("*.mcap"))
+    for pattern, remedy in _OTHER_STORAGES.items():
+        if not files and (others := sorted(given.glob(pattern))):
+            raise RecordingError(f"The bag in {given} is {others[0].name}: {remedy}.")
     if len(files) != 1:
         raise RecordingError(f"The folder {given} holds {len(files)} MCAP files: name one of them.")
     return files[0]

@@ -159,7 +159,9 @@ class SensorErrors:
             np.array(
                 [[*(one.position_bias or zero), *(one.attitude_bias or zero)] for one in each]
             ).reshape(-1, 6),
-            np.array([one.joint_bias or (0.0,) * robot.n for one in each]).reshape(len(each), robot.n),
+            np.array([one.joint_bias or (0.0,) * robot.n for one in each]).reshape(
+                len(each), robot.n
+            ),
             np.array([one.seed for one in each], dtype=np.int64),
         )
 
