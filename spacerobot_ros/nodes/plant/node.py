@@ -250,6 +250,9 @@ class PlantNode(FlightNode):
                 self._clearance.observe(self.plant)
             self._count_commanders()
         self._under_efforts = None
+        if self._real_time is not None:
+            # Time stands still meanwhile: this command, and the wrench beside it, answer its state.
+            self._real_time.start(self._steady.now().nanoseconds, self._tick)
         self._monitor.observe(self._commands, self.plant, config)
         self.get_logger().info(f"Commands carry {_CARRIED[actuation]}: the plant takes these.")
         self._publish_changed_status()
