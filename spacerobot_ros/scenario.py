@@ -756,7 +756,6 @@ def _read_content(path: Path) -> dict[Any, Any]:
 
 
 def _parameters_by_node(content: Mapping[str, Any], path: Path) -> dict[str, dict[str, Any]]:
-    """Return the parameters by node and full name in the content of a parameter file."""
     by_node: dict[str, dict[str, Any]] = {}
     of_all_nodes: dict[str, Any] = {}
     for key, section in content.items():

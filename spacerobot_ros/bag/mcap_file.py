@@ -305,11 +305,9 @@ class _AppendedFile:
         self.waiting = bytearray()
 
     def write(self, data: bytes) -> None:
-        """Append bytes to those that wait, as the library's stream."""
         self.waiting += data
 
     def tell(self) -> int:
-        """Return the position of the next byte, as the library's stream."""
         return self.size + len(self.waiting)
 
     def flush(self) -> None:

@@ -111,7 +111,6 @@ def starts_accepted_by_plant(flights: Flights) -> Flags:
 
 
 def _block_size(flights: Flights, tick: CompiledTick) -> int:
-    """Return how many flights fit into a block."""
     n, chunk = flights.robot.n, min(flights.ticks, _CHUNK_TICKS)
     each = 8 * (2 * tick.memory_layout.total_rows + 60 * len(flights.report_ticks))
     if flights.sensors is not None:
@@ -203,7 +202,6 @@ class LaneBlock:
         self._write_rows("state", state, lanes)
 
     def _write_errors_and_gains(self) -> None:
-        """Write the biases of sensors and the gains of the flights."""
         at = self._rows_of_lanes
         if self._flights.sensors is not None:
             self._write_rows("joint_bias", self._flights.sensors.joint_bias[at])
@@ -367,7 +365,6 @@ class LaneBlock:
         return reports.reshape(-1, self._reports.shape[2])[:count]
 
     def _end_flight(self, index: int, tick: int, message: str, failures: dict[int, str]) -> None:
-        """End the flight of a lane that fails at a tick."""
         group, lane = divmod(index, self._lanes)
         self._memory[group, self._rows["alive"], lane] = 0.0
         if index < len(self._flown):
@@ -375,7 +372,6 @@ class LaneBlock:
             self._ended[index] = tick
 
     def _begin_control(self, failures: dict[int, str]) -> None:
-        """Begin the references of all flights at their first measured states."""
         controller = self._tick.controller
         if controller is None:
             return
@@ -473,7 +469,6 @@ class LaneBlock:
         result.measured_pose[rows], result.measured_q[rows] = pose, q
 
     def _write_decisions(self, result: BatchResult, rows: Counts) -> None:
-        """Write the decisions about goals, and the ends of the flights."""
         controller, count = self._tick.controller, len(rows)
         assert controller is not None
         result.decision[rows] = self._read_rows("decision")[:count, 0].astype(np.int64)

@@ -407,7 +407,6 @@ def _read_distribution(target: DispersionTarget, given: Any) -> Distribution:
 
 
 def _read_choice(target: DispersionTarget, value: Any) -> Any:
-    """Return a value to choose from, a text or a finite number as its target takes it."""
     if target.is_text:
         if not isinstance(value, str):
             raise ParameterError(f"'{target.name}' is a text; the choice has {value!r}.")
@@ -418,7 +417,6 @@ def _read_choice(target: DispersionTarget, value: Any) -> Any:
 
 
 def _require_node_accepts(target: DispersionTarget, value: Any, scenario: Scenario) -> None:
-    """Refuse a value that a node would refuse in every flight."""
     flight = target.apply(DrawnFlight.of(scenario), value)
     for node in ("plant", *scenario.commanders):
         flight.scenario.config(node)

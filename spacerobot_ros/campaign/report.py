@@ -55,7 +55,6 @@ PASSED_COLOUR = "passing"
 
 _WORST_FLIGHTS_SHOWN = 10
 _MESSAGES_SHOWN = 4
-"""Messages of flights of one outcome."""
 _MAX_BOUND_DISTANCE = 100.0
 """Distance from a bound at which the order of the worst flights saturates, standard deviations."""
 
@@ -67,11 +66,7 @@ NO_INFLUENCES_TEXT = "no correlation is beyond chance (p < 0.05, corrected for a
 Flags = npt.NDArray[np.bool_]
 
 _QUANTILES_SHOWN = (0.01, 0.5, 0.99)
-"""Quantiles shown of each distribution."""
-
 _MAX_CURVE_STEPS = 2000
-"""Steps of a curve of cumulative shares."""
-
 _REASON = "reason"
 _TEXT_COLUMNS = ("outcome", _REASON, "engine", "fallback")
 
@@ -372,7 +367,6 @@ def write_campaign_report(folder: Path, path: Path) -> list[str]:
 
 
 def _sort_passing_first(found: Sequence[Influence]) -> list[Influence]:
-    """Return sensitivities in their order, those of passing before the others."""
     return sorted(found, key=lambda each: each.metric != PASSED_COLOUR)
 
 

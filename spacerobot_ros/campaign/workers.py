@@ -54,7 +54,6 @@ _NO_WORKER_WARNING_DELAY = 5.0
 """Wall time without a worker after which a warning is printed, s."""
 
 _THREAD_COUNT_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS")
-"""Environment variables for the number of threads of a worker."""
 
 KILLED = "killed"
 """The outcome of a flight during which a worker died twice."""
@@ -155,7 +154,6 @@ class _LocalWorker:
             other.close()
 
     def close(self) -> None:
-        """End the process."""
         self.process.kill()
         self.process.join()
         self.connection.close()
@@ -462,7 +460,6 @@ class TaskDistributor:
             self._workers.cancel(list(self._running))
 
     def _submit_tasks(self, waiting: deque[int]) -> None:
-        """Keep the workers busy."""
         workers = self._workers.count()
         most = workers * self._workers.tasks_per_worker
         alone = any(task.runs_alone for task in self._running.values())

@@ -430,7 +430,6 @@ class Commander(ABC):
         self._publish_decision(self._make_status("refused", message, goal_id))
 
     def _abort_waiting(self, message: str) -> None:
-        """Give up the goals that wait for a robot."""
         *_, goal = self._waiting_goals.values()
         self._waiting_goals = {}
         self._goal_file.delete()
@@ -456,7 +455,6 @@ class Commander(ABC):
     # -- goals of actions ---------------------------------------------------------------------
 
     def _active_goal_ids(self) -> set[str]:
-        """Return the ids of the goals that are pursued, or wait to be."""
         pursued = {goal.goal_id for goal in self._waiting_goals.values()}
         if self.active and self.executive is not None:
             pursued |= self.executive.unfinished_goals
@@ -689,7 +687,6 @@ class Commander(ABC):
                 self._change_masses(self.robot)
 
     def _with_payload(self, robot: SpaceRobot) -> SpaceRobot:
-        """Return the robot with the body that it holds according to the plant's status."""
         self._held = None
         try:
             if self._payload:
@@ -733,13 +730,11 @@ class Commander(ABC):
         self._configure_executive()
 
     def _adapted(self, config: Any) -> Any:
-        """Return a configuration with the known rate of the plant, for the robot."""
         config = replace(config, tick_rate=self.config.tick_rate)
         return config if self._described is None else config.for_robot(self._described.description)
 
     @property
     def _knows_rate(self) -> bool:
-        """Whether the rate of the plant is known, so that states can be answered."""
         return self.config.tick_rate > 0
 
     @abstractmethod

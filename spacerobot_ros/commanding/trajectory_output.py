@@ -183,7 +183,6 @@ class TrajectoryOutput:
 
 
 def _motion_end(outcome: Outcome, code: int, text: str) -> TrajectoryEnd:
-    """Return the meaning of a result."""
     if outcome is Outcome.SUCCEEDED and code == ErrorCode.SUCCESSFUL:
         return TrajectoryEnd()
     text = printable(text).rstrip(".")

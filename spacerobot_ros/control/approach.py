@@ -55,7 +55,6 @@ _STANDOFF_FACTORS = (1.0, 2.0, 3.0)
 """Standoff distances that are tried where the target blocks the way, over the given one."""
 
 _MAX_BLOCKED_PATHS = 100
-"""Number of paths past the body of the target that are tried."""
 
 _ARM_RATE_SHARE = 0.9
 """Share of the joint rates that the path of an arm may take."""
@@ -482,7 +481,6 @@ class TargetClearance:
         return found
 
     def _base_in_target(self, base: Pose, grapple: FrameMotion) -> BasePoses:
-        """Return the poses of the base in T."""
         R_TW = self._grapple.R @ np.swapaxes(grapple.R, 1, 2)
         r_TB = np.einsum("kij,kj->ki", R_TW, base.r - grapple.r) + self._grapple.r
         R_TB = R_TW @ base.R

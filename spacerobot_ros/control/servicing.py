@@ -212,7 +212,6 @@ class ApproachTask:
         return TaskProgress(TaskState.FAILED, f"The approach is given up: {why}.")
 
     def _is_off_prediction(self, time: float, measured: BodyMotion) -> bool:
-        """Whether the target is away from its predicted motion."""
         assert self._predicted is not None
         assert self.target.body is not None
         expected = self._predicted.grapple([self.target.time - self._planned_at]).body_motion()
@@ -220,7 +219,6 @@ class ApproachTask:
         return off.distance > _PREDICTION_TOLERANCE or off.angle > _PREDICTION_TOLERANCE
 
     def _clearance(self, controller: CoordinatedController) -> TargetClearance | None:
-        """Return the distances of the robot from the body of the target."""
         target, link = self.target, controller.law.outputs.selection.end_effector_link
         least = self.config.target.clearance
         if target.description is None or target.body is None or not least:

@@ -36,7 +36,6 @@ _DUMP_TIME = 5.0
 """Time constant with which rates decay while momentum is dumped, s."""
 
 _DUMPED_SHARE = 0.02
-"""Share of the largest rates below which momentum counts as dumped."""
 
 _DUMP_TORQUE_SHARE = 0.5
 """Share of the thrusters' torque for dumping; control needs the other part."""

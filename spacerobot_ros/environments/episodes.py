@@ -38,8 +38,6 @@ _MAX_DRAWS = 10_000
 """Largest number of draws of a campaign that episodes start from."""
 
 _MAX_REFUSED_DRAWS = 100
-"""Number of draws in succession that may be refused, before a campaign is."""
-
 _DEFAULT_SCENARIOS = {"reorient": "arm_attitude", "reach": "reach"}
 
 _GOALS = ("random", "scenario")
@@ -234,7 +232,6 @@ class EpisodeStarts:
 
 
 def _require_steppable(scenario: Scenario, robot: SpaceRobot) -> None:
-    """Refuse what environments do not have."""
     plant = scenario.plant
     parts = {
         "faults": bool(plant.faults),

@@ -272,7 +272,6 @@ def _with_goals(
     rotvec: npt.ArrayLike | None,
     hands: Sequence[EndEffectorGoal],
 ) -> Scenario:
-    """Return a scenario with other goals of its base, and of end-effectors."""
     scenario = _with_goal(scenario, goal, position, rotvec)
     if not hands:
         return scenario
@@ -295,7 +294,6 @@ def _changed_goal(
     position: npt.ArrayLike | None,
     rotvec: npt.ArrayLike | None,
 ) -> Goal:
-    """Return the given goal, or the earlier goal with another position or attitude."""
     made = before
     if isinstance(goal, Goal):
         made = goal

@@ -548,7 +548,6 @@ def _read_statuses(bag: FlightBag, commander: str) -> list[tuple[int, Status]]:
 
 
 def _scenario_in_bag(bag: FlightBag) -> Scenario:
-    """Return the scenario of a flight, as far as its bag holds it."""
     about = bag.metadata.get("scenario", {})
     nodes: dict[str, dict[str, Any]] = {
         node: _recorded_values(kind, bag.metadata[f"parameters/{node}"])

@@ -194,7 +194,6 @@ def _streams(flight: Flight) -> Iterator[_Stream]:
 
 
 def _state_streams(flight: Flight) -> Iterator[_Stream]:
-    """Yield the topics of the plant's state, in the order of their publication."""
     period = round(flight.control_period * SECOND)
     stamps: NDArray[np.int64] = np.arange(len(flight.time), dtype=np.int64) * period
     config, robot = flight.scenario.plant, flight.required_robot()
@@ -295,7 +294,6 @@ def _frame_streams(flight: Flight) -> Iterator[_Stream]:
 def _marker_maker(
     flight: Flight, markers: RobotMarkers, ticks: NDArray[np.int64]
 ) -> Callable[[slice], list[bytes]]:
-    """Return the function that makes the markers of some of the ticks."""
     robot, period = flight.required_robot(), flight.scenario.plant.period_ns
     kinematics = ForwardKinematics(robot)
     order = [kinematics.links.index(link.name) for link in robot.links]
@@ -401,7 +399,6 @@ def _plan_streams(flight: Flight) -> Iterator[_Stream]:
 
 
 def _status_streams(flight: Flight) -> Iterator[_Stream]:
-    """Yield statuses, events and diagnostics."""
     yield _Stream.of(
         TOPICS["plant/status"],
         (

@@ -106,7 +106,6 @@ class MessageTemplate:
         self._parts: list[bytes | memoryview] = []
         """What the message is joined of: fed arrays, stamps, and the bytes between them."""
         self._places_of_stamps: list[int] = []
-        """Indices of the stamps among the parts."""
 
     def floats(self, path: str, count: int) -> Array:
         """Return a writable view of the ``count`` float64 values from ``path`` on."""
@@ -459,7 +458,6 @@ class JointReader:
         return self._reader.stamp_ns
 
     def _check_names_and_lengths(self) -> None:
-        """Check joint names and array lengths of a new layout."""
         names = self._reader.texts("name")
         self._problem, self._missing, self._order = "", "", None
         try:

@@ -590,7 +590,6 @@ def _require_mass(robot: RobotDescription) -> None:
 # -- form of the text -------------------------------------------------------------------------
 
 _OTHER_FORMATS = {"sdf": "an SDF model", "mujoco": "a MuJoCo model"}
-"""Descriptions of other file formats by their root elements."""
 
 _ELEMENTS_READ = {
     "robot": ("link", "joint", "material", "disable_collisions", "world"),
@@ -748,7 +747,6 @@ def _require_type(joint: Element, where: str) -> None:
 
 
 def _require_element(element: Element, where: str) -> None:
-    """Check an element of a link, joint or material, and its children."""
     if element.tag == "material":
         _remove_children(
             element, {child.tag for child in element} - set(_ELEMENTS_READ["material"])

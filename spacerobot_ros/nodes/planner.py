@@ -152,8 +152,6 @@ class PlannerNode(CommanderNode):
     # -- inputs -------------------------------------------------------------------------------
 
     def _take_twists(self, link: str) -> None:
-        """Subscribe to the twists of a link."""
-
         def on_twist(message: TwistStamped) -> None:
             twist, commander = message.twist, self.commander
             linear, angular = (
@@ -167,8 +165,6 @@ class PlannerNode(CommanderNode):
         self.commander.receive_obstacles(message.data)
 
     def _take_paths(self, link: str) -> None:
-        """Subscribe to the paths of a link."""
-
         def on_path(message: Path) -> None:
             self.receive(link, message, lambda: self._read_path(link, message))
 

@@ -59,8 +59,6 @@ _CLOCK_TOPIC = "/clock"
 """Topic of the clock before remaps."""
 
 _SHARED_TOPICS = ("/diagnostics", TRANSFORMS, STATIC_TRANSFORMS)
-"""Topics, before remaps, that stacks in different namespaces may share."""
-
 _DESCRIPTION_TOPIC = "robot_description"
 
 _TEXT_TYPE = "std_msgs/msg/String"
@@ -451,7 +449,6 @@ class _RecordedTransforms:
         self._channel = -1
 
     def listener(self, topic: str) -> RawCallback | None:
-        """Return the callback of every message of a topic, if there is one."""
         return self._callbacks.get(topic)
 
     def _on_odom(self, raw: bytes) -> None:
@@ -509,7 +506,6 @@ class _RecordedTransforms:
         return True
 
     def _write_static(self, frames: RobotTransforms, time_ns: int) -> None:
-        """Write the message of the fixed links, if there are any."""
         static = frames.static_message(time_ns)
         if static is not None:
             channel = self._recording.writer.add_topic(self._topics[1], TRANSFORM_TYPE, LATCHED)
@@ -571,7 +567,6 @@ def _recording_callback(
 
 
 def _record_and_listen(record: RawCallback, listener: RawCallback | None) -> RawCallback:
-    """Return a callback that records a message, then calls a listener."""
     if listener is None:
         return record
 
@@ -596,7 +591,6 @@ def loss_events(recording: Recording, topic: str) -> SubscriptionEventCallbacks:
 
 
 def _recorded_qos(offered: QoSProfile) -> QosProfile:
-    """Return a publisher's quality of service in the words of a bag."""
     return QosProfile(
         history=offered.history.name.lower(),
         depth=offered.depth,

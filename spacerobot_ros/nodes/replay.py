@@ -227,7 +227,6 @@ class ReplayNode(FlightNode):
         self._timer.reset()
 
     def _send_due_messages(self) -> None:
-        """Send the messages that are due, and set the timer for the next one."""
         try:
             for message in self._playback.take_due(self._now(), _MAX_MESSAGES_AT_ONCE):
                 self._send(message)
@@ -319,7 +318,6 @@ class ReplayNode(FlightNode):
             self._end_with_error(error)
 
     def _publish_status(self) -> None:
-        """Publish position, rate and state of the replay."""
         playback = self._playback
         position = playback.bag_time(self._now()) - playback.start_ns
         status = ReplayStatus(

@@ -141,7 +141,6 @@ _FAULT_KINDS = frozenset(
         EventKind.DISTURBANCE_ENDED,
     )
 )
-"""Kinds of faults and disturbances."""
 _PROMINENT_KINDS = _FAULT_KINDS | {
     EventKind.STUCK_JOINT,
     EventKind.LATCHED,

@@ -160,7 +160,6 @@ def _read_style(path: Path) -> mpl.RcParams:
 
 
 def _require_fonts(path: Path) -> None:
-    """Check that the font settings of a style file can be used."""
     size = float(mpl.rcParams["font.size"])
     if not _FONT_SIZE_RANGE[0] <= size <= _FONT_SIZE_RANGE[1]:
         raise SpaceRobotError(
@@ -194,7 +193,6 @@ def _is_font_installed(family: str) -> bool:
 
 @contextmanager
 def _collected_warnings() -> Iterator[_Warnings]:
-    """Collect the warnings that matplotlib logs while the block lasts."""
     warnings = _Warnings()
     loggers = [logging.getLogger(name) for name in ("matplotlib", "matplotlib.font_manager")]
     for logger in loggers:

@@ -408,7 +408,6 @@ def shape_figure(flight: FlightReport) -> ReportFigure | str:
 
 
 def _why_no_joints(flight: FlightReport) -> str:
-    """Return the reason why there is no figure of the joints."""
     jointless = flight.robot is not None and not flight.robot.joint_names
     return "The robot has no joints." if jointless else NO_JOINTS_TEXT
 
@@ -666,7 +665,6 @@ def momentum_budget_figure(flight: FlightReport) -> ReportFigure | str | None:
 
 
 _MAX_CLEARANCE_SAMPLES = 2000
-"""States of a flight whose smallest distances are drawn."""
 
 
 def clearance_figure(flight: FlightReport) -> ReportFigure | str | None:

@@ -440,7 +440,6 @@ def _robot_commands(robot: RobotDescription, meshes: Mapping[str, TriangleMesh])
 
 
 def _obstacle_commands(flight: FlightReport) -> list[Command]:
-    """The obstacles, which stand still in the world."""
     commands: list[Command] = []
     for number, (visual, pose) in enumerate(flight.obstacles):
         path = f"{WORLD}/obstacle {number} {_node_name(visual.link)}"
@@ -450,7 +449,6 @@ def _obstacle_commands(flight: FlightReport) -> list[Command]:
 
 
 def _target_commands(flight: FlightReport) -> list[Command]:
-    """The target, whose pose the animation gives."""
     if flight.target is None or not len(flight.target_pose):
         return []
     commands = [set_transform(TARGET, matrix_of(_pose_of(flight.target_pose.values[0])))]
@@ -503,7 +501,6 @@ def _scaled_by_tolerances(pose: Signal, radius: float) -> Signal:
 
 
 def _path_commands(flight: FlightReport) -> list[Command]:
-    """Paths of base and end-effector, and the path of the base that was planned."""
     lines = [("path of the base", flight.position.values, PALETTE[0])]
     if len(flight.tool):
         lines.append(("path of the end-effector", flight.tool.values[:, :3], PALETTE[4]))
@@ -522,7 +519,6 @@ def _path_commands(flight: FlightReport) -> list[Command]:
 
 
 def _goal_commands(flight: FlightReport, robot: RobotDescription, radius: float) -> list[Command]:
-    """The base at its last goal and a mark at the end-effector's."""
     commands: list[Command] = []
     if flight.base_goal is not None and flight.controls("base"):
         matrix = matrix_of(

@@ -37,7 +37,6 @@ _LEAST_ROTATION_WITHOUT_LOOPS = math.radians(0.2)
 """Smallest first rotation without loops of the joints, rad."""
 
 _ROTATION_TO_TOLERANCE = 50.0
-"""Ratio of a small rotation goal to its tolerance."""
 
 _LEAST_BASE_MASS_RATIO, _LARGEST_BASE_MASS_RATIO = 0.2, 500.0
 """Usual ratios of the base's mass to the mass of all other bodies."""

@@ -240,11 +240,9 @@ class MultiProcessStack:
         return environment
 
     def _log_file_of(self, name: str) -> Path:
-        """Return the file that receives standard output and error of a node."""
         return Path(self._folder.name, f"{name}.txt")
 
     def _end_message(self, name: str) -> str:
-        """Return how and why a node has ended."""
         code = self.processes[name].returncode
         return end_message(name, code, self._read_log(name))
 
@@ -384,7 +382,6 @@ class MultiProcessStack:
                 self._events.publish(status)
 
     def _end_nodes(self, names: Sequence[str]) -> dict[str, int]:
-        """End nodes together, and return their exit codes."""
         for name in names:
             self.processes[name].send_signal(signal.SIGINT)
         # SIGABRT makes a hanging node print a traceback.

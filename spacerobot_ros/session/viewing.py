@@ -161,7 +161,6 @@ def lower_priority(pid: int) -> None:
 
 
 def _read_log_lines(log: Path) -> list[str]:
-    """Return the lines that the viewer has written to standard error."""
     return log.read_text("utf-8", errors="replace").strip().splitlines()
 
 

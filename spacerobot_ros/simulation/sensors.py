@@ -120,7 +120,6 @@ class Sensors:
         self.qdot[:] = plant.qdot + noise["joint_rates"] * normal(n)
 
     def _apply_faults(self, faults: tuple[Fault, ...]) -> None:
-        """Apply the active faults of sensors."""
         self._faults = faults
         config = self._config
         self._pose_bias[:3] = config.position_bias or 0.0

@@ -239,8 +239,6 @@ class GoalEditor:
         return self._check
 
     def _defer_edit(self, act: Callable[[], None]) -> None:
-        """Queue a change of the goal by a user."""
-
         def edit() -> None:
             self._origin = Origin.USER
             act()
@@ -439,7 +437,6 @@ class GoalEditor:
         self._mark_changed()
 
     def _mark_changed(self) -> None:
-        """Note that the goal has changed."""
         if not self.placed:
             return
         self._changed_at = time.monotonic()
@@ -462,7 +459,6 @@ class GoalEditor:
         self._mark_changed()
 
     def _place_link_gizmo(self, link: str) -> None:
-        """Move the gizmo of a link to where the link is."""
         if self._kinematics is None or self._present is None:
             return
         name = _link_gizmo(link)
@@ -537,12 +533,10 @@ class _PartMenu:
 
     @property
     def links(self) -> tuple[str, ...]:
-        """The links that goals are offered for."""
         return tuple(part for part in self._menus if part != BASE_GOAL_KEY)
 
     @property
     def shown(self) -> Part:
-        """The part whose numbers are shown."""
         return str(self._numbers.value)
 
     def asked(self, part: Part) -> RequestedPart:
@@ -552,7 +546,6 @@ class _PartMenu:
         return RequestedPart.POSE if part == BASE_GOAL_KEY else RequestedPart.NOTHING
 
     def requested_links(self) -> dict[str, RequestedPart]:
-        """Return for each link of the goal whether it is for its position or its pose."""
         asked = {link: self.asked(link) for link in self.links}
         return {link: each for link, each in asked.items() if each is not RequestedPart.NOTHING}
 
@@ -574,7 +567,6 @@ class _PartMenu:
         self._update()
 
     def show(self, *, visible: bool) -> None:
-        """Show or hide the controls."""
         if (visible and bool(self.links)) != self._there:
             self._there = not self._there
             self._update()
@@ -659,7 +651,6 @@ class _FinalShape:
         return np.array([field.value for field in self._fields], float)
 
     def show_robot(self, robot: RobotDescription | None) -> None:
-        """Show a field for each joint of another robot."""
         for field in self._fields:
             field.remove()
         self._fields, self._q, self._enabled.value = [], np.zeros(0), False
@@ -689,14 +680,12 @@ class _FinalShape:
         self._q = q
 
     def fill(self) -> None:
-        """Set the fields to the joint positions of the robot."""
         for field, position in zip(self._fields, self._q, strict=False):
             low, high = getattr(field, "min", None), getattr(field, "max", None)
             value = round(float(position), 4)
             field.value = value if low is None or high is None else min(max(value, low), high)
 
     def show(self, *, visible: bool) -> None:
-        """Show or hide the controls of the final joint positions."""
         shown = visible and bool(self._fields)
         if shown != self._enabled.visible:
             self._enabled.visible = shown
@@ -715,7 +704,6 @@ class _FinalShape:
 
 
 def _links_of(goals: Mapping[Part, Goal]) -> dict[str, EndEffectorGoal]:
-    """Return the goals of links among goals by part."""
     return {aim.link: aim for goal in goals.values() for aim in goal.end_effectors}
 
 

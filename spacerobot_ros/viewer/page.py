@@ -280,7 +280,6 @@ class FaultPanel:
 
     @property
     def _has_value(self) -> bool:
-        """Whether the chosen kind of fault takes a number."""
         kind = FAULT_KINDS.get(self._kind.value)
         return kind is not None and bool(kind.value)
 
@@ -442,11 +441,9 @@ class _Plot:
         self.width = len(names)
 
     def clear(self) -> None:
-        """Drop the history."""
         self.history = History(self.width)
 
     def draw(self) -> None:
-        """Send the curves to browsers."""
         self.handle.data = self.history.arrays()
 
 
@@ -694,7 +691,6 @@ class Page:
         self._target_drawing.base.visible = False
 
     def _show_layers(self) -> None:
-        """Show the layers that users have chosen."""
         shown = {name: bool(handle.value) for name, handle in self._layers.items()}
         if self._drawing is not None:
             self._drawing.show_collision_shapes(visible=shown["Collision shapes"])
@@ -814,7 +810,6 @@ class Page:
             )
 
     def _draw_paths(self, state: StackState, around: scene.Surroundings, until: float) -> None:
-        """Draw the planned paths, and those flown until a time."""
         around.flown.draw(self._trail.points_until(until))
         path = state.planned_path
         around.planned.draw(np.zeros((0, 3)) if path is None else path)
@@ -878,7 +873,6 @@ class Page:
         camera.position, camera.look_at = at + away, at
 
     def _aim_cameras(self) -> None:
-        """Turn the cameras of all browsers to the robot."""
         for client in self._server.get_clients().values():
             self._aim_camera(client.camera)
 

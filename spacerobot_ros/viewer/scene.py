@@ -125,7 +125,6 @@ class RobotDrawing:
         return paths
 
     def _add_visual(self, path: str, visual: Visual) -> Any:
-        """Draw a visual in the frame of its link."""
         red, green, blue, alpha = visual.shape.rgba
         solid = self._color is None
         look: dict[str, Any] = {"cast_shadow": solid, "receive_shadow": solid}
@@ -360,7 +359,6 @@ class Surroundings:
         self._paths_shown = True
 
     def _add_sky(self, reach: float, center: Array) -> list[Any]:
-        """Add stars, and the Sun with its light, around a point."""
         directions = np.random.default_rng(1957).normal(size=(_STARS, 3))
         directions /= np.linalg.norm(directions, axis=1, keepdims=True)
         # Most stars are faint.

@@ -77,7 +77,6 @@ class CommanderNode(FlightNode):
     _statuses: Subscription | None = None
     _decoder: MessageDecoder | None = None
     _goal_actions: GoalActions | None = None
-    """The action servers, once they are created."""
 
     # -- life ---------------------------------------------------------------------------------
 
@@ -111,7 +110,6 @@ class CommanderNode(FlightNode):
         self._unheard = ""
         """Name of a state topic with a publisher whose QoS the subscription does not match."""
         self._inputs: dict[str, Subscription] = {}
-        """Messages of states and references by their topics."""
         self._subscribe_states()
         self.create_timer(
             _WAITING_STATE_CHECK_PERIOD,

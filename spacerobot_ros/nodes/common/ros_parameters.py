@@ -84,13 +84,11 @@ class RemoteParameters:
 
 
 def _json_value(value: Any) -> Any:
-    """Return a parameter value as a JSON value."""
     return value if value is None or isinstance(value, (bool, int, float, str)) else list(value)
 
 
 _LARGEST_FLOAT = sys.float_info.max
 _INTEGER_BOUNDS = -(2**63), 2**63 - 1
-"""Integer bounds of parameter descriptors."""
 
 
 def _descriptor(parameter: Parameter) -> ParameterDescriptor:

@@ -158,7 +158,6 @@ class Liveness:
         self._role = "" if role is None else role.value
         self._publisher = node.create_publisher(DiagnosticStatus, TOPIC, HEARTBEAT_QOS)
         self._timers: list[Timer] = []
-        """The timers of an active node."""
         self._watched = {each.value for each in depends_on}
         self._watchdog: Watchdog | None = None
         """The watchdog of an active node that watches others."""
@@ -212,7 +211,6 @@ class Liveness:
             self._beat()
 
     def _beat(self) -> None:
-        """Send a heartbeat if the node is active."""
         if self._timers:
             self._publish(HeartbeatState.BUSY if self._busy else HeartbeatState.ACTIVE)
 
@@ -238,7 +236,6 @@ class Liveness:
             self._report(lost)
 
     def _report(self, news: list[SilenceReport]) -> None:
-        """Report changes to the node, and publish diagnostics about silent nodes."""
         for silence in news:
             self._on_silence(silence)
         if self._watchdog is None:

@@ -211,7 +211,6 @@ class PlantNode(FlightNode):
         self._publish_status(self._monitor.status)
 
     def _use_plant(self, plant: PlantWithFaults, config: PlantConfig) -> None:
-        """Simulate this plant from the present tick on."""
         self.plant, plant.tick = plant, self._tick
         self._reported = ReportedState(plant, config)
         self._commands = CommandValidator(plant, config)
@@ -366,7 +365,6 @@ class PlantNode(FlightNode):
         self._publish_status(PlantStatus(PlantState.INACTIVE, "The plant is not configured."))
 
     def _publish_changed_status(self) -> None:
-        """Publish the status if it has changed, and the events since the last call."""
         assert self._monitor is not None
         self._injected_seen = self.plant.injected
         events = self._monitor.update(self._active, self.time_ns / SECOND)
@@ -405,7 +403,6 @@ class PlantNode(FlightNode):
     def _resumed_plant(
         self, robot: SpaceRobot, config: PlantConfig, state: LastState
     ) -> PlantWithFaults:
-        """Return the plant in a recorded state."""
         # Servos hold the rates that they are commanded: only motors leave joints moving.
         moving = config.actuation == "effort"
         initial = InitialState(

@@ -234,7 +234,6 @@ class StatePublisher:
         return self._outputs[topic.name]
 
     def _template(self, topic: Topic) -> MessageTemplate:
-        """Return the message of a topic, fed with the quantities that it carries."""
         names = self._state.names(topic)
         target = self._state.target
         prototype = state_message(

@@ -80,7 +80,6 @@ _ROSOUT_QOS = QoSProfile(
     durability=DurabilityPolicy.VOLATILE,
 )
 _LEAST_SHOWN_LOG_LEVEL = 30
-"""Least level of shown log messages (rcl_interfaces/Log)."""
 
 _PARTS_WITH_RECEIVED_GOALS = (BASE_GOAL_KEY, DEFAULT_END_EFFECTOR)
 """Parts whose goals this node receives as well as sends."""
@@ -478,7 +477,6 @@ class ViewerNode(FlightNode):
             editor.show_check(GoalCheck(Verdict.UNCHECKED, "It was sent before it was checked."))
 
     def _call_service(self, request: Request) -> None:
-        """Call the service of a request on every node that has it."""
         keys, service, data = _SERVICE_BY_REQUEST[request]
         called = False
         for key in keys:

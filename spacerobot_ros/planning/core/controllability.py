@@ -236,7 +236,6 @@ def _span_of_brackets(
 
 
 def _numerical_rank(values: Array) -> int:
-    """Return the number of descending singular values above rounding errors."""
     return int(np.sum(values > max(ZERO_TURN_PER_AREA, float(values[0]) / MAX_CONDITION)))
 
 

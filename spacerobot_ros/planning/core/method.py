@@ -304,7 +304,6 @@ class GaitMethod(ABC):
         return shape
 
     def _require_goal_of_base(self, goal: Goal) -> None:
-        """Refuse goals of end-effectors, by methods that reach none."""
         self._require_no_path(goal)
         if goal.end_effectors:
             names = " and ".join(f"'{each.link}'" for each in goal.end_effectors)
@@ -314,7 +313,6 @@ class GaitMethod(ABC):
             )
 
     def _require_no_path(self, goal: Goal) -> None:
-        """Refuse goals with a path, by methods that follow none."""
         for each in goal.end_effectors:
             if each.waypoints is not None:
                 raise PlanningError(
@@ -324,7 +322,6 @@ class GaitMethod(ABC):
 
     @property
     def _has_obstacles(self) -> bool:
-        """Whether there are obstacles around the robot that schedules keep clear of."""
         return self.clearance is not None and self.clearance.has_obstacles
 
     def _base_poses(
@@ -361,7 +358,6 @@ class GaitMethod(ABC):
         return self.clearance.clause(found[0], period) if found else ""
 
     def _require_suitable_setup(self) -> None:
-        """Refuse a robot that was found unsuitable."""
         if self._setup_refusal is not None:
             raise PlanningError(str(self._setup_refusal))
 

@@ -508,7 +508,6 @@ class Executive:
         return has_goal
 
     def _commands_were_obeyed(self, commanded_until_ns: int, rests_since_ns: int) -> bool:
-        """Whether a plant has obeyed the active goal before it came to rest."""
         active, since = self._active_goal, self._commanded_from_ns
         if active is None or commanded_until_ns < active.begins_ns:
             return False
@@ -696,7 +695,6 @@ class Executive:
         return tracker.setpoint
 
     def _do_phase_work(self, measured: MeasuredState) -> None:
-        """Do the work of the present phase beside tracking."""
         match self.phase:
             case Phase.MEASURING | Phase.EVALUATING:
                 self._measure_at_rest(measured)
@@ -728,7 +726,6 @@ class Executive:
     # -- TELEOPERATING ------------------------------------------------------------------------
 
     def _keep_base_pose(self, teleoperation: Teleoperation, measured: MeasuredState) -> None:
-        """Keep the measured pose of the base, if it is one."""
         base = measured.base()
         if base is not None and np.all(np.isfinite(base.pose)):
             teleoperation.pose, teleoperation.pose_ns = base.pose, measured.stamp_ns
@@ -766,7 +763,6 @@ class Executive:
             self.outputs.append(PlannerStatus(PlannerState.TELEOPERATING, message))
 
     def _end_teleoperation(self, event: Event, message: str) -> None:
-        """End the teleoperation at once."""
         self._teleoperation = None
         self._tracker.stop()
         self._average.restart()
@@ -910,7 +906,6 @@ class Executive:
             self._request_plan(job, state)
 
     def _can_replan(self) -> bool:
-        """Whether a plan may take over in motion from the schedule that is tracked."""
         return (
             self._active_goal is not None
             and not self.plant_rests
@@ -953,7 +948,6 @@ class Executive:
     # -- in motion: REPLANNING and TAKING_OVER ------------------------------------------------
 
     def _await_take_over(self) -> None:
-        """Take the finished plan in motion, and start its schedule at its tick."""
         if self.phase is Phase.REPLANNING:
             self._take_plan_result()
         match self._pending_plan:
@@ -963,7 +957,6 @@ class Executive:
                 self._handle_late_plan(job)
 
     def _switch_schedule(self, ready: ReadyPlan) -> None:
-        """Track the ready plan from its first tick on."""
         job, schedule, begins_ns = ready.job, ready.schedule, ready.job.take_over.stamp_ns
         self._pending_plan = None
         if job.reason.is_for_new_goal:
@@ -1004,7 +997,6 @@ class Executive:
             self._request_plan(job, state)
 
     def _reset_plan_count(self) -> None:
-        """Reset number and time of plans for the waiting goal, which no longer waits."""
         self._new_goal = None
         self._total_plan_time, self._plan_count = 0.0, 0
 
@@ -1056,7 +1048,6 @@ class Executive:
         self._take_plan_result()
 
     def _take_plan_result(self) -> None:
-        """Act on the result of the requested plan, once the worker has it."""
         result = self._worker.poll()
         if result is None:
             return
@@ -1142,7 +1133,6 @@ class Executive:
                 self._change_phase(Event.REFUSED, self._phase_without_plan())
 
     def _accept_goal(self, active: ActiveGoal) -> None:
-        """Make a new goal the active goal, for all joints, and save it."""
         self._active_goal, self._tracker.stuck = active, []
         self._add_event(EventKind.GOAL_ACCEPTED, "The goal is accepted.", active.identified)
         try:
@@ -1192,7 +1182,6 @@ class Executive:
 
     @staticmethod
     def _subtract_remainder(active: ActiveGoal, stamp_ns: int) -> None:
-        """Subtract the remaining duration of the present schedule from the manoeuvre time."""
         remainder = active.ends_at - stamp_ns / 1e9
         if remainder > 0:
             active.manoeuvre_time -= min(remainder, active.schedule.duration)
@@ -1274,7 +1263,6 @@ class Executive:
         return self._phase_at_rest()
 
     def _phase_at_rest(self) -> Phase:
-        """Return the next phase when the joints have come to rest."""
         if self._new_goal is not None:
             return Phase.MEASURING
         return Phase.IDLE if self._active_goal is None else Phase.EVALUATING
@@ -1298,7 +1286,6 @@ class Executive:
         self._change_phase(event, self._phase_at_rest())
 
     def _forget_goals(self) -> None:
-        """Drop the plan, every goal, and the teleoperation."""
         self._drop_plan()
         self._new_goal = self._active_goal = self._teleoperation = None
 
@@ -1307,17 +1294,14 @@ class Executive:
         return self._new_goal or self._planned_goal() or self._pursued_goal()
 
     def _planned_goal(self) -> IdentifiedGoal | None:
-        """Return the goal of the requested or ready plan."""
         plan = self._pending_plan
         job = plan.job if isinstance(plan, ReadyPlan) else plan
         return None if job is None else job.identified
 
     def _pursued_goal(self) -> IdentifiedGoal | None:
-        """Return the goal that is executed or evaluated."""
         return None if self._active_goal is None else self._active_goal.identified
 
     def _tolerance_of(self, identified: IdentifiedGoal) -> Tolerance:
-        """Return the largest errors with which a goal is reached."""
         return identified.tolerance or self.config.tolerance
 
     def _pursued_id(self) -> str:
@@ -1351,7 +1335,6 @@ class Executive:
         level: int = 0,
         **about: str,
     ) -> None:
-        """Report an event about a goal."""
         now = self._stamp_ns / 1e9
         self.outputs.append(FlightEvent(kind, message, level, now, identified.goal_id, about))
 
@@ -1364,7 +1347,6 @@ class Executive:
         remaining: PoseError | None = None,
         schedule: GaitSchedule | None = None,
     ) -> None:
-        """Report a status of a goal, with corrections, durations, remaining error and schedule."""
         values: dict[str, Any] = {}
         if active is not None:
             values["corrections"] = active.corrections

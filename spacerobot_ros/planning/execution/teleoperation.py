@@ -44,7 +44,6 @@ _MIDPOINT_STEPS = 2
 """Steps to the rates in the middle of a tick."""
 
 _ROUNDING = 1e-12
-"""Rates and twists below this count as zero."""
 
 
 class TwistFrame(Enum):

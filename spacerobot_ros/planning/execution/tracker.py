@@ -439,7 +439,6 @@ class TrajectoryTracker:
 # -- stuck joints ---------------------------------------------------------------------------------
 
 _STUCK_SHARE = 0.05
-"""Share of the commanded range below which the motion of a joint counts as stuck."""
 
 _MIN_FOLLOWED_SHARE = 0.5
 """Share of the commanded range above which a joint counts as following its commands. In between it

@@ -389,7 +389,6 @@ class AreaLoopGait(GaitMethod):
         return self._add_legs(start, ends).attitudes[-1]
 
     def _add_legs(self, gait: _PlannedMotion, ends: LegEnds) -> _PlannedMotion:
-        """Return the gait with straight legs added."""
         shapes = straight_motion(
             self.robot, gait.positions[-1], ends, self.control_period, self.options.longest
         )

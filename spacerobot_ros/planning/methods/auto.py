@@ -214,7 +214,6 @@ def _add_notes(
     results: Mapping[str, _MethodResult],
     refusals: Mapping[str, SpaceRobotError],
 ) -> GaitSchedule:
-    """Return a schedule with notes on all compared manoeuvres."""
     compared = [f"{name}: {result.message}." for name, result in results.items()]
     compared += [f"{name}: {refusal}" for name, refusal in refusals.items()]
     notes = {"chosen": chosen, "because": because, "compared": " ".join(compared)}

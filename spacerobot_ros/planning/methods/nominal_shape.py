@@ -53,7 +53,6 @@ _BOX_SHARES = (1.0, 0.5, 0.25, 0.125)
 """Edges of the boxes in which links keep clear, as shares of the longest edges of loops."""
 
 _BOX_GRID_POINTS = 7
-"""Points per joint of the grid on which such boxes are looked for."""
 
 _MAX_BOXES = 300
 """Largest number of boxes of one size that are examined, the best first."""
@@ -294,7 +293,6 @@ def nominal_with_clearance(
 def _select_best_triples(
     robot: SpaceRobot, triples: Sequence[tuple[int, int, int]], largest_edge: float
 ) -> Sequence[tuple[int, int, int]]:
-    """Return the triples of joints with the best measures over sampled shapes."""
     if len(triples) <= _MAX_TRIPLES:
         return triples
     shapes = sample_shapes(robot, _SAMPLED_SHAPE_COUNT)

@@ -60,7 +60,6 @@ _TRACE_STEP = 0.02
 """Longest step along a path of the joints, rad of the fastest one."""
 
 _MIN_TRACE_STEPS = 20
-"""Smallest number of steps along a path."""
 
 MIN_PROGRESS_RATE = 0.01
 """Progress on the line below which a singularity is near: the line in reaches of the end-effector,
@@ -85,10 +84,7 @@ _PATH_LENGTH_SAMPLES = 200
 """Places of a curved way from which its scaled length is estimated."""
 
 _TIMING_INTERVALS = 160
-"""Intervals of the linear program."""
-
 _MAX_TIMING_INTERVALS = 1600
-"""Largest number of intervals, for ways with many corners."""
 
 _USED_ACCELERATION_SHARE = 0.99
 """Share of the limits of acceleration for the path; corrections of the ticks may use the rest."""
@@ -332,7 +328,6 @@ class _LinkPaths:
         return "the smallest singular value of J* (scaled)", float(value)
 
     def position_text(self, share: float) -> str:
-        """Return a share of the lines in words."""
         line = self._lines[0]
         way, kind = (
             line.path_from_start.total_length,
@@ -494,7 +489,6 @@ class _TimedPath:
     def of(
         cls, path: JointPath, limits: MotionLimits, intervals: int = _TIMING_INTERVALS
     ) -> _TimedPath:
-        """Return a path at its fastest."""
         from scipy.interpolate import CubicSpline
 
         shape = CubicSpline(path.arc_length, path.shapes)

@@ -59,7 +59,6 @@ _SAMPLED_SHAPES = 8
 """Shapes in general position at which the motion of the links is examined."""
 
 _SINGULAR_VALUE_TOLERANCE = 1e-7
-"""Singular values below this share of the largest count as zero."""
 
 _MIN_MOTION = 1e-9
 """Motion of a link per metre or radian of the joints that counts as zero, m or rad."""

@@ -44,13 +44,8 @@ from spacerobot_ros.planning.methods.optimal.problem import (
 _ZERO_ROTATION_ANGLE = 1e-9
 
 _SAMPLED_SHAPE_COUNT = 12
-"""Number of sampled shapes in tests of a robot."""
-
 _SINGULAR_VALUE_TOLERANCE = 1e-7
-"""Singular values below this share of the largest count as zero."""
-
 _AXIS_TOLERANCE = 1e-6
-"""Sine of the angle between two directions below which they are the same."""
 
 _MIN_BASE_TURN = 1e-12
 """Turn of the base per metre or radian of the joints that counts as zero, rad."""

@@ -54,7 +54,6 @@ from spacerobot_ros.planning.methods.optimal.problem import (
 )
 
 _WAVES_PER_JOINT = 6
-"""Number of waves of a joint that can be added to a path."""
 
 _ATTITUDE_TOLERANCE = 1e-11
 """Attitude error that counts as zero, rad."""
@@ -82,7 +81,6 @@ _TICK_ROUNDING = 0.02
 """Share of a tick by which a solver's duration may miss a whole number of ticks."""
 
 _LIMIT_ROUNDING = 1e-9
-"""Relative rounding error by which a limit may be exceeded."""
 
 _FADING_ZONE = 0.02
 """Share of half a joint's range, off its ends, within which waves are smaller."""

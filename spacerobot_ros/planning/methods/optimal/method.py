@@ -102,7 +102,6 @@ _COASTING_ANGLE = math.radians(5.0)
 """Angle between the attitudes at which it is looked whether the base passes the goal."""
 
 _COASTING_TURNS = 4.0
-"""Largest number of turns of the base while it coasts."""
 
 _MAX_COASTING_ENDS = 3
 """Largest number of instants at which the coasting base passes the goal that are tried."""
@@ -121,7 +120,6 @@ _MAX_FASTEST_RATIO = 1.25
 on: there may be a faster one, but none so much faster."""
 
 _LIMIT_ROUNDING = 1e-8
-"""Largest relative excess over a limit that counts as rounding."""
 
 
 @dataclass(frozen=True)
@@ -155,7 +153,6 @@ class _Searches:
 
     @classmethod
     def of(cls, model: ManoeuvreModel) -> _Searches:
-        """Make both searches for one model."""
         search = ManoeuvreSearch(model)
         return cls(search, MotionSearch(model, search.solver))
 
@@ -654,7 +651,6 @@ class OptimalGait(GaitMethod):
         )
 
     def _coast(self, request: PlanRequest, ticks: int) -> _CoastingMotion:
-        """Return the motion of the base while the joints rest."""
         state, shapes = request.state, np.tile(request.state.q, (ticks + 1, 1))
         attitudes = self._prediction.attitudes(shapes, state.quaternion, state.angular_momentum)
         times = self.control_period * np.arange(ticks + 1, dtype=np.float64)
@@ -665,7 +661,6 @@ class OptimalGait(GaitMethod):
     def _later(
         self, request: PlanRequest, boundary: BoundaryConditions, coast: _CoastingMotion, ticks: int
     ) -> tuple[PlanRequest, BoundaryConditions]:
-        """Return the request and its boundary conditions after some ticks of coasting."""
         state, quaternion = request.state, coast.attitudes[ticks]
         after = replace(state, position=coast.positions[ticks], quaternion=quaternion)
         later = replace(request, state=after)
@@ -890,7 +885,6 @@ class OptimalGait(GaitMethod):
         L_B: Array | None = None,
         after: Array | float = 0.0,
     ) -> str:
-        """Return the active limits of held commands, with the joints at each limit."""
         if len(positions) < 2:
             return "nothing"
         speed, change = self._limits.limit_shares(positions, self.control_period, velocity, after)
@@ -955,14 +949,12 @@ class _CachedPlan:
     notes: Notes
 
     def to_bytes(self) -> bytes:
-        """Return the plan as a numpy archive."""
         file = io.BytesIO()
         np.savez(file, positions=self.positions, notes=json.dumps(self.notes))
         return file.getvalue()
 
     @classmethod
     def from_bytes(cls, content: bytes) -> _CachedPlan:
-        """Return the plan of a numpy archive."""
         with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
             return cls(arrays["positions"], json.loads(str(arrays["notes"])))
 

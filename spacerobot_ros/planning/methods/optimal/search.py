@@ -80,7 +80,6 @@ _GENTLE_DURATION_FACTOR = 4.0
 fast as the limits allow."""
 
 _COARSE_GRID_RATIO = 5
-"""Ratio of the intervals of the full grid to those of the coarse grid."""
 
 _COARSE_TOLERANCE = 1e-4
 """Tolerance of the solver on the coarse grid, whose own error is larger."""
@@ -89,7 +88,6 @@ _MIN_COARSE_INTERVALS = 8
 """Fewest intervals of a coarse grid; with fewer there is none."""
 
 _MAX_REFINED_SOLUTIONS = 2
-"""Largest number of coarse solutions that are refined."""
 
 _MAX_REFINED_COST_RATIO = 1.1
 """Largest ratio of the cost of a coarse solution to the best one at which it is refined, too: the
@@ -107,14 +105,12 @@ _CLEARING_TIME_FACTOR, _RESAMPLED_TIME_FACTOR = 2.0, 1.2
 of a clear path on a coarse grid: slow joints leave room to go round."""
 
 _SAME_COST_TOLERANCE = 1e-3
-"""Relative difference of costs below which two solutions count as the same."""
 
 _AGREEING_COST_TOLERANCE = 3e-3
 """Solutions whose costs are this near, relative, agree: the coarse grid and the tolerance of the
 solver leave as much between them."""
 
 _AGREEING_SOLUTIONS_WITH_GUESS = 2
-"""Number of agreeing solutions that end a search whose first guess is given."""
 
 _MAX_ITERATIONS_OF_STOPS = 120
 """Steps of the solver from a guess in which wheels stop the base: most take twenty."""
@@ -157,7 +153,6 @@ _CLEARING_TIME_FACTORS_IN_MOTION = (1.4, 2.5)
 intervals, but slow ones need the time."""
 
 _MIN_TICKS_IN_MOTION = 4
-"""Control periods that a manoeuvre in motion takes at least."""
 
 _ADDITIONAL_TICKS = (0, 1, 3, 7)
 """Control periods that lengthen a manoeuvre in motion whose commands exceed a limit."""
@@ -261,7 +256,6 @@ class _SearchState:
 
     @property
     def hastens(self) -> bool:
-        """Whether the manoeuvre is to be fast."""
         return self.options.duration == 0 and not self.gentle
 
     def clearing(self) -> _SearchState:
@@ -276,7 +270,6 @@ class _SearchState:
         return self.stop_rule(found=found).is_expired(found=found)
 
     def report(self, step: str, result: str, iterations: int) -> None:
-        """Log the result of a guess, and the progress of the search."""
         seconds = time.monotonic() - self._began
         # Without a coarse solution, some guesses are tried on the full grid as well.
         most = max(self.options.starts, self.starts)
@@ -287,7 +280,6 @@ class _SearchState:
         )
 
     def solutions_agree(self, solutions: list[Trajectory]) -> bool:
-        """Whether the best solution was found often enough."""
         costs = np.array([self.cost(each) for each in solutions])
         agreeing = self.options.agreeing
         if self.guess is not None:
@@ -797,7 +789,6 @@ class ManoeuvreSearch:
     def _slow_to_effort_limits(
         self, trajectory: Trajectory, boundary: BoundaryConditions
     ) -> Trajectory:
-        """Return the trajectory, slowed to the effort limits of the joints."""
         return trajectory if self._efforts is None else self._efforts.slowed(trajectory, boundary)
 
     def _make_held_commands(
@@ -1170,7 +1161,6 @@ def _fastest_others(found: Sequence[Trajectory], tried: Sequence[float]) -> list
 
 
 def _durations_agree(found: list[Trajectory]) -> bool:
-    """Whether the fastest trajectory was found often enough."""
     durations = np.array([each.duration for each in found])
     return (
         int(np.sum(durations <= durations.min(initial=math.inf) * (1 + _SAME_COST_TOLERANCE)))
