@@ -239,7 +239,6 @@ class Metric:
 
 
 def _capture_metric(name: str, unit: str, description: str, *, yes_or_no: bool = False) -> Metric:
-    """Return the metric of a field of :class:`CaptureMeasures`."""
     evaluate = attrgetter(f"capture.{name}")
     return Metric(unit, description, lambda m, _: float(evaluate(m)), yes_or_no=yes_or_no)
 

@@ -560,10 +560,7 @@ def _with_world(
 ) -> dict[str, dict[str, Any]]:
     """Return the parameters of a scenario file with its obstacles for the plant and the planner.
 
-    Raises
-    ------
-    ParameterError
-        There is no such file, or it is refused.
+    ParameterError if there is no such file, or it is refused.
     """
     try:
         file = (path.parent / world).resolve()

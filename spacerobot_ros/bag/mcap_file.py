@@ -159,7 +159,6 @@ class QosProfile:
 
 
 def _profile_arguments(profile: Qos) -> dict[str, Any]:
-    """Return the arguments of a profile that ``rosbags`` has read."""
     arguments: dict[str, Any] = {}
     for name, value in profile._asdict().items():
         if isinstance(value, QosTime):

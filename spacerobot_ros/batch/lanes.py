@@ -69,13 +69,7 @@ def fly_lanes(flights: Flights) -> BatchResult:
 
 
 def _fly_all_in_lanes(flights: Flights) -> BatchResult:
-    """Fly on vector registers.
-
-    Raises
-    ------
-    NoLibraryError
-        The tick cannot be compiled for them here.
-    """
+    """Fly on vector registers; NoLibraryError if the tick cannot be compiled for them here."""
     model, p = symbolic_model_of(flights)
     tick = CompiledTick.of(flights, model)
     fit = starts_accepted_by_plant(flights)

@@ -284,13 +284,7 @@ class _Engine(Protocol):
 
 
 class _LaneEngine:
-    """Flights in SIMD lanes, all in one block.
-
-    Raises
-    ------
-    NoLibraryError
-        The tick cannot be compiled for lanes here.
-    """
+    """Flights in SIMD lanes, all in one block; NoLibraryError if no tick can be compiled here."""
 
     def __init__(self, flights: Flights, link: str) -> None:
         self._flights, self._link = flights, link

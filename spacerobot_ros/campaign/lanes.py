@@ -411,13 +411,7 @@ class _ControlledLanes:
         return ready
 
     def flights(self, campaign: Campaign, batch: Sequence[_PreparedDraw]) -> Flights:
-        """Return the batch of some draws.
-
-        Raises
-        ------
-        SpaceRobotError
-            A parameter, a start or a goal is refused.
-        """
+        """Return the batch of draws; SpaceRobotError if a parameter, start or goal is refused."""
         scenario = campaign.scenario
         drawn = [each.flight for each in batch]
         goals = [_goals_by_frame(each.scenario) for each in drawn]
@@ -576,16 +570,8 @@ def _decide_goal(
 class _PlannedValues:
     """The values of a scenario that determine a plan for the first state.
 
-    Attributes
-    ----------
-    scenario
-        The scenario.
-    are_noisy
-        Whether the first measured state may differ from draw to draw.
-    depend_on_masses
-        Whether the plan depends on the masses of the plant's robot.
-    others
-        All values that determine a plan without noise besides these masses, to be compared.
+    ``are_noisy``: the first measured state may differ from draw to draw. ``others`` are all values
+    that determine a plan without noise, beside the masses of the plant's robot.
     """
 
     scenario: Scenario

@@ -219,7 +219,6 @@ class ControlExecutive:
         return parts
 
     def _require_controlled(self, key: str, goal: IdentifiedGoal) -> None:
-        """Raise PlanningError where the law does not control the goal's part of the robot."""
         law = self.controller.law
         if not getattr(law.outputs.selection, key):
             raise PlanningError(
@@ -236,7 +235,6 @@ class ControlExecutive:
             )
 
     def _require_tolerances_met(self, key: str, identified: IdentifiedGoal) -> None:
-        """Raise PlanningError where the goal has a tolerance that the law does not look at."""
         selection, goal = self.controller.law.outputs.selection, identified.goal
         axes = selection.base if key == BASE_GOAL_KEY else selection.end_effector
         controls: set[Controlled] = {

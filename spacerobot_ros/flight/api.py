@@ -123,13 +123,7 @@ def _require_goal(scenario: Scenario) -> None:
 
 
 def _raise_if_refused(flight: Flight) -> Flight:
-    """Return a flight whose goal was accepted.
-
-    Raises
-    ------
-    PlanningError
-        The goal was refused; the message is the commander's reason.
-    """
+    """Return a flight whose goal was accepted; else raise PlanningError with the reason."""
     if flight.outcome is Outcome.REFUSED:
         raise PlanningError(flight.message)
     return flight
@@ -320,7 +314,6 @@ def _float_list(values: npt.ArrayLike, what: str) -> list[float]:
 
 
 def _with_parameters(scenario: Scenario, settings: Mapping[str, Any]) -> Scenario:
-    """Return the scenario with other parameters, by ``node.parameter``."""
     if not isinstance(settings, Mapping):
         raise ParameterError(
             "Parameters are given by name, as {'plant.sensors.position_noise': 0.001}, and not as "

@@ -253,7 +253,6 @@ class FlightBag:
         return _LazyMapping(makers)
 
     def _poses_of_end_effectors(self) -> Iterator[Topic]:
-        """Yield the topics ``NAME/pose`` that the bag has."""
         for name in dict.fromkeys(name for part in self.parts for name in part.topic_names()):
             if name.endswith("/pose") and self.series_of(name):
                 yield topic_named(name)

@@ -73,18 +73,10 @@ _PUBLISHED_QOS = QosProfile(depth=100)
 
 @dataclass(frozen=True)
 class _Stream:
-    """The messages of a topic.
+    """The messages of a topic, published at ``time_ns`` (N,), ns, in ascending order.
 
-    Attributes
-    ----------
-    topic
-        The topic.
-    time_ns
-        (N,) when each was published, ns, in ascending order.
-    messages
-        Returns the bytes of some of them.
-    stamp_ns
-        The stamp of all of them, ns; None: the time of their publication.
+    ``messages`` returns the bytes of some of them; ``stamp_ns`` is the stamp of all, None: that is
+    the time of their publication.
     """
 
     topic: Topic

@@ -168,18 +168,9 @@ RecordedCommand = NDArray[np.float64] | CommandError
 class _RecordedPlant:
     """The plant of a bag that was flown in lockstep.
 
-    Attributes
-    ----------
-    recorded
-        The topics of its robot.
-    config
-        Its parameters; those that an earlier version did not have are at their defaults.
-    robot
-        The model.
-    injections
-        The faults that were injected in each tick, and the disturbances.
-    grasps
-        Requests in each tick: captures (true) and releases (false).
+    Parameters that an earlier version did not have are at their defaults. By tick, ``injections``
+    are the injected faults and disturbances, ``grasps`` requested captures (true) and releases
+    (false).
     """
 
     recorded: RecordedRobot

@@ -200,10 +200,7 @@ class _Skeleton:
     def points(self, poses: Array, q: Array) -> Array:
         """Return the points (K, 2 L, 3) in the world, m: the frames, then the centres of mass.
 
-        Parameters
-        ----------
-        poses, q
-            Poses (K, 7) of the base in the world, and joint positions (K, n).
+        ``poses`` (K, 7) are those of the base in the world, ``q`` (K, n) the joint positions.
         """
         R_WL, r_WL = self._kinematics.poses_in_world(poses, q)
         centers = r_WL + np.einsum("klij,lj->kli", R_WL, self._com)

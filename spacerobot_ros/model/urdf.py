@@ -138,7 +138,6 @@ def _loaded(path: Path, parse: Callable[[str], RobotDescription]) -> RobotDescri
 
 
 def _expand_xacro(path: Path) -> str:
-    """Return the URDF text of a xacro file; see :mod:`spacerobot_ros.model.xacro_files`."""
     by_hand = f"`xacro {path.name} > {path.name.split('.')[0]}.urdf`"
     if find_spec("xacro") is None:
         raise RobotDescriptionError(
@@ -300,7 +299,6 @@ def _read_tree(text: str) -> RobotDescription:
 
 
 def _read_numbers(element: Element | None, name: str, default: str, where: str) -> Array:
-    """Return the numbers of an attribute; ``default`` for a missing attribute or element."""
     text = default if element is None else element.get(name, default)
     return _require_finite([float(word) for word in text.split()], where)
 
@@ -668,11 +666,8 @@ _JOINT_TYPES = tuple(kind.value for kind in JointKind)
 def _checked_root(text: str) -> Element:
     """Return the root of a URDF text, reduced to the :data:`_ELEMENTS_READ`.
 
-    Raises
-    ------
-    RobotDescriptionError
-        The text is not XML or not URDF; an attribute or element is missing, given twice, or not a
-        number.
+    RobotDescriptionError if the text is not XML or not URDF, or if an attribute or element is
+    missing, given twice, or not a number.
     """
     try:
         root = fromstring(text)

@@ -171,13 +171,7 @@ class PlannerNode(CommanderNode):
         self.create_subscription(Path, path_topic(link), on_path, STREAM)
 
     def _read_path(self, link: str, message: Path) -> Goal:
-        """Return the goal of a path for an end-effector.
-
-        Raises
-        ------
-        PlanningError
-            It is refused.
-        """
+        """Return the goal of a path for an end-effector; PlanningError if it is refused."""
         what, frame = f"The path of the end-effector '{link}'", self.config.world_frame
         aim = EndEffectorGoal.along(link, path_poses(message, frame, what, self._pose_of))
         if link == DEFAULT_END_EFFECTOR:

@@ -180,7 +180,6 @@ def _round_values(values: Array) -> list[float]:
 
 
 def _color_number(color: str) -> int:
-    """Return a color ``#rrggbb`` as a number."""
     return int(color[1:], 16)
 
 

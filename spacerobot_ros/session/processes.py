@@ -474,13 +474,7 @@ class MultiProcessStack:
 
 
 def _require_flyable(scenario: Scenario) -> None:
-    """Refuse what nodes cannot fly.
-
-    Raises
-    ------
-    ParameterError
-        The scenario kills nodes in lockstep, or its goals cannot be sent.
-    """
+    """Raise ParameterError if the scenario kills nodes in lockstep, or its goals cannot be sent."""
     if scenario.kills and scenario.lockstep:
         raise ParameterError(
             f"The scenario '{scenario.name}' kills nodes on the way: fly it with --nodes and "

@@ -495,17 +495,9 @@ class GoalEditor:
 class _PartMenu:
     """Controls of the parts of the robot that a goal for a planner asks for.
 
-    Without end-effectors, or without a planner, that is the pose of the base.
-
-    Parameters
-    ----------
-    gui, defer, on_note
-        As for :class:`GoalEditor`.
-    edit
-        Queues the changes of users that change the goal.
-    on_change
-        Called with the part when users have changed the parts of its goal, or the part whose
-        numbers are shown.
+    Without end-effectors, or without a planner, that is the pose of the base. ``edit`` queues the
+    changes of users that change the goal; ``on_change`` is called with the part when users have
+    changed the parts of its goal, or the part whose numbers are shown.
     """
 
     def __init__(
@@ -616,14 +608,7 @@ class _PartMenu:
 class _FinalShape:
     """Controls of the joint positions at the end of the manoeuvre.
 
-    Parameters
-    ----------
-    gui
-        As for :class:`GoalEditor`.
-    edit
-        Queues the changes of users.
-    on_change
-        Called when users have changed them.
+    ``edit`` queues the changes of users; ``on_change`` is called when users have changed them.
     """
 
     def __init__(self, gui: viser.GuiApi, edit: Defer, on_change: Callable[[], None]) -> None:

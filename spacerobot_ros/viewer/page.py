@@ -392,21 +392,8 @@ class Plots:
 class _Plot:
     """A plot and its history; its colours can be seen on white and on black.
 
-    Parameters
-    ----------
-    gui, title
-        GUI that the plot is added to, and its title.
-    names
-        Names of the curves.
-    least
-        Least upper end of the axis, so that rounding errors do not look like peaks.
-    signed
-        Whether the numbers may be negative.
-
-    Attributes
-    ----------
-    history, width
-        The numbers so far, and how many curves there are.
+    ``least`` is the least upper end of the axis, so that rounding errors do not look like peaks;
+    ``signed``: the numbers may be negative.
     """
 
     def __init__(

@@ -92,7 +92,6 @@ _INTEGER_BOUNDS = -(2**63), 2**63 - 1
 
 
 def _descriptor(parameter: Parameter) -> ParameterDescriptor:
-    """Return the descriptor that ``ros2 param describe`` shows."""
     unit = f" [{parameter.unit}]" if parameter.unit else ""
     choices = ", ".join(parameter.choices)
     described = ParameterDescriptor(
@@ -144,7 +143,6 @@ def declare(node: Node, parameters: Sequence[Parameter]) -> dict[str, Value]:
 
 
 def _given_value(node: Node, name: str) -> Any:
-    """Return the value that the user set for a parameter; None without one."""
     overrides = getattr(node, "_parameter_overrides", None)
     if isinstance(overrides, dict):
         return overrides[name].value if name in overrides else None

@@ -380,7 +380,6 @@ class PlantNode(FlightNode):
         self._status.take(record.encoded())
 
     def _last_state(self, robot: SpaceRobot) -> LastState | None:
-        """Return the state to go on from; None: the initial one."""
         path = self.config.resume_bag
         if not path:
             return None

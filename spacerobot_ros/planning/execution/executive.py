@@ -312,7 +312,6 @@ class Executive:
         self._stamp_ns = 0
         """Stamp of the state that :meth:`update` answers, ns."""
         self._new_goal: IdentifiedGoal | None = None
-        """A new goal without a plan so far."""
         self._in_motion_attempts = 0
         """Number of late or refused plans in motion for the new goal."""
         self._pending_plan: PlanJob | ReadyPlan | None = None
@@ -385,7 +384,6 @@ class Executive:
         self._teleoperation.twist, self._teleoperation.received_ns = twist, self._stamp_ns
 
     def _require_no_goal(self, link: str) -> None:
-        """Raise PlanningError if twists of a link cannot be followed now."""
         teleoperation, refused = self._teleoperation, self._refused_twist_ns
         if self.phase not in (Phase.IDLE, Phase.TELEOPERATING) or self._new_goal is not None:
             raise PlanningError("Twists are not followed while a goal is pursued: abort it first.")
@@ -850,7 +848,6 @@ class Executive:
         self._average.restart()
 
     def _plan_new_goal_in_motion(self, waiting: IdentifiedGoal, take_over: TakeOver) -> None:
-        """Request a plan for a new goal that takes over without a stop."""
         assert self._active_goal is not None
         if waiting.goal.equals(self._active_goal.identified.goal):
             self._keep_schedule_for(waiting, self._active_goal)
@@ -1257,7 +1254,6 @@ class Executive:
             self._new_goal = self._new_goal or job.identified
 
     def _phase_without_plan(self) -> Phase:
-        """Return the next phase without a plan."""
         if self._tracker.is_active:
             return Phase.BRAKING if self._tracker.is_braking else Phase.EXECUTING
         return self._phase_at_rest()

@@ -303,10 +303,8 @@ class AreaLoopGait(GaitMethod):
     ) -> float:
         """Return the expected number of cycles for the goal, with those that are ``flown``.
 
-        Raises
-        ------
-        PlanningError
-            It is above ``most_cycles``; the message has the clause ``too_near`` on larger loops.
+        PlanningError if it is above ``most_cycles``; the message has the clause ``too_near`` on
+        larger loops.
         """
         cycles = flown + self._count_cycles_left(missing, share, enough)
         most = self.options.most_cycles
@@ -329,12 +327,8 @@ class AreaLoopGait(GaitMethod):
         """Return a share of areas ``S`` (3,), up to a given one, on whose loop links keep clear.
 
         ``state`` is the start of the gait. The second is the clause on the last loop that was too
-        large; empty where the first one is clear.
-
-        Raises
-        ------
-        PlanningError
-            Links come too near on small loops, too.
+        large; empty where the first one is clear. PlanningError if links come too near on small
+        loops, too.
         """
         too_near = ""
         if self.clearance is None:

@@ -169,17 +169,8 @@ class AutoGait(GaitMethod):
 
 @dataclass(frozen=True)
 class _MethodResult:
-    """Result of a method.
-
-    Attributes
-    ----------
-    schedule
-        Its schedule.
-    parts
-        The parts of the goal that it controls.
-    reaches_goal
-        Whether it is predicted to end on the goal, by itself or with the schedules after it.
-    """
+    """A schedule, the controlled parts of the goal, and whether it is predicted to end on the goal,
+    by itself or with the schedules after it."""
 
     schedule: GaitSchedule
     parts: frozenset[Controlled]

@@ -136,21 +136,9 @@ class _SmoothPath:
     """A smooth way through points (K, 3), m, from the origin: a natural cubic spline by the lengths
     of its chords, which through two points is the straight line.
 
-    Parameters
-    ----------
-    points
-        The points.
-    turn
-        (3,) rotation vector from the start to the end, in step with the way, rad.
-
-    Attributes
-    ----------
-    length, total_length
-        Of the chords together, m.
-    is_straight
-        Whether it is a straight line.
-    curvature_breaks
-        Shares of the way at which its curvature jumps: none.
+    ``turn`` (3,) is the rotation vector from the start to the end, in step with the way, rad;
+    ``length`` and ``total_length`` are of the chords together, m. There are no
+    ``curvature_breaks``, shares of the way at which its curvature jumps.
     """
 
     curvature_breaks = np.zeros(0)
@@ -195,16 +183,9 @@ class _SmoothPath:
 class _LinkPath:
     """The line of a link E, in the base B_0 at the start, seen from the centre of mass.
 
-    Attributes
-    ----------
-    link
-        Name of the link.
-    displacements, rotations
-        (k, 3) and (l, 3) directions in which the joints move and turn it, and in which it follows.
-    start_position, start_attitude
-        (3,) and (4,) of its pose at the start.
-    path_from_start
-        The way from the start to the goal.
+    ``displacements`` (k, 3) and ``rotations`` (l, 3) are the directions in which the joints move
+    and turn it, and in which it follows; ``start_position`` (3,) and ``start_attitude`` (4,) its
+    pose at the start.
     """
 
     link: str
@@ -232,16 +213,9 @@ class _LinkPaths:
     """The lines of all links of a goal, and how the joints move the links along them.
 
     Rows are scaled by the reach of the links, joints by their velocity limits: all are radians of
-    the fastest joint.
-
-    Attributes
-    ----------
-    joint_scales
-        (n,) motion of each joint while the fastest one moves by a radian, m or rad.
-    length
-        Length of the lines together, scaled.
-    curvature_breaks
-        Shares of the lines at which their curvature jumps.
+    the fastest joint. ``joint_scales`` (n,) is the motion of each joint while the fastest one moves
+    by a radian, m or rad; ``length`` is that of the lines together, scaled; ``curvature_breaks``
+    are the shares of the lines at which their curvature jumps.
     """
 
     def __init__(self, robot: SpaceRobot, lines: Sequence[_LinkPath], limits: MotionLimits) -> None:
@@ -624,10 +598,7 @@ class ResolvedRateGait(GaitMethod):
     def _route(self, request: PlanRequest, tolerance: float) -> PosePath:
         """Return the path of a request in W, from where the end-effector is.
 
-        Raises
-        ------
-        PlanningError
-            The goal has several end-effectors, or its path too many corners.
+        PlanningError if the goal has several end-effectors, or its path too many corners.
         """
         state, goal = request.state, request.goal
         if len(goal.end_effectors) > 1:
@@ -660,10 +631,7 @@ class ResolvedRateGait(GaitMethod):
     ) -> tuple[Array, Array, Notes]:
         """Return shapes (N + 1, n) and shares of the lines (N + 1,) at ticks, with notes.
 
-        Raises
-        ------
-        PlanningError
-            The lines meet a singularity or a limit; :meth:`plan` says when they are refused.
+        PlanningError if the lines meet a singularity or a limit; :meth:`plan` says when they do.
         """
         path = trace_joint_path(lines, state.q, cancellation)
         notes: Notes = {}
@@ -766,12 +734,8 @@ class ResolvedRateGait(GaitMethod):
         """Return the lines of a goal, along directions in which the joints move the links.
 
         ``piece`` is a part of a given path that the first link follows, the metres before it and
-        those of the whole path; None: it goes through the waypoints to the goal.
-
-        Raises
-        ------
-        PlanningError
-            The goal lies off these directions, or has more of them than the joints can follow.
+        those of the whole path; None: it goes through the waypoints to the goal. PlanningError if
+        the goal lies off these directions, or has more of them than the joints can follow.
         """
         robot = self.robot
         turning = BaseRotations.of(robot)
@@ -869,10 +833,7 @@ class ResolvedRateGait(GaitMethod):
     def _held_commands(self, lines: _LinkPaths, state: RobotState, timed: _TimedPath) -> Array:
         """Return the shapes (N + 1, n) at ticks, with the end-effectors on their lines at each.
 
-        Raises
-        ------
-        PlanningError
-            No number of ticks keeps the limits of the joints.
+        PlanningError if no number of ticks keeps the limits of the joints.
         """
         period = self.control_period
         ticks = max(1, math.ceil(timed.time[-1] / period - 1e-9))

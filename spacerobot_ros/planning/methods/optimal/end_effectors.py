@@ -450,10 +450,7 @@ class EndEffectorSpecification:
     ) -> Array:
         """Return the turn (4,) of the base that puts the end-effectors to their goals in a shape.
 
-        Raises
-        ------
-        UnreachableError
-            No turn of the base puts the end-effectors to their goals.
+        UnreachableError if there is none.
         """
         tolerance = request.tolerance
         X = turn
@@ -500,13 +497,7 @@ class EndEffectorSpecification:
     def _find_possible_ends(
         self, start: Array, limits: MotionLimits, parameters: Array, turn: Array
     ) -> list[PossibleEnd]:
-        """Return ends of guesses, those that the joints reach soonest first.
-
-        Raises
-        ------
-        NotFoundError
-            No possible end was found.
-        """
+        """Return ends of guesses, those that the joints reach soonest first, or NotFoundError."""
         rng = np.random.default_rng(0)
         middle, half = limits.joint_ranges(start)
         speed = np.where(np.isfinite(limits.velocity), limits.velocity, half)
@@ -542,13 +533,8 @@ class EndEffectorSpecification:
         ends: Sequence[PossibleEnd],
         tolerance: Tolerance,
     ) -> PossibleEnd:
-        """Return the first of some ends that meets an overdetermined goal within its tolerance.
-
-        Raises
-        ------
-        NotFoundError
-            None does.
-        """
+        """Return the first end that meets an overdetermined goal within its tolerance, or
+        NotFoundError."""
         turns = np.array([each.base_rotation for each in ends])
         shapes, X, miss = self._inverse_kinematics(
             np.array([each.shape for each in ends]),
@@ -643,13 +629,7 @@ class EndEffectorSpecification:
 def _require_within_radius(
     robot: SpaceRobot, limits: MotionLimits, state: RobotState, goal: Goal
 ) -> None:
-    """Refuse goals that are farther from the centre of mass than any shape puts the end-effector.
-
-    Raises
-    ------
-    UnreachableError
-        The goal is too far from the centre of mass.
-    """
+    """Raise UnreachableError if a goal is farther from the centre of mass than shapes reach."""
     R_WB = matrix_from_quaternion(state.quaternion)
     r_WC = state.position + R_WB @ robot.center_of_mass(state.q)
     for each in goal.end_effectors:

@@ -259,10 +259,7 @@ class GoalSpecification:
     ) -> Array:
         """Return the turn (4,) on any path to a shape (n,), for robots whose loops turn nothing.
 
-        Raises
-        ------
-        UnreachableError
-            It is not the turn of the goal.
+        UnreachableError if it is not the turn of the goal.
         """
         axis, way = self.base_rotations.axes[0], shape - start
         nodes, weights = np.polynomial.legendre.leggauss(_QUADRATURE_NODES)

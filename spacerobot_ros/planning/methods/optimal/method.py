@@ -222,13 +222,8 @@ class OptimalGait(GaitMethod):
         self._cache = Cache(cache_directory() / "plans") if chosen.cache else None
 
     def _kind_of(self, goal: Goal) -> _GoalKind:
-        """Return the kind of a goal; that of a goal of end-effectors is made when it is needed.
-
-        Raises
-        ------
-        GoalError
-            The robot has no such link.
-        """
+        """Return the kind of a goal, made when it is needed; GoalError if the robot has no such
+        link."""
         if not goal.end_effectors:
             return self._base_goals
         key = EndEffectorSpecification.key(goal)
@@ -299,14 +294,8 @@ class OptimalGait(GaitMethod):
         """Return boundary conditions with the rates of reaction wheels at both ends.
 
         The angle of a wheel is free at the end; its rate there is such that the wheels hold all of
-        the momentum, and the base rests.
-
-        Raises
-        ------
-        UnreachableError
-            The wheels cannot hold it.
-        PlanningError
-            The goal leaves the attitude open, on which the rates depend, or wheels are too fast.
+        the momentum, and the base rests. UnreachableError if they cannot hold it; PlanningError if
+        the goal leaves the attitude open, on which the rates depend, or wheels are too fast.
         """
         wheels, n, state = self._wheels, self.robot.n, request.state
         if not len(wheels):
@@ -353,10 +342,7 @@ class OptimalGait(GaitMethod):
     ) -> GaitSchedule:
         """Return the schedule of a robot whose centre of mass coasts, in the frame of that.
 
-        Raises
-        ------
-        PlanningError
-            There are obstacles, or no manoeuvre ends when the goal is where it leads.
+        PlanningError if there are obstacles, or no manoeuvre ends when the goal is where it leads.
         """
         state, goal = request.state, request.goal
         velocity = state.linear_momentum / self.robot.total_mass
@@ -499,12 +485,8 @@ class OptimalGait(GaitMethod):
     ) -> DurationBound:
         """Return a bound of the duration of all manoeuvres from rest to the goal.
 
-        ``final_is_given``: the goal has the last shape of the boundary conditions.
-
-        Raises
-        ------
-        PlanningError
-            It is longer than the time that the options give.
+        ``final_is_given``: the goal has the last shape of the boundary conditions. PlanningError if
+        the bound is longer than the time that the options give.
         """
         robot = self.robot
         # The slots of three sliders determine the shape.
@@ -538,10 +520,7 @@ class OptimalGait(GaitMethod):
     ) -> _PlanResult:
         """Return a manoeuvre from rest that takes no longer than the options ask for.
 
-        Raises
-        ------
-        NotFoundError
-            None was found; where a longer one was found, the message has its duration.
+        NotFoundError if none was found; if a longer one was, the message has its duration.
         """
         searched = request, boundary, limits
         unlimited = replace(chosen, duration=0.0, longest=OptimalOptions().longest)
@@ -700,14 +679,11 @@ class OptimalGait(GaitMethod):
         end: int,
     ) -> _PlanResult:
         """Return a manoeuvre that ends about when the coasting base passes the goal, at tick
-        ``end``. Its first guess turns the base at zero momentum by the angle that is left there.
+        ``end``.
 
-        Raises
-        ------
-        PlanningError
-            None was found.
-        UnusableCandidateError
-            Coasting violates a path constraint.
+        Its first guess turns the base at zero momentum by the angle that is left there.
+        PlanningError if none was found, UnusableCandidateError if coasting violates a path
+        constraint.
         """
         h = self.control_period
         there, aimed = self._later(request, boundary, coast, end)

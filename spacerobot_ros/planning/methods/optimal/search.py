@@ -213,20 +213,12 @@ class Manoeuvre:
 
 @dataclass
 class _SearchState:
-    """One search: its problem and its progress.
+    """One search: its problem, as of :meth:`ManoeuvreSearch.search`, and its progress.
 
-    Attributes
-    ----------
-    boundary, limits, quaternion, options, cancellation, guess
-        As of :meth:`ManoeuvreSearch.search`.
-    starts, rejection
-        Guesses that were tried, and the reason against the last candidate.
-    shortest
-        Duration of the fastest solution so far, s.
-    max_failed_starts
-        Guesses without any solution after which the search ends.
-    kept
-        The pairs of links that are kept apart; None: no clearance is asked for.
+    ``starts`` guesses were tried, ``rejection`` is the reason against the last candidate,
+    ``shortest`` the duration of the fastest solution so far, s; without any, the search ends after
+    ``max_failed_starts``. The pairs of links ``kept`` are kept apart; None: no clearance is asked
+    for.
     """
 
     boundary: BoundaryConditions
@@ -495,12 +487,7 @@ class ManoeuvreSearch:
     ) -> tuple[_SearchState, Trajectory]:
         """Return a fast path near to another one that keeps clear on a coarse grid, with the search
         whose pairs it keeps apart; the same path where it is for the full grid alone.
-
-        Raises
-        ------
-        UnusableCandidateError
-            None was found.
-        """
+        UnusableCandidateError if none was found."""
         coarser, tolerance = self._coarse_grid(progress, intervals)
         if not progress.hastens or coarser == intervals:
             return progress, path
@@ -512,12 +499,7 @@ class ManoeuvreSearch:
 
     def _clear_finely(self, progress: _SearchState, path: Trajectory, intervals: int) -> Manoeuvre:
         """Return a manoeuvre near to a path that keeps clear, by the full grid.
-
-        Raises
-        ------
-        UnusableCandidateError
-            None was found.
-        """
+        UnusableCandidateError if none was found."""
         options, kept = progress.options, progress.kept
         assert kept is not None
         clearing = self._path_clearing(
@@ -570,12 +552,7 @@ class ManoeuvreSearch:
     ) -> tuple[Trajectory, float]:
         """Return a solution near to a guess that keeps pairs of links apart, in a duration, s
         (None: the fastest one), and by how much they are too near all the same, m.
-
-        Raises
-        ------
-        UnusableCandidateError
-            No such solution was found.
-        """
+        UnusableCandidateError if no such solution was found."""
         kept, boundary, limits = progress.kept, progress.boundary, progress.limits
         assert kept is not None
         if progress.options.duration > 0:
@@ -755,7 +732,6 @@ class ManoeuvreSearch:
         *,
         refining: bool = False,
     ) -> Trajectory | None:
-        """Return the solution from a guess, None if there is none."""
         boundary, limits, options = progress.boundary, progress.limits, progress.options
         shortest = self._shortest_duration(progress)
         guess = self._constraints.slowed(guess)
@@ -794,13 +770,8 @@ class ManoeuvreSearch:
     def _make_held_commands(
         self, progress: _SearchState, trajectory: Trajectory | None
     ) -> Manoeuvre:
-        """Return a solution as held commands.
-
-        Raises
-        ------
-        UnusableCandidateError
-            There is no solution, or none that commands reach within the constraints.
-        """
+        """Return a solution as held commands; UnusableCandidateError if there is no solution, or
+        none that commands reach within the constraints."""
         if trajectory is None:
             raise UnusableCandidateError(_NO_PATH_FOUND)
         fixed = progress.options.duration > 0
@@ -827,8 +798,8 @@ class ManoeuvreSearch:
         """Return a solution whose duration matters as held commands; None where that fails.
 
         Were it stretched to whole control periods, the base would turn on meanwhile, or the wheels
-        begin at other rates. So the
-        trajectory of least effort in as many control periods, or a few more, is solved for.
+        begin at other rates. So the trajectory of least effort in as many control periods, or a few
+        more, is solved for.
         """
         boundary, limits, kept = progress.boundary, progress.limits, progress.kept
         narrowed, near = _narrowed(limits), None
@@ -971,13 +942,8 @@ class MotionSearch:
         stop: StopRule,
         kept: KeptDistances | None,
     ) -> HeldCommands:
-        """Return a candidate as held commands that keep clear.
-
-        Raises
-        ------
-        UnusableCandidateError
-            There are none that reach the goal within the limits.
-        """
+        """Return a candidate as held commands that keep clear; UnusableCandidateError if there are
+        none that reach the goal within the limits."""
         position, drifting = boundary.center is not None, boundary.drifts
         free = self._solver(intervals, position, TOLERANCE, (), drifting=drifting)
         guesses = _build_guesses(self._robot, free, boundary)
@@ -1060,7 +1026,6 @@ class MotionSearch:
         stop: StopRule,
         options: OptimalOptions,
     ) -> Trajectory | None:
-        """Return the fastest trajectory near a guess, None if there is none."""
         duration = self._duration_bounds(options)
         for room in _ACCELERATION_SHARES_IN_MOTION:
             narrowed = self._narrow_limits(limits, room)
@@ -1090,12 +1055,7 @@ class MotionSearch:
         near: Neighbourhood | None = None,
     ) -> HeldCommands:
         """Return a path as held commands, in a duration (s) or a few more control periods.
-
-        Raises
-        ------
-        UnusableCandidateError
-            There are none that reach the goal within the limits.
-        """
+        UnusableCandidateError if there are none that reach the goal within the limits."""
         most = 1 if options.duration > 0 else len(_ADDITIONAL_TICKS)
         ticks = max(1, math.ceil(duration / self._period - 1e-6))
         aim = boundary

@@ -530,14 +530,9 @@ class Program:
 class _PlacedBlock:
     """A block placed at every interval or end of the program.
 
-    Attributes
-    ----------
-    block
-        Its functions.
-    variables, rows
-        Places (count, ...) of its variables in x, and of its rows in g; rows of -1 are left out.
-    parameters
-        The part of p that it takes: a column for all places, or one for each.
+    ``variables`` and ``rows`` (count, ...) are the places of its variables in x and of its rows in
+    g (-1: left out), ``parameters`` the part of p that it takes: a column for all places, or one
+    for each.
     """
 
     block: ConstraintBlock
