@@ -81,7 +81,7 @@ def _fly_row(
         case FollowedSchedule() as program:
             command = _schedule_commands(flights, program, row)
         case HeldCommands() as program:
-            command = _held_commands(flights, program, row)
+            command = _held_commands(program, row)
         case ControlledGoals(ends_when_decided=ends):
             assert controller is not None
             command = _controlled_commands(controller, row, result)
@@ -111,7 +111,7 @@ def _fly_row(
             result.limited_ticks[name][row] = counts
 
 
-def _held_commands(flights: Flights, program: HeldCommands, row: int) -> _Commands:
+def _held_commands(program: HeldCommands, row: int) -> _Commands:
     """Return the commands of a table, zero after its end."""
     tables = [program.joints] if program.wrench is None else [program.joints, program.wrench]
     tables = [_table_of_row(table, row) for table in tables]

@@ -437,7 +437,7 @@ def _page_body(results: Results) -> list[str]:
             _percentiles_section(results),
             _histograms_section(results),
             "<h2>Drivers of the result</h2>",
-            _sensitivity_section(results, found),
+            _sensitivity_section(found),
             _scatter_section(results, found),
             "<h2>The worst flights</h2>",
             _worst_flights_section(results),
@@ -561,7 +561,7 @@ def _histograms_section(results: Results) -> str:
     return picture_part(figure, "distributions", caption)
 
 
-def _sensitivity_section(results: Results, found: Sequence[Influence]) -> str:
+def _sensitivity_section(found: Sequence[Influence]) -> str:
     if not found:
         return '<p class="missing">No drawn number varies with a metric.</p>'
     sobol = any(each.total_order_index is not None for each in found)

@@ -351,7 +351,7 @@ class Commander(ABC):
             self._refuse_goal(str(error), goal_id)
             return None
         accepted = IdentifiedGoal(goal, goal_id)
-        self._follow_goal(key, goal_id)
+        self._follow_goal(goal_id)
         self._accept_goal(key, accepted)
         return accepted
 
@@ -422,7 +422,7 @@ class Commander(ABC):
             self._submit_goal(key, goal)
         self._fly_to.end_dropped_goals(self._active_goal_ids())
 
-    def _follow_goal(self, key: str, goal_id: str) -> None:
+    def _follow_goal(self, goal_id: str) -> None:
         """Report the end of a goal that came by topic, whatever ends it."""
         self._fly_to.begin(goal_id)
 

@@ -97,7 +97,7 @@ class ControllerCommander(Commander):
         if self.executive is not None:
             self.executive.configure(self.config)
 
-    def _follow_goal(self, key: str, goal_id: str) -> None:
+    def _follow_goal(self, goal_id: str) -> None:
         # Goals of base and end-effector are pursued together, under the id of the later one: a
         # goal is replaced by one for the same part alone.
         pass

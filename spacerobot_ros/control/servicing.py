@@ -158,7 +158,7 @@ class ApproachTask:
         age = time - target.time
         if age > options.timeout:
             return self._ended(f"the target is lost: its odometry is {age:.3g} s old")
-        if self._plan is not None and self._is_off_prediction(time, target.motion):
+        if self._plan is not None and self._is_off_prediction(target.motion):
             self._plan = None
         if self._plan is None:
             try:
@@ -211,7 +211,7 @@ class ApproachTask:
             return TaskProgress(TaskState.REFUSED, f"The approach is refused: {why}.")
         return TaskProgress(TaskState.FAILED, f"The approach is given up: {why}.")
 
-    def _is_off_prediction(self, time: float, measured: BodyMotion) -> bool:
+    def _is_off_prediction(self, measured: BodyMotion) -> bool:
         assert self._predicted is not None
         assert self.target.body is not None
         expected = self._predicted.grapple([self.target.time - self._planned_at]).body_motion()

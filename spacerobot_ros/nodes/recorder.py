@@ -185,8 +185,8 @@ class RecorderNode(FlightNode):
             if paused:
                 self.report_event(Event(EventKind.RECORDING_PAUSED, "Recording is paused."))
 
-    def drain(self, executor: EventsExecutor, quiet: float = 0.3) -> None:
-        """Record messages on their way, until none has come for ``quiet`` wall s."""
+    def drain(self, executor: EventsExecutor) -> None:
+        """Record messages on their way, until none has come for 0.3 s of wall time."""
         began = last = time.monotonic()
         recording = self.recording
         while recording is not None and recording.running and last - began < _LONGEST_DRAIN:
@@ -194,7 +194,7 @@ class RecorderNode(FlightNode):
             executor.spin_once(timeout_sec=0.001)
             if recording.messages != before:
                 last = time.monotonic()
-            elif time.monotonic() - last > quiet:
+            elif time.monotonic() - last > 0.3:
                 return
 
     def cleanup(self) -> None:

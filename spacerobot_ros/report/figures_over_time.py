@@ -197,7 +197,8 @@ def time_figure(
     if cycles is not None:
         aside += (
             f" The flight ends with {cycles.count} equal cycles of {cycles.period:.4g} s; below, "
-            f"the part before them, and {_close_up_text(cycles)}."
+            f"the part before them, and the last {SHOWN_CYCLES} of them, as change since the "
+            "first instant shown."
         )
     aside += f" {BAND_CAPTION}" if any(dense) else ""
     aside += f" {EVENTS_CAPTION}" if flight.timed_events else ""
@@ -228,10 +229,6 @@ def _draw_rows(axes: Axes, flight: FlightReport, group: TraceGroup, share: float
     axes.set_title(f"{group.label} ({group.unit})")
     set_time(axes, 0.0, flight.end)
     return dense
-
-
-def _close_up_text(cycles: Cycles) -> str:
-    return f"the last {SHOWN_CYCLES} of them, as change since the first instant shown"
 
 
 def _draw_before_cycles(axes: Axes, group: TraceGroup, cycles: Cycles) -> bool:

@@ -226,7 +226,7 @@ class ViewerNode(FlightNode):
         now, state = time.monotonic(), self._listener.state()
         self._take_parameters()
         for action in self._page.update(state, now):
-            self._carry_out(action, state)
+            self._carry_out(action)
         planner = None if "planner" in state.absent else state.planner
         planner_state = None if planner is None else planner.state
         if planner_state is not self._planner_state:
@@ -407,7 +407,7 @@ class ViewerNode(FlightNode):
 
     # -- actions of users -----------------------------------------------------------------------
 
-    def _carry_out(self, action: Action, state: StackState) -> None:
+    def _carry_out(self, action: Action) -> None:
         match action:
             case FlyAction(goals):
                 self._goals_to_send = goals, time.monotonic() + _LONGEST_MATCHING_WAIT

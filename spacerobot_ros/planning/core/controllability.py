@@ -128,11 +128,9 @@ def best_triple(K: Array, among: Sequence[int]) -> tuple[tuple[int, int, int], A
     return triples[best], matrices[best]
 
 
-def brackets_at(
-    robot: SpaceRobot, shape: Array, among: Sequence[int] | None = None
-) -> Controllability:
-    """Return the span of the first-order brackets of joints (indices) at a shape (n,)."""
-    return _span_of_brackets(robot, shape[np.newaxis], among)
+def brackets_at(robot: SpaceRobot, shape: Array) -> Controllability:
+    """Return the span of the first-order brackets of all joints at a shape (n,)."""
+    return _span_of_brackets(robot, shape[np.newaxis], None)
 
 
 def best_sampled_brackets(robot: SpaceRobot, among: Sequence[int] | None = None) -> Controllability:

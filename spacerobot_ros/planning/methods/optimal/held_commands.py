@@ -88,13 +88,12 @@ _FADING_ZONE = 0.02
 
 @dataclass(frozen=True)
 class HeldCommands:
-    """Shapes ``positions`` (N + 1, n) at the ticks, attitudes ``quaternions`` (N + 1, 4) that they
-    cause, from the starting one, and the angle ``end_error`` (rad) that is left to the goal.
+    """Shapes ``positions`` (N + 1, n) at the ticks, and the attitudes ``quaternions`` (N + 1, 4)
+    that they cause, from the starting one.
     """
 
     positions: Array
     quaternions: Array
-    end_error: float
 
 
 @dataclass(frozen=True)
@@ -331,7 +330,7 @@ class CommandHolder:
             if miss <= _ATTITUDE_TOLERANCE or (
                 miss <= 1e3 * _ATTITUDE_TOLERANCE and miss > best / 2
             ):
-                return HeldCommands(positions, quaternions, miss)
+                return HeldCommands(positions, quaternions)
             if miss > 2 * best:
                 return None
             best = min(best, miss)

@@ -478,11 +478,6 @@ class PathConstraints:
         bodies = tuple(_SmoothBody.of(robot, *box) for box in corners)
         return cls(options.max_base_rate, axis, direction, options.keep_angle, corners, bodies)
 
-    @property
-    def knot_inequality_count(self) -> int:
-        """Number of inequalities that :meth:`symbolic` returns."""
-        return len(self.keep_out_boxes) + (self.axis_B is not None)
-
     def symbolic(self, q: ca.SX, quaternion: ca.SX, direction: ca.SX) -> ca.SX:
         """Return the inequality constraints, not negative, at a shape and an attitude.
 

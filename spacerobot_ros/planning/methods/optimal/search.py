@@ -183,8 +183,6 @@ class Manoeuvre:
         Durations of all manoeuvres that were found, s.
     cut_short
         Whether the wall time was used up before the search had come to its end.
-    separated_pairs
-        Number of pairs of links that the solver was told to keep apart.
     """
 
     held: HeldCommands
@@ -193,7 +191,6 @@ class Manoeuvre:
     starts: int = 1
     solutions: list[float] = field(default_factory=list)
     cut_short: bool = False
-    separated_pairs: int = 0
 
     @property
     def positions(self) -> Array:
@@ -526,7 +523,7 @@ class ManoeuvreSearch:
         if made.duration > max(options.longest, options.duration) + self._period / 2:
             raise UnusableCandidateError(_NO_PATH_FOUND)
         progress.report("manoeuvre that keeps clear", f"{made.duration:.6g} s", 0)
-        return replace(made, separated_pairs=len(kept.pairs))
+        return made
 
     def _path_clearing(
         self,
