@@ -411,7 +411,6 @@ class LaneBlock:
                         result.fallback_ticks[self._flown[index]] += 1
 
     def _command_lane(self, group: int, lane: int, index: int, result: BatchResult) -> None:
-        """Compute a lane's command by the controller itself."""
         controller, row = self._tick.controller, int(self._rows_of_lanes[index])
         assert controller is not None
         state = ControlState.unstack(self._memory[group, self._rows["measured"], lane])
@@ -491,7 +490,6 @@ def _pad_table(table: Array, ticks: int, dimensions: int, count: int) -> Array:
 
 
 def _aligned_array(shape: tuple[int, ...], value: float = 0.0) -> Array:
-    """Return an array of equal numbers, aligned for vector registers."""
     count = int(np.prod(shape))
     memory = np.full(count + 8, value)
     offset = (-memory.ctypes.data % 64) // 8

@@ -350,13 +350,11 @@ def _read_dispersions(section: Mapping[str, Any], scenario: Scenario) -> tuple[D
 
 
 _SCIPY_NAMES = {"normal": "norm", "gauss": "norm", "gaussian": "norm", "exponential": "expon"}
-"""Common names of distributions, with those of scipy.stats."""
 
 _ARGUMENT_HELP = {
     "norm": "loc is its mean and scale its standard deviation",
     "uniform": "loc is its least value and scale its width",
 }
-"""Meaning of loc and scale in messages about unknown arguments."""
 
 
 def _read_distribution(target: DispersionTarget, given: Any) -> Distribution:

@@ -444,7 +444,6 @@ def _center_target(index: int, column: int, name: str) -> DispersionTarget:
 
 
 def _floating_target(name: str, part: str, scenario: Scenario) -> DispersionTarget:
-    """Return a mass property of the body that floats beside the robot."""
     if load_target(scenario.plant.target) is None:
         raise ParameterError(
             f"'{name}': there is no target: the scenario '{scenario.name}' has no "

@@ -247,7 +247,6 @@ class DaskWorkers:
     def __init__(self, client: Any) -> None:
         self._client = client
         self._checked: set[str] = set()
-        """Addresses of workers that have this package."""
         self._empty_since = math.inf
         """Monotonic time since which the scheduler has no worker; infinite while it has."""
 

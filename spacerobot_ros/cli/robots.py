@@ -323,7 +323,6 @@ def _finding_json(found: Controllability) -> dict[str, Any]:
 
 
 def _finite_conditions(found: Analysis) -> list[float]:
-    """Return the condition numbers of the shapes where the brackets span all rotations."""
     return [float(x) for x in found.conditions if math.isfinite(x)]
 
 

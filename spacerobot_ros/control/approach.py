@@ -40,7 +40,6 @@ _SAMPLE_PERIOD = 0.25
 """Time between two samples of a reference whose limits are checked, s."""
 
 _COARSE_STRIDE = 8
-"""Stride of the samples in the first, coarse check of a reference."""
 
 _START_PERIOD = 1.0
 """Time between two start times that are tried, s."""

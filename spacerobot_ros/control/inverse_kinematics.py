@@ -27,7 +27,6 @@ _SEARCH_STARTS = 8
 """Shapes from which a search starts: the present one, and random ones."""
 
 _MAX_EVALUATIONS = 30
-"""Largest number of evaluations of the error from each start."""
 
 _SEARCH_TOLERANCE = 1e-4
 """Error below which a search ends, m and rad."""

@@ -24,8 +24,6 @@ if TYPE_CHECKING:
 
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 _DASHES = ("-", "--", "-.", ":")
-"""Line styles of the joints beyond the number of colours."""
-
 _ROBOT_COLOUR, _GOAL_COLOUR = "#1f2328", "#CC79A7"
 _MAX_FRAMES = 1000
 

@@ -52,8 +52,6 @@ _MAX_LIST_TEXTS = 10_000
 """Largest number of texts in a list; a faulty publisher may send a million."""
 
 _HEADER_BYTES = 4096
-"""Size allowed for the header of a JointState and for padding, bytes."""
-
 _POSE_PATH, _TWIST_PATH = "pose.pose.position.x", "twist.twist.linear.x"
 _WRENCH_PATH = "wrench.force.x"
 

@@ -658,7 +658,6 @@ _REQUIRED_ELEMENTS = {
     "collision": {"geometry": _GEOMETRY_REMEDY},
     "joint": {"parent": '<parent link="..."/>', "child": '<child link="..."/>'},
 }
-"""Required elements by their parent, and the text to write."""
 
 _JOINT_TYPES = tuple(kind.value for kind in JointKind)
 

@@ -56,8 +56,6 @@ from spacerobot_ros.topics import TOPICS_NOT_RECORDED
 from spacerobot_ros.version import __version__
 
 _CLOCK_TOPIC = "/clock"
-"""Topic of the clock before remaps."""
-
 _SHARED_TOPICS = ("/diagnostics", TRANSFORMS, STATIC_TRANSFORMS)
 _DESCRIPTION_TOPIC = "robot_description"
 

@@ -39,7 +39,6 @@ _MAX_MESSAGES_AT_ONCE = 500
 """Largest number of messages sent before services and signals are served."""
 
 _LONGEST_DELIVERY = Duration(seconds=2)
-"""Longest wait for readers to receive the last messages."""
 
 _LONGEST_TIMER_PERIOD_NS = 3600 * SECOND
 """Longest period of a timer, ns; gaps between messages in a bag may be longer."""

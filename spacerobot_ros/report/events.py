@@ -54,7 +54,6 @@ _DETAIL_KEYS = (
     "second",
     "wheel",
 )
-"""Keys that distinguish an event from others of its kind."""
 
 
 @dataclass(frozen=True)

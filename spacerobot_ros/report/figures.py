@@ -71,7 +71,6 @@ _FIXED_SETTINGS: Any = {
     "figure.autolayout": False,
     "figure.constrained_layout.use": False,
 }
-"""Settings that style files cannot change."""
 
 
 _figure_width = ContextVar("_figure_width", default=WIDTH)

@@ -741,7 +741,6 @@ def errors_figure(flight: FlightReport) -> ReportFigure | str | None:
 
 
 _MAX_DECADES = 8
-"""Largest number of powers of ten of an axis of errors."""
 
 _ERROR_PARTS: tuple[tuple[Literal["position", "attitude"], str, str], ...] = (
     ("position", "distance", "m"),

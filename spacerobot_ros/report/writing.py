@@ -234,7 +234,6 @@ def write_picture(bag: Path, picture: Path, *, namespace: str | None = None) -> 
 
 
 def _overview_figure(flight: FlightReport) -> Figure:
-    """Base pose and shape over time, beside the robot where it can be drawn."""
     groups = [position_group(flight), attitude_group(flight)]
     if len(flight.shape):
         groups += shape_groups(flight)[:1]

@@ -85,7 +85,6 @@ _CONNECTION_CHECK_PERIOD = 0.05
 """Wall time from one check of the connections to the next, s."""
 
 _CHILD_MODULE = "spacerobot_ros.session.child"
-"""Module that runs a node until this process ends."""
 
 
 def namespace_arguments(namespace: str) -> list[str]:

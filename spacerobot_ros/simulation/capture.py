@@ -586,7 +586,6 @@ class CapturePlant(WrappedPlant):
         return RobotMotion(self.pose.copy(), self.twist.copy(), self.q.copy(), self.qdot.copy())
 
     def _body(self) -> BodyMotion:
-        """Return the present motion of the target."""
         if self.payload is None:
             return self.target.motion
         return frame_motion(self.robot, self.link, self._motion()).at(self._grasp)

@@ -419,7 +419,6 @@ class Listener:
         self._combine_path_and_schedule()
 
     def _combine_path_and_schedule(self) -> None:
-        """Combine path and schedule if they are of one plan."""
         path, schedule = self._path, self._schedule
         self._motion = None
         if path is not None and schedule is not None and path.begin_ns == schedule.begin_ns:

@@ -82,7 +82,6 @@ _ROSOUT_QOS = QoSProfile(
 _LEAST_SHOWN_LOG_LEVEL = 30
 
 _PARTS_WITH_RECEIVED_GOALS = (BASE_GOAL_KEY, DEFAULT_END_EFFECTOR)
-"""Parts whose goals this node receives as well as sends."""
 
 _SERVICE_BY_REQUEST: Mapping[Request, tuple[tuple[str, ...], str, bool | None]] = {
     Request.ABORT: (("planner", "controller"), "abort", None),
@@ -97,7 +96,6 @@ _SERVICE_BY_REQUEST: Mapping[Request, tuple[tuple[str, ...], str, bool | None]] 
 """For each request of the page: nodes, name of their service, and its data (None: Trigger)."""
 
 _NODES_WITH_PARAMETERS = ("plant", "planner", "controller")
-"""Nodes whose parameters the page reads."""
 
 _LONGEST_MATCHING_WAIT = 4.0
 """Wall time that a goal waits for subscribers that are known but not matched yet, s."""

@@ -174,7 +174,6 @@ class GaitMethod(ABC):
 
     @cached_property
     def _prediction(self) -> BasePrediction:
-        """The prediction of the base motion under held commands, as the plant integrates it."""
         return BasePrediction(self.robot, self.control_period, self.integration_step)
 
     @cached_property

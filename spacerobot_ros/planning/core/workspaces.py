@@ -32,8 +32,6 @@ _SAMPLED_SHAPES = 48
 """Shapes from which singular ones are sought, and shapes that are examined for the reach."""
 
 _EXTREME_STARTS = 3
-"""Shapes from which an extreme distance is sought."""
-
 _NEWTON_STEPS, _LONGEST_NEWTON_STEP = 40, 0.5
 _WALK_STEPS, _LONGEST_STEP, _SHORTEST_STEP = 60, 0.25, 1e-4
 """Steps along curves of singular shapes, rad (or m) of the joint that moves most."""

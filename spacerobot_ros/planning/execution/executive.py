@@ -313,13 +313,11 @@ class Executive:
         """Stamp of the state that :meth:`update` answers, ns."""
         self._new_goal: IdentifiedGoal | None = None
         self._in_motion_attempts = 0
-        """Number of late or refused plans in motion for the new goal."""
         self._pending_plan: PlanJob | ReadyPlan | None = None
         """The requested plan, or the plan that waits for its tick (``TAKING_OVER``)."""
         self._coasting: _PlannedRest | None = None
         """The rest that the requested plan begins with, because the base drifts meanwhile."""
         self._active_goal: ActiveGoal | None = None
-        """The goal that is executed or evaluated."""
         self._replan_ns = 0
         """Stamp from which on the remaining motion is planned again, ns."""
         self._commanded_from_ns = 0

@@ -192,7 +192,6 @@ class _MethodResult:
 
     @property
     def message(self) -> str:
-        """The duration of the schedule as a message, with a reason against the schedule, if any."""
         about = "about " if self.schedule.partial else ""
         off = "" if self.reaches_goal else ", which ends off the goal"
         return f"{about}{self.schedule.expected_duration:.6g} s{off}"

@@ -34,7 +34,6 @@ _MAX_AXIS_TILT = 1e-5
 the rounding error of angles with six digits."""
 
 _SAMPLED_SHAPE_COUNT = 8
-"""Number of sampled shapes in the test whether a robot stays in its plane."""
 
 _MAX_PANEL_ANGLE = 0.5
 """Longest piece of a leg that one Gauss rule integrates, rad."""

@@ -55,7 +55,6 @@ _BOX_SHARES = (1.0, 0.5, 0.25, 0.125)
 _BOX_GRID_POINTS = 7
 
 _MAX_BOXES = 300
-"""Largest number of boxes of one size that are examined, the best first."""
 
 ClearanceTest = Callable[[Array], bool]
 """Whether links keep clear at all of some shapes (N, n)."""

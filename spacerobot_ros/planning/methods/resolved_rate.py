@@ -81,8 +81,6 @@ _SAMPLED_SHAPES = 8
 """Shapes in general position at which the freedom of the joints is examined."""
 
 _PATH_LENGTH_SAMPLES = 200
-"""Places of a curved way from which its scaled length is estimated."""
-
 _TIMING_INTERVALS = 160
 _MAX_TIMING_INTERVALS = 1600
 

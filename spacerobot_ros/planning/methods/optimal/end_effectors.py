@@ -56,8 +56,6 @@ from spacerobot_ros.planning.methods.optimal.problem import (
 from spacerobot_ros.planning.methods.optimal.transcription import turn_function
 
 _SAMPLED_SHAPES = 8
-"""Shapes in general position at which the motion of the links is examined."""
-
 _SINGULAR_VALUE_TOLERANCE = 1e-7
 
 _MIN_MOTION = 1e-9
@@ -82,7 +80,6 @@ _END_ERROR = 2e-3
 """Error of a shape that may be the end of a guess, m or rad: the solver brings it to the goal."""
 
 _DIRECT_PATH_STEPS = 12
-"""Steps in which the turn of the base on the direct way to a shape is integrated."""
 
 _MAX_STEP = 0.5
 """Longest step of a joint in inverse kinematics, m or rad."""

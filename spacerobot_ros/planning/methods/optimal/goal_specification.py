@@ -51,7 +51,6 @@ _MIN_BASE_TURN = 1e-12
 """Turn of the base per metre or radian of the joints that counts as zero, rad."""
 
 _MAX_SHAPE_GUESSES = 8
-"""Number of start shapes in the search for a shape with a given centre of mass."""
 
 _INTEGRATION_STEPS, _INTEGRATION_ERROR = 1000, 1e-5
 """Steps in which the turn by one joint is integrated, and the error that this may make, rad."""

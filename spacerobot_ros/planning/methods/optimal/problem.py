@@ -157,7 +157,6 @@ _UNLIMITED_HALF_RANGE = np.pi
 """Half of the range that a guess uses of a joint without limits, rad or m."""
 
 _SMOOTH_BODY_EXPONENT = 8
-"""Exponent of the smooth bodies that stand for boxes of shapes."""
 
 _UNBOUNDED_FROM = 1e6
 """Bounds of a box beyond this, m or rad, do not count for joints without limits."""

@@ -82,7 +82,6 @@ fast as the limits allow."""
 _COARSE_GRID_RATIO = 5
 
 _COARSE_TOLERANCE = 1e-4
-"""Tolerance of the solver on the coarse grid, whose own error is larger."""
 
 _MIN_COARSE_INTERVALS = 8
 """Fewest intervals of a coarse grid; with fewer there is none."""
@@ -233,7 +232,6 @@ class _SearchState:
     _began: float = field(default_factory=lambda: time.monotonic())
 
     def stop_rule(self, *, found: bool) -> StopRule:
-        """Return the stop rule of the solver, with more time until a first solution."""
         deadline = last_call = math.inf
         if self.options.time_budget > 0:
             deadline, last_call = (
