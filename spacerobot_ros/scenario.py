@@ -76,8 +76,7 @@ _SCENARIO_KEYS = (
     *(f"{goal}_{part}" for goal in _GOAL_KEYS for part in ("position", "orientation", "rotvec")),
 )
 
-_LONGEST_TF_PERIOD = 0.1
-"""Longest wall time between transforms of a flight in real time, s."""
+_LONGEST_TF_PERIOD = 0.1  # wall s
 
 
 @dataclass(frozen=True)

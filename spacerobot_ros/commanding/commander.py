@@ -52,8 +52,7 @@ from spacerobot_ros.planning.execution.status import ScheduleStart
 from spacerobot_ros.simulation.status import PlantState, PlantStatus
 from spacerobot_ros.times import SECOND
 
-_REPORT_PERIOD = 1.0
-"""Shortest wall time between two warnings about ignored states, s."""
+_REPORT_PERIOD = 1.0  # wall s, between warnings about ignored states
 
 _LONGEST_SILENCE, _SILENT_PERIODS = 1.0, 5
 """Time without a state after which states are waited for, wall s, and at least control periods."""
@@ -64,9 +63,7 @@ _SUSPENSION_TIME = 0.5
 _EQUAL_RATES = 0.05
 """Largest relative difference between two rates that count as one."""
 
-_FAULT_LOG_PERIOD = 5.0
-"""Shortest wall time between two log lines about one kind of faulty message, s."""
-
+_FAULT_LOG_PERIOD = 5.0  # wall s, of one kind of faulty message
 LogLevel = Literal["debug", "info", "warning", "error"]
 
 

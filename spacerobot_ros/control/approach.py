@@ -36,13 +36,10 @@ from spacerobot_ros.model.rotations import matrix_from_quaternion, quaternion_fr
 from spacerobot_ros.model.space_robot import SpaceRobot
 from spacerobot_ros.parameters import parameter
 
-_SAMPLE_PERIOD = 0.25
-"""Time between two samples of a reference whose limits are checked, s."""
-
+_SAMPLE_PERIOD = 0.25  # s, of checks of limits
 _COARSE_STRIDE = 8
 
-_START_PERIOD = 1.0
-"""Time between two start times that are tried, s."""
+_START_PERIOD = 1.0  # s
 
 _SHORTEST_PATH, _PATH_RATIO, _LONGEST_PATH = 4.0, 1.4, 60.0
 """Shortest duration of a path to the standoff, ratio of two that are tried, and the longest, s."""

@@ -28,8 +28,7 @@ _SEARCH_STARTS = 8
 
 _MAX_EVALUATIONS = 30
 
-_SEARCH_TOLERANCE = 1e-4
-"""Error below which a search ends, m and rad."""
+_SEARCH_TOLERANCE = 1e-4  # m and rad
 
 _RADIAN_LENGTH = 0.5
 """Weight of an error of one radian in a search, m."""

@@ -63,9 +63,7 @@ Progress = Callable[[float, float], bool]
 """Called now and then with simulated time and the time the present schedule ends, s; returns
 whether the flight is to end."""
 
-_PROGRESS_PERIOD = 0.2
-"""Wall time between two calls of the progress function, s."""
-
+_PROGRESS_PERIOD = 0.2  # wall s
 _TICKS_PER_CLOCK_READ = 64
 
 

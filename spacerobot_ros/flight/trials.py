@@ -35,8 +35,7 @@ from spacerobot_ros.simulation.velocity_plant import VelocityPlant
 
 _MAX_SCHEDULES = 1000
 
-_RANDOM_GOAL_TOLERANCE = 1e-5
-"""Tolerance of random goals, rad and m."""
+_RANDOM_GOAL_TOLERANCE = 1e-5  # rad and m
 
 
 @dataclass(frozen=True)

@@ -80,14 +80,12 @@ _QUEUE_DEPTH = 2000
 _CHUNK_SIZE = 262_144
 """Chunk size before compression, bytes: larger chunks have lower fixed costs, but slow seeking."""
 
-_SCAN_PERIOD = 0.1
-"""Wall time between two checks for new topics, s."""
+_SCAN_PERIOD = 0.1  # wall s
 
 _CHECK_PERIOD = 0.4
 """Wall time between two checks that the bag file exists, s: a failure is seen within a second."""
 
-_LONGEST_DRAIN = 1.2
-"""Longest wall time after a signal for recording messages still in transit, s."""
+_LONGEST_DRAIN = 1.2  # wall s
 
 _LOSS_LOG_PERIOD = 5.0
 """Wall s between two log lines about lost messages."""

@@ -292,9 +292,7 @@ def key_frames(motion: Signal, cycles: Cycles | None) -> KeyFrames:
 _POSITION_TOLERANCE = 0.001
 """Tolerance of positions between key frames, as a share of the size of the scene."""
 
-_ANGLE_TOLERANCE = 0.005
-"""Tolerance of angles between key frames, rad."""
-
+_ANGLE_TOLERANCE = 0.005  # rad
 _MAX_LINE_POINTS = 4000
 _MAX_MESH_FACES = 20_000
 """Largest number of faces of all meshes together: some 0.6 MB."""

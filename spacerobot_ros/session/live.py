@@ -114,8 +114,7 @@ def _summary(stack: MultiProcessStack, wall_time: float) -> dict[str, Any]:
     return {**flight.summary(), **recorded}
 
 
-_LONGEST_DISCOVERY = 10.0
-"""Longest wall time until a commander is discovered, s."""
+_LONGEST_DISCOVERY = 10.0  # wall s
 
 _LONGEST_STATUS_WAIT = 1.0
 """Wall time to wait for the status of earlier goals, which is no answer to the new one, s."""

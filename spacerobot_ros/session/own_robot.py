@@ -21,11 +21,8 @@ from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.methods.optimal.goal_specification import BaseRotations
 from spacerobot_ros.simulation import InitialState
 
-_LARGEST_FIRST_ROTATION = math.radians(5.0)
-"""Largest turn of the base in the first scenario of a robot, rad."""
-
-_MAX_USUAL_LIMIT = 4 * math.pi
-"""Largest usual joint limit, rad; larger ones may be in degrees."""
+_LARGEST_FIRST_ROTATION = math.radians(5.0)  # rad
+_MAX_USUAL_LIMIT = 4 * math.pi  # rad; larger ones may be in degrees
 
 _LARGEST_SHARE_OF_DISTANCE_TO_LIMIT = 0.5
 """Largest share of the distance to its limits that a joint uses in the first rotation."""

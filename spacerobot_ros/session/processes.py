@@ -46,11 +46,8 @@ from spacerobot_ros.termination import end_child, start_child
 from spacerobot_ros.times import SECOND, stamp_to_ns
 from spacerobot_ros.topics import GLOBAL_TOPICS, TOPICS_NOT_RECORDED
 
-_LONGEST_START = 60.0
-"""Longest wait for the start of all nodes, wall s."""
-
-_RESTART_PERIOD = 60.0
-"""Wall time over which restarts are counted, s."""
+_LONGEST_START = 60.0  # wall s
+_RESTART_PERIOD = 60.0  # wall s, over which restarts are counted
 
 _LONGEST_END = 10.0
 """Wall time after a signal at which a node that still runs is killed, s."""
@@ -78,12 +75,8 @@ _LONGEST_RECORDING_DELAY = 1.0
 """Wall time for the recorder to receive the last messages of the plant, s."""
 
 
-_LONGEST_ANSWER_AFTER_INTERRUPT = 0.5
-"""Longest wait for an answer after an interrupt, wall s."""
-
-_CONNECTION_CHECK_PERIOD = 0.05
-"""Wall time from one check of the connections to the next, s."""
-
+_LONGEST_ANSWER_AFTER_INTERRUPT = 0.5  # wall s
+_CONNECTION_CHECK_PERIOD = 0.05  # wall s
 _CHILD_MODULE = "spacerobot_ros.session.child"
 
 

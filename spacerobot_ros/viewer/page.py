@@ -61,11 +61,8 @@ _CURVE_COLORS = (
 _AXIS_COLOR = "#8a8f98"
 _PLOT_PIXELS = 170
 
-_LOOK_BACK_STEP_S = 0.1
-"""Step of the slider over the past, simulated s."""
-
-_MIN_LOOK_BACK_S = 1.0
-"""Shortest past that has a slider, simulated s."""
+_LOOK_BACK_STEP_S = 0.1  # simulated s
+_MIN_LOOK_BACK_S = 1.0  # simulated s
 
 _SLIDER_HOLD_S = 1.5
 """Wall time for which the page does not move the time slider after a user has, s."""
@@ -462,8 +459,7 @@ _OBSTACLES_PATH, _TARGET_PATH = "/obstacles", "/target"
 _TEXTS_S, _TABLES_S, _PLOTS_S, _PATHS_S = 0.2, 0.25, 0.5, 0.5
 """Period of drawing of the slower parts, wall s."""
 
-_ANNOUNCEMENT_TIME_S = 60.0
-"""Wall time for which an announcement is shown, s."""
+_ANNOUNCEMENT_TIME_S = 60.0  # wall s
 
 CAMERA = np.array([1.1, 1.4, 0.8])
 """Initial position of the camera relative to the robot, in robot lengths.

@@ -31,8 +31,7 @@ _FLOWN: Color = (60, 130, 240)
 _FLOWN_END_EFFECTOR: Color = (20, 190, 170)
 _PLUME: Color = (255, 110, 40)
 _COLLISION: Color = (200, 60, 200)
-_LINE_WIDTH = 3.0
-"""Width of lines in the scene, pixels."""
+_LINE_WIDTH = 3.0  # pixels
 
 _FRAME_SIZE = 0.12
 """Length of the axes of a link, in robot lengths."""

@@ -25,15 +25,12 @@ TOPIC = "heartbeat"
 HEARTBEAT_PERIOD = 0.2
 """Wall s between two heartbeats of an active node."""
 
-_SILENCE_CHECK_PERIOD = 0.1
-"""Wall time between two checks for silent nodes, s."""
+_SILENCE_CHECK_PERIOD = 0.1  # wall s
 
 _SUSPENSION_TIME = 0.3
 """Wall time between two checks beyond which this node itself was suspended, s."""
 
-_REPORT_PERIOD = 1.0
-"""Wall s between two diagnostics while a node is silent."""
-
+_REPORT_PERIOD = 1.0  # wall s, while a node is silent
 HEARTBEAT_QOS = QoSProfile(depth=20, reliability=ReliabilityPolicy.RELIABLE)
 
 

@@ -56,18 +56,14 @@ from spacerobot_ros.topics import TOPICS
 if TYPE_CHECKING:
     from spacerobot_ros.bag.salvage import LastState
 
-_READER_CHECK_PERIOD = 0.1
-"""Wall time between two checks for new subscribers and commanders, s."""
+_READER_CHECK_PERIOD = 0.1  # wall s
 
 _MAX_UNCONFIRMED_TICKS = STREAM.depth // 2
 """Ticks that a lockstep plant takes at most before all readers confirm that they have their states:
 a reader that has fallen further behind than what publishers keep would lose some."""
 
-_MAX_RATE_AT_REST = 1e-3
-"""Joint rates of a robot at rest, m/s or rad/s."""
-
-_LONGEST_REST = 0.8
-"""Longest wall time to bring the joints to rest before the process ends, s."""
+_MAX_RATE_AT_REST = 1e-3  # m/s or rad/s
+_LONGEST_REST = 0.8  # wall s, before the process ends
 
 _REPORT_PERIOD_NS = 950_000_000
 """Wall time after the last diagnostics at which new ones are due, ns: about one a second."""

@@ -97,12 +97,8 @@ _SERVICE_BY_REQUEST: Mapping[Request, tuple[tuple[str, ...], str, bool | None]] 
 
 _NODES_WITH_PARAMETERS = ("plant", "planner", "controller")
 
-_LONGEST_MATCHING_WAIT = 4.0
-"""Wall time that a goal waits for subscribers that are known but not matched yet, s."""
-
-_LONGEST_GOAL_ANSWER_WAIT = 5.0
-"""Wall time within which a planner or controller answers a goal, s."""
-
+_LONGEST_MATCHING_WAIT = 4.0  # wall s
+_LONGEST_GOAL_ANSWER_WAIT = 5.0  # wall s
 _MICROSECOND_NS = 1000
 _MILLISECOND_NS = 1_000_000
 

@@ -22,8 +22,7 @@ from spacerobot_ros.planning.core.joint_efforts import JointEfforts, given_effor
 from spacerobot_ros.planning.core.prediction import BasePrediction
 from spacerobot_ros.planning.core.schedule import BasePath, GaitSchedule, Notes
 
-_REST_MOMENTUM = 1e-9
-"""Momenta per mass below this count as zero, m/s and m^2/s."""
+_REST_MOMENTUM = 1e-9  # per mass: m/s and m^2/s
 
 END_EFFECTOR_METHOD = "optimal"
 """Name of the method that plans for goals of end-effectors."""
@@ -31,8 +30,7 @@ END_EFFECTOR_METHOD = "optimal"
 PATH_METHOD = "resolved_rate"
 """Name of the method that takes end-effectors along given paths."""
 
-_LIMIT_SLACK = 1e-9
-"""Rounding error by which a goal shape may exceed a joint limit, m or rad."""
+_LIMIT_SLACK = 1e-9  # m or rad
 
 
 @dataclass(frozen=True)

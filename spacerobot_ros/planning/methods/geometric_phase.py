@@ -57,8 +57,7 @@ _MAX_PEAKS = 4
 _EQUAL_PEAK_TOLERANCE = 1e-4
 """Relative difference below which peaks of the curvature count as equal."""
 
-_EQUAL_DISTANCE_TOLERANCE = 1e-2
-"""Distances that differ by less than this count as equal, rad."""
+_EQUAL_DISTANCE_TOLERANCE = 1e-2  # rad
 
 _NEIGHBOUR_OFFSETS = np.array([[x, y] for x in (0.0, -1.0, 1.0) for y in (0.0, -1.0, 1.0)])
 """Offsets of a grid point and its eight neighbours; the first, of the point itself, wins ties."""

@@ -40,8 +40,7 @@ _GRID_REFINEMENTS = 10
 _EQUAL_MEASURE_TOLERANCE = 1e-6
 """Relative difference below which shapes are equally good; the most central shape wins."""
 
-_MIN_EDGE = 1e-4
-"""Shortest usable edge of a loop, m or rad."""
+_MIN_EDGE = 1e-4  # m or rad
 
 _HELD_JOINT_TOLERANCE = 1e-3
 """Motion of held joints up to which a chosen nominal shape still applies, m or rad."""

@@ -74,8 +74,7 @@ _SINGULARITY_STEP_SHARE = 0.25
 _KNOT_TOLERANCE = 1e-6
 """Share of the way within which a jump of its curvature counts as passed."""
 
-_ZERO_DISTANCE = 1e-10
-"""Error of an end-effector that counts as zero, m or rad."""
+_ZERO_DISTANCE = 1e-10  # m or rad
 
 _SAMPLED_SHAPES = 8
 """Shapes in general position at which the freedom of the joints is examined."""

@@ -81,8 +81,7 @@ _END_ERROR = 2e-3
 
 _DIRECT_PATH_STEPS = 12
 
-_MAX_STEP = 0.5
-"""Longest step of a joint in inverse kinematics, m or rad."""
+_MAX_STEP = 0.5  # m or rad
 
 _POSSIBLE_ENDS = 6
 """Ends that guesses of the search have, one after the other."""

@@ -55,8 +55,7 @@ _MAX_SHAPE_GUESSES = 8
 _INTEGRATION_STEPS, _INTEGRATION_ERROR = 1000, 1e-5
 """Steps in which the turn by one joint is integrated, and the error that this may make, rad."""
 
-_JOINT_LIMIT_ROUNDING = 1e-9
-"""Rounding error by which a joint may exceed its limits, m or rad."""
+_JOINT_LIMIT_ROUNDING = 1e-9  # m or rad
 
 _QUADRATURE_NODES = 48
 """Nodes of Gauss and Legendre along the way to a shape."""
@@ -64,8 +63,7 @@ _QUADRATURE_NODES = 48
 _MAX_REPORTED_RANGE_FACTOR = 4.0
 """Ratio to the joint range up to which a shape beyond the limits is reported."""
 
-_POSITION_TOLERANCE = 1e-10
-"""Distance of the base from its wanted position that counts as zero, m."""
+_POSITION_TOLERANCE = 1e-10  # m
 
 
 @dataclass(frozen=True)

@@ -55,9 +55,7 @@ from spacerobot_ros.planning.methods.optimal.problem import (
 
 _WAVES_PER_JOINT = 6
 
-_ATTITUDE_TOLERANCE = 1e-11
-"""Attitude error that counts as zero, rad."""
-
+_ATTITUDE_TOLERANCE = 1e-11  # rad
 _MAX_NEWTON_STEPS = 25
 _MAX_STRETCHES = 40
 _MAX_STRETCH_FACTOR = 1.25
