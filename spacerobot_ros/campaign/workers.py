@@ -437,7 +437,6 @@ class TaskDistributor:
         self._fallbacks: deque[int] = deque()
         """Draws that the engine passes on to the engine ``flights``."""
         self._reasons: dict[int, str] = {}
-        """Reason of each of these outcomes."""
         self._running: dict[Any, _SubmittedTask] = {}
         self._retry_alone: deque[int] = deque()
         """Draws of tasks whose worker died."""

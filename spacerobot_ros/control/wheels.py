@@ -27,7 +27,6 @@ _MIN_PERIODS_TO_LIMIT = 2
 """Shortest time for a wheel to reach its largest rate, in control periods."""
 
 _SATURATED_SHARE = 0.99
-"""Share of the largest rate from which on a wheel counts as saturated."""
 
 _ANNOUNCEMENT_HYSTERESIS = 0.05
 """Decrease of a wheel's rate after which it may be reported again, as share of the largest."""

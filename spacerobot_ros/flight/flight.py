@@ -704,7 +704,6 @@ class Flight:
 
     @property
     def _attributes(self) -> dict[str, str]:
-        """The flight that a table is of."""
         return {
             "scenario": self.scenario.name,
             "method": self.method,

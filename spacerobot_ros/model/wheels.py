@@ -31,7 +31,6 @@ _MOMENTUM_ROUNDING, _LEAST_MOMENTUM = 1e-9, 1e-12
 """Angular momentum that wheels may leave to the base, relative to all of it, and kg m^2/s."""
 
 _REST_SHARE = 1e-9
-"""Share of the largest rates of wheels up to which they rest."""
 
 _MAX_ASYMMETRY = 1e-3
 """Largest difference of a wheel's inertia from that of a body of revolution, relative."""

@@ -61,7 +61,6 @@ _PAPER_WIDTHS = (40.0, 400.0)
 """Least and largest width of a figure for a paper, mm."""
 
 _PICTURE_PIXELS = 1000
-"""Width of a picture in pixels."""
 
 _ROBOT_PANEL_WIDTH = 3.9
 """Width of the robot in a picture, inches."""

@@ -117,7 +117,6 @@ class RobotDrawing:
         self._collision_shapes: list[Any] | None = None
 
     def _node_paths(self, robot: RobotDescription) -> dict[str, str]:
-        """Return the path of the scene node of every link."""
         paths = {robot.base_link: self._path}
         for joint in joints_outward(robot):
             paths[joint.child] = f"{paths[joint.parent]}/link{len(paths)}"

@@ -157,7 +157,6 @@ class Liveness:
         self._timers: list[Timer] = []
         self._watched = {each.value for each in depends_on}
         self._watchdog: Watchdog | None = None
-        """The watchdog of an active node that watches others."""
         self._timeout = 0.0
         self._busy = 0
         """Number of computations under way that may take long."""

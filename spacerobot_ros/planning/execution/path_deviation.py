@@ -200,7 +200,6 @@ class PathCheck:
 
 
 def _excess_share(error: float, allowed: float) -> float:
-    """Return the excess of an error over its allowed size, as a share of the error."""
     return max(0.0, 1.0 - allowed / error) if error > 0 else 0.0
 
 

@@ -360,7 +360,6 @@ class AreaLoopGait(GaitMethod):
         return many + max(1.0, math.log(unbounded / enough) / factor)
 
     def _edge_ends(self, path: EdgePath, nominal: NominalShape) -> LegEnds:
-        """Return the ends of the edges of a path that begins and ends at the nominal shape."""
         chosen = list(nominal.joints)
         lower, upper = self.robot.lower[chosen], self.robot.upper[chosen]
         ends: LegEnds = []

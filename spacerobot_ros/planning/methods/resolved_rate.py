@@ -69,7 +69,6 @@ _ZERO_PROGRESS_RATE = 1e-8
 """Progress below which the path has come to the singularity itself."""
 
 _SINGULARITY_STEP_SHARE = 0.25
-"""Largest step, as a share of the way to a singularity."""
 
 _KNOT_TOLERANCE = 1e-6
 """Share of the way within which a jump of its curvature counts as passed."""

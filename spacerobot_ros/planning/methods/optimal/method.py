@@ -80,7 +80,6 @@ _ZERO_ERROR = 1e-10
 """Largest error that counts as zero: the robot is at the goal; rad, m and joint coordinates."""
 
 _ACTIVE_LIMIT_SHARE = 0.95
-"""Share of a limit beyond which a manoeuvre counts as limited by it."""
 
 _MAX_MOVING_AIMS = 4
 """Largest number of fastest manoeuvres to where a goal is at the end of the one before, seen from a
@@ -166,7 +165,6 @@ class _GoalKind:
 
     @cached_property
     def without_effort_limits(self) -> _Searches:
-        """The searches without effort limits."""
         return _Searches.of(replace(self.model, efforts=None))
 
     @cached_property

@@ -73,7 +73,6 @@ _GENTLE_TICKS, _GENTLE_TIME = 20, 1.0
 small error, and haste would leave a larger one."""
 
 _BUDGET_FACTOR_WITHOUT_SOLUTION = 5.0
-"""Factor of the time budget after which a search without any solution ends."""
 
 _GENTLE_DURATION_FACTOR = 4.0
 """A gentle manoeuvre is the path of least effort in this many times the time of its guess, then as
