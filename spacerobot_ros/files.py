@@ -29,10 +29,7 @@ _CACHE_MAGIC = b"spacerobot_ros cache 2"
 """Beginning of the last line of a cache file, with the number of the file format."""
 
 _MCAP_MAGIC = b"\x89MCAP"
-"""First bytes of a bag."""
-
 _MAX_YAML_CHARACTERS = 1_000_000
-"""Largest number of characters of a YAML text."""
 
 _MAX_YAML_VALUES = 100_000
 """Largest number of values of a YAML text, with those that aliases repeat."""

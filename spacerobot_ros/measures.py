@@ -239,7 +239,6 @@ class Metric:
 
 
 def _capture_metric(name: str, unit: str, description: str, *, yes_or_no: bool = False) -> Metric:
-    """Return the metric of a field of :class:`CaptureMeasures`."""
     evaluate = attrgetter(f"capture.{name}")
     return Metric(unit, description, lambda m, _: float(evaluate(m)), yes_or_no=yes_or_no)
 
@@ -354,16 +353,10 @@ METRICS: dict[str, Metric] = {
 """Every metric by its name."""
 
 
-def metrics_of(measures: Measures, robot: RobotDescription) -> dict[str, float]:
-    """Return every metric of a flight by name, those of joints too; NaN where it has none."""
-    (metrics,) = metrics_of_each([measures], robot)
-    return metrics
-
-
 def metrics_of_each(
     measures: Sequence[Measures], robot: RobotDescription
 ) -> list[dict[str, float]]:
-    """Return the metrics of flights of the same robot; see :func:`metrics_of`."""
+    """Return every metric by name, those of joints too, of flights of one robot; NaN: none."""
     if not measures:
         return []
     joints = {name: np.array([getattr(each, name) for each in measures]) for name in _OF_JOINTS}
@@ -385,7 +378,7 @@ def metrics_of_each(
 
 
 def metric_names(joints: Sequence[str]) -> list[str]:
-    """Return the names that :func:`metrics_of` gives for a robot with these joints, in order."""
+    """Return the names that :func:`metrics_of_each` gives for these joints, in order."""
     names: list[str] = []
     for name, metric in METRICS.items():
         names.append(name)

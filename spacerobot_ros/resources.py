@@ -49,15 +49,8 @@ def resource_names(folder: str, suffix: str) -> list[str]:
     return sorted(path.stem for path in (share_directory() / folder).glob(f"*{suffix}"))
 
 
-def robot_file(name: str, beside: Path | None = None) -> Path:
-    """Return the file of a robot: a path, or the name of a robot of this package.
-
-    Parameters
-    ----------
-    name
-        A path to a URDF or xacro file, or the name of a robot of this package.
-    beside
-        A folder where relative paths are looked for before the current one.
+def robot_file(name: str) -> Path:
+    """Return the file of a robot by a path (URDF or xacro), or by the name of one of this package.
 
     Raises
     ------
@@ -73,11 +66,9 @@ def robot_file(name: str, beside: Path | None = None) -> Path:
             f"There is no robot '{name}': there is no such URDF file, nor a robot of that name "
             f"(known: {', '.join(known)}).{suggestion(name, known)}"
         )
-    folders = [Path()] if beside is None else [beside, Path()]
-    for folder in folders:
-        if (folder / name).is_file():
-            return folder / name
-    if any((folder / name).is_dir() for folder in folders):
+    if Path(name).is_file():
+        return Path(name)
+    if Path(name).is_dir():
         raise ParameterError(f"'{name}' is a folder; name the URDF file in it.")
     nearby = sorted(path.name for path in Path(name).parent.glob("*") if is_path(path.name))
     nearby += resource_names("urdf", ".urdf")

@@ -76,8 +76,7 @@ _SCENARIO_KEYS = (
     *(f"{goal}_{part}" for goal in _GOAL_KEYS for part in ("position", "orientation", "rotvec")),
 )
 
-_LONGEST_TF_PERIOD = 0.1
-"""Longest wall time between transforms of a flight in real time, s."""
+_LONGEST_TF_PERIOD = 0.1  # wall s
 
 
 @dataclass(frozen=True)
@@ -560,10 +559,7 @@ def _with_world(
 ) -> dict[str, dict[str, Any]]:
     """Return the parameters of a scenario file with its obstacles for the plant and the planner.
 
-    Raises
-    ------
-    ParameterError
-        There is no such file, or it is refused.
+    ParameterError if there is no such file, or it is refused.
     """
     try:
         file = (path.parent / world).resolve()
@@ -756,7 +752,6 @@ def _read_content(path: Path) -> dict[Any, Any]:
 
 
 def _parameters_by_node(content: Mapping[str, Any], path: Path) -> dict[str, dict[str, Any]]:
-    """Return the parameters by node and full name in the content of a parameter file."""
     by_node: dict[str, dict[str, Any]] = {}
     of_all_nodes: dict[str, Any] = {}
     for key, section in content.items():

@@ -68,8 +68,6 @@ class Terminated(KeyboardInterrupt):
 
 
 class _Guard:
-    """The signal handlers of this process, and what they have received."""
-
     def __init__(self) -> None:
         self.ending: Terminated | None = None
         """The first signal; None before one."""
@@ -85,7 +83,6 @@ class _Guard:
         self._handlers = {each: signal.signal(each, self._on_signal) for each in numbers}
 
     def remove(self) -> None:
-        """Restore the earlier signal handlers."""
         self.restore_stderr()
         if signal.getsignal(signal.SIGALRM) == self._end_process:
             signal.setitimer(signal.ITIMER_REAL, 0.0)
@@ -94,7 +91,6 @@ class _Guard:
             signal.signal(number, handler)
 
     def restore_stderr(self) -> None:
-        """Restore standard error."""
         if self._errors is not None:
             self._errors, sys.stderr = None, self._errors
 

@@ -310,11 +310,7 @@ def test_robots_that_are_no_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     monkeypatch.chdir(tmp_path)
     (tmp_path / "folder.urdf").mkdir()
     (tmp_path / "robot.urdf").write_text("x")
-    (tmp_path / "beside").mkdir()
-    (tmp_path / "beside" / "robot.urdf").write_text("y")
     assert resources.robot_file("robot.urdf") == Path("robot.urdf")
-    beside = tmp_path / "beside"
-    assert resources.robot_file("robot.urdf", beside) == beside / "robot.urdf"
     for name, sentence in (
         ("folder.urdf", "'folder.urdf' is a folder; name the URDF file in it."),
         (

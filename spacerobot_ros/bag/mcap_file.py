@@ -159,7 +159,6 @@ class QosProfile:
 
 
 def _profile_arguments(profile: Qos) -> dict[str, Any]:
-    """Return the arguments of a profile that ``rosbags`` has read."""
     arguments: dict[str, Any] = {}
     for name, value in profile._asdict().items():
         if isinstance(value, QosTime):
@@ -305,11 +304,9 @@ class _AppendedFile:
         self.waiting = bytearray()
 
     def write(self, data: bytes) -> None:
-        """Append bytes to those that wait, as the library's stream."""
         self.waiting += data
 
     def tell(self) -> int:
-        """Return the position of the next byte, as the library's stream."""
         return self.size + len(self.waiting)
 
     def flush(self) -> None:

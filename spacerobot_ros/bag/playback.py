@@ -15,7 +15,6 @@ from spacerobot_ros.times import SECOND
 
 _LATEST_TIME_NS = 2**63 - 1
 _MAX_AGE_REPUBLISHED_AFTER_SEEK_NS = SECOND
-"""Greatest age of a message that is published again after a jump of the replay, ns."""
 
 _MAX_REPLAYED_TOPICS = 1000
 """Largest number of replayed topics: each one needs a publisher, memory and discovery."""

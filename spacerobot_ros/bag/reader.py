@@ -343,7 +343,6 @@ class Bag:
         return [*found, *attached.values()]
 
     def _prismatic_joints(self, namespace: str) -> dict[str, bool]:
-        """Whether each joint of the robot in a namespace is prismatic."""
         if namespace not in self._prismatic_by_namespace:
             # Importing the robot model doubles the import time of this module.
             from spacerobot_ros.model.description import JointKind
@@ -408,7 +407,6 @@ class Bag:
             ) from error
 
     def _read_together(self, decoders: Mapping[str, Callable[[bytes], Any]]) -> None:
-        """Read the messages of topics, each with the function that decodes a message."""
         ids = {topic: [each.id for each in self._channels(topic)] for topic in decoders}
         times: dict[str, list[NDArray[np.uint64]]] = {topic: [] for topic in decoders}
         data: dict[str, list[bytes]] = {topic: [] for topic in decoders}

@@ -202,7 +202,6 @@ class _Copy:
         return topics
 
     def _new_channel_id(self, channel_id: int) -> int:
-        """Return the channel of the new file for one of the old file."""
         if channel_id not in self._new_channel_ids:
             channel = self._channels[channel_id]
             number = channel.schema_id if channel.schema_id in self._schemas else 0

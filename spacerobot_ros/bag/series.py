@@ -23,7 +23,6 @@ from spacerobot_ros.times import SECOND
 _HEADER = (Nodetype.NAME, "std_msgs/msg/Header")
 
 _DECODING_ERRORS = (SerdeError, ValueError, IndexError, OverflowError, TypeError, struct.error)
-"""Exceptions of decoding a damaged message."""
 
 
 class TopicSeries:

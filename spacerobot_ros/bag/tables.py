@@ -287,7 +287,6 @@ def _object_array(values: list[str]) -> NDArray[Any]:
 
 
 def _json_value(value: Any) -> Any:
-    """Return a part of a message as JSON values."""
     if is_dataclass(value):
         # Constants are in capitals, and fields never are.
         names = (each.name for each in fields(value) if not each.name.isupper())
@@ -308,10 +307,8 @@ _MATLAB_KEYWORD = re.compile(
     "break|case|catch|classdef|continue|else|elseif|end|for|function|global|if|otherwise|parfor|"
     "persistent|return|spmd|switch|try|while"
 )
-"""Keywords of MATLAB, which no variable may be named by."""
 
 _QUOTED_CHARACTERS = re.compile(r'[,"\r\n]')
-"""Characters for which a text in CSV is quoted."""
 
 
 class ExportFormat(str, Enum):
@@ -427,7 +424,6 @@ def export(
 
 
 def _require_suffix(target: Path, format: ExportFormat) -> None:
-    """Refuse an output name whose suffix belongs to another format."""
     suffix = target.suffix.lower()
     if format is ExportFormat.MAT:
         if suffix not in ("", ".mat"):
@@ -563,7 +559,6 @@ def _matlab_struct(table: TopicTable) -> dict[str, Any]:
 
 
 def _matlab_variable(name: str, taken: Mapping[str, Any]) -> str:
-    """Return an unused name of a MATLAB variable."""
     made = re.sub(r"\W+", "_", name, flags=re.ASCII).strip("_")
     made = f"x{made}" if _MATLAB_KEYWORD.fullmatch(made) or not made[:1].isalpha() else made
     return _unused_name(made[: _MAX_VARIABLE_NAME - 4], taken)

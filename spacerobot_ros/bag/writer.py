@@ -288,7 +288,6 @@ class BagWriter:
             self._unsplit_path = asked.with_name(f"{asked.stem}-{number}{asked.suffix}")
 
     def _require_no_numbered_files(self) -> None:
-        """Raise BagExistsError if numbered files of another bag with this name exist."""
         whole = self._unsplit_path
         pattern = re.compile(rf"{re.escape(whole.stem)}_\d+{re.escape(whole.suffix)}")
         with suppress(OSError):

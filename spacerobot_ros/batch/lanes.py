@@ -69,13 +69,7 @@ def fly_lanes(flights: Flights) -> BatchResult:
 
 
 def _fly_all_in_lanes(flights: Flights) -> BatchResult:
-    """Fly on vector registers.
-
-    Raises
-    ------
-    NoLibraryError
-        The tick cannot be compiled for them here.
-    """
+    """Fly on vector registers; NoLibraryError if the tick cannot be compiled for them here."""
     model, p = symbolic_model_of(flights)
     tick = CompiledTick.of(flights, model)
     fit = starts_accepted_by_plant(flights)
@@ -111,7 +105,6 @@ def starts_accepted_by_plant(flights: Flights) -> Flags:
 
 
 def _block_size(flights: Flights, tick: CompiledTick) -> int:
-    """Return how many flights fit into a block."""
     n, chunk = flights.robot.n, min(flights.ticks, _CHUNK_TICKS)
     each = 8 * (2 * tick.memory_layout.total_rows + 60 * len(flights.report_ticks))
     if flights.sensors is not None:
@@ -203,7 +196,6 @@ class LaneBlock:
         self._write_rows("state", state, lanes)
 
     def _write_errors_and_gains(self) -> None:
-        """Write the biases of sensors and the gains of the flights."""
         at = self._rows_of_lanes
         if self._flights.sensors is not None:
             self._write_rows("joint_bias", self._flights.sensors.joint_bias[at])
@@ -367,7 +359,6 @@ class LaneBlock:
         return reports.reshape(-1, self._reports.shape[2])[:count]
 
     def _end_flight(self, index: int, tick: int, message: str, failures: dict[int, str]) -> None:
-        """End the flight of a lane that fails at a tick."""
         group, lane = divmod(index, self._lanes)
         self._memory[group, self._rows["alive"], lane] = 0.0
         if index < len(self._flown):
@@ -375,7 +366,6 @@ class LaneBlock:
             self._ended[index] = tick
 
     def _begin_control(self, failures: dict[int, str]) -> None:
-        """Begin the references of all flights at their first measured states."""
         controller = self._tick.controller
         if controller is None:
             return
@@ -421,7 +411,6 @@ class LaneBlock:
                         result.fallback_ticks[self._flown[index]] += 1
 
     def _command_lane(self, group: int, lane: int, index: int, result: BatchResult) -> None:
-        """Compute a lane's command by the controller itself."""
         controller, row = self._tick.controller, int(self._rows_of_lanes[index])
         assert controller is not None
         state = ControlState.unstack(self._memory[group, self._rows["measured"], lane])
@@ -473,7 +462,6 @@ class LaneBlock:
         result.measured_pose[rows], result.measured_q[rows] = pose, q
 
     def _write_decisions(self, result: BatchResult, rows: Counts) -> None:
-        """Write the decisions about goals, and the ends of the flights."""
         controller, count = self._tick.controller, len(rows)
         assert controller is not None
         result.decision[rows] = self._read_rows("decision")[:count, 0].astype(np.int64)
@@ -502,7 +490,6 @@ def _pad_table(table: Array, ticks: int, dimensions: int, count: int) -> Array:
 
 
 def _aligned_array(shape: tuple[int, ...], value: float = 0.0) -> Array:
-    """Return an array of equal numbers, aligned for vector registers."""
     count = int(np.prod(shape))
     memory = np.full(count + 8, value)
     offset = (-memory.ctypes.data % 64) // 8

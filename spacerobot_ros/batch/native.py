@@ -431,7 +431,6 @@ def _shared_declarations(
     arrays: Mapping[str, Iterable[int]],
     spans: Mapping[str, Iterable[tuple[int, int, int]]],
 ) -> str:
-    """Return the C++ declarations that the driver shares with Python."""
     lines = [f"#define {name} {value}" for name, value in constants.items()]
     lines.append("namespace row {")
     lines += [f"constexpr long long {name} = {at.start};" for name, at in rows.slices.items()]

@@ -81,7 +81,7 @@ def _fly_row(
         case FollowedSchedule() as program:
             command = _schedule_commands(flights, program, row)
         case HeldCommands() as program:
-            command = _held_commands(flights, program, row)
+            command = _held_commands(program, row)
         case ControlledGoals(ends_when_decided=ends):
             assert controller is not None
             command = _controlled_commands(controller, row, result)
@@ -111,7 +111,7 @@ def _fly_row(
             result.limited_ticks[name][row] = counts
 
 
-def _held_commands(flights: Flights, program: HeldCommands, row: int) -> _Commands:
+def _held_commands(program: HeldCommands, row: int) -> _Commands:
     """Return the commands of a table, zero after its end."""
     tables = [program.joints] if program.wrench is None else [program.joints, program.wrench]
     tables = [_table_of_row(table, row) for table in tables]
@@ -123,7 +123,6 @@ def _held_commands(flights: Flights, program: HeldCommands, row: int) -> _Comman
 
 
 def _schedule_commands(flights: Flights, program: FollowedSchedule, row: int) -> _Commands:
-    """Return the velocities of the planner's tracker along a schedule."""
     goal = Goal(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]))
     path = BasePath(np.zeros(1), goal.position[None], goal.quaternion[None])
     names, period = flights.robot.joint_names, flights.control_period
@@ -140,7 +139,6 @@ def _schedule_commands(flights: Flights, program: FollowedSchedule, row: int) ->
 
 
 def _controlled_commands(controller: BatchController, row: int, result: BatchResult) -> _Commands:
-    """Return the commands of a controller, which writes the decision about its goal."""
     monitor, bounds, goal = GoalMonitor(), np.zeros(0), Reference()
 
     def command(tick: int, measured: Plant | Sensors) -> Sequence[Array]:
@@ -181,7 +179,6 @@ def _write_report(
 def _update_peaks(
     plant: Plant, commands: Sequence[Array], control_period: float, result: BatchResult, row: int
 ) -> None:
-    """Update the peaks and integrals of a flight after a tick."""
     for name, value in (("peak_rate", plant.qdot), ("peak_effort", plant.effort)):
         peak = getattr(result, name)[row]
         np.maximum(peak, np.abs(value), out=peak)

@@ -27,8 +27,6 @@ from spacerobot_ros.model.inertial_parameters import InertialParameters
 from spacerobot_ros.simulation.actuators import PLANTS
 from spacerobot_ros.simulation.plant import Plant
 
-Flags = npt.NDArray[np.bool_]
-
 LINK_POSE_SIZE = 12
 """Numbers of a link's pose: rotation by columns and position."""
 
@@ -284,13 +282,7 @@ class _Engine(Protocol):
 
 
 class _LaneEngine:
-    """Flights in SIMD lanes, all in one block.
-
-    Raises
-    ------
-    NoLibraryError
-        The tick cannot be compiled for lanes here.
-    """
+    """Flights in SIMD lanes, all in one block; NoLibraryError if no tick can be compiled here."""
 
     def __init__(self, flights: Flights, link: str) -> None:
         self._flights, self._link = flights, link
@@ -327,8 +319,6 @@ class _LaneEngine:
 
 
 class _PlantEngine:
-    """Flights in one plant each."""
-
     name = "scalar"
 
     def __init__(self, flights: Flights, link: str) -> None:

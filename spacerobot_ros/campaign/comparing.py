@@ -105,7 +105,6 @@ def write_comparison(folders: tuple[Path, Path], path: Path) -> list[str]:
 
 
 def _parameters_part(first: Campaign, second: Campaign) -> list[str]:
-    """Return a table of the parameters that differ, with its heading."""
     rows = [list(row) for row in different_parameters([first.scenario, second.scenario])]
     if not rows:
         return ["<h2>Parameters that differ</h2>", '<p class="missing">None differ.</p>']
@@ -122,7 +121,6 @@ def _difference_line(each: PairedDifference, second: str, first: str) -> str:
 
 
 def _notes_on_failures(first: Results, second: Results) -> list[str]:
-    """Return a sentence on the most frequent reason of each campaign for not reaching a goal."""
     notes = []
     for each in (first, second):
         missed = [found for found in messages_of(each) if found[0] != "reached"]
@@ -135,7 +133,6 @@ def _notes_on_failures(first: Results, second: Results) -> list[str]:
 
 
 def _notes_on_control(first: Results, second: Results) -> list[str]:
-    """Return a sentence on the parts of the goal that each campaign does not control."""
     return [
         f"{each.campaign.name} does not control the {' and '.join(parts)}: that error is where "
         "the motion ends, and is no part of passing unless a criterion names it."

@@ -350,13 +350,11 @@ def _read_dispersions(section: Mapping[str, Any], scenario: Scenario) -> tuple[D
 
 
 _SCIPY_NAMES = {"normal": "norm", "gauss": "norm", "gaussian": "norm", "exponential": "expon"}
-"""Common names of distributions, with those of scipy.stats."""
 
 _ARGUMENT_HELP = {
     "norm": "loc is its mean and scale its standard deviation",
     "uniform": "loc is its least value and scale its width",
 }
-"""Meaning of loc and scale in messages about unknown arguments."""
 
 
 def _read_distribution(target: DispersionTarget, given: Any) -> Distribution:
@@ -407,7 +405,6 @@ def _read_distribution(target: DispersionTarget, given: Any) -> Distribution:
 
 
 def _read_choice(target: DispersionTarget, value: Any) -> Any:
-    """Return a value to choose from, a text or a finite number as its target takes it."""
     if target.is_text:
         if not isinstance(value, str):
             raise ParameterError(f"'{target.name}' is a text; the choice has {value!r}.")
@@ -418,7 +415,6 @@ def _read_choice(target: DispersionTarget, value: Any) -> Any:
 
 
 def _require_node_accepts(target: DispersionTarget, value: Any, scenario: Scenario) -> None:
-    """Refuse a value that a node would refuse in every flight."""
     flight = target.apply(DrawnFlight.of(scenario), value)
     for node in ("plant", *scenario.commanders):
         flight.scenario.config(node)

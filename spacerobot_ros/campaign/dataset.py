@@ -115,7 +115,6 @@ class Dataset:
         )
 
     def _require_no_other_files(self) -> None:
-        """Raise an error for a folder with files that do not belong to a campaign."""
         if not self.folder.exists():
             return
         if not self.folder.is_dir():
@@ -286,13 +285,7 @@ class Dataset:
 
 
 def _read_row_file(part: Path, columns: Sequence[str] | None = None) -> Any:
-    """Return a file of rows as a pyarrow table, with those of ``columns`` that it has.
-
-    Raises
-    ------
-    ParameterError
-        The file is damaged.
-    """
+    """Return a file of rows as a pyarrow table of ``columns`` it has; ParameterError if damaged."""
     arrow, parquet = require_module("pyarrow"), require_module("pyarrow.parquet")
     try:
         with parquet.ParquetFile(part) as file:

@@ -64,7 +64,6 @@ _END_POSITION_TOLERANCE = 1e-6
 """Largest distance of a joint from its last position at the end of a schedule, m or rad."""
 
 _EXTERNAL_LOAD_PREFIXES = "plant.disturbances", "plant.orbit.", "plant.table."
-"""Prefixes of the parameters of loads from outside."""
 
 _GAIN_PREFIX = "coordinated_control.gains."
 """Prefix of the controller's parameters that may differ from lane to lane."""
@@ -80,7 +79,6 @@ _PARAMETERS_COMMON_TO_LANES = (
     "plant.engine",
     "plant.robot",
 )
-"""Prefixes of the plant's parameters that all lanes share."""
 
 _PARAMETERS_COMMON_TO_SCHEDULES = (
     "plant.tick_rate",
@@ -95,7 +93,6 @@ _PARAMETERS_COMMON_TO_SCHEDULES = (
     "planner.max_corrections",
     "planner.output",
 )
-"""Prefixes of the parameters that all lanes along schedules share."""
 
 _OUTCOME_OF_DECISION = {
     Decision.REACHED: (Outcome.REACHED, ControllerState.REACHED),
@@ -122,7 +119,6 @@ class _PreparedDraw:
 
     @property
     def schedule(self) -> GaitSchedule:
-        """Schedule of the draw's plan."""
         assert self.plan is not None
         return self.plan.schedule
 
@@ -202,7 +198,6 @@ class LanesEngine:
         lanes: _ScheduledLanes | _ControlledLanes,
         batch: Sequence[_PreparedDraw],
     ) -> Iterator[Row | Fallback]:
-        """Fly a batch."""
         began = time.perf_counter()
         try:
             flights = lanes.flights(campaign, batch)
@@ -227,7 +222,6 @@ class _ScheduledLanes:
     """Flights along the schedules that the planner's executive makes for the first states."""
 
     max_batch_flights = 512
-    """Largest number of flights of one batch."""
 
     def __init__(self) -> None:
         self._extremes: tuple[GaitSchedule, Array, Array] | None = None
@@ -258,7 +252,6 @@ class _ScheduledLanes:
     def prepare_draw(
         self, campaign: Campaign, draw: Draw, flight: DrawnFlight
     ) -> _PreparedDraw | Fallback:
-        """Let the executive plan a draw."""
         began = time.perf_counter()
         plan = self._plan_first_state(flight)
         if plan is None:
@@ -288,7 +281,6 @@ class _ScheduledLanes:
         return self._extremes[1:]
 
     def flights(self, campaign: Campaign, batch: Sequence[_PreparedDraw]) -> Flights:
-        """Return the batch of some draws."""
         planner = batch[0].flight.scenario.planner
         first, ticks = batch[0].schedule, [each.schedule.ticks for each in batch]
         most = max(ticks)
@@ -373,7 +365,6 @@ class _ControlledLanes:
     """Flights of coordinated control, to the decisions about their goals."""
 
     max_batch_flights = 128
-    """Largest number of flights of one batch."""
 
     def refusal(self, campaign: Campaign) -> str:
         """Return the reason why lanes cannot fly a campaign, as a clause; empty if they can."""
@@ -420,13 +411,7 @@ class _ControlledLanes:
         return ready
 
     def flights(self, campaign: Campaign, batch: Sequence[_PreparedDraw]) -> Flights:
-        """Return the batch of some draws.
-
-        Raises
-        ------
-        SpaceRobotError
-            A parameter, a start or a goal is refused.
-        """
+        """Return the batch of draws; SpaceRobotError if a parameter, start or goal is refused."""
         scenario = campaign.scenario
         drawn = [each.flight for each in batch]
         goals = [_goals_by_frame(each.scenario) for each in drawn]
@@ -513,7 +498,6 @@ def _batch_of_flights(
     ticks: int,
     instants: tuple[int, ...] = (),
 ) -> Flights:
-    """Return the batch of drawn flights under the commands of a program."""
     robot, nominal = plant_robot(drawn[0]), InertialParameters.of(drawn[0].nominal)
     # Draws that leave the scenario share it.
     scenarios = {id(each.scenario): each.scenario for each in drawn}
@@ -556,7 +540,6 @@ def _end_effector_error(
 
 
 def _turns_end_effector(flights: Flights) -> bool:
-    """Whether the controller of a batch turns the end-effector to an attitude."""
     program = flights.program
     assert isinstance(program, ControlledGoals)
     law_type = LAWS[program.config.law]
@@ -587,16 +570,8 @@ def _decide_goal(
 class _PlannedValues:
     """The values of a scenario that determine a plan for the first state.
 
-    Attributes
-    ----------
-    scenario
-        The scenario.
-    are_noisy
-        Whether the first measured state may differ from draw to draw.
-    depend_on_masses
-        Whether the plan depends on the masses of the plant's robot.
-    others
-        All values that determine a plan without noise besides these masses, to be compared.
+    ``are_noisy``: the first measured state may differ from draw to draw. ``others`` are all values
+    that determine a plan without noise, beside the masses of the plant's robot.
     """
 
     scenario: Scenario
@@ -606,7 +581,6 @@ class _PlannedValues:
 
     @classmethod
     def of(cls, scenario: Scenario) -> _PlannedValues:
-        """Return the values of a scenario."""
         plant, goal = scenario.plant, scenario.goal
         sensors = {name: value for name, value in vars(plant.sensors).items() if name != "seed"}
         # Plans from rest do not depend on the masses of the plant's robot.
@@ -669,7 +643,6 @@ def _goal_poses(goals: Sequence[Goal | None]) -> Array | None:
 
 
 def _tick_of_interruption(longest: float, period_ns: int) -> int:
-    """Return the first tick at which a flight is interrupted."""
     tick = max(1, int(longest * SECOND / period_ns) - 1)
     while tick * period_ns / SECOND < longest:
         tick += 1

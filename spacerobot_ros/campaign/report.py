@@ -55,7 +55,6 @@ PASSED_COLOUR = "passing"
 
 _WORST_FLIGHTS_SHOWN = 10
 _MESSAGES_SHOWN = 4
-"""Messages of flights of one outcome."""
 _MAX_BOUND_DISTANCE = 100.0
 """Distance from a bound at which the order of the worst flights saturates, standard deviations."""
 
@@ -67,11 +66,7 @@ NO_INFLUENCES_TEXT = "no correlation is beyond chance (p < 0.05, corrected for a
 Flags = npt.NDArray[np.bool_]
 
 _QUANTILES_SHOWN = (0.01, 0.5, 0.99)
-"""Quantiles shown of each distribution."""
-
 _MAX_CURVE_STEPS = 2000
-"""Steps of a curve of cumulative shares."""
-
 _REASON = "reason"
 _TEXT_COLUMNS = ("outcome", _REASON, "engine", "fallback")
 
@@ -372,7 +367,6 @@ def write_campaign_report(folder: Path, path: Path) -> list[str]:
 
 
 def _sort_passing_first(found: Sequence[Influence]) -> list[Influence]:
-    """Return sensitivities in their order, those of passing before the others."""
     return sorted(found, key=lambda each: each.metric != PASSED_COLOUR)
 
 
@@ -443,7 +437,7 @@ def _page_body(results: Results) -> list[str]:
             _percentiles_section(results),
             _histograms_section(results),
             "<h2>Drivers of the result</h2>",
-            _sensitivity_section(results, found),
+            _sensitivity_section(found),
             _scatter_section(results, found),
             "<h2>The worst flights</h2>",
             _worst_flights_section(results),
@@ -567,7 +561,7 @@ def _histograms_section(results: Results) -> str:
     return picture_part(figure, "distributions", caption)
 
 
-def _sensitivity_section(results: Results, found: Sequence[Influence]) -> str:
+def _sensitivity_section(found: Sequence[Influence]) -> str:
     if not found:
         return '<p class="missing">No drawn number varies with a metric.</p>'
     sobol = any(each.total_order_index is not None for each in found)

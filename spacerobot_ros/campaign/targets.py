@@ -33,7 +33,6 @@ _PARAMETERS_EQUAL_IN_ALL_FLIGHTS = (
     *("plant.robot", "plant.robot_description", "plant.time_mode", "plant.resume_bag"),
     *("planner.resume_file", "coordinated_control.resume_file"),
 )
-"""Parameters that are the same in all flights of a campaign."""
 _MIN_FACTOR = 1e-6
 """Factors of masses and inertias between this and its inverse need no check of every body."""
 
@@ -337,7 +336,6 @@ def _scalar_target(name: str, node: str, declaration: Parameter, value: Any) -> 
 def _list_entry_target(
     name: str, node: str, declaration: Parameter, index: str, scenario: Scenario
 ) -> DispersionTarget:
-    """Return the target of a number in a list, by its index or by its joint."""
     values = _list_values(name, node, declaration, scenario)
     of_joints = declaration.of_joints or (node == "plant" and declaration.length is None)
     joints = list(description_of(scenario).joint_names) if of_joints else []
@@ -446,7 +444,6 @@ def _center_target(index: int, column: int, name: str) -> DispersionTarget:
 
 
 def _floating_target(name: str, part: str, scenario: Scenario) -> DispersionTarget:
-    """Return a mass property of the body that floats beside the robot."""
     if load_target(scenario.plant.target) is None:
         raise ParameterError(
             f"'{name}': there is no target: the scenario '{scenario.name}' has no "
@@ -557,7 +554,6 @@ def _fault_target(name: str, index: int, part: str, scenario: Scenario) -> Dispe
 
 
 def _edit_fault_line(words: list[str], part: str, text: str) -> str:
-    """Return the line of a fault with another time or value."""
     if part == "value":
         return " ".join([*words[:2], text, *words[3:]])
     if part in words:

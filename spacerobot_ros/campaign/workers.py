@@ -54,7 +54,6 @@ _NO_WORKER_WARNING_DELAY = 5.0
 """Wall time without a worker after which a warning is printed, s."""
 
 _THREAD_COUNT_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS")
-"""Environment variables for the number of threads of a worker."""
 
 KILLED = "killed"
 """The outcome of a flight during which a worker died twice."""
@@ -155,7 +154,6 @@ class _LocalWorker:
             other.close()
 
     def close(self) -> None:
-        """End the process."""
         self.process.kill()
         self.process.join()
         self.connection.close()
@@ -249,7 +247,6 @@ class DaskWorkers:
     def __init__(self, client: Any) -> None:
         self._client = client
         self._checked: set[str] = set()
-        """Addresses of workers that have this package."""
         self._empty_since = math.inf
         """Monotonic time since which the scheduler has no worker; infinite while it has."""
 
@@ -440,7 +437,6 @@ class TaskDistributor:
         self._fallbacks: deque[int] = deque()
         """Draws that the engine passes on to the engine ``flights``."""
         self._reasons: dict[int, str] = {}
-        """Reason of each of these outcomes."""
         self._running: dict[Any, _SubmittedTask] = {}
         self._retry_alone: deque[int] = deque()
         """Draws of tasks whose worker died."""
@@ -462,7 +458,6 @@ class TaskDistributor:
             self._workers.cancel(list(self._running))
 
     def _submit_tasks(self, waiting: deque[int]) -> None:
-        """Keep the workers busy."""
         workers = self._workers.count()
         most = workers * self._workers.tasks_per_worker
         alone = any(task.runs_alone for task in self._running.values())

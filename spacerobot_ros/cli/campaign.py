@@ -202,7 +202,6 @@ def _compare(
     out: Path | None,
     report: Path | None,
 ) -> None:
-    """Fly two campaigns on the same draws, and write a report of their differences."""
     from spacerobot_ros.campaign.comparing import require_same_draws, write_comparison
     from spacerobot_ros.campaign.config import load_campaign
 

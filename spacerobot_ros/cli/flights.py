@@ -145,7 +145,6 @@ def _changed_scenario(
     settings: tuple[str, ...],
     realtime: float | None,
 ) -> Scenario:
-    """Return the scenario with the changes of the command line."""
     from spacerobot_ros.scenario import scenario_or_robot
 
     scenario = goal.apply_to(scenario_or_robot(name))
@@ -157,7 +156,6 @@ def _changed_scenario(
 
 
 def _summary_lines(summary: dict[str, Any]) -> list[str]:
-    """Return the result as lines for the user."""
     position, attitude = summary["position_error_m"], summary["attitude_error_rad"]
     beside = turned = ""
     if position is not None and attitude is not None:
@@ -248,7 +246,6 @@ def _clearance_line(summary: dict[str, Any]) -> list[str]:
 
 
 def _published_lines(scenario: Scenario, summary: dict[str, Any]) -> list[str]:
-    """Return lines with the published figures beside the measured ones."""
     lines = []
     for row in scenario.comparable if summary["state"] in ("reached", "failed") else ():
         measured = summary.get(row.quantity, summary["gait"].get(row.quantity))

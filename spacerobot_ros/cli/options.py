@@ -34,13 +34,6 @@ class _TextPath(click.Path):
     """
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """Return the path.
-
-        Raises
-        ------
-        click.BadParameter
-            The name has bytes that are not UTF-8, or is ``-``.
-        """
         if str(value) == "-" and not (param and "--json" in param.opts):
             self.fail("'-' stands for no file here: name one.", param, ctx)
         try:
@@ -246,13 +239,7 @@ class EndEffectorOptions:
 
 
 def _read_path(file: Path) -> list[list[float]]:
-    """Return the numbers of a path in a text file: a line is a position or a pose.
-
-    Raises
-    ------
-    click.BadParameter
-        The file cannot be read, or has other text.
-    """
+    """Return the numbers of a text file, a position or a pose a line; else raise BadParameter."""
     try:
         if not file.is_file():
             raise click.BadParameter(f"The path {file} is no regular file.")

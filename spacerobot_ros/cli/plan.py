@@ -122,7 +122,6 @@ def plan_command(
 
 
 def _distance_from(goal: Goal, trial: PlanEvaluation) -> str:
-    """Return how far a plan ends from its goal."""
     if not goal.end_effectors:
         return f"{trial.error.angle:.3g} rad and {trial.error.distance:.3g} m from the goal"
     from spacerobot_ros.planning.execution.status import describe_remaining_error
@@ -131,7 +130,6 @@ def _distance_from(goal: Goal, trial: PlanEvaluation) -> str:
 
 
 def _clearance_line(problem: PlanningProblem, trial: PlanEvaluation) -> str:
-    """Return a line with the nearest approach of two links, or to an obstacle, in a plan."""
     from spacerobot_ros.collision import CollisionGeometry, PathCheck
     from spacerobot_ros.planning import RobotState
     from spacerobot_ros.planning.core.prediction import BasePrediction
@@ -210,7 +208,6 @@ def plan_json(problem: PlanningProblem, trial: PlanEvaluation) -> dict[str, Any]
 
 
 def _end_effectors_of(goal: Goal, trial: PlanEvaluation) -> dict[str, Any]:
-    """Return goals and errors of end-effectors, where the goal has any."""
     if not goal.end_effectors:
         return {}
     return {
@@ -271,7 +268,6 @@ def _plan_random_goals(
 
 
 def _row_of_method(name: str, goals: int, trials: Sequence[PlanEvaluation]) -> str:
-    """Return the row of a method for a number of goals, of which these were simulated."""
     import numpy as np
 
     reached = sum(each.reached for each in trials)

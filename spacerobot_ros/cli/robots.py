@@ -34,7 +34,6 @@ _MAX_PLAUSIBLE_SPEED = 25.0
 """Speed of a joint, rad/s, beyond which it is likely to be in degrees; that of fast legs is 21."""
 
 _MAX_LISTED_DISTANCES = 3
-"""Pairs of links whose distances are listed, nearest first."""
 
 _MAX_LISTED_INTERVALS = 4
 """Intervals of distances that are listed; of more, the number and the length are."""
@@ -245,7 +244,6 @@ def _joint_rows(robot: SpaceRobot) -> list[str]:
 
 
 def _degree_warnings(robot: RobotDescription) -> list[str]:
-    """Return warnings about limits and speeds that look as if they were in degrees."""
     turning = [each for each in robot.movable_joints if each.unit == "rad"]
     wide = [
         joint.name
@@ -325,7 +323,6 @@ def _finding_json(found: Controllability) -> dict[str, Any]:
 
 
 def _finite_conditions(found: Analysis) -> list[float]:
-    """Return the condition numbers of the shapes where the brackets span all rotations."""
     return [float(x) for x in found.conditions if math.isfinite(x)]
 
 

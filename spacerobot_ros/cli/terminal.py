@@ -91,7 +91,6 @@ def sentences() -> Iterator[None]:
 
 
 _BAR_STEPS = 1000
-"""Number of steps of a flight's progress bar."""
 
 
 class Display:

@@ -434,7 +434,6 @@ def _spins_in_place(solid: Solid, link_pose: Pose, joint: Joint) -> bool:
 
 
 def _solid_in_world(obstacle: Solid, pose: Pose) -> Solid:
-    """Return an obstacle in the frame of the world, from its link's frame at a pose there."""
     box, vertices = obstacle.enclosure, obstacle.vertices
     return replace(
         obstacle,

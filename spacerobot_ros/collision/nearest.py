@@ -137,18 +137,10 @@ class Approach:
 
 @dataclass(frozen=True)
 class _Path:
-    """A path of the shape, with the base where obstacles count.
+    """A path of shapes (N + 1, n) at the ticks, with the base where obstacles count, else None.
 
-    Attributes
-    ----------
-    positions
-        (N + 1, n) shapes at the ticks, m or rad.
-    base
-        Poses of the base at the ticks; None: obstacles do not count.
-    distance_bounds
-        (N + 1, P) lower bounds of the distances of pairs at the ticks, m.
-    largest_motions
-        (N, P): how far pairs move against each other at most in each tick, m.
+    ``distance_bounds`` (N + 1, P) are lower bounds of the distances of pairs, m;
+    ``largest_motions`` (N, P) how far pairs move against each other at most in each tick, m.
     """
 
     positions: Array

@@ -52,8 +52,7 @@ from spacerobot_ros.planning.execution.status import ScheduleStart
 from spacerobot_ros.simulation.status import PlantState, PlantStatus
 from spacerobot_ros.times import SECOND
 
-_REPORT_PERIOD = 1.0
-"""Shortest wall time between two warnings about ignored states, s."""
+_REPORT_PERIOD = 1.0  # wall s, between warnings about ignored states
 
 _LONGEST_SILENCE, _SILENT_PERIODS = 1.0, 5
 """Time without a state after which states are waited for, wall s, and at least control periods."""
@@ -64,9 +63,7 @@ _SUSPENSION_TIME = 0.5
 _EQUAL_RATES = 0.05
 """Largest relative difference between two rates that count as one."""
 
-_FAULT_LOG_PERIOD = 5.0
-"""Shortest wall time between two log lines about one kind of faulty message, s."""
-
+_FAULT_LOG_PERIOD = 5.0  # wall s, of one kind of faulty message
 LogLevel = Literal["debug", "info", "warning", "error"]
 
 
@@ -351,7 +348,7 @@ class Commander(ABC):
             self._refuse_goal(str(error), goal_id)
             return None
         accepted = IdentifiedGoal(goal, goal_id)
-        self._follow_goal(key, goal_id)
+        self._follow_goal(goal_id)
         self._accept_goal(key, accepted)
         return accepted
 
@@ -422,7 +419,7 @@ class Commander(ABC):
             self._submit_goal(key, goal)
         self._fly_to.end_dropped_goals(self._active_goal_ids())
 
-    def _follow_goal(self, key: str, goal_id: str) -> None:
+    def _follow_goal(self, goal_id: str) -> None:
         """Report the end of a goal that came by topic, whatever ends it."""
         self._fly_to.begin(goal_id)
 
@@ -430,7 +427,6 @@ class Commander(ABC):
         self._publish_decision(self._make_status("refused", message, goal_id))
 
     def _abort_waiting(self, message: str) -> None:
-        """Give up the goals that wait for a robot."""
         *_, goal = self._waiting_goals.values()
         self._waiting_goals = {}
         self._goal_file.delete()
@@ -456,7 +452,6 @@ class Commander(ABC):
     # -- goals of actions ---------------------------------------------------------------------
 
     def _active_goal_ids(self) -> set[str]:
-        """Return the ids of the goals that are pursued, or wait to be."""
         pursued = {goal.goal_id for goal in self._waiting_goals.values()}
         if self.active and self.executive is not None:
             pursued |= self.executive.unfinished_goals
@@ -689,7 +684,6 @@ class Commander(ABC):
                 self._change_masses(self.robot)
 
     def _with_payload(self, robot: SpaceRobot) -> SpaceRobot:
-        """Return the robot with the body that it holds according to the plant's status."""
         self._held = None
         try:
             if self._payload:
@@ -733,13 +727,11 @@ class Commander(ABC):
         self._configure_executive()
 
     def _adapted(self, config: Any) -> Any:
-        """Return a configuration with the known rate of the plant, for the robot."""
         config = replace(config, tick_rate=self.config.tick_rate)
         return config if self._described is None else config.for_robot(self._described.description)
 
     @property
     def _knows_rate(self) -> bool:
-        """Whether the rate of the plant is known, so that states can be answered."""
         return self.config.tick_rate > 0
 
     @abstractmethod

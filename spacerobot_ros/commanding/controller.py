@@ -85,10 +85,8 @@ class ControllerCommander(Commander):
         self._pose_has_come = self._odom_was_connected = False
         self.effort, self.wrench = np.zeros(0), np.zeros(6)
         self._measured: ControlState | None = None
-        """The last measured state."""
         self._measured_arrays: tuple[Array, ...] = ()
         self._target: RobotDescription | None = None
-        """The target, as it is described."""
         self._target_odometry: Stamped | None = None
         """The latest odometry of the target, until it is read."""
 
@@ -99,7 +97,7 @@ class ControllerCommander(Commander):
         if self.executive is not None:
             self.executive.configure(self.config)
 
-    def _follow_goal(self, key: str, goal_id: str) -> None:
+    def _follow_goal(self, goal_id: str) -> None:
         # Goals of base and end-effector are pursued together, under the id of the later one: a
         # goal is replaced by one for the same part alone.
         pass
@@ -403,7 +401,6 @@ class ControllerCommander(Commander):
         return measured
 
     def _read_target(self, decoder: StateDecoder) -> None:
-        """Read the latest odometry of the target."""
         if self._target_odometry is not None:
             assert self.executive is not None
             (stamp_ns, message), self._target_odometry = self._target_odometry, None

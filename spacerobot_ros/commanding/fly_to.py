@@ -224,7 +224,6 @@ class FlyToGoals:
         self._served: dict[str, _ActionGoal] = {}
         """By goal id, in the order in which they came."""
         self._clients = 0
-        """Number of goals with a client."""
         self._accepted: list[str] = []
         """Ids of the goals that were accepted and not refused, by action or by topic, in order."""
 

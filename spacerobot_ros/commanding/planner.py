@@ -103,11 +103,8 @@ class PlannerCommander(Commander):
         super().__init__(config, host, (BASE_GOAL_KEY,), pose_required=False, clock=clock)
         self._method, self._on_long_work = method, long_work
         self._last_goal: IdentifiedGoal | None = None
-        """The goal that was accepted last."""
         self._status: PlannerStatus | None = None
-        """The status that the executive has reported last."""
         self._disturbances: tuple[str, ...] = ()
-        """Lines of the active disturbances of the plant."""
         self._obstacles: str | None = None
         """The text on the topic obstacles; None: the robot has its own."""
         self._world: RobotDescription | None = None
@@ -151,7 +148,6 @@ class PlannerCommander(Commander):
         self._measured = _MeasuredState(decoder)
 
     def _make_worker(self, robot: SpaceRobot, method: GaitMethod | None) -> PlanningWorker:
-        """Return a worker that plans around the present obstacles."""
         described = robot.description
         if self._obstacles is not None:
             described = with_world(described, self._world)

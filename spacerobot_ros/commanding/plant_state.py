@@ -162,7 +162,6 @@ class StampFilter:
         return (odom if odom.stamp_ns == joints.stamp_ns else None), joints
 
     def _begin(self, stamp_ns: int) -> None:
-        """Begin a time with its first state."""
         self.now_ns = self._first_ns = stamp_ns
         self._wall = self._first_wall = self._clock()
         self._longest_step = math.inf

@@ -18,10 +18,7 @@ from spacerobot_ros.planning.execution.status import ScheduleStart
 from spacerobot_ros.times import SECOND
 
 _ANSWER_TIMEOUT_NS = 5 * SECOND
-"""Longest time until the server has accepted or rejected a schedule, ns."""
-
 _SERVER_CHECK_PERIOD_NS = SECOND
-"""Time between two checks for the server, ns."""
 
 _PHASES_OF_MOTION = (Phase.EXECUTING, Phase.REPLANNING, Phase.TAKING_OVER, Phase.PLANNING)
 """Phases in which a schedule is followed on; in PLANNING its successor replaces it."""
@@ -183,7 +180,6 @@ class TrajectoryOutput:
 
 
 def _motion_end(outcome: Outcome, code: int, text: str) -> TrajectoryEnd:
-    """Return the meaning of a result."""
     if outcome is Outcome.SUCCEEDED and code == ErrorCode.SUCCESSFUL:
         return TrajectoryEnd()
     text = printable(text).rstrip(".")

@@ -36,14 +36,10 @@ from spacerobot_ros.model.rotations import matrix_from_quaternion, quaternion_fr
 from spacerobot_ros.model.space_robot import SpaceRobot
 from spacerobot_ros.parameters import parameter
 
-_SAMPLE_PERIOD = 0.25
-"""Time between two samples of a reference whose limits are checked, s."""
-
+_SAMPLE_PERIOD = 0.25  # s, of checks of limits
 _COARSE_STRIDE = 8
-"""Stride of the samples in the first, coarse check of a reference."""
 
-_START_PERIOD = 1.0
-"""Time between two start times that are tried, s."""
+_START_PERIOD = 1.0  # s
 
 _SHORTEST_PATH, _PATH_RATIO, _LONGEST_PATH = 4.0, 1.4, 60.0
 """Shortest duration of a path to the standoff, ratio of two that are tried, and the longest, s."""
@@ -55,7 +51,6 @@ _STANDOFF_FACTORS = (1.0, 2.0, 3.0)
 """Standoff distances that are tried where the target blocks the way, over the given one."""
 
 _MAX_BLOCKED_PATHS = 100
-"""Number of paths past the body of the target that are tried."""
 
 _ARM_RATE_SHARE = 0.9
 """Share of the joint rates that the path of an arm may take."""
@@ -482,7 +477,6 @@ class TargetClearance:
         return found
 
     def _base_in_target(self, base: Pose, grapple: FrameMotion) -> BasePoses:
-        """Return the poses of the base in T."""
         R_TW = self._grapple.R @ np.swapaxes(grapple.R, 1, 2)
         r_TB = np.einsum("kij,kj->ki", R_TW, base.r - grapple.r) + self._grapple.r
         R_TB = R_TW @ base.R

@@ -108,7 +108,6 @@ class ControlExecutive:
         """Whether the plant ignores commands, set by the owner. Each command then holds the pose of
         its state, so that none of them moves the robot when the plant obeys again."""
         self._abort_message = ""
-        """The message of the status while the state is aborted."""
         self._pending: dict[str, IdentifiedGoal] = {}
         """Accepted goals that wait for the next measured state."""
         self._abort_requested = False
@@ -116,12 +115,10 @@ class ControlExecutive:
         self._goal_id = ""
         self._monitor, self._stall = GoalMonitor(), StallMonitor()
         self._was_measured = False
-        """Whether the base has been measured."""
         self.servicing.end()
         self._resumes = True
         """Whether the present goal is saved in the file of goals."""
         self._after_tasks: dict[str, IdentifiedGoal] = {}
-        """The goals that are pursued after tasks."""
         self._requested: tuple[Task, ...] | None = None
         """Tasks that were requested without a goal, and wait for the next measured state."""
         self._error_bounds: Array | None = None
@@ -197,7 +194,6 @@ class ControlExecutive:
             self._pending[part] = each
 
     def _parts_of(self, identified: IdentifiedGoal) -> dict[str, IdentifiedGoal]:
-        """Return the goals of the base and the end-effector by their keys."""
         law, goal = (
             self.controller.law,
             identified.goal.for_robot(self.controller.law.robot.description),
@@ -223,7 +219,6 @@ class ControlExecutive:
         return parts
 
     def _require_controlled(self, key: str, goal: IdentifiedGoal) -> None:
-        """Raise PlanningError where the law does not control the goal's part of the robot."""
         law = self.controller.law
         if not getattr(law.outputs.selection, key):
             raise PlanningError(
@@ -240,7 +235,6 @@ class ControlExecutive:
             )
 
     def _require_tolerances_met(self, key: str, identified: IdentifiedGoal) -> None:
-        """Raise PlanningError where the goal has a tolerance that the law does not look at."""
         selection, goal = self.controller.law.outputs.selection, identified.goal
         axes = selection.base if key == BASE_GOAL_KEY else selection.end_effector
         controls: set[Controlled] = {
@@ -364,7 +358,6 @@ class ControlExecutive:
         self._file.delete()
 
     def _report_abort(self) -> None:
-        """Report that every goal has been given up."""
         self._goal_state = self._reported_state = ControllerState.ABORTED
         self._publish(ControllerState.ABORTED, self._abort_message)
         self._report_decision(EventKind.GOAL_ABORTED, self._abort_message, ControllerState.ABORTED)
@@ -552,7 +545,6 @@ class ControlExecutive:
                 self._end_tasks(time, state, progress)
 
     def _begin_tasks(self, time: float, tasks: tuple[Task, ...]) -> None:
-        """Start with the tasks before a goal, or with requested ones."""
         self.servicing.begin(tasks)
         self._goal_id = self._latest_id() if self._pending else ""
         if self._pending:
@@ -608,7 +600,6 @@ class ControlExecutive:
         self._save(self._goals_to_save())
 
     def _take_tolerance(self, tolerance: Tolerance | None) -> None:
-        """Use the tolerances of a goal instead of those of the parameters, if it has any."""
         self._goal_tolerance, self._goal_config = tolerance, self._config
         if tolerance is not None:
             self._goal_config = replace(
@@ -637,7 +628,6 @@ class ControlExecutive:
         return pose
 
     def _goals_to_save(self) -> dict[str, IdentifiedGoal]:
-        """Return the goals of all controlled poses, to resume with."""
         goal, selection = self.controller.goal, self.controller.law.outputs.selection
         shape = goal.joints.q if goal.joints is not None and selection.joints else None
         if shape is not None and self.controller.wheels is not None:
@@ -652,7 +642,6 @@ class ControlExecutive:
         }
 
     def _latest_id(self) -> str:
-        """Return the id of the last accepted goal."""
         return next(reversed(self._pending.values())).goal_id if self._pending else self._goal_id
 
     # -- status -------------------------------------------------------------------------------

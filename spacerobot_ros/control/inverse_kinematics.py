@@ -27,10 +27,8 @@ _SEARCH_STARTS = 8
 """Shapes from which a search starts: the present one, and random ones."""
 
 _MAX_EVALUATIONS = 30
-"""Largest number of evaluations of the error from each start."""
 
-_SEARCH_TOLERANCE = 1e-4
-"""Error below which a search ends, m and rad."""
+_SEARCH_TOLERANCE = 1e-4  # m and rad
 
 _RADIAN_LENGTH = 0.5
 """Weight of an error of one radian in a search, m."""

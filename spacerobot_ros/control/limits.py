@@ -37,7 +37,6 @@ _SLOW_RATE_SHARE = 0.5
 evaluated."""
 
 _MOBILITY_SHAPES = 16
-"""Number of random shapes for the estimate of each joint's largest mobility."""
 
 _SURE_SHARE = 1.0 - 1e-9
 """Share of the limit of a force or torque up to which no rounding counts."""
@@ -177,7 +176,6 @@ class ActuatorLimits:
         return Saturated(commanded, self._no_excess)
 
     def _keeps(self, commanded: Actuation) -> bool:
-        """Whether a command is within the limits."""
         # In Python's numbers: numpy takes longer for so few.
         wrench = commanded.wrench_B.tolist()
         if not (math.hypot(*wrench[:3]) <= self.force and math.hypot(*wrench[3:]) <= self.torque):
@@ -374,7 +372,6 @@ class LimitCheck:
         effort[:] = actuators.effort
         per_rate[:], per_effort[:] = rates.factors()
         self._checked: Array | None = None
-        """The bounds of the last check."""
         self._given: Array | None = None
         self._share = 0.0
 

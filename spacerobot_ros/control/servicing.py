@@ -158,7 +158,7 @@ class ApproachTask:
         age = time - target.time
         if age > options.timeout:
             return self._ended(f"the target is lost: its odometry is {age:.3g} s old")
-        if self._plan is not None and self._is_off_prediction(time, target.motion):
+        if self._plan is not None and self._is_off_prediction(target.motion):
             self._plan = None
         if self._plan is None:
             try:
@@ -211,8 +211,7 @@ class ApproachTask:
             return TaskProgress(TaskState.REFUSED, f"The approach is refused: {why}.")
         return TaskProgress(TaskState.FAILED, f"The approach is given up: {why}.")
 
-    def _is_off_prediction(self, time: float, measured: BodyMotion) -> bool:
-        """Whether the target is away from its predicted motion."""
+    def _is_off_prediction(self, measured: BodyMotion) -> bool:
         assert self._predicted is not None
         assert self.target.body is not None
         expected = self._predicted.grapple([self.target.time - self._planned_at]).body_motion()
@@ -220,7 +219,6 @@ class ApproachTask:
         return off.distance > _PREDICTION_TOLERANCE or off.angle > _PREDICTION_TOLERANCE
 
     def _clearance(self, controller: CoordinatedController) -> TargetClearance | None:
-        """Return the distances of the robot from the body of the target."""
         target, link = self.target, controller.law.outputs.selection.end_effector_link
         least = self.config.target.clearance
         if target.description is None or target.body is None or not least:

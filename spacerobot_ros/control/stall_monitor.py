@@ -132,7 +132,6 @@ class StallMonitor:
             self.cause = self._find_cause(controller, result)
 
     def _find_cause(self, controller: CoordinatedController, result: Saturated) -> str:
-        """Return the first of the known causes."""
         law, limited = controller.law, self._is_limited
         stop = _joint_at_stop(law.robot, law.state.q)
         if stop and limited:
@@ -166,7 +165,6 @@ def _joint_at_stop(robot: SpaceRobot, q: Array) -> str:
 
 
 def _largest_share(errors: OutputErrors, config: ControllerConfig) -> float:
-    """Return the largest error as a share of its tolerance."""
     return max(
         error / max(tolerance, _LEAST_SMALLEST_TOLERANCE)
         for error, tolerance in (
@@ -180,7 +178,6 @@ def _largest_share(errors: OutputErrors, config: ControllerConfig) -> float:
 def _lag(
     errors: OutputErrors, controller: CoordinatedController, config: ControllerConfig
 ) -> float:
-    """Return the largest error as a share of the way of its reference."""
     assert controller.profile is not None
     ways = controller.profile.distances()
     pairs = (

@@ -29,14 +29,9 @@ from spacerobot_ros.model.rotations import (
     rotvec_from_quaternion,
 )
 
-_STEP_ANGLE = 0.05
-"""Rotation of the target in one Runge-Kutta step, rad."""
-
-_LONGEST_STEP = 1.0
-"""Longest Runge-Kutta step, s."""
-
-_SMALL_ANGLE = 1e-3
-"""Angle below which functions of an angle are series, rad."""
+_STEP_ANGLE = 0.05  # rad, of the target in one step
+_LONGEST_STEP = 1.0  # s, of Runge-Kutta
+_SMALL_ANGLE = 1e-3  # rad; below it, functions of an angle are series
 
 
 @dataclass(frozen=True)

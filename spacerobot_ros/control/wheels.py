@@ -27,7 +27,6 @@ _MIN_PERIODS_TO_LIMIT = 2
 """Shortest time for a wheel to reach its largest rate, in control periods."""
 
 _SATURATED_SHARE = 0.99
-"""Share of the largest rate from which on a wheel counts as saturated."""
 
 _ANNOUNCEMENT_HYSTERESIS = 0.05
 """Decrease of a wheel's rate after which it may be reported again, as share of the largest."""
@@ -36,7 +35,6 @@ _DUMP_TIME = 5.0
 """Time constant with which rates decay while momentum is dumped, s."""
 
 _DUMPED_SHARE = 0.02
-"""Share of the largest rates below which momentum counts as dumped."""
 
 _DUMP_TORQUE_SHARE = 0.5
 """Share of the thrusters' torque for dumping; control needs the other part."""

@@ -35,16 +35,11 @@ from spacerobot_ros.simulation.config import OrbitConfig, TableConfig
 from spacerobot_ros.simulation.plant import InitialState
 
 _MAX_DRAWS = 10_000
-"""Largest number of draws of a campaign that episodes start from."""
-
 _MAX_REFUSED_DRAWS = 100
-"""Number of draws in succession that may be refused, before a campaign is."""
-
 _DEFAULT_SCENARIOS = {"reorient": "arm_attitude", "reach": "reach"}
 
 _GOALS = ("random", "scenario")
 
-Flags = npt.NDArray[np.bool_]
 Counts = npt.NDArray[np.int64]
 
 
@@ -234,7 +229,6 @@ class EpisodeStarts:
 
 
 def _require_steppable(scenario: Scenario, robot: SpaceRobot) -> None:
-    """Refuse what environments do not have."""
     plant = scenario.plant
     parts = {
         "faults": bool(plant.faults),

@@ -24,7 +24,6 @@ from gymnasium.vector.utils import batch_space  # noqa: E402
 
 
 def _spaces(episodes: Episodes) -> tuple[Any, Any]:
-    """Return the spaces of observations and actions."""
     low, high = episodes.task.observation_bounds()
     size = (episodes.action_size,)
     return Box(low, high, dtype=np.float64), Box(-1.0, 1.0, size, dtype=np.float64)
@@ -158,7 +157,6 @@ class SpaceRobotVectorEnv(VectorEnv, EzPickle):
         self._generators = [generator for generator, _ in seeded]
         self._seeds = [seed for _, seed in seeded]
         self._begun = np.zeros(num_envs, dtype=np.bool_)
-        """Whether each robot was ever reset."""
         self._ended = np.zeros(num_envs, dtype=np.bool_)
         """Episodes that have ended and not begun anew."""
 

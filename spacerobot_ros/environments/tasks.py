@@ -30,7 +30,6 @@ from spacerobot_ros.planning.core.controllability import sample_shapes
 from spacerobot_ros.planning.methods.optimal.goal_specification import BaseRotations
 
 _SAMPLED_SHAPE_COUNT = 12
-"""Number of shapes at which the motions of a link are looked at."""
 
 _MIN_SHARE_OF_MOTION = 1e-7
 """Singular values below this share of the largest are no motion."""

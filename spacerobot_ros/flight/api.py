@@ -123,13 +123,7 @@ def _require_goal(scenario: Scenario) -> None:
 
 
 def _raise_if_refused(flight: Flight) -> Flight:
-    """Return a flight whose goal was accepted.
-
-    Raises
-    ------
-    PlanningError
-        The goal was refused; the message is the commander's reason.
-    """
+    """Return a flight whose goal was accepted; else raise PlanningError with the reason."""
     if flight.outcome is Outcome.REFUSED:
         raise PlanningError(flight.message)
     return flight
@@ -272,7 +266,6 @@ def _with_goals(
     rotvec: npt.ArrayLike | None,
     hands: Sequence[EndEffectorGoal],
 ) -> Scenario:
-    """Return a scenario with other goals of its base, and of end-effectors."""
     scenario = _with_goal(scenario, goal, position, rotvec)
     if not hands:
         return scenario
@@ -295,7 +288,6 @@ def _changed_goal(
     position: npt.ArrayLike | None,
     rotvec: npt.ArrayLike | None,
 ) -> Goal:
-    """Return the given goal, or the earlier goal with another position or attitude."""
     made = before
     if isinstance(goal, Goal):
         made = goal
@@ -322,7 +314,6 @@ def _float_list(values: npt.ArrayLike, what: str) -> list[float]:
 
 
 def _with_parameters(scenario: Scenario, settings: Mapping[str, Any]) -> Scenario:
-    """Return the scenario with other parameters, by ``node.parameter``."""
     if not isinstance(settings, Mapping):
         raise ParameterError(
             "Parameters are given by name, as {'plant.sensors.position_noise': 0.001}, and not as "

@@ -37,8 +37,7 @@ from spacerobot_ros.simulation.loads import Surroundings
 BUDGET_PARTS = ("base", "arm", "wheels", "sum")
 """Columns of :func:`momentum_budget_over_time`."""
 
-_SAME_TIME = 1e-6
-"""Largest difference of times that count as equal, s."""
+_SAME_TIME = 1e-6  # s
 
 
 @dataclass(frozen=True)

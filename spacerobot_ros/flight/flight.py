@@ -62,7 +62,6 @@ if TYPE_CHECKING:
 _INITIAL_ROW_COUNT = 1024
 
 _TRUE_QUANTITIES = ("pose", "twist", "q", "qdot", "effort", "momentum")
-"""Quantities that are attributes of a flight."""
 
 _QUANTITY_SIZES = {
     **dict.fromkeys(("pose", "momentum", "measured_pose", "end_effector_pose"), 7),
@@ -328,7 +327,6 @@ class Flight:
 
     @property
     def _holds_target(self) -> bool:
-        """Whether the robot holds the target at the end."""
         changes = (EventKind.CAPTURED, EventKind.RELEASED)
         last = [event.kind for event in self.events if event.kind in changes][-1:]
         return last == [EventKind.CAPTURED]
@@ -564,7 +562,6 @@ class Flight:
 
     @property
     def _turned_links(self) -> list[str]:
-        """Links whose attitude the planner's goal names."""
         assert self.goal is not None
         assert self.robot is not None
         aims = self.goal.for_robot(self.robot).end_effectors
@@ -707,7 +704,6 @@ class Flight:
 
     @property
     def _attributes(self) -> dict[str, str]:
-        """The flight that a table is of."""
         return {
             "scenario": self.scenario.name,
             "method": self.method,
@@ -945,8 +941,6 @@ class FlightLog:
 
 
 class _GrowingTable:
-    """A table that grows by rows."""
-
     def __init__(self, size: int) -> None:
         self._table = np.empty((_INITIAL_ROW_COUNT, size))
         self._count = 0

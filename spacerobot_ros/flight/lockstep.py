@@ -63,11 +63,8 @@ Progress = Callable[[float, float], bool]
 """Called now and then with simulated time and the time the present schedule ends, s; returns
 whether the flight is to end."""
 
-_PROGRESS_PERIOD = 0.2
-"""Wall time between two calls of the progress function, s."""
-
+_PROGRESS_PERIOD = 0.2  # wall s
 _TICKS_PER_CLOCK_READ = 64
-"""Number of ticks between two reads of the wall clock."""
 
 
 @dataclass(frozen=True)
@@ -270,7 +267,6 @@ class LockstepFlight:
         self._diagnosed_ns: dict[str, int] = {}
         """When the diagnostics of each commander were published last, ns."""
         self._statuses: dict[str, StatusRecord] = {}
-        """The last status of each commander."""
         self.log = FlightLog(self._plant, self._reported, self._commands, self._period_ns)
         self._follower = GoalFollower(GoalIds().of(*_FIRST_GOAL_STAMP))
         self._decided: _DecisionState | None = None
@@ -383,7 +379,6 @@ class LockstepFlight:
         return self._status.ends_at_s if isinstance(self._status, PlannerStatus) else 0.0
 
     def _report_state(self) -> None:
-        """Report the state of a tick, as the node publishes it."""
         self._reported.update()
         self.log.add_state(self._tick)
         if self._report_ticks and self._tick % self._report_ticks == 0:
@@ -405,7 +400,6 @@ class LockstepFlight:
         return True
 
     def _answer_state(self) -> None:
-        """Have the commanders answer the present state."""
         self._moment = _DecisionState.BEFORE_COMMAND
         quantities, now = self._reported.quantities, self._now_ns
         q, qdot = quantities["measured_q"], quantities["measured_qdot"]
@@ -484,7 +478,6 @@ class LockstepFlight:
     # -- the status of the plant --------------------------------------------------------------
 
     def _report_plant_status(self, activity: PlantState) -> None:
-        """Pass a change of the plant's status to the commanders."""
         self._injected_seen, self._moment = self._plant.injected, _DecisionState.AFTER_COMMAND
         before = self._monitor.status
         self.log.events += self._events_until(activity)

@@ -253,7 +253,6 @@ class FlightBag:
         return _LazyMapping(makers)
 
     def _poses_of_end_effectors(self) -> Iterator[Topic]:
-        """Yield the topics ``NAME/pose`` that the bag has."""
         for name in dict.fromkeys(name for part in self.parts for name in part.topic_names()):
             if name.endswith("/pose") and self.series_of(name):
                 yield topic_named(name)
@@ -548,7 +547,6 @@ def _read_statuses(bag: FlightBag, commander: str) -> list[tuple[int, Status]]:
 
 
 def _scenario_in_bag(bag: FlightBag) -> Scenario:
-    """Return the scenario of a flight, as far as its bag holds it."""
     about = bag.metadata.get("scenario", {})
     nodes: dict[str, dict[str, Any]] = {
         node: _recorded_values(kind, bag.metadata[f"parameters/{node}"])

@@ -73,18 +73,10 @@ _PUBLISHED_QOS = QosProfile(depth=100)
 
 @dataclass(frozen=True)
 class _Stream:
-    """The messages of a topic.
+    """The messages of a topic, published at ``time_ns`` (N,), ns, in ascending order.
 
-    Attributes
-    ----------
-    topic
-        The topic.
-    time_ns
-        (N,) when each was published, ns, in ascending order.
-    messages
-        Returns the bytes of some of them.
-    stamp_ns
-        The stamp of all of them, ns; None: the time of their publication.
+    ``messages`` returns the bytes of some of them; ``stamp_ns`` is the stamp of all, None: that is
+    the time of their publication.
     """
 
     topic: Topic
@@ -194,7 +186,6 @@ def _streams(flight: Flight) -> Iterator[_Stream]:
 
 
 def _state_streams(flight: Flight) -> Iterator[_Stream]:
-    """Yield the topics of the plant's state, in the order of their publication."""
     period = round(flight.control_period * SECOND)
     stamps: NDArray[np.int64] = np.arange(len(flight.time), dtype=np.int64) * period
     config, robot = flight.scenario.plant, flight.required_robot()
@@ -295,7 +286,6 @@ def _frame_streams(flight: Flight) -> Iterator[_Stream]:
 def _marker_maker(
     flight: Flight, markers: RobotMarkers, ticks: NDArray[np.int64]
 ) -> Callable[[slice], list[bytes]]:
-    """Return the function that makes the markers of some of the ticks."""
     robot, period = flight.required_robot(), flight.scenario.plant.period_ns
     kinematics = ForwardKinematics(robot)
     order = [kinematics.links.index(link.name) for link in robot.links]
@@ -401,7 +391,6 @@ def _plan_streams(flight: Flight) -> Iterator[_Stream]:
 
 
 def _status_streams(flight: Flight) -> Iterator[_Stream]:
-    """Yield statuses, events and diagnostics."""
     yield _Stream.of(
         TOPICS["plant/status"],
         (

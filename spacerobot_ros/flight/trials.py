@@ -34,10 +34,8 @@ from spacerobot_ros.simulation.plant import InitialState
 from spacerobot_ros.simulation.velocity_plant import VelocityPlant
 
 _MAX_SCHEDULES = 1000
-"""Largest number of successive schedules of a method that plans in stages."""
 
-_RANDOM_GOAL_TOLERANCE = 1e-5
-"""Tolerance of random goals, rad and m."""
+_RANDOM_GOAL_TOLERANCE = 1e-5  # rad and m
 
 
 @dataclass(frozen=True)

@@ -81,7 +81,6 @@ def verdict_of(flight: Flight) -> Verdict:
 
 
 def _automatic_capture_is_missing(flight: Flight) -> bool:
-    """Whether the plant was to capture the target by itself, and has not."""
     automatic = flight.scenario.plant.capture.mode == "automatic"
     return automatic and flight.capture == {"captured": False}
 

@@ -168,18 +168,9 @@ RecordedCommand = NDArray[np.float64] | CommandError
 class _RecordedPlant:
     """The plant of a bag that was flown in lockstep.
 
-    Attributes
-    ----------
-    recorded
-        The topics of its robot.
-    config
-        Its parameters; those that an earlier version did not have are at their defaults.
-    robot
-        The model.
-    injections
-        The faults that were injected in each tick, and the disturbances.
-    grasps
-        Requests in each tick: captures (true) and releases (false).
+    Parameters that an earlier version did not have are at their defaults. By tick, ``injections``
+    are the injected faults and disturbances, ``grasps`` requested captures (true) and releases
+    (false).
     """
 
     recorded: RecordedRobot
@@ -231,7 +222,6 @@ class _RecordedPlant:
 
     @property
     def path(self) -> Path:
-        """The bag."""
         return self.recorded.bag.path
 
 
@@ -265,7 +255,6 @@ def _requested_grasps(recorded: RecordedRobot, config: PlantConfig) -> dict[int,
 
 
 def _recorded_robot(bag: Bag) -> RecordedRobot:
-    """Return the one robot of which the bag holds odom and joint_states."""
     candidates = [RecordedRobot(bag, name) for name in namespaces(bag)]
     found = [each for each in candidates if each.get("odom") and each.get("joint_states")]
     if len(found) != 1:
@@ -451,7 +440,6 @@ def _rates_at(first: int, published: list[_PublishedTopic], flight: _RecordedPla
 
 
 def _has_efforts(published: list[_PublishedTopic]) -> bool:
-    """Whether any published effort of a joint is not zero."""
     with_efforts = (p for p in published if p.topic.state[-1].quantity == "effort")
     return any(p.values[:, -p.values.shape[1] // 3 :].any() for p in with_efforts)
 
@@ -596,8 +584,6 @@ def _require_no_reset(
 
 
 class _Comparison:
-    """The comparison of published and re-simulated states."""
-
     def __init__(
         self,
         flight: _RecordedPlant,
@@ -610,7 +596,6 @@ class _Comparison:
         self._pairs = [(p, *self._deviation(p)) for p in published]
 
     def result(self) -> Verification:
-        """Find the first difference and, before it, the largest deviation."""
         difference = self._first_difference()
         end = np.inf if difference is None else round(difference.time * SECOND / self._period)
         largest, largest_at = 0.0, None

@@ -24,8 +24,6 @@ if TYPE_CHECKING:
 
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 _DASHES = ("-", "--", "-.", ":")
-"""Line styles of the joints beyond the number of colours."""
-
 _ROBOT_COLOUR, _GOAL_COLOUR = "#1f2328", "#CC79A7"
 _MAX_FRAMES = 1000
 
@@ -200,10 +198,7 @@ class _Skeleton:
     def points(self, poses: Array, q: Array) -> Array:
         """Return the points (K, 2 L, 3) in the world, m: the frames, then the centres of mass.
 
-        Parameters
-        ----------
-        poses, q
-            Poses (K, 7) of the base in the world, and joint positions (K, n).
+        ``poses`` (K, 7) are those of the base in the world, ``q`` (K, n) the joint positions.
         """
         R_WL, r_WL = self._kinematics.poses_in_world(poses, q)
         centers = r_WL + np.einsum("klij,lj->kli", R_WL, self._com)

@@ -194,7 +194,6 @@ class _InterfaceName:
         return f"{self.package}/{self.kind}/{self.whole}"
 
     def file(self) -> Path:
-        """Return the file that declares the message."""
         share = _share_folder(self.package)
         path = share / self.kind / f"{self.interface}.{self.kind}"
         if not path.is_file():

@@ -52,8 +52,6 @@ _MAX_LIST_TEXTS = 10_000
 """Largest number of texts in a list; a faulty publisher may send a million."""
 
 _HEADER_BYTES = 4096
-"""Size allowed for the header of a JointState and for padding, bytes."""
-
 _POSE_PATH, _TWIST_PATH = "pose.pose.position.x", "twist.twist.linear.x"
 _WRENCH_PATH = "wrench.force.x"
 
@@ -106,7 +104,6 @@ class MessageTemplate:
         self._parts: list[bytes | memoryview] = []
         """What the message is joined of: fed arrays, stamps, and the bytes between them."""
         self._places_of_stamps: list[int] = []
-        """Indices of the stamps among the parts."""
 
     def floats(self, path: str, count: int) -> Array:
         """Return a writable view of the ``count`` float64 values from ``path`` on."""
@@ -459,7 +456,6 @@ class JointReader:
         return self._reader.stamp_ns
 
     def _check_names_and_lengths(self) -> None:
-        """Check joint names and array lengths of a new layout."""
         names = self._reader.texts("name")
         self._problem, self._missing, self._order = "", "", None
         try:

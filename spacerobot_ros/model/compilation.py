@@ -218,12 +218,7 @@ def load_library(
 def _run_compiler(command: Sequence[str], folder: Path) -> None:
     """Run the compiler in the contexts of :data:`compilation_contexts`.
 
-    Raises
-    ------
-    NoLibraryError
-        It fails.
-    OSError
-        It cannot be started.
+    NoLibraryError if it fails, OSError if it cannot be started.
     """
     # The compiler's temporary files are deleted with the folder, also if it is killed.
     environment = {**os.environ, "TMPDIR": str(folder)}

@@ -190,31 +190,13 @@ def mean_motion_at(altitude: float) -> float:
     return math.sqrt(EARTH_GRAVITATION / (EARTH_RADIUS + altitude) ** 3)
 
 
-def relative_acceleration(n: float, r_O: npt.ArrayLike, v_O: npt.ArrayLike) -> Array:
-    """Return the acceleration (..., 3) of a free body in the orbital frame, m/s^2.
-
-    The equations of Clohessy and Wiltshire (1960): ``xdd = 3 n^2 x + 2 n yd``, ``ydd = -2 n xd``,
-    ``zdd = -n^2 z``.
-
-    Parameters
-    ----------
-    n
-        Mean motion, rad/s.
-    r_O, v_O
-        (..., 3) position (m) and velocity (m/s), both relative to O and in its components.
-    """
-    x, _, z = np.moveaxis(np.asarray(r_O, dtype=float), -1, 0)
-    x_dot, y_dot, _ = np.moveaxis(np.asarray(v_O, dtype=float), -1, 0)
-    components = 3 * n**2 * x + 2 * n * y_dot, -2 * n * x_dot, -(n**2) * z
-    return np.stack(components, axis=-1)
-
-
 def relative_motion(
     n: float, r0_O: npt.ArrayLike, v0_O: npt.ArrayLike, t: npt.ArrayLike
 ) -> tuple[Array, Array]:
     """Return position and velocity of a free body in the orbital frame at some times.
 
-    The closed solution of :func:`relative_acceleration`.
+    The closed solution of the equations of Clohessy and Wiltshire (1960),
+    ``xdd = 3 n^2 x + 2 n yd``, ``ydd = -2 n xd``, ``zdd = -n^2 z``.
 
     Parameters
     ----------

@@ -252,7 +252,6 @@ class SymbolicMassProperties(MassProperties):
     """
 
     def __init__(self, free: npt.NDArray[np.bool_]) -> None:
-        self.free = free
         self._p = ca.SX.sym("p", int(np.count_nonzero(free)))
         rows = ca.SX(len(free), 1)
         for at, index in enumerate(np.flatnonzero(free).tolist()):

@@ -272,7 +272,6 @@ def _require_sound_mesh(mesh: TriangleMesh) -> TriangleMesh:
 
 
 def _without_degenerate_faces(faces: Faces) -> Faces:
-    """Return the faces with three different corners."""
     a, b, c = faces.T
     return faces[(a != b) & (b != c) & (c != a)]
 
@@ -328,7 +327,6 @@ def _read_obj(data: bytes) -> TriangleMesh:
 
 
 def _read_by_trimesh(path: Path, data: bytes) -> TriangleMesh:
-    """Read a file by trimesh, with every part of a scene at its place."""
     # trimesh takes a second to import, and few robots need it.
     try:
         import trimesh

@@ -295,4 +295,3 @@ def _parameters_of_pseudo_inertia(J: Array) -> Array:
 
 
 _LOWER_TRIANGLE = np.tril_indices(4, -1)
-"""Entries of a Cholesky factor below its diagonal."""

@@ -18,8 +18,7 @@ from spacerobot_ros.times import SECOND
 DEFAULT_TICK_RATE = 20.0
 """Ticks a second of a plant whose parameters do not say otherwise, Hz."""
 
-_MIN_RATE = 0.001
-"""Smallest rate of a commander, Hz."""
+_MIN_RATE = 0.001  # Hz
 
 DEFAULT_POSITION_TOLERANCE = 1e-3
 """Automatic position tolerance where no robot is known, m."""

@@ -138,7 +138,6 @@ def _loaded(path: Path, parse: Callable[[str], RobotDescription]) -> RobotDescri
 
 
 def _expand_xacro(path: Path) -> str:
-    """Return the URDF text of a xacro file; see :mod:`spacerobot_ros.model.xacro_files`."""
     by_hand = f"`xacro {path.name} > {path.name.split('.')[0]}.urdf`"
     if find_spec("xacro") is None:
         raise RobotDescriptionError(
@@ -300,7 +299,6 @@ def _read_tree(text: str) -> RobotDescription:
 
 
 def _read_numbers(element: Element | None, name: str, default: str, where: str) -> Array:
-    """Return the numbers of an attribute; ``default`` for a missing attribute or element."""
     text = default if element is None else element.get(name, default)
     return _require_finite([float(word) for word in text.split()], where)
 
@@ -590,7 +588,6 @@ def _require_mass(robot: RobotDescription) -> None:
 # -- form of the text -------------------------------------------------------------------------
 
 _OTHER_FORMATS = {"sdf": "an SDF model", "mujoco": "a MuJoCo model"}
-"""Descriptions of other file formats by their root elements."""
 
 _ELEMENTS_READ = {
     "robot": ("link", "joint", "material", "disable_collisions", "world"),
@@ -661,7 +658,6 @@ _REQUIRED_ELEMENTS = {
     "collision": {"geometry": _GEOMETRY_REMEDY},
     "joint": {"parent": '<parent link="..."/>', "child": '<child link="..."/>'},
 }
-"""Required elements by their parent, and the text to write."""
 
 _JOINT_TYPES = tuple(kind.value for kind in JointKind)
 
@@ -669,11 +665,8 @@ _JOINT_TYPES = tuple(kind.value for kind in JointKind)
 def _checked_root(text: str) -> Element:
     """Return the root of a URDF text, reduced to the :data:`_ELEMENTS_READ`.
 
-    Raises
-    ------
-    RobotDescriptionError
-        The text is not XML or not URDF; an attribute or element is missing, given twice, or not a
-        number.
+    RobotDescriptionError if the text is not XML or not URDF, or if an attribute or element is
+    missing, given twice, or not a number.
     """
     try:
         root = fromstring(text)
@@ -748,7 +741,6 @@ def _require_type(joint: Element, where: str) -> None:
 
 
 def _require_element(element: Element, where: str) -> None:
-    """Check an element of a link, joint or material, and its children."""
     if element.tag == "material":
         _remove_children(
             element, {child.tag for child in element} - set(_ELEMENTS_READ["material"])

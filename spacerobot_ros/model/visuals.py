@@ -30,7 +30,6 @@ from spacerobot_ros.model.meshes import (
 )
 
 _FACETS_AROUND = 24
-"""Facets around a cylinder or a sphere."""
 
 _ROD_THICKNESS_RATIO = 0.05
 """Ratio of thickness to length below which a box counts as a rod, drawn as a line."""
@@ -316,6 +315,5 @@ def has_meshes(attachments: Mapping[str, bytes]) -> bool:
 
 
 def _mesh_uris(robot: RobotDescription) -> list[str]:
-    """Return the URIs of all meshes, each once."""
     shapes = (shape for link in robot.links for shape in link.shapes if shape.kind == "mesh")
     return list(dict.fromkeys(shape.resource for shape in shapes))

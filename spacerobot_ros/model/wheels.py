@@ -25,14 +25,12 @@ import numpy.typing as npt
 from spacerobot_ros.errors import Proof, RobotDescriptionError, UnreachableError
 from spacerobot_ros.model.description import Array, Body, JointKind, RobotDescription
 
-_MAX_OFFSET = 1e-4
-"""Largest distance of a wheel's centre of mass from its axis, m."""
+_MAX_OFFSET = 1e-4  # m, of the centre of mass from the axis
 
 _MOMENTUM_ROUNDING, _LEAST_MOMENTUM = 1e-9, 1e-12
 """Angular momentum that wheels may leave to the base, relative to all of it, and kg m^2/s."""
 
 _REST_SHARE = 1e-9
-"""Share of the largest rates of wheels up to which they rest."""
 
 _MAX_ASYMMETRY = 1e-3
 """Largest difference of a wheel's inertia from that of a body of revolution, relative."""

@@ -152,8 +152,6 @@ class PlannerNode(CommanderNode):
     # -- inputs -------------------------------------------------------------------------------
 
     def _take_twists(self, link: str) -> None:
-        """Subscribe to the twists of a link."""
-
         def on_twist(message: TwistStamped) -> None:
             twist, commander = message.twist, self.commander
             linear, angular = (
@@ -167,21 +165,13 @@ class PlannerNode(CommanderNode):
         self.commander.receive_obstacles(message.data)
 
     def _take_paths(self, link: str) -> None:
-        """Subscribe to the paths of a link."""
-
         def on_path(message: Path) -> None:
             self.receive(link, message, lambda: self._read_path(link, message))
 
         self.create_subscription(Path, path_topic(link), on_path, STREAM)
 
     def _read_path(self, link: str, message: Path) -> Goal:
-        """Return the goal of a path for an end-effector.
-
-        Raises
-        ------
-        PlanningError
-            It is refused.
-        """
+        """Return the goal of a path for an end-effector; PlanningError if it is refused."""
         what, frame = f"The path of the end-effector '{link}'", self.config.world_frame
         aim = EndEffectorGoal.along(link, path_poses(message, frame, what, self._pose_of))
         if link == DEFAULT_END_EFFECTOR:

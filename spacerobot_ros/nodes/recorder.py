@@ -56,11 +56,7 @@ from spacerobot_ros.topics import TOPICS_NOT_RECORDED
 from spacerobot_ros.version import __version__
 
 _CLOCK_TOPIC = "/clock"
-"""Topic of the clock before remaps."""
-
 _SHARED_TOPICS = ("/diagnostics", TRANSFORMS, STATIC_TRANSFORMS)
-"""Topics, before remaps, that stacks in different namespaces may share."""
-
 _DESCRIPTION_TOPIC = "robot_description"
 
 _TEXT_TYPE = "std_msgs/msg/String"
@@ -84,14 +80,12 @@ _QUEUE_DEPTH = 2000
 _CHUNK_SIZE = 262_144
 """Chunk size before compression, bytes: larger chunks have lower fixed costs, but slow seeking."""
 
-_SCAN_PERIOD = 0.1
-"""Wall time between two checks for new topics, s."""
+_SCAN_PERIOD = 0.1  # wall s
 
 _CHECK_PERIOD = 0.4
 """Wall time between two checks that the bag file exists, s: a failure is seen within a second."""
 
-_LONGEST_DRAIN = 1.2
-"""Longest wall time after a signal for recording messages still in transit, s."""
+_LONGEST_DRAIN = 1.2  # wall s
 
 _LOSS_LOG_PERIOD = 5.0
 """Wall s between two log lines about lost messages."""
@@ -187,8 +181,8 @@ class RecorderNode(FlightNode):
             if paused:
                 self.report_event(Event(EventKind.RECORDING_PAUSED, "Recording is paused."))
 
-    def drain(self, executor: EventsExecutor, quiet: float = 0.3) -> None:
-        """Record messages on their way, until none has come for ``quiet`` wall s."""
+    def drain(self, executor: EventsExecutor) -> None:
+        """Record messages on their way, until none has come for 0.3 s of wall time."""
         began = last = time.monotonic()
         recording = self.recording
         while recording is not None and recording.running and last - began < _LONGEST_DRAIN:
@@ -196,7 +190,7 @@ class RecorderNode(FlightNode):
             executor.spin_once(timeout_sec=0.001)
             if recording.messages != before:
                 last = time.monotonic()
-            elif time.monotonic() - last > quiet:
+            elif time.monotonic() - last > 0.3:
                 return
 
     def cleanup(self) -> None:
@@ -451,7 +445,6 @@ class _RecordedTransforms:
         self._channel = -1
 
     def listener(self, topic: str) -> RawCallback | None:
-        """Return the callback of every message of a topic, if there is one."""
         return self._callbacks.get(topic)
 
     def _on_odom(self, raw: bytes) -> None:
@@ -509,7 +502,6 @@ class _RecordedTransforms:
         return True
 
     def _write_static(self, frames: RobotTransforms, time_ns: int) -> None:
-        """Write the message of the fixed links, if there are any."""
         static = frames.static_message(time_ns)
         if static is not None:
             channel = self._recording.writer.add_topic(self._topics[1], TRANSFORM_TYPE, LATCHED)
@@ -571,7 +563,6 @@ def _recording_callback(
 
 
 def _record_and_listen(record: RawCallback, listener: RawCallback | None) -> RawCallback:
-    """Return a callback that records a message, then calls a listener."""
     if listener is None:
         return record
 
@@ -596,7 +587,6 @@ def loss_events(recording: Recording, topic: str) -> SubscriptionEventCallbacks:
 
 
 def _recorded_qos(offered: QoSProfile) -> QosProfile:
-    """Return a publisher's quality of service in the words of a bag."""
     return QosProfile(
         history=offered.history.name.lower(),
         depth=offered.depth,

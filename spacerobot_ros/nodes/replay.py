@@ -32,14 +32,9 @@ from spacerobot_ros.nodes.common.streams import raw_publish
 from spacerobot_ros.nodes.common.watchdog import Role
 from spacerobot_ros.times import LATEST_NS, SECOND, set_stamp
 
-_READER_CHECK_PERIOD = 0.05
-"""Wall time between two checks for readers, s."""
-
+_READER_CHECK_PERIOD = 0.05  # wall s
 _MAX_MESSAGES_AT_ONCE = 500
-"""Largest number of messages sent before services and signals are served."""
-
 _LONGEST_DELIVERY = Duration(seconds=2)
-"""Longest wait for readers to receive the last messages."""
 
 _LONGEST_TIMER_PERIOD_NS = 3600 * SECOND
 """Longest period of a timer, ns; gaps between messages in a bag may be longer."""
@@ -50,9 +45,7 @@ _MAX_QUEUE_DEPTH = 10_000
 _CLOCK_TOPIC = "/clock"
 _STATUS_TOPIC, _SEEK_TOPIC = "replay/status", "replay/seek"
 
-_STATUS_PERIOD = 0.2
-"""Wall time between two status messages, s."""
-
+_STATUS_PERIOD = 0.2  # wall s
 _TEXT_TYPE, _DESCRIPTION_TOPIC = "std_msgs/msg/String", "/robot_description"
 
 _BAD_BAG_EXIT_CODE = 2
@@ -227,7 +220,6 @@ class ReplayNode(FlightNode):
         self._timer.reset()
 
     def _send_due_messages(self) -> None:
-        """Send the messages that are due, and set the timer for the next one."""
         try:
             for message in self._playback.take_due(self._now(), _MAX_MESSAGES_AT_ONCE):
                 self._send(message)
@@ -319,7 +311,6 @@ class ReplayNode(FlightNode):
             self._end_with_error(error)
 
     def _publish_status(self) -> None:
-        """Publish position, rate and state of the replay."""
         playback = self._playback
         position = playback.bag_time(self._now()) - playback.start_ns
         status = ReplayStatus(

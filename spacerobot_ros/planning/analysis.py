@@ -34,7 +34,6 @@ from spacerobot_ros.planning.methods.optimal import OptimalGait
 from spacerobot_ros.planning.methods.registry import METHODS
 
 _CONDITION_SAMPLE_COUNT = 300
-"""Number of sampled shapes of the condition numbers in an analysis."""
 
 _LOOP_EDGE_LENGTH = 1.0
 """Length of loop edges for which the nominal shape is optimised, m or rad: those of area_loop."""

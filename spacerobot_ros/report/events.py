@@ -54,7 +54,6 @@ _DETAIL_KEYS = (
     "second",
     "wheel",
 )
-"""Keys that distinguish an event from others of its kind."""
 
 
 @dataclass(frozen=True)
@@ -141,7 +140,6 @@ _FAULT_KINDS = frozenset(
         EventKind.DISTURBANCE_ENDED,
     )
 )
-"""Kinds of faults and disturbances."""
 _PROMINENT_KINDS = _FAULT_KINDS | {
     EventKind.STUCK_JOINT,
     EventKind.LATCHED,

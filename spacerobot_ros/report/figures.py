@@ -71,7 +71,6 @@ _FIXED_SETTINGS: Any = {
     "figure.autolayout": False,
     "figure.constrained_layout.use": False,
 }
-"""Settings that style files cannot change."""
 
 
 _figure_width = ContextVar("_figure_width", default=WIDTH)
@@ -160,7 +159,6 @@ def _read_style(path: Path) -> mpl.RcParams:
 
 
 def _require_fonts(path: Path) -> None:
-    """Check that the font settings of a style file can be used."""
     size = float(mpl.rcParams["font.size"])
     if not _FONT_SIZE_RANGE[0] <= size <= _FONT_SIZE_RANGE[1]:
         raise SpaceRobotError(
@@ -194,7 +192,6 @@ def _is_font_installed(family: str) -> bool:
 
 @contextmanager
 def _collected_warnings() -> Iterator[_Warnings]:
-    """Collect the warnings that matplotlib logs while the block lasts."""
     warnings = _Warnings()
     loggers = [logging.getLogger(name) for name in ("matplotlib", "matplotlib.font_manager")]
     for logger in loggers:

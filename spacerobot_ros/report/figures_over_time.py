@@ -197,7 +197,8 @@ def time_figure(
     if cycles is not None:
         aside += (
             f" The flight ends with {cycles.count} equal cycles of {cycles.period:.4g} s; below, "
-            f"the part before them, and {_close_up_text(cycles)}."
+            f"the part before them, and the last {SHOWN_CYCLES} of them, as change since the "
+            "first instant shown."
         )
     aside += f" {BAND_CAPTION}" if any(dense) else ""
     aside += f" {EVENTS_CAPTION}" if flight.timed_events else ""
@@ -228,10 +229,6 @@ def _draw_rows(axes: Axes, flight: FlightReport, group: TraceGroup, share: float
     axes.set_title(f"{group.label} ({group.unit})")
     set_time(axes, 0.0, flight.end)
     return dense
-
-
-def _close_up_text(cycles: Cycles) -> str:
-    return f"the last {SHOWN_CYCLES} of them, as change since the first instant shown"
 
 
 def _draw_before_cycles(axes: Axes, group: TraceGroup, cycles: Cycles) -> bool:
@@ -408,7 +405,6 @@ def shape_figure(flight: FlightReport) -> ReportFigure | str:
 
 
 def _why_no_joints(flight: FlightReport) -> str:
-    """Return the reason why there is no figure of the joints."""
     jointless = flight.robot is not None and not flight.robot.joint_names
     return "The robot has no joints." if jointless else NO_JOINTS_TEXT
 
@@ -666,7 +662,6 @@ def momentum_budget_figure(flight: FlightReport) -> ReportFigure | str | None:
 
 
 _MAX_CLEARANCE_SAMPLES = 2000
-"""States of a flight whose smallest distances are drawn."""
 
 
 def clearance_figure(flight: FlightReport) -> ReportFigure | str | None:
@@ -746,7 +741,6 @@ def errors_figure(flight: FlightReport) -> ReportFigure | str | None:
 
 
 _MAX_DECADES = 8
-"""Largest number of powers of ten of an axis of errors."""
 
 _ERROR_PARTS: tuple[tuple[Literal["position", "attitude"], str, str], ...] = (
     ("position", "distance", "m"),

@@ -185,7 +185,6 @@ def _round_length(longest: float) -> float:
 
 _PLANNED_COLOUR, _TOOL_COLOUR = PALETTE[1], PALETTE[4]
 _LINK_COLOURS = (_TOOL_COLOUR, *PALETTE[2:4], *PALETTE[5:])
-"""Colours of links with goals."""
 
 _FLIGHT_COLOURS = (PALETTE[0], PALETTE[2], PALETTE[5], *PALETTE[6:])
 """Colours of compared flights; the first colour is for the flight of the report."""
@@ -350,7 +349,6 @@ def _signed_area(x: Array, y: Array) -> float:
 
 
 def _draw_direction(axes: Axes, x: Array, y: Array) -> None:
-    """Draw the direction of a loop as an arrow at its fastest point."""
     low, high = np.array([axes.get_xlim(), axes.get_ylim()]).T
     steps = np.hypot(np.diff(x) / (high - low)[0], np.diff(y) / (high - low)[1])
     k = int(np.argmax(steps))

@@ -50,10 +50,7 @@ from spacerobot_ros.scenario import COMMANDERS
 from spacerobot_ros.times import SECOND
 
 _MAX_BUDGET_STATES = 2000
-"""States of a flight at which the momentum budget is evaluated."""
-
 _MAX_LINK_ERROR_STATES = 2000
-"""States of a flight at which the errors of links are evaluated."""
 
 
 @dataclass(frozen=True)

@@ -81,7 +81,6 @@ def html_page(title: str, body: Sequence[str], footer: str, parts: Sequence[Page
 
 
 def _script_policy(parts: Sequence[PagePart]) -> str:
-    """Return the directive that allows the scripts of a page."""
     programs = [program for part in parts for program in part.programs]
     hashes = [hashlib.sha256(program.encode()).digest() for program in programs]
     allowed = " ".join(f"'sha256-{base64.b64encode(digest).decode()}'" for digest in hashes)
@@ -101,7 +100,6 @@ def _scripts_html(parts: Sequence[PagePart]) -> str:
 
 
 def _licences_html(parts: Sequence[PagePart]) -> str:
-    """Return the licences of third-party scripts, folded up."""
     notices = [notice for part in parts for notice in part.notices]
     if not notices:
         return ""

@@ -67,7 +67,6 @@ _RING_STYLES: dict[str, dict[str, Any]] = {
         "lw": 0.6,
     },
 }
-"""How the two kinds of workspaces are drawn."""
 
 _AXIS_NAMES = ("x", "y", "z")
 

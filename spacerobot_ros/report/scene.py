@@ -180,7 +180,6 @@ def _round_values(values: Array) -> list[float]:
 
 
 def _color_number(color: str) -> int:
-    """Return a color ``#rrggbb`` as a number."""
     return int(color[1:], 16)
 
 
@@ -293,9 +292,7 @@ def key_frames(motion: Signal, cycles: Cycles | None) -> KeyFrames:
 _POSITION_TOLERANCE = 0.001
 """Tolerance of positions between key frames, as a share of the size of the scene."""
 
-_ANGLE_TOLERANCE = 0.005
-"""Tolerance of angles between key frames, rad."""
-
+_ANGLE_TOLERANCE = 0.005  # rad
 _MAX_LINE_POINTS = 4000
 _MAX_MESH_FACES = 20_000
 """Largest number of faces of all meshes together: some 0.6 MB."""
@@ -440,7 +437,6 @@ def _robot_commands(robot: RobotDescription, meshes: Mapping[str, TriangleMesh])
 
 
 def _obstacle_commands(flight: FlightReport) -> list[Command]:
-    """The obstacles, which stand still in the world."""
     commands: list[Command] = []
     for number, (visual, pose) in enumerate(flight.obstacles):
         path = f"{WORLD}/obstacle {number} {_node_name(visual.link)}"
@@ -450,7 +446,6 @@ def _obstacle_commands(flight: FlightReport) -> list[Command]:
 
 
 def _target_commands(flight: FlightReport) -> list[Command]:
-    """The target, whose pose the animation gives."""
     if flight.target is None or not len(flight.target_pose):
         return []
     commands = [set_transform(TARGET, matrix_of(_pose_of(flight.target_pose.values[0])))]
@@ -503,7 +498,6 @@ def _scaled_by_tolerances(pose: Signal, radius: float) -> Signal:
 
 
 def _path_commands(flight: FlightReport) -> list[Command]:
-    """Paths of base and end-effector, and the path of the base that was planned."""
     lines = [("path of the base", flight.position.values, PALETTE[0])]
     if len(flight.tool):
         lines.append(("path of the end-effector", flight.tool.values[:, :3], PALETTE[4]))
@@ -522,7 +516,6 @@ def _path_commands(flight: FlightReport) -> list[Command]:
 
 
 def _goal_commands(flight: FlightReport, robot: RobotDescription, radius: float) -> list[Command]:
-    """The base at its last goal and a mark at the end-effector's."""
     commands: list[Command] = []
     if flight.base_goal is not None and flight.controls("base"):
         matrix = matrix_of(

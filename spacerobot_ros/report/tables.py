@@ -92,7 +92,6 @@ def _end_effector_note(flight: FlightReport, turn: str) -> str:
 def _error_with_tolerance(
     flight: FlightReport, part: Literal["position", "attitude"], error: str, note: str
 ) -> tuple[str, str]:
-    """Return value and note of an error with its tolerance, or that it is not controlled."""
     if part in flight.not_controlled:
         return "not controlled", f"{error} from the goal"
     tolerance = _tolerance_text(flight, part, "m" if part == "position" else "rad").strip(" ()")
@@ -198,7 +197,6 @@ def different_goals(flights: Sequence[FlightReport]) -> list[tuple[str, ...]]:
 
 
 def _payload_rows(flight: FlightReport) -> list[tuple[str, ...]]:
-    """Return the estimated parameters of each body that the robot held."""
     try:
         estimates = payload_estimates(flight)
     except SpaceRobotError as error:
@@ -242,7 +240,6 @@ def _tool_rows(flight: FlightReport, error: PoseError) -> list[tuple[str, ...]]:
 
 
 def _link_rows(flight: FlightReport) -> list[tuple[str, ...]]:
-    """Return goal, final position and errors of each link that has a goal at the end."""
     rows: list[tuple[str, ...]] = []
     errors = flight.end_effector_errors
     for link, goal in flight.link_goals.items():
@@ -318,7 +315,6 @@ def published_table(flight: FlightReport) -> Table | None:
 
 
 def _measured_values(flight: FlightReport, row: Published) -> tuple[list[float], str]:
-    """Return the figure of this flight for a published one, and its source."""
     figures: dict[str, Iterable[float]] = {}
     if len(flight.position):
         figures["final_position_m"] = flight.position.values[-1]
@@ -341,7 +337,6 @@ def _measured_values(flight: FlightReport, row: Published) -> tuple[list[float],
 
 
 def _count_decimals(x: float) -> int:
-    """Return the number of decimals of a printed figure."""
     text = repr(x)
     return 0 if "e" in text or text.endswith(".0") else len(text.partition(".")[2])
 

@@ -61,7 +61,6 @@ _PAPER_WIDTHS = (40.0, 400.0)
 """Least and largest width of a figure for a paper, mm."""
 
 _PICTURE_PIXELS = 1000
-"""Width of a picture in pixels."""
 
 _ROBOT_PANEL_WIDTH = 3.9
 """Width of the robot in a picture, inches."""
@@ -234,7 +233,6 @@ def write_picture(bag: Path, picture: Path, *, namespace: str | None = None) -> 
 
 
 def _overview_figure(flight: FlightReport) -> Figure:
-    """Base pose and shape over time, beside the robot where it can be drawn."""
     groups = [position_group(flight), attitude_group(flight)]
     if len(flight.shape):
         groups += shape_groups(flight)[:1]

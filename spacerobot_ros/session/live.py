@@ -89,7 +89,6 @@ def fly_by_nodes(
 
 
 def _summary(stack: MultiProcessStack, wall_time: float) -> dict[str, Any]:
-    """Return the measures of a finished flight, from its bag and from the mission client."""
     scenario, client = stack.scenario, stack.client
     assert stack.bag is not None
     bag = open_flight_bag(stack.bag)
@@ -115,8 +114,7 @@ def _summary(stack: MultiProcessStack, wall_time: float) -> dict[str, Any]:
     return {**flight.summary(), **recorded}
 
 
-_LONGEST_DISCOVERY = 10.0
-"""Longest wall time until a commander is discovered, s."""
+_LONGEST_DISCOVERY = 10.0  # wall s
 
 _LONGEST_STATUS_WAIT = 1.0
 """Wall time to wait for the status of earlier goals, which is no answer to the new one, s."""
@@ -125,13 +123,10 @@ _CHECK_PERIOD = 0.1
 
 
 class _StatusPrinter:
-    """Shows each new status message that a client receives."""
-
     def __init__(self, client: MissionClient, show: Callable[[str], None]) -> None:
         self._client, self._show, self._shown = client, show, ""
 
     def show(self) -> None:
-        """Show the message of the last status if it is new."""
         if self._client.message != self._shown:
             self._shown = self._client.message
             with suppress(OSError):  # A closed terminal must not stop the robot.

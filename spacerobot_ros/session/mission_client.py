@@ -30,11 +30,8 @@ from spacerobot_ros.planning.execution.goal_file import GoalIds
 from spacerobot_ros.planning.execution.status import PlannerStatus
 from spacerobot_ros.topics import goal_topic, path_topic
 
-_STATUS_CHECK_PERIOD = 0.2
-"""Wall time between two calls of a ``look`` function, s."""
-
-_LONGEST_DELIVERY = 5.0
-"""Longest wall time until every subscriber has received a goal, s."""
+_STATUS_CHECK_PERIOD = 0.2  # wall s
+_LONGEST_DELIVERY = 5.0  # wall s
 
 
 class MissionClient:

@@ -21,11 +21,8 @@ from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.methods.optimal.goal_specification import BaseRotations
 from spacerobot_ros.simulation import InitialState
 
-_LARGEST_FIRST_ROTATION = math.radians(5.0)
-"""Largest turn of the base in the first scenario of a robot, rad."""
-
-_MAX_USUAL_LIMIT = 4 * math.pi
-"""Largest usual joint limit, rad; larger ones may be in degrees."""
+_LARGEST_FIRST_ROTATION = math.radians(5.0)  # rad
+_MAX_USUAL_LIMIT = 4 * math.pi  # rad; larger ones may be in degrees
 
 _LARGEST_SHARE_OF_DISTANCE_TO_LIMIT = 0.5
 """Largest share of the distance to its limits that a joint uses in the first rotation."""
@@ -37,7 +34,6 @@ _LEAST_ROTATION_WITHOUT_LOOPS = math.radians(0.2)
 """Smallest first rotation without loops of the joints, rad."""
 
 _ROTATION_TO_TOLERANCE = 50.0
-"""Ratio of a small rotation goal to its tolerance."""
 
 _LEAST_BASE_MASS_RATIO, _LARGEST_BASE_MASS_RATIO = 0.2, 500.0
 """Usual ratios of the base's mass to the mass of all other bodies."""

@@ -46,11 +46,8 @@ from spacerobot_ros.termination import end_child, start_child
 from spacerobot_ros.times import SECOND, stamp_to_ns
 from spacerobot_ros.topics import GLOBAL_TOPICS, TOPICS_NOT_RECORDED
 
-_LONGEST_START = 60.0
-"""Longest wait for the start of all nodes, wall s."""
-
-_RESTART_PERIOD = 60.0
-"""Wall time over which restarts are counted, s."""
+_LONGEST_START = 60.0  # wall s
+_RESTART_PERIOD = 60.0  # wall s, over which restarts are counted
 
 _LONGEST_END = 10.0
 """Wall time after a signal at which a node that still runs is killed, s."""
@@ -78,14 +75,9 @@ _LONGEST_RECORDING_DELAY = 1.0
 """Wall time for the recorder to receive the last messages of the plant, s."""
 
 
-_LONGEST_ANSWER_AFTER_INTERRUPT = 0.5
-"""Longest wait for an answer after an interrupt, wall s."""
-
-_CONNECTION_CHECK_PERIOD = 0.05
-"""Wall time from one check of the connections to the next, s."""
-
+_LONGEST_ANSWER_AFTER_INTERRUPT = 0.5  # wall s
+_CONNECTION_CHECK_PERIOD = 0.05  # wall s
 _CHILD_MODULE = "spacerobot_ros.session.child"
-"""Module that runs a node until this process ends."""
 
 
 def namespace_arguments(namespace: str) -> list[str]:
@@ -240,11 +232,9 @@ class MultiProcessStack:
         return environment
 
     def _log_file_of(self, name: str) -> Path:
-        """Return the file that receives standard output and error of a node."""
         return Path(self._folder.name, f"{name}.txt")
 
     def _end_message(self, name: str) -> str:
-        """Return how and why a node has ended."""
         code = self.processes[name].returncode
         return end_message(name, code, self._read_log(name))
 
@@ -384,7 +374,6 @@ class MultiProcessStack:
                 self._events.publish(status)
 
     def _end_nodes(self, names: Sequence[str]) -> dict[str, int]:
-        """End nodes together, and return their exit codes."""
         for name in names:
             self.processes[name].send_signal(signal.SIGINT)
         # SIGABRT makes a hanging node print a traceback.
@@ -477,13 +466,7 @@ class MultiProcessStack:
 
 
 def _require_flyable(scenario: Scenario) -> None:
-    """Refuse what nodes cannot fly.
-
-    Raises
-    ------
-    ParameterError
-        The scenario kills nodes in lockstep, or its goals cannot be sent.
-    """
+    """Raise ParameterError if the scenario kills nodes in lockstep, or its goals cannot be sent."""
     if scenario.kills and scenario.lockstep:
         raise ParameterError(
             f"The scenario '{scenario.name}' kills nodes on the way: fly it with --nodes and "

@@ -26,8 +26,7 @@ from spacerobot_ros.session.processes import (
 from spacerobot_ros.termination import end_child, start_child
 from spacerobot_ros.viewer.server import require_viser
 
-_LONGEST_START = 30.0
-"""Wall time within which the page must be served, s."""
+_LONGEST_START = 30.0  # wall s
 
 _LONGEST_END = 1.5
 """Wall time after SIGINT at which the process is killed, s."""
@@ -161,7 +160,6 @@ def lower_priority(pid: int) -> None:
 
 
 def _read_log_lines(log: Path) -> list[str]:
-    """Return the lines that the viewer has written to standard error."""
     return log.read_text("utf-8", errors="replace").strip().splitlines()
 
 

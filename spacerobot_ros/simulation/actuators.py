@@ -370,7 +370,6 @@ class PlantWithFaults(WrappedPlant):
         self.step = self._loaded_step
 
     def _loaded_step(self, *commands: Any) -> bool:
-        """Advance a tick under external loads."""
         assert self.loads is not None
         if self.tick >= self._next_disturbance:
             self._apply_active_disturbances()  # The owner may have set the tick.
@@ -382,7 +381,6 @@ class PlantWithFaults(WrappedPlant):
         return limited
 
     def _apply_active_disturbances(self) -> None:
-        """Apply the disturbances that are active at the present time."""
         timeline, loads = self._disturbances, self.loads
         active = timeline.at(self.time + _FAULT_TIME_ROUNDING * self._control_period)
         self._next_disturbance = timeline.next_change / self._control_period - _FAULT_TIME_ROUNDING
@@ -406,7 +404,6 @@ class PlantWithFaults(WrappedPlant):
                     thrusters.thruster_health[nozzle] *= fault.value
 
     def _step(self, *commands: Any) -> bool:
-        """Advance a tick under the commands of the wrapped plant."""
         if self._actuators_sound:
             limited = self.plant.step(*commands)
         else:
@@ -527,7 +524,6 @@ def _own_engine_plant(
     step: float,
     description: RobotDescription | None,
 ) -> Plant:
-    """Return the plant of the package's own equations of motion, and the target beside it."""
     kind, control_period = PLANTS[config.actuation], config.control_period
 
     def dynamics(of: SpaceRobot, at: InitialState) -> Plant:

@@ -581,13 +581,11 @@ class CapturePlant(WrappedPlant):
         plant.hold(self._held_joints)
 
     def _motion(self) -> RobotMotion:
-        """Return the present motion of the robot."""
         if self._changed is not None:
             return self._changed
         return RobotMotion(self.pose.copy(), self.twist.copy(), self.q.copy(), self.qdot.copy())
 
     def _body(self) -> BodyMotion:
-        """Return the present motion of the target."""
         if self.payload is None:
             return self.target.motion
         return frame_motion(self.robot, self.link, self._motion()).at(self._grasp)
@@ -599,7 +597,6 @@ class CapturePlant(WrappedPlant):
         return motion.pose[:3] + motion.R_WB @ r_BC_B, of_target.r_WT
 
     def _update(self) -> None:
-        """Copy the state of the plant and the target."""
         plant = self.plant
         self.pose[:], self.twist[:] = plant.pose, plant.twist
         self.q[:], self.qdot[:], self.effort[:] = plant.q, plant.qdot, plant.effort

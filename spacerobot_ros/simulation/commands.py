@@ -405,7 +405,6 @@ class CommandValidator:
     def _refusal_of_values(
         self, source: CommandSource, values: Array | CommandError
     ) -> Refusal | None:
-        """Return the refusal of invalid values, None for valid values."""
         if isinstance(values, CommandError):
             return Refusal(Reason.MALFORMED, str(values))
         # A sum is finite only if all its terms are; summing a list is fastest for few numbers.

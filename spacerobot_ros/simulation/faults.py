@@ -178,8 +178,7 @@ def fault_timeline(lines: Iterable[str], targets: FaultTargets) -> Timeline[Faul
 
 # -- disturbances ---------------------------------------------------------------------------------
 
-_MAX_COMPONENT = 1e6
-"""Largest component of a force or torque, N or N m."""
+_MAX_COMPONENT = 1e6  # N or N m
 
 _LINE_FORMAT = (
     "it must be LINK [force X Y Z] [torque X Y Z] [in world|link] [at SECONDS] [until SECONDS], "

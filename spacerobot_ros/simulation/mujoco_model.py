@@ -169,7 +169,7 @@ def _add_contacts(
     shapes: list[str] = []
     if target is not None:
         body, link = target
-        _add_target(mujoco, spec, body)
+        _add_target(spec, body)
         solids, _ = solids_of(body)
         shapes = [
             _add_shape(mujoco, spec, solid, f"{TARGET}{index}", TARGET)
@@ -217,7 +217,7 @@ def _set_inertia(body: Any, inertia: Inertia) -> None:
     body.inertia, body.iquat = moments, np.roll(quaternion_from_matrix(axes), 1)
 
 
-def _add_target(mujoco: Any, spec: Any, target: RobotDescription) -> None:
+def _add_target(spec: Any, target: RobotDescription) -> None:
     body = spec.worldbody.add_body(name=f"{TARGET}{target.base_link}")
     joint = body.add_freejoint()
     joint.name = f"{TARGET}free"

@@ -321,7 +321,6 @@ class MujocoPlant:
         return np.where(slowest, 0.0, -limit), np.where(fastest, 0.0, limit)
 
     def _advance(self, steps: int) -> None:
-        """Take integration steps under the present controls and loads."""
         mujoco = self._mujoco
         with _CONTROL_CALLBACK:
             if self._loaded or self.wrench.any():
@@ -399,7 +398,6 @@ class MujocoPlant:
         return np.asarray(masses[roots] @ centers[roots] / masses[roots].sum())
 
     def _update(self) -> None:
-        """Copy the state of MuJoCo, and compute momenta and energy by it."""
         model, data, mujoco = self._model, self._data, self._mujoco
         mujoco.mj_fwdPosition(model, data)
         mujoco.mj_fwdVelocity(model, data)

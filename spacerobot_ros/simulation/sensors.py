@@ -120,7 +120,6 @@ class Sensors:
         self.qdot[:] = plant.qdot + noise["joint_rates"] * normal(n)
 
     def _apply_faults(self, faults: tuple[Fault, ...]) -> None:
-        """Apply the active faults of sensors."""
         self._faults = faults
         config = self._config
         self._pose_bias[:3] = config.position_bias or 0.0
@@ -354,7 +353,6 @@ class ReportedState:
 
 
 def _link_indices(robot: SpaceRobot, names: Sequence[str]) -> list[int]:
-    """Return the indices of the links in the parameter ``end_effectors``."""
     links = list(robot.link_names)
     for name in names:
         if name not in links:
@@ -371,7 +369,6 @@ def _link_indices(robot: SpaceRobot, names: Sequence[str]) -> list[int]:
 
 
 def _end_effector_index(robot: SpaceRobot, name: str) -> int | None:
-    """Return the index of the end-effector's link; None: there is none."""
     links = list(robot.link_names)
     link = robot.description.end_effector(name)
     if link and link not in links:

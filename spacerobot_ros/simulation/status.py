@@ -212,7 +212,6 @@ class PlantMonitor:
         return [*captures, *_events_between(before, self.status)]
 
     def _take_reports(self) -> list[CaptureReport | ReleaseReport]:
-        """Return the captures and releases since the last update."""
         capturing = self._plant.capturing
         if capturing is None:
             return []
@@ -225,7 +224,6 @@ class PlantMonitor:
         return "" if payload is None else payload.to_text()
 
     def _status(self, activity: PlantState) -> PlantStatus:
-        """Return the present status, with state, message and reason."""
         commands, fault = self._commands, self._commands.fault
         match activity:
             case PlantState.INACTIVE:
@@ -259,7 +257,6 @@ class PlantMonitor:
 
 
 def _events_between(before: PlantStatus, now: PlantStatus) -> list[Event]:
-    """Return the events that lead from one status to the next, in a plausible order."""
     events: list[Event] = []
 
     def add(kind: EventKind, message: str, level: int = 0, **about: str) -> None:

@@ -41,7 +41,6 @@ _WARNING_WHEEL_SHARE, _SATURATED_WHEEL_SHARE = 0.8, 0.98
 """Shares of the largest rate of a wheel from which it is marked amber, and red."""
 
 _MAX_NAME_LENGTH = 21
-"""Characters shown of the name of a joint."""
 
 COLORS: Mapping[Verdict, Color] = {
     Verdict.UNCHECKED: (150, 150, 160),
@@ -256,7 +255,6 @@ def _node_html(state: StackState, key: str, word: str, message: str, level: int)
 
 
 def _grey_out(html: str, *, offline: bool) -> str:
-    """Return the message of a node, greyed out if the node is offline."""
     return f'<div style="opacity:.75">{html}</div>' if offline else html
 
 

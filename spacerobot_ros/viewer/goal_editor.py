@@ -239,8 +239,6 @@ class GoalEditor:
         return self._check
 
     def _defer_edit(self, act: Callable[[], None]) -> None:
-        """Queue a change of the goal by a user."""
-
         def edit() -> None:
             self._origin = Origin.USER
             act()
@@ -439,7 +437,6 @@ class GoalEditor:
         self._mark_changed()
 
     def _mark_changed(self) -> None:
-        """Note that the goal has changed."""
         if not self.placed:
             return
         self._changed_at = time.monotonic()
@@ -462,7 +459,6 @@ class GoalEditor:
         self._mark_changed()
 
     def _place_link_gizmo(self, link: str) -> None:
-        """Move the gizmo of a link to where the link is."""
         if self._kinematics is None or self._present is None:
             return
         name = _link_gizmo(link)
@@ -499,17 +495,9 @@ class GoalEditor:
 class _PartMenu:
     """Controls of the parts of the robot that a goal for a planner asks for.
 
-    Without end-effectors, or without a planner, that is the pose of the base.
-
-    Parameters
-    ----------
-    gui, defer, on_note
-        As for :class:`GoalEditor`.
-    edit
-        Queues the changes of users that change the goal.
-    on_change
-        Called with the part when users have changed the parts of its goal, or the part whose
-        numbers are shown.
+    Without end-effectors, or without a planner, that is the pose of the base. ``edit`` queues the
+    changes of users that change the goal; ``on_change`` is called with the part when users have
+    changed the parts of its goal, or the part whose numbers are shown.
     """
 
     def __init__(
@@ -537,12 +525,10 @@ class _PartMenu:
 
     @property
     def links(self) -> tuple[str, ...]:
-        """The links that goals are offered for."""
         return tuple(part for part in self._menus if part != BASE_GOAL_KEY)
 
     @property
     def shown(self) -> Part:
-        """The part whose numbers are shown."""
         return str(self._numbers.value)
 
     def asked(self, part: Part) -> RequestedPart:
@@ -552,7 +538,6 @@ class _PartMenu:
         return RequestedPart.POSE if part == BASE_GOAL_KEY else RequestedPart.NOTHING
 
     def requested_links(self) -> dict[str, RequestedPart]:
-        """Return for each link of the goal whether it is for its position or its pose."""
         asked = {link: self.asked(link) for link in self.links}
         return {link: each for link, each in asked.items() if each is not RequestedPart.NOTHING}
 
@@ -574,7 +559,6 @@ class _PartMenu:
         self._update()
 
     def show(self, *, visible: bool) -> None:
-        """Show or hide the controls."""
         if (visible and bool(self.links)) != self._there:
             self._there = not self._there
             self._update()
@@ -624,14 +608,7 @@ class _PartMenu:
 class _FinalShape:
     """Controls of the joint positions at the end of the manoeuvre.
 
-    Parameters
-    ----------
-    gui
-        As for :class:`GoalEditor`.
-    edit
-        Queues the changes of users.
-    on_change
-        Called when users have changed them.
+    ``edit`` queues the changes of users; ``on_change`` is called when users have changed them.
     """
 
     def __init__(self, gui: viser.GuiApi, edit: Defer, on_change: Callable[[], None]) -> None:
@@ -659,7 +636,6 @@ class _FinalShape:
         return np.array([field.value for field in self._fields], float)
 
     def show_robot(self, robot: RobotDescription | None) -> None:
-        """Show a field for each joint of another robot."""
         for field in self._fields:
             field.remove()
         self._fields, self._q, self._enabled.value = [], np.zeros(0), False
@@ -689,14 +665,12 @@ class _FinalShape:
         self._q = q
 
     def fill(self) -> None:
-        """Set the fields to the joint positions of the robot."""
         for field, position in zip(self._fields, self._q, strict=False):
             low, high = getattr(field, "min", None), getattr(field, "max", None)
             value = round(float(position), 4)
             field.value = value if low is None or high is None else min(max(value, low), high)
 
     def show(self, *, visible: bool) -> None:
-        """Show or hide the controls of the final joint positions."""
         shown = visible and bool(self._fields)
         if shown != self._enabled.visible:
             self._enabled.visible = shown
@@ -715,7 +689,6 @@ class _FinalShape:
 
 
 def _links_of(goals: Mapping[Part, Goal]) -> dict[str, EndEffectorGoal]:
-    """Return the goals of links among goals by part."""
     return {aim.link: aim for goal in goals.values() for aim in goal.end_effectors}
 
 

@@ -61,11 +61,8 @@ _CURVE_COLORS = (
 _AXIS_COLOR = "#8a8f98"
 _PLOT_PIXELS = 170
 
-_LOOK_BACK_STEP_S = 0.1
-"""Step of the slider over the past, simulated s."""
-
-_MIN_LOOK_BACK_S = 1.0
-"""Shortest past that has a slider, simulated s."""
+_LOOK_BACK_STEP_S = 0.1  # simulated s
+_MIN_LOOK_BACK_S = 1.0  # simulated s
 
 _SLIDER_HOLD_S = 1.5
 """Wall time for which the page does not move the time slider after a user has, s."""
@@ -280,7 +277,6 @@ class FaultPanel:
 
     @property
     def _has_value(self) -> bool:
-        """Whether the chosen kind of fault takes a number."""
         kind = FAULT_KINDS.get(self._kind.value)
         return kind is not None and bool(kind.value)
 
@@ -393,21 +389,8 @@ class Plots:
 class _Plot:
     """A plot and its history; its colours can be seen on white and on black.
 
-    Parameters
-    ----------
-    gui, title
-        GUI that the plot is added to, and its title.
-    names
-        Names of the curves.
-    least
-        Least upper end of the axis, so that rounding errors do not look like peaks.
-    signed
-        Whether the numbers may be negative.
-
-    Attributes
-    ----------
-    history, width
-        The numbers so far, and how many curves there are.
+    ``least`` is the least upper end of the axis, so that rounding errors do not look like peaks;
+    ``signed``: the numbers may be negative.
     """
 
     def __init__(
@@ -442,11 +425,9 @@ class _Plot:
         self.width = len(names)
 
     def clear(self) -> None:
-        """Drop the history."""
         self.history = History(self.width)
 
     def draw(self) -> None:
-        """Send the curves to browsers."""
         self.handle.data = self.history.arrays()
 
 
@@ -478,8 +459,7 @@ _OBSTACLES_PATH, _TARGET_PATH = "/obstacles", "/target"
 _TEXTS_S, _TABLES_S, _PLOTS_S, _PATHS_S = 0.2, 0.25, 0.5, 0.5
 """Period of drawing of the slower parts, wall s."""
 
-_ANNOUNCEMENT_TIME_S = 60.0
-"""Wall time for which an announcement is shown, s."""
+_ANNOUNCEMENT_TIME_S = 60.0  # wall s
 
 CAMERA = np.array([1.1, 1.4, 0.8])
 """Initial position of the camera relative to the robot, in robot lengths.
@@ -694,7 +674,6 @@ class Page:
         self._target_drawing.base.visible = False
 
     def _show_layers(self) -> None:
-        """Show the layers that users have chosen."""
         shown = {name: bool(handle.value) for name, handle in self._layers.items()}
         if self._drawing is not None:
             self._drawing.show_collision_shapes(visible=shown["Collision shapes"])
@@ -814,7 +793,6 @@ class Page:
             )
 
     def _draw_paths(self, state: StackState, around: scene.Surroundings, until: float) -> None:
-        """Draw the planned paths, and those flown until a time."""
         around.flown.draw(self._trail.points_until(until))
         path = state.planned_path
         around.planned.draw(np.zeros((0, 3)) if path is None else path)
@@ -878,7 +856,6 @@ class Page:
         camera.position, camera.look_at = at + away, at
 
     def _aim_cameras(self) -> None:
-        """Turn the cameras of all browsers to the robot."""
         for client in self._server.get_clients().values():
             self._aim_camera(client.camera)
 

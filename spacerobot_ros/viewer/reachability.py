@@ -422,7 +422,6 @@ def _uncontrolled_text(
 
 
 def _check_arm(question: GoalQuestion, tool: Goal) -> GoalCheck:
-    """Return whether the arm reaches its goal."""
     base, end = (
         Pose(matrix_from_quaternion(g.quaternion), g.position) for g in (question.goal, tool)
     )

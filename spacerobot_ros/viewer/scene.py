@@ -31,8 +31,7 @@ _FLOWN: Color = (60, 130, 240)
 _FLOWN_END_EFFECTOR: Color = (20, 190, 170)
 _PLUME: Color = (255, 110, 40)
 _COLLISION: Color = (200, 60, 200)
-_LINE_WIDTH = 3.0
-"""Width of lines in the scene, pixels."""
+_LINE_WIDTH = 3.0  # pixels
 
 _FRAME_SIZE = 0.12
 """Length of the axes of a link, in robot lengths."""
@@ -118,14 +117,12 @@ class RobotDrawing:
         self._collision_shapes: list[Any] | None = None
 
     def _node_paths(self, robot: RobotDescription) -> dict[str, str]:
-        """Return the path of the scene node of every link."""
         paths = {robot.base_link: self._path}
         for joint in joints_outward(robot):
             paths[joint.child] = f"{paths[joint.parent]}/link{len(paths)}"
         return paths
 
     def _add_visual(self, path: str, visual: Visual) -> Any:
-        """Draw a visual in the frame of its link."""
         red, green, blue, alpha = visual.shape.rgba
         solid = self._color is None
         look: dict[str, Any] = {"cast_shadow": solid, "receive_shadow": solid}
@@ -360,7 +357,6 @@ class Surroundings:
         self._paths_shown = True
 
     def _add_sky(self, reach: float, center: Array) -> list[Any]:
-        """Add stars, and the Sun with its light, around a point."""
         directions = np.random.default_rng(1957).normal(size=(_STARS, 3))
         directions /= np.linalg.norm(directions, axis=1, keepdims=True)
         # Most stars are faint.

@@ -61,13 +61,11 @@ class ViewerConfig(WatchdogConfig):
 
 
 _PORTS_TRIED = 100
-"""Number of ports that are tried, one after the other."""
 
 _NO_FRAMING_HEADERS = {
     "Content-Security-Policy": "frame-ancestors 'none'",
     "X-Frame-Options": "DENY",
 }
-"""HTTP headers that keep browsers from showing the page inside another one."""
 
 _PAGE_TITLE = "spacerobot"
 

@@ -23,7 +23,6 @@ from spacerobot_ros.measures import (
     CaptureMeasures,
     Measures,
     Outcome,
-    metrics_of,
     metrics_of_each,
 )
 from spacerobot_ros.planning.core.goal import PoseError
@@ -209,7 +208,7 @@ def test_the_metrics_of_flights_are_those_of_each() -> None:
     robot = description_of(campaign().scenario)
     other = replace(FLOWN, duration=3.5, peak_rate=np.array([9.0, 0.0, math.nan]), error=None)
     found = metrics_of_each([FLOWN, other, FLOWN], robot)
-    assert str(found) == str([metrics_of(each, robot) for each in (FLOWN, other, FLOWN)])
+    assert str(found) == str([metrics_of_each([each], robot)[0] for each in (FLOWN, other, FLOWN)])
     assert [each["duration_s"] for each in found] == [41.5, 3.5, 41.5]
     assert [each["peak_rate.slider_1"] for each in found] == [0.25, 9.0, 0.25]
     assert [str(each["peak_rate"]) for each in found] == ["0.5", "nan", "0.5"]

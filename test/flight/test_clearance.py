@@ -14,7 +14,7 @@ from spacerobot_ros.events import EventKind
 from spacerobot_ros.flight.clearance import FlightClearance
 from spacerobot_ros.flight.flight import Flight
 from spacerobot_ros.flight.reading import read_run
-from spacerobot_ros.measures import metrics_of
+from spacerobot_ros.measures import metrics_of_each
 from spacerobot_ros.model import SpaceRobot, parse_robot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.planning.execution.config import PlannerConfig
@@ -100,7 +100,7 @@ def test_a_flight_through_contacts_has_events_and_a_clearance(through: Flight) -
     at = through.time[truth.min(axis=1).argmin()]
     assert summary["clearance_time_s"] == pytest.approx(at, abs=0.05)
     robot = through.required_robot()
-    assert metrics_of(through.measures, robot)["clearance_m"] == summary["clearance_m"]
+    assert metrics_of_each([through.measures], robot)[0]["clearance_m"] == summary["clearance_m"]
     assert math.isnan(through.measured(clearance=False).clearance)
     looked_at = truth[::2]  # Every 0.1 s, at 20 Hz.
     begins = {

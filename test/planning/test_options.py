@@ -379,7 +379,6 @@ def test_constraints_that_make_no_sense_are_refused(
 
 def test_no_constraint_is_none(arm: SpaceRobot) -> None:
     none = PathConstraints.of(arm, OptimalOptions())
-    assert none.knot_inequality_count == 0
     assert none.symbolic(ca.SX.sym("q", 3), ca.SX.sym("x", 4), ca.SX.sym("d", 3)).shape[0] == 0
     none.check(np.zeros((2, 3)), np.tile(IDENTITY, (2, 1)), 0.5)
     guess = parabola(4, -3.0, 2.0)

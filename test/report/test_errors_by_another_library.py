@@ -25,7 +25,7 @@ from spacerobot_ros import fly, read_run
 from spacerobot_ros.cli.flights import _summary_lines
 from spacerobot_ros.flight.flight import Flight
 from spacerobot_ros.flight.reading import open_flight_bag, read_flight
-from spacerobot_ros.measures import Outcome, metrics_of
+from spacerobot_ros.measures import Outcome, metrics_of_each
 from spacerobot_ros.model.kinematics import ForwardKinematics
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.core.goal import Tolerance
@@ -159,7 +159,7 @@ def assert_all_say(bag: Path, flight: Flight, *, position_counts: bool) -> None:
     same(shown(left, r", # m"), shown(left, r"and # rad from the goal"), 3)
 
     assert flight.robot is not None
-    metrics = metrics_of(flight.measured(clearance=False), flight.robot)
+    (metrics,) = metrics_of_each([flight.measured(clearance=False)], flight.robot)
     same(metrics["position_error_m"], metrics["attitude_error_rad"], 9)
 
     report = FlightReport.of(open_flight_bag(bag))
@@ -201,7 +201,7 @@ def assert_all_say_of_the_end_effector(bag: Path, flight: Flight) -> None:
     summary = flight.summary() | {"bag": str(bag), "messages_recorded": 0}
     assert summary["end_effector_position_error_m"] == pytest.approx(distance, rel=1e-9)
     assert flight.robot is not None
-    metrics = metrics_of(flight.measured(clearance=False), flight.robot)
+    (metrics,) = metrics_of_each([flight.measured(clearance=False)], flight.robot)
     assert metrics["end_effector_position_error_m"] == pytest.approx(distance, rel=1e-9)
     report = FlightReport.of(open_flight_bag(bag))
     texts = Cells(page(report, PagePart(""), [])).texts

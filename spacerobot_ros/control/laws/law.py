@@ -514,7 +514,6 @@ class ControlLaw(ABC):
         return LawStatus(smallest, singular, self._damping(smallest))
 
     def _damping(self, singular_value: float) -> float:
-        """Return the damping that the law adds to a singular value of J_z."""
         return 0.0
 
     def _inputs(self) -> Mapping[str, npt.ArrayLike]:

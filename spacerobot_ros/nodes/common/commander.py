@@ -46,11 +46,8 @@ from spacerobot_ros.planning.execution.goal_file import BASE_GOAL_KEY
 from spacerobot_ros.simulation.status import PlantStatus
 from spacerobot_ros.times import SECOND, first_time_ns
 
-_WAITING_STATE_CHECK_PERIOD = 0.1
-"""Wall time between two checks of postponed state messages, s."""
-
-_STATUS_LOG_PERIOD = 5.0
-"""Least wall time between log lines about statuses of the plant that do not count, s."""
+_WAITING_STATE_CHECK_PERIOD = 0.1  # wall s
+_STATUS_LOG_PERIOD = 5.0  # wall s, of statuses that do not count
 
 _LONGEST_DIAGNOSTICS_PERIOD = 1.0
 """Longest wall time between diagnostics in runs that need not be repeatable, s."""
@@ -77,7 +74,6 @@ class CommanderNode(FlightNode):
     _statuses: Subscription | None = None
     _decoder: MessageDecoder | None = None
     _goal_actions: GoalActions | None = None
-    """The action servers, once they are created."""
 
     # -- life ---------------------------------------------------------------------------------
 
@@ -111,7 +107,6 @@ class CommanderNode(FlightNode):
         self._unheard = ""
         """Name of a state topic with a publisher whose QoS the subscription does not match."""
         self._inputs: dict[str, Subscription] = {}
-        """Messages of states and references by their topics."""
         self._subscribe_states()
         self.create_timer(
             _WAITING_STATE_CHECK_PERIOD,

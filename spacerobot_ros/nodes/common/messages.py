@@ -199,10 +199,7 @@ def _pose_of_frame(
 ) -> Array | None:
     """Return the pose (7,) of a frame by its name in ``frame``; None: it is that frame.
 
-    Raises
-    ------
-    PlanningError
-        It is not known; ``what`` is in it.
+    PlanningError if it is not known; ``what`` is in it.
     """
     given = name.removeprefix("/")
     if given in ("", frame):

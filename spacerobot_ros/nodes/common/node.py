@@ -276,7 +276,6 @@ class FlightNode(LifecycleNode):
         return super().set_parameters_atomically(changes)
 
     def _has_value(self, given: RosParameter) -> bool:
-        """Whether a parameter has this value already."""
         present = self.get_parameter_or(given.name)
         return bool(present.type_ == given.type_ and present.value == given.value)
 

@@ -84,17 +84,14 @@ class RemoteParameters:
 
 
 def _json_value(value: Any) -> Any:
-    """Return a parameter value as a JSON value."""
     return value if value is None or isinstance(value, (bool, int, float, str)) else list(value)
 
 
 _LARGEST_FLOAT = sys.float_info.max
 _INTEGER_BOUNDS = -(2**63), 2**63 - 1
-"""Integer bounds of parameter descriptors."""
 
 
 def _descriptor(parameter: Parameter) -> ParameterDescriptor:
-    """Return the descriptor that ``ros2 param describe`` shows."""
     unit = f" [{parameter.unit}]" if parameter.unit else ""
     choices = ", ".join(parameter.choices)
     described = ParameterDescriptor(
@@ -146,7 +143,6 @@ def declare(node: Node, parameters: Sequence[Parameter]) -> dict[str, Value]:
 
 
 def _given_value(node: Node, name: str) -> Any:
-    """Return the value that the user set for a parameter; None without one."""
     overrides = getattr(node, "_parameter_overrides", None)
     if isinstance(overrides, dict):
         return overrides[name].value if name in overrides else None

@@ -52,7 +52,6 @@ class TrajectoryClients:
             )
         self._kind, self._node = kind, node
         self._clients: dict[str, ActionClient] = {}
-        """Clients by the name of their action."""
 
     def connect(self, name: str, on_end: Callable[[TrajectoryEnd], None]) -> TrajectoryOutput:
         """Return an output to the server of an action, which tells ends as `on_end`."""
@@ -83,7 +82,6 @@ class _Connection:
         """Schedules that are cancelled as soon as they are accepted."""
 
     def is_available(self) -> bool:
-        """Whether the server is there."""
         return bool(self._client.server_is_ready())
 
     def send(self, number: int, start: ScheduleStart) -> None:

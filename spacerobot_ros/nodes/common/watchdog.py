@@ -25,15 +25,12 @@ TOPIC = "heartbeat"
 HEARTBEAT_PERIOD = 0.2
 """Wall s between two heartbeats of an active node."""
 
-_SILENCE_CHECK_PERIOD = 0.1
-"""Wall time between two checks for silent nodes, s."""
+_SILENCE_CHECK_PERIOD = 0.1  # wall s
 
 _SUSPENSION_TIME = 0.3
 """Wall time between two checks beyond which this node itself was suspended, s."""
 
-_REPORT_PERIOD = 1.0
-"""Wall s between two diagnostics while a node is silent."""
-
+_REPORT_PERIOD = 1.0  # wall s, while a node is silent
 HEARTBEAT_QOS = QoSProfile(depth=20, reliability=ReliabilityPolicy.RELIABLE)
 
 
@@ -158,10 +155,8 @@ class Liveness:
         self._role = "" if role is None else role.value
         self._publisher = node.create_publisher(DiagnosticStatus, TOPIC, HEARTBEAT_QOS)
         self._timers: list[Timer] = []
-        """The timers of an active node."""
         self._watched = {each.value for each in depends_on}
         self._watchdog: Watchdog | None = None
-        """The watchdog of an active node that watches others."""
         self._timeout = 0.0
         self._busy = 0
         """Number of computations under way that may take long."""
@@ -212,7 +207,6 @@ class Liveness:
             self._beat()
 
     def _beat(self) -> None:
-        """Send a heartbeat if the node is active."""
         if self._timers:
             self._publish(HeartbeatState.BUSY if self._busy else HeartbeatState.ACTIVE)
 
@@ -238,7 +232,6 @@ class Liveness:
             self._report(lost)
 
     def _report(self, news: list[SilenceReport]) -> None:
-        """Report changes to the node, and publish diagnostics about silent nodes."""
         for silence in news:
             self._on_silence(silence)
         if self._watchdog is None:

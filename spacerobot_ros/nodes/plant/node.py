@@ -56,18 +56,14 @@ from spacerobot_ros.topics import TOPICS
 if TYPE_CHECKING:
     from spacerobot_ros.bag.salvage import LastState
 
-_READER_CHECK_PERIOD = 0.1
-"""Wall time between two checks for new subscribers and commanders, s."""
+_READER_CHECK_PERIOD = 0.1  # wall s
 
 _MAX_UNCONFIRMED_TICKS = STREAM.depth // 2
 """Ticks that a lockstep plant takes at most before all readers confirm that they have their states:
 a reader that has fallen further behind than what publishers keep would lose some."""
 
-_MAX_RATE_AT_REST = 1e-3
-"""Joint rates of a robot at rest, m/s or rad/s."""
-
-_LONGEST_REST = 0.8
-"""Longest wall time to bring the joints to rest before the process ends, s."""
+_MAX_RATE_AT_REST = 1e-3  # m/s or rad/s
+_LONGEST_REST = 0.8  # wall s, before the process ends
 
 _REPORT_PERIOD_NS = 950_000_000
 """Wall time after the last diagnostics at which new ones are due, ns: about one a second."""
@@ -211,7 +207,6 @@ class PlantNode(FlightNode):
         self._publish_status(self._monitor.status)
 
     def _use_plant(self, plant: PlantWithFaults, config: PlantConfig) -> None:
-        """Simulate this plant from the present tick on."""
         self.plant, plant.tick = plant, self._tick
         self._reported = ReportedState(plant, config)
         self._commands = CommandValidator(plant, config)
@@ -369,7 +364,6 @@ class PlantNode(FlightNode):
         self._publish_status(PlantStatus(PlantState.INACTIVE, "The plant is not configured."))
 
     def _publish_changed_status(self) -> None:
-        """Publish the status if it has changed, and the events since the last call."""
         assert self._monitor is not None
         self._injected_seen = self.plant.injected
         events = self._monitor.update(self._active, self.time_ns / SECOND)
@@ -385,7 +379,6 @@ class PlantNode(FlightNode):
         self._status.take(record.encoded())
 
     def _last_state(self, robot: SpaceRobot) -> LastState | None:
-        """Return the state to go on from; None: the initial one."""
         path = self.config.resume_bag
         if not path:
             return None
@@ -408,7 +401,6 @@ class PlantNode(FlightNode):
     def _resumed_plant(
         self, robot: SpaceRobot, config: PlantConfig, state: LastState
     ) -> PlantWithFaults:
-        """Return the plant in a recorded state."""
         # Servos hold the rates that they are commanded: only motors leave joints moving.
         moving = config.actuation == "effort"
         initial = InitialState(

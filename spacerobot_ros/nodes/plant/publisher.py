@@ -38,8 +38,7 @@ from spacerobot_ros.topics import TOPICS, Topic, pose_topic
 if TYPE_CHECKING:
     from spacerobot_ros.simulation.clearance import ClearanceMonitor
 
-_LOG_PERIOD = 5.0
-"""Wall time between two log lines of one kind, s."""
+_LOG_PERIOD = 5.0  # wall s, of lines of one kind
 
 _RESTING_SHARE = 0.01
 """Share of its effort limit that a joint which rests on its stop may push."""
@@ -126,8 +125,7 @@ class PlantReport:
 
 _TARGET = "target/odom"
 
-_LONGEST_WAIT = 0.5
-"""Longest wait for readers, wall s."""
+_LONGEST_WAIT = 0.5  # wall s, for readers
 
 
 class StatePublisher:
@@ -234,7 +232,6 @@ class StatePublisher:
         return self._outputs[topic.name]
 
     def _template(self, topic: Topic) -> MessageTemplate:
-        """Return the message of a topic, fed with the quantities that it carries."""
         names = self._state.names(topic)
         target = self._state.target
         prototype = state_message(

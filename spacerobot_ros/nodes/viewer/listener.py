@@ -62,7 +62,6 @@ _REFUSED = " A later goal is refused: "
 """Between the message about the goal that is pursued and the reason of a refusal."""
 
 _MAX_PATH_POINTS = 1000
-"""Largest number of points of a planned path."""
 
 _MAX_MOTION_POINTS = 200
 """Largest number of poses and shapes of a planned motion: links are placed at each."""
@@ -420,7 +419,6 @@ class Listener:
         self._combine_path_and_schedule()
 
     def _combine_path_and_schedule(self) -> None:
-        """Combine path and schedule if they are of one plan."""
         path, schedule = self._path, self._schedule
         self._motion = None
         if path is not None and schedule is not None and path.begin_ns == schedule.begin_ns:
@@ -445,7 +443,6 @@ class Listener:
             self._hidden = {name: by for name, by in self._hidden.items() if by != message.name}
 
     def _hide_long_silent_nodes(self, now: float) -> None:
-        """Hide the reports of nodes that have long been silent, and of a replay that is over."""
         if now - self._last_call > _MAX_CALL_INTERVAL:
             # This process was suspended, so the other nodes were not silent.
             gap = now - self._last_call

@@ -80,10 +80,8 @@ _ROSOUT_QOS = QoSProfile(
     durability=DurabilityPolicy.VOLATILE,
 )
 _LEAST_SHOWN_LOG_LEVEL = 30
-"""Least level of shown log messages (rcl_interfaces/Log)."""
 
 _PARTS_WITH_RECEIVED_GOALS = (BASE_GOAL_KEY, DEFAULT_END_EFFECTOR)
-"""Parts whose goals this node receives as well as sends."""
 
 _SERVICE_BY_REQUEST: Mapping[Request, tuple[tuple[str, ...], str, bool | None]] = {
     Request.ABORT: (("planner", "controller"), "abort", None),
@@ -98,14 +96,9 @@ _SERVICE_BY_REQUEST: Mapping[Request, tuple[tuple[str, ...], str, bool | None]] 
 """For each request of the page: nodes, name of their service, and its data (None: Trigger)."""
 
 _NODES_WITH_PARAMETERS = ("plant", "planner", "controller")
-"""Nodes whose parameters the page reads."""
 
-_LONGEST_MATCHING_WAIT = 4.0
-"""Wall time that a goal waits for subscribers that are known but not matched yet, s."""
-
-_LONGEST_GOAL_ANSWER_WAIT = 5.0
-"""Wall time within which a planner or controller answers a goal, s."""
-
+_LONGEST_MATCHING_WAIT = 4.0  # wall s
+_LONGEST_GOAL_ANSWER_WAIT = 5.0  # wall s
 _MICROSECOND_NS = 1000
 _MILLISECOND_NS = 1_000_000
 
@@ -227,7 +220,7 @@ class ViewerNode(FlightNode):
         now, state = time.monotonic(), self._listener.state()
         self._take_parameters()
         for action in self._page.update(state, now):
-            self._carry_out(action, state)
+            self._carry_out(action)
         planner = None if "planner" in state.absent else state.planner
         planner_state = None if planner is None else planner.state
         if planner_state is not self._planner_state:
@@ -408,7 +401,7 @@ class ViewerNode(FlightNode):
 
     # -- actions of users -----------------------------------------------------------------------
 
-    def _carry_out(self, action: Action, state: StackState) -> None:
+    def _carry_out(self, action: Action) -> None:
         match action:
             case FlyAction(goals):
                 self._goals_to_send = goals, time.monotonic() + _LONGEST_MATCHING_WAIT
@@ -478,7 +471,6 @@ class ViewerNode(FlightNode):
             editor.show_check(GoalCheck(Verdict.UNCHECKED, "It was sent before it was checked."))
 
     def _call_service(self, request: Request) -> None:
-        """Call the service of a request on every node that has it."""
         keys, service, data = _SERVICE_BY_REQUEST[request]
         called = False
         for key in keys:

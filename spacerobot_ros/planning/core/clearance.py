@@ -40,7 +40,6 @@ _DISTANCE_ERROR = 1e-6
 """Error of a distance, m."""
 
 _CLEARANCE_FACTOR_FOR_LOOPS = 5.0
-"""Smallest distance of links in the centre shape of loops, in clearances."""
 
 _MIN_START_SHARE = 0.5
 """Share of the clearance from which on a start is refused: a flight that has ended at the clearance

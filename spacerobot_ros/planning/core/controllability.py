@@ -128,11 +128,9 @@ def best_triple(K: Array, among: Sequence[int]) -> tuple[tuple[int, int, int], A
     return triples[best], matrices[best]
 
 
-def brackets_at(
-    robot: SpaceRobot, shape: Array, among: Sequence[int] | None = None
-) -> Controllability:
-    """Return the span of the first-order brackets of joints (indices) at a shape (n,)."""
-    return _span_of_brackets(robot, shape[np.newaxis], among)
+def brackets_at(robot: SpaceRobot, shape: Array) -> Controllability:
+    """Return the span of the first-order brackets of all joints at a shape (n,)."""
+    return _span_of_brackets(robot, shape[np.newaxis], None)
 
 
 def best_sampled_brackets(robot: SpaceRobot, among: Sequence[int] | None = None) -> Controllability:
@@ -236,7 +234,6 @@ def _span_of_brackets(
 
 
 def _numerical_rank(values: Array) -> int:
-    """Return the number of descending singular values above rounding errors."""
     return int(np.sum(values > max(ZERO_TURN_PER_AREA, float(values[0]) / MAX_CONDITION)))
 
 

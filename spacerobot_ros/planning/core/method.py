@@ -22,8 +22,7 @@ from spacerobot_ros.planning.core.joint_efforts import JointEfforts, given_effor
 from spacerobot_ros.planning.core.prediction import BasePrediction
 from spacerobot_ros.planning.core.schedule import BasePath, GaitSchedule, Notes
 
-_REST_MOMENTUM = 1e-9
-"""Momenta per mass below this count as zero, m/s and m^2/s."""
+_REST_MOMENTUM = 1e-9  # per mass: m/s and m^2/s
 
 END_EFFECTOR_METHOD = "optimal"
 """Name of the method that plans for goals of end-effectors."""
@@ -31,8 +30,7 @@ END_EFFECTOR_METHOD = "optimal"
 PATH_METHOD = "resolved_rate"
 """Name of the method that takes end-effectors along given paths."""
 
-_LIMIT_SLACK = 1e-9
-"""Rounding error by which a goal shape may exceed a joint limit, m or rad."""
+_LIMIT_SLACK = 1e-9  # m or rad
 
 
 @dataclass(frozen=True)
@@ -174,7 +172,6 @@ class GaitMethod(ABC):
 
     @cached_property
     def _prediction(self) -> BasePrediction:
-        """The prediction of the base motion under held commands, as the plant integrates it."""
         return BasePrediction(self.robot, self.control_period, self.integration_step)
 
     @cached_property
@@ -304,7 +301,6 @@ class GaitMethod(ABC):
         return shape
 
     def _require_goal_of_base(self, goal: Goal) -> None:
-        """Refuse goals of end-effectors, by methods that reach none."""
         self._require_no_path(goal)
         if goal.end_effectors:
             names = " and ".join(f"'{each.link}'" for each in goal.end_effectors)
@@ -314,7 +310,6 @@ class GaitMethod(ABC):
             )
 
     def _require_no_path(self, goal: Goal) -> None:
-        """Refuse goals with a path, by methods that follow none."""
         for each in goal.end_effectors:
             if each.waypoints is not None:
                 raise PlanningError(
@@ -324,7 +319,6 @@ class GaitMethod(ABC):
 
     @property
     def _has_obstacles(self) -> bool:
-        """Whether there are obstacles around the robot that schedules keep clear of."""
         return self.clearance is not None and self.clearance.has_obstacles
 
     def _base_poses(
@@ -361,7 +355,6 @@ class GaitMethod(ABC):
         return self.clearance.clause(found[0], period) if found else ""
 
     def _require_suitable_setup(self) -> None:
-        """Refuse a robot that was found unsuitable."""
         if self._setup_refusal is not None:
             raise PlanningError(str(self._setup_refusal))
 

@@ -15,8 +15,6 @@ from dataclasses import dataclass
 from spacerobot_ros.model.compilation import ANNOUNCEMENT_ATTRIBUTE
 
 _RECORD_ATTRIBUTE = "search_progress"
-"""The attribute of log records that holds a SearchProgress."""
-
 _PACKAGE = "spacerobot_ros"
 
 

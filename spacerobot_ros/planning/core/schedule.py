@@ -115,8 +115,7 @@ class GaitSchedule:
         return np.diff(self.positions, axis=0) / self.control_period
 
 
-_MIN_JOINT_MOTION = 1e-9
-"""A joint with a planned motion below this, m or rad, stays at rest."""
+_MIN_JOINT_MOTION = 1e-9  # m or rad
 
 
 def straight_motion(

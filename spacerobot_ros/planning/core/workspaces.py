@@ -32,8 +32,6 @@ _SAMPLED_SHAPES = 48
 """Shapes from which singular ones are sought, and shapes that are examined for the reach."""
 
 _EXTREME_STARTS = 3
-"""Shapes from which an extreme distance is sought."""
-
 _NEWTON_STEPS, _LONGEST_NEWTON_STEP = 40, 0.5
 _WALK_STEPS, _LONGEST_STEP, _SHORTEST_STEP = 60, 0.25, 1e-4
 """Steps along curves of singular shapes, rad (or m) of the joint that moves most."""
@@ -149,16 +147,10 @@ def _bounds(robot: SpaceRobot, within_limits: bool) -> tuple[Array, Array]:
 class _Equations:
     """Equations of a link's singular shapes, ``J*^T u = 0``, ``|u|^2 = 1``, in units of the reach.
 
-    Attributes
-    ----------
-    jacobian
-        ``q -> J*`` (m, n), rows along the directions in which the joints move the link.
-    function
-        ``(q, u) -> equations (n + 1,), derivatives (n + 1, n + m), distance, its gradient``.
-    samples
-        (K, n) shapes all over the shape space.
-    dimensions, rank
-        m, and the largest rank of J* at the samples.
+    ``jacobian`` is ``q -> J*`` (m, n), rows along the directions in which the joints move the link;
+    ``function`` is ``(q, u) -> equations (n + 1,), derivatives (n + 1, n + m), distance, its
+    gradient``. ``samples`` (K, n) are shapes all over the shape space, ``rank`` is the largest rank
+    of J* there.
     """
 
     jacobian: ca.Function

@@ -312,15 +312,12 @@ class Executive:
         self._stamp_ns = 0
         """Stamp of the state that :meth:`update` answers, ns."""
         self._new_goal: IdentifiedGoal | None = None
-        """A new goal without a plan so far."""
         self._in_motion_attempts = 0
-        """Number of late or refused plans in motion for the new goal."""
         self._pending_plan: PlanJob | ReadyPlan | None = None
         """The requested plan, or the plan that waits for its tick (``TAKING_OVER``)."""
         self._coasting: _PlannedRest | None = None
         """The rest that the requested plan begins with, because the base drifts meanwhile."""
         self._active_goal: ActiveGoal | None = None
-        """The goal that is executed or evaluated."""
         self._replan_ns = 0
         """Stamp from which on the remaining motion is planned again, ns."""
         self._commanded_from_ns = 0
@@ -385,7 +382,6 @@ class Executive:
         self._teleoperation.twist, self._teleoperation.received_ns = twist, self._stamp_ns
 
     def _require_no_goal(self, link: str) -> None:
-        """Raise PlanningError if twists of a link cannot be followed now."""
         teleoperation, refused = self._teleoperation, self._refused_twist_ns
         if self.phase not in (Phase.IDLE, Phase.TELEOPERATING) or self._new_goal is not None:
             raise PlanningError("Twists are not followed while a goal is pursued: abort it first.")
@@ -508,7 +504,6 @@ class Executive:
         return has_goal
 
     def _commands_were_obeyed(self, commanded_until_ns: int, rests_since_ns: int) -> bool:
-        """Whether a plant has obeyed the active goal before it came to rest."""
         active, since = self._active_goal, self._commanded_from_ns
         if active is None or commanded_until_ns < active.begins_ns:
             return False
@@ -696,7 +691,6 @@ class Executive:
         return tracker.setpoint
 
     def _do_phase_work(self, measured: MeasuredState) -> None:
-        """Do the work of the present phase beside tracking."""
         match self.phase:
             case Phase.MEASURING | Phase.EVALUATING:
                 self._measure_at_rest(measured)
@@ -728,7 +722,6 @@ class Executive:
     # -- TELEOPERATING ------------------------------------------------------------------------
 
     def _keep_base_pose(self, teleoperation: Teleoperation, measured: MeasuredState) -> None:
-        """Keep the measured pose of the base, if it is one."""
         base = measured.base()
         if base is not None and np.all(np.isfinite(base.pose)):
             teleoperation.pose, teleoperation.pose_ns = base.pose, measured.stamp_ns
@@ -766,7 +759,6 @@ class Executive:
             self.outputs.append(PlannerStatus(PlannerState.TELEOPERATING, message))
 
     def _end_teleoperation(self, event: Event, message: str) -> None:
-        """End the teleoperation at once."""
         self._teleoperation = None
         self._tracker.stop()
         self._average.restart()
@@ -854,7 +846,6 @@ class Executive:
         self._average.restart()
 
     def _plan_new_goal_in_motion(self, waiting: IdentifiedGoal, take_over: TakeOver) -> None:
-        """Request a plan for a new goal that takes over without a stop."""
         assert self._active_goal is not None
         if waiting.goal.equals(self._active_goal.identified.goal):
             self._keep_schedule_for(waiting, self._active_goal)
@@ -910,7 +901,6 @@ class Executive:
             self._request_plan(job, state)
 
     def _can_replan(self) -> bool:
-        """Whether a plan may take over in motion from the schedule that is tracked."""
         return (
             self._active_goal is not None
             and not self.plant_rests
@@ -953,7 +943,6 @@ class Executive:
     # -- in motion: REPLANNING and TAKING_OVER ------------------------------------------------
 
     def _await_take_over(self) -> None:
-        """Take the finished plan in motion, and start its schedule at its tick."""
         if self.phase is Phase.REPLANNING:
             self._take_plan_result()
         match self._pending_plan:
@@ -963,7 +952,6 @@ class Executive:
                 self._handle_late_plan(job)
 
     def _switch_schedule(self, ready: ReadyPlan) -> None:
-        """Track the ready plan from its first tick on."""
         job, schedule, begins_ns = ready.job, ready.schedule, ready.job.take_over.stamp_ns
         self._pending_plan = None
         if job.reason.is_for_new_goal:
@@ -1004,7 +992,6 @@ class Executive:
             self._request_plan(job, state)
 
     def _reset_plan_count(self) -> None:
-        """Reset number and time of plans for the waiting goal, which no longer waits."""
         self._new_goal = None
         self._total_plan_time, self._plan_count = 0.0, 0
 
@@ -1056,7 +1043,6 @@ class Executive:
         self._take_plan_result()
 
     def _take_plan_result(self) -> None:
-        """Act on the result of the requested plan, once the worker has it."""
         result = self._worker.poll()
         if result is None:
             return
@@ -1142,7 +1128,6 @@ class Executive:
                 self._change_phase(Event.REFUSED, self._phase_without_plan())
 
     def _accept_goal(self, active: ActiveGoal) -> None:
-        """Make a new goal the active goal, for all joints, and save it."""
         self._active_goal, self._tracker.stuck = active, []
         self._add_event(EventKind.GOAL_ACCEPTED, "The goal is accepted.", active.identified)
         try:
@@ -1192,7 +1177,6 @@ class Executive:
 
     @staticmethod
     def _subtract_remainder(active: ActiveGoal, stamp_ns: int) -> None:
-        """Subtract the remaining duration of the present schedule from the manoeuvre time."""
         remainder = active.ends_at - stamp_ns / 1e9
         if remainder > 0:
             active.manoeuvre_time -= min(remainder, active.schedule.duration)
@@ -1268,13 +1252,11 @@ class Executive:
             self._new_goal = self._new_goal or job.identified
 
     def _phase_without_plan(self) -> Phase:
-        """Return the next phase without a plan."""
         if self._tracker.is_active:
             return Phase.BRAKING if self._tracker.is_braking else Phase.EXECUTING
         return self._phase_at_rest()
 
     def _phase_at_rest(self) -> Phase:
-        """Return the next phase when the joints have come to rest."""
         if self._new_goal is not None:
             return Phase.MEASURING
         return Phase.IDLE if self._active_goal is None else Phase.EVALUATING
@@ -1298,7 +1280,6 @@ class Executive:
         self._change_phase(event, self._phase_at_rest())
 
     def _forget_goals(self) -> None:
-        """Drop the plan, every goal, and the teleoperation."""
         self._drop_plan()
         self._new_goal = self._active_goal = self._teleoperation = None
 
@@ -1307,17 +1288,14 @@ class Executive:
         return self._new_goal or self._planned_goal() or self._pursued_goal()
 
     def _planned_goal(self) -> IdentifiedGoal | None:
-        """Return the goal of the requested or ready plan."""
         plan = self._pending_plan
         job = plan.job if isinstance(plan, ReadyPlan) else plan
         return None if job is None else job.identified
 
     def _pursued_goal(self) -> IdentifiedGoal | None:
-        """Return the goal that is executed or evaluated."""
         return None if self._active_goal is None else self._active_goal.identified
 
     def _tolerance_of(self, identified: IdentifiedGoal) -> Tolerance:
-        """Return the largest errors with which a goal is reached."""
         return identified.tolerance or self.config.tolerance
 
     def _pursued_id(self) -> str:
@@ -1351,7 +1329,6 @@ class Executive:
         level: int = 0,
         **about: str,
     ) -> None:
-        """Report an event about a goal."""
         now = self._stamp_ns / 1e9
         self.outputs.append(FlightEvent(kind, message, level, now, identified.goal_id, about))
 
@@ -1364,7 +1341,6 @@ class Executive:
         remaining: PoseError | None = None,
         schedule: GaitSchedule | None = None,
     ) -> None:
-        """Report a status of a goal, with corrections, durations, remaining error and schedule."""
         values: dict[str, Any] = {}
         if active is not None:
             values["corrections"] = active.corrections

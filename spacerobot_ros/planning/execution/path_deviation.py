@@ -38,10 +38,7 @@ from spacerobot_ros.planning.core.schedule import BasePath, GaitSchedule
 from spacerobot_ros.planning.execution.config import PlannerConfig
 
 _MAX_EVALUATED_SHAPES = 48
-"""Largest number of shapes along a path for which the model is evaluated."""
-
 _DIFFERENCE_STEP = 1e-6
-"""Relative step of the finite differences."""
 
 _PRIOR_DEVIATION = 0.1
 """Prior standard deviation of the relative errors of masses and inertias."""
@@ -189,7 +186,6 @@ class PathCheck:
     def _aimed_end_effector(
         self, goal: EndEffectorGoal, error: PoseError, within: Tolerance, *, late: bool
     ) -> EndEffectorGoal:
-        """Return the goal of an end-effector, shifted likewise."""
         position, quaternion = end_effector_pose(
             self._robot, goal.link, *self.end, self._positions[-1]
         )
@@ -204,7 +200,6 @@ class PathCheck:
 
 
 def _excess_share(error: float, allowed: float) -> float:
-    """Return the excess of an error over its allowed size, as a share of the error."""
     return max(0.0, 1.0 - allowed / error) if error > 0 else 0.0
 
 

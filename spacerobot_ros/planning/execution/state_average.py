@@ -17,8 +17,7 @@ from spacerobot_ros.model.rotations import (
 from spacerobot_ros.model.wheels import ReactionWheels
 from spacerobot_ros.planning.core.goal import RobotState
 
-_REST_RATE = 1e-9
-"""Joint rates below which the joints rest, m/s or rad/s."""
+_REST_RATE = 1e-9  # m/s or rad/s
 
 
 class BaseMeasurement(NamedTuple):

@@ -41,10 +41,7 @@ _TRIED_SPEED_SHARES = (1.0, 0.5, 0.25, 0.0)
 """Shares of the rates that are tried where links come too near; with the last one joints brake."""
 
 _MIDPOINT_STEPS = 2
-"""Steps to the rates in the middle of a tick."""
-
 _ROUNDING = 1e-12
-"""Rates and twists below this count as zero."""
 
 
 class TwistFrame(Enum):

@@ -26,11 +26,8 @@ from spacerobot_ros.planning.execution.path_deviation import (
 )
 from spacerobot_ros.times import SECOND
 
-_END_TOLERANCE = 1e-6
-"""Largest distance of the joints from their last positions at the end of a schedule, m or rad."""
-
-_MAX_SETTLING_TIME = 5.0
-"""Time after its last tick at which a schedule ends in any case, s."""
+_END_TOLERANCE = 1e-6  # m or rad
+_MAX_SETTLING_TIME = 5.0  # s
 
 
 @dataclass(frozen=True)
@@ -439,7 +436,6 @@ class TrajectoryTracker:
 # -- stuck joints ---------------------------------------------------------------------------------
 
 _STUCK_SHARE = 0.05
-"""Share of the commanded range below which the motion of a joint counts as stuck."""
 
 _MIN_FOLLOWED_SHARE = 0.5
 """Share of the commanded range above which a joint counts as following its commands. In between it
@@ -451,8 +447,7 @@ _MAX_STANDSTILL_WINDOWS = 8
 _CHECK_PERIOD = 16
 """Ticks between two checks of joints that have all followed so far: a check takes time."""
 
-_MIN_JOINT_ERROR = 1e-6
-"""Joint errors below this count as rounding, m or rad."""
+_MIN_JOINT_ERROR = 1e-6  # m or rad
 
 
 class StuckJointWatch:

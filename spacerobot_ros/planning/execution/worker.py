@@ -325,8 +325,6 @@ class PlanningWorker:
 
 
 class _PlanThread(Thread):
-    """A thread that makes one plan, and the plan's result."""
-
     def __init__(self, worker: PlanningWorker, task: PlanningTask) -> None:
         super().__init__(daemon=True)
         self.cancellation = Cancellation()

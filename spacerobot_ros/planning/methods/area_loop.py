@@ -303,10 +303,8 @@ class AreaLoopGait(GaitMethod):
     ) -> float:
         """Return the expected number of cycles for the goal, with those that are ``flown``.
 
-        Raises
-        ------
-        PlanningError
-            It is above ``most_cycles``; the message has the clause ``too_near`` on larger loops.
+        PlanningError if it is above ``most_cycles``; the message has the clause ``too_near`` on
+        larger loops.
         """
         cycles = flown + self._count_cycles_left(missing, share, enough)
         most = self.options.most_cycles
@@ -329,12 +327,8 @@ class AreaLoopGait(GaitMethod):
         """Return a share of areas ``S`` (3,), up to a given one, on whose loop links keep clear.
 
         ``state`` is the start of the gait. The second is the clause on the last loop that was too
-        large; empty where the first one is clear.
-
-        Raises
-        ------
-        PlanningError
-            Links come too near on small loops, too.
+        large; empty where the first one is clear. PlanningError if links come too near on small
+        loops, too.
         """
         too_near = ""
         if self.clearance is None:
@@ -366,7 +360,6 @@ class AreaLoopGait(GaitMethod):
         return many + max(1.0, math.log(unbounded / enough) / factor)
 
     def _edge_ends(self, path: EdgePath, nominal: NominalShape) -> LegEnds:
-        """Return the ends of the edges of a path that begins and ends at the nominal shape."""
         chosen = list(nominal.joints)
         lower, upper = self.robot.lower[chosen], self.robot.upper[chosen]
         ends: LegEnds = []
@@ -389,7 +382,6 @@ class AreaLoopGait(GaitMethod):
         return self._add_legs(start, ends).attitudes[-1]
 
     def _add_legs(self, gait: _PlannedMotion, ends: LegEnds) -> _PlannedMotion:
-        """Return the gait with straight legs added."""
         shapes = straight_motion(
             self.robot, gait.positions[-1], ends, self.control_period, self.options.longest
         )

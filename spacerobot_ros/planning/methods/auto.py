@@ -169,17 +169,8 @@ class AutoGait(GaitMethod):
 
 @dataclass(frozen=True)
 class _MethodResult:
-    """Result of a method.
-
-    Attributes
-    ----------
-    schedule
-        Its schedule.
-    parts
-        The parts of the goal that it controls.
-    reaches_goal
-        Whether it is predicted to end on the goal, by itself or with the schedules after it.
-    """
+    """A schedule, the controlled parts of the goal, and whether it is predicted to end on the goal,
+    by itself or with the schedules after it."""
 
     schedule: GaitSchedule
     parts: frozenset[Controlled]
@@ -201,7 +192,6 @@ class _MethodResult:
 
     @property
     def message(self) -> str:
-        """The duration of the schedule as a message, with a reason against the schedule, if any."""
         about = "about " if self.schedule.partial else ""
         off = "" if self.reaches_goal else ", which ends off the goal"
         return f"{about}{self.schedule.expected_duration:.6g} s{off}"
@@ -214,7 +204,6 @@ def _add_notes(
     results: Mapping[str, _MethodResult],
     refusals: Mapping[str, SpaceRobotError],
 ) -> GaitSchedule:
-    """Return a schedule with notes on all compared manoeuvres."""
     compared = [f"{name}: {result.message}." for name, result in results.items()]
     compared += [f"{name}: {refusal}" for name, refusal in refusals.items()]
     notes = {"chosen": chosen, "because": because, "compared": " ".join(compared)}

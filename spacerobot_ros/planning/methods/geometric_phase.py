@@ -34,7 +34,6 @@ _MAX_AXIS_TILT = 1e-5
 the rounding error of angles with six digits."""
 
 _SAMPLED_SHAPE_COUNT = 8
-"""Number of sampled shapes in the test whether a robot stays in its plane."""
 
 _MAX_PANEL_ANGLE = 0.5
 """Longest piece of a leg that one Gauss rule integrates, rad."""
@@ -58,8 +57,7 @@ _MAX_PEAKS = 4
 _EQUAL_PEAK_TOLERANCE = 1e-4
 """Relative difference below which peaks of the curvature count as equal."""
 
-_EQUAL_DISTANCE_TOLERANCE = 1e-2
-"""Distances that differ by less than this count as equal, rad."""
+_EQUAL_DISTANCE_TOLERANCE = 1e-2  # rad
 
 _NEIGHBOUR_OFFSETS = np.array([[x, y] for x in (0.0, -1.0, 1.0) for y in (0.0, -1.0, 1.0)])
 """Offsets of a grid point and its eight neighbours; the first, of the point itself, wins ties."""

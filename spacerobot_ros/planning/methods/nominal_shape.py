@@ -40,8 +40,7 @@ _GRID_REFINEMENTS = 10
 _EQUAL_MEASURE_TOLERANCE = 1e-6
 """Relative difference below which shapes are equally good; the most central shape wins."""
 
-_MIN_EDGE = 1e-4
-"""Shortest usable edge of a loop, m or rad."""
+_MIN_EDGE = 1e-4  # m or rad
 
 _HELD_JOINT_TOLERANCE = 1e-3
 """Motion of held joints up to which a chosen nominal shape still applies, m or rad."""
@@ -53,10 +52,8 @@ _BOX_SHARES = (1.0, 0.5, 0.25, 0.125)
 """Edges of the boxes in which links keep clear, as shares of the longest edges of loops."""
 
 _BOX_GRID_POINTS = 7
-"""Points per joint of the grid on which such boxes are looked for."""
 
 _MAX_BOXES = 300
-"""Largest number of boxes of one size that are examined, the best first."""
 
 ClearanceTest = Callable[[Array], bool]
 """Whether links keep clear at all of some shapes (N, n)."""
@@ -294,7 +291,6 @@ def nominal_with_clearance(
 def _select_best_triples(
     robot: SpaceRobot, triples: Sequence[tuple[int, int, int]], largest_edge: float
 ) -> Sequence[tuple[int, int, int]]:
-    """Return the triples of joints with the best measures over sampled shapes."""
     if len(triples) <= _MAX_TRIPLES:
         return triples
     shapes = sample_shapes(robot, _SAMPLED_SHAPE_COUNT)

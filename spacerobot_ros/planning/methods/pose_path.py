@@ -29,8 +29,7 @@ from spacerobot_ros.model.rotations import (
 MAX_CORNERS = 500
 """Largest number of corners that is planned for: it bounds the time of a plan."""
 
-_SAME_POSE = 1e-10
-"""Distance of equal poses, m or rad."""
+_SAME_POSE = 1e-10  # m or rad
 
 _MIN_BLEND_COSINE = -0.5
 """Cosine of the largest angle of a corner that is rounded; beyond it the motion stops there."""

@@ -60,7 +60,6 @@ _TRACE_STEP = 0.02
 """Longest step along a path of the joints, rad of the fastest one."""
 
 _MIN_TRACE_STEPS = 20
-"""Smallest number of steps along a path."""
 
 MIN_PROGRESS_RATE = 0.01
 """Progress on the line below which a singularity is near: the line in reaches of the end-effector,
@@ -70,25 +69,18 @@ _ZERO_PROGRESS_RATE = 1e-8
 """Progress below which the path has come to the singularity itself."""
 
 _SINGULARITY_STEP_SHARE = 0.25
-"""Largest step, as a share of the way to a singularity."""
 
 _KNOT_TOLERANCE = 1e-6
 """Share of the way within which a jump of its curvature counts as passed."""
 
-_ZERO_DISTANCE = 1e-10
-"""Error of an end-effector that counts as zero, m or rad."""
+_ZERO_DISTANCE = 1e-10  # m or rad
 
 _SAMPLED_SHAPES = 8
 """Shapes in general position at which the freedom of the joints is examined."""
 
 _PATH_LENGTH_SAMPLES = 200
-"""Places of a curved way from which its scaled length is estimated."""
-
 _TIMING_INTERVALS = 160
-"""Intervals of the linear program."""
-
 _MAX_TIMING_INTERVALS = 1600
-"""Largest number of intervals, for ways with many corners."""
 
 _USED_ACCELERATION_SHARE = 0.99
 """Share of the limits of acceleration for the path; corrections of the ticks may use the rest."""
@@ -140,21 +132,9 @@ class _SmoothPath:
     """A smooth way through points (K, 3), m, from the origin: a natural cubic spline by the lengths
     of its chords, which through two points is the straight line.
 
-    Parameters
-    ----------
-    points
-        The points.
-    turn
-        (3,) rotation vector from the start to the end, in step with the way, rad.
-
-    Attributes
-    ----------
-    length, total_length
-        Of the chords together, m.
-    is_straight
-        Whether it is a straight line.
-    curvature_breaks
-        Shares of the way at which its curvature jumps: none.
+    ``turn`` (3,) is the rotation vector from the start to the end, in step with the way, rad;
+    ``length`` and ``total_length`` are of the chords together, m. There are no
+    ``curvature_breaks``, shares of the way at which its curvature jumps.
     """
 
     curvature_breaks = np.zeros(0)
@@ -199,16 +179,9 @@ class _SmoothPath:
 class _LinkPath:
     """The line of a link E, in the base B_0 at the start, seen from the centre of mass.
 
-    Attributes
-    ----------
-    link
-        Name of the link.
-    displacements, rotations
-        (k, 3) and (l, 3) directions in which the joints move and turn it, and in which it follows.
-    start_position, start_attitude
-        (3,) and (4,) of its pose at the start.
-    path_from_start
-        The way from the start to the goal.
+    ``displacements`` (k, 3) and ``rotations`` (l, 3) are the directions in which the joints move
+    and turn it, and in which it follows; ``start_position`` (3,) and ``start_attitude`` (4,) its
+    pose at the start.
     """
 
     link: str
@@ -236,16 +209,9 @@ class _LinkPaths:
     """The lines of all links of a goal, and how the joints move the links along them.
 
     Rows are scaled by the reach of the links, joints by their velocity limits: all are radians of
-    the fastest joint.
-
-    Attributes
-    ----------
-    joint_scales
-        (n,) motion of each joint while the fastest one moves by a radian, m or rad.
-    length
-        Length of the lines together, scaled.
-    curvature_breaks
-        Shares of the lines at which their curvature jumps.
+    the fastest joint. ``joint_scales`` (n,) is the motion of each joint while the fastest one moves
+    by a radian, m or rad; ``length`` is that of the lines together, scaled; ``curvature_breaks``
+    are the shares of the lines at which their curvature jumps.
     """
 
     def __init__(self, robot: SpaceRobot, lines: Sequence[_LinkPath], limits: MotionLimits) -> None:
@@ -332,7 +298,6 @@ class _LinkPaths:
         return "the smallest singular value of J* (scaled)", float(value)
 
     def position_text(self, share: float) -> str:
-        """Return a share of the lines in words."""
         line = self._lines[0]
         way, kind = (
             line.path_from_start.total_length,
@@ -494,7 +459,6 @@ class _TimedPath:
     def of(
         cls, path: JointPath, limits: MotionLimits, intervals: int = _TIMING_INTERVALS
     ) -> _TimedPath:
-        """Return a path at its fastest."""
         from scipy.interpolate import CubicSpline
 
         shape = CubicSpline(path.arc_length, path.shapes)
@@ -630,10 +594,7 @@ class ResolvedRateGait(GaitMethod):
     def _route(self, request: PlanRequest, tolerance: float) -> PosePath:
         """Return the path of a request in W, from where the end-effector is.
 
-        Raises
-        ------
-        PlanningError
-            The goal has several end-effectors, or its path too many corners.
+        PlanningError if the goal has several end-effectors, or its path too many corners.
         """
         state, goal = request.state, request.goal
         if len(goal.end_effectors) > 1:
@@ -666,10 +627,7 @@ class ResolvedRateGait(GaitMethod):
     ) -> tuple[Array, Array, Notes]:
         """Return shapes (N + 1, n) and shares of the lines (N + 1,) at ticks, with notes.
 
-        Raises
-        ------
-        PlanningError
-            The lines meet a singularity or a limit; :meth:`plan` says when they are refused.
+        PlanningError if the lines meet a singularity or a limit; :meth:`plan` says when they do.
         """
         path = trace_joint_path(lines, state.q, cancellation)
         notes: Notes = {}
@@ -772,12 +730,8 @@ class ResolvedRateGait(GaitMethod):
         """Return the lines of a goal, along directions in which the joints move the links.
 
         ``piece`` is a part of a given path that the first link follows, the metres before it and
-        those of the whole path; None: it goes through the waypoints to the goal.
-
-        Raises
-        ------
-        PlanningError
-            The goal lies off these directions, or has more of them than the joints can follow.
+        those of the whole path; None: it goes through the waypoints to the goal. PlanningError if
+        the goal lies off these directions, or has more of them than the joints can follow.
         """
         robot = self.robot
         turning = BaseRotations.of(robot)
@@ -875,10 +829,7 @@ class ResolvedRateGait(GaitMethod):
     def _held_commands(self, lines: _LinkPaths, state: RobotState, timed: _TimedPath) -> Array:
         """Return the shapes (N + 1, n) at ticks, with the end-effectors on their lines at each.
 
-        Raises
-        ------
-        PlanningError
-            No number of ticks keeps the limits of the joints.
+        PlanningError if no number of ticks keeps the limits of the joints.
         """
         period = self.control_period
         ticks = max(1, math.ceil(timed.time[-1] / period - 1e-9))

@@ -56,10 +56,7 @@ from spacerobot_ros.planning.methods.optimal.problem import (
 from spacerobot_ros.planning.methods.optimal.transcription import turn_function
 
 _SAMPLED_SHAPES = 8
-"""Shapes in general position at which the motion of the links is examined."""
-
 _SINGULAR_VALUE_TOLERANCE = 1e-7
-"""Singular values below this share of the largest count as zero."""
 
 _MIN_MOTION = 1e-9
 """Motion of a link per metre or radian of the joints that counts as zero, m or rad."""
@@ -83,10 +80,8 @@ _END_ERROR = 2e-3
 """Error of a shape that may be the end of a guess, m or rad: the solver brings it to the goal."""
 
 _DIRECT_PATH_STEPS = 12
-"""Steps in which the turn of the base on the direct way to a shape is integrated."""
 
-_MAX_STEP = 0.5
-"""Longest step of a joint in inverse kinematics, m or rad."""
+_MAX_STEP = 0.5  # m or rad
 
 _POSSIBLE_ENDS = 6
 """Ends that guesses of the search have, one after the other."""
@@ -451,10 +446,7 @@ class EndEffectorSpecification:
     ) -> Array:
         """Return the turn (4,) of the base that puts the end-effectors to their goals in a shape.
 
-        Raises
-        ------
-        UnreachableError
-            No turn of the base puts the end-effectors to their goals.
+        UnreachableError if there is none.
         """
         tolerance = request.tolerance
         X = turn
@@ -501,13 +493,7 @@ class EndEffectorSpecification:
     def _find_possible_ends(
         self, start: Array, limits: MotionLimits, parameters: Array, turn: Array
     ) -> list[PossibleEnd]:
-        """Return ends of guesses, those that the joints reach soonest first.
-
-        Raises
-        ------
-        NotFoundError
-            No possible end was found.
-        """
+        """Return ends of guesses, those that the joints reach soonest first, or NotFoundError."""
         rng = np.random.default_rng(0)
         middle, half = limits.joint_ranges(start)
         speed = np.where(np.isfinite(limits.velocity), limits.velocity, half)
@@ -543,13 +529,8 @@ class EndEffectorSpecification:
         ends: Sequence[PossibleEnd],
         tolerance: Tolerance,
     ) -> PossibleEnd:
-        """Return the first of some ends that meets an overdetermined goal within its tolerance.
-
-        Raises
-        ------
-        NotFoundError
-            None does.
-        """
+        """Return the first end that meets an overdetermined goal within its tolerance, or
+        NotFoundError."""
         turns = np.array([each.base_rotation for each in ends])
         shapes, X, miss = self._inverse_kinematics(
             np.array([each.shape for each in ends]),
@@ -644,13 +625,7 @@ class EndEffectorSpecification:
 def _require_within_radius(
     robot: SpaceRobot, limits: MotionLimits, state: RobotState, goal: Goal
 ) -> None:
-    """Refuse goals that are farther from the centre of mass than any shape puts the end-effector.
-
-    Raises
-    ------
-    UnreachableError
-        The goal is too far from the centre of mass.
-    """
+    """Raise UnreachableError if a goal is farther from the centre of mass than shapes reach."""
     R_WB = matrix_from_quaternion(state.quaternion)
     r_WC = state.position + R_WB @ robot.center_of_mass(state.q)
     for each in goal.end_effectors:

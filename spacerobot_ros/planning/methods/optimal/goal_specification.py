@@ -44,25 +44,18 @@ from spacerobot_ros.planning.methods.optimal.problem import (
 _ZERO_ROTATION_ANGLE = 1e-9
 
 _SAMPLED_SHAPE_COUNT = 12
-"""Number of sampled shapes in tests of a robot."""
-
 _SINGULAR_VALUE_TOLERANCE = 1e-7
-"""Singular values below this share of the largest count as zero."""
-
 _AXIS_TOLERANCE = 1e-6
-"""Sine of the angle between two directions below which they are the same."""
 
 _MIN_BASE_TURN = 1e-12
 """Turn of the base per metre or radian of the joints that counts as zero, rad."""
 
 _MAX_SHAPE_GUESSES = 8
-"""Number of start shapes in the search for a shape with a given centre of mass."""
 
 _INTEGRATION_STEPS, _INTEGRATION_ERROR = 1000, 1e-5
 """Steps in which the turn by one joint is integrated, and the error that this may make, rad."""
 
-_JOINT_LIMIT_ROUNDING = 1e-9
-"""Rounding error by which a joint may exceed its limits, m or rad."""
+_JOINT_LIMIT_ROUNDING = 1e-9  # m or rad
 
 _QUADRATURE_NODES = 48
 """Nodes of Gauss and Legendre along the way to a shape."""
@@ -70,8 +63,7 @@ _QUADRATURE_NODES = 48
 _MAX_REPORTED_RANGE_FACTOR = 4.0
 """Ratio to the joint range up to which a shape beyond the limits is reported."""
 
-_POSITION_TOLERANCE = 1e-10
-"""Distance of the base from its wanted position that counts as zero, m."""
+_POSITION_TOLERANCE = 1e-10  # m
 
 
 @dataclass(frozen=True)
@@ -264,10 +256,7 @@ class GoalSpecification:
     ) -> Array:
         """Return the turn (4,) on any path to a shape (n,), for robots whose loops turn nothing.
 
-        Raises
-        ------
-        UnreachableError
-            It is not the turn of the goal.
+        UnreachableError if it is not the turn of the goal.
         """
         axis, way = self.base_rotations.axes[0], shape - start
         nodes, weights = np.polynomial.legendre.leggauss(_QUADRATURE_NODES)

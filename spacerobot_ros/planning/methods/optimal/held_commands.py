@@ -54,11 +54,8 @@ from spacerobot_ros.planning.methods.optimal.problem import (
 )
 
 _WAVES_PER_JOINT = 6
-"""Number of waves of a joint that can be added to a path."""
 
-_ATTITUDE_TOLERANCE = 1e-11
-"""Attitude error that counts as zero, rad."""
-
+_ATTITUDE_TOLERANCE = 1e-11  # rad
 _MAX_NEWTON_STEPS = 25
 _MAX_STRETCHES = 40
 _MAX_STRETCH_FACTOR = 1.25
@@ -82,7 +79,6 @@ _TICK_ROUNDING = 0.02
 """Share of a tick by which a solver's duration may miss a whole number of ticks."""
 
 _LIMIT_ROUNDING = 1e-9
-"""Relative rounding error by which a limit may be exceeded."""
 
 _FADING_ZONE = 0.02
 """Share of half a joint's range, off its ends, within which waves are smaller."""
@@ -90,13 +86,12 @@ _FADING_ZONE = 0.02
 
 @dataclass(frozen=True)
 class HeldCommands:
-    """Shapes ``positions`` (N + 1, n) at the ticks, attitudes ``quaternions`` (N + 1, 4) that they
-    cause, from the starting one, and the angle ``end_error`` (rad) that is left to the goal.
+    """Shapes ``positions`` (N + 1, n) at the ticks, and the attitudes ``quaternions`` (N + 1, 4)
+    that they cause, from the starting one.
     """
 
     positions: Array
     quaternions: Array
-    end_error: float
 
 
 @dataclass(frozen=True)
@@ -333,7 +328,7 @@ class CommandHolder:
             if miss <= _ATTITUDE_TOLERANCE or (
                 miss <= 1e3 * _ATTITUDE_TOLERANCE and miss > best / 2
             ):
-                return HeldCommands(positions, quaternions, miss)
+                return HeldCommands(positions, quaternions)
             if miss > 2 * best:
                 return None
             best = min(best, miss)

@@ -42,7 +42,6 @@ _MIN_LOOP_SIZE = 0.1
 """Least size of loops on the way to a possible end, in half ranges, from the second guess on."""
 
 _MAX_RANGE_SHARE = 0.85
-"""Largest share of half the joints' ranges that a guess uses."""
 
 _MAX_COASTING_SHARE = 0.6
 """Largest share of a guess in which the joints rest first while the base drifts."""
@@ -51,7 +50,6 @@ _LEAST_TURN_TIME, _TURN_STRETCHES = 0.5, tuple(1.15**k for k in range(16))
 """Shortest guess with reaction wheels, s, and the factors by which others are longer."""
 
 _TURNED_GUESSES = 3
-"""Number of guesses with reaction wheels along one path of the other joints."""
 
 _BRAKING_TIME_FACTOR = 4.0
 """A joint that moves at the start is back on the way of its guess after this many times the time

@@ -80,7 +80,6 @@ _ZERO_ERROR = 1e-10
 """Largest error that counts as zero: the robot is at the goal; rad, m and joint coordinates."""
 
 _ACTIVE_LIMIT_SHARE = 0.95
-"""Share of a limit beyond which a manoeuvre counts as limited by it."""
 
 _MAX_MOVING_AIMS = 4
 """Largest number of fastest manoeuvres to where a goal is at the end of the one before, seen from a
@@ -102,7 +101,6 @@ _COASTING_ANGLE = math.radians(5.0)
 """Angle between the attitudes at which it is looked whether the base passes the goal."""
 
 _COASTING_TURNS = 4.0
-"""Largest number of turns of the base while it coasts."""
 
 _MAX_COASTING_ENDS = 3
 """Largest number of instants at which the coasting base passes the goal that are tried."""
@@ -121,7 +119,6 @@ _MAX_FASTEST_RATIO = 1.25
 on: there may be a faster one, but none so much faster."""
 
 _LIMIT_ROUNDING = 1e-8
-"""Largest relative excess over a limit that counts as rounding."""
 
 
 @dataclass(frozen=True)
@@ -155,7 +152,6 @@ class _Searches:
 
     @classmethod
     def of(cls, model: ManoeuvreModel) -> _Searches:
-        """Make both searches for one model."""
         search = ManoeuvreSearch(model)
         return cls(search, MotionSearch(model, search.solver))
 
@@ -169,7 +165,6 @@ class _GoalKind:
 
     @cached_property
     def without_effort_limits(self) -> _Searches:
-        """The searches without effort limits."""
         return _Searches.of(replace(self.model, efforts=None))
 
     @cached_property
@@ -225,13 +220,8 @@ class OptimalGait(GaitMethod):
         self._cache = Cache(cache_directory() / "plans") if chosen.cache else None
 
     def _kind_of(self, goal: Goal) -> _GoalKind:
-        """Return the kind of a goal; that of a goal of end-effectors is made when it is needed.
-
-        Raises
-        ------
-        GoalError
-            The robot has no such link.
-        """
+        """Return the kind of a goal, made when it is needed; GoalError if the robot has no such
+        link."""
         if not goal.end_effectors:
             return self._base_goals
         key = EndEffectorSpecification.key(goal)
@@ -302,14 +292,8 @@ class OptimalGait(GaitMethod):
         """Return boundary conditions with the rates of reaction wheels at both ends.
 
         The angle of a wheel is free at the end; its rate there is such that the wheels hold all of
-        the momentum, and the base rests.
-
-        Raises
-        ------
-        UnreachableError
-            The wheels cannot hold it.
-        PlanningError
-            The goal leaves the attitude open, on which the rates depend, or wheels are too fast.
+        the momentum, and the base rests. UnreachableError if they cannot hold it; PlanningError if
+        the goal leaves the attitude open, on which the rates depend, or wheels are too fast.
         """
         wheels, n, state = self._wheels, self.robot.n, request.state
         if not len(wheels):
@@ -356,10 +340,7 @@ class OptimalGait(GaitMethod):
     ) -> GaitSchedule:
         """Return the schedule of a robot whose centre of mass coasts, in the frame of that.
 
-        Raises
-        ------
-        PlanningError
-            There are obstacles, or no manoeuvre ends when the goal is where it leads.
+        PlanningError if there are obstacles, or no manoeuvre ends when the goal is where it leads.
         """
         state, goal = request.state, request.goal
         velocity = state.linear_momentum / self.robot.total_mass
@@ -502,12 +483,8 @@ class OptimalGait(GaitMethod):
     ) -> DurationBound:
         """Return a bound of the duration of all manoeuvres from rest to the goal.
 
-        ``final_is_given``: the goal has the last shape of the boundary conditions.
-
-        Raises
-        ------
-        PlanningError
-            It is longer than the time that the options give.
+        ``final_is_given``: the goal has the last shape of the boundary conditions. PlanningError if
+        the bound is longer than the time that the options give.
         """
         robot = self.robot
         # The slots of three sliders determine the shape.
@@ -541,10 +518,7 @@ class OptimalGait(GaitMethod):
     ) -> _PlanResult:
         """Return a manoeuvre from rest that takes no longer than the options ask for.
 
-        Raises
-        ------
-        NotFoundError
-            None was found; where a longer one was found, the message has its duration.
+        NotFoundError if none was found; if a longer one was, the message has its duration.
         """
         searched = request, boundary, limits
         unlimited = replace(chosen, duration=0.0, longest=OptimalOptions().longest)
@@ -654,7 +628,6 @@ class OptimalGait(GaitMethod):
         )
 
     def _coast(self, request: PlanRequest, ticks: int) -> _CoastingMotion:
-        """Return the motion of the base while the joints rest."""
         state, shapes = request.state, np.tile(request.state.q, (ticks + 1, 1))
         attitudes = self._prediction.attitudes(shapes, state.quaternion, state.angular_momentum)
         times = self.control_period * np.arange(ticks + 1, dtype=np.float64)
@@ -665,7 +638,6 @@ class OptimalGait(GaitMethod):
     def _later(
         self, request: PlanRequest, boundary: BoundaryConditions, coast: _CoastingMotion, ticks: int
     ) -> tuple[PlanRequest, BoundaryConditions]:
-        """Return the request and its boundary conditions after some ticks of coasting."""
         state, quaternion = request.state, coast.attitudes[ticks]
         after = replace(state, position=coast.positions[ticks], quaternion=quaternion)
         later = replace(request, state=after)
@@ -705,14 +677,11 @@ class OptimalGait(GaitMethod):
         end: int,
     ) -> _PlanResult:
         """Return a manoeuvre that ends about when the coasting base passes the goal, at tick
-        ``end``. Its first guess turns the base at zero momentum by the angle that is left there.
+        ``end``.
 
-        Raises
-        ------
-        PlanningError
-            None was found.
-        UnusableCandidateError
-            Coasting violates a path constraint.
+        Its first guess turns the base at zero momentum by the angle that is left there.
+        PlanningError if none was found, UnusableCandidateError if coasting violates a path
+        constraint.
         """
         h = self.control_period
         there, aimed = self._later(request, boundary, coast, end)
@@ -890,7 +859,6 @@ class OptimalGait(GaitMethod):
         L_B: Array | None = None,
         after: Array | float = 0.0,
     ) -> str:
-        """Return the active limits of held commands, with the joints at each limit."""
         if len(positions) < 2:
             return "nothing"
         speed, change = self._limits.limit_shares(positions, self.control_period, velocity, after)
@@ -955,14 +923,12 @@ class _CachedPlan:
     notes: Notes
 
     def to_bytes(self) -> bytes:
-        """Return the plan as a numpy archive."""
         file = io.BytesIO()
         np.savez(file, positions=self.positions, notes=json.dumps(self.notes))
         return file.getvalue()
 
     @classmethod
     def from_bytes(cls, content: bytes) -> _CachedPlan:
-        """Return the plan of a numpy archive."""
         with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
             return cls(arrays["positions"], json.loads(str(arrays["notes"])))
 

@@ -233,16 +233,9 @@ def _coupled(robot: SpaceRobot, values: Array) -> Array:
 class _Tree:
     """The bodies of a robot, with bounds of the distances between them.
 
-    Attributes
-    ----------
-    bodies
-        As of the description.
-    hinges
-        (b, 3) origin of each body in its parent at the middle of the joint's range, m.
-    travels
-        Half of the range of the slider that carries each body, m; 0: it does not slide.
-    least_moments
-        Smallest principal moment of inertia of each body, kg m^2.
+    ``hinges`` (b, 3) are the origins of bodies in their parents at the middle of the joint's range,
+    m; ``travels`` half of the range of the slider that carries each body, m (0: none does);
+    ``least_moments`` the smallest principal moments of inertia, kg m^2.
     """
 
     bodies: Sequence[Body]

@@ -306,7 +306,6 @@ class MultipleShooting:
         return trajectory
 
     def _initial_variables(self, guess: Trajectory, lack: float) -> Array:
-        """Return the initial values of the program's variables by a guess."""
         h, v = guess.step, guess.velocities
         a = np.diff(v, axis=0) / h
         x = _pack_knots(self._program.layout, h, guess.quaternions, guess.shapes + h * v / 2, v, a)
@@ -372,7 +371,6 @@ class _SolverMonitor(ca.Callback):
         self.construct("watch", {})
 
     def begin(self, stop: StopRule) -> None:
-        """Prepare the monitor for the next problem."""
         self.best, self._least, self._stop, self._iterates = None, math.inf, stop, 0
 
     def get_n_in(self) -> int:
@@ -394,7 +392,6 @@ class _SolverMonitor(ca.Callback):
     def eval_buffer(
         self, arguments: tuple[memoryview, ...], results: tuple[memoryview, ...]
     ) -> int:
-        """Look at an iterate."""
         x, f, g = (np.frombuffer(each) for each in arguments[:3])
         if f[0] < self._least:
             worst = max((self._lower - g).max(), (g - self._upper).max())

@@ -157,7 +157,6 @@ _UNLIMITED_HALF_RANGE = np.pi
 """Half of the range that a guess uses of a joint without limits, rad or m."""
 
 _SMOOTH_BODY_EXPONENT = 8
-"""Exponent of the smooth bodies that stand for boxes of shapes."""
 
 _UNBOUNDED_FROM = 1e6
 """Bounds of a box beyond this, m or rad, do not count for joints without limits."""
@@ -477,11 +476,6 @@ class PathConstraints:
             )
         bodies = tuple(_SmoothBody.of(robot, *box) for box in corners)
         return cls(options.max_base_rate, axis, direction, options.keep_angle, corners, bodies)
-
-    @property
-    def knot_inequality_count(self) -> int:
-        """Number of inequalities that :meth:`symbolic` returns."""
-        return len(self.keep_out_boxes) + (self.axis_B is not None)
 
     def symbolic(self, q: ca.SX, quaternion: ca.SX, direction: ca.SX) -> ca.SX:
         """Return the inequality constraints, not negative, at a shape and an attitude.

@@ -73,23 +73,19 @@ _GENTLE_TICKS, _GENTLE_TIME = 20, 1.0
 small error, and haste would leave a larger one."""
 
 _BUDGET_FACTOR_WITHOUT_SOLUTION = 5.0
-"""Factor of the time budget after which a search without any solution ends."""
 
 _GENTLE_DURATION_FACTOR = 4.0
 """A gentle manoeuvre is the path of least effort in this many times the time of its guess, then as
 fast as the limits allow."""
 
 _COARSE_GRID_RATIO = 5
-"""Ratio of the intervals of the full grid to those of the coarse grid."""
 
 _COARSE_TOLERANCE = 1e-4
-"""Tolerance of the solver on the coarse grid, whose own error is larger."""
 
 _MIN_COARSE_INTERVALS = 8
 """Fewest intervals of a coarse grid; with fewer there is none."""
 
 _MAX_REFINED_SOLUTIONS = 2
-"""Largest number of coarse solutions that are refined."""
 
 _MAX_REFINED_COST_RATIO = 1.1
 """Largest ratio of the cost of a coarse solution to the best one at which it is refined, too: the
@@ -107,14 +103,12 @@ _CLEARING_TIME_FACTOR, _RESAMPLED_TIME_FACTOR = 2.0, 1.2
 of a clear path on a coarse grid: slow joints leave room to go round."""
 
 _SAME_COST_TOLERANCE = 1e-3
-"""Relative difference of costs below which two solutions count as the same."""
 
 _AGREEING_COST_TOLERANCE = 3e-3
 """Solutions whose costs are this near, relative, agree: the coarse grid and the tolerance of the
 solver leave as much between them."""
 
 _AGREEING_SOLUTIONS_WITH_GUESS = 2
-"""Number of agreeing solutions that end a search whose first guess is given."""
 
 _MAX_ITERATIONS_OF_STOPS = 120
 """Steps of the solver from a guess in which wheels stop the base: most take twenty."""
@@ -157,7 +151,6 @@ _CLEARING_TIME_FACTORS_IN_MOTION = (1.4, 2.5)
 intervals, but slow ones need the time."""
 
 _MIN_TICKS_IN_MOTION = 4
-"""Control periods that a manoeuvre in motion takes at least."""
 
 _ADDITIONAL_TICKS = (0, 1, 3, 7)
 """Control periods that lengthen a manoeuvre in motion whose commands exceed a limit."""
@@ -188,8 +181,6 @@ class Manoeuvre:
         Durations of all manoeuvres that were found, s.
     cut_short
         Whether the wall time was used up before the search had come to its end.
-    separated_pairs
-        Number of pairs of links that the solver was told to keep apart.
     """
 
     held: HeldCommands
@@ -198,7 +189,6 @@ class Manoeuvre:
     starts: int = 1
     solutions: list[float] = field(default_factory=list)
     cut_short: bool = False
-    separated_pairs: int = 0
 
     @property
     def positions(self) -> Array:
@@ -218,20 +208,12 @@ class Manoeuvre:
 
 @dataclass
 class _SearchState:
-    """One search: its problem and its progress.
+    """One search: its problem, as of :meth:`ManoeuvreSearch.search`, and its progress.
 
-    Attributes
-    ----------
-    boundary, limits, quaternion, options, cancellation, guess
-        As of :meth:`ManoeuvreSearch.search`.
-    starts, rejection
-        Guesses that were tried, and the reason against the last candidate.
-    shortest
-        Duration of the fastest solution so far, s.
-    max_failed_starts
-        Guesses without any solution after which the search ends.
-    kept
-        The pairs of links that are kept apart; None: no clearance is asked for.
+    ``starts`` guesses were tried, ``rejection`` is the reason against the last candidate,
+    ``shortest`` the duration of the fastest solution so far, s; without any, the search ends after
+    ``max_failed_starts``. The pairs of links ``kept`` are kept apart; None: no clearance is asked
+    for.
     """
 
     boundary: BoundaryConditions
@@ -249,7 +231,6 @@ class _SearchState:
     _began: float = field(default_factory=lambda: time.monotonic())
 
     def stop_rule(self, *, found: bool) -> StopRule:
-        """Return the stop rule of the solver, with more time until a first solution."""
         deadline = last_call = math.inf
         if self.options.time_budget > 0:
             deadline, last_call = (
@@ -261,7 +242,6 @@ class _SearchState:
 
     @property
     def hastens(self) -> bool:
-        """Whether the manoeuvre is to be fast."""
         return self.options.duration == 0 and not self.gentle
 
     def clearing(self) -> _SearchState:
@@ -276,7 +256,6 @@ class _SearchState:
         return self.stop_rule(found=found).is_expired(found=found)
 
     def report(self, step: str, result: str, iterations: int) -> None:
-        """Log the result of a guess, and the progress of the search."""
         seconds = time.monotonic() - self._began
         # Without a coarse solution, some guesses are tried on the full grid as well.
         most = max(self.options.starts, self.starts)
@@ -287,7 +266,6 @@ class _SearchState:
         )
 
     def solutions_agree(self, solutions: list[Trajectory]) -> bool:
-        """Whether the best solution was found often enough."""
         costs = np.array([self.cost(each) for each in solutions])
         agreeing = self.options.agreeing
         if self.guess is not None:
@@ -503,12 +481,7 @@ class ManoeuvreSearch:
     ) -> tuple[_SearchState, Trajectory]:
         """Return a fast path near to another one that keeps clear on a coarse grid, with the search
         whose pairs it keeps apart; the same path where it is for the full grid alone.
-
-        Raises
-        ------
-        UnusableCandidateError
-            None was found.
-        """
+        UnusableCandidateError if none was found."""
         coarser, tolerance = self._coarse_grid(progress, intervals)
         if not progress.hastens or coarser == intervals:
             return progress, path
@@ -520,12 +493,7 @@ class ManoeuvreSearch:
 
     def _clear_finely(self, progress: _SearchState, path: Trajectory, intervals: int) -> Manoeuvre:
         """Return a manoeuvre near to a path that keeps clear, by the full grid.
-
-        Raises
-        ------
-        UnusableCandidateError
-            None was found.
-        """
+        UnusableCandidateError if none was found."""
         options, kept = progress.options, progress.kept
         assert kept is not None
         clearing = self._path_clearing(
@@ -552,7 +520,7 @@ class ManoeuvreSearch:
         if made.duration > max(options.longest, options.duration) + self._period / 2:
             raise UnusableCandidateError(_NO_PATH_FOUND)
         progress.report("manoeuvre that keeps clear", f"{made.duration:.6g} s", 0)
-        return replace(made, separated_pairs=len(kept.pairs))
+        return made
 
     def _path_clearing(
         self,
@@ -578,12 +546,7 @@ class ManoeuvreSearch:
     ) -> tuple[Trajectory, float]:
         """Return a solution near to a guess that keeps pairs of links apart, in a duration, s
         (None: the fastest one), and by how much they are too near all the same, m.
-
-        Raises
-        ------
-        UnusableCandidateError
-            No such solution was found.
-        """
+        UnusableCandidateError if no such solution was found."""
         kept, boundary, limits = progress.kept, progress.boundary, progress.limits
         assert kept is not None
         if progress.options.duration > 0:
@@ -763,7 +726,6 @@ class ManoeuvreSearch:
         *,
         refining: bool = False,
     ) -> Trajectory | None:
-        """Return the solution from a guess, None if there is none."""
         boundary, limits, options = progress.boundary, progress.limits, progress.options
         shortest = self._shortest_duration(progress)
         guess = self._constraints.slowed(guess)
@@ -797,19 +759,13 @@ class ManoeuvreSearch:
     def _slow_to_effort_limits(
         self, trajectory: Trajectory, boundary: BoundaryConditions
     ) -> Trajectory:
-        """Return the trajectory, slowed to the effort limits of the joints."""
         return trajectory if self._efforts is None else self._efforts.slowed(trajectory, boundary)
 
     def _make_held_commands(
         self, progress: _SearchState, trajectory: Trajectory | None
     ) -> Manoeuvre:
-        """Return a solution as held commands.
-
-        Raises
-        ------
-        UnusableCandidateError
-            There is no solution, or none that commands reach within the constraints.
-        """
+        """Return a solution as held commands; UnusableCandidateError if there is no solution, or
+        none that commands reach within the constraints."""
         if trajectory is None:
             raise UnusableCandidateError(_NO_PATH_FOUND)
         fixed = progress.options.duration > 0
@@ -836,8 +792,8 @@ class ManoeuvreSearch:
         """Return a solution whose duration matters as held commands; None where that fails.
 
         Were it stretched to whole control periods, the base would turn on meanwhile, or the wheels
-        begin at other rates. So the
-        trajectory of least effort in as many control periods, or a few more, is solved for.
+        begin at other rates. So the trajectory of least effort in as many control periods, or a few
+        more, is solved for.
         """
         boundary, limits, kept = progress.boundary, progress.limits, progress.kept
         narrowed, near = _narrowed(limits), None
@@ -980,13 +936,8 @@ class MotionSearch:
         stop: StopRule,
         kept: KeptDistances | None,
     ) -> HeldCommands:
-        """Return a candidate as held commands that keep clear.
-
-        Raises
-        ------
-        UnusableCandidateError
-            There are none that reach the goal within the limits.
-        """
+        """Return a candidate as held commands that keep clear; UnusableCandidateError if there are
+        none that reach the goal within the limits."""
         position, drifting = boundary.center is not None, boundary.drifts
         free = self._solver(intervals, position, TOLERANCE, (), drifting=drifting)
         guesses = _build_guesses(self._robot, free, boundary)
@@ -1069,7 +1020,6 @@ class MotionSearch:
         stop: StopRule,
         options: OptimalOptions,
     ) -> Trajectory | None:
-        """Return the fastest trajectory near a guess, None if there is none."""
         duration = self._duration_bounds(options)
         for room in _ACCELERATION_SHARES_IN_MOTION:
             narrowed = self._narrow_limits(limits, room)
@@ -1099,12 +1049,7 @@ class MotionSearch:
         near: Neighbourhood | None = None,
     ) -> HeldCommands:
         """Return a path as held commands, in a duration (s) or a few more control periods.
-
-        Raises
-        ------
-        UnusableCandidateError
-            There are none that reach the goal within the limits.
-        """
+        UnusableCandidateError if there are none that reach the goal within the limits."""
         most = 1 if options.duration > 0 else len(_ADDITIONAL_TICKS)
         ticks = max(1, math.ceil(duration / self._period - 1e-6))
         aim = boundary
@@ -1170,7 +1115,6 @@ def _fastest_others(found: Sequence[Trajectory], tried: Sequence[float]) -> list
 
 
 def _durations_agree(found: list[Trajectory]) -> bool:
-    """Whether the fastest trajectory was found often enough."""
     durations = np.array([each.duration for each in found])
     return (
         int(np.sum(durations <= durations.min(initial=math.inf) * (1 + _SAME_COST_TOLERANCE)))

@@ -217,7 +217,6 @@ class Stages:
 
 
 def _count_dynamics_rows(joints: int) -> int:
-    """Return the number of rows of an interval that are its dynamics."""
     return 2 * joints + 4
 
 
@@ -228,7 +227,6 @@ def _cached_interval(
     *,
     drifting: bool,
 ) -> ConstraintBlock:
-    """Return the block of an interval from the cache, or derive it."""
     q, X, direction = ca.SX.sym("q", robot.n), ca.SX.sym("X", 4), ca.SX.sym("d", 3)
     on_knots = constraints.symbolic(q, X, direction)
     facts = [
@@ -392,7 +390,6 @@ def _path_constraint_rows(
     direction: ca.SX,
     L_0: ca.SX,
 ) -> ca.SX:
-    """Return the rows of an interval that must not be negative."""
     h, X, s, v, a, X_next, _, v_next = ca.vertsplit(
         z, np.cumsum([0, 1, 4, n, n, n, 4, n, n]).tolist()
     )
@@ -533,14 +530,9 @@ class Program:
 class _PlacedBlock:
     """A block placed at every interval or end of the program.
 
-    Attributes
-    ----------
-    block
-        Its functions.
-    variables, rows
-        Places (count, ...) of its variables in x, and of its rows in g; rows of -1 are left out.
-    parameters
-        The part of p that it takes: a column for all places, or one for each.
+    ``variables`` and ``rows`` (count, ...) are the places of its variables in x and of its rows in
+    g (-1: left out), ``parameters`` the part of p that it takes: a column for all places, or one
+    for each.
     """
 
     block: ConstraintBlock
@@ -645,7 +637,6 @@ def _gather_rows(rows: int, parts: Sequence[tuple[Indices, ca.MX]]) -> ca.MX:
 
 
 def _jacobian(placed: Sequence[_PlacedBlock], x: ca.MX, rows: int) -> tuple[ca.MX, ca.MX]:
-    """Return g and its Jacobian."""
     values, nonzeros, at_row, at_column = [], [], [], []
     for each in placed:
         g, J = each.called(each.block.jacobian, x)
@@ -676,7 +667,6 @@ def _hessian(placed: Sequence[_PlacedBlock], x: ca.MX, lam_g: ca.MX) -> ca.MX:
 
 
 def _nonzero_indices(sparsity: ca.Sparsity) -> tuple[Indices, Indices]:
-    """Return rows and columns of the nonzeros, in their order."""
     rows, columns = (np.array(each, dtype=np.int64) for each in sparsity.get_triplet())
     return rows, columns
 
