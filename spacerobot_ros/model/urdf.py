@@ -597,8 +597,8 @@ _ELEMENTS_READ = {
 }
 """Tags of the elements to read, by the tag of their parent; other elements are ignored."""
 
-_EXACT_ELEMENTS = ("origin", "mass", "inertia", "axis", "mimic")
-"""Elements whose other attributes are slips: without them, the robot would be another one."""
+_EXACT_ELEMENTS = ("origin", "mimic")
+"""Elements of optional attributes: another one is a slip, and would leave another robot."""
 
 _GEOMETRIES = ("box", "cylinder", "sphere", "capsule", "mesh")
 _ACCEPTED_GEOMETRIES = [[name] for name in _GEOMETRIES]

@@ -383,7 +383,7 @@ def test_what_other_programs_have_written_is_passed_over(tmp_path: Path) -> None
 
 def test_what_a_link_is_welded_to_makes_up_for_its_inertia(tmp_path: Path) -> None:
     """Antennas and mounts of many a public URDF have moments that no body has."""
-    impossible = TOOL.replace(SOME_INERTIA, SOME_INERTIA.replace('ixx="1"', 'ixx="0.4" was="1"'))
+    impossible = TOOL.replace(SOME_INERTIA, SOME_INERTIA.replace('ixx="1"', 'ixx="0.4"'))
     text = more(impossible.replace('izz="1"', 'izz="1.5"'), joint("mount", "arm", "tool"))
     with pytest.raises(RobotDescriptionError, match=r"inertia of link 'tool' is that of no body"):
         load_robot(file_with(tmp_path, text))
