@@ -6,7 +6,9 @@ import json
 import os
 import signal
 import subprocess
+import time
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -75,6 +77,40 @@ def test_each_node_in_a_process_of_its_own_flies_the_same_manoeuvre(
     bag = read_bag(tmp_path / "many.mcap")
     assert bag.message_count("/odom") == many["ticks"] + 1, "from the first state on, none lost"
     assert bag.metadata["scenario"]["name"] == "planar_chain"
+
+
+def pid_of(node: str, domain: int, other: int = 0) -> int:
+    """Return the process of a node in a ROS domain that is not another one, once there is one."""
+    deadline = time.monotonic() + PATIENCE
+    while time.monotonic() < deadline:
+        for folder in Path("/proc").glob("[0-9]*"):
+            with suppress(OSError):
+                ours = f"ROS_DOMAIN_ID={domain}\0" in (folder / "environ").read_text()
+                named = f"__node:={node}\0" in (folder / "cmdline").read_text()
+                if ours and named and int(folder.name) != other:
+                    return int(folder.name)
+    raise AssertionError(f"no process of {node}")
+
+
+def test_a_planner_that_dies_is_started_again_within_the_limit(
+    spacerobot: Command, ros_domain: int
+) -> None:
+    with spacerobot.start("up", "sliding_masses", "--restarts", "1") as robot:
+        assert robot.stdout is not None
+        lines = iter(robot.stdout.readline, "")
+        next(line for line in lines if "Waiting for a goal pose" in line)
+        first = pid_of("planner", ros_domain)
+        environment = Path(f"/proc/{first}/environ").read_text()
+        assert "FASTDDS_BUILTIN_TRANSPORTS=UDPv4" in environment
+        os.kill(first, signal.SIGKILL)
+        killed = "Node 'planner' was ended by SIGKILL."
+        assert next(line for line in lines if "SIGKILL" in line).strip() == (
+            f"{killed} It is started again."
+        )
+        os.kill(pid_of("planner", ros_domain, first), signal.SIGKILL)
+        rest = "".join(lines)
+        assert f"{killed} It was started again once within a minute" in rest
+        assert robot.wait(PATIENCE) == 2
 
 
 @pytest.fixture
