@@ -5,25 +5,19 @@ from __future__ import annotations
 import errno
 import os
 import signal
-import struct
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import pytest
+from support.hostile.records import string
 
 from spacerobot_ros.bag import BagWriter, Recording, RecordingError, free_name, iterate_raw
 from spacerobot_ros.bag.mcap_file import McapFile, _AppendedFile
 from spacerobot_ros.bag.salvage import is_complete, salvage_bag
 
 STRING = "std_msgs/msg/String"
-
-
-def string(text: str) -> bytes:
-    """Serialise a std_msgs/String by hand."""
-    data = text.encode() + b"\0"
-    return b"\0\1\0\0" + struct.pack("<I", len(data)) + data
 
 
 def numbers(path: Path) -> list[int]:
@@ -38,7 +32,7 @@ def make_bag(path: Path, count: int = 3) -> bytes:
     return path.read_bytes()
 
 
-# -- names ------------------------------------------------------------------------------------
+# -- names -------------------------------------------------------------------------------------
 
 
 def test_a_bag_that_is_there_is_kept_and_the_next_name_taken(tmp_path: Path) -> None:
@@ -102,7 +96,7 @@ def test_a_file_in_the_way_of_a_split_is_stepped_over(tmp_path: Path) -> None:
     assert found == list(range(60))
 
 
-# -- a file that goes while it is written -----------------------------------------------------
+# -- a file that goes while it is written ------------------------------------------------------
 
 
 def unlink(path: Path) -> None:
@@ -200,7 +194,7 @@ def test_a_disk_that_is_full_at_the_very_end_is_a_failure(
     assert recording.failure is not None
 
 
-# -- kills ------------------------------------------------------------------------------------
+# -- kills -------------------------------------------------------------------------------------
 
 
 def record_until_killed(path: Path, step: int, share: float) -> None:

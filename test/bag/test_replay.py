@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Sequence
 from fractions import Fraction
 from pathlib import Path
@@ -11,6 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from mcap.writer import CompressionType, Writer
+from support.hostile.records import string
 
 from spacerobot_ros.bag import LATCHED, Bag, BagWriter, RecordingError, read_bag
 from spacerobot_ros.bag.playback import Playback, ReplayMessage, SubscriberWait, renamed_topics
@@ -21,12 +21,6 @@ S = 10**9
 BEGAN = 1_700_000_000 * S
 CLOCK = 77 * S
 """Where the clock of a replay is when it begins."""
-
-
-def string(text: str) -> bytes:
-    """Serialise a std_msgs/String by hand."""
-    data = text.encode() + b"\0"
-    return b"\0\1\0\0" + struct.pack("<I", len(data)) + data
 
 
 def bag_of(path: Path, entries: Sequence[tuple[str, float]], chunk_size: int = 65536) -> Path:

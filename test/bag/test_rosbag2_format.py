@@ -24,6 +24,7 @@ from rosbags.interfaces import (
     QosReliability,
     QosTime,
 )
+from support.hostile.records import string
 
 from spacerobot_ros.bag import LATCHED, BagWriter, QosProfile, RecordingError, type_hash
 
@@ -44,12 +45,6 @@ def bag(tmp_path: Path, samples: list[Sample]) -> Path:
                 time_ns = 10**18 + (k * len(samples) + n) * 10_000_000
                 writer.write(channel, serialize_message(message), time_ns, time_ns - 1000)
     return path
-
-
-def string(text: str) -> bytes:
-    """Serialise a std_msgs/String by hand."""
-    data = text.encode() + b"\0"
-    return b"\0\1\0\0" + struct.pack("<I", len(data)) + data
 
 
 def test_rosbags_decodes_every_type(
