@@ -317,3 +317,70 @@ def test_another_thread_has_no_signals() -> None:
         thread.start()
         thread.join()
     assert answers == [False, False]
+
+
+# -- signals in this process -------------------------------------------------------------------
+
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+
+
+@pytest.fixture
+def noted() -> Iterator[list[int]]:
+    """Note signals that nothing else handles: they would end the tests."""
+    found: list[int] = []
+    before = {
+        number: signal.signal(number, lambda number, _: found.append(number)) for number in SIGNALS
+    }
+    yield found
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
+@pytest.mark.parametrize("number", SIGNALS)
+def test_a_flight_is_asked_to_end_by_each_signal(noted: list[int], number: signal.Signals) -> None:
+    asked: list[str] = []
+    try:
+        with graceful_shutdown(lambda: asked.append("main")) as stopped:
+            assert not stopped()
+            os.kill(os.getpid(), number)
+            assert stopped()
+            assert asked == ["main"]
+    except Terminated as end:
+        # It is no Exception: pytest itself would end.
+        pytest.fail(f"the flight was ended: {end}")
+    assert noted == []
+    # What was there before is there again.
+    os.kill(os.getpid(), number)
+    assert noted == [number]
+    with graceful_shutdown() as stopped:
+        assert not stopped(), "a signal of an earlier flight"
+
+
+@pytest.mark.parametrize("number", SIGNALS)
+def test_what_asks_for_nothing_is_ended(noted: list[int], number: signal.Signals) -> None:
+    with pytest.raises(Terminated) as end, guarded():
+        os.kill(os.getpid(), number)
+    assert end.value.exit_code == 128 + number
+    assert noted == []
+
+
+# -- programs of nodes -------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", sorted(path.name for path in (ROOT / "scripts").iterdir()))
+def test_an_interrupt_while_a_node_imports_is_no_traceback(name: str) -> None:
+    """The interpreter itself reports its imports, and so when the signal is to come."""
+    with subprocess.Popen(
+        [sys.executable, "-X", "importtime", str(ROOT / "scripts" / name)],
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        stderr=subprocess.PIPE,
+        text=True,
+    ) as process:
+        assert process.stderr is not None
+        for line in process.stderr:
+            if "numpy" in line:
+                process.send_signal(signal.SIGINT)
+                break
+        rest = process.stderr.read()
+        assert process.wait(60.0) == 0
+    assert "Traceback" not in rest

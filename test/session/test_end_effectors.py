@@ -1,9 +1,10 @@
-"""Scenarios that reach with end-effectors: through ROS, without it, and from their bags."""
+"""Scenarios that reach with end-effectors: flown, by the command, and from their bags."""
 
 from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from support.hand_motion import end_of_motion
 
 from spacerobot_ros import fly
 from spacerobot_ros.bag import read_bag
+from spacerobot_ros.cli.main import main
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.flight.reading import read_run
 from spacerobot_ros.measures import Outcome
@@ -22,11 +24,6 @@ from spacerobot_ros.scenario import Scenario, load_scenario, scenario_or_robot, 
 from spacerobot_ros.session.run import run_scenario
 
 QUICK = {"optimal.answers": 1, "optimal.intervals": 20, "optimal.cache": 0}
-
-
-@pytest.fixture(autouse=True)
-def own_domain(ros_domain: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("ROS_DOMAIN_ID", str(ros_domain))
 
 
 def quick(name: str) -> Scenario:
@@ -125,6 +122,7 @@ def test_a_scenario_may_have_paths_of_end_effectors(tmp_path: Path) -> None:
         assert given == {"link_5": way, "link_7": [0.4, 0.1, 1.8]}
 
 
+@pytest.mark.usefixtures("own_domain")
 @pytest.mark.slow
 @pytest.mark.parametrize("nodes", [False, True])
 def test_a_path_is_flown_and_in_the_bag(tmp_path: Path, nodes: bool) -> None:
@@ -178,8 +176,52 @@ def test_goals_of_a_file_that_are_none_are_refused(
         load_scenario(str(file))
 
 
+@pytest.mark.usefixtures("own_domain")
 def test_a_part_of_the_base_is_not_sent_with_an_end_effector(tmp_path: Path) -> None:
     aim = EndEffectorGoal.checked("link_7", [0.4, 0.1, 0.8])
     scenario = load_scenario("reach").with_end_effectors([aim], frozenset({"attitude"}))
     with pytest.raises(ParameterError, match="whole pose of the base or with none"):
         run_scenario(scenario, tmp_path / "run.mcap", nodes=True)
+
+
+# -- random goals by the command ---------------------------------------------------------------
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", range(2))
+@pytest.mark.parametrize(
+    ("name", "link"), [("three_joint_arm", "end_effector"), ("seven_joint_arm", "link_7")]
+)
+def test_goals_of_the_command_are_reached(
+    name: str, link: str, number: int, tmp_path: Path
+) -> None:
+    """Positions and poses by turns, where the link is after a straight way of the joints."""
+    urdf, robot = robot_file(name).read_text("utf-8"), SpaceRobot.from_file(robot_file(name))
+    rng = np.random.default_rng([number, 26])
+    lower, upper = np.maximum(robot.lower, -np.pi), np.minimum(robot.upper, np.pi)
+    q, end = (lower + (upper - lower) * rng.uniform(a, 1 - a, robot.n) for a in (0.3, 0.1))
+    place, attitude = rng.normal(size=3), Rotation.from_rotvec(rng.normal(size=3))
+    way = q + np.linspace(0, 1, 60)[:, np.newaxis] * (end - q)
+    r, R = end_of_motion(urdf, robot.joint_names, way, [link], place, attitude)[link]
+    goal: list[Any] = ["--end-effector-position", *r]
+    if number % 2:
+        goal = ["--end-effector-goal", *r, *R.as_quat()]
+    settings = {
+        "planner.clearance": 0.0,
+        "planner.position_tolerance": 1e-6,
+        "planner.attitude_tolerance": 1e-6,
+        "plant.initial_joint_positions": q.tolist(),
+        "plant.initial_position": place.tolist(),
+        "plant.initial_orientation": attitude.as_quat().tolist(),
+    }
+    words = ["run", name, "--method", "optimal", "--end-effector", link, *map(str, goal)]
+    words += [f"--set={each}={value}" for each, value in settings.items()]
+    bag = tmp_path / "hand.mcap"
+    with pytest.raises(SystemExit) as ended:
+        main([*words, "--bag", str(bag)])
+    assert ended.value.code == 0
+    flown = read_run(bag).q
+    reached, turned = end_of_motion(urdf, robot.joint_names, flown, [link], place, attitude)[link]
+    np.testing.assert_allclose(reached, r, atol=1e-6)
+    if number % 2:
+        assert (turned.inv() * R).magnitude() < 1e-6

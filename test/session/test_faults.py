@@ -18,6 +18,8 @@ from spacerobot_ros.scenario import load_scenario, parse_kills
 from spacerobot_ros.session.processes import KillTimeline
 from spacerobot_ros.session.run import run_scenario
 
+pytestmark = pytest.mark.usefixtures("own_domain")
+
 # Whether the goal is met, and to how many m and rad of the truth; None: not the method's to meet.
 EXPECTED: dict[str, tuple[bool, float | None, float | None]] = {
     "noisy_sensors": (True, 3e-3, 2.6e-3),
@@ -31,13 +33,7 @@ EXPECTED: dict[str, tuple[bool, float | None, float | None]] = {
     "biased_pose": (True, 0.11, 2e-3),
     "missed_capture": (True, 1e-6, 1e-6),
 }
-FAST = ("noisy_sensors", "late_poses")
 KILLED = "killed_nodes"
-
-
-@pytest.fixture(autouse=True)
-def own_domain(ros_domain: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("ROS_DOMAIN_ID", str(ros_domain))
 
 
 def test_every_scenario_is_here() -> None:
@@ -46,9 +42,7 @@ def test_every_scenario_is_here() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "name", [pytest.param(n, marks=[] if n in FAST else pytest.mark.slow) for n in EXPECTED]
-)
+@pytest.mark.parametrize("name", EXPECTED)
 def test_a_scenario_ends_as_documented_and_can_be_flown_again(name: str, tmp_path: Path) -> None:
     met, distance, angle = EXPECTED[name]
     scenario = load_scenario(f"faults/{name}")
