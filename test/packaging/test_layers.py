@@ -200,7 +200,7 @@ def test_programs_run_once_their_module_is_whole() -> None:
         assert "__name__ == '__main__'" in ast.unparse(last), f"{module}: code follows the guard"
 
 
-# -- values -----------------------------------------------------------------------------------
+# -- values ------------------------------------------------------------------------------------
 
 MUTABLE = {
     "spacerobot_ros.commanding.fly_to._ActionGoal",

@@ -1,4 +1,4 @@
-"""The real actions: packages of interfaces are built, and the tests of actions run with them."""
+"""Real actions and /tf: packages of interfaces are built, and the tests of nodes run with them."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from support.interface_package import (
     CONTROL_MSGS,
     NAV2_MSGS,
     SPACEROBOT_MSGS,
+    TF2_MSGS,
     InterfacePackage,
     with_interfaces,
 )
@@ -40,5 +41,20 @@ def _run(tests: str, *packages: InterfacePackage) -> None:
     )  # fmt: skip
     told = [line for line in run.stdout.splitlines() if not line.startswith("[")]
     print("\n".join(told))
+    assert run.returncode == 0, run.stdout[-3000:]
+    assert "skipped" not in run.stdout
+
+
+# -- the real /tf ------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_frames_on_the_real_topic_are_those_of_odom_and_pinocchio() -> None:
+    environment = {**os.environ, **with_interfaces(TF2_MSGS)}
+    run = subprocess.run(
+        [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-rs",
+         "test/nodes/test_transforms.py"],
+        cwd=ROOT, env=environment, capture_output=True, text=True, check=False,
+    )  # fmt: skip
     assert run.returncode == 0, run.stdout[-3000:]
     assert "skipped" not in run.stdout

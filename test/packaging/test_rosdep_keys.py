@@ -8,14 +8,94 @@ from __future__ import annotations
 
 import json
 import os
+import re
+import shutil
+import subprocess
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 import pytest
-from support.rosdep import MANIFESTS, ROOT, installed, keys_of, resolved
+import yaml
+from catkin_pkg.package import parse_package
+from support.colcon import COLCON, new_environment, run
+
+ROOT = Path(__file__).resolve().parents[2]
+MANIFESTS = ("package.xml", "spacerobot_msgs/package.xml")
+DISTRIBUTION, CODENAME = "jazzy", "noble"
 
 KEPT = json.loads((ROOT / "test" / "expected" / "rosdep.json").read_text("utf-8"))
 CHECKOUT = os.environ.get("SPACEROBOT_ROSDISTRO", "")
+
+
+def keys_of(*manifests: str) -> list[str]:
+    """Return the keys that manifests of the project depend on, sorted."""
+    found = set()
+    for path in manifests:
+        package = parse_package(ROOT / path, warnings=[])
+        found |= {
+            depend.name
+            for kind in ("build", "buildtool", "build_export", "exec", "test", "doc")
+            for depend in getattr(package, f"{kind}_depends")
+        }
+    return sorted(found)
+
+
+def resolved(keys: Iterable[str], checkout: Path) -> dict[str, str]:
+    """Return by key what is installed: ``apt NAME ...`` or ``pip NAME ...``; empty: nothing is.
+
+    A package that the distribution has released is ``apt ros-jazzy-...``.
+
+    Parameters
+    ----------
+    keys
+        Keys of rosdep.
+    checkout
+        A work tree of rosdistro, or its git directory.
+    """
+    rules: dict[str, Any] = {}
+    for name in ("base", "python"):
+        rules |= _document(checkout, f"rosdep/{name}.yaml")
+    repositories = _document(checkout, f"{DISTRIBUTION}/distribution.yaml")["repositories"]
+    released = {
+        package
+        for repository, about in repositories.items()
+        if "version" in about.get("release", {})
+        for package in about["release"].get("packages", [repository])
+    }
+    return {
+        key: f"apt ros-{DISTRIBUTION}-{key.replace('_', '-')}"
+        if key in released
+        else installed(rules.get(key, {}).get("ubuntu"))
+        for key in keys
+    }
+
+
+def installed(rule: Any) -> str:
+    """Return what a rule for Ubuntu installs there; empty: nothing."""
+    installers = {"apt", "pip"}
+    if isinstance(rule, dict) and not installers & set(rule):
+        rule = rule.get(CODENAME, rule.get("*"))
+    if not rule:
+        return ""
+    if isinstance(rule, dict):
+        (installer,) = installers & set(rule)
+        return " ".join([installer, *rule[installer]["packages"]])
+    return " ".join(["apt", *([rule] if isinstance(rule, str) else rule)])
+
+
+def _document(checkout: Path, path: str) -> dict[str, Any]:
+    file = checkout / path
+    if file.is_file():
+        text = file.read_text("utf-8")
+    else:
+        text = subprocess.run(
+            ["git", "-C", str(checkout), "show", f"HEAD:{path}"],
+            capture_output=True, text=True, check=True,
+        ).stdout  # fmt: skip
+    document = yaml.load(text, Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))
+    assert isinstance(document, dict)
+    return document
 
 
 def test_each_key_is_in_the_list() -> None:
@@ -90,3 +170,60 @@ def test_the_list_is_that_of_rosdistro() -> None:
     # Packages that the pages name, without which some doors are closed.
     more = ["control_msgs", "joint_state_topic_hardware_interface", "nav2_msgs", "ros2_control"]
     assert all(resolved([*more, "ros2_controllers"], Path(CHECKOUT)).values())
+
+
+# -- `colcon test` with the packages that package.xml names ------------------------------------
+
+WHEELS = {
+    "casadi-pip": "casadi",
+    "mcap-ros2-support": "mcap-ros2-support",
+    "pinocchio": "pin",
+    "python3-catkin-pkg": "catkin_pkg",
+    "python3-click": "click",
+    "python3-hypothesis": "hypothesis",
+    "python3-matplotlib": "matplotlib",
+    "python3-mujoco-pip": "mujoco",
+    "python3-numpy": "numpy",
+    "python3-pytest": "pytest",
+    "python3-rosbags-pip": "rosbags",
+    "python3-scipy": "scipy",
+    "python3-yaml": "PyYAML",
+    "rclpy": "ros-jazzy-rclpy[fastrtps]",
+    "xacro": "xacro",
+}
+"""Wheels of keys whose packages have other names there."""
+
+NO_WHEELS = {"launch", "launch_ros", "tf2_msgs"}
+
+
+@pytest.mark.slow
+def test_colcon_collects_the_tests_and_says_what_is_skipped(tmp_path: Path) -> None:
+    keys = set(keys_of("package.xml")) - NO_WHEELS
+    wheels = [WHEELS.get(key, f"ros-jazzy-{key.replace('_', '-')}") for key in sorted(keys)]
+    environment = tmp_path / "environment"
+    python = new_environment(environment)
+    run([python, "-m", "pip", "install", "-q", *wheels, *COLCON])
+    found = run([python, "-m", "pip", "list", "--format=freeze"])
+    for other in ("pandas", "dask", "gymnasium", "viser", "xdist", "psutil"):
+        assert f"\n{other}=" not in found, f"{other} is there"
+
+    source = tmp_path / "src" / "spacerobot_ros"
+    left_out = shutil.ignore_patterns(".*", "out", "build", "*.egg-info", "__pycache__")
+    shutil.copytree(ROOT, source, ignore=left_out)
+    colcon, path = environment / "bin" / "colcon", str(environment / "bin")
+    run([colcon, "build", "--base-paths", "src"], cwd=tmp_path, path=path)
+    options = "--base-paths src --event-handlers console_direct+ --return-code-on-test-failure"
+    line = f". install/setup.sh; {colcon} test {options} --pytest-args --collect-only -qq"
+    told = run(["sh", "-e", "-c", line], cwd=tmp_path, path=path)
+    assert "ERROR" not in told, told[-3000:]
+    collected = [line for line in told.splitlines() if re.fullmatch(r"test/\S+\.py: \d+", line)]
+    assert len(collected) > 300
+    skipped = [line for line in told.splitlines() if line.startswith("SKIPPED")]
+    reason = re.compile(
+        r"is not installed \(pip install 'spacerobot_ros\[test\]'\)|could not import"
+    )
+    assert skipped
+    assert [line for line in skipped if not reason.search(line)] == []
+    print(
+        f"{len(collected)} modules of tests collected, {len(skipped)} skipped:", *skipped, sep="\n"
+    )
