@@ -1,8 +1,9 @@
-"""Reports, pictures and results are written as a whole, or what was there before stays."""
+"""Files are written as a whole, read within limits, and trusted where nobody else writes them."""
 
 from __future__ import annotations
 
 import json
+import logging
 import os
 import resource
 import signal
@@ -16,7 +17,14 @@ from support.sentences import assert_one_sentence
 
 from spacerobot_ros.cli.main import main
 from spacerobot_ros.errors import SpaceRobotError
-from spacerobot_ros.files import write_output
+from spacerobot_ros.files import (
+    Cache,
+    UntrustedFileError,
+    load_yaml,
+    read_private,
+    write_output,
+    write_whole,
+)
 
 
 @pytest.fixture
@@ -87,3 +95,100 @@ def test_json_is_written_whole(tmp_path: Path) -> None:
     words = ["analyze", "planar_chain", "--json", str(file), "--picture", str(tmp_path / "a.svg")]
     assert CliRunner().invoke(main, words).exit_code == 0
     assert json.loads(file.read_text())["robot"] == "planar_chain"
+
+
+def test_a_whole_file_is_of_this_user_alone(tmp_path: Path) -> None:
+    path = tmp_path / ("n" * 150)
+    write_whole(path, b"content")
+    assert path.read_bytes() == b"content"
+    assert stat.S_IMODE(path.stat().st_mode) == 0o600
+    assert os.listdir(tmp_path) == [path.name]
+    with pytest.raises(OSError, match="No such file"):
+        write_whole(tmp_path / "none" / "a", b"")
+
+
+def test_a_new_file_has_a_mode_and_a_bag_is_not_replaced(tmp_path: Path) -> None:
+    write_output(tmp_path / "b", b"b", mode=0o600)
+    assert stat.S_IMODE((tmp_path / "b").stat().st_mode) == 0o600
+    bag = tmp_path / "c.mcap"
+    bag.write_bytes(b"\x89MCAP and more")
+    with pytest.raises(SpaceRobotError) as refused:
+        write_output(bag, b"x")
+    assert str(refused.value) == f"The file {bag} is a bag, which is not replaced: name another."
+    bag.write_bytes(b"\x89MCA")
+    write_output(bag, b"x")
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("a" * 1_000_001, "it has more than 1000000 characters"),
+        ("[" * 10_000, "it is nested too deeply"),
+        ("&a [*a]", "it has more than 100000 values"),
+        (f"[&a [{'1, ' * 1000}], {'*a, ' * 100}]", "it has more than 100000 values"),
+        ("a: [", "while parsing a flow node"),
+    ],
+)
+def test_yaml_of_unknown_origin_is_limited(text: str, reason: str) -> None:
+    with pytest.raises(ValueError, match=r"\w") as refused:
+        load_yaml(text)
+    assert str(refused.value).startswith(reason)
+    assert "\n" not in str(refused.value)
+
+
+def test_yaml_up_to_its_limits_is_read() -> None:
+    assert load_yaml("a" * 1_000_000) == "a" * 1_000_000
+    assert len(load_yaml(f"[&a [{'1, ' * 1000}], {'*a, ' * 98}]")) == 99
+    assert load_yaml("") is None
+    assert load_yaml("[&a [1, 2], *a]") == [[1, 2], [1, 2]]
+    assert load_yaml("{a: 1, 2: b}") == {"a": 1, 2: "b"}
+
+
+def test_a_private_file_is_of_this_user_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "a"
+    path.write_bytes(b"12345")
+    for mode in (0o600, 0o644):
+        path.chmod(mode)
+        assert read_private(path) == b"12345"
+    for mode in (0o620, 0o602):
+        path.chmod(mode)
+        with pytest.raises(UntrustedFileError) as refused:
+            read_private(path)
+        assert str(refused.value) == (
+            f"others may write '{path}' (mode {mode:o}); make it yours alone with "
+            f"chmod go-w '{path}'."
+        )
+    path.chmod(0o600)
+    if (owner := path.stat().st_uid) == 0:
+        os.chown(path, 4_000_001, -1)
+    else:
+        monkeypatch.setattr(os, "geteuid", lambda: owner + 1)
+    with pytest.raises(UntrustedFileError, match=r"belongs to user \d+; use one of your own\.$"):
+        read_private(path)
+
+
+def test_a_cache_gives_what_was_stored_under_a_key(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    cache = Cache(tmp_path / "a" / "b")
+    assert cache.load("x", "key") is None
+    path = cache.store("x", "key", b"content")
+    assert path == tmp_path / "a" / "b" / "x"
+    assert stat.S_IMODE((tmp_path / "a" / "b").stat().st_mode) == 0o700
+    assert cache.load("x", "key") == (path, b"content")
+    assert path.read_bytes().splitlines()[-1].startswith(b"spacerobot_ros cache 2 key 7 ")
+    with caplog.at_level(logging.WARNING):
+        assert cache.load("x", "other") is None
+    assert not path.exists()
+    assert caplog.messages == [
+        f"'{path}' is deleted and computed again: it is damaged, or stored under another key."
+    ]
+    damaged = cache.store("y", "key", b"content")
+    assert damaged is not None
+    damaged.write_bytes(damaged.read_bytes().replace(b"content", b"contents"))
+    assert cache.load("y", "key") is None
+    empty = cache.store("z", "key", b"")
+    assert empty is not None
+    assert cache.load("z", "key") == (empty, b"")

@@ -1,16 +1,14 @@
-"""The modules that all others use: files, errors, events, times, parameters, scenarios."""
+"""The modules that all others use: errors, events, times, topics, parameters, scenarios."""
 
 from __future__ import annotations
 
 import importlib
-import logging
 import math
-import os
-import stat
 import subprocess
 import sys
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from importlib import import_module
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -20,6 +18,7 @@ import pytest
 import yaml
 
 from spacerobot_ros import errors, measures, resources, times
+from spacerobot_ros.bag import message_definition
 from spacerobot_ros.errors import (
     GoalError,
     NotFoundError,
@@ -33,14 +32,6 @@ from spacerobot_ros.errors import (
     sentence_case,
 )
 from spacerobot_ros.events import Event, EventKind
-from spacerobot_ros.files import (
-    Cache,
-    UntrustedFileError,
-    load_yaml,
-    read_private,
-    write_output,
-    write_whole,
-)
 from spacerobot_ros.flight.trials import PlanningProblem
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.parameters import (
@@ -60,9 +51,9 @@ from spacerobot_ros.scenario import (
     scenario_or_robot,
     scenario_text,
 )
-from spacerobot_ros.topics import TOPICS, goal_topic, pose_topic, topic_named
+from spacerobot_ros.topics import TOPICS, Topic, goal_topic, pose_topic, state_topics, topic_named
 
-# -- errors ---------------------------------------------------------------------------------------
+# -- errors ------------------------------------------------------------------------------------
 
 
 def test_messages_are_lines_of_at_most_two_thousand_characters() -> None:
@@ -89,7 +80,7 @@ def test_a_proof_by_one_method_holds_for_all() -> None:
     assert errors.PlanningError is PlanningError
 
 
-# -- times and events -----------------------------------------------------------------------------
+# -- times and events --------------------------------------------------------------------------
 
 
 def test_times_are_split_into_seconds_and_the_rest() -> None:
@@ -150,124 +141,7 @@ def test_topics_of_end_effectors() -> None:
         topic_named("nothing")
 
 
-# -- files ----------------------------------------------------------------------------------------
-
-
-def test_a_whole_file_is_of_this_user_alone(tmp_path: Path) -> None:
-    path = tmp_path / ("n" * 150)
-    write_whole(path, b"content")
-    assert path.read_bytes() == b"content"
-    assert stat.S_IMODE(path.stat().st_mode) == 0o600
-    assert os.listdir(tmp_path) == [path.name]
-    with pytest.raises(OSError, match="No such file"):
-        write_whole(tmp_path / "none" / "a", b"")
-
-
-def test_outputs_keep_the_permissions_of_older_files(tmp_path: Path) -> None:
-    umask = os.umask(0o022)
-    try:
-        path = tmp_path / "new" / "a.txt"
-        write_output(path, "ü")
-        assert path.read_bytes() == "ü".encode()
-        assert stat.S_IMODE(path.stat().st_mode) == 0o644
-        path.chmod(0o640)
-        write_output(path, b"b", mode=0o600)
-        assert stat.S_IMODE(path.stat().st_mode) == 0o640
-        write_output(tmp_path / "b", b"b", mode=0o600)
-        assert stat.S_IMODE((tmp_path / "b").stat().st_mode) == 0o600
-    finally:
-        os.umask(umask)
-    bag = tmp_path / "c.mcap"
-    bag.write_bytes(b"\x89MCAP and more")
-    with pytest.raises(SpaceRobotError) as refused:
-        write_output(bag, b"x")
-    assert str(refused.value) == f"The file {bag} is a bag, which is not replaced: name another."
-    bag.write_bytes(b"\x89MCA")
-    write_output(bag, b"x")
-    below = tmp_path / "b" / "c"
-    with pytest.raises(SpaceRobotError) as refused:
-        write_output(below, b"x")
-    assert (
-        str(refused.value) == f"The file {below} cannot be written: {tmp_path / 'b'} is no folder."
-    )
-
-
-@pytest.mark.parametrize(
-    ("text", "reason"),
-    [
-        ("a" * 1_000_001, "it has more than 1000000 characters"),
-        ("[" * 10_000, "it is nested too deeply"),
-        ("&a [*a]", "it has more than 100000 values"),
-        (f"[&a [{'1, ' * 1000}], {'*a, ' * 100}]", "it has more than 100000 values"),
-        ("a: [", "while parsing a flow node"),
-    ],
-)
-def test_yaml_of_unknown_origin_is_limited(text: str, reason: str) -> None:
-    with pytest.raises(ValueError, match=r"\w") as refused:
-        load_yaml(text)
-    assert str(refused.value).startswith(reason)
-    assert "\n" not in str(refused.value)
-
-
-def test_yaml_up_to_its_limits_is_read() -> None:
-    assert load_yaml("a" * 1_000_000) == "a" * 1_000_000
-    assert len(load_yaml(f"[&a [{'1, ' * 1000}], {'*a, ' * 98}]")) == 99
-    assert load_yaml("") is None
-    assert load_yaml("[&a [1, 2], *a]") == [[1, 2], [1, 2]]
-    assert load_yaml("{a: 1, 2: b}") == {"a": 1, 2: "b"}
-
-
-def test_a_private_file_is_of_this_user_alone(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    path = tmp_path / "a"
-    path.write_bytes(b"12345")
-    for mode in (0o600, 0o644):
-        path.chmod(mode)
-        assert read_private(path) == b"12345"
-    for mode in (0o620, 0o602):
-        path.chmod(mode)
-        with pytest.raises(UntrustedFileError) as refused:
-            read_private(path)
-        assert str(refused.value) == (
-            f"others may write '{path}' (mode {mode:o}); make it yours alone with "
-            f"chmod go-w '{path}'."
-        )
-    path.chmod(0o600)
-    if (owner := path.stat().st_uid) == 0:
-        os.chown(path, 4_000_001, -1)
-    else:
-        monkeypatch.setattr(os, "geteuid", lambda: owner + 1)
-    with pytest.raises(UntrustedFileError, match=r"belongs to user \d+; use one of your own\.$"):
-        read_private(path)
-
-
-def test_a_cache_gives_what_was_stored_under_a_key(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    cache = Cache(tmp_path / "a" / "b")
-    assert cache.load("x", "key") is None
-    path = cache.store("x", "key", b"content")
-    assert path == tmp_path / "a" / "b" / "x"
-    assert stat.S_IMODE((tmp_path / "a" / "b").stat().st_mode) == 0o700
-    assert cache.load("x", "key") == (path, b"content")
-    assert path.read_bytes().splitlines()[-1].startswith(b"spacerobot_ros cache 2 key 7 ")
-    with caplog.at_level(logging.WARNING):
-        assert cache.load("x", "other") is None
-    assert not path.exists()
-    assert caplog.messages == [
-        f"'{path}' is deleted and computed again: it is damaged, or stored under another key."
-    ]
-    damaged = cache.store("y", "key", b"content")
-    assert damaged is not None
-    damaged.write_bytes(damaged.read_bytes().replace(b"content", b"contents"))
-    assert cache.load("y", "key") is None
-    empty = cache.store("z", "key", b"")
-    assert empty is not None
-    assert cache.load("z", "key") == (empty, b"")
-
-
-# -- parameters -----------------------------------------------------------------------------------
+# -- parameters --------------------------------------------------------------------------------
 
 
 def test_a_copy_with_other_fields_is_checked_and_knows_nothing_of_the_first() -> None:
@@ -296,7 +170,7 @@ def test_a_copy_with_other_fields_is_checked_and_knows_nothing_of_the_first() ->
         replaced(first, low=3.0)
 
 
-# -- resources ------------------------------------------------------------------------------------
+# -- resources ---------------------------------------------------------------------------------
 
 
 def test_names_of_robots_and_paths() -> None:
@@ -357,7 +231,7 @@ def test_data_files_are_in_the_checkout_or_installed(
     assert find() == checkout
 
 
-# -- measures -------------------------------------------------------------------------------------
+# -- measures ----------------------------------------------------------------------------------
 
 
 def test_momenta_of_a_flight() -> None:
@@ -382,7 +256,7 @@ def test_momenta_of_a_flight() -> None:
     np.testing.assert_allclose(measures.peak_wrench(wrenches), [5.0, 13.0])
 
 
-# -- scenarios ------------------------------------------------------------------------------------
+# -- scenarios ---------------------------------------------------------------------------------
 
 
 def text_of(*goal: str, **nodes: Any) -> str:
@@ -435,11 +309,6 @@ def test_kills_that_are_refused(lines: Any, sentence: str) -> None:
     with pytest.raises(ParameterError) as refused:
         parse_kills(lines, "here")
     assert str(refused.value) == sentence
-
-
-def test_kills_are_sorted_by_time() -> None:
-    found = parse_kills(["plant at 3", "planner at 0.5 until 1"], "here")
-    assert [kill.at for kill in found] == [0.5, 3.0]
 
 
 @pytest.mark.parametrize(
@@ -656,3 +525,57 @@ def test_a_plant_node_imports_no_planner_and_no_page() -> None:
     assert "spacerobot_ros.simulation.velocity_plant" in loaded
     for module in ("planning", "control.laws", "control.outputs", "viewer", "bag", "commanding"):
         assert f"spacerobot_ros.{module}" not in loaded
+
+
+# -- the table of topics -----------------------------------------------------------------------
+
+
+def message_of(topic: Topic) -> Any:
+    package, _, name = topic.type.split("/")
+    return getattr(import_module(f"{package}.msg"), name)()
+
+
+@pytest.mark.parametrize("topic", TOPICS.values(), ids=TOPICS)
+def test_every_topic_has_a_type_that_is_installed_and_says_what_it_is(topic: Topic) -> None:
+    if topic.name in ("/tf", "/tf_static"):
+        # Its package is not everywhere; its definition is in the bags.
+        assert "TransformStamped[] transforms" in message_definition(topic.type)
+    else:
+        message_of(topic)
+    assert topic.publishers
+    assert topic.meaning
+    assert "\n" not in topic.meaning + topic.condition
+
+
+@pytest.mark.parametrize("topic", state_topics(), ids=lambda topic: topic.name)
+def test_state_topics_name_numbers_of_their_messages(topic: Topic) -> None:
+    message = message_of(topic)
+    names = ["elbow", "wrist"]
+    for entry in topic.state:
+        for column in entry.columns:
+            value = message
+            for part in column.split("."):
+                value = getattr(value, part)
+            if entry.members:
+                assert isinstance(value, float), column
+            else:
+                assert len(value) == 0
+                assert value.typecode == "d"
+        width = len(entry.members or entry.array_entry_names) or len(names)
+        assert len(entry.labels(names)) == width
+
+
+def test_labels_and_quaternions() -> None:
+    odom, joints = TOPICS["odom"].state, TOPICS["joint_states"].state
+    assert [field.quaternion for field in odom] == [3, None]
+    assert joints[0].labels(["elbow"]) == ["position of elbow"]
+    assert TOPICS["momentum"].state[0].labels([])[-1] == "kinetic energy"
+    assert TOPICS["odom"].short_type == "nav_msgs/Odometry"
+
+
+def test_the_plant_publishes_the_clock_first_and_what_sets_commanders_off_late() -> None:
+    names = list(TOPICS)
+    assert names[0] == "/clock"
+    measured = [names.index("odom"), names.index("joint_states")]
+    before = ["base_pose", "end_effector_pose", "momentum", "momentum_expected", "odom_true"]
+    assert max(map(names.index, before)) < min(measured)

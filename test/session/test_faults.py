@@ -120,19 +120,6 @@ def test_kills_need_nodes_in_real_time(tmp_path: Path, nodes: bool) -> None:
     assert not (tmp_path / "run.mcap").exists()
 
 
-@pytest.mark.parametrize(
-    "line",
-    [
-        "planner", "planner at", "planner at x", "planner at nan", "planner at 3 until 2",
-        "planner at -1", "recorder at 5", "gremlin at 5", "", None, 5, "planner until 5",
-    ],
-)  # fmt: skip
-def test_a_kill_that_is_none_is_refused(line: object) -> None:
-    with pytest.raises(ParameterError) as caught:
-        parse_kills([line], "the file x.yaml")
-    assert_one_sentence(str(caught.value), "the file x.yaml")
-
-
 def test_kills_come_in_their_order() -> None:
     lines = ["plant at 5 until 6", "planner  at 1 until 4.5", "planner at 7"]
     kills = parse_kills(lines, "x.yaml")
