@@ -367,7 +367,7 @@ def test_what_asks_for_nothing_is_ended(noted: list[int], number: signal.Signals
 # -- programs of nodes -------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", sorted(path.name for path in (ROOT / "scripts").iterdir()))
+@pytest.mark.parametrize("name", sorted(path.name for path in (ROOT / "scripts").glob("*")))
 def test_an_interrupt_while_a_node_imports_is_no_traceback(name: str) -> None:
     """The interpreter itself reports its imports, and so when the signal is to come."""
     with subprocess.Popen(
