@@ -124,6 +124,19 @@ def test_a_planner_that_dies_is_started_again_within_the_limit(
         assert robot.wait(PATIENCE) == 2
 
 
+@pytest.mark.slow
+@pytest.mark.usefixtures("own_domain")
+def test_a_flight_by_nodes_that_is_interrupted_says_so(tmp_path: Path) -> None:
+    scenario = load_scenario("planar_chain").with_overrides("planner", {"method": "square_path"})
+    result = run_scenario(scenario, tmp_path / "run.mcap", nodes=True, longest=1.0)
+    assert not result.succeeded
+    assert result.summary["state"] == "interrupted"
+    flown = result.summary["sim_time_s"]
+    assert result.message == f"Interrupted after {flown:.6g} s of simulated time."
+    assert result.summary["method"] == "square_path"
+    assert read_bag(tmp_path / "run.mcap").message_count("/odom") == result.summary["ticks"] + 1
+
+
 @pytest.fixture
 def robot(spacerobot: Command) -> Iterator[WarmProcess]:
     """Sliding masses that are up, five times as fast as real time."""
