@@ -19,10 +19,10 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from support.hostile import containers, contents, flights
+from support.hostile import containers, contents
 from support.hostile.records import CASES, GIB, MOST
 
-MAKERS = (containers, contents, flights)
+MAKERS = (containers, contents)
 """What fills the cases when it is imported."""
 
 TIME_LIMIT = 10.0
