@@ -100,6 +100,8 @@ def test_a_copy_says_what_the_tests_notice(tmp_path: Path) -> None:
     project, module = tmp_path / "project", "spacerobot_ros/x.py"
     for folder in ("spacerobot_ros", "test"):
         (project / folder).mkdir(parents=True)
+    # Without it the package that is installed would be found first.
+    (project / "spacerobot_ros" / "__init__.py").touch()
     (project / module).write_text("def f(x):\n    return x + 1\n", "utf-8")
     (project / "test" / "test_x.py").write_text(
         "from spacerobot_ros.x import f\n\ndef test_f():\n    assert f(0) == 1\n", "utf-8"
