@@ -14,6 +14,7 @@ from support.sentences import assert_one_sentence
 
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.nodes import PlannerNode
+from spacerobot_ros.nodes.common.fly_to import action_class
 
 pytestmark = pytest.mark.usefixtures("one_plant")
 
@@ -110,3 +111,10 @@ def test_a_planner_that_is_configured_again_finds_its_robot_again(harness: Harne
     assert flight.planner.trigger_activate() is TransitionCallbackReturn.SUCCESS
     assert values_of(flight.decide(HERE))["state"] == "reached"
     assert flight.error_to(HERE)[0] < 1e-3
+
+
+def test_without_the_package_of_the_action_the_planner_says_so(harness: Harness) -> None:
+    if action_class("control_msgs", "FollowJointTrajectory") is not None:
+        pytest.skip("control_msgs is installed")
+    with pytest.raises(SpaceRobotError, match="needs the package control_msgs: install it"):
+        harness.make(PlannerNode, {"robot": "sliding_masses", "output": "trajectory"})
