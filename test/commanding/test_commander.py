@@ -2,100 +2,37 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
+from commanding.commanders import GOAL, METHOD, Rig, config
 from support.sentences import assert_one_sentence
 
 from spacerobot_ros.commanding.commander import (
-    ArrayDecoder,
-    Commander,
     CommanderActivity,
-    StateArrays,
 )
 from spacerobot_ros.commanding.controller import JOINT_REFERENCE, ControllerCommander
 from spacerobot_ros.commanding.fly_to import FlyTo
-from spacerobot_ros.commanding.goal_follower import Status
 from spacerobot_ros.commanding.planner import PlannerCommander
-from spacerobot_ros.commanding.plant_state import Stamped
 from spacerobot_ros.commanding.trajectory_output import TrajectoryOutput
 from spacerobot_ros.control.config import ControllerConfig
-from spacerobot_ros.errors import CommandError, PlanningError
-from spacerobot_ros.events import Event, EventKind
+from spacerobot_ros.errors import PlanningError
+from spacerobot_ros.events import EventKind
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Inertia
 from spacerobot_ros.model.grasp import Payload
 from spacerobot_ros.model.urdf import load_robot
-from spacerobot_ros.parameters import configured, declared
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.execution.goal_file import BASE_GOAL_KEY, GoalFile, IdentifiedGoal
 from spacerobot_ros.resources import robot_file
 from spacerobot_ros.simulation.status import PlantState, PlantStatus
 
-TICK = 50_000_000
-GOAL = Goal.checked([0.05, -0.03, 0.02], [0.0, 0.0, 0.0, 1.0])
 LATCHED = PlantStatus(PlantState.LATCHED, "Nothing moves.", "abort", "a fuse is blown")
-
-
-class Host:
-    """Records in order whatever a commander does."""
-
-    def __init__(self) -> None:
-        self.commands: list[int] = []
-        self.statuses: list[Status] = []
-        self.events: list[Event] = []
-        self.lines: list[tuple[str, str]] = []
-        self.publishers = {"odom"}
-        self.waiting: tuple[list[Stamped], list[Stamped]] = ([], [])
-
-    def send_command(self, stamp_ns: int) -> None:
-        self.commands.append(stamp_ns // TICK)
-
-    def publish_status(self, status: Status) -> None:
-        self.statuses.append(status)
-
-    def report_event(self, event: Event) -> None:
-        self.events.append(event)
-
-    def publish_start(self, start: Any) -> None:
-        pass
-
-    def log(self, level: str, message: str) -> None:
-        self.lines.append((level, message))
-
-    def has_publisher(self, topic: str) -> bool:
-        return topic in self.publishers
-
-    def waiting_states(self) -> tuple[list[Stamped], list[Stamped]]:
-        waiting, self.waiting = self.waiting, ([], [])
-        return waiting
-
-    @property
-    def states(self) -> list[str]:
-        return [status.state.value for status in self.statuses]
-
-
-class OneRobotDecoder(ArrayDecoder):
-    """Refuses joints of another number, and odom that is no pose."""
-
-    def __init__(self, n: int) -> None:
-        self._n = n
-
-    def check_robot(self, joints: StateArrays) -> None:
-        if len(joints.q) != self._n:
-            raise CommandError("joint 'wing' is unknown")
-
-    def decode_base(self, odom: StateArrays) -> tuple[Any, Any]:
-        if odom.pose is None:
-            raise CommandError("its bytes are no Odometry")
-        return super().decode_base(odom)
 
 
 @pytest.fixture(scope="module")
@@ -106,53 +43,6 @@ def robot() -> SpaceRobot:
 @pytest.fixture(scope="module")
 def arm() -> SpaceRobot:
     return SpaceRobot(load_robot(robot_file("planar_manipulator")))
-
-
-def config(kind: Any, **settings: Any) -> Any:
-    defaults = {each.name: each.default for each in declared(kind)}
-    return configured(kind, {**defaults, "tick_rate": 20.0, **settings})
-
-
-class Rig:
-    """A commander, its host, a wall clock that the test moves, and states of a robot at rest."""
-
-    def __init__(
-        self, make: Callable[..., Commander], settings: Any, n: int, **others: Any
-    ) -> None:
-        self.wall, self.n, self.host = 10.0, n, Host()
-        self.commander: Any = make(settings, self.host, clock=lambda: self.wall, **others)
-
-    def message(self, tick: int, *, n: int | None = None, posed: bool = True) -> StateArrays:
-        joints = np.zeros(self.n if n is None else n)
-        pose = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]) if posed else None
-        return StateArrays(tick * TICK, joints, joints, pose, np.zeros(6))
-
-    def stamped(self, tick: int, **about: Any) -> Stamped:
-        return Stamped(tick * TICK, self.message(tick, **about))
-
-    def odom(self, tick: int, **about: Any) -> None:
-        self.commander.receive_odom(*self.stamped(tick, **about))
-
-    def joints(self, tick: int, **about: Any) -> None:
-        self.commander.receive_joints(*self.stamped(tick, **about))
-
-    def state(self, tick: int) -> None:
-        self.odom(tick)
-        self.joints(tick)
-
-    def goal(self, sec: int = 7, goal: Goal = GOAL) -> Any:
-        return self.commander.receive_goal(BASE_GOAL_KEY, sec, 0, lambda: goal)
-
-    def use(self, robot: SpaceRobot) -> None:
-        self.commander.use_robot(robot, OneRobotDecoder(self.n))
-
-
-METHOD = {
-    "method": "lie_bracket",
-    "lie_bracket.t1": 2.0,
-    "lie_bracket.n1": 1,
-    "plan_in_background": False,
-}
 
 
 @pytest.fixture
@@ -174,67 +64,24 @@ def controller(arm: SpaceRobot) -> Rig:
 def test_goals_of_the_base_are_left_to_a_planner_whose_reference_a_law_of_joints_tracks(
     arm: SpaceRobot,
 ) -> None:
-    def told(*publishers: str, action: bool = False) -> Rig:
+    def told(*publishers: str) -> Rig:
         rig = Rig(ControllerCommander, config(ControllerConfig, law="computed_torque"), arm.n)
         rig.use(arm)
         rig.host.publishers |= {*publishers}
         rig.commander.activate()
-        if action:
-            request = SimpleNamespace(goal=GOAL, tolerance_or=lambda one: one, tolerance=None)
-            rig.commander._fly_to = MagicMock()
-            rig.commander.receive_fly_to("one", lambda: request, MagicMock())
-        else:
-            rig.goal()
+        rig.goal()
         return rig
 
     left = told(JOINT_REFERENCE)
     assert left.host.states == ["waiting"]
     assert left.host.events == []
     assert left.host.lines[-1][1].startswith("The goal is left to the planner. The law 'computed_")
-    for refused in (told(), told(JOINT_REFERENCE, action=True)):
-        assert refused.host.states == ["waiting", "refused"]
-        assert_one_sentence(refused.host.statuses[0].message)
+    refused = told()
+    assert refused.host.states == ["waiting", "refused"]
+    assert_one_sentence(refused.host.statuses[0].message)
 
 
 # -- states -----------------------------------------------------------------------------------
-
-
-def test_every_state_is_answered_once_by_its_stamp(planner: Rig, controller: Rig) -> None:
-    for rig in (planner, controller):
-        for tick in (1, 2, 3):
-            rig.state(tick)
-        assert rig.host.commands == [1, 2, 3]
-
-
-def test_a_controller_answers_when_the_pose_comes_after_the_joints(controller: Rig) -> None:
-    controller.joints(1)
-    assert controller.host.commands == []
-    controller.odom(1)
-    assert controller.host.commands == [1]
-
-
-def test_an_inactive_commander_answers_nothing_until_it_is_active(planner: Rig) -> None:
-    planner.commander.deactivate()
-    planner.state(1)
-    assert planner.host.commands == []
-    planner.commander.activate()
-    assert planner.host.commands == [1], "the state that has waited"
-
-
-def test_after_a_standstill_only_the_last_state_is_answered(planner: Rig) -> None:
-    for tick in range(1, 6):
-        planner.wall += 0.05
-        planner.state(tick)
-    planner.wall += 1.0
-    planner.host.waiting = (
-        [planner.stamped(tick) for tick in (6, 7, 8)],
-        [planner.stamped(7), planner.stamped(8), planner.stamped(900), planner.stamped(9, n=2)],
-    )
-    planner.joints(6)
-    assert planner.host.commands == [1, 2, 3, 4, 5, 8]
-    planner.wall += 0.001
-    planner.joints(9)
-    assert planner.host.commands[-1] == 9
 
 
 def test_faults_of_messages_are_logged_from_the_start_of_the_clock_once_a_period(
@@ -248,20 +95,6 @@ def test_faults_of_messages_are_logged_from_the_start_of_the_clock_once_a_period
         rig.wall = wall
         rig.joints(1, n=7)
         assert rig.host.lines == [("error", "joint_states: joint 'wing' is unknown.")] * count
-
-
-def test_joints_of_another_robot_are_skipped_and_logged_once(planner: Rig) -> None:
-    planner.state(1)
-    for _ in range(3):
-        planner.joints(2, n=5)
-    planner.state(2)
-    errors = [line for level, line in planner.host.lines if level == "error"]
-    assert len(errors) == 1
-    assert "wing" in errors[0]
-    assert planner.host.commands == [1, 2]
-    planner.wall += 6.0
-    planner.joints(3, n=5)
-    assert len([1 for level, _ in planner.host.lines if level == "error"]) == 2
 
 
 def test_a_jump_is_answered_with_its_pose_once_its_time_is_accepted(controller: Rig) -> None:
@@ -302,45 +135,7 @@ def test_ignored_states_are_reported_once_a_second(planner: Rig) -> None:
     assert ("warning", warned[0]) in planner.host.lines
 
 
-def test_a_pose_that_is_unreadable_is_no_pose(planner: Rig, controller: Rig) -> None:
-    for rig in (planner, controller):
-        rig.goal()
-        rig.odom(1, posed=False)
-        rig.joints(1)
-        assert any("no Odometry" in line for _, line in rig.host.lines)
-    assert planner.host.commands == [1]
-    assert controller.host.commands == []
-
-
 # -- the references of a controller -----------------------------------------------------------
-
-
-def test_a_state_waits_for_a_reference_that_has_a_publisher(arm: SpaceRobot) -> None:
-    rig = Rig(ControllerCommander, config(ControllerConfig), arm.n)
-    rig.host.publishers.add(JOINT_REFERENCE)
-    rig.use(arm)
-    rig.commander.activate()
-    rig.state(1)
-    assert rig.host.commands == []
-    rig.commander.receive_reference(JOINT_REFERENCE, *rig.stamped(1))
-    assert rig.host.commands == [1]
-
-
-def test_a_pose_is_lost_only_after_odom_was_connected(controller: Rig) -> None:
-    controller.host.publishers.clear()
-    for tick in range(1, 5):
-        controller.joints(tick)
-    assert controller.host.states == ["waiting"]
-    controller.wall += 2.0
-    controller.commander.take_accepted_jump()
-    message = "Waiting for states on 'odom', and no node publishes 'odom'."
-    assert controller.host.statuses[-1].message == message
-    controller.host.publishers.add("odom")
-    for tick in range(5, 8):
-        controller.joints(tick)
-    # State 5 was answered a tick late, which nobody is sent; the later ones at once.
-    assert controller.host.commands == [6, 7]
-    assert (controller.host.states[-1], controller.host.statuses[-1].state.level) == ("waiting", 0)
 
 
 def test_a_controller_says_what_it_waits_for(arm: SpaceRobot) -> None:
@@ -425,23 +220,6 @@ def test_a_process_that_slept_does_not_count_it_as_silence(arm: SpaceRobot) -> N
 
 
 # -- goals ------------------------------------------------------------------------------------
-
-
-def test_goals_that_come_before_the_robot_wait_for_it(robot: SpaceRobot, arm: SpaceRobot) -> None:
-    for make, kind, settings, model in (
-        (PlannerCommander, PlannerConfig, METHOD, robot),
-        (ControllerCommander, ControllerConfig, {}, arm),
-    ):
-        rig = Rig(make, config(kind, **settings), model.n)
-        rig.commander.activate()
-        assert rig.goal(sec=7) == IdentifiedGoal(GOAL, "7.000000000")
-        rig.state(1)
-        assert rig.host.commands == []
-        rig.use(model)
-        rig.commander.answer()
-        assert rig.host.commands == [1]
-        accepted = [e for e in rig.host.events if e.kind is EventKind.GOAL_ACCEPTED]
-        assert [event.goal_id for event in accepted] == ["7.000000000"]
 
 
 def test_a_goal_is_never_lost_without_a_word(planner: Rig, controller: Rig) -> None:
@@ -539,22 +317,6 @@ def test_a_controller_that_is_to_stop_with_the_decision_does(arm: SpaceRobot) ->
     assert rig.host.commands[-1] < 11
 
 
-def test_an_abort_gives_up_goals_with_and_without_a_robot(robot: SpaceRobot) -> None:
-    rig = Rig(PlannerCommander, config(PlannerConfig, **METHOD), robot.n)
-    rig.commander.activate()
-    assert rig.commander.abort() is None
-    rig.goal(sec=4)
-    answer = rig.commander.abort()
-    assert_one_sentence(answer, "before the robot was known")
-    assert (rig.host.states[-1], rig.host.statuses[-1].goal_id) == ("aborted", "4.000000000")
-    assert rig.host.events[-1].kind is EventKind.GOAL_ABORTED
-    rig.use(robot)
-    rig.goal(sec=5)
-    rig.state(1)
-    assert rig.commander.abort() is not None
-    assert rig.host.statuses[-1].goal_id == "5.000000000"
-
-
 def test_a_goal_of_an_action_that_a_later_one_replaces_is_reported_as_aborted(
     planner: Rig,
 ) -> None:
@@ -586,25 +348,6 @@ def test_goals_on_file_are_resumed_and_deleted_when_they_are_aborted(
 # -- the plant and its robot ------------------------------------------------------------------
 
 
-def test_a_robot_that_is_replaced_takes_its_goals_along(planner: Rig, robot: SpaceRobot) -> None:
-    planner.goal(sec=6)
-    planner.state(1)
-    planner.commander.drop_robot("robot_description describes another robot now.")
-    assert (planner.host.states[-1], planner.host.statuses[-1].goal_id) == (
-        "aborted",
-        "6.000000000",
-    )
-    assert "another robot" in planner.host.statuses[-1].message
-    planner.state(2)
-    assert planner.host.commands == [1]
-    planner.use(robot)
-    planner.commander.answer()
-    planner.goal(sec=8)
-    planner.state(3)
-    assert planner.host.commands == [1, 2, 3]
-    assert planner.host.statuses[-1].goal_id == "8.000000000"
-
-
 def test_a_plant_that_is_reset_shows_another_pose_of_one_time(controller: Rig) -> None:
     controller.state(1)
     running = PlantStatus(PlantState.RUNNING, "A command is in force.")
@@ -627,43 +370,6 @@ CAPTURED = PlantStatus(PlantState.RUNNING, "A command is in force.", payload=HEL
 RELEASED = PlantStatus(PlantState.RUNNING, "A command is in force.")
 
 
-def test_a_controller_commands_the_robot_with_the_body_that_it_holds(
-    controller: Rig, arm: SpaceRobot
-) -> None:
-    commander = controller.commander
-    controller.goal()
-    controller.state(1)
-    before, effort, wrench = commander.executive.controller, commander.effort, commander.wrench
-    assert before.law.robot is arm
-    commander.receive_plant_status(CAPTURED)
-    assert commander.robot.total_mass == pytest.approx(arm.total_mass + 4.0)
-    after = commander.executive.controller
-    assert after.law.robot is commander.robot
-    # The goal goes on, in the arrays that the messages are fed with.
-    assert after.profile is before.profile
-    assert commander.effort is effort
-    assert commander.wrench is wrench
-    controller.state(2)
-    assert controller.host.states[-1] == "tracking"
-    np.testing.assert_array_equal(after.goal.base.position, GOAL.position)
-    assert after.profile is not before.profile
-    assert controller.host.commands == [1, 2]
-    commander.receive_plant_status(CAPTURED)
-    assert commander.executive.controller is after
-    commander.receive_plant_status(RELEASED)
-    assert commander.robot is arm
-
-
-def test_a_controller_without_a_goal_holds_where_it_held(controller: Rig) -> None:
-    controller.state(1)
-    commander = controller.commander
-    held = commander.executive.controller.profile
-    commander.receive_plant_status(CAPTURED)
-    controller.state(2)
-    assert commander.executive.controller.profile is held
-    assert controller.host.states[-1] == "holding"
-
-
 def test_a_planner_plans_again_for_the_robot_with_the_body_that_it_holds(
     planner: Rig, robot: SpaceRobot
 ) -> None:
@@ -672,13 +378,8 @@ def test_a_planner_plans_again_for_the_robot_with_the_body_that_it_holds(
     for tick in range(1, 5):
         planner.state(tick)
     assert planner.host.states[-1] == "executing"
-    setpoint = planner.commander.setpoint
-    assert setpoint.velocity.any()
-    executive = planner.commander.executive
     planner.commander.receive_plant_status(replace(CAPTURED, payload=held.to_text()))
     assert planner.commander.robot.total_mass == pytest.approx(robot.total_mass + 4.0)
-    assert planner.commander.executive is executive
-    assert planner.commander.setpoint is setpoint
     warnings = [line for level, line in planner.host.lines if level == "warning"]
     assert warnings == ["The robot has another mass now: the motion is planned again."]
     plans = planner.commander.statistics.plans
@@ -741,3 +442,32 @@ def test_a_plan_that_a_disturbance_pushes_is_reported_with_a_warning(
     ]
     assert {(each.level, each.goal_id) for each in found} == {(1, rig.host.statuses[-1].goal_id)}
     assert found[0].goal_id
+
+
+# -- obstacles --------------------------------------------------------------------------------
+
+BALL = (
+    '<robot name="w"><link name="w"/><link name="ball"><collision><geometry><sphere radius="0.3"/>'
+    '</geometry></collision></link><joint name="a" type="fixed"><parent link="w"/>'
+    '<child link="ball"/></joint></robot>'
+)
+
+
+def test_obstacles_are_told_of_once_and_refused_ones_leave_those_so_far(robot: SpaceRobot) -> None:
+    rig = Rig(PlannerCommander, config(PlannerConfig, **METHOD), robot.n)
+    rig.commander.receive_obstacles(BALL)
+    rig.use(robot)
+    rig.commander.receive_obstacles(BALL)
+    rig.commander.receive_obstacles(BALL.replace('"fixed"', '"floating"'))
+    rig.commander.receive_obstacles(BALL.replace("ball", "stone"))
+    rig.commander.receive_obstacles("")
+    told = [
+        "1 obstacle(s): ball",
+        "The obstacles so far stay",
+        "1 obstacle(s): stone",
+        "0 obstacle(s)",
+    ]
+    assert len(rig.host.lines) == len(told)
+    for (level, line), words in zip(rig.host.lines, told, strict=True):
+        assert words in line
+        assert (level == "error") is ("stay" in words)

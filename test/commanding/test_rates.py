@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
 import pytest
+from commanding.commanders import GOAL, Rig
 from support.sentences import assert_one_sentence
 
-from spacerobot_ros.commanding.commander import ArrayDecoder, StateArrays
 from spacerobot_ros.commanding.controller import ControllerCommander
 from spacerobot_ros.commanding.planner import PlannerCommander
 from spacerobot_ros.control.config import ControllerConfig
@@ -16,7 +15,6 @@ from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.urdf import load_robot
 from spacerobot_ros.parameters import configured
-from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.execution.goal_file import BASE_GOAL_KEY
 from spacerobot_ros.resources import robot_file
@@ -26,62 +24,27 @@ KINDS = {
     "planner": (PlannerCommander, PlannerConfig, "sliding_masses", "velocity"),
     "controller": (ControllerCommander, ControllerConfig, "planar_manipulator", "effort"),
 }
-GOAL = Goal.checked([0.05, -0.03, 0.02], [0.0, 0.0, 0.0, 1.0])
 
 
-class Host:
-    """Keeps what a commander does."""
-
-    def __init__(self) -> None:
-        self.commands: list[float] = []
-        self.statuses: list[Any] = []
-        self.lines: list[tuple[str, str]] = []
-        self.starts: list[Any] = []
-
-    def send_command(self, stamp_ns: int) -> None:
-        self.commands.append(stamp_ns / 1e9)
-
-    def publish_status(self, status: Any) -> None:
-        self.statuses.append(status)
-
-    def report_event(self, event: Any) -> None:
-        pass
-
-    def publish_start(self, start: Any) -> None:
-        self.starts.append(start)
-
-    def log(self, level: str, message: str) -> None:
-        self.lines.append((level, message))
-
-    def has_publisher(self, topic: str) -> bool:
-        return topic == "odom"
-
-    def waiting_states(self) -> tuple[list[Any], list[Any]]:
-        return [], []
-
-
-class Rig:
-    """A commander, and a robot at rest whose states come at a rate, on a clock by hand."""
+class RateRig(Rig):
+    """A commander, and a robot at rest whose states come at a rate."""
 
     def __init__(self, kind: str, **settings: Any) -> None:
-        make, config, robot, self.actuation = KINDS[kind]
-        self.wall, self.time, self.host = 10.0, 40.0, Host()
+        make, kind_of_config, robot, self.actuation = KINDS[kind]
         model = SpaceRobot(load_robot(robot_file(robot)))
-        self.n = model.n
-        made: Any = make
-        self.commander: Any = made(configured(config, settings), self.host, clock=lambda: self.wall)
-        self.commander.use_robot(model, ArrayDecoder())
+        super().__init__(make, configured(kind_of_config, settings), model.n)
+        self.time = 40.0
+        self.use(model)
         self.commander.activate()
 
     def states(self, count: int, rate: float) -> None:
         for _ in range(count):
             self.time += 1 / rate
             self.wall += 1 / rate
-            stamp, zeros = round(self.time * 1e9), np.zeros(self.n)
-            pose = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
-            state = StateArrays(stamp, zeros, zeros, pose, np.zeros(6))
-            self.commander.receive_odom(stamp, state)
-            self.commander.receive_joints(stamp, state)
+            state = self.message(0)
+            state.stamp_ns = round(self.time * 1e9)
+            self.commander.receive_odom(state.stamp_ns, state)
+            self.commander.receive_joints(state.stamp_ns, state)
             self.commander.take_accepted_jump()
 
     def plant_says(self, **about: Any) -> None:
@@ -96,7 +59,7 @@ class Rig:
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("rate", [2.0, 10.0, 50.0, 200.0])
 def test_states_of_any_rate_are_answered_from_the_third_on(kind: str, rate: float) -> None:
-    rig = Rig(kind)
+    rig = RateRig(kind)
     rig.states(30, rate)
     assert len(rig.host.commands) == 28
     assert rig.commander.config.control_period == pytest.approx(1 / rate, rel=1e-6)
@@ -105,7 +68,7 @@ def test_states_of_any_rate_are_answered_from_the_third_on(kind: str, rate: floa
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_rate_that_differs_from_the_parameter_is_followed_and_said_once(kind: str) -> None:
-    rig = Rig(kind, tick_rate=100.0)
+    rig = RateRig(kind, tick_rate=100.0)
     rig.states(60, 20.0)
     assert len(rig.host.commands) == 60
     assert rig.commander.config.tick_rate == pytest.approx(20.0)
@@ -116,7 +79,7 @@ def test_a_rate_that_differs_from_the_parameter_is_followed_and_said_once(kind: 
 @pytest.mark.parametrize("kind", KINDS)
 def test_states_that_are_skipped_do_not_change_the_rate(kind: str) -> None:
     """As under load, where only the last of several states is answered."""
-    rig = Rig(kind)
+    rig = RateRig(kind)
     rig.states(5, 20.0)
     for skipped in (2, 2, 3, 2, 2, 1, 2, 2, 1, 2):
         rig.states(1, 20.0 / skipped)
@@ -126,7 +89,7 @@ def test_states_that_are_skipped_do_not_change_the_rate(kind: str) -> None:
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_first_state_of_a_plant_in_lockstep_is_answered(kind: str) -> None:
-    rig = Rig(kind)
+    rig = RateRig(kind)
     rig.plant_says(tick_rate_hz=25.0, time_mode="lockstep")
     rig.states(1, 25.0)
     assert len(rig.host.commands) == 1
@@ -138,7 +101,7 @@ def test_the_first_state_of_a_plant_in_lockstep_is_answered(kind: str) -> None:
 def test_plans_have_the_period_of_the_plant(rate: float, other: float) -> None:
     """Also one that is restarted with another rate."""
     method = {"method": "lie_bracket", "lie_bracket.t1": 2.0, "lie_bracket.n1": 1}
-    rig = Rig("planner", **method)
+    rig = RateRig("planner", **method)
     for each in (rate, other):
         rig.plant_says(tick_rate_hz=each, time_mode="lockstep")
         rig.states(3, each)
@@ -151,7 +114,7 @@ def test_plans_have_the_period_of_the_plant(rate: float, other: float) -> None:
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_plant_of_other_commands_is_named_once_and_goals_are_refused(kind: str) -> None:
-    rig = Rig(kind)
+    rig = RateRig(kind)
     rig.plant_says(actuation="auto")
     assert not rig.warnings
     other = "velocity" if rig.actuation == "effort" else "effort"
