@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import replace
-from types import SimpleNamespace
+from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
@@ -13,19 +13,18 @@ import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseStamped
-from nav_msgs.msg import Path
+from nav_msgs.msg import Path as PathMessage
 from rclpy.serialization import deserialize_message
 from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import JointState
 from support.ros_harness import nanoseconds
 from visualization_msgs.msg import Marker, MarkerArray
 
-from spacerobot_ros.errors import PlanningError
+from spacerobot_ros.errors import PlanningError, SpaceRobotError
 from spacerobot_ros.messages.builders import path_message
 from spacerobot_ros.messages.diagnostics import (
     PlantDiagnostics,
     encode_diagnostics,
-    timing_record,
 )
 from spacerobot_ros.messages.layout import encode
 from spacerobot_ros.messages.markers import (
@@ -39,11 +38,10 @@ from spacerobot_ros.model.description import Pose, Shape
 from spacerobot_ros.model.rotations import matrix_from_quaternion
 from spacerobot_ros.model.urdf import parse_world
 from spacerobot_ros.model.world import with_world
-from spacerobot_ros.nodes.common.messages import goal_of, shape_of
-from spacerobot_ros.nodes.plant.publisher import PlantReport
+from spacerobot_ros.nodes.common.messages import goal_of, interface_class, message_class, shape_of
 from spacerobot_ros.planning import BasePath, Goal
 from spacerobot_ros.resources import robot_file
-from spacerobot_ros.simulation.actuators import build_plant
+from spacerobot_ros.simulation.actuators import build_plant, thrusters_in
 from spacerobot_ros.simulation.commands import CommandValidator
 from spacerobot_ros.simulation.config import PlantConfig
 
@@ -161,7 +159,7 @@ def test_the_goal_is_a_ghost_of_the_base_and_the_path_a_line(name: str) -> None:
 
 
 def test_a_path_begins_at_its_start() -> None:
-    message = deserialize_message(path_message(PATH, 7_900_000_000, "map"), Path)
+    message = deserialize_message(path_message(PATH, 7_900_000_000, "map"), PathMessage)
     assert (message.header.frame_id, nanoseconds(message.header.stamp)) == ("map", 7_900_000_000)
     times = [nanoseconds(pose.header.stamp) for pose in message.poses]
     assert times == [7_900_000_000, 8_400_000_000, 10_150_000_000]
@@ -201,38 +199,14 @@ def test_a_goal_shape_is_taken_by_the_names_of_its_joints() -> None:
 # -- the plant --------------------------------------------------------------------------------
 
 
-class FakeNode:
-    """Keeps what is published and logged."""
-
-    def __init__(self) -> None:
-        self.published: list[Any] = []
-        self.logged: list[str] = []
-
-    def send_raw(self, *_: Any) -> Any:
-        return SimpleNamespace(take=self.published.append)
-
-    def get_fully_qualified_name(self) -> str:
-        return "/a/plant"
-
-    def get_logger(self) -> Any:
-        def log(sentence: str, **_: Any) -> None:
-            self.logged.append(sentence)
-
-        return SimpleNamespace(warning=log, error=log, info=log)
-
-
 class Diagnosed:
-    """A plant of sliding masses at rest, and what its diagnostics say."""
+    """A plant at rest, and what its diagnostics say."""
 
-    def __init__(self, **parameters: Any) -> None:
-        self.node = FakeNode()
-        config = PlantConfig(robot="sliding_masses", time_mode="lockstep", **parameters)
-        robot = SpaceRobot.from_file(robot_file("sliding_masses"))
-        self.plant = build_plant(robot, config, None)
-        self.commands = CommandValidator(self.plant, config)
-        node: Any = self.node
-        self.report = PlantReport(node, self.plant, self.commands, None)
-        self.diagnostics = PlantDiagnostics("/a/plant", self.plant, self.commands)
+    def __init__(self, robot: str = "sliding_masses", **parameters: Any) -> None:
+        config = PlantConfig(robot=robot, time_mode="lockstep", **parameters)
+        self.plant = build_plant(SpaceRobot.from_file(robot_file(robot)), config)
+        commands = CommandValidator(self.plant, config)
+        self.diagnostics = PlantDiagnostics("/a/plant", self.plant, commands)
 
     def status(self, part: str) -> tuple[int, str, Mapping[str, str]]:
         """Return level, sentence and values of a part."""
@@ -292,38 +266,26 @@ def test_limits_are_a_warning_once(diagnosed: Diagnosed) -> None:
     assert values[f"{what}_limited.slider_2"] == "3"
     assert values[f"{what}_limited.slider_1"] == "0"
     assert diagnosed.status("actuators")[0] == OK
-    diagnosed.report.limited()
-    assert diagnosed.node.logged == [
-        f"Limits of the URDF held joints back so far: {what} of slider_2."
-    ]
 
 
-def test_what_thrusters_could_not_give_is_a_warning_once(diagnosed: Diagnosed) -> None:
-    thrusters: Any = SimpleNamespace(
-        missing="",
-        unmet_ticks=2,
-        unmet=np.array([3.0, 4.0, 0.0, 0.0, 0.0, -0.5]),
-        propellant=0.0123456789,
-        pulses=np.array([3, 0, 4]),
-        table=SimpleNamespace(names=["a", "b", "c"]),
-    )
-    status = diagnosed.diagnostics.of_thrusters(thrusters)
-    assert (status.level, status.message) == (WARN, "the wanted wrench is beyond them")
-    assert status.values == {
-        "propellant_kg": "0.0123456789",
-        "pulses": "7",
-        "unmet_ticks": "2",
-        "unmet_force_N": "5",
-        "unmet_torque_Nm": "0.5",
-        "pulses.a": "3",
-        "pulses.b": "0",
-        "pulses.c": "4",
-    }
-    again = diagnosed.diagnostics.of_thrusters(thrusters)
-    assert (again.level, again.message) == (OK, "the wanted wrench is given")
-    thrusters.missing = "torque about z"
-    last = diagnosed.diagnostics.of_thrusters(thrusters)
-    assert (last.level, last.message) == (WARN, "they cannot give torque about z")
+def test_what_thrusters_could_not_give_is_a_warning_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SPACEROBOT_COMPILE", "0")
+    diagnosed = Diagnosed("servicer", actuation="effort", thrusters="urdf")
+    thrusters = thrusters_in(diagnosed.plant)
+    assert thrusters is not None
+    none = np.zeros(diagnosed.plant.robot.n)
+    for _ in range(3):
+        diagnosed.plant.step(none, np.array([1e3, 0.0, 0.0, 0.0, 0.0, 1e2]))
+    level, message, values = diagnosed.status("thrusters")
+    assert (level, message) == (WARN, "the wanted wrench is beyond them")
+    assert float(values["propellant_kg"]) == pytest.approx(thrusters.propellant) != 0.0
+    counts = [int(values[f"pulses.{name}"]) for name in thrusters.table.names]
+    assert max(counts) > 1
+    assert int(values["pulses"]) == sum(counts) == thrusters.pulses.sum()
+    assert int(values["unmet_ticks"]) == 3
+    assert float(values["unmet_force_N"]) == pytest.approx(1e3, rel=0.2)
+    assert float(values["unmet_torque_Nm"]) == pytest.approx(1e2, rel=0.2)
+    assert diagnosed.status("thrusters")[:2] == (OK, "the wanted wrench is given")
 
 
 def test_faults_are_listed(diagnosed: Diagnosed) -> None:
@@ -341,36 +303,6 @@ def test_faults_are_listed(diagnosed: Diagnosed) -> None:
         "injected: mass_1 force 1 0 0 in world at 0; mass_2 torque 0 0 1 in world at 0"
     )
     assert list(values) == ["disturbance_1", "disturbance_2"]
-
-
-def test_times_are_in_milliseconds() -> None:
-    timing = SimpleNamespace(
-        tick_rate=99.5,
-        ticks=1000,
-        ticks_late=3,
-        worst_tick=0.0125,
-        commands=999,
-        commands_late=2,
-        worst_command=0.0025,
-        command_age=0.04,
-        worse=True,
-    )
-    real_time: Any = SimpleNamespace(report=lambda: timing)
-    status = timing_record("/a", "robot", real_time)
-    assert (status.name, status.hardware_id) == ("a: timing", "robot")
-    assert (status.level, status.message) == (WARN, "deadlines were missed")
-    assert status.values == {
-        "tick_rate_Hz": "99.5",
-        "ticks": "1000",
-        "ticks_late": "3",
-        "worst_tick_ms": "12.500",
-        "commands": "999",
-        "commands_late": "2",
-        "worst_command_ms": "2.500",
-        "command_age_s": "0.04",
-    }
-    timing.worse = False
-    assert timing_record("/a", "robot", real_time).level == OK
 
 
 URDF = """<robot name="r"><link name="base"><inertial><mass value="1"/>
@@ -451,3 +383,37 @@ def test_obstacles_that_are_gone_are_erased() -> None:
         [("ball", 3, Marker.DELETE), ("post", 2, Marker.DELETE)],
         [("ball", 2, Marker.ADD), ("ball", 3, Marker.DELETE), ("post", 2, Marker.DELETE)],
     ]
+
+
+@pytest.mark.parametrize(
+    "name", ["trap/msg/Sprung", "trap/Sprung", "../trap/msg/Sprung", "trap", "", "a/b/c/d"]
+)
+def test_a_type_name_imports_no_module_that_is_not_of_messages(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Type names stand in bags, which others write."""
+    (tmp_path / "trap" / "msg").mkdir(parents=True)
+    (tmp_path / "trap" / "__init__.py").write_text("raise SystemExit('sprung')")
+    (tmp_path / "trap" / "msg" / "__init__.py").write_text("Sprung = int")
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(SpaceRobotError, match="is not installed here"):
+        message_class(name)
+    assert message_class("nav_msgs/msg/Odometry").__name__ == "Odometry"
+
+
+def test_a_package_without_its_libraries_is_not_installed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its Python modules may be on the paths alone: then its types cannot be sent."""
+
+    class Half:
+        @classmethod
+        def __import_type_support__(cls) -> None:
+            raise RuntimeError("Could not import 'rosidl_typesupport_c' for package 'nav_msgs'")
+
+        _TYPE_SUPPORT = None
+
+    monkeypatch.setattr("nav_msgs.msg.Odometry", Half)
+    assert interface_class("nav_msgs.msg", "Odometry") is None
+    with pytest.raises(SpaceRobotError, match="its type nav_msgs/msg/Odometry is not installed"):
+        message_class("nav_msgs/msg/Odometry")
+    assert interface_class("nav_msgs.msg", "Path") is not None
+    assert interface_class("nav_msgs.msg", "Absent") is None

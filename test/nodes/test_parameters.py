@@ -1,13 +1,15 @@
-"""Parameters as the ros2 command reads and sets them: all at once, and between two lives."""
+"""Parameters of nodes: checked, listed, set in flight, asked for by others."""
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
+import numpy as np
 import pytest
 import yaml
 from nav_msgs.msg import Odometry
@@ -20,17 +22,21 @@ from rcl_interfaces.srv import (
     SetParameters,
     SetParametersAtomically,
 )
+from rclpy.client import Client
 from rclpy.node import Node
 from rclpy.parameter import Parameter, parameter_value_to_python
 from rclpy.parameter_client import AsyncParameterClient
 from sensor_msgs.msg import JointState
+from support.control_loop import Loop, pose
+from support.planner_flight import HERE, NEAR, Flight
 from support.ros_harness import Harness, construction
 
 from spacerobot_ros.nodes import NODE_TYPES
 from spacerobot_ros.nodes.common.node import FlightNode
-from spacerobot_ros.nodes.common.ros_parameters import declare
+from spacerobot_ros.nodes.common.ros_parameters import RemoteParameters, declare
 from spacerobot_ros.nodes.replay import ReplayNode
 from spacerobot_ros.parameters import Parameter as Declaration
+from spacerobot_ros.parameters import declared
 
 KINDS: dict[str, Any] = {**NODE_TYPES, "replay": ReplayNode}
 
@@ -263,3 +269,116 @@ def test_descriptions_have_units_ranges_and_choices(harness: Harness) -> None:
     assert (whole.from_value, whole.to_value) == (1, 9)
     assert mode.additional_constraints == "one of: fast, slow"
     assert not [*mode.integer_range, *mode.floating_point_range, *rate.integer_range]
+
+
+NUMBERS = (0.0, 1e-300, 1e300, -1.0, math.nan, math.inf, -math.inf)
+
+
+def attempts(parameter: Declaration) -> list[Any]:
+    """Return values within, at and beyond the bounds of a parameter, and of other types."""
+    if isinstance(parameter.default, float):
+        return [parameter.minimum, parameter.maximum, *NUMBERS, "x", True]
+    return [0, 1, -1, 2**62, -(2**62), 1.5, "x"]
+
+
+def set_everything(node: FlightNode, fly: Any) -> tuple[int, int]:
+    """Set each live parameter to each value, with a part of the flight after each that is taken.
+
+    Return how many were accepted and refused; all are as before afterwards.
+    """
+    accepted = refused = 0
+    for parameter in (each for each in declared(node.Config) if not each.read_only):
+        before = node.get_parameter(parameter.name)
+        for value in attempts(parameter):
+            (result,) = node.set_parameters([Parameter(parameter.name, value=value)])
+            if result.successful:
+                accepted += 1
+                fly()
+            else:
+                refused += 1
+                assert result.reason
+            assert node.is_active
+            assert node.parameter_values[parameter.name] == pytest.approx(
+                node.get_parameter(parameter.name).value
+            )
+        assert node.set_parameters([before])[0].successful
+    return accepted, refused
+
+
+def test_a_planner_flies_on_whatever_its_parameters_are_set_to(harness: Harness) -> None:
+    flight = Flight(harness)
+    flight.start()
+    flight.send(NEAR)
+    flight.ticks(3)
+    accepted, refused = set_everything(flight.planner, lambda: flight.ticks(2))
+    assert accepted >= 8
+    assert refused >= 16
+    flight.send(HERE)
+    flight.wait("reached")
+
+
+@pytest.mark.filterwarnings("ignore:overflow encountered")  # Gains of 1e300 are accepted.
+def test_a_controller_flies_on_whatever_its_parameters_are_set_to(harness: Harness) -> None:
+    loop = Loop(harness)
+    loop.answer()
+    loop.aim(base=pose([0.1, 0.0, 0.0]))
+    before = loop.answer()
+    accepted, refused = set_everything(loop.node, loop.answer)
+    assert accepted >= 30
+    assert refused >= 50
+    wrench, efforts = loop.answer()
+    assert np.all(np.isfinite(wrench))
+    assert np.all(np.isfinite(efforts))
+    assert np.sign(wrench[0]) == np.sign(before[0][0])
+
+
+# -- parameters of another node ----------------------------------------------------------------
+
+
+class Asking(Node):
+    """A node that counts how often it finds a service before it calls it."""
+
+    looks = 0
+
+    def create_client(self, *arguments: Any, **options: Any) -> Client:
+        client = super().create_client(*arguments, **options)
+        is_ready, self.looks = client.service_is_ready, 0
+
+        def counted() -> bool:
+            self.looks += is_ready()
+            return is_ready()
+
+        def call(request: Any) -> Any:
+            assert self.looks > 3, "the service may not have met the client yet"
+            return type(client).call_async(client, request)
+
+        client.service_is_ready, client.call_async = counted, call
+        return client
+
+
+def test_an_answer_that_is_lost_is_asked_for_again(harness: Harness) -> None:
+    def plant() -> Node:
+        node = Node("plant", context=harness.context)
+        node.declare_parameter("rate", 2.5)
+        return node
+
+    asking_node = harness.add(Asking("asking", context=harness.context))
+    clients = list(asking_node.clients)
+    deaf = plant()  # It takes no request, as nobody runs its callbacks.
+    asking = RemoteParameters(asking_node, "/plant")
+    for _ in range(40):
+        harness.executor.spin_once(timeout_sec=0.01)
+        assert not asking.look()
+    deaf.destroy_node()
+    harness.add(plant())
+    harness.spin_until(lambda: any(asking.look() for _ in range(4)), "an answer")
+    assert asking.values is not None
+    assert asking.values["rate"] == "2.5"
+    assert list(asking_node.clients) == clients
+
+
+def test_a_node_that_never_answers_is_given_up(harness: Harness) -> None:
+    node = harness.add(Node("asking", context=harness.context))
+    asking = RemoteParameters(node, "/nobody")
+    assert any(asking.look() for _ in range(1000))
+    assert asking.values is None

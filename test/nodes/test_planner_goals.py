@@ -1,17 +1,42 @@
-"""Goals of the planner node: met, or refused with the true reason."""
+"""Goals of a planner: flown to, announced, resumed, planned in the background, and refused."""
 
 from __future__ import annotations
 
 import math
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseStamped
-from support.planner_flight import HERE, NEAR, TURNED, Flight, Place, goal_at, stamp_of, values_of
+from scipy.spatial.transform import Rotation
+from sensor_msgs.msg import JointState
+from std_srvs.srv import Trigger
+from support.planner_flight import (
+    HERE,
+    NEAR,
+    TOPICS,
+    TURNED,
+    Flight,
+    Place,
+    goal_at,
+    pose_arrays,
+    stamp_of,
+    values_of,
+)
 from support.plant_rig import SLIDERS, TICK_NS
-from support.ros_harness import Harness
+from support.ros_harness import Harness, nanoseconds
 from support.sentences import assert_one_sentence
+from visualization_msgs.msg import Marker, MarkerArray
+
+from spacerobot_ros.nodes.common.messages import goal_of
+from spacerobot_ros.planning import METHODS, GaitSchedule
+from spacerobot_ros.planning.execution.goal_file import BASE_GOAL_KEY, GoalFile, IdentifiedGoal
+from spacerobot_ros.planning.methods.lie_bracket import LieBracketGait
 
 pytestmark = pytest.mark.usefixtures("one_plant")
 
@@ -123,3 +148,262 @@ def test_a_refused_goal_does_not_disturb_the_one_that_is_flown(harness: Harness,
     assert flight.states == ["idle", "executing", "refused", "reached"]
     assert max(flight.error_to(NEAR)) <= 1e-3
     assert len(flight.probe.messages["gait_schedule"]) == 1
+
+
+@pytest.fixture
+def flown(harness: Harness) -> Flight:
+    """Return a flight with a slide and a turn, from a pose and a shape that are not zero."""
+    flight = Flight(
+        harness,
+        {"position_tolerance": 2e-3, "attitude_tolerance": 2e-3},
+        {
+            "initial_position": [1.0, -0.5, 0.25],
+            "initial_orientation": Rotation.from_rotvec([0.4, -0.3, 0.2]).as_quat().tolist(),
+            "initial_joint_positions": [0.2, -0.1, 0.15],
+        },
+    )
+    status = flight.decide(([1.01, -0.52, 0.26], [0.41, -0.31, 0.215]))
+    assert values_of(status)["state"] == "reached", status.message
+    return flight
+
+
+def test_the_schedule_is_what_is_flown(flown: Flight) -> None:
+    (schedule,) = flown.probe.messages["gait_schedule"]
+    assert list(schedule.joint_names) == SLIDERS
+    assert schedule.header.frame_id == "base_link"
+    measured = {stamp_of(m): m for m in flown.probe.messages["joint_states"]}
+    start = stamp_of(schedule)
+    assert len(schedule.points) > 100
+    for k, point in enumerate(schedule.points):
+        assert nanoseconds(point.time_from_start) == k * TICK_NS
+        state = measured[start + k * TICK_NS]
+        np.testing.assert_allclose(point.positions, state.position, rtol=0, atol=1e-9)
+        if k:
+            held = schedule.points[k - 1].velocities
+            np.testing.assert_allclose(held, state.velocity, rtol=0, atol=1e-9)
+    assert list(schedule.points[-1].velocities) == [0.0] * 3
+
+
+def test_the_path_is_what_is_flown(flown: Flight) -> None:
+    (path,) = flown.probe.messages["planned_path"]
+    measured = {stamp_of(m): m.pose.pose for m in flown.probe.messages["odom"]}
+    assert path.header.frame_id == "world"
+    assert len(path.poses) > 20
+    for knot in path.poses:
+        assert knot.header.frame_id == "world"
+        planned, flown_there = pose_arrays(knot.pose), pose_arrays(measured[stamp_of(knot)])
+        np.testing.assert_allclose(planned[0], flown_there[0], rtol=0, atol=1e-9)
+        assert (planned[1].inv() * flown_there[1]).magnitude() <= 1e-9
+
+
+def test_schedule_and_path_fit_each_other(flown: Flight) -> None:
+    (schedule,), (path,) = (flown.probe.messages[t] for t in ("gait_schedule", "planned_path"))
+    assert path.header.stamp == schedule.header.stamp
+    assert stamp_of(path.poses[0]) == stamp_of(schedule)
+    times = [stamp_of(knot) - stamp_of(schedule) for knot in path.poses]
+    assert times == sorted(set(times))
+    assert times[-1] == nanoseconds(schedule.points[-1].time_from_start)
+    status = next(
+        values_of(s)
+        for s in flown.probe.messages["planner/status"]
+        if values_of(s)["state"] == "executing"
+    )
+    assert float(status["duration_s"]) == pytest.approx(times[-1] / 1e9)
+    assert status["method"] == "lie_bracket"
+    # Three 2 kg masses on the axes of a 10 kg base: the centre of mass is at q / 8, and it rests.
+    centres = []
+    for at, knot in zip(times, path.poses, strict=True):
+        position, attitude = pose_arrays(knot.pose)
+        shape = np.array(schedule.points[at // TICK_NS].positions)
+        centres.append(position + attitude.apply(shape / 8))
+    np.testing.assert_allclose(centres, np.tile(centres[0], (len(centres), 1)), atol=1e-12)
+
+
+def test_schedule_path_and_status_are_there_for_a_late_reader(flown: Flight) -> None:
+    latched = ("gait_schedule", "planned_path", "planner/status")
+    late = flown.harness.probe({t: TOPICS[t] for t in latched}, latched=latched, name="late")
+    flown.harness.spin_until(lambda: all(late.count(t) for t in latched), "the latched topics")
+    for topic in latched:
+        assert late.count(topic) == 1
+        assert late.last(topic) == flown.probe.last(topic)
+
+
+def test_markers_show_the_goal_and_the_path(harness: Harness) -> None:
+    flight = Flight(harness)
+    flight.probe.watch("markers", MarkerArray)
+    harness.connect()
+    flight.decide(NEAR)
+    (array,) = flight.probe.messages["markers"]
+    ghosts = [m for m in array.markers if m.ns == "goal"]
+    assert ghosts
+    for ghost in ghosts:
+        position, attitude = pose_arrays(ghost.pose)
+        np.testing.assert_allclose(position, NEAR[0])
+        assert attitude.magnitude() == 0.0
+    (line,) = (m for m in array.markers if m.type == Marker.LINE_STRIP)
+    path = flight.probe.last("planned_path")
+    assert [(p.x, p.y, p.z) for p in line.points] == [
+        (k.pose.position.x, k.pose.position.y, k.pose.position.z) for k in path.poses
+    ]
+
+
+REAL_TIME = {"time_mode": "realtime"}
+THOROUGH = {"optimal.cache": 0, "optimal.answers": 9999, "optimal.starts": 9999}
+FAR = ([50.0, 0.0, 0.0], [0.0, 0.0, 0.0])
+
+
+class Gate:
+    """Holds every plan back until it is opened."""
+
+    def __init__(self) -> None:
+        self.open = threading.Event()
+        self.waiting = threading.Event()
+
+    def held(self, plan: Callable[..., GaitSchedule]) -> Callable[..., GaitSchedule]:
+        def wait(*args: Any, **options: Any) -> GaitSchedule:
+            self.waiting.set()
+            assert self.open.wait(30.0)
+            return plan(*args, **options)
+
+        return wait
+
+
+@pytest.fixture
+def gate(monkeypatch: pytest.MonkeyPatch) -> Iterator[Gate]:
+    gate = Gate()
+    assert METHODS["lie_bracket"] is LieBracketGait
+    monkeypatch.setattr(LieBracketGait, "plan", gate.held(LieBracketGait.plan))
+    yield gate
+    gate.open.set()
+
+
+@pytest.fixture
+def flight(harness: Harness) -> Flight:
+    return Flight(harness, {"abort_time": 0.5}, REAL_TIME)
+
+
+def speeds(flight: Flight, since: int = 0) -> list[float]:
+    """The largest commanded velocities, by state."""
+    return [max(map(abs, m.velocity)) for m in flight.probe.messages["joint_commands"][since:]]
+
+
+def test_states_are_answered_at_rest_until_the_plan_is_there(flight: Flight, gate: Gate) -> None:
+    flight.send(NEAR)
+    flight.start()
+    flight.harness.spin_until(gate.waiting.is_set, "the planner plans")
+    flight.ticks(40)
+    assert flight.states[-1] != "executing"
+    assert not any(speeds(flight))
+    gate.open.set()
+    flight.wait("executing")
+    flight.wait("reached")
+    assert flight.error_to(NEAR)[0] < 1e-3
+    assert any(speeds(flight))
+    # One command for a state, with its stamp; where states pile up, for the last of them.
+    flight.plant.trigger_deactivate()
+    flight.harness.settle(flight.probe)
+    stamps = [m.header.stamp for m in flight.probe.messages["joint_commands"]]
+    states = [nanoseconds(m.header.stamp) for m in flight.probe.messages["joint_states"]]
+    answered = [nanoseconds(stamp) for stamp in stamps]
+    assert answered == sorted(set(answered))
+    assert set(answered) <= set(states)
+    assert len(answered) > 0.5 * len(states)
+    assert flight.probe.count("gait_schedule") >= 1
+
+
+def test_an_abort_drops_what_is_being_planned(flight: Flight, gate: Gate) -> None:
+    client = flight.probe.create_client(Trigger, "/planner/abort")
+    flight.send(NEAR)
+    flight.start()
+    flight.harness.spin_until(gate.waiting.is_set, "the planner plans")
+    answer = flight.harness.call(client, Trigger.Request())
+    assert answer.success
+    gate.open.set()
+    flight.ticks(40)
+    assert flight.states[-1] == "aborted"
+    assert not any(speeds(flight))
+    # Another goal is taken up as ever.
+    flight.decide(NEAR)
+    assert flight.states[-1] == "reached"
+
+
+def test_a_node_that_ends_has_its_search_given_up(harness: Harness) -> None:
+    flight = Flight(
+        harness,
+        {"robot": "seven_joint_arm", "method": "optimal", **THOROUGH},
+        {"robot": "seven_joint_arm", **REAL_TIME},
+    )
+    flight.send(([0.0, 0.0, 0.0], [0.5, -0.3, 0.2]))
+    flight.start()
+    before = threading.active_count()
+    flight.harness.spin_until(lambda: threading.active_count() > before, "the search")
+    flight.ticks(10)
+    assert flight.states[-1] != "executing", "it searches still"
+    began = time.monotonic()
+    flight.planner.trigger_deactivate()
+    assert time.monotonic() - began < 1.6
+    flight.harness.spin_until(lambda: threading.active_count() <= before, "the thread is gone")
+
+
+def interrupted(harness: Harness, path: Path) -> Flight:
+    """Start a planner whose predecessor was flying to a goal; time stands still."""
+    goal = goal_of(goal_at(TURNED), "world")
+    GoalFile(str(path)).save({BASE_GOAL_KEY: IdentifiedGoal(goal, "7.000000000")})
+    flight = Flight(harness, {"robot": "", "resume_file": str(path)})
+    status = flight.wait("waiting")
+    assert values_of(status)["goal_id"] == "7.000000000"
+    assert path.exists()
+    return flight
+
+
+def abort(flight: Flight) -> Trigger.Response:
+    client = flight.probe.create_client(Trigger, "planner/abort")
+    return flight.harness.call(client, Trigger.Request())
+
+
+def test_a_goal_is_flown_to_once_the_robot_is_known(harness: Harness, tmp_path: Path) -> None:
+    path = tmp_path / "goal.json"
+    flight = interrupted(harness, path)
+    flight.start()
+    assert values_of(flight.wait("reached"))["goal_id"] == "7.000000000"
+    assert max(flight.error_to(TURNED)) <= 1e-3
+    assert not path.exists()
+
+
+def test_a_goal_that_is_aborted_before_is_not_flown_to(harness: Harness, tmp_path: Path) -> None:
+    path = tmp_path / "goal.json"
+    flight = interrupted(harness, path)
+    answer = abort(flight)
+    assert answer.success
+    # Who follows the goal learns of its end.
+    status = flight.wait("aborted")
+    assert values_of(status)["goal_id"] == "7.000000000"
+    assert answer.message == status.message
+    assert not path.exists()
+    flight.start()
+    flight.ticks(20)
+    assert "executing" not in flight.states
+    assert list(flight.probe.last("joint_states").velocity) == [0.0] * 3
+    assert not abort(flight).success, "nothing is pursued"
+    # A new goal is.
+    assert values_of(flight.decide(NEAR))["state"] == "reached"
+    assert max(flight.error_to(NEAR)) <= 1e-3
+
+
+def test_a_goal_has_the_shape_that_was_wanted_before_it(harness: Harness, tmp_path: Path) -> None:
+    path = tmp_path / "goal.json"
+    flight = Flight(harness, {"resume_file": str(path)})
+    shapes = flight.probe.create_publisher(JointState, "goal_joint_states", 10)
+    harness.connect()
+    names = ["slider_3", "slider_1", "slider_2"]
+    shapes.publish(JointState(name=names, position=[0.3, 0.1, 0.2]))
+    harness.spin_until(lambda: flight.planner._shape is not None, "the shape is received")
+    flight.send(NEAR)
+    flight.start()
+    harness.spin_until(path.exists, "the goal is pursued")
+    goal = GoalFile(str(path)).load()[BASE_GOAL_KEY].goal
+    assert goal.joint_positions is not None
+    assert goal.joint_positions.tolist() == [0.1, 0.2, 0.3]
+    # A message without joints lets later goals end in any.
+    shapes.publish(JointState())
+    harness.spin_until(lambda: flight.planner._shape is None, "the shape is free")

@@ -1,20 +1,39 @@
-"""Managed life and parameters of the planner node."""
+"""Managed life and parameters of the planner node, before and in flight."""
 
 from __future__ import annotations
 
 import math
+from pathlib import Path
 from typing import Any
 
 import pytest
 import rclpy
+from diagnostic_msgs.msg import DiagnosticStatus
+from geometry_msgs.msg import PoseStamped
+from rcl_interfaces.msg import Log
+from rcl_interfaces.srv import SetParameters
 from rclpy.lifecycle import TransitionCallbackReturn
-from support.planner_flight import HERE, NEAR, PLANNER, TURNED, Flight, values_of
+from rclpy.parameter import Parameter
+from std_srvs.srv import Trigger
+from support.planner_flight import (
+    HERE,
+    NEAR,
+    PLANNER,
+    TURNED,
+    Flight,
+    Place,
+    goal_at,
+    stamp_of,
+    values_of,
+)
+from support.plant_rig import TICK_NS
 from support.ros_harness import Harness, construction
 from support.sentences import assert_one_sentence
 
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.nodes import PlannerNode
 from spacerobot_ros.nodes.common.fly_to import action_class
+from spacerobot_ros.planning.execution.status import PlannerStatistics
 
 pytestmark = pytest.mark.usefixtures("one_plant")
 
@@ -118,3 +137,212 @@ def test_without_the_package_of_the_action_the_planner_says_so(harness: Harness)
         pytest.skip("control_msgs is installed")
     with pytest.raises(SpaceRobotError, match="needs the package control_msgs: install it"):
         harness.make(PlannerNode, {"robot": "sliding_masses", "output": "trajectory"})
+
+
+# -- services ---------------------------------------------------------------------------------
+
+
+def test_abortion_brings_the_joints_to_rest(harness: Harness) -> None:
+    flight = Flight(harness)
+    flight.send(NEAR)
+    flight.start()
+    flight.wait("executing")
+    flight.ticks(15)
+    assert any(flight.probe.last("joint_states").velocity)
+    client = flight.probe.create_client(Trigger, "planner/abort")
+    answer = harness.call(client, Trigger.Request())
+    assert answer.success
+    assert_one_sentence(answer.message, "brake along the planned path")
+    status = flight.wait("aborted")
+    assert status.level == DiagnosticStatus.WARN
+    assert_one_sentence(status.message, answer.message)
+    flight.ticks(10**9 // TICK_NS + 3)  # abort_time, and commands that were on their way.
+    place = list(flight.probe.last("joint_states").position)
+    flight.ticks(60)
+    assert list(flight.probe.last("joint_states").position) == place
+    assert list(flight.probe.last("joint_states").velocity) == [0.0] * 3
+    assert flight.states == ["idle", "executing", "aborted"]
+    answer = harness.call(client, Trigger.Request())
+    assert not answer.success
+    assert answer.message
+    flight.decide(NEAR)
+    assert flight.states[-1] == "reached"
+    assert max(flight.error_to(NEAR)) <= 1e-3
+
+
+def test_statistics_are_those_of_the_flight(harness: Harness) -> None:
+    flight = Flight(harness)
+    client = flight.probe.create_client(Trigger, "planner/statistics")
+    flight.decide(NEAR)
+    flight.plant.trigger_deactivate()
+    harness.settle(flight.probe)
+    answer = harness.call(client, Trigger.Request())
+    assert answer.success
+    statistics = PlannerStatistics.from_json(answer.message)
+    assert statistics == flight.planner.statistics
+    assert statistics.commands_published == flight.probe.count("joint_commands")
+    assert statistics.plans == 1
+    assert 0.0 < statistics.plan_time_s < 15.0
+
+
+def test_a_reset_of_the_plant_does_not_keep_the_goal_from_being_met(harness: Harness) -> None:
+    flight = Flight(harness)
+    flight.send(NEAR)
+    flight.start()
+    flight.wait("executing")
+    flight.ticks(15)
+    flight.probe.watch("/rosout", Log)
+    harness.connect()
+    harness.call(flight.probe.create_client(Trigger, "plant/reset"), Trigger.Request())
+    flight.wait("reached", "failed")
+    assert flight.states[-1] == "reached"
+    assert max(flight.error_to(NEAR)) <= 1e-3
+    # The state of the same time that the plant then shows is no other plant's.
+    assert not [log.msg for log in flight.probe.messages["/rosout"] if "more than one" in log.msg]
+
+
+# -- corrections ------------------------------------------------------------------------------
+
+
+def test_a_tolerance_that_is_tightened_in_flight_makes_corrections_happen(harness: Harness) -> None:
+    # Wide tolerances and one large cycle: a first order that is some way off.
+    flight = Flight(
+        harness,
+        {
+            "position_tolerance": 0.1,
+            "attitude_tolerance": 0.1,
+            "lie_bracket.loop_area": 10.0,
+            "max_corrections": 5,
+        },
+    )
+    flight.send(TURNED)
+    flight.start()
+    flight.wait("executing")
+    request = SetParameters.Request(
+        parameters=[
+            Parameter(f"{what}_tolerance", value=1e-6).to_parameter_msg()
+            for what in ("position", "attitude")
+        ]
+    )
+    client = flight.probe.create_client(SetParameters, "planner/set_parameters")
+    assert [r.successful for r in harness.call(client, request).results] == [True, True]
+    status = flight.wait("reached", "failed")
+    assert values_of(status)["state"] == "reached", status.message
+    assert max(flight.error_to(TURNED)) <= 1e-6
+    corrections = int(values_of(status)["corrections"])
+    assert corrections >= 1
+    assert flight.states == ["idle", "executing", *["executing"] * corrections, "reached"]
+    assert len(flight.probe.messages["gait_schedule"]) == 1 + corrections
+
+
+def test_a_bad_change_in_flight_is_refused(harness: Harness) -> None:
+    flight = Flight(harness)
+    flight.send(NEAR)
+    flight.start()
+    flight.wait("executing")
+    cases: list[tuple[str, Any, str]] = [
+        ("position_tolerance", -1.0, "position_tolerance"),
+        ("max_corrections", -1, "max_corrections"),
+        ("attitude_tolerance", "small", "'attitude_tolerance' is 'small'; it must be a number"),
+        ("max_corrections", 2.5, "'max_corrections' is 2.5; it must be a whole number"),
+        ("tick_rate", 50.0, "tick_rate"),
+    ]
+    for name, value, mention in cases:
+        before = flight.planner.get_parameter(name).value
+        (result,) = flight.planner.set_parameters([Parameter(name, value=value)])
+        assert not result.successful
+        assert mention in result.reason
+        assert flight.planner.get_parameter(name).value == before
+    flight.wait("reached")
+    assert max(flight.error_to(NEAR)) <= 1e-3
+
+
+# -- ids --------------------------------------------------------------------------------------
+
+
+def stamped(place: Place, sec: int, nanosec: int) -> PoseStamped:
+    goal = goal_at(place)
+    goal.header.stamp.sec, goal.header.stamp.nanosec = sec, nanosec
+    return goal
+
+
+def ids_of(flight: Flight) -> list[tuple[str, str]]:
+    """States with the ids of the goals that they speak of."""
+    values = [values_of(status) for status in flight.probe.messages["planner/status"]]
+    found = [(value["state"], value.get("goal_id", "")) for value in values]
+    return [each for each in found if each[0] not in ("idle", "planning", "waiting")]
+
+
+def test_statuses_name_the_goal_by_its_stamp(harness: Harness) -> None:
+    flight = Flight(harness)
+    flight.decide(stamped(NEAR, 3, 5))
+    flight.decide(NEAR)
+    refused = stamped(NEAR, 4, 123456789)
+    refused.header.frame_id = "moon"
+    flight.decide(refused)
+    assert ids_of(flight) == [
+        ("executing", "3.000000005"),
+        ("reached", "3.000000005"),
+        ("executing", "unstamped-1"),
+        ("reached", "unstamped-1"),
+        ("refused", "4.123456789"),
+    ]
+
+
+@pytest.mark.slow
+def test_a_planner_that_starts_again_resumes_its_goal_by_its_id(
+    harness: Harness, tmp_path: Path
+) -> None:
+    flight = Flight(harness, {"resume_file": str(tmp_path / "goal.json")})
+    flight.send(stamped(TURNED, 7, 0))
+    flight.start()
+    flight.wait("executing")
+    flight.ticks(15)
+    for step in ("deactivate", "cleanup", "configure"):
+        assert getattr(flight.planner, f"trigger_{step}")() is TransitionCallbackReturn.SUCCESS
+    harness.connect()
+    flight.planner.trigger_activate()
+    flight.wait("reached")
+    assert max(flight.error_to(TURNED)) <= 1e-3
+    assert ids_of(flight)[2:] == [
+        ("planning", "7.000000000"),
+        ("executing", "7.000000000"),
+        ("reached", "7.000000000"),
+    ]
+    assert not (tmp_path / "goal.json").exists()
+
+
+# -- without a stop ---------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_a_goal_that_is_changed_in_flight_causes_no_stop(harness: Harness) -> None:
+    chain: dict[str, Any] = {"robot": "planar_chain"}
+    optimal = {"method": "optimal", "optimal.cache": 0, "optimal.answers": 1, "takeover_time": 0.3}
+    plant = {**chain, "initial_joint_positions": [0.3, -0.2]}
+    flight = Flight(harness, {**chain, **optimal}, plant)
+    flight.send(([0.0, 0.0, 0.0], [0.0, 0.0, 1.2]))
+    flight.start()
+    flight.wait("executing")
+    flight.ticks(6)
+    first = flight.probe.last("gait_schedule")
+    flight.send(([0.0, 0.0, 0.0], [0.0, 0.0, 1.4]))
+    schedules = flight.probe.messages["gait_schedule"]
+    harness.spin_until(lambda: len(schedules) == 2, "the plan takes over")
+    second = flight.probe.last("gait_schedule")
+    begins = stamp_of(second)
+    # The first shape of the second is on the first, at the tick that its stamp says.
+    tick = (begins - stamp_of(first)) // TICK_NS
+    assert list(second.points[0].positions) == pytest.approx(
+        list(first.points[tick].positions), abs=1e-9
+    )
+    flight.wait("reached", "failed")
+    assert flight.states == ["idle", "executing", "executing", "reached"]
+    assert flight.error_to(([0.0, 0.0, 0.0], [0.0, 0.0, 1.4]))[1] < 1e-3
+    near = [
+        max(map(abs, message.velocity))
+        for message in flight.probe.messages["joint_commands"]
+        if abs(stamp_of(message) - begins) <= 4 * TICK_NS
+    ]
+    assert len(near) == 9
+    assert min(near) > 0.1, "it never stops"

@@ -1,10 +1,12 @@
-"""The recorder's files: split, with what was lost, and after a kill at any moment."""
+"""Files of the recorder: split, with losses, after kills; and what it refuses to write."""
 
 from __future__ import annotations
 
 import itertools
+import json
 import os
 import random
+import signal
 import subprocess
 import sys
 import time
@@ -15,13 +17,24 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState
 from mcap.reader import make_reader
+from rclpy.lifecycle import TransitionCallbackReturn
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import JointState
 from std_msgs.msg import String
-from support.ros_harness import Harness
+from support.made_bags import joint_states
+from support.recorded_stack import LATCHED_TOPICS, STREAMS, BagContent, Stack, message_class
+from support.ros_harness import LATCHED, Harness, Probe, construction
+from support.sentences import assert_one_sentence
 
-from spacerobot_ros.bag import RecordingError, read_bag
+from spacerobot_ros.bag import BagWriter, RecordingError, read_bag
 from spacerobot_ros.bag.salvage import salvage_bag
+from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.nodes import RecorderNode
 from spacerobot_ros.nodes.recorder import loss_events
 
@@ -147,3 +160,252 @@ def test_a_kill_at_any_moment_leaves_all_but_the_last_second(
         found = [int(message.data[8:14]) for message in messages]
         assert found == list(range(found[0], found[0] + len(found)))
         probe.destroy_timer(timer)
+
+
+ERROR = 40  # of rcl_interfaces/msg/Log
+
+
+def errors(probe: Probe) -> list[str]:
+    return [m.msg for m in probe.messages["/rosout"] if m.level >= ERROR]
+
+
+def test_a_full_disk_ends_the_recording_with_one_sentence_and_not_the_flight(
+    harness: Harness, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole, room = BagWriter.write, 100
+
+    def write(self: BagWriter, *message: Any) -> None:
+        nonlocal room
+        room -= 1
+        if room < 0:
+            raise RecordingError(f"The bag {self.path} cannot be written: no space left.")
+        whole(self, *message)
+
+    monkeypatch.setattr(BagWriter, "write", write)
+    stack = Stack(harness, tmp_path / "flight.mcap")
+    stack.configure(*STREAMS, *LATCHED_TOPICS)
+    stack.recorder.trigger_activate()
+    for x in (0.05, 0.0, 0.05):
+        stack.fly(x)
+    stack.stop()
+    harness.spin_until(lambda: errors(stack.probe), "the failure of the next flush")
+    (sentence,) = errors(stack.probe)
+    assert_one_sentence(sentence, "Recording has ended", str(stack.bag), "no space left")
+    assert str(stack.recorder.failure) in sentence
+    assert stack.recorder.messages_recorded == 100
+    assert stack.recorder.trigger_shutdown() is TransitionCallbackReturn.SUCCESS
+    assert BagContent(stack.bag).count == 100
+
+
+def test_a_device_is_refused_in_a_sentence(harness: Harness) -> None:
+    stack = Stack(harness, Path("/dev/full"))
+    assert stack.recorder.trigger_configure() is not TransitionCallbackReturn.SUCCESS
+    assert_one_sentence(str(stack.recorder.fault), "/dev/full", "it is a device")
+    stack.probe.watch("/planner/status", message_class("diagnostic_msgs/msg/DiagnosticStatus"))
+    harness.connect()
+    stack.fly()
+
+
+def test_a_bag_that_cannot_be_made_is_refused_in_a_sentence(
+    ros_context: rclpy.Context, tmp_path: Path
+) -> None:
+    (tmp_path / "file").touch()
+    for bag in (tmp_path, tmp_path / "file" / "flight.mcap"):
+        with pytest.raises(SpaceRobotError) as refusal:
+            RecorderNode(**construction(ros_context, {"bag": str(bag)}))
+        assert_one_sentence(str(refusal.value), str(bag))
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("compression", "zip"), ("flush_period", 0.0), ("flush_period", "often"), ("topics", 3)],
+)
+def test_a_bad_parameter_is_refused_with_a_sentence_that_names_it(
+    ros_context: rclpy.Context, tmp_path: Path, name: str, value: Any
+) -> None:
+    parameters = {"bag": str(tmp_path / "flight.mcap"), name: value}
+    with pytest.raises(SpaceRobotError) as refusal:
+        RecorderNode(**construction(ros_context, parameters))
+    assert_one_sentence(str(refusal.value), f"'{name}'", str(value))
+    assert not (tmp_path / "flight.mcap").exists()
+
+
+def test_a_recorder_that_is_to_refuse_a_bag_that_is_there_does(
+    ros_context: rclpy.Context, tmp_path: Path
+) -> None:
+    bag = tmp_path / "flight.mcap"
+    bag.write_bytes(b"the record of the crash")
+    parameters = {"bag": str(bag), "when_exists": "refuse"}
+    with pytest.raises(SpaceRobotError) as refusal:
+        RecorderNode(**construction(ros_context, parameters))
+    assert_one_sentence(str(refusal.value), str(bag), "File exists")
+    assert bag.read_bytes() == b"the record of the crash"
+
+
+def test_a_bag_that_goes_is_reported_within_a_second(
+    harness: Harness, ros_domain: int, tmp_path: Path
+) -> None:
+    kinds = {"/diagnostics": DiagnosticArray, "/events": DiagnosticStatus}
+    probe = harness.probe(kinds)
+    bag = tmp_path / "folder" / "flight.mcap"
+    with subprocess.Popen(
+        [
+            *(sys.executable, "-m", "spacerobot_ros.nodes.recorder", "--ros-args"),
+            *("-p", f"bag:={bag}", "-p", "flush_period:=60.0"),
+        ],
+        cwd=Path(__file__).parents[2],
+        env={**os.environ, "ROS_DOMAIN_ID": str(ros_domain)},
+        stderr=subprocess.PIPE,
+        text=True,
+    ) as process:
+        try:
+            change = probe.create_client(ChangeState, "recorder/change_state")
+            while not probe.messages["/events"]:  # Until these have met: paused, and on again.
+                for transition in (
+                    Transition.TRANSITION_DEACTIVATE,
+                    Transition.TRANSITION_ACTIVATE,
+                ):
+                    request = ChangeState.Request(transition=Transition(id=transition))
+                    assert harness.call(change, request).success
+            bag.unlink()
+            bag.parent.rmdir()
+            gone = time.monotonic()
+            harness.spin_until(lambda: probe.messages["/diagnostics"], "it is reported")
+            seconds = time.monotonic() - gone
+            harness.spin_until(
+                lambda: any(
+                    "recording_failed" in [pair.value for pair in event.values]
+                    for event in probe.messages["/events"]
+                ),
+                "the event",
+            )
+        finally:
+            process.send_signal(signal.SIGINT)
+            errors = process.communicate(timeout=20)[1]
+    (status,) = probe.last("/diagnostics").status
+    assert status.level == DiagnosticStatus.ERROR
+    assert "is lost while it is written: it was removed or moved" in status.message
+    assert seconds < 1.0
+    assert process.returncode == 1
+    assert "is lost while it is written" in errors.splitlines()[-1]
+    assert "Traceback" not in errors
+
+
+RELIABLE, BEST_EFFORT = ReliabilityPolicy.RELIABLE, ReliabilityPolicy.BEST_EFFORT
+KEPT, VOLATILE = DurabilityPolicy.TRANSIENT_LOCAL, DurabilityPolicy.VOLATILE
+S = 10**9
+
+
+class Recorded:
+    """A recorder of chosen topics, and a probe that publishes on them."""
+
+    def __init__(self, harness: Harness, bag: Path, **parameters: Any) -> None:
+        self.harness, self.bag, self.sent = harness, bag, 0
+        self.probe = harness.probe({})
+        self.parameters = {"bag": str(bag), "watchdog_timeout": 0.0, "tf_period": 0.0, **parameters}
+
+    def start(self, *topics: str) -> None:
+        self.recorder = self.harness.make(
+            RecorderNode, {**self.parameters, "topics": " ".join(topics)}
+        )
+        self.harness.spin_until(lambda: self.recorder.topics == set(topics), "subscriptions")
+        self.harness.connect()
+
+    def publish(self, publisher: Any, message: Any) -> None:
+        """Publish a message, and wait until it is recorded."""
+        recording = self.recorder.recording
+        assert recording is not None
+        publisher.publish(message)
+        self.sent += 1
+        self.harness.spin_until(
+            lambda: recording.messages + recording.messages_waiting >= self.sent, "it is recorded"
+        )
+
+    def close(self) -> dict[str, list[tuple[float, float]]]:
+        """Close the bag; return log and publish times in s by topic."""
+        self.recorder.trigger_shutdown()
+        found: dict[str, list[tuple[float, float]]] = {}
+        with self.bag.open("rb") as file:
+            for _, channel, record in make_reader(file).iter_messages(log_time_order=False):
+                times = record.log_time / S, record.publish_time / S
+                found.setdefault(channel.topic, []).append(times)
+        return found
+
+
+def test_every_publisher_of_a_topic_is_heard_as_it_offers(harness: Harness, tmp_path: Path) -> None:
+    """A reader that asks for more than a publisher offers hears nothing of that one."""
+    recorded = Recorded(harness, tmp_path / "a.mcap", clock_wait=0.0)
+    offers = {
+        "/reliability": [(RELIABLE, VOLATILE), (BEST_EFFORT, VOLATILE)],
+        "/durability": [(RELIABLE, KEPT), (RELIABLE, VOLATILE)],
+        "/kept": [(BEST_EFFORT, KEPT)],
+    }
+    publishers = [
+        recorded.probe.create_publisher(
+            String, topic, QoSProfile(depth=7, reliability=reliability, durability=durability)
+        )
+        for topic, offered in offers.items()
+        for reliability, durability in offered
+    ]
+    recorded.start(*offers)
+    for publisher in publishers:
+        recorded.publish(publisher, String(data="heard"))
+    assert {topic: len(times) for topic, times in recorded.close().items()} == {
+        topic: len(offered) for topic, offered in offers.items()
+    }
+    (qos,) = read_bag(recorded.bag).qos("/kept")
+    assert (qos.reliability, qos.durability) == ("best_effort", "transient_local")
+
+
+def test_messages_carry_the_clock_and_their_stamps(harness: Harness, tmp_path: Path) -> None:
+    recorded = Recorded(harness, tmp_path / "a.mcap")
+    create = recorded.probe.create_publisher
+    clock, joints = create(Clock, "/clock", 10), create(JointState, "/joint_states", 10)
+    talk, urdf = create(String, "/talk", 10), create(String, "/a/robot_description", LATCHED)
+    recorded.start("/clock", "/joint_states", "/talk", "/a/robot_description")
+    for second in (1, 2, 2):
+        message = Clock()
+        message.clock.sec = second
+        recorded.publish(clock, message)
+        recorded.publish(joints, joint_states(second - 0.5, ["a"], [1.0], [2.0]))
+        recorded.publish(talk, String(data=f"at {second}"))
+        recorded.publish(urdf, String(data=f"<robot name='{second}'/>"))
+    assert recorded.close() == {
+        "/clock": [(1.0, 1.0), (2.0, 2.0), (2.0, 2.0)],
+        "/joint_states": [(1.0, 0.5), (2.0, 1.5), (2.0, 1.5)],
+        "/talk": [(1.0, 1.0), (2.0, 2.0), (2.0, 2.0)],
+        "/a/robot_description": [(1.0, 1.0), (2.0, 2.0), (2.0, 2.0)],
+    }
+    # The first one only; the others are messages like all.
+    with recorded.bag.open("rb") as file:
+        attachments = [(a.name, a.data) for a in make_reader(file).iter_attachments()]
+    assert attachments == [("a.robot_description.urdf", b"<robot name='1'/>")]
+
+
+def test_without_a_clock_messages_keep_their_stamps(harness: Harness, tmp_path: Path) -> None:
+    recorded = Recorded(harness, tmp_path / "a.mcap", clock_wait=0.0)
+    joints = recorded.probe.create_publisher(JointState, "/joint_states", 10)
+    recorded.start("/joint_states")
+    stamps = [0.5, 1.5, 1.5, 1.25]
+    for second in stamps:
+        recorded.publish(joints, joint_states(second, ["a"], [1.0], [2.0]))
+    times = recorded.close()["/joint_states"]
+    assert [publish for _, publish in times] == stamps
+    assert all(abs(log - time.time()) < 60 for log, _ in times)
+
+
+def test_a_file_of_named_objects_is_in_the_bag_or_refused(harness: Harness, tmp_path: Path) -> None:
+    file = tmp_path / "about.json"
+    file.write_text(json.dumps({"one": {"a": 1, "b": "x"}, "two": {}}))
+    recorded = Recorded(harness, tmp_path / "a.mcap", describe=str(file))
+    recorded.probe.create_publisher(String, "/talk", 10)
+    recorded.start("/talk")
+    recorded.close()
+    metadata = read_bag(recorded.bag).metadata
+    assert (metadata["one"], metadata["two"]) == ({"a": "1", "b": "x"}, {})
+    refusing = harness.make(RecorderNode, recorded.parameters, autostart=False)
+    for text in ("[1]", "{", '{"one": 5}'):
+        file.write_text(text)
+        refusing.trigger_configure()
+        assert_one_sentence(str(refusing.fault), "'describe'")
+        refusing.cleanup()

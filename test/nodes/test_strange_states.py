@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import array
 import copy
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from builtin_interfaces.msg import Time
-from diagnostic_msgs.msg import DiagnosticStatus
 from nav_msgs.msg import Odometry, Path
 from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import JointState
@@ -20,9 +18,7 @@ from support.ros_harness import Harness
 from spacerobot_ros.errors import CommandError, SpaceRobotError
 from spacerobot_ros.messages.builders import path_message
 from spacerobot_ros.messages.readers import JointReader, UnreadableError
-from spacerobot_ros.nodes import PlantNode
 from spacerobot_ros.planning import BasePath
-from spacerobot_ros.simulation.actuators import build_plant
 from spacerobot_ros.times import LATEST_NS, first_time_ns, set_stamp, stamp_bytes, stamp_to_ns
 
 LAST = 2**31 - 1
@@ -85,38 +81,6 @@ def test_a_path_that_ends_beyond_all_stamps_ends_at_the_last() -> None:
     path = BasePath(np.array([0.0, 5.0]), np.zeros((2, 3)), np.tile([0.0, 0, 0, 1], (2, 1)))
     message = deserialize_message(path_message(path, LAST * SECOND, "world"), Path)
     assert [pose.header.stamp.sec for pose in message.poses] == [LAST, LAST]
-
-
-def test_a_plant_whose_time_no_stamp_carries_says_so(
-    harness: Harness, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """At a tick in 1000 s that is after two million of them."""
-    last = SimpleNamespace(time_ns=LAST // 1000 * 1000 * SECOND)
-    monkeypatch.setattr(PlantNode, "_last_state", lambda self, robot: last)
-    monkeypatch.setattr(
-        PlantNode, "_resumed_plant", lambda self, robot, config, state: build_plant(robot, config)
-    )
-    plant = harness.make(
-        PlantNode,
-        {"robot": "sliding_masses", "time_mode": "lockstep", "tick_rate": 0.001},
-        autostart=False,
-    )
-    probe = harness.probe(
-        {"joint_states": JointState, "plant/status": DiagnosticStatus}, latched=("plant/status",)
-    )
-    commands = probe.create_publisher(JointState, "joint_commands", 10)
-    plant.trigger_configure()
-    harness.connect()
-    plant.trigger_activate()
-    harness.spin_until(lambda: probe.count("joint_states"), "a state")
-    state = probe.last("joint_states")
-    state.velocity = [0.0] * len(state.name)
-    commands.publish(state)
-    harness.spin_until(
-        lambda: any("2^31 s" in each.message for each in probe.messages["plant/status"]),
-        "the plant to say why it ended",
-    )
-    assert not plant.is_active
 
 
 # -- joints -----------------------------------------------------------------------------------

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -16,6 +15,7 @@ from nav_msgs.msg import Odometry
 from rclpy.serialization import serialize_message
 from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
+from sensor_msgs.msg import JointState
 from support.planner_flight import NEAR, Flight, goal_at, values_of
 from support.ros_harness import Harness, nanoseconds
 from support.sentences import assert_one_sentence
@@ -23,18 +23,13 @@ from support.sentences import assert_one_sentence
 from spacerobot_ros.bag import Bag, RecordedRobot, read_bag, type_hash
 from spacerobot_ros.bag.reader import columns
 from spacerobot_ros.messages.builders import TRANSFORM_TYPE, TRANSFORMS, TransformTemplate
-from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.kinematics import ForwardKinematics
 from spacerobot_ros.model.rotations import compose_poses, matrix_from_quaternion
 from spacerobot_ros.model.urdf import load_robot
 from spacerobot_ros.nodes import PlantNode, RecorderNode
 from spacerobot_ros.nodes.common.messages import KnownFrames, pose_array
 from spacerobot_ros.nodes.plant import publisher
-from spacerobot_ros.nodes.plant.publisher import TransformPublisher
 from spacerobot_ros.resources import resource_names, robot_file
-from spacerobot_ros.simulation.actuators import build_plant
-from spacerobot_ros.simulation.config import PlantConfig, SensorConfig
-from spacerobot_ros.simulation.sensors import ReportedState
 
 TOLERANCE = 1e-12
 
@@ -168,28 +163,73 @@ def test_a_recorder_writes_frames_as_often_as_it_is_to(harness: Harness, tmp_pat
     assert set(np.diff([time for time, _ in bag["/tf"].messages()])) == {200_000_000}
 
 
+class Frames:
+    """A plant whose frames are heard as if the package of their message were installed."""
+
+    def __init__(
+        self, harness: Harness, monkeypatch: pytest.MonkeyPatch, robot: str, **given: Any
+    ) -> None:
+        # Bytes pass as they are, whatever the type of their topic is called.
+        monkeypatch.setattr(publisher, "transform_class", lambda: Odometry)
+        self.sent: list[bytes] = []
+        probe = harness.probe({"odom": Odometry, "joint_states": JointState})
+        probe.create_subscription(Odometry, TRANSFORMS, self.sent.append, 100, raw=True)
+        values = {"robot": robot, "tick_rate": 50.0, "actuation": "effort", **given}
+        node = harness.make(PlantNode, values, autostart=False)
+        node.require_transition(node.trigger_configure)
+        harness.connect()
+        node.require_transition(node.trigger_activate)
+        harness.spin_until(lambda: node.tick > 12, "some ticks")
+        node.trigger_deactivate()
+        harness.settle(probe)
+        store = get_typestore(Stores.ROS2_JAZZY)
+        self.messages: list[Any] = [store.deserialize_cdr(raw, TRANSFORM_TYPE) for raw in self.sent]
+        self.states = {
+            nanoseconds(odom.header.stamp): (odom.pose.pose, joints)
+            for odom, joints in zip(
+                probe.messages["odom"], probe.messages["joint_states"], strict=True
+            )
+        }
+
+
 def test_a_plant_sends_frames_as_often_and_of_as_many_links_as_it_is_to(
     harness: Harness, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    sent: list[bytes] = []
-    send_raw = PlantNode.send_raw
-
-    def keep(node: PlantNode, kind: Any, topic: str, *arguments: Any) -> Any:
-        if topic == TRANSFORMS:
-            return SimpleNamespace(take=sent.append)
-        return send_raw(node, kind, topic, *arguments)
-
-    # As if the package of their message were installed.
-    monkeypatch.setattr(publisher, "transform_class", lambda: Odometry)
-    monkeypatch.setattr(PlantNode, "send_raw", keep)
-    given = {"robot": "planar_chain", "tick_rate": 50.0, "tf_period": 0.06, "tf_links": False}
-    node = harness.make(PlantNode, {**given, "actuation": "effort"})
-    harness.spin_until(lambda: node.tick > 12)
-    store = get_typestore(Stores.ROS2_JAZZY)
-    messages: list[Any] = [store.deserialize_cdr(raw, TRANSFORM_TYPE) for raw in sent]
-    frames = [transform for message in messages for transform in message.transforms]
+    sent = Frames(harness, monkeypatch, "planar_chain", tf_period=0.06, tf_links=False).messages
+    frames = [transform for message in sent for transform in message.transforms]
     assert [each.child_frame_id for each in frames] == ["base_link"] * len(sent)
     assert set(np.diff([nanoseconds(each.header.stamp) for each in frames])) == {60_000_000}
+
+
+def test_transforms_have_the_measured_pose_and_shape_and_not_the_true_ones(
+    harness: Harness, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    noise = dict.fromkeys(("position_noise", "attitude_noise", "joint_noise"), 0.05)
+    frames = Frames(
+        harness,
+        monkeypatch,
+        "three_joint_arm",
+        initial_position=[0.4, -0.2, 0.3],
+        **{f"sensors.{name}": value for name, value in noise.items()},
+    )
+    kinematics = ForwardKinematics(load_robot(robot_file("three_joint_arm")))
+    assert frames.messages
+    for message in frames.messages:
+        base, *links = message.transforms
+        pose, joints = frames.states[nanoseconds(base.header.stamp)]
+        R, r = placed(base.transform)
+        o = pose.orientation
+        assert r.tolist() == [pose.position.x, pose.position.y, pose.position.z]
+        np.testing.assert_allclose(R, matrix_from_quaternion([o.x, o.y, o.z, o.w]), atol=TOLERANCE)
+        assert np.linalg.norm(r - [0.4, -0.2, 0.3]) > 1e-3, "that is the true pose"
+        kinematics.update(np.array(joints.position))
+        children = (child for _, child in kinematics.moving)
+        places = dict(zip(children, kinematics.transforms, strict=True))
+        for link in links:
+            R, r = placed(link.transform)
+            place = places[link.child_frame_id]
+            np.testing.assert_allclose(r, place[:3], atol=TOLERANCE)
+            np.testing.assert_allclose(R, matrix_from_quaternion(place[3:]), atol=TOLERANCE)
 
 
 @pytest.mark.parametrize("robot", resource_names("urdf", ".urdf"))
@@ -279,55 +319,6 @@ def test_the_topic_has_the_frames_of_odom(harness: Harness) -> None:
         seen += 1
     assert seen >= 2
     assert plant.is_active
-
-
-def test_transforms_have_the_measured_pose_and_shape_and_not_the_true_ones(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """Where the sensors err; without tf2_msgs, whose type only the publisher would need."""
-    monkeypatch.setattr(
-        "spacerobot_ros.nodes.plant.publisher.transform_class", lambda: TransformStamped
-    )
-    robot = SpaceRobot.from_file(robot_file("three_joint_arm"))
-    config = PlantConfig(
-        initial_position=(0.4, -0.2, 0.3),
-        sensors=SensorConfig(position_noise=0.05, attitude_noise=0.05, joint_noise=0.05, seed=3),
-    )
-    plant = build_plant(robot, config)
-    state = ReportedState(plant, config)
-    sent: dict[str, list[bytes]] = {}
-    node: Any = SimpleNamespace(
-        send_raw=lambda kind, topic, qos=None: SimpleNamespace(
-            take=sent.setdefault(topic, []).append
-        )
-    )
-    publisher = TransformPublisher(node, robot, state, config)
-    store = get_typestore(Stores.ROS2_JAZZY)
-    for tick in range(1, 4):
-        plant.step(np.array([0.3, -0.2, 0.1]))
-        state.update()
-        publisher.publish(tick * 50_000_000)
-        message: Any = store.deserialize_cdr(sent["/tf"][-1], TRANSFORM_TYPE)
-        base, *links = message.transforms
-        R, r = placed(base.transform)
-        pose = state.quantities["measured_pose"]
-        np.testing.assert_allclose(r, pose[:3], atol=TOLERANCE)
-        np.testing.assert_allclose(R, matrix_from_quaternion(pose[3:]), atol=TOLERANCE)
-        assert np.linalg.norm(r - plant.pose[:3]) > 1e-3, "that is the true pose"
-        assert np.abs(R - matrix_from_quaternion(plant.pose[3:])).max() > 1e-3
-        expected = ForwardKinematics(robot.description)
-        expected.update(state.quantities["measured_q"])
-        places = {child: pose for (_, child), pose in zip(
-            expected.moving, expected.transforms.copy(), strict=True
-        )}  # fmt: skip
-        true = ForwardKinematics(robot.description)
-        true.update(plant.q)
-        for link in links:
-            R, r = placed(link.transform)
-            np.testing.assert_allclose(r, places[link.child_frame_id][:3], atol=TOLERANCE)
-            turn = matrix_from_quaternion(places[link.child_frame_id][3:])
-            np.testing.assert_allclose(R, turn, atol=TOLERANCE)
-        assert np.abs(expected.transforms - true.transforms).max() > 1e-3
 
 
 LINK = next(joint for joint in load_robot(robot_file("sliding_masses")).joints).child
