@@ -250,31 +250,6 @@ def test_what_is_late_is_counted_with_the_worst() -> None:
     assert timing_record("/plant", "robot", time).level == 0, "nothing new is late"
 
 
-def test_a_command_in_force_counts_once() -> None:
-    time = RealTime(10 * MS)
-    time.start(0, 0)
-    for now in (15, 18, 95):
-        time.count_command(now * MS, 10 * MS)
-    timing = time.report()
-    assert timing.commands == 1
-    assert timing.commands_late == 0
-
-
-def test_a_late_plant_catches_up_in_small_steps_and_gives_up_what_is_far_behind() -> None:
-    time = RealTime(20 * MS, factor=2.0)
-    time.start(5 * MS, 100)
-    assert time.period == pytest.approx(0.01)
-    assert time.due_ticks(14 * MS, 100) == 0
-    assert time.due_ticks(16 * MS, 100) == 1
-    assert time.due_ticks(46 * MS, 100) == 2, "commands get a word in between"
-    # 30 ticks behind, of which 10 are made up: time goes on as if the others had never been due.
-    assert time.due_ticks(306 * MS, 100) == 2
-    assert time.ticks_lost == 20
-    assert [time.due_ticks(306 * MS, tick) for tick in (108, 109, 110)] == [2, 1, 0]
-    assert time.due_ticks(316 * MS, 110) == 1
-    assert time.ticks_lost == 20
-
-
 def real_time_plant(harness: Harness, **parameters: Any) -> PlantNode:
     return harness.make(
         PlantNode,

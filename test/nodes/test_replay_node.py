@@ -31,7 +31,6 @@ from spacerobot_ros.bag.playback import ReplayStatus
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.model.meshes import TriangleMesh, mesh_file, read_mesh, stl_of
 from spacerobot_ros.nodes import ReplayNode
-from spacerobot_ros.nodes.replay import _publisher_qos
 
 ROOT = Path(__file__).parents[2]
 STRING = "std_msgs/msg/String"
@@ -112,17 +111,23 @@ def test_publishers_offer_what_was_recorded(harness: Harness, bag: Path) -> None
     assert offers["/loose"].reliability == ReliabilityPolicy.BEST_EFFORT
 
 
-@pytest.mark.parametrize(
-    ("profile", "depth"),
-    [
-        # Humble's bags say no depth: like the streams of the stack, or the one latched message.
-        (QosProfile(depth=0), 100),
-        (QosProfile(depth=0, durability="transient_local"), 1),
-        (QosProfile(depth=7), 7),
-    ],
-)
-def test_depths_that_are_not_in_a_bag(profile: QosProfile, depth: int) -> None:
-    assert _publisher_qos(profile).depth == depth
+def test_depths_that_are_not_in_a_bag(harness: Harness, tmp_path: Path) -> None:
+    """Humble's bags say no depth: like the streams of the stack, or the one latched message."""
+    recorded = {
+        "/stream": (QosProfile(depth=0), 100),
+        "/latched": (QosProfile(depth=0, durability="transient_local"), 1),
+        "/deep": (QosProfile(depth=7), 7),
+        "/deepest": (QosProfile(depth=10_001), 10_000),
+    }
+    path = tmp_path / "a.mcap"
+    with BagWriter(path) as writer:
+        for topic, (profile, _) in recorded.items():
+            writer.write(writer.add_topic(topic, STRING, profile), string(""), BEGAN, BEGAN)
+    replay = Played(harness, path, paused=True).node
+    offered = {each.topic_name: each.qos_profile.depth for each in replay.publishers}
+    assert {topic: offered[topic] for topic in recorded} == {
+        topic: depth for topic, (_, depth) in recorded.items()
+    }
 
 
 def test_a_bag_that_turns_out_damaged_is_exit_2(harness: Harness, tmp_path: Path) -> None:
