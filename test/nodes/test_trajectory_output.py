@@ -191,3 +191,18 @@ def test_texts_of_servers_are_printable(flight: DrivenFlight) -> None:
     flight.server.answer, flight.server.text = -6, "stop\n\x1b[31m pressed"
     _, _, message = flight.ended(NEAR)
     assert message.endswith("ended early by error code -6: stop \ufffd[31m pressed.")
+
+
+class Lost(DrivenFlight):
+    """Its planner looks for a server of another name."""
+
+    def find_server(self) -> None:
+        pass
+
+
+def test_a_goal_without_a_server_fails_and_names_the_action(harness: Harness) -> None:
+    flight = Lost(harness, trajectory_action="arm/follow")
+    state, _, message = flight.ended(NEAR)
+    flight.server.close()
+    assert state == "failed"
+    assert "no server of the action '/arm/follow' is there" in message

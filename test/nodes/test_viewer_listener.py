@@ -366,14 +366,21 @@ def test_a_plan_that_does_not_fit_has_no_motion(viewed: Viewed, fault: str) -> N
     assert viewed.look().planned_motion is None
 
 
-def test_a_node_is_silent_after_the_time_that_is_given(harness: Harness) -> None:
-    parameters = {"port": 0, "watchdog_timeout": 0.25}
-    viewer = harness.make(ViewerNode, parameters)
-    beats = harness.probe({}).create_publisher(DiagnosticStatus, "heartbeat", 10)
-    harness.matched(beats)
+@pytest.mark.parametrize(("timeout", "is_silent"), [(0.25, True), (60.0, False)])
+def test_a_node_is_silent_after_the_time_that_is_given(
+    harness: Harness, timeout: float, is_silent: bool
+) -> None:
+    viewer = harness.make(ViewerNode, {"port": 0, "watchdog_timeout": timeout})
+    probe = harness.probe({"heartbeat": DiagnosticStatus})
+    beats = harness.matched(probe.create_publisher(DiagnosticStatus, "heartbeat", 10), 2)
     beats.publish(DiagnosticStatus(name="/planner", message="active", hardware_id="commander"))
     page: Any = viewer._page
-    harness.spin_until(lambda: "/planner" in page._status.content, "it is said to be silent")
+    if is_silent:
+        harness.spin_until(lambda: "/planner" in page._status.content, "it is said to be silent")
+        return
+    harness.spin_until(lambda: probe.count("heartbeat"), "the heartbeat is heard")
+    harness.spin_for(2.0)  # Longer than by default.
+    assert "/planner" not in page._status.content
 
 
 def test_a_goal_that_nobody_takes_is_reported(harness: Harness) -> None:
