@@ -241,7 +241,7 @@ class EndEffectorOptions:
 def _read_path(file: Path) -> list[list[float]]:
     """Return the numbers of a text file, a position or a pose a line; else raise BadParameter."""
     try:
-        if not file.is_file():
+        if file.exists() and not file.is_file():
             raise click.BadParameter(f"The path {file} is no regular file.")
         lines = [line.partition("#")[0] for line in file.read_text("utf-8").splitlines()]
         rows = [list(map(float, line.replace(",", " ").split())) for line in lines]
