@@ -27,7 +27,13 @@ from spacerobot_ros.nodes.common.messages import message_class, transform_class
 from spacerobot_ros.nodes.common.node import LATCHED, FlightNode
 from spacerobot_ros.nodes.common.streams import RawOutput
 from spacerobot_ros.simulation.actuators import PlantWithFaults, thrusters_in
-from spacerobot_ros.simulation.commands import CommandSource, CommandValidator, Refusal
+from spacerobot_ros.simulation.commands import (
+    NO_STAMP,
+    CommandSource,
+    CommandValidator,
+    Reason,
+    Refusal,
+)
 from spacerobot_ros.simulation.config import PlantConfig
 from spacerobot_ros.simulation.plant import Plant
 from spacerobot_ros.simulation.sensors import ReportedState
@@ -80,7 +86,11 @@ class PlantReport:
     def refused(self, source: CommandSource, refusal: Refusal) -> None:
         """Log a refused command, which its validator has counted."""
         sentence = self._diagnostics.note_refusal(source, refusal)
-        self._node.get_logger().warning(sentence, throttle_duration_sec=_LOG_PERIOD)
+        if refusal.reason is Reason.STALE and source.stamp_ns == NO_STAMP:
+            # A commander that has just begun answers a state from before it was ready.
+            self._node.get_logger().info(sentence, throttle_duration_sec=_LOG_PERIOD)
+        else:
+            self._node.get_logger().warning(sentence, throttle_duration_sec=_LOG_PERIOD)
         if refusal.latches:
             self.latched()
 
