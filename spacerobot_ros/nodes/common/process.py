@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import faulthandler
 import fcntl
 import gc
 import itertools
@@ -27,6 +28,9 @@ _LOG = logging.getLogger(__name__)
 
 _LONGEST_DELIVERY = 1.0
 """Longest wall time to wait after a signal until readers confirm messages, s."""
+
+_LONGEST_END = 10.0
+"""Longest wall time from a signal to the end of the process, s."""
 
 _LAST_DOMAIN = 232
 """Largest ROS_DOMAIN_ID: ports of larger ones do not exist."""
@@ -167,6 +171,8 @@ def _run_node(factory: Callable[[], FlightNode], arguments: list[str] | None) ->
         executor.add_node(node)
 
         def request_end() -> None:
+            # The middleware may hang while it is shut down; this says where, and ends the process.
+            faulthandler.dump_traceback_later(_LONGEST_END, exit=True)
             stop.set_result(None)
             node.interrupt()
 
@@ -180,6 +186,7 @@ def _run_node(factory: Callable[[], FlightNode], arguments: list[str] | None) ->
         if node is not None:
             node.destroy_node()
         rclpy.try_shutdown()
+        faulthandler.cancel_dump_traceback_later()
 
 
 def _await_delivery(node: FlightNode) -> None:
