@@ -1,6 +1,7 @@
 """A control law of one's own: transposed-Jacobian control whose pull saturates.
 
-Run it with ``python examples/own_control_law.py``.
+Run it with ``python examples/own_control_law.py``, or fly it with
+``spacerobot --plugin examples/own_control_law.py run coordinated_control --method soft``.
 """
 
 from dataclasses import dataclass
@@ -11,7 +12,6 @@ import numpy as np
 from spacerobot_ros.control import ControlState, Gains, PoseReference, Reference
 from spacerobot_ros.control.laws.law import ControlLaw, LawOptions
 from spacerobot_ros.control.laws.transposed_jacobian import TransposedJacobianLaw
-from spacerobot_ros.control.state import Actuation
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.parameters import parameter
 from spacerobot_ros.resources import robot_file
@@ -35,10 +35,6 @@ class SoftLaw(ControlLaw):
         z1, d = self.outputs, self.options.reach
         pull = symbols["kp"] * d * ca.tanh(z1.error / d) + symbols["kd"] * z1.error_rate
         return {"actuation": (z1.J_z @ z1.J_q_inverse).T @ pull}
-
-    def _actuation(self, reference: Reference) -> Actuation:
-        self._function.evaluate()
-        return Actuation(self._out["actuation"][:6].copy(), self._out["actuation"][6:].copy())
 
 
 def main() -> None:

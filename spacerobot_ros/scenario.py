@@ -333,6 +333,8 @@ class Scenario:
     def with_method(self, method: str) -> Scenario:
         """Return the scenario with another gait method, or another control law.
 
+        A robot alone has a controller instead of its planner, if it is a law.
+
         Raises
         ------
         ParameterError
@@ -341,12 +343,22 @@ class Scenario:
         kind, node, parameter = "gait method", "planner", "method"
         if method in LAWS:
             kind, node, parameter = "control law", "coordinated_control", "law"
+            if self._is_robot_alone:
+                robot = self.in_file["plant"]
+                nodes = {"plant": robot, "coordinated_control": {**robot, "law": method}}
+                return replace(self, in_file=nodes, commanders=(node,))
         if node not in self.commanders:
             raise ParameterError(
                 f"'{method}' is a {kind}, and the scenario '{self.name}' has no section "
                 f"'{node}' that could use it: it flies with {' and '.join(self.commanders)}."
             )
         return self.with_overrides(node, {parameter: method})
+
+    @property
+    def _is_robot_alone(self) -> bool:
+        """Whether it has no parameters but the robot, as :func:`scenario_or_robot` returns it."""
+        sections = tuple(self.in_file.values())
+        return self.in_file == _nodes_of(dict(sections[0])) and len(sections[0]) == 1
 
     def with_settings(self, texts: Sequence[str]) -> Scenario:
         """Return the scenario with ``node.parameter=value`` set, each as :func:`parse_setting`.

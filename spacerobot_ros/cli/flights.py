@@ -149,10 +149,11 @@ def _changed_scenario(
 
     scenario = goal.apply_to(scenario_or_robot(name))
     scenario.require_goal()
+    if method is not None:
+        scenario = scenario.with_method(method)
     if realtime is not None:
         scenario = scenario.in_real_time(realtime)
-    scenario = scenario.with_settings(settings)
-    return scenario if method is None else scenario.with_method(method)
+    return scenario.with_settings(settings)
 
 
 def _summary_lines(summary: dict[str, Any]) -> list[str]:

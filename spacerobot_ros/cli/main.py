@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from importlib import import_module
+from pathlib import Path
 from typing import Any
 
 import click
@@ -52,8 +53,22 @@ class CommandGroup(click.Group):
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
 )
 @click.version_option(__version__, prog_name="spacerobot")
-def main() -> None:
+@click.option(
+    "--plugin",
+    "plugins",
+    type=click.Path(exists=True, dir_okay=False, path_type=Path),
+    multiple=True,
+    metavar="FILE.py",
+    help="Python file with control laws or gait methods of your own, for all commands; nodes take "
+    "such files from SPACEROBOT_PLUGINS. May be repeated.",
+)
+def main(plugins: tuple[Path, ...]) -> None:
     """Plan, fly, record and report the motion of free-floating space robots with ROS 2."""
+    if plugins:
+        from spacerobot_ros.registry import add_plugin
+
+        for file in plugins:
+            add_plugin(file)
 
 
 if __name__ == "__main__":

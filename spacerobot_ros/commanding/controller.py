@@ -20,7 +20,7 @@ from spacerobot_ros.commanding.goal_follower import Status
 from spacerobot_ros.commanding.plant_state import Pairing, PlantChange, Stamped
 from spacerobot_ros.control import ControlState, NotFiniteError, PoseReference, Reference
 from spacerobot_ros.control.config import ControllerConfig
-from spacerobot_ros.control.controller import OwnLaw, build_controller
+from spacerobot_ros.control.controller import build_controller
 from spacerobot_ros.control.executive import GOAL_KEYS, ControlExecutive
 from spacerobot_ros.control.reference import HeldVelocityReference
 from spacerobot_ros.control.servicing import Task
@@ -52,8 +52,6 @@ class ControllerCommander(Commander):
     ----------
     config, host, clock
         See :class:`Commander`.
-    own_law
-        A law that is in no registry.
     partner_is_busy
         Whether a planner is known to plan for long: states then wait for its reference.
     """
@@ -66,12 +64,11 @@ class ControllerCommander(Commander):
         config: ControllerConfig,
         host: CommanderHost,
         *,
-        own_law: OwnLaw | None = None,
         clock: Callable[[], float] = time.monotonic,
         partner_is_busy: Callable[[], bool] = lambda: False,
     ) -> None:
         super().__init__(config, host, GOAL_KEYS, pose_required=True, clock=clock)
-        self._own_law, self._partner_is_busy = own_law, partner_is_busy
+        self._partner_is_busy = partner_is_busy
         self._ids_by_key: dict[str, str] = {}
         """Ids of the last goals that came by topic, by the part of the robot that they are for."""
         self._silent: set[str] = set()
@@ -231,7 +228,7 @@ class ControllerCommander(Commander):
         robot = self.robot
         if robot is None:
             return
-        controller = build_controller(robot, self.config, self._own_law)
+        controller = build_controller(robot, self.config)
         executive = ControlExecutive(controller, self.config, lambda status: None)
         q, rates = np.clip(np.zeros(robot.n), robot.lower, robot.upper), np.zeros(robot.n)
         upright = np.array([0.0, 0.0, 0.0, 1.0])
@@ -246,7 +243,7 @@ class ControllerCommander(Commander):
 
     def _build_executive(self, robot: SpaceRobot, decoder: StateDecoder) -> None:
         self.executive = ControlExecutive(
-            build_controller(robot, self.config, self._own_law),
+            build_controller(robot, self.config),
             self.config,
             self._publish_status,
             self._goal_file,
@@ -261,7 +258,7 @@ class ControllerCommander(Commander):
 
     def _change_masses(self, robot: SpaceRobot) -> None:
         assert self.executive is not None
-        controller = build_controller(robot, self.config, self._own_law)
+        controller = build_controller(robot, self.config)
         self.executive.use_controller(controller, self._held)
 
     def _change_rate(self, robot: SpaceRobot) -> None:

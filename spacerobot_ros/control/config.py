@@ -44,7 +44,7 @@ class ErrorMargin:
 class ControllerConfig(CommanderConfig):
     """Parameters of a controller: outputs, law, limits, and the decision about goals."""
 
-    law: str = parameter("transposed_jacobian", "control law", choices=tuple(LAWS))
+    law: str = parameter("transposed_jacobian", "control law", choices=LAWS)
     end_effector_frame: str = parameter(
         "", "link of the end-effector; '': 'end_effector', if there is one"
     )

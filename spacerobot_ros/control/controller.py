@@ -6,7 +6,6 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from enum import Enum
-from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -161,7 +160,6 @@ class CoordinatedController:
         A robot that was brought to rest has no earlier goals: such a group stays where it is. The
         integral of the errors begins anew.
         """
-        self.law.reset_integral()
         if self.coming_to_rest:
             self.profile, self.coming_to_rest = None, False
         start = self._present_reference(time, state)
@@ -177,6 +175,7 @@ class CoordinatedController:
             motion = self.wheels.limits_with_wheels(motion, state.q)
         self.profile = self._profile_type(start, goal, motion)
         self._began = time
+        self.law.start(time, start, goal)
 
     def restart_motion(self, time: float, state: ControlState) -> None:
         """Restart towards the present goals from the measured pose instead of the reference."""
@@ -264,6 +263,7 @@ class CoordinatedController:
                 )
                 self._began = time
             # The law is always evaluated, for its errors and status.
+            self.law.time = time
             packed = self._packed_reference(time)
             if packed is None:
                 commanded = self.law.command(state, self._reference_at(time))
@@ -472,14 +472,8 @@ class CoordinatedController:
         return law.command(state, reference)
 
 
-OwnLaw = tuple[type[ControlLaw], Any]
-"""A law that is in no registry, and an instance of its ``Options``."""
-
-
-def build_controller(
-    robot: SpaceRobot, config: ControllerConfig, own_law: OwnLaw | None = None
-) -> CoordinatedController:
-    """Return the controller of a robot that a configuration describes, or one with another law.
+def build_controller(robot: SpaceRobot, config: ControllerConfig) -> CoordinatedController:
+    """Return the controller of a robot that a configuration describes.
 
     The law of a robot with reaction wheels controls its gyrostat, without the wheels as joints.
 
@@ -488,7 +482,7 @@ def build_controller(
     ParameterError
         The robot does not have the outputs that are named, or the law cannot drive them.
     """
-    law_type, options = own_law or (LAWS[config.law], config.options[config.law])
+    law_type = LAWS[config.law]
     thrust = config.use_thrusters
     force, torque = config.max_force or math.inf, config.max_torque or math.inf
     if not thrust:
@@ -505,7 +499,7 @@ def build_controller(
             robot,
             outputs,
             config.gains,
-            options,
+            config.options[config.law],
             thrust=thrust,
             control_period=config.control_period,
         ),

@@ -19,12 +19,10 @@ from spacerobot_ros.model.rotations import (
 )
 from spacerobot_ros.model.space_robot import SpaceRobot
 
-_ZERO = np.zeros(3)
-_ZERO.flags.writeable = False
-
 
 def _zero() -> Array:
-    return _ZERO
+    # One of their own for each: callers' libraries refuse arrays that cannot be written to.
+    return np.zeros(3)
 
 
 class TargetNotSetError(SpaceRobotError):

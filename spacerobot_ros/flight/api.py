@@ -13,13 +13,14 @@ import numpy.typing as npt
 
 from spacerobot_ros import planning
 from spacerobot_ros.control.laws.law import ControlLaw
+from spacerobot_ros.control.laws.registry import LAWS
 from spacerobot_ros.errors import GoalError, ParameterError, PlanningError
 from spacerobot_ros.flight.flight import Flight
-from spacerobot_ros.flight.lockstep import Robots, fly_scenario
+from spacerobot_ros.flight.lockstep import fly_scenario
 from spacerobot_ros.flight.trials import PlanningProblem, robot_state_of
 from spacerobot_ros.measures import Outcome
 from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.parameters import configured, require_known
+from spacerobot_ros.parameters import require_known
 from spacerobot_ros.planning import GaitSchedule, Goal
 from spacerobot_ros.planning.api import EndEffectorValues, end_effector_goals
 from spacerobot_ros.planning.core.goal import POSE, Controlled, EndEffectorGoal
@@ -75,8 +76,8 @@ def fly(
     method
         A gait method or a control law; None: that of the scenario.
     law, law_options
-        A class of a control law that is in no registry, and its options by name; the scenario has
-        a controller, whose gains it takes.
+        A class of a control law of your own, which is registered, and its options by name; the
+        scenario has a controller, whose gains it takes.
     seed
         Seed of the noise of sensors and actuators.
     parameters
@@ -94,25 +95,20 @@ def fly(
     hands = end_effector_goals(end_effector_position, end_effector_pose, end_effector)
     scenario = scenario_to_fly(what, goal, position, rotvec, hands)
     _require_goal(scenario)
-    scenario = _with_parameters(scenario, {} if parameters is None else parameters)
+    if law is not None:
+        LAWS.register(law)
+        require_known(law.name, law.Options, law_options or {})
+        options = {f"{law.name}.{name}": value for name, value in (law_options or {}).items()}
+        scenario = scenario.with_method(law.name)
+        scenario = scenario.with_overrides("coordinated_control", options)
+    elif law_options is not None:
+        raise ParameterError("law_options are those of a law: give it as law=MyLaw.")
     if method is not None:
         scenario = scenario.with_method(method)
+    scenario = _with_parameters(scenario, {} if parameters is None else parameters)
     if seed is not None:
         scenario = scenario.with_overrides("plant", {"sensors.seed": seed})
-    if law is None:
-        if law_options is not None:
-            raise ParameterError("law_options are those of a law: give it as law=MyLaw.")
-        return _raise_if_refused(fly_scenario(scenario))
-    if "coordinated_control" not in scenario.commanders:
-        raise ParameterError(
-            f"'{scenario.name}' has no controller that could use the law '{law.name}': it flies "
-            f"with {' and '.join(scenario.commanders)}."
-        )
-    values = {} if law_options is None else law_options
-    require_known(law.name, law.Options, values)
-    own_law = law, configured(law.Options, values)
-    robots = replace(Robots.of(scenario), own_law=own_law)
-    return _raise_if_refused(fly_scenario(scenario, robots=robots))
+    return _raise_if_refused(fly_scenario(scenario))
 
 
 def _require_goal(scenario: Scenario) -> None:

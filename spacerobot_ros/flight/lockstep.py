@@ -33,7 +33,6 @@ from spacerobot_ros.commanding.controller import (
 from spacerobot_ros.commanding.goal_follower import GoalFollower, Status
 from spacerobot_ros.commanding.planner import PlannerCommander
 from spacerobot_ros.commanding.plant_state import Stamped
-from spacerobot_ros.control.controller import OwnLaw
 from spacerobot_ros.control.executive import END_EFFECTOR
 from spacerobot_ros.errors import ParameterError, SpaceRobotError
 from spacerobot_ros.events import CONTACTS, Event, EventKind
@@ -78,8 +77,6 @@ class Robots:
     """Of the plant, with the URDF that is recorded; None: as its model has it."""
     method: GaitMethod | None = None
     """Gait method for the planner's robot and configuration; None: it is built for this flight."""
-    own_law: OwnLaw | None = None
-    """Control law that is in no registry; None: the one that the configuration names."""
 
     @classmethod
     def of(
@@ -287,7 +284,7 @@ class LockstepFlight:
         if "coordinated_control" in scenario.commanders:
             host = _Host(self, "coordinated_control", self._send_actuation)
             commanders["coordinated_control"] = self._controller = ControllerCommander(
-                scenario.controller, host, own_law=robots.own_law
+                scenario.controller, host
             )
             self._controller.use_robot(robots.controller, ArrayDecoder())
             if self._plant.capturing is not None:

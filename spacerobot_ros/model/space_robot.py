@@ -22,6 +22,7 @@ from spacerobot_ros.model.compilation import BufferedFunction
 from spacerobot_ros.model.description import Array, RobotDescription
 from spacerobot_ros.model.inertial_parameters import InertialParameters
 from spacerobot_ros.model.model_functions import Composition, ModelFunctions, SymbolicModels
+from spacerobot_ros.model.rotations import hat
 from spacerobot_ros.model.urdf import load_robot, parse_robot
 
 _Made = TypeVar("_Made")
@@ -164,6 +165,56 @@ class SpaceRobot:
         return self._call_function("forward_dynamics", q, v_cm_B, omega_WB_B, qdot, wrench_B, tau)[
             0
         ]
+
+    def linearised(
+        self,
+        q: npt.ArrayLike,
+        v_WB_B: npt.ArrayLike | None = None,
+        omega_WB_B: npt.ArrayLike | None = None,
+        qdot: npt.ArrayLike | None = None,
+        wrench_B: npt.ArrayLike | None = None,
+        tau: npt.ArrayLike | None = None,
+    ) -> tuple[Array, Array]:
+        """Return ``A`` (12 + 2 n, 12 + 2 n) and ``B`` (12 + 2 n, 6 + n) of the equations of motion
+        about a state and an actuation; those left out are zero.
+
+        ``d/dt dx = A dx + B du`` to first order, with ``dx = [dr; dtheta; dq; dv; domega; dqdot]``:
+        position (m) and rotation vector (rad) of the base from its motion in that state, joint
+        positions, twist of the base, and joint velocities, the vectors in base components, and
+        ``du = [f; n; tau]``, the change of force, torque and efforts.
+        """
+        n = self.n
+        given = zip((3, 3, n, 6, n), (v_WB_B, omega_WB_B, qdot, wrench_B, tau), strict=True)
+        values = [np.zeros(m) if x is None else np.asarray(x, dtype=float) for m, x in given]
+        A_v, A_q, B_u = (np.array(each) for each in self._acceleration_jacobians(q, *values))
+        v, omega = (hat(x) for x in values[:2])
+        A = np.zeros((12 + 2 * n, 12 + 2 * n))
+        A[:3, :3] = A[3:6, 3:6] = -omega
+        A[:3, 3:6] = -v
+        A[: 6 + n, 6 + n :] = np.eye(6 + n)
+        A[6 + n :, 6 : 6 + n], A[6 + n :, 6 + n :] = A_q, A_v
+        return A, np.vstack([np.zeros((6 + n, 6 + n)), B_u])
+
+    @cached_property
+    def _acceleration_jacobians(self) -> ca.Function:
+        """Return the function of the derivatives of ``[vdot; omegadot; qddot]`` in B by the
+        velocities, ``q``, and the actuation.
+        """
+        n = self.n
+        q, v, omega, qdot = (ca.SX.sym("x", m) for m in (n, 3, 3, n))
+        wrench, tau = ca.SX.sym("wrench", 6), ca.SX.sym("tau", n)
+        r = self.function("center_of_mass", compile=False)(q)
+        v_BC = ca.jtimes(r, q, qdot)
+        v_cm = v + ca.cross(omega, r) + v_BC
+        forward = self.function("forward_dynamics", compile=False)
+        rates = forward(q, v_cm, omega, qdot, wrench, tau)
+        alpha, qddot = rates[3:6], rates[6:]
+        dv_BC = ca.jtimes(v_BC, q, qdot) + ca.jtimes(r, q, qddot)
+        vdot = rates[:3] - ca.cross(alpha, r) - ca.cross(omega, v_BC) - dv_BC
+        acceleration = ca.vertcat(vdot, alpha, qddot)
+        by = ca.vertcat(v, omega, qdot), q, ca.vertcat(wrench, tau)
+        results = [ca.jacobian(acceleration, each) for each in by]
+        return ca.Function("linearised", [q, v, omega, qdot, wrench, tau], results)
 
     def joint_efforts(self, q: npt.ArrayLike, qdot: npt.ArrayLike, qddot: npt.ArrayLike) -> Array:
         """Return the efforts (n,), N or N m, of a motion of the shape at zero momentum.

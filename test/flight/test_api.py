@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -16,7 +17,7 @@ from support.sentences import assert_one_sentence
 
 import spacerobot_ros
 from spacerobot_ros import fly, load_scenario, plan, read_bag
-from spacerobot_ros.control.controller import build_controller
+from spacerobot_ros.control.laws.registry import LAWS
 from spacerobot_ros.control.laws.transposed_jacobian import TransposedJacobianLaw
 from spacerobot_ros.errors import GoalError, ParameterError, PlanningError, RecordingError
 from spacerobot_ros.flight import api
@@ -25,6 +26,7 @@ from spacerobot_ros.measures import Outcome
 from spacerobot_ros.model import SpaceRobot, load_robot
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.resources import robot_file
+from spacerobot_ros.scenario import Scenario
 
 QUICK = {"planner.lie_bracket.t1": 2.0, "planner.lie_bracket.cycle_period": 1.0}
 
@@ -219,36 +221,25 @@ class _HalfLaw(TransposedJacobianLaw):
 
 
 @pytest.fixture
-def asked(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Any, Any]]:
-    """Scenario and robots of flights, which are not flown."""
-    found: list[tuple[Any, Any]] = []
-
-    def fly_none(scenario: Any, robots: Any = None) -> SimpleNamespace:
-        found.append((scenario, robots))
-        return SimpleNamespace(outcome=Outcome.REACHED)
-
-    monkeypatch.setattr(api, "fly_scenario", fly_none)
-    return found
+def _laws() -> Iterator[None]:
+    """Leave the registry as it was."""
+    before = dict(LAWS)
+    yield
+    LAWS.clear()
+    LAWS.update(before)
 
 
-def test_a_flight_takes_a_law_that_is_in_no_registry(asked: list[tuple[Any, Any]]) -> None:
-    fly("coordinated_control", law=_HalfLaw, law_options={"singular_value_threshold": 0.25})
-    fly("coordinated_control", law=_HalfLaw)
-    fly("coordinated_control")
-    (_, first), (_, second), (_, third) = asked
-    assert [robots.own_law[0] for robots in (first, second)] == [_HalfLaw] * 2
-    thresholds = [robots.own_law[1].singular_value_threshold for robots in (first, second)]
-    assert thresholds == [0.25, 0.1]
-    assert third is None
-    controller = build_controller(
-        first.controller, asked[0][0].controller, (_HalfLaw, first.own_law[1])
-    )
-    assert type(controller.law) is _HalfLaw
-    assert controller.law.options.singular_value_threshold == 0.25
-    assert build_controller(first.controller, asked[0][0].controller).law.name != "half"
+@pytest.mark.usefixtures("_laws")
+def test_a_flight_takes_a_law_of_ones_own_and_its_options() -> None:
+    short = QUICK | {"coordinated_control.time_limit": 0.3}
+    options = {"singular_value_threshold": 0.25}
+    flight = fly("coordinated_control", law=_HalfLaw, law_options=options, parameters=short)
+    assert flight.method == "half"
+    assert flight.scenario.controller.options["half"].singular_value_threshold == 0.25
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("_laws")
 def test_a_law_of_ones_own_flies_and_is_named() -> None:
     class Fast(_HalfLaw):
         name = "fast"
@@ -259,6 +250,7 @@ def test_a_law_of_ones_own_flies_and_is_named() -> None:
     assert known.method == "transposed_jacobian"
 
 
+@pytest.mark.usefixtures("_laws")
 @pytest.mark.parametrize(
     ("scenario", "given", "words"),
     [
@@ -275,14 +267,27 @@ def test_a_law_that_nothing_can_use_is_refused(
     assert_one_sentence(str(refused.value), *words)
 
 
-def test_a_flight_takes_the_goals_that_a_plan_takes(asked: list[tuple[Any, Any]]) -> None:
+@pytest.fixture
+def asked(monkeypatch: pytest.MonkeyPatch) -> list[Scenario]:
+    """Scenarios of flights, which are not flown."""
+    found: list[Scenario] = []
+
+    def fly_none(scenario: Scenario) -> SimpleNamespace:
+        found.append(scenario)
+        return SimpleNamespace(outcome=Outcome.REACHED)
+
+    monkeypatch.setattr(api, "fly_scenario", fly_none)
+    return found
+
+
+def test_a_flight_takes_the_goals_that_a_plan_takes(asked: list[Scenario]) -> None:
     at, hand = (0.25, -0.5, 0.125), (1.0, 2.0, 3.0)
     fly("sliding_masses", position=at)
     fly("reach", end_effector_position=hand, end_effector="hand")
     fly("reach", end_effector_position=hand, end_effector="hand", position=at)
     fly("reach", end_effector_position=hand, end_effector="hand", rotvec=(0.0, 0.0, 0.5))
     fly("reach", (*at, 0.0, 0.0, 0.0, 1.0), end_effector_position=hand, end_effector="hand")
-    goals = [scenario.goal for scenario, _ in asked]
+    goals = [scenario.goal for scenario in asked]
     np.testing.assert_allclose(goals[0].position, at)
     for goal in goals[1:]:
         (aim,) = goal.end_effectors

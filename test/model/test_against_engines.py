@@ -10,6 +10,7 @@ from pathlib import Path
 import casadi as ca
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from support.oracles import (
     ENGINES,
     Array,
@@ -31,6 +32,9 @@ from spacerobot_ros.model.rotations import matrix_from_quaternion
 from spacerobot_ros.resources import share_directory
 
 SEEDS = range(10)
+
+_DISTURBED = 1e-5
+"""Share of a disturbance of order one by which a motion is disturbed."""
 
 
 @dataclass(frozen=True)
@@ -416,3 +420,46 @@ def test_compiled_numbers(compiled_code: Path) -> None:
     (compiled,) = BufferedFunction(function)(*interpreted.arguments())
     expected = interpreted.barycentric_dynamics()
     assert relative_deviation(compiled, expected) < 1e-12
+
+
+def test_the_linearised_equations_lead_away_from_a_motion_as_pinocchio_does(case: Case) -> None:
+    """A motion that is disturbed in every part, integrated by Pinocchio beside the undisturbed."""
+    oracle, m, n = case.engines[PinocchioOracle.__name__], case.motion, case.robot.n
+    assert isinstance(oracle, PinocchioOracle)
+    A, B = case.robot.linearised(m.q, case.v_WB_B, m.omega_WB_B, m.qdot, case.wrench_B, case.tau)
+    rng = np.random.default_rng(8)
+    dx, du = rng.uniform(-1.0, 1.0, 12 + 2 * n), rng.uniform(-1.0, 1.0, 6 + n)
+
+    def flown(scale: float, time: float) -> tuple[Array, Array, Array, Array, Array]:
+        """Return r_WB, R_WB, q, and the velocities of both, after ``time``."""
+        R_WB = Rotation.from_quat(m.quaternion_WB) * Rotation.from_rotvec(scale * dx[3:6])
+        r_WB = m.r_WB_W + Rotation.from_quat(m.quaternion_WB).apply(scale * dx[:3])
+        q = m.q + scale * dx[6 : 6 + n]
+        twist = np.concatenate([case.v_WB_B, m.omega_WB_B]) + scale * dx[6 + n : 12 + n]
+        qdot = m.qdot + scale * dx[12 + n :]
+        oracle.set_configuration(q, R_WB.as_quat(), r_WB)
+        u = oracle.base_velocities(twist) + oracle.joint_velocities(qdot)
+        oracle.move(u)
+        rates = oracle.own_acceleration(case.wrench_B + scale * du[:6], case.tau + scale * du[6:])
+        # To second order in time, which differences about time zero cancel.
+        u = u + time * rates
+        velocities = oracle.selection @ u
+        oracle.set_configuration(q, R_WB.as_quat(), r_WB)
+        mean = R_WB * Rotation.from_rotvec(time / 2 * twist[3:])
+        return (
+            r_WB + time * mean.apply(twist[:3]),
+            (R_WB * Rotation.from_rotvec(time * twist[3:])).as_matrix(),
+            q + time * qdot,
+            np.concatenate([u[:3], velocities[:3]]),
+            velocities[3:],
+        )
+
+    def distance(time: float) -> Array:
+        r_0, R_0, q_0, twist_0, qdot_0 = flown(0.0, time)
+        r_1, R_1, q_1, twist_1, qdot_1 = flown(_DISTURBED, time)
+        turned = Rotation.from_matrix(R_0.T @ R_1).as_rotvec()
+        parts = R_0.T @ (r_1 - r_0), turned, q_1 - q_0, twist_1 - twist_0, qdot_1 - qdot_0
+        return np.concatenate(parts) / _DISTURBED
+
+    rate = (distance(1e-4) - distance(-1e-4)) / 2e-4
+    np.testing.assert_allclose(rate, A @ dx + B @ du, rtol=1e-4, atol=1e-4 * np.abs(rate).max())

@@ -37,7 +37,7 @@ LAYERS: dict[str, tuple[tuple[str, ...], ...]] = {
         ("planning", "simulation"),  # flight software and plant, both on the model
         ("collision",),
         ("model",),
-        ("events", "parameters", "resources", "termination"),
+        ("events", "parameters", "registry", "resources", "termination"),
         ("lazy", "times", "topics", "version"),
         ("files",),
         ("errors",),

@@ -223,6 +223,10 @@ class ControlLaw(ABC):
         control_period: float = 0.0,
     ) -> None:
         self.robot = robot
+        self.control_period = control_period
+        """Time for which a command is held, s; 0: not known."""
+        self.time = 0.0
+        """Time of the command, s, which the controller sets before each."""
         self._damping_rate = _FASTEST_DAMPING
         """Automatic Kd per unit of mass, 1/s."""
         if control_period > 0:
@@ -390,6 +394,13 @@ class ControlLaw(ABC):
         added = np.where((self._ki == 0.0) | (grows & limited), 0.0, duration * error)
         self._integral += added
         self._in["integral"][:] = self._ki * self._integral
+
+    def start(self, time: float, start: Reference, goal: Reference) -> None:
+        """Begin anew: at ``time`` (s) the reference starts towards new goals.
+
+        A law that keeps a state between commands starts it here, after this base method.
+        """
+        self.reset_integral()
 
     def reset_integral(self) -> None:
         """Set the integral of the error to zero."""

@@ -23,7 +23,7 @@ _BACKGROUND_REPLAN_PERIOD = 2.0
 class PlannerConfig(CommanderConfig):
     """Parameters of planning, of tracking schedules, and of corrections."""
 
-    method: str = parameter("auto", "gait method", choices=tuple(METHODS))
+    method: str = parameter("auto", "gait method", choices=METHODS)
     integration_step: float = parameter(
         0.01, "longest step of the prediction", unit="s", minimum=1e-06
     )

@@ -17,16 +17,23 @@ from spacerobot_ros.planning.methods.lie_bracket import LieBracketGait
 from spacerobot_ros.planning.methods.optimal import OptimalGait
 from spacerobot_ros.planning.methods.resolved_rate import ResolvedRateGait
 from spacerobot_ros.planning.methods.square_path import SquarePathGait
+from spacerobot_ros.registry import Registry
 
-METHODS: dict[str, type[GaitMethod]] = {
-    # Specialised methods come first: `auto` takes the first of equally long manoeuvres.
-    LieBracketGait.name: LieBracketGait,
-    SquarePathGait.name: SquarePathGait,
-    AreaLoopGait.name: AreaLoopGait,
-    OptimalGait.name: OptimalGait,
-    ResolvedRateGait.name: ResolvedRateGait,
-    AutoGait.name: AutoGait,
-}
+METHODS: Registry[GaitMethod] = Registry(
+    "gait method",
+    "spacerobot_ros.gait_methods",
+    GaitMethod,
+    (
+        # Specialised methods come first: `auto` takes the first of equally long manoeuvres.
+        LieBracketGait,
+        SquarePathGait,
+        AreaLoopGait,
+        OptimalGait,
+        ResolvedRateGait,
+        AutoGait,
+    ),
+)
+METHODS.load()
 
 
 def build_method(

@@ -1,0 +1,63 @@
+"""Base class of control laws that are written in plain numpy, and that may have a state."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from typing import ClassVar
+
+import casadi as ca
+
+from spacerobot_ros.control.laws.law import ACCELERATION_GAINS, ControlLaw
+from spacerobot_ros.control.state import Actuation, ControlState, Reference
+from spacerobot_ros.model.description import Array
+
+
+class NumpyLaw(ControlLaw):
+    """A law that computes its command in Python, from a state and a reference.
+
+    A subclass gives ``name`` and :meth:`actuation`. Before each call the base class evaluates
+    :attr:`error`, :attr:`error_rate` and :attr:`J_z` of the outputs; :attr:`gain_diagonals` are the
+    parameters ``gains``. A law with a state keeps it in its attributes, and starts it anew in
+    :meth:`start`. All engines but the lanes of campaigns fly such a law.
+
+    See :class:`ControlLaw` for the parameters and errors of the constructor.
+    """
+
+    gain_units: ClassVar[tuple[str, str]] = ACCELERATION_GAINS
+
+    @abstractmethod
+    def actuation(self, state: ControlState, reference: Reference) -> Actuation:
+        """Return the wrench on the base and the joint efforts, not limited.
+
+        Parameters
+        ----------
+        state
+            The measured state, or the estimate while the base is not measured.
+        reference
+            The present reference of base, end-effector and joints; a group that is not among the
+            outputs is None.
+
+        Returns
+        -------
+        Actuation
+            ``wrench_B`` (6,), force (N) over torque (N m) at the origin of the base link in base
+            components, and ``tau`` (n,), joint efforts (N or N m).
+        """
+
+    @property
+    def J_z(self) -> Array:
+        """Jacobian (m, 6 + n) of the outputs from ``[v_cm; omega; qdot]`` (paper 4, eq. 23)."""
+        return self._out["J_z"].copy()
+
+    def command(self, state: ControlState, reference: Reference) -> Actuation:
+        """Return :meth:`actuation`, after the errors of the outputs; see :class:`ControlLaw`."""
+        super().command(state, reference)
+        return self.actuation(state, reference)
+
+    @property
+    def fixed_inputs(self) -> None:
+        """None: the command is more than a function of numbers."""
+        return None
+
+    def _results(self, symbols: dict[str, ca.SX]) -> dict[str, ca.SX]:
+        return {"actuation": ca.SX(6 + self.robot.n, 1)}

@@ -1,0 +1,162 @@
+"""Registries of control laws and gait methods: the package's own, and those of users.
+
+A class of a user comes into a registry in one of three ways:
+
+- an installed package names it as an entry point of the registry's group;
+- the environment variable ``SPACEROBOT_PLUGINS`` (or ``--plugin``) names the Python file that
+  defines it; processes that are started inherit the variable;
+- a script calls :meth:`Registry.register`.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.util
+import inspect
+import logging
+import os
+import sys
+from collections.abc import Iterable
+from functools import cache
+from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
+from types import ModuleType
+from typing import Any, TypeVar
+
+from spacerobot_ros.errors import ParameterError
+
+PLUGINS_VARIABLE = "SPACEROBOT_PLUGINS"
+"""Environment variable with Python files, separated as in PATH."""
+
+
+T = TypeVar("T")
+
+
+class Registry(dict[str, type[T]]):
+    """Classes by their ``name``.
+
+    Parameters
+    ----------
+    kind
+        What the classes are, for messages: ``control law``.
+    group
+        Group of entry points by which installed packages add classes.
+    base
+        Class that all of them are derived from.
+    own
+        The classes of this package, which no other class replaces.
+    """
+
+    def __init__(self, kind: str, group: str, base: Any, own: Iterable[type[T]]) -> None:
+        super().__init__()
+        self.kind, self.group, self.base = kind, group, base
+        self._own: frozenset[str] = frozenset()
+        for entry in own:
+            self.register(entry)
+        self._own = frozenset(self)
+
+    def register(self, entry: type[T]) -> type[T]:
+        """Add a class, in place of an earlier one of its name; usable as a decorator.
+
+        Raises
+        ------
+        ParameterError
+            It is not derived from the base class or leaves out something abstract, it has no name,
+            or the name is one of the package's own.
+        """
+        name = self._usable_name(entry)
+        self[name] = entry
+        return entry
+
+    def load(self) -> None:
+        """Add the classes of installed packages and of the files in ``SPACEROBOT_PLUGINS``.
+
+        An entry point that is refused is left out with a warning: it must not end the flights of
+        those who do not use it.
+
+        Raises
+        ------
+        ParameterError
+            A file cannot be read, or a class in it is refused.
+        """
+        for point in sorted(entry_points(group=self.group), key=lambda point: point.name):
+            try:
+                self.register(_loaded(point))
+            except ParameterError as error:
+                logging.getLogger(__name__).warning("%s It is left out.", error)
+        _LOADED.append(self)
+        self._load_files()
+
+    def _load_files(self) -> None:
+        for file in filter(None, os.environ.get(PLUGINS_VARIABLE, "").split(os.pathsep)):
+            module = _module_of(Path(file).resolve())
+            for entry in vars(module).values():
+                own = inspect.isclass(entry) and entry.__module__ == module.__name__
+                if own and issubclass(entry, self.base) and not inspect.isabstract(entry):
+                    self.register(entry)
+
+    def _usable_name(self, entry: Any) -> str:
+        named = f"The {self.kind} '{getattr(entry, '__name__', entry)}'"
+        if not (inspect.isclass(entry) and issubclass(entry, self.base)):
+            raise ParameterError(f"{named} is no class derived from {self.base.__name__}.")
+        name = getattr(entry, "name", None)
+        if inspect.isabstract(entry):
+            missing = ", ".join(sorted(vars(entry)["__abstractmethods__"]))
+            raise ParameterError(f"{named} lacks {missing}.")
+        if not isinstance(name, str) or not name.isidentifier():
+            raise ParameterError(
+                f"{named} needs a name of letters, digits and underscores: name = 'my_name'."
+            )
+        if name in self._own and self[name] is not entry:
+            raise ParameterError(
+                f"{named} has the name of the package's own '{name}': give it another one."
+            )
+        return name
+
+
+_LOADED: list[Registry[Any]] = []
+"""Registries of this process, to which later plugins are added."""
+
+
+def add_plugin(file: Path) -> None:
+    """Add a Python file to ``SPACEROBOT_PLUGINS`` of this process and of those that it starts.
+
+    Raises
+    ------
+    ParameterError
+        The file cannot be imported, or a class in it is refused. Registries that are not imported
+        yet raise the error when they are.
+    """
+    files = [each for each in os.environ.get(PLUGINS_VARIABLE, "").split(os.pathsep) if each]
+    os.environ[PLUGINS_VARIABLE] = os.pathsep.join(dict.fromkeys([*files, str(file.resolve())]))
+    for registry in _LOADED:
+        registry._load_files()
+
+
+def _loaded(point: EntryPoint) -> Any:
+    try:
+        return point.load()
+    except Exception as error:
+        package = "" if point.dist is None else f" of the package '{point.dist.name}'"
+        raise ParameterError(
+            f"The entry point '{point.name} = {point.value}'{package} cannot be loaded: "
+            f"{type(error).__name__}: {error}."
+        ) from error
+
+
+@cache
+def _module_of(file: Path) -> ModuleType:
+    """Import a file, once, under a name of its own, so that its objects can be pickled."""
+    name = f"spacerobot_plugin_{file.stem}_{hashlib.sha256(str(file).encode()).hexdigest()[:8]}"
+    spec = importlib.util.spec_from_file_location(name, file)
+    if spec is None or spec.loader is None:
+        raise ParameterError(f"The plugin '{file}' is no Python file: its name must end in .py.")
+    module = sys.modules[name] = importlib.util.module_from_spec(spec)
+    try:
+        spec.loader.exec_module(module)
+    except Exception as error:
+        del sys.modules[name]
+        raise ParameterError(
+            f"The plugin '{file}' cannot be imported: {type(error).__name__}: {error}."
+        ) from error
+    return module

@@ -1,0 +1,196 @@
+"""Control laws and gait methods of users: by installed packages, files, and in scripts."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from rosbags.highlevel import AnyReader
+from rosbags.typesys import Stores, get_typestore
+
+from spacerobot_ros.control.laws.numpy_law import NumpyLaw
+from spacerobot_ros.control.laws.registry import LAWS
+from spacerobot_ros.control.laws.transposed_jacobian import TransposedJacobianLaw
+from spacerobot_ros.errors import ParameterError
+from spacerobot_ros.planning.methods.registry import METHODS
+from spacerobot_ros.registry import PLUGINS_VARIABLE, add_plugin
+
+EXAMPLES = Path(__file__).parents[1] / "examples"
+GOAL = [0.3, -0.2, 0.1, 0.0, 0.3826834323650898, 0.0, 0.9238795325112867]
+
+_ENTRY_POINTS = """
+[spacerobot_ros.control_laws]
+lqr = strangers.law:LqrLaw
+lost = strangers.nowhere:Law
+transposed_jacobian = strangers.law:Clash
+[spacerobot_ros.gait_methods]
+stow = strangers.method:StowGait
+"""
+
+
+def _run(words: list[str], folder: Path, **environment: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "spacerobot_ros", *words],
+        cwd=folder,
+        env=os.environ | environment,
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=False,
+    )
+
+
+def _last_pose(bag: Path) -> tuple[list[float], list[float]]:
+    with AnyReader([bag], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as reader:
+        connections = [c for c in reader.connections if c.topic == "/base_pose"]
+        *_, (connection, _, data) = reader.messages(connections)
+        message: Any = reader.deserialize(data, connection.msgtype)
+    p, o = message.pose.position, message.pose.orientation
+    return [p.x, p.y, p.z], [o.x, o.y, o.z, o.w]
+
+
+@pytest.fixture
+def installed(tmp_path: Path) -> Path:
+    """Return a folder with an installed package that has laws and a method."""
+    package = tmp_path / "site" / "strangers"
+    package.mkdir(parents=True)
+    (package / "__init__.py").touch()
+    shutil.copy(EXAMPLES / "lqr_law.py", package / "law.py")
+    shutil.copy(EXAMPLES / "own_gait_method.py", package / "method.py")
+    clash = "\n\nclass Clash(LqrLaw):\n    name = 'transposed_jacobian'\n"
+    (package / "law.py").write_text((package / "law.py").read_text() + clash)
+    information = tmp_path / "site" / "strangers-1.0.dist-info"
+    information.mkdir()
+    (information / "METADATA").write_text("Metadata-Version: 2.1\nName: strangers\nVersion: 1.0\n")
+    (information / "entry_points.txt").write_text(_ENTRY_POINTS)
+    return tmp_path / "site"
+
+
+def test_a_law_of_an_installed_package_flies_by_its_name(tmp_path: Path, installed: Path) -> None:
+    """A robot alone has a controller then; entry points that are refused end no flight."""
+    words = ["run", "servicer_thrusters", "--method", "lqr"]
+    path = os.pathsep.join([str(installed), *sys.path])
+    refused = _run(words, tmp_path, PYTHONPATH=path)
+    assert refused.returncode == 1
+    assert "The law 'lqr' does not control the end-effector" in refused.stderr
+
+    words = ["run", "planar_manipulator", "--method", "lqr", "--set", "plant.tick_rate=50"]
+    words += ["--set", "coordinated_control.lqr.response_time=1.0"]
+    goal = [0.3, -0.2, 0.0, 0.0, 0.0, 0.3826834323650898, 0.9238795325112867]
+    flown = _run([*words, "--goal", *map(str, goal), "--json", "-"], tmp_path, PYTHONPATH=path)
+    assert flown.returncode == 0, flown.stderr
+    assert flown.stderr.count("It is left out.") == 2
+    assert "'lost = strangers.nowhere:Law' of the package 'strangers' cannot be" in flown.stderr
+    assert "has the name of the package's own 'transposed_jacobian'" in flown.stderr
+    result = json.loads(flown.stdout)
+    assert result["method"] == "lqr"
+    position, quaternion = _last_pose(tmp_path / result["bag"])
+    np.testing.assert_allclose(position, goal[:3], atol=1e-3)
+    assert abs(np.dot(quaternion, goal[3:])) > np.cos(1e-3 / 2)
+
+
+@pytest.mark.slow
+def test_a_plugin_flies_by_nodes_and_in_the_workers_of_a_campaign(tmp_path: Path) -> None:
+    plugin = ["--plugin", str(EXAMPLES / "own_control_law.py")]
+    words = ["run", "coordinated_control", "--method", "soft"]
+    by_loop = _run([*plugin, *words, "--bag", "loop.mcap"], tmp_path)
+    by_nodes = _run(
+        [*words, "--bag", "nodes.mcap", "--nodes"],
+        tmp_path,
+        SPACEROBOT_PLUGINS=str(EXAMPLES / "own_control_law.py"),
+    )
+    assert (by_loop.returncode, by_nodes.returncode) == (0, 0), by_nodes.stderr
+    assert _last_pose(tmp_path / "loop.mcap") == _last_pose(tmp_path / "nodes.mcap")
+
+    campaign = tmp_path / "two.yaml"
+    campaign.write_text(
+        "campaign:\n  scenario: coordinated_control\n  flights: 3\n  engine: flights\n"
+        "  method: soft\n  disperse:\n"
+        "    coordinated_control.soft.reach: {uniform: [0.1, 0.2]}\n"
+    )
+    flown = _run([*plugin, "campaign", "fly", str(campaign), "--workers", "2"], tmp_path)
+    assert flown.returncode == 0, flown.stderr
+    assert "3 of 3" in flown.stdout
+
+
+class _Plain(NumpyLaw):
+    """A law that lacks its command."""
+
+    name = "plain"
+
+
+class _Unnamed(TransposedJacobianLaw):
+    name = "two words"
+
+
+class _Clash(TransposedJacobianLaw):
+    pass
+
+
+@pytest.mark.parametrize(
+    ("entry", "sentence"),
+    [
+        (_Plain, "The control law '_Plain' lacks actuation."),
+        (_Unnamed, "needs a name of letters, digits and underscores"),
+        (_Clash, "has the name of the package's own 'transposed_jacobian'"),
+        (METHODS["optimal"], "'OptimalGait' is no class derived from ControlLaw."),
+        ("lqr", "'lqr' is no class derived from ControlLaw."),
+    ],
+)
+def test_a_class_that_is_no_law_is_refused(entry: Any, sentence: str) -> None:
+    before = dict(LAWS)
+    with pytest.raises(ParameterError, match=sentence):
+        LAWS.register(entry)
+    assert before == LAWS
+
+
+@pytest.fixture
+def plugins(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Leave the registries and the environment as they were."""
+    monkeypatch.setenv(PLUGINS_VARIABLE, "")
+    registries: tuple[dict[str, Any], ...] = LAWS, METHODS
+    before = [dict(each) for each in registries]
+    yield
+    for each, entries in zip(registries, before, strict=True):
+        each.clear()
+        each.update(entries)
+
+
+@pytest.mark.usefixtures("plugins")
+@pytest.mark.parametrize(
+    ("name", "text", "sentence"),
+    [
+        ("law.py", "import nowhere_at_all", "cannot be imported: ModuleNotFoundError: No module"),
+        ("law.py", "def f(:", "cannot be imported: SyntaxError"),
+        ("law.txt", "", "its name must end in .py"),
+        ("law.py", None, "cannot be imported: FileNotFoundError"),
+    ],
+)
+def test_a_plugin_that_is_none_is_refused(
+    tmp_path: Path, name: str, text: str | None, sentence: str
+) -> None:
+    file = tmp_path / name
+    if text is not None:
+        file.write_text(text)
+    with pytest.raises(ParameterError, match=f"^The plugin '{file}' .*{sentence}"):
+        add_plugin(file)
+
+
+@pytest.mark.usefixtures("plugins")
+def test_a_plugin_adds_what_it_defines_and_not_what_it_imports(tmp_path: Path) -> None:
+    for name in ("lqr_law.py", "own_gait_method.py"):
+        add_plugin(EXAMPLES / name)
+    assert list(LAWS) == ["transposed_jacobian", "model_based", "computed_torque", "lqr"]
+    assert METHODS["stow"].controls == {"shape"}
+    assert os.environ[PLUGINS_VARIABLE].split(os.pathsep) == [
+        str(EXAMPLES / "lqr_law.py"),
+        str(EXAMPLES / "own_gait_method.py"),
+    ]
