@@ -20,6 +20,11 @@ def printable(text: str) -> str:
     return "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in line)
 
 
+def reason(error: Exception) -> str:
+    """Return why a file cannot be used, without the number of the error and without the path."""
+    return getattr(error, "strerror", None) or str(error)
+
+
 def sentence_case(text: str) -> str:
     """Return a text with a capital first letter, as the beginning of a sentence."""
     return text[:1].upper() + text[1:]

@@ -17,7 +17,7 @@ import yaml
 from spacerobot_ros.bag.config import RecorderConfig
 from spacerobot_ros.control.config import ControllerConfig
 from spacerobot_ros.control.laws.registry import LAWS
-from spacerobot_ros.errors import GoalError, ParameterError, RobotDescriptionError
+from spacerobot_ros.errors import GoalError, ParameterError, RobotDescriptionError, reason
 from spacerobot_ros.files import load_yaml
 from spacerobot_ros.model import RobotDescription, SpaceRobot, load_robot
 from spacerobot_ros.model.description import DEFAULT_END_EFFECTOR
@@ -380,7 +380,8 @@ class Scenario:
         rotvec: Sequence[float] | None = None,
         rpy_deg: Sequence[float] | None = None,
     ) -> Scenario:
-        """Return the scenario with another pose (7,), and then another attitude (3,), if given.
+        """Return the scenario with another pose (7,) or position (3,), and then another attitude
+        (3,), if given.
 
         The attitude is a rotation vector (rad), or roll, pitch and yaw about fixed axes (deg). The
         published figures, which hold for the published goal, are dropped.
@@ -392,7 +393,7 @@ class Scenario:
         """
         goal = self.goal
         if pose is not None:
-            given = Goal.checked(pose[:3], pose[3:])
+            given = Goal.checked(pose[:3], pose[3:] or goal.quaternion)
             goal = replace(goal, position=given.position, quaternion=given.quaternion)
         if rotvec is not None and rpy_deg is not None:
             raise GoalError("The attitude of the goal is given twice, in radians and in degrees.")
@@ -505,7 +506,10 @@ def load_scenario(name: str) -> Scenario:
         There is no such scenario, or its file cannot be used; the message names it.
     """
     path = Path(name)
-    if path.suffix not in (".yaml", ".yml"):
+    if path.suffix in (".yaml", ".yml"):
+        if not path.is_file():
+            raise ParameterError(f"There is no scenario file '{name}'.")
+    else:
         path = share_directory() / "config" / f"{name}.yaml"
     if not path.is_file():
         known, robots = scenario_names(), resource_names("urdf", ".urdf")
@@ -759,7 +763,9 @@ def _read_content(path: Path) -> dict[Any, Any]:
     try:
         content = load_yaml(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
-        raise ParameterError(f"The scenario file {path} cannot be read: {error}.") from error
+        raise ParameterError(
+            f"The scenario file {path} cannot be read: {reason(error)}."
+        ) from error
     return content if isinstance(content, dict) else {}
 
 

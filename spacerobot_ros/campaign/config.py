@@ -18,7 +18,7 @@ from spacerobot_ros.campaign.targets import (
     description_of,
     targets_of,
 )
-from spacerobot_ros.errors import ParameterError, printable
+from spacerobot_ros.errors import ParameterError, printable, reason
 from spacerobot_ros.files import load_yaml
 from spacerobot_ros.measures import CLEARANCE, METRICS, metric_names
 from spacerobot_ros.model.description import Array
@@ -196,7 +196,9 @@ def load_campaign(path: Path, flights: int | None = None) -> Campaign:
     try:
         content = load_yaml(path.read_text(encoding="utf-8"), _UniqueKeyLoader)
     except (OSError, ValueError) as error:
-        raise ParameterError(f"The campaign file {path} cannot be read: {error}.") from error
+        raise ParameterError(
+            f"The campaign file {path} cannot be read: {reason(error)}."
+        ) from error
     section = content.get("campaign") if isinstance(content, dict) else None
     if not isinstance(section, dict):
         raise ParameterError(f"The campaign file {path} has no section 'campaign:'.")

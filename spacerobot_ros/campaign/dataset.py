@@ -20,7 +20,7 @@ from spacerobot_ros.campaign.config import FIXED_SIZE_SAMPLERS, Campaign, parse_
 from spacerobot_ros.campaign.draws import require_module
 from spacerobot_ros.campaign.rows import Row
 from spacerobot_ros.campaign.targets import description_of
-from spacerobot_ros.errors import ParameterError, RecordingError
+from spacerobot_ros.errors import ParameterError, RecordingError, reason
 from spacerobot_ros.files import load_yaml
 from spacerobot_ros.measures import metric_names
 from spacerobot_ros.model.urdf import load_robot, parse_robot
@@ -95,7 +95,9 @@ class Dataset:
             return done
         except OSError as error:
             self.close()
-            raise RecordingError(f"The folder {self.folder} cannot be written: {error}.") from error
+            raise RecordingError(
+                f"The folder {self.folder} cannot be written: {reason(error)}."
+            ) from error
         except BaseException:
             self.close()
             raise
@@ -248,8 +250,8 @@ class Dataset:
             os.replace(folder / f".{path.name}", path)
         except OSError as error:
             raise RecordingError(
-                f"The last {len(self._rows)} flights cannot be written to {path}: {error}. The "
-                "same command goes on from those before them."
+                f"The last {len(self._rows)} flights cannot be written to {path}: {reason(error)}. "
+                "The same command goes on from those before them."
             ) from error
         self._rows.clear()
 

@@ -10,11 +10,13 @@ from contextlib import contextmanager, redirect_stdout
 from dataclasses import dataclass, field
 from functools import cached_property, wraps
 from importlib import import_module
+from itertools import takewhile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 import click
 
+from spacerobot_ros.errors import reason
 from spacerobot_ros.files import write_output
 
 if TYPE_CHECKING:
@@ -159,8 +161,55 @@ def _attitude_options(*prefixes: str) -> Callable[..., Any]:
 
 attitude_options = _attitude_options("goal-", "")
 _pose_option = click.option(
-    "--goal", nargs=7, type=float, metavar="X Y Z QX QY QZ QW", help="Goal pose (m, quaternion)."
+    "--goal",
+    nargs=7,
+    type=float,
+    metavar="X Y Z [QX QY QZ QW]",
+    help="Goal pose (m, quaternion), or its position with the attitude of the scenario.",
 )
+_position_option = click.option(
+    "--goal-position",
+    "position",
+    nargs=3,
+    type=float,
+    metavar="X Y Z",
+    help="Goal position (m), as --goal with three numbers.",
+)
+
+
+class NumberRange(click.FloatRange):
+    """A range of numbers without NaN, which every comparison lets through."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """Return the number, or fail with what was given."""
+        number = super().convert(value, param, ctx)
+        if math.isnan(number):
+            self.fail(f"{value!r} is not a number.", param, ctx)
+        return number
+
+
+class GoalCommand(click.Command):
+    """A command whose ``--goal`` takes 3 or 7 numbers: options of click take a fixed number."""
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Parse the arguments, with ``--goal`` of three numbers as ``--goal-position``."""
+        args = list(args)
+        for place, word in enumerate(args):
+            if word == "--goal":
+                count = sum(1 for _ in takewhile(_is_number, args[place + 1 :]))
+                if count == 3:
+                    args[place] = "--goal-position"
+                elif count < 7:
+                    raise click.UsageError("A goal is X Y Z, or X Y Z QX QY QZ QW.", ctx)
+        return super().parse_args(ctx, args)
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
 
 
 @dataclass(frozen=True)
@@ -170,7 +219,7 @@ class GoalOptions:
     Attributes
     ----------
     pose
-        (7,) position (m) and quaternion, if given.
+        (7,) position (m) and quaternion, or (3,) position, if given.
     rotvec, rpy_deg
         (3,) attitude in radians or in degrees, if given.
     """
@@ -191,7 +240,7 @@ class GoalOptions:
         attitude = self.rotvec is not None or self.rpy_deg is not None
         asked: set[Controlled] = {"attitude"} if attitude else set()
         if self.pose is not None:
-            asked = {"position", "attitude"}
+            asked |= {"position"} if len(self.pose) == 3 else {"position", "attitude"}
         return scenario.with_end_effectors(hands, frozenset(asked))
 
 
@@ -247,7 +296,7 @@ def _read_path(file: Path) -> list[list[float]]:
         rows = [list(map(float, line.replace(",", " ").split())) for line in lines]
     except (OSError, ValueError) as error:
         raise click.BadParameter(
-            f"The path {file} cannot be read: {error}. Each of its lines has 3 numbers, a "
+            f"The path {file} cannot be read: {reason(error)}. Each of its lines has 3 numbers, a "
             "position, or 7, a position and a quaternion."
         ) from error
     found = [row for row in rows if row]
@@ -266,6 +315,7 @@ def goal_options(command: Callable[..., None]) -> Callable[..., None]:
     def with_goal(
         *words: Any,
         goal: Any,
+        position: Any,
         rotvec: Any,
         rpy_deg: Any,
         poses: Any = (),
@@ -275,9 +325,10 @@ def goal_options(command: Callable[..., None]) -> Callable[..., None]:
         **options: Any,
     ) -> None:
         hands = EndEffectorOptions(poses, positions, links, paths)
-        command(*words, goal=GoalOptions(goal, rotvec, rpy_deg, hands), **options)
+        command(*words, goal=GoalOptions(goal or position, rotvec, rpy_deg, hands), **options)
 
-    return cast("Callable[..., None]", _pose_option(_attitude_options("goal-")(with_goal)))
+    with_poses = _position_option(_pose_option(_attitude_options("goal-")(with_goal)))
+    return cast("Callable[..., None]", with_poses)
 
 
 def end_effector_options(command: Callable[..., None]) -> Callable[..., None]:
@@ -357,6 +408,22 @@ class RegisteredName(_Choice):
             module, _, attribute = registry.partition(":")
             names |= set(getattr(import_module(module), attribute))
         return tuple(sorted(names))
+
+
+class RegisteredOption(click.Option):
+    """An option with a name in registries, which its help lists."""
+
+    def get_help_record(self, ctx: click.Context) -> tuple[str, str] | None:
+        """Return the option and its help, with the names."""
+        record = super().get_help_record(ctx)
+        names = ", ".join(cast("RegisteredName", self.type).choices)
+        return None if record is None else (record[0], f"{record[1]} One of {names}.")
+
+
+def registered_option(*names: str, registries: Sequence[str], help: str) -> Any:
+    """Return an option that takes a name in registries."""
+    kind = RegisteredName(*registries)
+    return click.option(*names, type=kind, cls=RegisteredOption, metavar="NAME", help=help)
 
 
 METHODS = "spacerobot_ros.planning.methods.registry:METHODS"

@@ -14,12 +14,13 @@ import click
 
 from spacerobot_ros.cli.options import (
     METHODS,
+    GoalCommand,
     GoalOptions,
-    RegisteredName,
     end_effector_options,
     goal_options,
     json_option,
     picture_option,
+    registered_option,
     settings_option,
     within_option,
     write_json,
@@ -36,11 +37,11 @@ if TYPE_CHECKING:
 _NO_GOAL = GoalOptions(None, None, None)
 
 
-@click.command("plan")
+@click.command("plan", cls=GoalCommand)
 @click.argument("scenario", metavar="SCENARIO|ROBOT")
 @end_effector_options
 @goal_options
-@click.option("--method", type=RegisteredName(METHODS), help="Gait method [the scenario's].")
+@registered_option("--method", registries=(METHODS,), help="Gait method [the scenario's].")
 @settings_option
 @json_option("Write schedule and predicted path as JSON.")
 @picture_option("Draw schedule and predicted path (.png, .svg, .pdf).")
@@ -55,8 +56,8 @@ _NO_GOAL = GoalOptions(None, None, None)
     help="Instead: plan N random goals, and print figures of all.",
 )
 @within_option((0.3, 180.0), "With --random: largest")
-@click.option(
-    "--beside", type=RegisteredName(METHODS), help="With --random: plan them by this method too."
+@registered_option(
+    "--beside", registries=(METHODS,), help="With --random: plan them by this method too."
 )
 def plan_command(
     scenario: str,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import sys
 import threading
 from collections.abc import Iterator
@@ -79,6 +80,11 @@ def sentences() -> Iterator[None]:
         out_of_reach = isinstance(error, PlanningError) and not isinstance(error, GoalError)
         click.echo(str(error), err=True)
         sys.exit(ExitCode.NOT_REACHED if out_of_reach else ExitCode.BAD_INPUT)
+    except OSError as error:
+        if error.errno != errno.ENOSPC or error.filename is not None:
+            raise
+        click.echo("Standard output cannot be written: no space is left on its device.", err=True)
+        sys.exit(ExitCode.BAD_INPUT)
     except ImportError as error:
         if not error.name or error.name.split(".")[0] not in _ROS_MODULES:
             raise

@@ -13,7 +13,7 @@ from html import escape
 from pathlib import Path
 from xml.etree.ElementTree import Element, ParseError, fromstring
 
-from spacerobot_ros.errors import RobotDescriptionError
+from spacerobot_ros.errors import RobotDescriptionError, reason
 from spacerobot_ros.model.description import RobotDescription
 from spacerobot_ros.resources import suggestion
 
@@ -35,7 +35,7 @@ def with_srdf(robot: RobotDescription, path: str | Path) -> RobotDescription:
     try:
         root = fromstring(Path(path).read_bytes())
     except OSError as error:
-        raise RobotDescriptionError(f"The SRDF {path} cannot be read: {error}.") from error
+        raise RobotDescriptionError(f"The SRDF {path} cannot be read: {reason(error)}.") from error
     except (ParseError, ValueError) as error:
         raise RobotDescriptionError(f"The SRDF {path} is no XML ({error}).") from error
     if root.tag != "robot":

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from spacerobot_ros.errors import ParameterError, RobotDescriptionError, SpaceRobotError
+from spacerobot_ros.errors import ParameterError, RobotDescriptionError, SpaceRobotError, reason
 from spacerobot_ros.files import load_yaml
 from spacerobot_ros.model.description import Array, Pose, RobotDescription
 from spacerobot_ros.model.rotations import matrix_from_rpy
@@ -187,7 +187,9 @@ def load_thrusters(path: str | Path, robot: RobotDescription) -> ThrusterTable:
     try:
         content = load_yaml(Path(path).read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
-        raise ParameterError(f"The thruster file {path} cannot be read: {error}.") from error
+        raise ParameterError(
+            f"The thruster file {path} cannot be read: {reason(error)}."
+        ) from error
     entries = content.get("thrusters") if isinstance(content, dict) else None
     defaults = content.get("defaults", {}) if isinstance(content, dict) else {}
     if not (isinstance(entries, list) and entries and isinstance(defaults, dict)):

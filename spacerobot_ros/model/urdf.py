@@ -21,7 +21,7 @@ from xml.etree.ElementTree import Element, ParseError, fromstring, tostring
 
 import numpy as np
 
-from spacerobot_ros.errors import RobotDescriptionError
+from spacerobot_ros.errors import RobotDescriptionError, reason
 from spacerobot_ros.model import xacro_files
 from spacerobot_ros.model.description import (
     Array,
@@ -120,7 +120,7 @@ def _loaded(path: Path, parse: Callable[[str], RobotDescription]) -> RobotDescri
     try:
         text = path.read_text(encoding="utf-8")
     except OSError as error:
-        raise RobotDescriptionError(f"The URDF {path} cannot be read: {error}.") from error
+        raise RobotDescriptionError(f"The URDF {path} cannot be read: {reason(error)}.") from error
     except UnicodeDecodeError as error:
         raise RobotDescriptionError(
             f"The URDF {path} cannot be read: it is no text in UTF-8 ({error}). Save it as UTF-8."

@@ -10,19 +10,26 @@ from types import SimpleNamespace
 from typing import Any
 
 import click
+import numpy as np
 import pytest
+from support.command_line import CliRunner
+from support.warm_python import WarmPython
 
 import spacerobot_ros.cli as cli
 from spacerobot_ros.cli import terminal
+from spacerobot_ros.cli.main import main
 from spacerobot_ros.cli.options import (
     EndEffectorOptions,
+    GoalCommand,
     GoalOptions,
     RegisteredName,
+    goal_options,
     viewer_if_requested,
     warn_of_large_angles,
 )
 from spacerobot_ros.cli.terminal import sentences
 from spacerobot_ros.errors import GoalError
+from spacerobot_ros.scenario import load_scenario
 from spacerobot_ros.termination import Terminated
 
 POSE = (1.0, 2.0, 3.0, 0.0, 0.6, 0.0, 0.8)
@@ -50,6 +57,8 @@ class RequestedPart:
         (None, None, None, []),
         (POSE, None, None, ["attitude", "position"]),
         (POSE, (0.0, 0.0, 1.0), None, ["attitude", "position"]),
+        (POSE[:3], None, None, ["position"]),
+        (POSE[:3], None, (0.0, 0.0, 1.0), ["attitude", "position"]),
         (None, (0.0, 0.0, 1.0), None, ["attitude"]),
         (None, None, (0.0, 0.0, 1.0), ["attitude"]),
     ],
@@ -272,3 +281,57 @@ def test_files_that_are_no_paths_are_refused(tmp_path: Path, text: str | None, w
     assert f"The path {file}" in refused.value.message
     assert words in refused.value.message
     assert "7, a position and a quaternion" in refused.value.message
+
+
+@pytest.mark.parametrize("words", [["0.25", "-0.5", "1e-1"], ["0.25", "-0.5", ".1", *"0001"]])
+def test_a_goal_of_the_command_line_is_a_position_or_a_pose(words: list[str]) -> None:
+    """Three numbers keep the attitude of the scenario; negative ones are no options."""
+    found: list[Any] = []
+
+    @click.command(cls=GoalCommand)
+    @click.argument("scenario")
+    @goal_options
+    def fly(scenario: str, goal: GoalOptions) -> None:
+        found.append(goal.apply_to(load_scenario(scenario)).goal)
+
+    result = CliRunner().invoke(fly, ["sliding_masses", "--goal", *words])
+    assert result.exit_code == 0, result.output
+    (goal,) = found
+    np.testing.assert_allclose(goal.position, [0.25, -0.5, 0.1])
+    kept = load_scenario("sliding_masses").goal.quaternion
+    assert np.linalg.norm(kept[:3]) > 0.1
+    np.testing.assert_array_equal(goal.quaternion, kept if len(words) == 3 else [0, 0, 0, 1])
+    for wrong in (words[:2], [*words, "1"]):
+        refused = CliRunner().invoke(fly, ["sliding_masses", "--goal", *wrong])
+        assert refused.exit_code == 2
+        assert "X Y Z" in refused.output or "unexpected extra" in refused.output
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["run", "sliding_masses", "--longest"],
+        ["goal", "1", "2", "3", "--timeout"],
+        ["verify", __file__, "--tolerance"],
+        ["replay", __file__, "--wait"],
+    ],
+)
+def test_a_duration_is_a_number(words: list[str]) -> None:
+    result = CliRunner().invoke(main, [*words, "nan"])
+    assert result.exit_code == 2
+    assert "'nan' is not a number" in result.output
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a device that is always full")
+def test_an_output_without_space_is_bad_input_and_no_verdict(warm_python: WarmPython) -> None:
+    words = ["-m", "spacerobot_ros", "robots"]
+    with (
+        Path("/dev/full").open("w") as full,
+        warm_python.start(
+            words, Path.cwd(), os.environ, stdout=full, stderr=subprocess.PIPE
+        ) as shown,
+    ):
+        assert shown.stderr is not None
+        told = shown.stderr.read()
+        assert shown.wait(60) == 2
+    assert told == "Standard output cannot be written: no space is left on its device.\n"
