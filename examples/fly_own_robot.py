@@ -64,7 +64,7 @@ def xyz(kind: Any, values: Any) -> Any:
 
 
 if __name__ == "__main__":
-    rclpy.init(args=["--ros-args", "-p", "robot:=sliding_masses", "-p", "time_mode:=lockstep"])
+    rclpy.init(args=["--ros-args", "-p", "robot:=sliding_masses"])
     lab, driver, late = PlantNode(namespace="lab"), Driver(), list[PoseStamped]()
     driver.create_subscription(PoseStamped, "lab/base_pose", late.append, 10)
     goals = driver.create_publisher(PoseStamped, "goal_pose", 10)

@@ -1,6 +1,7 @@
 """A control law of one's own in plain numpy: a linear-quadratic regulator of base and joints.
 
-Fly it with ``spacerobot --plugin examples/lqr_law.py run servicer_thrusters --method lqr``.
+Run it with ``python examples/lqr_law.py``; any robot flies with it by ``spacerobot --plugin
+examples/lqr_law.py run ROBOT --method lqr --goal X Y Z``.
 """
 
 from dataclasses import dataclass
@@ -9,6 +10,7 @@ import numpy as np
 from scipy.linalg import solve_continuous_are
 from scipy.spatial.transform import Rotation
 
+from spacerobot_ros import fly
 from spacerobot_ros.control import Actuation, ControlState, OutputSelection, Reference
 from spacerobot_ros.control.laws.law import LawOptions
 from spacerobot_ros.control.laws.numpy_law import NumpyLaw
@@ -60,18 +62,18 @@ class LqrLaw(NumpyLaw):
         R_WB = Rotation.from_quat(state.quaternion_WB)
         turned = Rotation.from_quat(base.quaternion).inv() * R_WB
         to_base = R_WB.inv().apply
-        dx = np.concatenate(
-            [
-                to_base(state.r_WB - base.position),
-                turned.as_rotvec(),
-                state.q - joints.q,
-                state.v_WB_B - to_base(base.velocity),
-                state.omega_WB_B - to_base(base.angular_velocity),
-                state.qdot - joints.qdot,
-            ]
-        )
-        acceleration = np.concatenate(
-            [to_base(base.acceleration), to_base(base.angular_acceleration), joints.qddot]
-        )
-        command = self._M @ acceleration - self._K @ dx
+        r, v = to_base(state.r_WB - base.position), state.v_WB_B - to_base(base.velocity)
+        omega = state.omega_WB_B - to_base(base.angular_velocity)
+        q, qdot = state.q - joints.q, state.qdot - joints.qdot
+        a, alpha = to_base(base.acceleration), to_base(base.angular_acceleration)
+        command = self._M @ np.concatenate([a, alpha, joints.qddot])
+        command -= self._K @ np.concatenate([r, turned.as_rotvec(), q, v, omega, qdot])
         return Actuation(command[:6], command[6:])
+
+
+if __name__ == "__main__":
+    for seconds in (1.0, 2.0, 4.0):
+        flight = fly(
+            "free_flyer", (0.4, 0.1, 0.2), law=LqrLaw, law_options={"response_time": seconds}
+        )
+        print(f"response time {seconds:g} s: {flight.message}")

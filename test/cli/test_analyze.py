@@ -227,4 +227,4 @@ def test_what_is_refused_with_a_sentence(arguments: list[str], sentence: str) ->
 def test_every_robot_of_the_package_is_drawn(tmp_path: Path, robot: str) -> None:
     _, lines, picture = analyzed(tmp_path, robot)
     assert picture.is_file()
-    assert len(lines) <= 40
+    assert len(lines) <= 42
