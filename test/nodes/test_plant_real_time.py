@@ -76,7 +76,8 @@ def test_real_time_refuses_commands_from_another_time(
     rig = Rig(harness, REALTIME)
     harness.spin_until(lambda: rig.now_ns > 3_000_000_000, "three simulated seconds")
     rig.send([0.3, 0.3, 0.3], stamp_ns=rig.now_ns + offset_s * 10**9)
-    rig.wait_for_log(word)
+    rig.wait_for_refusals(1)
+    assert word in rig.diagnosis("commands").message
     rig.wait("joint_states", rig.probe.count("joint_states") + 3)
     assert not any(any(m.velocity) for m in rig.probe.messages["joint_states"])
 

@@ -288,7 +288,8 @@ def test_a_full_disk_ends_the_recording_and_nothing_else(
     for process in (plant, recorder):
         assert process.process.poll() is None, process.said
         process.signal(signal.SIGTERM)
-        assert process.end() == 0, process.said
+    assert plant.end() == 0, plant.said
+    assert recorder.end() == 1, "its bag is cut short"
     (sentence,) = (line for line in recorder.said.splitlines() if "has ended" in line)
     assert_one_sentence(sentence, str(bag))
     assert "Traceback" not in recorder.said
