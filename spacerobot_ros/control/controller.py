@@ -19,7 +19,6 @@ from spacerobot_ros.control.laws.registry import LAWS
 from spacerobot_ros.control.limits import (
     ActuatorLimits,
     JointRateLimits,
-    LimitCheck,
     MotionLimits,
     Saturated,
 )
@@ -27,7 +26,6 @@ from spacerobot_ros.control.outputs import OutputDistance, OutputSelection
 from spacerobot_ros.control.reference import (
     PROFILES,
     OutputErrors,
-    ProfileFunction,
     ReferenceProfile,
     StepReference,
 )
@@ -104,13 +102,7 @@ class CoordinatedController:
         self.wheels = wheels
         self.law, selection = law, law.outputs.selection
         self._kinds, self._distances = selection.error_kinds, selection.distances
-        self._profiles: ProfileFunction | None = None
-        """The profile as the law's function takes it; None: the law needs the parts."""
-        if law.fixed_inputs is not None:
-            groups = bool(selection.base), bool(selection.end_effector)
-            self._profiles = ProfileFunction(*groups, law.robot.n if selection.joints else 0)
         self._limits, self.joint_rate_limits = limits, rates
-        self._check = LimitCheck(limits, rates, law.outputs.m)
         self._profile_type, self._motion = profile, motion
         self._control_period, self._estimation_time = control_period, estimation_time
         self.mode = Mode.MEASURED
@@ -264,20 +256,12 @@ class CoordinatedController:
                 self._began = time
             # The law is always evaluated, for its errors and status.
             self.law.time = time
-            packed = self._packed_reference(time)
-            if packed is None:
-                commanded = self.law.command(state, self._reference_at(time))
-            else:
-                commanded = self.law.command_to_packed(state, packed)
+            commanded = self.law.command(state, self._reference_at(time))
             if self.coming_to_rest:
                 commanded = self._to_rest(state)
         if state is not None:
             periods = self._periods_held(time)
-            error = self.law.error
-            if self.wheels is None and self._check.is_within(commanded, state.qdot, periods, error):
-                result = self._limits.unchanged(commanded)
-            else:
-                result = self.apply_limits(state, commanded, periods)
+            result = self.apply_limits(state, commanded, periods)
             if self.law.integrates and not self.coming_to_rest:
                 self.law.integrate_error(periods * self._control_period, limited=result.limited)
         else:
@@ -354,8 +338,7 @@ class CoordinatedController:
 
     def largest_error_share(self, bounds: Array) -> float:
         """Return the largest error of the last command as a share of its bound (m,), > 0."""
-        share = self._check.error_share(bounds) if self.wheels is None else None
-        return self.law.largest_error_share(bounds) if share is None else share
+        return self.law.largest_error_share(bounds)
 
     def distance_from_reference(self) -> OutputDistance:
         """Return the distance of the last command's outputs from the reference."""
@@ -409,17 +392,6 @@ class CoordinatedController:
             return self.profile.at(time - self._began)
         link = self.law.outputs.selection.end_effector_link
         return Reference.present(self.law.robot, state, link)
-
-    def _packed_reference(self, time: float) -> Array | None:
-        """Return the reference of the profile for the law's function; None: the law also needs
-        its parts, or other references are followed.
-        """
-        given = self._followed
-        if self._profiles is None or self.profile is None:
-            return None
-        if not (given.base is None and given.joints is None and given.end_effector is None):
-            return None
-        return self._profiles.at(self.profile, time - self._began)
 
     def _reference_at(self, time: float) -> Reference:
         assert self.profile is not None

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields, replace
-from functools import cached_property, lru_cache
+from functools import cached_property
 from operator import mul
 from typing import NamedTuple
 
@@ -38,11 +38,6 @@ evaluated."""
 
 _MOBILITY_SHAPES = 16
 
-_SURE_SHARE = 1.0 - 1e-9
-"""Share of the limit of a force or torque up to which no rounding counts."""
-
-_SMALLEST_SQUARED_LIMIT = 1e-100
-"""Smallest limit (N, N m) whose square is known well enough for such a comparison."""
 
 _REST_RATE = 2.0
 """Decay rate of joint rates and momenta while a robot is brought to rest, 1/s."""
@@ -161,7 +156,7 @@ class ActuatorLimits:
     def apply(self, commanded: Actuation) -> Saturated:
         """Return the command within the limits."""
         if self._keeps(commanded):
-            return self.unchanged(commanded)
+            return Saturated(commanded, self._no_excess)
         wrench = np.concatenate(
             [
                 _limit_norm(commanded.wrench_B[:3], self.force),
@@ -170,10 +165,6 @@ class ActuatorLimits:
         )
         tau = np.clip(commanded.tau, -self.effort, self.effort)
         return Saturated.of(commanded, Actuation(wrench, tau))
-
-    def unchanged(self, commanded: Actuation) -> Saturated:
-        """Return a command that is known to be within the limits."""
-        return Saturated(commanded, self._no_excess)
 
     def _keeps(self, commanded: Actuation) -> bool:
         # In Python's numbers: numpy takes longer for so few.
@@ -275,14 +266,6 @@ class JointRateLimits:
                 return True
         return False
 
-    def factors(self) -> tuple[Array, Array]:
-        """Return the factors (n,) of joint rates, and of efforts held for one control period.
-
-        While a joint's rate and effort times its factors have magnitudes that sum up to 1 at most,
-        :meth:`apply` does not change a command because of that joint.
-        """
-        return self._per_rate, self._per_effort
-
     def exceeds_limits_expression(
         self, omega: ca.SX, q: ca.SX, qdot: ca.SX, actuation: ca.SX
     ) -> ca.SX:
@@ -345,100 +328,11 @@ class JointRateLimits:
         return largest
 
 
-class LimitCheck:
-    """Says of most commands that no limit changes them, and how large the errors are beside bounds.
-
-    Both are needed for every state: one function in the virtual machine takes a fifth of the time
-    of Python's numbers. The others, near a limit, are for :meth:`ActuatorLimits.apply` and
-    :meth:`JointRateLimits.apply`.
-
-    Parameters
-    ----------
-    actuators, rates
-        The limits.
-    outputs
-        Number of outputs, m.
-    """
-
-    def __init__(self, actuators: ActuatorLimits, rates: JointRateLimits, outputs: int) -> None:
-        self._function = BufferedFunction(_check_function(actuators.effort.size, outputs))
-        self._wrench, self._tau, self._qdot, self._periods, *limits = self._function.inputs
-        thrust, effort, per_rate, per_effort, self._error, self._bounds = limits
-        self._bounds[:] = np.inf
-        thrust[:] = [
-            (limit * _SURE_SHARE) ** 2 if limit > _SMALLEST_SQUARED_LIMIT else -1.0
-            for limit in (actuators.force, actuators.torque)
-        ]
-        effort[:] = actuators.effort
-        per_rate[:], per_effort[:] = rates.factors()
-        self._checked: Array | None = None
-        self._given: Array | None = None
-        self._share = 0.0
-
-    def is_within(self, commanded: Actuation, qdot: Array, periods: int, error: Array) -> bool:
-        """Return whether a command is surely within all limits.
-
-        Parameters
-        ----------
-        commanded
-            The command.
-        qdot
-            Joint rates (n,), m/s or rad/s.
-        periods
-            For how many control periods it is held.
-        error
-            Errors (m,) of the outputs, m or rad.
-        """
-        self._wrench[:], self._tau[:] = commanded
-        self._qdot[:], self._periods[0], self._error[:] = qdot, periods, error
-        self._function.evaluate()
-        within, share, total = self._function.outputs[0].tolist()
-        # The largest of some numbers may hide one that is none: it must not count as reached.
-        self._share = share if total == total else math.nan
-        self._checked = self._given
-        return bool(within)
-
-    def error_share(self, bounds: Array) -> float | None:
-        """Return the largest of the last errors as a share of its bound (m,), > 0.
-
-        None: these are other bounds than at the last check; the next one takes them.
-        """
-        if bounds is not self._given:
-            self._given, self._bounds[:] = bounds, bounds
-        return self._share if self._checked is bounds else None
-
-
 def _rate_shares(
     qdot: ca.SX, tau: ca.SX, per_rate: ca.SX | Array, per_effort: ca.SX | Array
 ) -> ca.SX:
     """Return numbers (n,) that are 1 at most while a joint cannot reach its largest rate."""
     return ca.fabs(qdot) * per_rate + ca.fabs(tau) * per_effort
-
-
-@lru_cache
-def _check_function(n: int, m: int) -> ca.Function:
-    """Return the function of a :class:`LimitCheck`: ``(sure, largest share, sum of shares)``.
-
-    Its comparisons of efforts and rates are those of the limits, operation by operation.
-    """
-    wrench, tau, qdot = ca.SX.sym("wrench", 6), ca.SX.sym("tau", n), ca.SX.sym("qdot", n)
-    periods, thrust, effort = ca.SX.sym("periods"), ca.SX.sym("thrust", 2), ca.SX.sym("effort", n)
-    per_rate, per_effort = ca.SX.sym("per_rate", n), ca.SX.sym("per_effort", n)
-    error, bounds = ca.SX.sym("error", m), ca.SX.sym("bounds", m)
-    sure = ca.SX(1)
-    for k, vector in enumerate((wrench[:3], wrench[3:])):
-        none = ca.sum1(ca.fabs(vector)) <= 0.0
-        sure = ca.logic_and(sure, ca.logic_or(none, ca.dot(vector, vector) <= thrust[k]))
-    shares = _rate_shares(qdot, tau, per_rate, periods * per_effort)
-    for i in range(n):
-        sure = ca.logic_and(sure, ca.logic_and(ca.fabs(tau[i]) <= effort[i], shares[i] <= 1.0))
-    largest, total = ca.SX(0.0), ca.SX(0.0)
-    for i in range(m):
-        share = ca.fabs(error[i] / bounds[i])
-        largest, total = ca.fmax(largest, share), total + share
-    inputs = [wrench, tau, qdot, periods, thrust, effort, per_rate, per_effort, error, bounds]
-    results = {"check": ca.vertcat(sure, largest, total)}
-    return dense_function("limit_check", {str(i): each for i, each in enumerate(inputs)}, results)
 
 
 def decay_rate(control_period: float) -> float:

@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, fields
-from functools import lru_cache
 from typing import Any, ClassVar
 
 import casadi as ca
@@ -18,7 +17,6 @@ import numpy.typing as npt
 
 from spacerobot_ros.control.limits import MotionLimits
 from spacerobot_ros.control.state import JointReference, PoseReference, Reference, TargetNotSetError
-from spacerobot_ros.model.compilation import BufferedFunction, dense_function
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.rotations import (
     attitude_error,
@@ -218,46 +216,6 @@ def profile_size(base: bool, end_effector: bool, n: int) -> int:
 
 def _profile_sizes(base: bool, end_effector: bool, n: int) -> list[int]:
     return [1, *([3, 3, 4, 4, 3, 1, 3, 4] * (base + end_effector)), *([n, n, n] if n else [])]
-
-
-class ProfileFunction:
-    """Evaluates profiles by :func:`profile_expression`, in the virtual machine.
-
-    Its references are :meth:`ReferenceProfile.at` in the form in which a law's function takes them,
-    in a tenth of the time.
-
-    Parameters
-    ----------
-    base, end_effector, n
-        As of :func:`profile_numbers`.
-    """
-
-    def __init__(self, base: bool, end_effector: bool, n: int) -> None:
-        self._groups = base, end_effector, n
-        self._function = BufferedFunction(_profile_function(*self._groups))
-        self._numbers, self._time = self._function.inputs
-        self._profile: ReferenceProfile | None = None
-
-    def at(self, profile: ReferenceProfile, time: float) -> Array | None:
-        """Return the reference of a profile ``time`` s after its start; it is valid until the next.
-
-        None: the profile lacks a controlled group.
-        """
-        if profile is not self._profile:
-            numbers = profile_numbers(profile, *self._groups)
-            if numbers.size != self._numbers.size:
-                return None
-            self._numbers[:], self._profile = numbers, profile
-        self._time[0] = time
-        self._function.evaluate()
-        return self._function.outputs[0]
-
-
-@lru_cache
-def _profile_function(base: bool, end_effector: bool, n: int) -> ca.Function:
-    numbers, time = ca.SX.sym("numbers", profile_size(base, end_effector, n)), ca.SX.sym("time")
-    reference = profile_expression(numbers, time, base, end_effector, n)
-    return dense_function("profile", {"numbers": numbers, "time": time}, {"reference": reference})
 
 
 class HeldVelocityReference:

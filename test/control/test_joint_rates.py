@@ -23,10 +23,7 @@ from spacerobot_ros.control.config import ControllerConfig
 from spacerobot_ros.control.controller import build_controller
 from spacerobot_ros.control.executive import ControlExecutive
 from spacerobot_ros.control.limits import (
-    ActuatorLimits,
     JointRateLimits,
-    LimitCheck,
-    Saturated,
 )
 from spacerobot_ros.control.status import ControllerStatus
 from spacerobot_ros.events import Event, EventKind
@@ -55,59 +52,6 @@ def energy(plant: PinocchioPlant) -> float:
     n = len(plant.state.q)
     q = plant._configuration(x)
     return float(pin.computeKineticEnergy(plant.model, plant.data, q, x[7 + n :]))
-
-
-# -- the check before the limits ---------------------------------------------------------------
-
-
-@pytest.mark.parametrize("thrust", [(3.0, 0.5), (0.0, 0.0), (math.inf, 1e-120)])
-def test_a_command_that_is_surely_within_the_limits_is_not_changed_by_them(
-    thrust: tuple[float, float],
-) -> None:
-    rng, robot = np.random.default_rng(7), random_robot(1)
-    actuators = ActuatorLimits(*thrust, rng.uniform(0.5, 2.0, robot.n))
-    rates = JointRateLimits(robot, rng.uniform(0.2, 1.0, robot.n), PERIOD)
-    check, bounds = LimitCheck(actuators, rates, 3), np.array([0.5, 1.0, 2.0])
-    found = dict.fromkeys((True, False), 0)
-    for _ in range(400):
-        size = 10.0 ** rng.uniform(-3.0, 0.5)
-        sides = [min(limit, 10.0) * size * rng.choice([0.0, 1.0]) for limit in thrust]
-        wrench = np.concatenate([side * rng.normal(size=3) for side in sides])
-        state = replace(moving(rng, robot), qdot=size * 0.2 * rng.normal(size=robot.n))
-        given = Actuation(wrench, size * 0.2 * rng.normal(size=robot.n))
-        error, periods = rng.normal(size=3), int(rng.integers(1, 4))
-        sure = check.is_within(given, state.qdot, periods, error)
-        found[sure] += 1
-        result = actuators.apply(given)
-        kept = rates.apply(state, result.realised, actuators.effort, periods)
-        if kept is not result.realised:
-            result = Saturated.of(given, kept)
-        assert not (sure and result.limited)
-        share = check.error_share(bounds)
-        assert share is None or share == np.max(np.abs(error) / bounds)
-    assert share is not None
-    assert min(found.values()) > 20
-
-
-def test_a_check_of_numbers_that_are_none_is_not_sure() -> None:
-    robot = random_robot(0)
-    actuators = ActuatorLimits(3.0, 0.5, np.ones(robot.n))
-    check, bounds = LimitCheck(actuators, JointRateLimits(robot, np.ones(robot.n), PERIOD), 3), 1.0
-    none, good, of_bounds = np.zeros(3), np.zeros(robot.n), np.full(3, bounds)
-    assert check.is_within(Actuation(np.zeros(6), good), good, 1, none)
-    for place in (0, 2, -1):
-        wrench, bad = np.zeros(6), np.zeros(robot.n)
-        wrench[place] = bad[place] = np.nan
-        assert not check.is_within(Actuation(wrench, good), good, 1, none)
-        assert not check.is_within(Actuation(np.zeros(6), bad), good, 1, none)
-        assert not check.is_within(Actuation(np.zeros(6), good), bad, 1, none)
-        error = np.full(3, 0.1)
-        error[place] = np.nan
-        assert check.error_share(of_bounds) is None or place != 0
-        assert check.is_within(Actuation(np.zeros(6), good), good, 1, error)
-        share = check.error_share(of_bounds)
-        assert share is not None
-        assert math.isnan(share)
 
 
 # -- rates ------------------------------------------------------------------------------------

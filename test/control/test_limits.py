@@ -249,20 +249,6 @@ def test_the_expression_of_a_profile_is_the_profile(kind: type) -> None:
             np.testing.assert_allclose(found, numbers(made.at(t))[kept], atol=1e-12)
 
 
-def test_one_function_evaluates_one_profile_after_the_other() -> None:
-    function = reference.ProfileFunction(True, False, 2)
-    kept = np.repeat([True, False], 19).tolist() + [True] * 6
-    back = QuinticReference(GOAL, START, LIMITS)
-    for made, share in ((QuinticReference(START, GOAL, LIMITS), 0.3), (back, 0.3), (back, 0.8)):
-        time = share * made.duration
-        found = function.at(made, time)
-        assert found is not None
-        np.testing.assert_allclose(found, numbers(made.at(time))[kept], atol=1e-12)
-    without = QuinticReference(START, _without(GOAL, {"joints": None}), LIMITS)
-    assert function.at(without, 0.0) is None
-    assert function.at(back, 0.0) is not None
-
-
 def test_held_velocities_have_their_mean_and_their_jump_at_a_command() -> None:
     held = HeldVelocityReference(0.25)
     velocity = np.array([1.0, -2.0])

@@ -16,7 +16,6 @@ from spacerobot_ros.control.outputs import (
     OutputSelection,
     OutputVector,
     default_selection,
-    require_finite,
 )
 from spacerobot_ros.control.state import Actuation, ControlState, Reference
 from spacerobot_ros.errors import ParameterError
@@ -434,16 +433,6 @@ class ControlLaw(ABC):
         self.outputs.pack_state(state, self._in["state"])
         self.outputs.pack_reference(reference, self._in["reference"])
         return self._actuation(reference)
-
-    def command_to_packed(self, state: ControlState, packed: Array) -> Actuation:
-        """Return :meth:`command` for a reference in the form of its :attr:`function`.
-
-        Only for laws with :attr:`fixed_inputs`: the others look at the joints of references.
-        """
-        self.outputs.pack_state(state, self._in["state"])
-        require_finite("reference", packed)
-        self._in["reference"][:] = packed
-        return self._actuation(_NO_REFERENCE)
 
     def slowest_decay(self) -> float:
         """Return the rate (1/s) at which the slowest error decays, near the last state at rest."""
