@@ -25,18 +25,18 @@ from mcap.writer import MCAP0_MAGIC
 
 from spacerobot_ros.bag.mcap_file import METADATA_NAME, McapFile, QosProfile, RecordedTopic
 from spacerobot_ros.bag.mcap_reading import (
+    BagFile,
     ChunkUnpacker,
     blocks_in_file_order,
     file_size,
-    open_bag,
     open_file,
     parse_record,
     read_record,
-    read_summary,
     records,
     records_in_chunk,
+    require_mcap,
 )
-from spacerobot_ros.bag.reader import Array, RecordedRobot, columns, read_bag
+from spacerobot_ros.bag.reader import Array, RecordedRobot, bag_files, columns, read_bag
 from spacerobot_ros.errors import RecordingError
 from spacerobot_ros.times import SECOND
 
@@ -91,10 +91,9 @@ def salvage_bag(
         raise RecordingError(f"The bag {source} is complete: there is nothing to salvage.")
     with open_file(source) as old:
         start = old.read(MAGIC_SIZE)
+        require_mcap(source, start)
         if start != MCAP0_MAGIC:
-            empty = start == MCAP0_MAGIC[: len(start)]
-            what = "holds nothing yet" if empty else "is not an MCAP file"
-            raise RecordingError(f"{source} {what}: there is nothing to salvage.")
+            raise RecordingError(f"{source} holds nothing yet: there is nothing to salvage.")
         profile = "ros2"
         with suppress(ValueError):
             profile = read_record(old, MAGIC_SIZE, Header).profile
@@ -120,12 +119,15 @@ def salvage_bag(
 def is_complete(path: Path) -> bool:
     """Whether every message of a bag can be read without a repair."""
     try:
-        with open_bag(path) as file:
-            summary = read_summary(path, file)
-            count = sum(len(messages) for *_, messages in blocks_in_file_order(file))
-            return summary.statistics is not None and summary.statistics.message_count == count
+        return all(_holds_what_it_counts(BagFile(file)) for file in bag_files(path))
     except RecordingError:
         return False
+
+
+def _holds_what_it_counts(file: BagFile) -> bool:
+    topics = [channel.topic for channel in file.summary.channels.values()]
+    count = sum(len(messages) for *_, messages in blocks_in_file_order(file, topics))
+    return file.statistics.message_count == count
 
 
 class _Copy:

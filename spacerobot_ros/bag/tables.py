@@ -31,7 +31,6 @@ if TYPE_CHECKING:
     import xarray
 
 _KEY_VALUES = "diagnostic_msgs/msg/KeyValue"
-_JOINT_STATE = "sensor_msgs/msg/JointState"
 _HEADER_STAMP = ("header.stamp.sec", "header.stamp.nanosec")
 _TIME_COLUMNS = ("time", "time_ns", "stamp", "stamp_ns")
 """Time columns of every table; a message field of such a name is put below ``message``."""
@@ -157,7 +156,7 @@ def table_of(series: TopicSeries, prismatic: Mapping[str, bool] | None = None) -
     RecordingError
         A message is damaged, or there is more than can be decoded.
     """
-    names = _joint_state_names(series)
+    names = series.joint_names
     found = [Field("time_ns", series.time_ns, ("ns",))]
     if series.stamped:
         found.append(Field("stamp", series.stamp, ("s",)))
@@ -169,17 +168,8 @@ def table_of(series: TopicSeries, prismatic: Mapping[str, bool] | None = None) -
     return TopicTable(series.topic, series.type_name, series.time, tuple(found))
 
 
-def _joint_state_names(series: TopicSeries) -> tuple[str, ...]:
-    """Return the joint names of a topic of joint states; empty if they differ between messages."""
-    if series.type_name != _JOINT_STATE or not len(series):
-        return ()
-    found = {tuple(names) for names in series.field("name")}
-    names = found.pop()
-    return names if not found and len(set(names)) == len(names) else ()
-
-
 def _table_fields(
-    series: TopicSeries, path: str, names: tuple[str, ...], prismatic: Mapping[str, bool]
+    series: TopicSeries, path: str, names: Sequence[str], prismatic: Mapping[str, bool]
 ) -> list[Field]:
     values = series.field(path)
     if series.element_type(path) == _KEY_VALUES:

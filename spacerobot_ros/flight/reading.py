@@ -12,7 +12,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import cached_property, partial
-from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
@@ -192,9 +191,11 @@ class FlightBag:
         """
         found = [Signal.empty(width)]
         for series in self.series_of(name):
-            values = series.table(fields, width)
             if topic_named(name).type == TOPICS["joint_states"].type:
-                values = _sort_by_name(values, series, self.names(name))
+                names = self.names(name)
+                values = np.hstack([series.of_joints(path, names) for path in fields])
+            else:
+                values = series.table(fields, width)
             whole = np.isfinite(values).all(axis=1)
             found.append(Signal(self._times(series)[whole], values[whole]))
         time: Array = np.concatenate([each.time for each in found])
@@ -330,33 +331,24 @@ class FlightBag:
 
     def commands(self, scenario: Scenario) -> Mapping[str, Commands]:
         """Return the commands by topic."""
-        n = len(self.names("joint_states"))
+        joints = self.names("joint_states")
 
         def read(name: str) -> Commands:
             config = scenario.plant
-            fields, width = (WRENCH_COLUMNS, 6) if name == "base_wrench" else (["velocity"], n)
-            if name == "joint_commands" and config.actuation != "velocity":
-                fields = ["effort"]
+            efforts = name == "joint_commands" and config.actuation != "velocity"
             each = self.series_of(name)
-            return Commands(
-                np.concatenate([series.stamp_ns // config.period_ns for series in each]),
-                np.concatenate([series.table(fields, width) for series in each]),
-            )
+            values = [
+                series.table(WRENCH_COLUMNS, 6)
+                if name == "base_wrench"
+                else series.of_joints("effort" if efforts else "velocity", joints)
+                for series in each
+            ]
+            stamps = [series.stamp_ns // config.period_ns for series in each]
+            return Commands(np.concatenate(stamps), np.concatenate(values))
 
         return _LazyMapping(
             {name: partial(read, name) for name in _COMMAND_TOPICS if self.series_of(name)}
         )
-
-
-def _sort_by_name(values: Array, series: TopicSeries, names: list[str]) -> Array:
-    """Return numbers (N, n) of joints in the order of ``names``; nan of those that lack one."""
-    if series.has_constant_texts("name"):
-        return values
-    made = np.full_like(values, np.nan)
-    for row, given in enumerate(series.field("name")):
-        if sorted(given) == sorted(names):
-            made[row] = values[row, [given.index(name) for name in names]]
-    return made
 
 
 # -- any bag ----------------------------------------------------------------------------------
@@ -368,7 +360,7 @@ def open_flight_bag(path: str | os.PathLike[str], namespace: str | None = None) 
     Parameters
     ----------
     path
-        The bag; where there is no such file, the parts ``NAME_0``, ``NAME_1``, ... of it.
+        As for :func:`~spacerobot_ros.bag.read_bag`.
     namespace
         Namespace of the robot's topics, with or without the slash before it; None: the first in
         alphabetical order of those that the bag has an ``odom`` of.
@@ -378,18 +370,17 @@ def open_flight_bag(path: str | os.PathLike[str], namespace: str | None = None) 
     RecordingError
         There is no such bag or robot, or it is damaged.
     """
-    bags = [read_bag(part) for part in _bag_files(Path(path))]
-    prefixes = sorted({name for bag in bags for name in namespaces(bag)})
+    bag = read_bag(path)
+    prefixes = namespaces(bag)
     chosen = prefixes[0] if prefixes else ""
     if namespace is not None:
         chosen = f"/{namespace.strip('/')}".rstrip("/")
         if chosen not in prefixes:
             known = ", ".join(name or "/" for name in prefixes) or "no robot"
             raise RecordingError(
-                f"The bag {bags[0].path} has no robot in the namespace '{namespace}': it has "
-                f"{known}."
+                f"The bag {bag.path} has no robot in the namespace '{namespace}': it has {known}."
             )
-    return FlightBag(bags, chosen)
+    return FlightBag([bag], chosen)
 
 
 def namespaces(bag: Bag) -> list[str]:
@@ -401,16 +392,6 @@ def namespaces(bag: Bag) -> list[str]:
     }
     # The target of a robot has an odometry, too.
     return sorted(found - {f"{name}/target" for name in found})
-
-
-def _bag_files(path: Path) -> list[Path]:
-    """Return the files of a bag in order: one, or ``NAME_0``, ``NAME_1``, ... if it was split."""
-    if path.exists():
-        return [path]
-    parts: list[Path] = []
-    while (part := path.with_name(f"{path.stem}_{len(parts)}{path.suffix}")).exists():
-        parts.append(part)
-    return parts or [path]
 
 
 def read_flight(bag: FlightBag) -> Flight:

@@ -400,7 +400,7 @@ def test_a_file_that_is_empty(tmp_path: Path) -> None:
     reading_fails(tmp_path / "a.mcap", "is empty")
 
 
-@pytest.mark.parametrize("content", [b"SQLite format 3\0" * 10, b"x", b"\x89MCAP1\r\n" * 3])
+@pytest.mark.parametrize("content", [b"x", b"\x89MCAP1\r\n" * 3])
 def test_a_file_that_is_not_mcap(tmp_path: Path, content: bytes) -> None:
     (tmp_path / "a.mcap").write_bytes(content)
     reading_fails(tmp_path / "a.mcap", "is not an MCAP file")
