@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
@@ -41,7 +41,7 @@ from spacerobot_ros.bag.tables import (
 )
 from spacerobot_ros.errors import RecordingError, RobotDescriptionError, printable
 from spacerobot_ros.files import load_yaml, warn_once
-from spacerobot_ros.messages.definitions import MessageTypes
+from spacerobot_ros.messages.definitions import MessageType, message_type
 from spacerobot_ros.resources import suggestion
 from spacerobot_ros.times import SECOND
 from spacerobot_ros.topics import TOPICS, topic_named
@@ -167,7 +167,6 @@ class Bag:
         self._files = [BagFile(file) for file in files or [path]]
         size = sum(file.size for file in self._files)
         self._max_decoded_bytes = max(_MAX_DECODED_BYTES, _MAX_DECODED_TO_FILE_RATIO * size)
-        self._message_types = MessageTypes()
         self._series_by_topic: dict[str, TopicSeries] = {}
         self._prismatic_by_namespace: dict[str, dict[str, bool]] = {}
 
@@ -444,7 +443,7 @@ class Bag:
     def __getitem__(self, topic: str) -> TopicSeries:
         topic = self._recorded_name(topic)
         if topic not in self._series_by_topic:
-            self._read_together({topic: self._decoder(topic)})
+            self._read_together({topic: self._message_type(topic)})
         return self._series_by_topic[topic]
 
     def load(self, topics: Iterable[str]) -> None:
@@ -452,13 +451,13 @@ class Bag:
 
         Each is in memory from then on.
         """
-        decoders = {}
+        types = {}
         wanted = {self._recorded_name(topic) for topic in topics}
         for topic in wanted - self._series_by_topic.keys():
             with suppress(RecordingError):
-                decoders[topic] = self._decoder(topic)
-        if decoders:
-            self._read_together(decoders)
+                types[topic] = self._message_type(topic)
+        if types:
+            self._read_together(types)
 
     def _channels(self, topic: str) -> list[_RecordedChannel]:
         channels = self._channels_by_topic.get(self._recorded_name(topic), [])
@@ -472,7 +471,7 @@ class Bag:
             raise RecordingError(f"The topic {topic} of the bag {self.path} has several types.")
         return channels
 
-    def _decoder(self, topic: str) -> Callable[[bytes], Any]:
+    def _message_type(self, topic: str) -> MessageType:
         recorded = self._channels(topic)[0]
         encoding, schema = recorded.encodings
         if (encoding, schema) != ("cdr", "ros2msg"):
@@ -481,15 +480,15 @@ class Bag:
                 f"defined by 'ros2msg'), but in {encoding!r} defined by {schema!r}."
             )
         try:
-            return self._message_types.decoder(recorded.type_name, recorded.definition)
+            return message_type(recorded.type_name, recorded.definition)
         except ValueError as error:
             raise RecordingError(
                 f"The definition of {recorded.type_name} in the bag {self.path} cannot be read: "
                 f"{error}."
             ) from error
 
-    def _read_together(self, decoders: Mapping[str, Callable[[bytes], Any]]) -> None:
-        topics = list(decoders)
+    def _read_together(self, types: Mapping[str, MessageType]) -> None:
+        topics = list(types)
         times: list[list[NDArray[np.uint64]]] = [[np.zeros(0, np.uint64)] for _ in topics]
         data: list[list[bytes]] = [[] for _ in topics]
         for numbers, log_times, _, messages in blocks_in_time_order(self._files, topics):
@@ -497,14 +496,13 @@ class Bag:
                 rows = np.flatnonzero(numbers == number)
                 times[number].append(log_times[rows])
                 data[number] += [messages[row] for row in rows.tolist()]
-        for number, (topic, decode) in enumerate(decoders.items()):
+        for number, (topic, kind) in enumerate(types.items()):
             self._series_by_topic[topic] = TopicSeries(
                 topic,
                 self.topics[topic],
                 np.concatenate(times[number]).astype(np.int64),
                 data[number],
-                self._message_types.fields,
-                decode,
+                kind,
                 self._max_decoded_bytes,
             )
 

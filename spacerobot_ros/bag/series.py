@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from copy import copy
 from functools import cached_property
 from operator import attrgetter
@@ -16,7 +16,7 @@ from rosbags.interfaces import Nodetype
 from rosbags.serde import SerdeError
 
 from spacerobot_ros.errors import RecordingError
-from spacerobot_ros.messages.definitions import Fields
+from spacerobot_ros.messages.definitions import MessageType
 from spacerobot_ros.messages.layout import DTYPES, Columns, column_dtype, read_columns
 from spacerobot_ros.times import SECOND
 
@@ -49,8 +49,7 @@ class TopicSeries:
         type_name: str,
         time_ns: NDArray[np.int64],
         data: Sequence[bytes],
-        fields: Fields,
-        decode: Callable[[bytes], Any],
+        kind: MessageType,
         max_decoded_bytes: float = math.inf,
     ) -> None:
         self.topic = topic
@@ -59,8 +58,7 @@ class TopicSeries:
         # A change in place would change the array for every reader.
         self.time_ns.flags.writeable = False
         self.data = data
-        self._fields = fields
-        self._decode = decode
+        self._kind, self._fields = kind, kind.fields
         self._max_decoded_bytes = max_decoded_bytes
 
     def __len__(self) -> int:
@@ -269,7 +267,7 @@ class TopicSeries:
 
     def _decode_message(self, data: bytes) -> Any:
         try:
-            return self._decode(data)
+            return self._kind.decode(data)
         except _DECODING_ERRORS as error:
             raise self._damage_error(error) from error
 

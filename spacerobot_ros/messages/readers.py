@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from spacerobot_ros.errors import CommandError
-from spacerobot_ros.messages.definitions import MessageTypes, fields_of, message_definition
+from spacerobot_ros.messages.definitions import fields_of, message_definition, message_type
 from spacerobot_ros.messages.layout import (
     BIG_ENDIAN,
     LITTLE_ENDIAN,
@@ -303,10 +303,9 @@ class TemplateReader:
 
 def _as_little_endian(raw: bytes, type_name: str) -> bytes:
     """Return a big-endian message as little-endian; IndexError where it is not of the type."""
-    types = MessageTypes()
-    decode = types.decoder(type_name, message_definition(type_name).encode())
+    kind = message_type(type_name, message_definition(type_name).encode())
     try:
-        return bytes(types.serialise(decode(raw)))
+        return kind.serialise(kind.decode(raw))
     except Exception as error:  # Decoding raises any kind of error, depending on the bytes.
         raise IndexError(str(error)) from error
 

@@ -47,7 +47,7 @@ from spacerobot_ros.bag.mcap_reading import (
 )
 from spacerobot_ros.bag.playback import Playback
 from spacerobot_ros.bag.salvage import salvage_bag
-from spacerobot_ros.messages.definitions import MessageTypes
+from spacerobot_ros.messages.definitions import MessageType
 
 STRING = "std_msgs/msg/String"
 S = 10**9
@@ -475,14 +475,14 @@ def test_a_chunk_and_its_index_agree(tmp_path: Path) -> None:
 
 def refused(text: str) -> str:
     try:
-        MessageTypes().decoder("a/msg/A", text.encode())
+        MessageType("a/msg/A", text.encode())
     except ValueError as error:
         return str(error)
     raise AssertionError("it is accepted")
 
 
 def accepted(text: str) -> None:
-    MessageTypes().decoder("a/msg/A", text.encode())
+    MessageType("a/msg/A", text.encode())
 
 
 def test_a_message_may_have_a_thousand_fields_and_no_more() -> None:

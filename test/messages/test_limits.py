@@ -15,8 +15,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Header, String
 
 from spacerobot_ros.errors import CommandError, RecordingError
-from spacerobot_ros.messages import definitions
-from spacerobot_ros.messages.definitions import fields_of
+from spacerobot_ros.messages.definitions import MessageType, fields_of, message_definition
 from spacerobot_ros.messages.layout import (
     Layout,
     TooLongError,
@@ -41,7 +40,7 @@ NAME = "a/msg/B"
 
 def refused(text: str, name: str = NAME) -> str:
     with pytest.raises(ValueError, match=r"\w") as caught:
-        definitions._parse_definition(name, text.encode())
+        MessageType(name, text.encode())
     return str(caught.value)
 
 
@@ -53,11 +52,11 @@ def test_types_have_names_of_three_parts(name: str) -> None:
 def test_texts_of_types_are_limited() -> None:
     line = "int32 x\n"
     full = line + "#" * (262_144 - len(line))
-    assert definitions._parse_definition(NAME, full.encode())
+    assert MessageType(NAME, full.encode())
     long = "its text is longer than 262144 bytes or 5000 lines, which no message needs"
     assert refused(full + "#") == long
     lines = line + "\n" * 4_999
-    assert definitions._parse_definition(NAME, lines.encode())
+    assert MessageType(NAME, lines.encode())
     assert refused(lines + "\n") == long
 
 
@@ -73,10 +72,9 @@ def test_texts_of_types_are_limited() -> None:
     ],
 )  # fmt: skip
 def test_fields_are_counted_with_those_of_messages_in_them(text: str, count: int) -> None:
-    types = definitions._parse_definition(NAME, text.encode())
-    assert definitions._FieldCounts(types).of(NAME, 0) == count
+    assert NAME in MessageType(NAME, text.encode()).fields
     if count < 1000:
-        assert definitions._parse_definition(NAME, f"string[{1000 - count}] z\n{text}".encode())
+        assert MessageType(NAME, f"string[{1000 - count}] z\n{text}".encode())
     more = f"string[{1001 - count}] z\n{text}"
     assert refused(more).startswith("a/msg/B has more than 1000 fields")
 
@@ -88,25 +86,16 @@ def chain(depth: int) -> str:
 
 
 def test_types_are_nested_at_most_32_deep_and_never_in_themselves() -> None:
-    assert definitions._parse_definition(NAME, chain(32).encode())
+    assert MessageType(NAME, chain(32).encode())
     deep = "its types are nested more than 32 deep, or in themselves"
     assert refused(chain(33)) == refused("B x\n") == deep
     assert refused("C x\n") == "it does not define a/msg/C"
 
 
-@pytest.mark.parametrize(("length", "cut"), [(200, False), (201, True)])
-def test_errors_are_one_line(length: int, cut: bool) -> None:
-    text = "x" * length
-    found = definitions._error_in_one_line(ValueError(f" {text}\n"))
-    assert found == ("x" * 200 + " ..." if cut else text)
-    assert definitions._error_in_one_line(KeyError()) == "KeyError"
-    assert definitions._error_in_one_line(ValueError("a \n  b")) == "a b"
-
-
 @pytest.mark.parametrize("wrong", ["String", "std_msgs/msg/", "a/msg/B/c", "/String"])
 def test_names_that_are_none_of_types_are_refused(wrong: str) -> None:
     with pytest.raises(RecordingError, match="is not the name of a message type"):
-        definitions.message_definition(wrong)
+        message_definition(wrong)
 
 
 # -- messages -----------------------------------------------------------------------------------
