@@ -45,13 +45,13 @@ def export_command(bag: Path, format_name: str, out: Path | None, topics: tuple[
     if out is None:
         out = beside(bag, ".mat" if format_name == "mat" else f"_{format_name}")
     tables = {opened[topic].topic: opened.table(topic) for topic in topics} or opened.tables()
-    exported = export(tables.values(), out, ExportFormat(format_name))
+    rows_by_topic = export(tables.values(), out, ExportFormat(format_name))
     for topic in tables:
-        rows = exported.rows.get(topic)
+        rows = rows_by_topic.get(topic)
         click.echo(
             f"{printable(topic):<27} {'no messages, left out' if rows is None else f'{rows} rows'}"
         )
-    click.echo(f"{'tables':<27} {exported.path}")
+    click.echo(f"{'tables':<27} {out}")
 
 
 _MILLIMETRES_BY_UNIT = {"": 1.0, "mm": 1.0, "cm": 10.0, "in": 25.4, "pt": 25.4 / 72}

@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import errno
-import io
-import os
 import signal
 import struct
 import subprocess
@@ -20,6 +17,7 @@ from mcap.reader import make_reader
 from mcap.records import Message
 from mcap.stream_reader import StreamReader
 from rosbags.highlevel import AnyReader
+from support.full_disk import MakeDisk
 from support.hostile.records import string
 
 import spacerobot_ros
@@ -64,16 +62,6 @@ def test_every_compression_is_read_back(tmp_path: Path, compression: str) -> Non
         assert [data for _, _, data in reader.messages()] == [string(text) for text in texts]
 
 
-def test_what_is_not_bytes_leaves_no_trace(tmp_path: Path) -> None:
-    with BagWriter(tmp_path / "a.mcap") as writer:
-        channel = writer.add_topic("/a", STRING)
-        writer.write(channel, string("before"), 1, 1)
-        with pytest.raises(TypeError):
-            writer.write(channel, "text", 2, 2)  # type: ignore[arg-type]
-        writer.write(channel, bytearray(string("after")), 3, 3)  # type: ignore[arg-type]
-    assert data_of(tmp_path / "a.mcap") == [string("before"), string("after")]
-
-
 def test_messages_are_counted_by_topic(tmp_path: Path) -> None:
     with BagWriter(tmp_path / "a.mcap", chunk_size=200) as writer:
         one, two = writer.add_topic("/one", STRING), writer.add_topic("/two", STRING)
@@ -113,9 +101,8 @@ def test_a_type_that_is_not_installed_leaves_no_trace(tmp_path: Path) -> None:
     [
         ((99, b"", 1, 1), "has no channel 99"),
         ((70000, b"", 1, 1), "has no channel 70000"),
-        ((1, b"", -1, 1), "non-negative numbers of nanoseconds"),
-        ((1, b"", 1, 2**64), "non-negative numbers of nanoseconds"),
-        ((1, b"", 1.5, 1), "non-negative numbers of nanoseconds"),
+        ((1, b"", -1, 1), "no times before zero"),
+        ((1, b"", 1, -1), "no times before zero"),
     ],
 )
 def test_what_no_bag_can_hold_is_refused(
@@ -201,8 +188,6 @@ def test_where_no_bag_can_be_made(tmp_path: Path) -> None:
         BagWriter(tmp_path)
     with pytest.raises(RecordingError, match="Cannot make the bag"):
         BagWriter(tmp_path / "file" / "a.mcap")
-    with pytest.raises(RecordingError, match="'gzip' is not one of zstd, lz4, none"):
-        BagWriter(tmp_path / "a.mcap", compression="gzip")
 
 
 @pytest.mark.parametrize("limit", [{"max_size": 20_000}, {"max_duration_ns": 10**9}])
@@ -263,27 +248,6 @@ def salvaged(path: Path) -> list[bytes]:
     return found
 
 
-class Disk:
-    """A disk of some bytes, in place of the one that `open` opens files on."""
-
-    def __init__(self, monkeypatch: pytest.MonkeyPatch, size: int) -> None:
-        self.size = size
-        disk = self
-
-        class File(io.FileIO):
-            def write(self, data: Any) -> int:
-                free = disk.size - self.tell()
-                if free <= 0:
-                    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-                return super().write(bytes(data)[:free])
-
-        def fake_open(path: Path, mode: str, buffering: int) -> File:
-            assert buffering == 0
-            return File(path, mode)
-
-        monkeypatch.setattr("spacerobot_ros.bag.mcap_file.open", fake_open, raising=False)
-
-
 def fill(writer: BagWriter, channel: int) -> int:
     """Write until the disk is full; return how many messages were accepted before."""
     accepted = 0
@@ -299,9 +263,9 @@ def fill(writer: BagWriter, channel: int) -> int:
 
 
 def test_a_full_disk_leaves_a_complete_bag_of_what_fits(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, make_disk: MakeDisk
 ) -> None:
-    disk = Disk(monkeypatch, 1_000_000)
+    disk = make_disk(1_000_000)
     writer = BagWriter(tmp_path / "a.mcap", compression="none")
     channel = writer.add_topic("/a", STRING)
     accepted = fill(writer, channel)
@@ -335,9 +299,9 @@ def test_a_full_disk_leaves_a_complete_bag_of_what_fits(
 
 
 def test_a_disk_without_room_for_a_file_leaves_a_complete_bag(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, make_disk: MakeDisk
 ) -> None:
-    Disk(monkeypatch, 100_000)
+    make_disk(100_000)
     writer = BagWriter(tmp_path / "a.mcap")
     channel = writer.add_topic("/a", STRING)
     writer.write(channel, string("kept"), 1, 1)
@@ -362,9 +326,9 @@ def test_a_disk_without_room_for_a_file_leaves_a_complete_bag(
 
 
 def test_a_disk_without_room_for_the_summary_leaves_the_chunks(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, make_disk: MakeDisk
 ) -> None:
-    disk = Disk(monkeypatch, 1_000_000)
+    disk = make_disk(1_000_000)
     writer = BagWriter(tmp_path / "a.mcap", compression="none")
     fill(writer, writer.add_topic("/a", STRING))
     size = (tmp_path / "a.mcap").stat().st_size
@@ -378,9 +342,9 @@ def test_a_disk_without_room_for_the_summary_leaves_the_chunks(
 
 
 def test_a_disk_that_fills_up_on_closing_is_reported_once(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, make_disk: MakeDisk
 ) -> None:
-    disk = Disk(monkeypatch, 1_000_000)
+    disk = make_disk(1_000_000)
     writer = BagWriter(tmp_path / "a.mcap")
     writer.write(writer.add_topic("/a", STRING), string("kept"), 1, 1)
     writer.flush()
@@ -391,10 +355,8 @@ def test_a_disk_that_fills_up_on_closing_is_reported_once(
     assert salvaged(tmp_path / "a.mcap") == [string("kept")]
 
 
-def test_a_disk_that_is_full_from_the_start(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    Disk(monkeypatch, 10)
+def test_a_disk_that_is_full_from_the_start(tmp_path: Path, make_disk: MakeDisk) -> None:
+    make_disk(10)
     with pytest.raises(RecordingError, match=r"a\.mcap: No space left on device"):
         BagWriter(tmp_path / "a.mcap")
 
