@@ -114,6 +114,11 @@ class RecorderNode(FlightNode):
     def configure(self) -> None:
         """Open the bag and look for topics; they are subscribed, and recorded once active."""
         config = self.config
+        # What may be refused comes before the bag, which would stay open.
+        descriptions = _read_descriptions(config.describe)
+        self._clock_topic = self.resolve_topic_name(_CLOCK_TOPIC)
+        self._chosen_topics = {self.resolve_topic_name(topic) for topic in config.topics.split()}
+        self._shared_topics = {self._clock_topic, *map(self.resolve_topic_name, _SHARED_TOPICS)}
         writer = BagWriter(
             config.bag or time.strftime("spacerobot-%Y%m%d-%H%M%S.mcap"),
             compression=config.compression,
@@ -124,9 +129,6 @@ class RecorderNode(FlightNode):
             max_duration_ns=round(config.max_duration * SECOND),
         )
         self.recording = Recording(writer, config.clock_wait, self._on_failure)
-        self._clock_topic = self.resolve_topic_name(_CLOCK_TOPIC)
-        self._chosen_topics = {self.resolve_topic_name(topic) for topic in config.topics.split()}
-        self._shared_topics = {self._clock_topic, *map(self.resolve_topic_name, _SHARED_TOPICS)}
         self._parameter_requests = {}
         self._topics_without_owner = set()
         frames = tuple(map(self.resolve_topic_name, (TRANSFORMS, STATIC_TRANSFORMS)))
@@ -156,7 +158,7 @@ class RecorderNode(FlightNode):
         if config.diagnostics_period:
             self.create_timer(config.diagnostics_period, self._publish_state, clock=steady)
         self.describe("spacerobot", {"version": __version__})
-        for title, values in _read_descriptions(config.describe):
+        for title, values in descriptions:
             self.describe(title, values)
         if self._chosen_topics and self._clock_topic not in self._chosen_topics:
             self._follow_clock(self.recording)
