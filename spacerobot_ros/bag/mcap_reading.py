@@ -98,22 +98,41 @@ def require_regular(mode: int, path: Path, action: str = "read") -> None:
 
 
 @contextmanager
-def open_file(path: Path) -> Iterator[BinaryIO]:
-    """Open a regular file for reading.
+def open_file(path: Path, content: Path | None = None) -> Iterator[BinaryIO]:
+    """Open a bag for reading, or the file with its unpacked content.
 
     Raises
     ------
     RecordingError
-        There is no such file, it is no regular file, or it cannot be read while the context lasts.
+        There is no such file, it is no regular file, or it cannot be read, or a record turns out
+        damaged, while the context lasts.
     """
+    content = content or path
     try:
-        require_regular(os.stat(path).st_mode, path)
-        with path.open("rb") as file:
+        require_regular(os.stat(content).st_mode, path)
+        with content.open("rb") as file:
             yield file
     except FileNotFoundError as error:
         raise RecordingError(f"There is no bag at {path}.") from error
     except OSError as error:
         raise RecordingError(f"Cannot read the bag {path}: {error.strerror or error}.") from error
+    except DAMAGE_ERRORS as error:
+        reason = str(error) or type(error).__name__
+        raise RecordingError(f"The bag {path} is damaged: {reason}.") from error
+
+
+class RecordedChannel(NamedTuple):
+    """A channel of a file: a topic as one publisher offered it."""
+
+    number: int
+    topic: str
+    encodings: tuple[str, str]
+    """Of the messages, and of their definition."""
+    type_name: str
+    definition: bytes
+    offered_qos: str
+    message_count: int
+    """As the file says."""
 
 
 class BagFile:
@@ -136,7 +155,7 @@ class BagFile:
     def __init__(self, path: Path) -> None:
         self.path = path
         self._content = path
-        with self._reading() as file:
+        with open_file(path) as file:
             if file.read(len(zstandard.FRAME_HEADER)) == zstandard.FRAME_HEADER:
                 descriptor, name = tempfile.mkstemp(".mcap", "spacerobot_")
                 weakref.finalize(self, os.unlink, name)
@@ -146,6 +165,21 @@ class BagFile:
         with self.open() as file:
             self.size = file_size(file)
             self.summary, self.statistics = _read_summary(path, file)
+        counts, schemas = self.statistics.channel_message_counts, self.summary.schemas
+        nothing = Schema(id=0, data=b"", encoding="", name="")
+        self.channels = [
+            RecordedChannel(
+                number=channel.id,
+                topic=channel.topic,
+                encodings=(channel.message_encoding, schema.encoding),
+                type_name=schema.name,
+                definition=schema.data,
+                offered_qos=channel.metadata.get("offered_qos_profiles", ""),
+                message_count=counts.get(channel.id, 0),
+            )
+            for channel in self.summary.channels.values()
+            for schema in [schemas.get(channel.schema_id, nothing)]
+        ]
 
     @contextmanager
     def open(self) -> Iterator[BinaryIO]:
@@ -156,18 +190,9 @@ class BagFile:
         RecordingError
             As of the class, or a record turns out damaged while the context lasts.
         """
-        with self._reading() as file:
+        with open_file(self.path, self._content) as file:
             _require_magic_bytes(self.path, file)
             yield file
-
-    @contextmanager
-    def _reading(self) -> Iterator[BinaryIO]:
-        try:
-            with open_file(self._content) as file:
-                yield file
-        except DAMAGE_ERRORS as error:
-            reason = str(error) or type(error).__name__
-            raise RecordingError(f"The bag {self.path} is damaged: {reason}.") from error
 
 
 def _unpack(file: BinaryIO, unpacked: BinaryIO) -> None:
@@ -261,21 +286,17 @@ def records_in_chunk(data: bytes, place: int) -> Iterator[tuple[int, int]]:
         position = end
 
 
-def parse_record(record: bytes, place: int) -> McapRecord | None:
-    """Return the record at ``place``, a chunk still packed; None for a kind that MCAP lacks."""
+def parse_record(record: bytes) -> McapRecord | None:
+    """Return a record, a chunk still packed; None for a kind that MCAP lacks."""
     if record[0] not in _OPCODES:
         return None
-    try:
-        return next(StreamReader(BytesIO(record), skip_magic=True, emit_chunks=True).records)
-    except DAMAGE_ERRORS as error:
-        reason = str(error) or type(error).__name__
-        raise ValueError(f"the record at byte {place} cannot be read ({reason})") from error
+    return next(StreamReader(BytesIO(record), skip_magic=True, emit_chunks=True).records)
 
 
 def read_record(file: BinaryIO, place: int, kind: type[RecordT]) -> RecordT:
     """Return the record at byte ``place`` of a file, which must be of a kind."""
     for _, _, record in records(file, place):
-        found = parse_record(record, place)
+        found = parse_record(record)
         if isinstance(found, kind):
             return found
         break
@@ -325,8 +346,7 @@ class ChunkUnpacker:
             # One more byte shows whether the chunk is larger than stated.
             data = _DECOMPRESSORS[chunk.compression](chunk.data, size + 1) if size else chunk.data
         except DAMAGE_ERRORS as error:
-            reason = str(error) or type(error).__name__
-            raise ValueError(f"the chunk at byte {place} cannot be unpacked ({reason})") from error
+            raise ValueError(f"the chunk at byte {place} cannot be unpacked: {error}") from error
         if len(data) != size:
             raise ValueError(f"the chunk at byte {place} does not hold the {size} bytes it claims")
         if chunk.uncompressed_crc and zlib.crc32(data) != chunk.uncompressed_crc:
@@ -354,8 +374,8 @@ def _read_summary(path: Path, file: BinaryIO) -> tuple[Summary, Statistics]:
     if start > size:
         raise ValueError(f"its summary begins at byte {start}, behind its end")
     summary, chunks = Summary(), ChunkUnpacker(size)
-    for place, _, record in records(file, start) if start else ():
-        match parse_record(record, place):
+    for _, _, record in records(file, start) if start else ():
+        match parse_record(record):
             case Statistics() as statistics:
                 summary.statistics = statistics
             case Schema() as schema:
@@ -418,8 +438,8 @@ class _Wanted:
     ) -> None:
         places = {topic: number for number, topic in enumerate(topics)}
         self.numbers = np.full(_MOST_CHANNELS, _NO_TOPIC, np.intp)
-        for channel in file.summary.channels.values():
-            self.numbers[channel.id] = places.get(channel.topic, _NOT_WANTED)
+        for channel in file.channels:
+            self.numbers[channel.number] = places.get(channel.topic, _NOT_WANTED)
         self.start_ns, self.end_ns = min(start_ns, _LATEST_TIME_NS), min(end_ns, _LATEST_TIME_NS)
 
     def may_be_in(self, index: ChunkIndex) -> bool:
@@ -445,7 +465,7 @@ def _blocks_of_records(opened: BinaryIO, wanted: _Wanted) -> Iterator[MessageBlo
     chunks = ChunkUnpacker(file_size(opened))
     for place, opcode, record in records(opened, MAGIC_SIZE):
         if opcode == Opcode.CHUNK:
-            chunk = cast("Chunk", parse_record(record, place))
+            chunk = cast("Chunk", parse_record(record))
             yield _messages_in(chunks.unpack(chunk, place), place, wanted)
         elif opcode == Opcode.MESSAGE:
             yield _messages_in(record, place, wanted)

@@ -5,27 +5,19 @@ from __future__ import annotations
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from functools import cached_property
 from html import escape
 from pathlib import Path, PurePath
-from typing import TYPE_CHECKING, Any, TypeVar, overload
+from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
-from mcap.records import (
-    Attachment,
-    AttachmentIndex,
-    Channel,
-    Metadata,
-    MetadataIndex,
-    Schema,
-    Statistics,
-)
+from mcap.records import Attachment, AttachmentIndex, Metadata, MetadataIndex, Statistics
 from numpy.typing import NDArray
 
 from spacerobot_ros.bag.mcap_file import QosProfile
 from spacerobot_ros.bag.mcap_reading import (
     BagFile,
+    RecordedChannel,
     RecordT,
     blocks_in_file_order,
     blocks_in_time_order,
@@ -51,7 +43,6 @@ if TYPE_CHECKING:
     import xarray
 
 Array = NDArray[np.float64]
-_DefaultT = TypeVar("_DefaultT")
 
 _STRING_TYPE = "std_msgs/msg/String"
 
@@ -89,8 +80,7 @@ def iterate_raw(path: str | os.PathLike[str]) -> Iterator[tuple[str, str, int, i
         As of :func:`read_bag`, when the first message or a damaged one is asked for.
     """
     for file in map(BagFile, bag_files(Path(path))):
-        summary = file.summary
-        types = {c.topic: _type_name(summary.schemas, c) for c in summary.channels.values()}
+        types = {channel.topic: channel.type_name for channel in file.channels}
         topics = list(types)
         for numbers, *times, messages in blocks_in_file_order(file, topics):
             log_times, publish_times = (each.tolist() for each in times)
@@ -149,7 +139,7 @@ def _listed_files(folder: Path) -> list[str]:
         return []
 
 
-class Bag:
+class Bag(Mapping[str, TopicSeries]):
     """A bag as time series: ``bag["odom"].field("pose.pose.position.x")``.
 
     It is a mapping from the names of its topics, with the slash before them or without, to their
@@ -171,25 +161,16 @@ class Bag:
         self._prismatic_by_namespace: dict[str, dict[str, bool]] = {}
 
     @cached_property
-    def _channels_by_topic(self) -> dict[str, list[_RecordedChannel]]:
-        found: dict[str, list[_RecordedChannel]] = {}
-        for file in self._files:
-            summary = file.summary
-            counts = file.statistics.channel_message_counts
-            for channel in summary.channels.values():
-                schema = summary.schemas.get(channel.schema_id)
-                made = _RecordedChannel(channel, schema, counts.get(channel.id, 0))
-                found.setdefault(channel.topic, []).append(made)
+    def _channels_by_topic(self) -> dict[str, list[RecordedChannel]]:
+        found: dict[str, list[RecordedChannel]] = {}
+        for channel in (each for file in self._files for each in file.channels):
+            found.setdefault(channel.topic, []).append(channel)
         return found
 
     @cached_property
     def topics(self) -> dict[str, str]:
         """Type of every recorded topic by its name, including topics without messages."""
         return {name: each[-1].type_name for name, each in self._channels_by_topic.items()}
-
-    def keys(self) -> list[str]:
-        """Return the names of all topics, as they were recorded."""
-        return list(self.topics)
 
     def __iter__(self) -> Iterator[str]:
         return iter(self.topics)
@@ -200,26 +181,17 @@ class Bag:
     def __bool__(self) -> bool:
         return True
 
+    # Two bags are not compared message by message.
+    __eq__, __hash__ = object.__eq__, object.__hash__
+
     def __contains__(self, topic: object) -> bool:
         return isinstance(topic, str) and self._recorded_name(topic) in self.topics
 
-    def items(self) -> Iterator[tuple[str, TopicSeries]]:
-        """Iterate over names and messages of all topics."""
-        return ((topic, self[topic]) for topic in self)
-
-    def values(self) -> Iterator[TopicSeries]:
-        """Iterate over the messages of all topics."""
-        return (self[topic] for topic in self)
-
-    @overload
-    def get(self, topic: str) -> TopicSeries | None: ...
-    @overload
-    def get(self, topic: str, default: _DefaultT) -> TopicSeries | _DefaultT: ...
     def get(self, topic: str, default: Any = None) -> Any:
         """Return the messages of a topic, or ``default`` where there is no such topic."""
-        if topic not in self:
-            return default
-        return self[topic]
+        if topic in self:
+            return self[topic]
+        return default
 
     def __repr__(self) -> str:
         rows = self._topic_rows()
@@ -242,7 +214,11 @@ class Bag:
     def _topic_rows(self) -> list[tuple[str, int, str]]:
         """Name, number of messages and type of every topic, by name."""
         return [
-            (printable(topic), sum(c.count for c in channels), printable(self.topics[topic]))
+            (
+                printable(topic),
+                sum(c.message_count for c in channels),
+                printable(self.topics[topic]),
+            )
             for topic, channels in sorted(self._channels_by_topic.items())
         ]
 
@@ -302,7 +278,7 @@ class Bag:
         """Return the number of messages of a topic, or of the whole bag."""
         if topic is None:
             return sum(int(each.message_count) for each in self._statistics)
-        return sum(channel.count for channel in self._channels(topic))
+        return sum(channel.message_count for channel in self._channels(topic))
 
     def raw_messages(
         self, topics: Sequence[str], start_ns: int = 0, end_ns: int = 2**63 - 1
@@ -322,7 +298,7 @@ class Bag:
 
     def qos(self, topic: str) -> list[QosProfile]:
         """Return the recorded quality of service of the publishers of a topic."""
-        texts = [c.channel.metadata.get("offered_qos_profiles", "") for c in self._channels(topic)]
+        texts = [c.offered_qos for c in self._channels(topic)]
         return [profile for text in texts for profile in QosProfile.from_yaml(text)]
 
     def times(self, topic: str) -> NDArray[np.float64]:
@@ -459,7 +435,7 @@ class Bag:
         if types:
             self._read_together(types)
 
-    def _channels(self, topic: str) -> list[_RecordedChannel]:
+    def _channels(self, topic: str) -> list[RecordedChannel]:
         channels = self._channels_by_topic.get(self._recorded_name(topic), [])
         if not channels:
             raise RecordingError(
@@ -505,33 +481,6 @@ class Bag:
                 kind,
                 self._max_decoded_bytes,
             )
-
-
-@dataclass(frozen=True)
-class _RecordedChannel:
-    """A channel of a file of a bag: a topic as one publisher offers it."""
-
-    channel: Channel
-    schema: Schema | None
-    count: int
-    """Number of messages."""
-
-    @property
-    def type_name(self) -> str:
-        return "" if self.schema is None else self.schema.name
-
-    @property
-    def definition(self) -> bytes:
-        return b"" if self.schema is None else self.schema.data
-
-    @property
-    def encodings(self) -> tuple[str, str]:
-        return self.channel.message_encoding, "" if self.schema is None else self.schema.encoding
-
-
-def _type_name(schemas: dict[int, Any], channel: Channel) -> str:
-    schema = schemas.get(channel.schema_id)
-    return "" if schema is None else schema.name
 
 
 def _format_list(names: list[str], most: int = 40) -> str:

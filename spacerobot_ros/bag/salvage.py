@@ -25,6 +25,7 @@ from mcap.writer import MCAP0_MAGIC
 
 from spacerobot_ros.bag.mcap_file import METADATA_NAME, McapFile, QosProfile, RecordedTopic
 from spacerobot_ros.bag.mcap_reading import (
+    DAMAGE_ERRORS,
     BagFile,
     ChunkUnpacker,
     blocks_in_file_order,
@@ -95,7 +96,7 @@ def salvage_bag(
         if start != MCAP0_MAGIC:
             raise RecordingError(f"{source} holds nothing yet: there is nothing to salvage.")
         profile = "ros2"
-        with suppress(ValueError):
+        with suppress(*DAMAGE_ERRORS):
             profile = read_record(old, MAGIC_SIZE, Header).profile
         new = McapFile(target, overwrite=False, profile=profile)
         try:
@@ -125,7 +126,7 @@ def is_complete(path: Path) -> bool:
 
 
 def _holds_what_it_counts(file: BagFile) -> bool:
-    topics = [channel.topic for channel in file.summary.channels.values()]
+    topics = [channel.topic for channel in file.channels]
     count = sum(len(messages) for *_, messages in blocks_in_file_order(file, topics))
     return file.statistics.message_count == count
 
@@ -157,25 +158,25 @@ class _Copy:
                 if opcode == Opcode.CHUNK:
                     self._add_chunk(record, place, chunks)
                 else:
-                    self._add(record, place)
+                    self._add(record)
         self.lost_bytes = size - whole
 
     def _add_chunk(self, record: bytes, place: int, chunks: ChunkUnpacker) -> None:
         try:
-            data = chunks.unpack(cast("Chunk", parse_record(record, place)), place)
-        except ValueError as error:
+            data = chunks.unpack(cast("Chunk", parse_record(record)), place)
+        except DAMAGE_ERRORS as error:
             self.lost_chunks += 1
             self.loss_reason = self.loss_reason or str(error)
             return
         with suppress(ValueError):
             for begin, end in records_in_chunk(data, place):
-                self._add(data[begin:end], place)
+                self._add(data[begin:end])
 
-    def _add(self, record: bytes, place: int) -> None:
+    def _add(self, record: bytes) -> None:
         """Add a record; one that cannot be read, or is of an unknown channel, is left out."""
         found = None
-        with suppress(ValueError):
-            found = parse_record(record, place)
+        with suppress(*DAMAGE_ERRORS):
+            found = parse_record(record)
         self.empty &= found is None or isinstance(found, Header)
         match found:
             case Message() as message if message.channel_id in self._channels:
