@@ -49,11 +49,12 @@ from spacerobot_ros.nodes.common.messages import diagnostic_status, message_clas
 from spacerobot_ros.nodes.common.node import STREAM, FlightNode
 from spacerobot_ros.nodes.common.process import run_node
 from spacerobot_ros.nodes.common.ros_parameters import RemoteParameters
-from spacerobot_ros.nodes.common.streams import RawCallback
 from spacerobot_ros.nodes.common.watchdog import Role
 from spacerobot_ros.times import HEADER_STAMP, SECOND, first_time_ns, set_stamp
 from spacerobot_ros.topics import TOPICS_NOT_RECORDED
 from spacerobot_ros.version import __version__
+
+RawCallback = Callable[[bytes], None]
 
 _CLOCK_TOPIC = "/clock"
 _SHARED_TOPICS = ("/diagnostics", TRANSFORMS, STATIC_TRANSFORMS)
