@@ -12,8 +12,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import yaml
 from mcap.exceptions import EndOfFile
-from mcap.reader import make_reader
+from mcap.reader import NonSeekingReader, make_reader
 from mcap.records import Message
 from mcap.stream_reader import StreamReader
 from rosbags.highlevel import AnyReader
@@ -21,10 +22,11 @@ from support.full_disk import MakeDisk
 from support.hostile.records import string
 
 import spacerobot_ros
-from spacerobot_ros.bag import LATCHED, BagWriter, QosProfile, RecordingError
+from spacerobot_ros.bag import LATCHED, BagWriter, QosProfile, RecordingError, read_bag
 from spacerobot_ros.bag.mcap_file import INFINITE_NS
 
 STRING = "std_msgs/msg/String"
+S = 10**9
 
 
 def data_of(path: Path) -> list[bytes]:
@@ -230,6 +232,74 @@ def test_a_bag_is_split_into_complete_files(tmp_path: Path, limit: dict[str, int
         else:
             assert messages[-1].log_time - messages[0].log_time < 1.7e9
     assert found == list(range(count))
+
+
+def bag_of(path: Path, times: list[float], **options: Any) -> Path:
+    with BagWriter(path, chunk_size=1, **options) as writer:
+        writer.add_topic("/silent", STRING)
+        channel = writer.add_topic("/a", STRING)
+        for n, time in enumerate(times):
+            writer.write(channel, string(f"{n}"), round(time * S), round(time * S))
+    return path
+
+
+def test_a_file_is_full_when_it_lasts_exactly_as_long_as_it_may(tmp_path: Path) -> None:
+    bag_of(tmp_path / "a.mcap", [0.0, 0.5, 1.0, 1.5, 2.0, 2.5, 3.0], max_duration_ns=S)
+    times = []
+    for n in range(3):
+        with (tmp_path / f"a_{n}.mcap").open("rb") as file:
+            # As a stream: a message whose channel or schema did not come before is an error.
+            found = NonSeekingReader(file).iter_messages(log_time_order=False)
+            times.append([message.log_time / S for _, _, message in found])
+            file.seek(0)
+            assert list(StreamReader(file, validate_crcs=True).records)
+    assert times == [[0.0, 0.5, 1.0], [1.5, 2.0, 2.5], [3.0]]
+
+
+def test_the_statistics_of_messages_that_were_written_out_of_order(tmp_path: Path) -> None:
+    path = bag_of(tmp_path / "a.mcap", [5.0, 9.0, 3.0, 4.0])
+    with path.open("rb") as file:
+        summary = make_reader(file).get_summary()
+        content = {m.name: m.metadata for m in make_reader(file).iter_metadata()}
+    assert summary is not None
+    assert summary.statistics is not None
+    statistics = summary.statistics
+    assert (statistics.message_start_time, statistics.message_end_time) == (3 * S, 9 * S)
+    assert (statistics.channel_count, statistics.schema_count) == (2, 1)
+    assert (statistics.chunk_count, statistics.message_count) == (4, 4)
+    told = yaml.safe_load(content["rosbag2"]["serialized_metadata"])
+    assert told["starting_time"]["nanoseconds_since_epoch"] == 3 * S
+    assert told["duration"]["nanoseconds"] == 6 * S
+    bag = read_bag(path)
+    assert (bag.start_time, bag.end_time) == (3.0, 9.0)
+
+
+def test_what_waits_in_memory_is_counted_until_it_is_written(tmp_path: Path) -> None:
+    with BagWriter(tmp_path / "a.mcap") as writer:
+        channel = writer.add_topic("/a", STRING)
+        before, size = writer.bytes_waiting, writer.bytes_written
+        for _ in range(3):
+            writer.write(channel, string("x" * 91), 1, 1)
+        # A record is 9 + 22 bytes of head, 4 + 4 of the message, 91 of text and its zero.
+        assert writer.bytes_waiting - before == 3 * (9 + 22 + 4 + 4 + 91 + 1)
+        assert writer.bytes_written == size
+        writer.flush()
+        assert writer.bytes_waiting == 0
+        assert writer.bytes_written == (tmp_path / "a.mcap").stat().st_size > size
+
+
+def test_a_bag_that_cannot_be_begun_is_not_held_open(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bag = tmp_path / "a.mcap"
+
+    def full(*_: Any) -> None:
+        raise RecordingError("No space left on device.")
+
+    monkeypatch.setattr("spacerobot_ros.bag.mcap_file.McapFile.add_metadata", full)
+    with pytest.raises(RecordingError, match="No space left"):
+        BagWriter(bag)
+    assert not [path for path in Path("/proc/self/fd").iterdir() if path.resolve() == bag]
 
 
 # -- disks that fill up, and kills -------------------------------------------------------------
@@ -502,3 +572,13 @@ def test_numbers_of_earlier_versions_are_read() -> None:
 def test_what_is_no_profile_is_refused(text: str) -> None:
     with pytest.raises(RecordingError):
         QosProfile.from_yaml(text)
+
+
+def test_durations_beyond_the_longest_are_the_longest() -> None:
+    """Connext's infinite duration, for one, is more than a duration of ROS holds."""
+    text = "- deadline: {sec: 9223372036854775807, nsec: 4294967295}\n  lifespan: {sec: 2, nsec: 5}"
+    (profile,) = QosProfile.from_yaml(text)
+    assert profile.deadline_ns == INFINITE_NS
+    assert profile.lifespan_ns == 2 * S + 5
+    (again,) = QosProfile.from_yaml(profile.to_yaml())
+    assert again == profile
