@@ -526,6 +526,9 @@ class RecordedRobot:
         # The summary of a damaged bag may count messages that are missing.
         return self.bag[topic] if len(self.bag[topic]) else None
 
+    def __contains__(self, name: str) -> bool:
+        return self.get(name) is not None
+
     def load(self, names: Iterable[str]) -> None:
         """Read topics of the stack together, as far as the bag has them: see :meth:`Bag.load`."""
         types = {f"{self.namespace}/{name}": topic_named(name).type for name in names}

@@ -251,7 +251,7 @@ assert not hasattr(spacerobot_ros, "write_bag")
 def test_a_table_has_a_row_for_every_message_and_nan_where_numbers_are_missing(
     tmp_path: Path,
 ) -> None:
-    shapes = [[1.0, 2.0], [3.0], [], [4.0, 5.0]]
+    shapes = [[1.0, 2.0], [3.0], [], [4.0, 5.0], [6.0, 7.0, 8.0]]
     with BagWriter(tmp_path / "a.mcap") as writer:
         channel = writer.add_topic("/joint_states", "sensor_msgs/msg/JointState")
         for k, position in enumerate(shapes):
@@ -264,10 +264,10 @@ def test_a_table_has_a_row_for_every_message_and_nan_where_numbers_are_missing(
             writer.write(odom, serialize_message(pose), k, k)
     bag = read_bag(tmp_path / "a.mcap")
     nan = math.nan
-    expected = [[1, 2, -1, -2], [nan] * 4, [nan] * 4, [4, 5, -4, -5]]
+    expected = [[1, 2, -1, -2], [nan] * 4, [nan] * 4, [4, 5, -4, -5], [nan] * 4]
     joints = bag["/joint_states"]
     np.testing.assert_array_equal(joints.table(["position", "velocity"], 4), expected)
-    assert joints.table(["position"], 0).shape == joints.table([], 0).shape == (4, 0)
+    assert joints.table(["position"], 0).shape == joints.table([], 0).shape == (5, 0)
     fields = ["pose.pose.position.x", "pose.pose.position.z"]
     np.testing.assert_array_equal(bag["/odom"].table(fields), [[0, 0], [0.5, -1], [1, -2]])
 
@@ -310,7 +310,7 @@ def test_the_truth_is_what_was_measured_until_it_is_published(tmp_path: Path) ->
     bag = read_bag(tmp_path / "a.mcap")
 
     def truth(namespace: str) -> list[list[float]]:
-        flight = FlightBag([bag], namespace)
+        flight = FlightBag(bag, namespace)
         q, qdot = (flight.true_signal("joint_states", number) for number in (0, 1))
         return np.column_stack([q.time, q.values, qdot.values]).tolist()
 

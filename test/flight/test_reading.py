@@ -331,7 +331,7 @@ def test_a_run_that_is_not_whole_is_refused(
     assert str(refused.value).startswith(f"The bag {path} ")
     if changed:
         with pytest.raises(RecordingError, match="lacks the goal"):
-            recorded_scenario(open_flight_bag(path).parts[0].bag)
+            recorded_scenario(open_flight_bag(path).bag)
 
 
 def test_propellant_is_the_impulse_over_the_exhaust_speed() -> None:
