@@ -139,10 +139,10 @@ class _Copy:
         self.lost_chunks = self.lost_bytes = 0
         self.loss_reason = ""
         self._file = file
-        self._schemas: dict[int, Schema] = {}
-        self._channels: dict[int, Channel] = {}
-        self._new_schema_ids = {0: 0}
-        self._new_channel_ids: dict[int, int] = {}
+        self._schemas: dict[int, tuple[int, str]] = {}
+        """New number and name by the number in the old file."""
+        self._channels: dict[int, tuple[int, Channel]] = {}
+        """New number and old record likewise."""
 
     def add_readable_records(self, old: BinaryIO) -> None:
         """Add what can be read of a file, up to the first record that is cut."""
@@ -180,12 +180,17 @@ class _Copy:
         self.empty &= found is None or isinstance(found, Header)
         match found:
             case Message() as message if message.channel_id in self._channels:
-                channel_id = self._new_channel_id(message.channel_id)
-                self._file.write(channel_id, message.data, message.log_time, message.publish_time)
-            case Schema() as schema:
-                self._schemas[schema.id] = schema
-            case Channel() as channel:
-                self._channels[channel.id] = channel
+                number, _ = self._channels[message.channel_id]
+                self._file.write(number, message.data, message.log_time, message.publish_time)
+            case Schema() as schema if schema.id not in self._schemas:
+                number = self._file.add_schema(schema.name, schema.encoding, schema.data)
+                self._schemas[schema.id] = number, schema.name
+            case Channel() as channel if channel.id not in self._channels:
+                schema_id, _ = self._schemas.get(channel.schema_id, (0, ""))
+                number = self._file.add_channel(
+                    channel.topic, channel.message_encoding, schema_id, channel.metadata
+                )
+                self._channels[channel.id] = number, channel
             case Attachment() as file:
                 self._file.add_attachment(file.name, file.data, file.media_type, file.log_time)
             case Metadata() as metadata if metadata.name != METADATA_NAME:
@@ -194,32 +199,15 @@ class _Copy:
     def topics(self) -> list[RecordedTopic]:
         """Return all topics for rosbag2's record; those without a message are in the file too."""
         topics = []
-        for channel in self._channels.values():
-            count = self._file.message_counts[self._new_channel_id(channel.id)]
-            schema, words = self._schemas.get(channel.schema_id), channel.metadata
-            type_name, type_hash = schema.name if schema else "", words.get("topic_type_hash", "")
+        for number, channel in self._channels.values():
+            count, words = self._file.message_counts[number], channel.metadata
+            _, type_name = self._schemas.get(channel.schema_id, (0, ""))
+            type_hash = words.get("topic_type_hash", "")
             with suppress(RecordingError):
                 profiles = QosProfile.from_yaml(words.get("offered_qos_profiles", ""))
                 qos = profiles[0] if profiles else QosProfile()
                 topics.append(RecordedTopic(channel.topic, type_name, type_hash, qos, count))
         return topics
-
-    def _new_channel_id(self, channel_id: int) -> int:
-        if channel_id not in self._new_channel_ids:
-            channel = self._channels[channel_id]
-            number = channel.schema_id if channel.schema_id in self._schemas else 0
-            if number not in self._new_schema_ids:
-                schema = self._schemas[number]
-                self._new_schema_ids[number] = self._file.add_schema(
-                    schema.name, schema.encoding, schema.data
-                )
-            self._new_channel_ids[channel_id] = self._file.add_channel(
-                channel.topic,
-                channel.message_encoding,
-                self._new_schema_ids[number],
-                channel.metadata,
-            )
-        return self._new_channel_ids[channel_id]
 
 
 # -- the state to resume from -----------------------------------------------------------------

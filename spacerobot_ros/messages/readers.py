@@ -24,7 +24,6 @@ from spacerobot_ros.messages.layout import (
     Layout,
     TooLongError,
     encode,
-    layout_of,
 )
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
@@ -71,7 +70,7 @@ def read_text(raw: bytes, type_name: str, path: str) -> str:
         The bytes are no message of the type.
     """
     try:
-        leaf = layout_of(raw, type_name).leaves[path]
+        leaf = Layout(raw, type_name).leaves[path]
     except IndexError as error:
         raise UnreadableError(f"its bytes are no {type_name.rpartition('/')[2]}") from error
     return raw[leaf.offset : leaf.offset + leaf.size].decode(errors="replace")
@@ -90,7 +89,7 @@ class MessageTemplate:
 
     def __init__(self, type_name: str, prototype: bytes) -> None:
         self._buffer = bytearray(prototype)
-        self._leaves = layout_of(prototype, type_name, elements=True).leaves
+        self._leaves = Layout(prototype, type_name, elements=True).leaves
         self._feeds: dict[str, tuple[slice, memoryview]] = {}
         size = HEADER_STAMP.stop - HEADER_STAMP.start
         self._stamps = [
@@ -199,16 +198,12 @@ class TemplateReader:
                 f"it has {len(raw)} bytes, of which at most {self._max_size} can be meant"
             )
         name = self._type_name
-        layout = Layout(raw, name, self._fields, elements=True, max_elements=_MAX_LIST_TEXTS)
         try:
             if raw[:2] == BIG_ENDIAN:
                 raw = _as_little_endian(raw, name)
-                layout = Layout(
-                    raw, name, self._fields, elements=True, max_elements=_MAX_LIST_TEXTS
-                )
             if raw[:2] != LITTLE_ENDIAN:
                 raise IndexError("it is not in CDR")
-            layout.walk(name)
+            layout = Layout(raw, name, self._fields, elements=True, max_elements=_MAX_LIST_TEXTS)
         except IndexError as error:
             short = name.rpartition("/")[2]
             raise UnreadableError(f"its bytes are no {short}") from error

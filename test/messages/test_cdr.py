@@ -24,7 +24,7 @@ from support.random_messages import few, messages
 from trajectory_msgs.msg import JointTrajectory
 from visualization_msgs.msg import MarkerArray
 
-from spacerobot_ros.messages.layout import Layout, encode, layout_of
+from spacerobot_ros.messages.layout import Layout, encode
 from spacerobot_ros.messages.readers import (
     MessageDecoder,
     MessageTemplate,
@@ -66,7 +66,7 @@ def type_name(message_type: Any) -> str:
 
 
 def layout(message: Any) -> Layout:
-    return layout_of(serialize_message(message), type_name(type(message)), elements=True)
+    return Layout(serialize_message(message), type_name(type(message)), elements=True)
 
 
 def offset(found: Layout, path: str) -> int:

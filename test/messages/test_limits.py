@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import numpy as np
@@ -17,9 +16,6 @@ from std_msgs.msg import Header, String
 from spacerobot_ros.errors import CommandError, RecordingError
 from spacerobot_ros.messages.definitions import MessageType, fields_of, message_definition
 from spacerobot_ros.messages.layout import (
-    Layout,
-    TooLongError,
-    column_dtype,
     encode_list,
     read_columns,
     seconds_and_nanoseconds,
@@ -247,53 +243,3 @@ def test_copies_differ_in_stamps_and_numbers() -> None:
     assert list(found["wrench.force.y"]) == [1.5, 4.5, 7.5]
     assert list(found["wrench.torque.z"]) == [0.0] * 3
     assert found["header.frame_id"] == ["base"] * 3
-
-
-def test_messages_of_another_layout_have_no_columns() -> None:
-    name = "sensor_msgs/msg/JointState"
-    fields = fields_of(name)
-    some = [state(["a", "b"]), state(["a", "c"]), state(["a", "b"])]
-    found = read_columns(some, name, fields)
-    assert found is not None
-    assert not found.constant("name")
-    assert not found.constant("position")
-    same = read_columns([some[0], some[2]], name, fields)
-    assert same is not None
-    assert same.constant("name")
-    np.testing.assert_array_equal(same["position"], [[1.0, 2.0]] * 2)
-    # Equally long, with other lengths of their lists, in any of the messages.
-    other = state(["a", "b"], position=[1.0], velocity=[2.0])
-    assert len(other) == len(some[0])
-    for place in range(3):
-        mixed = [*some[:place], other, *some[place:]]
-        assert read_columns(mixed, name, fields) is None
-    assert read_columns([], name, fields) is None
-    assert read_columns([some[0], state(["a"])], name, fields) is None
-    assert read_columns([b"\0\0" + raw[2:] for raw in some], name, fields) is None
-    assert read_columns([raw[:-9] for raw in some], name, fields) is None
-    mixed = [some[0], b"\0\0" + some[1][2:]]
-    assert read_columns(mixed, name, fields) is None
-
-
-@pytest.mark.parametrize(
-    ("given", "wide"),
-    [("<f4", "f8"), ("<f8", "f8"), ("i1", "i8"), ("u1", "i8"), ("<u4", "i8"), ("<i4", "i8"),
-     ("<u8", "u8"), ("<i8", "i8"), ("?", "?")],
-)  # fmt: skip
-def test_columns_have_wide_numbers(given: str, wide: str) -> None:
-    assert column_dtype(np.dtype(given)) == np.dtype(wide)
-
-
-@pytest.mark.parametrize(("most", "refused"), [(math.inf, False), (3, False), (2, True)])
-def test_lists_of_a_layout_may_be_limited(most: float, refused: bool) -> None:
-    raw = state(["a", "b", "c"])
-    layout = Layout(raw, "sensor_msgs/msg/JointState", elements=True, max_elements=most)
-    if refused:
-        with pytest.raises(TooLongError, match="a list of 3 entries, more than 2"):
-            layout.walk("sensor_msgs/msg/JointState")
-        assert "header.stamp.sec" in layout.leaves
-        return
-    layout.walk("sensor_msgs/msg/JointState")
-    assert layout.end == 4 + 16 + 4 + 3 * 8 + 4 + 3 * 8 + 2 * 4
-    assert (layout.counts["name"], layout.leaves["name[2]"].size) == (3, 1)
-    assert layout.leaves["position"].shape == (3,)
