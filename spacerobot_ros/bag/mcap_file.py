@@ -275,21 +275,9 @@ class McapFile:
     that adds something raises RecordingError where the disk refuses it; the file is then as it was,
     and takes nothing more but its summary.
 
-    Parameters
-    ----------
-    path
-        The file; its folders are made.
-    compression, chunk_size, overwrite
-        As of :class:`~spacerobot_ros.bag.BagWriter`.
-    profile
-        Profile in the MCAP header.
-
-    Raises
-    ------
-    BagExistsError
-        The file is there and is not to be replaced, or is being written.
-    RecordingError
-        The file cannot be made.
+    The folders of ``path`` are made; ``compression``, ``chunk_size`` and ``overwrite`` are those of
+    :class:`~spacerobot_ros.bag.BagWriter`, ``profile`` is that of the MCAP header. RecordingError
+    if the file cannot be made; BagExistsError if it is there, or is being written.
     """
 
     def __init__(

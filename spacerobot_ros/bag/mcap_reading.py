@@ -307,13 +307,7 @@ def read_record(file: BinaryIO, place: int, kind: type[RecordT]) -> RecordT:
 
 
 class ChunkUnpacker:
-    """Unpacks the chunks of a file, up to a limit of the inflated size of all together.
-
-    Parameters
-    ----------
-    compressed
-        How large the file is, in bytes.
-    """
+    """Unpacks the chunks of a file of a size, up to a limit of their inflated sizes together."""
 
     def __init__(self, compressed: int) -> None:
         limit_mb = _DEFAULT_LIMIT_MB
@@ -518,16 +512,9 @@ def blocks_in_time_order(
 ) -> Iterator[MessageBlock]:
     """Iterate over messages of a bag by log time, those of one time in the order they were written.
 
-    Each block has the messages of chunks whose times overlap; only these are in memory together.
-
-    Parameters
-    ----------
-    files
-        The files of the bag in order; errors are those of :meth:`BagFile.open`.
-    topics
-        The topics to read.
-    start_ns, end_ns
-        Earliest and latest log time to read, in nanoseconds.
+    The messages are those of a bag's files on some topics, with log times in a span (ns). Each
+    block has those of chunks whose times overlap; only these are in memory together. Errors are
+    those of :meth:`BagFile.open`.
     """
     wanted = [_Wanted(file, topics, start_ns, end_ns) for file in files]
     sections = [

@@ -6,9 +6,8 @@ import os
 import re
 from collections import Counter
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
-from types import TracebackType
 
 from spacerobot_ros.bag.mcap_file import BagExistsError, McapFile, QosProfile, RecordedTopic
 from spacerobot_ros.errors import RecordingError
@@ -25,7 +24,7 @@ def free_name(path: Path, first: int = 0) -> Path:
         number += 1
 
 
-class BagWriter:
+class BagWriter(AbstractContextManager["BagWriter"]):
     """Writes serialised ROS 2 messages into a bag that any ROS 2 tool opens.
 
     Messages gather in a chunk in memory. A chunk that is full goes to the operating system as one
@@ -241,15 +240,7 @@ class BagWriter:
             if refusal is None:
                 raise
 
-    def __enter__(self) -> BagWriter:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def _register(self, name: str, type_name: str, qos: QosProfile) -> int:

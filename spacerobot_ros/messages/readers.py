@@ -276,8 +276,7 @@ class JointReader:
         self._problem = ""
         self._last_accepted: bytes | None = None
         """Last accepted message: publishers often repeat the same bytes."""
-        self._order: JointOrder | None = None
-        """Joints of the message and of the model; None: they are the same in the same order."""
+        self._order = JointOrder(np.zeros(0, np.intp), np.zeros(0, np.intp))
         self._missing = ""
         """A joint that measured states of this layout lack; empty: none."""
         self._seen = np.zeros(len(joint_names), dtype=np.bool_)
@@ -303,13 +302,8 @@ class JointReader:
         order = self._order
         for name, values in self.values.items():
             if self._reader.value_count(name):
-                given = self._reader.floats(name)
-                if order is None:
-                    values[:] = given
-                else:
-                    values[order.of_model] = given[order.of_message]
-        for kind in order.ignored if order is not None else ():
-            self.ignored[kind] += 1
+                values[order.of_model] = self._reader.floats(name)[order.of_message]
+        self.ignored.update(order.ignored)
         if self._measured and "velocity" in self.values:
             rates = self.values["velocity"]
             if not math.isfinite(sum(rates.tolist())):
@@ -333,7 +327,6 @@ class JointReader:
             pass
         else:
             return raw
-        assert self._order is not None
         self._copy_values()
         self._seen[self._order.of_model] = True
         if not self._seen.all():
@@ -380,9 +373,11 @@ class JointReader:
 
     def _check_names_and_lengths(self) -> None:
         names = self._reader.texts("name")
-        self._problem, self._missing, self._order = "", "", None
+        self._problem = self._missing = ""
         try:
-            order = JointOrder.of(self._joints, names, self._followers, partial=self._measured)
+            self._order = JointOrder.of(
+                self._joints, names, self._followers, partial=self._measured
+            )
             for i, quantity in enumerate(self._quantities):
                 count = self._reader.value_count(quantity)
                 if count or i == 0:
@@ -390,15 +385,11 @@ class JointReader:
         except CommandError as error:
             self._problem = str(error)
             return
-        if len(order.of_model) < len(self._joints):
-            present = set(order.of_model.tolist())
-            self._missing = next(n for i, n in enumerate(self._joints) if i not in present)
-            self._order = order
-            return
-        for values in self.values.values():
-            values[:] = 0.0
-        if names != self._joints:
-            self._order = order
+        present = set(self._order.of_model.tolist())
+        self._missing = next((n for i, n in enumerate(self._joints) if i not in present), "")
+        if not self._missing:
+            for values in self.values.values():
+                values[:] = 0.0
 
 
 class MissingJointError(CommandError):
