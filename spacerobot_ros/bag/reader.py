@@ -63,8 +63,8 @@ def read_bag(path: str | os.PathLike[str]) -> Bag:
     RecordingError
         There is no such bag, it is not MCAP, was cut short or is damaged.
     """
-    files = bag_files(Path(path))
-    return Bag(files[0] if len(files) == 1 else Path(path), files)
+    given, files = Path(path), bag_files(Path(path))
+    return Bag(given if given.is_dir() and len(files) > 1 else files[0], files)
 
 
 def iterate_raw(path: str | os.PathLike[str]) -> Iterator[tuple[str, str, int, int, bytes]]:
