@@ -158,8 +158,8 @@ class BagFile:
         with open_file(path) as file:
             if file.read(len(zstandard.FRAME_HEADER)) == zstandard.FRAME_HEADER:
                 descriptor, name = tempfile.mkstemp(".mcap", "spacerobot_")
-                weakref.finalize(self, os.unlink, name)
                 self._content = Path(name)
+                weakref.finalize(self, self._content.unlink, missing_ok=True)
                 with os.fdopen(descriptor, "wb") as unpacked:
                     _unpack(file, unpacked)
         with self.open() as file:

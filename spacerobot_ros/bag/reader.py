@@ -130,8 +130,11 @@ def _files_of_folder(folder: Path) -> list[Path]:
 
 def _listed_files(folder: Path) -> list[str]:
     """Return the names of the files of the bag in a folder, as rosbag2's metadata list them."""
+    file = folder / "metadata.yaml"
+    if not file.is_file():
+        return []
     try:
-        text = (folder / "metadata.yaml").read_text("utf-8")
+        text = file.read_text("utf-8")
         listed = load_yaml(text)["rosbag2_bagfile_information"]["relative_file_paths"]
         # Old versions of rosbag2 list them with the folder, others may be anywhere.
         return list(dict.fromkeys(PurePath(name).name for name in listed))
@@ -388,11 +391,11 @@ class Bag(Mapping[str, TopicSeries]):
             )
         return found
 
-    def robot_descriptions(self, namespace: str = "") -> list[bytes]:
+    def robot_descriptions(self, namespace: str = "", *, others: bool = True) -> list[bytes]:
         """Return texts that may be the URDF of the robot in a namespace, the likeliest first.
 
-        The file attached for the robot comes first, then its last robot_description, then other
-        files.
+        The file attached for the robot comes first, then its last robot_description, then, unless
+        they are not wanted, ``others`` that are attached.
         """
         topic = f"{namespace}/robot_description"
         attached = {n: text for n, text in self.attachments.items() if n.endswith(".urdf")}
@@ -400,7 +403,7 @@ class Bag(Mapping[str, TopicSeries]):
         found = [] if own is None else [own]
         if self.topics.get(topic) == _STRING_TYPE:
             found += [text.encode() for text in self[topic].field("data")[-1:]]
-        return [*found, *attached.values()]
+        return [*found, *attached.values()] if others else found
 
     def _prismatic_joints(self, namespace: str) -> dict[str, bool]:
         if namespace not in self._prismatic_by_namespace:
@@ -577,9 +580,4 @@ class RecordedRobot:
     @property
     def urdf(self) -> bytes | None:
         """The description of the robot: the attached file, or else the last message about it."""
-        name = f"{self.namespace}/robot_description".strip("/").replace("/", ".")
-        attached = self.bag.attachments.get(f"{name}.urdf")
-        if attached is not None:
-            return attached
-        series = self.get("robot_description")
-        return None if series is None else str(series.field("data")[-1]).encode()
+        return next(iter(self.bag.robot_descriptions(self.namespace, others=False)), None)
