@@ -131,29 +131,6 @@ def test_the_stamp_of_a_measured_state_is_one_of_an_answer(measured: bool) -> No
         reader.accept(late)
 
 
-def test_joints_are_taken_by_their_names_and_refused_messages_leave_nothing() -> None:
-    reader = JointReader(["a", "b", "c"], ["position", "velocity"])
-    position, velocity = reader.values["position"], reader.values["velocity"]
-    swapped = state(["c", "a", "b"], velocity=[7.0, 8.0, 9.0])
-    for _ in range(2):
-        reader.accept(swapped)
-        assert (position.tolist(), velocity.tolist()) == ([2, 3, 1], [8, 9, 7])
-    reader.accept(state(["a", "b", "c"], position=[4.0, 5.0, 6.0]))
-    assert (position.tolist(), velocity.tolist()) == ([4, 5, 6], [0, 0, 0])
-    for names, more in (
-        (["a", "b"], {}), (["a", "b", "b"], {}), (["a", "b", "x"], {}),
-        (["a", "b", "c"], {"position": []}), (["a", "b", "c"], {"velocity": [1.0]}),
-    ):  # fmt: skip
-        wrong = state(names, 5, 7, **more)
-        for _ in range(2):
-            with pytest.raises(CommandError):
-                reader.require(wrong)
-        with pytest.raises(CommandError):
-            reader.accept(wrong)
-        assert reader.stamp_ns == 5 * S + 7
-        assert position.tolist() == [4, 5, 6]
-
-
 def test_references_lack_what_they_do_not_give() -> None:
     decoder = MessageDecoder(["a", "b"])
     position, velocity = decoder.joint_reference(state(["b", "a"]))
