@@ -318,7 +318,8 @@ class Recorded:
         publisher.publish(message)
         self.sent += 1
         self.harness.spin_until(
-            lambda: recording.messages + recording.messages_waiting >= self.sent, "it is recorded"
+            lambda: recording.messages + len(recording.early_messages) >= self.sent,
+            "it is recorded",
         )
 
     def close(self) -> dict[str, list[tuple[float, float]]]:
