@@ -413,14 +413,13 @@ _LATEST_TIME_NS = 2**63 - 1
 """Latest time that an int64 of nanoseconds holds: the year 2262."""
 
 _MOST_CHANNELS = 65_536
-_NO_TOPIC, _NOT_WANTED = -2, -1
+_NOT_WANTED = -1
 
 
 class _Wanted:
     """The messages of a file to read: topics, whose numbers are their places in a list, and times.
 
-    ``numbers`` has the number of the topic of every channel; negative: the summary lacks the
-    channel, or its topic is not wanted.
+    ``numbers`` has the number of the topic of every channel; negative: it is not wanted.
     """
 
     def __init__(
@@ -431,9 +430,10 @@ class _Wanted:
         end_ns: int = _LATEST_TIME_NS,
     ) -> None:
         places = {topic: number for number, topic in enumerate(topics)}
-        self.numbers = np.full(_MOST_CHANNELS, _NO_TOPIC, np.intp)
+        self.numbers = np.full(_MOST_CHANNELS, _NOT_WANTED, np.intp)
         for channel in file.channels:
-            self.numbers[channel.number] = places.get(channel.topic, _NOT_WANTED)
+            if channel.topic in places:
+                self.numbers[channel.number] = places[channel.topic]
         self.start_ns, self.end_ns = min(start_ns, _LATEST_TIME_NS), min(end_ns, _LATEST_TIME_NS)
 
     def may_be_in(self, index: ChunkIndex) -> bool:
@@ -476,9 +476,6 @@ def _messages_in(data: bytes, place: int, wanted: _Wanted) -> MessageBlock:
     if (heads["length"] < size - _RECORD_HEAD.size).any():
         raise ValueError(f"a message of the chunk at byte {place} is shorter than its head")
     numbers = wanted.numbers[heads["channel"]]
-    if (numbers == _NO_TOPIC).any():
-        channel = heads["channel"][numbers == _NO_TOPIC][0]
-        raise ValueError(f"its summary lacks channel {channel}")
     rows = np.flatnonzero(
         (numbers >= 0)
         & (heads["log_time"] >= wanted.start_ns)
