@@ -376,6 +376,9 @@ class Bag(Mapping[str, TopicSeries]):
         """
         found: dict[str, TopicTable] = {}
         refused: dict[str, RecordingError] = {}
+        # One pass unpacks each chunk once; of a damaged bag some topics may be whole.
+        with suppress(RecordingError):
+            self.load(self)
         for topic in self:
             try:
                 found[topic] = self.table(topic, euler=euler)
