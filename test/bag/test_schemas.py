@@ -1,13 +1,4 @@
-"""\
-# Where to.
-Leaf goal
----
-uint8 NONE=0
-bool arrived
----
-float64 distance
-Leaf[] passed
-"""
+"""Definitions and hashes of message types, and columns cut out of serialised messages."""
 
 from __future__ import annotations
 
