@@ -90,8 +90,15 @@ def iterate_raw(path: str | os.PathLike[str]) -> Iterator[tuple[str, str, int, i
                 yield topic, types[topic], log_time_ns, publish_time_ns, data
 
 
+def salvaged_copy(path: Path) -> Path:
+    """Return the name of the salvaged copy of a file."""
+    return path.with_name(f"{path.stem}-salvaged.mcap")
+
+
 def bag_files(path: Path) -> list[Path]:
     """Return the files of a bag in order: of a folder, of a recording that was split, or one.
+
+    Of several files, salvaged copies take the place of those that were cut.
 
     Raises
     ------
@@ -111,13 +118,18 @@ def bag_files(path: Path) -> list[Path]:
     parts: list[Path] = []
     while (part := path.with_name(f"{path.stem}_{len(parts)}{path.suffix}")).exists():
         parts.append(part)
-    return parts or [path]
+    return _salvaged(parts) or [path]
+
+
+def _salvaged(files: list[Path]) -> list[Path]:
+    copies = map(salvaged_copy, files)
+    return [copy if copy.exists() else file for file, copy in zip(files, copies, strict=True)]
 
 
 def _files_of_folder(folder: Path) -> list[Path]:
     listed = [folder / name for name in _listed_files(folder)]
     if listed and all(file.is_file() for file in listed):
-        return listed
+        return _salvaged(listed)
     # Files of other formats are refused one by one, with what to do.
     found = (sorted(folder.glob(f"*{suffix}")) for suffix in (".mcap", ".mcap.zst*", ".db3"))
     files = next(filter(None, found), [])

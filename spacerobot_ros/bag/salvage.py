@@ -37,7 +37,14 @@ from spacerobot_ros.bag.mcap_reading import (
     records_in_chunk,
     require_mcap,
 )
-from spacerobot_ros.bag.reader import Array, RecordedRobot, bag_files, columns, read_bag
+from spacerobot_ros.bag.reader import (
+    Array,
+    RecordedRobot,
+    bag_files,
+    columns,
+    read_bag,
+    salvaged_copy,
+)
 from spacerobot_ros.errors import RecordingError
 from spacerobot_ros.times import SECOND
 
@@ -78,7 +85,7 @@ def salvage_bag(
     """Write the readable records of a bag into a new, complete one; the old one stays as it is.
 
     ``out`` is the new file, which must not exist; by default ``NAME-salvaged.mcap`` beside the old
-    one.
+    one. Of a bag of several files the first that needs it is salvaged.
 
     Raises
     ------
@@ -86,10 +93,10 @@ def salvage_bag(
         There is no such bag, it is not MCAP, it is complete already, nothing in it
         can be read, or the new one cannot be written.
     """
-    source = Path(path)
-    target = Path(out) if out is not None else source.with_name(f"{source.stem}-salvaged.mcap")
-    if is_complete(source):
-        raise RecordingError(f"The bag {source} is complete: there is nothing to salvage.")
+    source = next((file for file in bag_files(Path(path)) if not is_complete(file)), None)
+    if source is None:
+        raise RecordingError(f"The bag {path} is complete: there is nothing to salvage.")
+    target = Path(out) if out is not None else salvaged_copy(source)
     with open_file(source) as old:
         start = old.read(MAGIC_SIZE)
         require_mcap(source, start)

@@ -22,6 +22,7 @@ from support.command_line import CliRunner
 from support.sentences import assert_one_sentence
 
 from spacerobot_ros.bag import BagWriter, Playback, RecordingError, message_definition, read_bag
+from spacerobot_ros.bag.salvage import salvage_bag
 from spacerobot_ros.cli.main import main
 from spacerobot_ros.flight.reading import open_flight_bag
 from spacerobot_ros.flight.verification import verify_bag
@@ -121,6 +122,19 @@ def test_a_file_of_a_split_bag_says_so(split_bag: Path, caplog: pytest.LogCaptur
         f"{split_bag / 'split_3.mcap'} is one of 11 files of the bag in {split_bag}: name the "
         "folder to read all of them."
     )
+
+
+def test_a_file_of_a_split_bag_that_was_cut_is_replaced_by_its_salvaged_copy(
+    split_bag: Path,
+) -> None:
+    last = split_bag / "split_10.mcap"
+    last.write_bytes(last.read_bytes()[:-20])
+    with pytest.raises(RecordingError, match=f"{last} was cut short.*'spacerobot salvage {last}'"):
+        read_bag(split_bag)
+    assert salvage_bag(split_bag).path == split_bag / "split_10-salvaged.mcap"
+    assert read_bag(split_bag).message_count() == 22
+    with pytest.raises(RecordingError, match="is complete: there is nothing to salvage"):
+        salvage_bag(split_bag)
 
 
 def test_a_split_flight_is_verified_as_the_whole(tmp_path: Path) -> None:
