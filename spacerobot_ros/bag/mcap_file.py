@@ -32,30 +32,17 @@ from mcap.records import (
 )
 from mcap.stream_reader import StreamReader
 from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
-from rosbags.interfaces import (
-    Qos,
-    QosDurability,
-    QosHistory,
-    QosLiveliness,
-    QosReliability,
-    QosTime,
-)
+from rosbags.interfaces import Qos, QosTime
 
 from spacerobot_ros.bag.mcap_reading import require_regular
 from spacerobot_ros.errors import RecordingError
+from spacerobot_ros.files import load_yaml
 from spacerobot_ros.times import SECOND
 
 # -- quality of service -----------------------------------------------------------------------
 
 INFINITE_NS = 2**63 - 1
 """A duration without end, in nanoseconds (``RMW_DURATION_INFINITE``)."""
-
-_POLICIES: dict[str, type[Enum]] = {
-    "history": QosHistory,
-    "reliability": QosReliability,
-    "durability": QosDurability,
-    "liveliness": QosLiveliness,
-}
 
 
 @dataclass(frozen=True)
@@ -85,11 +72,6 @@ class QosProfile:
         How long a silent publisher counts as alive, in nanoseconds.
     avoid_ros_namespace_conventions
         Whether the topic is a bare DDS topic.
-
-    Raises
-    ------
-    RecordingError
-        A policy is not one of its words, or a number is none.
     """
 
     history: str = "keep_last"
@@ -101,18 +83,6 @@ class QosProfile:
     liveliness: str = "automatic"
     liveliness_lease_duration_ns: int = INFINITE_NS
     avoid_ros_namespace_conventions: bool = False
-
-    def __post_init__(self) -> None:
-        for policy, kind in _POLICIES.items():
-            word, words = getattr(self, policy), [each.lower() for each in kind.__members__]
-            if word not in words:
-                raise RecordingError(f"The QoS {policy} {word!r} is not one of {', '.join(words)}.")
-        durations = self.deadline_ns, self.lifespan_ns, self.liveliness_lease_duration_ns
-        for number in (self.depth, *durations):
-            if type(number) is not int or not 0 <= number <= INFINITE_NS:
-                raise RecordingError(
-                    f"A depth or duration of QoS is {number!r}, no whole number from 0 to 2^63 - 1."
-                )
 
     @classmethod
     def from_yaml(cls, text: str) -> list[QosProfile]:
@@ -130,17 +100,12 @@ class QosProfile:
         from rosbags.rosbag2.metadata import parse_qos
 
         try:
-            # References may multiply the parts of a text, and rosbag2 writes none.
-            if len(text) > _MAX_YAML_CHARACTERS or "*" in text:
-                raise ValueError("it is too long, or has references")
-            entries = [cls().to_dict() | entry for entry in yaml.safe_load(text) or []]
+            if len(text) > _MAX_YAML_CHARACTERS:
+                raise ValueError("it is too long")
+            entries = [cls().to_dict() | entry for entry in load_yaml(text) or []]
             return [cls(**_profile_arguments(profile)) for profile in parse_qos(entries)]
-        except (
-            *(yaml.YAMLError, TypeError, ValueError, AttributeError),
-            *(KeyError, OverflowError, RecursionError),
-        ) as error:
-            reason = " ".join(str(error).split())
-            raise RecordingError(f"A QoS profile of the bag cannot be read: {reason}.") from error
+        except (ValueError, TypeError, AttributeError, KeyError, OverflowError) as error:
+            raise RecordingError(f"A QoS profile of the bag cannot be read: {error}.") from error
 
     def to_yaml(self) -> str:
         """Return a channel's ``offered_qos_profiles`` with this profile, as rosbag2 dumps it."""
@@ -159,6 +124,8 @@ class QosProfile:
 
 
 def _profile_arguments(profile: Qos) -> dict[str, Any]:
+    if type(profile.depth) is not int or not 0 <= profile.depth <= INFINITE_NS:
+        raise ValueError(f"its depth is {profile.depth!r}")
     arguments: dict[str, Any] = {}
     for name, value in profile._asdict().items():
         if isinstance(value, QosTime):
@@ -244,12 +211,6 @@ def _rosbag2_metadata(
 
 # -- the file ---------------------------------------------------------------------------------
 
-_COMPRESSIONS = {
-    "zstd": CompressionType.ZSTD,
-    "lz4": CompressionType.LZ4,
-    "none": CompressionType.NONE,
-}
-
 _MESSAGE_HEAD_SIZE = 31
 """Length of what precedes the data of a message in a chunk, bytes."""
 
@@ -285,46 +246,82 @@ def _create_locked_file(path: Path, overwrite: bool) -> io.FileIO:
     return raw
 
 
-class _AppendedFile:
-    """A locked file that grows by whole records; what the library writes waits for a commit.
+class _Tail:
+    """What the library has written behind the part of a file that the operating system has.
 
     The library must not meet a full disk: its indexes would no longer fit the file.
     """
 
-    def __init__(self, path: Path, overwrite: bool) -> None:
+    def __init__(self) -> None:
+        self.start = 0
+        self.data = bytearray()
+
+    def write(self, data: bytes) -> None:
+        self.data += data
+
+    def tell(self) -> int:
+        return self.start + len(self.data)
+
+    def flush(self) -> None:
+        """Do nothing: the library calls it."""
+
+
+class McapFile:
+    """An MCAP file that grows by whole chunks.
+
+    Every chunk, attachment and metadata record goes to the operating system at once, and one that
+    fails is undone, so that the file of a process that dies is whole but for the record that it was
+    appending. While it is open it is locked: no second one can be opened on the same path. A call
+    that adds something raises RecordingError where the disk refuses it; the file is then as it was,
+    and takes nothing more but its summary.
+
+    The folders of ``path`` are made; ``compression``, ``chunk_size`` and ``overwrite`` are those of
+    :class:`~spacerobot_ros.bag.BagWriter`, ``profile`` is that of the MCAP header. RecordingError
+    if the file cannot be made; BagExistsError if it is there, or is being written.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        *,
+        compression: str = "zstd",
+        chunk_size: int = 65536,
+        overwrite: bool,
+        profile: str = "ros2",
+    ) -> None:
+        self.path = path
+        self.message_counts: Counter[int] = Counter()
+        """Number of messages by channel, those in the chunk in progress too."""
+        self.start_ns: int | None = None
+        self.end_ns: int | None = None
+        """Log times of the earliest and the latest message, ns."""
+        self.bytes_waiting = 0
+        """Size of the messages in the chunk in progress, bytes."""
+        self._counts_in_file: Counter[int] = Counter()
+        self._refused = self._finished = False
+        self._tail = _Tail()
+        self._library = Writer(
+            cast("IO[bytes]", self._tail),
+            chunk_size=chunk_size,
+            compression=CompressionType[compression.upper()],
+        )
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             self._raw = _create_locked_file(path, overwrite)
         except (OSError, ValueError) as error:
             reason = getattr(error, "strerror", None) or error
             raise RecordingError(f"Cannot make the bag {path}: {reason}.") from error
-        self.path = path
-        self.size = 0
-        """Number of bytes that the operating system has."""
-        self.waiting = bytearray()
-
-    def write(self, data: bytes) -> None:
-        self.waiting += data
-
-    def tell(self) -> int:
-        return self.size + len(self.waiting)
-
-    def flush(self) -> None:
-        """Do nothing, as the library's stream."""
-
-    def commit(self) -> None:
-        """Hand what waits to the operating system, all or nothing; raises OSError."""
-        data, self.waiting = self.waiting, bytearray()
-        rest = memoryview(data)
         try:
-            while rest:
-                rest = rest[self._raw.write(rest) :]
-        except OSError:
-            with suppress(OSError):
-                self._raw.truncate(self.size)
-                self._raw.seek(self.size, os.SEEK_SET)
+            self._library.start(profile, library="spacerobot_ros")
+            self._commit()
+        except RecordingError:
+            self.close()
             raise
-        self.size += len(data)
+
+    @property
+    def size(self) -> int:
+        """Number of bytes that the operating system has."""
+        return self._tail.start
 
     def check(self) -> None:
         """Check that the path still names this file, uncut; else raise RecordingError."""
@@ -337,87 +334,10 @@ class _AppendedFile:
                 problem = f"it has {ours.st_size} bytes, and {self.size} were written"
         except FileNotFoundError:
             problem = "it was removed or moved"
-        except (OSError, ValueError) as error:
-            problem = str(getattr(error, "strerror", None) or error)
+        except OSError as error:
+            problem = str(error.strerror or error)
         if problem:
             raise RecordingError(f"The bag {self.path} is lost while it is written: {problem}.")
-
-    def close(self) -> None:
-        """Close the file; does not raise."""
-        with suppress(OSError):
-            self._raw.close()
-
-
-class McapFile:
-    """An MCAP file that grows by whole chunks.
-
-    Every chunk, attachment and metadata record goes to the operating system at once, and one that
-    fails is undone, so that the file of a process that dies is whole but for the record that it was
-    appending. While it is open it is locked: no second one can be opened on the same path. A call
-    that adds something raises RecordingError where the disk refuses it; the file is then as it was,
-    and takes nothing more but its summary.
-
-    Parameters
-    ----------
-    path
-        The file; its folders are made.
-    compression, chunk_size, overwrite
-        As of :class:`~spacerobot_ros.bag.BagWriter`.
-    profile
-        Profile in the MCAP header.
-
-    Raises
-    ------
-    BagExistsError
-        The file is there and is not to be replaced, or is being written.
-    RecordingError
-        The file cannot be made.
-    """
-
-    def __init__(
-        self,
-        path: Path,
-        *,
-        compression: str = "zstd",
-        chunk_size: int = 65536,
-        overwrite: bool,
-        profile: str = "ros2",
-    ) -> None:
-        if compression not in _COMPRESSIONS:
-            raise RecordingError(
-                f"The compression {compression!r} is not one of {', '.join(_COMPRESSIONS)}."
-            )
-        self.path = path
-        self.message_counts: Counter[int] = Counter()
-        """Number of messages by channel, those in the chunk in progress too."""
-        self.start_ns: int | None = None
-        self.end_ns: int | None = None
-        """Log times of the earliest and the latest message, ns."""
-        self.bytes_waiting = 0
-        """Size of the messages in the chunk in progress, bytes."""
-        self._counts_in_file: Counter[int] = Counter()
-        self._refused = self._finished = False
-        self._file = _AppendedFile(path, overwrite)
-        self._library = Writer(
-            cast("IO[bytes]", self._file),
-            chunk_size=chunk_size,
-            compression=_COMPRESSIONS[compression],
-        )
-        try:
-            self._library.start(profile, library="spacerobot_ros")
-            self._commit()
-        except RecordingError:
-            self.close()
-            raise
-
-    @property
-    def size(self) -> int:
-        """Size of the file, bytes."""
-        return self._file.size
-
-    def check(self) -> None:
-        """Check that the path still names this file, uncut; else raise RecordingError."""
-        self._file.check()
 
     def add_schema(self, name: str, encoding: str, data: bytes) -> int:
         """Add the definition of a type, and return its number."""
@@ -479,21 +399,22 @@ class McapFile:
             try:
                 if self._refused:
                     self._library.flush()
-                    self._file.waiting.clear()
+                    self._tail.data.clear()
                 self._library.finish()
                 if self._refused:
-                    self._file.waiting = self._without_what_was_refused(self._file.waiting)
+                    self._tail.data = self._without_what_was_refused(self._tail.data)
                 self._commit()
             finally:
                 self.close()
 
     def close(self) -> None:
         """Close the file; does not raise."""
-        self._file.close()
+        with suppress(OSError):
+            self._raw.close()
 
     def _commit_full_chunk(self) -> bool:
         """Commit the chunk that the library may have completed; return whether it has."""
-        if not self._file.waiting:
+        if not self._tail.data:
             return False
         self.bytes_waiting = 0
         self._commit()
@@ -501,19 +422,27 @@ class McapFile:
         return True
 
     def _commit(self) -> None:
+        """Hand what the library has written to the operating system, all or nothing."""
+        data, self._tail.data = self._tail.data, bytearray()
+        rest = memoryview(data)
         try:
-            self._file.commit()
+            while rest:
+                rest = rest[self._raw.write(rest) :]
         except OSError as error:
+            with suppress(OSError):
+                self._raw.truncate(self.size)
+                self._raw.seek(self.size, os.SEEK_SET)
             self._refused = True
             self.message_counts = self._counts_in_file
             raise RecordingError(
                 f"Cannot write the bag {self.path}: {error.strerror or error}; "
                 f"the {self.message_counts.total()} messages before that are safe in it."
             ) from error
+        self._tail.start += len(data)
 
     def _without_what_was_refused(self, end: bytes | bytearray) -> bytearray:
         """Return the end of a file, from DataEnd on, without the indexes of what is not in it."""
-        size = self._file.size
+        size = self.size
         data_end, *found = StreamReader(BytesIO(end), skip_magic=True).records
         kept = [
             record

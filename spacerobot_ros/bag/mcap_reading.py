@@ -1,8 +1,8 @@
-"""Reads records, summary and messages of an MCAP file that anybody may have written.
+"""Reads records, summary and messages of MCAP files that anybody may have written.
 
 The records are parsed by ``mcap``. Values are checked before use: a record lies inside of its file,
 a chunk holds as much as it claims to, and all chunks of a bag together inflate to no more than a
-limit. A violation is a ``ValueError`` that names the byte; :func:`open_bag` turns it into a message
+limit. A violation is a ``ValueError`` that names the byte; :class:`BagFile` turns it into a message
 for users.
 """
 
@@ -12,6 +12,8 @@ import os
 import shlex
 import stat
 import struct
+import tempfile
+import weakref
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -55,6 +57,11 @@ _MAX_INFLATION_RATIO = 200
 """Largest ratio of inflated size to file size of a bag above the limit in MB. Telemetry has
 3 to 40, bags made to fill the memory 1000 and more."""
 
+_UNPACKED_AT_ONCE = 1 << 20  # bytes
+
+_SQLITE_MAGIC = b"SQLite f"
+"""First eight bytes of the files of rosbag2's other storage."""
+
 _RECORD_HEAD = struct.Struct("<BQ")
 """Head of a record: opcode and length of the body in bytes."""
 
@@ -91,41 +98,129 @@ def require_regular(mode: int, path: Path, action: str = "read") -> None:
 
 
 @contextmanager
-def open_file(path: Path) -> Iterator[BinaryIO]:
-    """Open a regular file for reading.
+def open_file(path: Path, content: Path | None = None) -> Iterator[BinaryIO]:
+    """Open a bag for reading, or the file with its unpacked content.
 
     Raises
     ------
     RecordingError
-        There is no such file, it is no regular file, or it cannot be read while the context lasts.
+        There is no such file, it is no regular file, or it cannot be read, or a record turns out
+        damaged, while the context lasts.
     """
+    content = content or path
     try:
-        require_regular(os.stat(path).st_mode, path)
-        with path.open("rb") as file:
+        require_regular(os.stat(content).st_mode, path)
+        with content.open("rb") as file:
             yield file
     except FileNotFoundError as error:
         raise RecordingError(f"There is no bag at {path}.") from error
     except OSError as error:
         raise RecordingError(f"Cannot read the bag {path}: {error.strerror or error}.") from error
+    except DAMAGE_ERRORS as error:
+        reason = str(error) or type(error).__name__
+        raise RecordingError(f"The bag {path} is damaged: {reason}.") from error
 
 
-@contextmanager
-def open_bag(path: Path) -> Iterator[BinaryIO]:
-    """Open a complete bag; turn every defect of it into an error of one sentence.
+class RecordedChannel(NamedTuple):
+    """A channel of a file: a topic as one publisher offered it."""
+
+    number: int
+    topic: str
+    encodings: tuple[str, str]
+    """Of the messages, and of their definition."""
+    type_name: str
+    definition: bytes
+    offered_qos: str
+    message_count: int
+    """As the file says."""
+
+
+class BagFile:
+    """One MCAP file of a bag, and its summary.
+
+    A file that was compressed as a whole, as ``NAME.mcap.zstd`` of rosbag2, is unpacked into a
+    temporary file, which is deleted with this object.
+
+    Parameters
+    ----------
+    path
+        The file; error messages name it.
 
     Raises
     ------
     RecordingError
-        There is no such file, it cannot be read, is not MCAP, was cut short, or a record turns out
-        damaged while the context lasts.
+        There is no such file, it cannot be read, is not MCAP, or was cut short.
     """
-    with open_file(path) as file:
-        try:
-            _require_magic_bytes(path, file)
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._content = path
+        with open_file(path) as file:
+            if file.read(len(zstandard.FRAME_HEADER)) == zstandard.FRAME_HEADER:
+                descriptor, name = tempfile.mkstemp(".mcap", "spacerobot_")
+                self._content = Path(name)
+                weakref.finalize(self, self._content.unlink, missing_ok=True)
+                with os.fdopen(descriptor, "wb") as unpacked:
+                    _unpack(file, unpacked)
+        with self.open() as file:
+            self.size = file_size(file)
+            self.summary, self.statistics = _read_summary(path, file)
+        counts, schemas = self.statistics.channel_message_counts, self.summary.schemas
+        nothing = Schema(id=0, data=b"", encoding="", name="")
+        self.channels = [
+            RecordedChannel(
+                number=channel.id,
+                topic=channel.topic,
+                encodings=(channel.message_encoding, schema.encoding),
+                type_name=schema.name,
+                definition=schema.data,
+                offered_qos=channel.metadata.get("offered_qos_profiles", ""),
+                message_count=counts.get(channel.id, 0),
+            )
+            for channel in self.summary.channels.values()
+            for schema in [schemas.get(channel.schema_id, nothing)]
+        ]
+
+    @contextmanager
+    def open(self) -> Iterator[BinaryIO]:
+        """Open the file; turn every defect of it into an error of one sentence.
+
+        Raises
+        ------
+        RecordingError
+            As of the class, or a record turns out damaged while the context lasts.
+        """
+        with open_file(self.path, self._content) as file:
+            _require_magic_bytes(self.path, file)
             yield file
-        except DAMAGE_ERRORS as error:
-            reason = str(error) or type(error).__name__
-            raise RecordingError(f"The bag {path} is damaged: {reason}.") from error
+
+
+def _unpack(file: BinaryIO, unpacked: BinaryIO) -> None:
+    """Write the content of a file that is compressed as a whole into another one."""
+    limit = ChunkUnpacker(file_size(file)).max_bytes
+    file.seek(0)
+    packed = zstandard.ZstdDecompressor().stream_reader(file, read_across_frames=True)
+    while block := packed.read(_UNPACKED_AT_ONCE):
+        unpacked.write(block)
+        if unpacked.tell() > limit:
+            raise ValueError(
+                f"it inflates to more than the {limit} bytes that its size allows (set "
+                f"{INFLATED_SIZE_VARIABLE} to more MB if you trust it)"
+            )
+
+
+def require_mcap(path: Path, start: bytes) -> None:
+    """Raise RecordingError unless a file begins as MCAP; ``start`` may be cut."""
+    if start.startswith(zstandard.FRAME_HEADER):
+        raise RecordingError(f"The bag {path} is compressed: unpack it by 'zstd -d'.")
+    if start == _SQLITE_MAGIC:
+        raise RecordingError(
+            f"The bag {path} is in SQLite: convert it by 'rosbags-convert --src "
+            f"{shlex.quote(str(path.parent))} --dst NEW_FOLDER --dst-storage mcap', or by "
+            "'ros2 bag convert'."
+        )
+    if start != MCAP0_MAGIC[: len(start)]:
+        raise RecordingError(f"{path} is not an MCAP file.")
 
 
 def _require_magic_bytes(path: Path, file: BinaryIO) -> None:
@@ -133,8 +228,7 @@ def _require_magic_bytes(path: Path, file: BinaryIO) -> None:
     start = file.read(size)
     if not start:
         raise RecordingError(f"The bag {path} is empty: its writer was stopped before it began.")
-    if start != MCAP0_MAGIC[: len(start)]:
-        raise RecordingError(f"{path} is not an MCAP file.")
+    require_mcap(path, start)
     length = file.seek(0, os.SEEK_END)
     file.seek(max(length - size, 0))
     if length < 2 * size or file.read(size) != MCAP0_MAGIC:
@@ -192,21 +286,17 @@ def records_in_chunk(data: bytes, place: int) -> Iterator[tuple[int, int]]:
         position = end
 
 
-def parse_record(record: bytes, place: int) -> McapRecord | None:
-    """Return the record at ``place``, a chunk still packed; None for a kind that MCAP lacks."""
+def parse_record(record: bytes) -> McapRecord | None:
+    """Return a record, a chunk still packed; None for a kind that MCAP lacks."""
     if record[0] not in _OPCODES:
         return None
-    try:
-        return next(StreamReader(BytesIO(record), skip_magic=True, emit_chunks=True).records)
-    except DAMAGE_ERRORS as error:
-        reason = str(error) or type(error).__name__
-        raise ValueError(f"the record at byte {place} cannot be read ({reason})") from error
+    return next(StreamReader(BytesIO(record), skip_magic=True, emit_chunks=True).records)
 
 
 def read_record(file: BinaryIO, place: int, kind: type[RecordT]) -> RecordT:
     """Return the record at byte ``place`` of a file, which must be of a kind."""
     for _, _, record in records(file, place):
-        found = parse_record(record, place)
+        found = parse_record(record)
         if isinstance(found, kind):
             return found
         break
@@ -217,13 +307,7 @@ def read_record(file: BinaryIO, place: int, kind: type[RecordT]) -> RecordT:
 
 
 class ChunkUnpacker:
-    """Unpacks the chunks of a file, up to a limit of the inflated size of all together.
-
-    Parameters
-    ----------
-    compressed
-        How large the file is, in bytes.
-    """
+    """Unpacks the chunks of a file of a size, up to a limit of their inflated sizes together."""
 
     def __init__(self, compressed: int) -> None:
         limit_mb = _DEFAULT_LIMIT_MB
@@ -256,8 +340,7 @@ class ChunkUnpacker:
             # One more byte shows whether the chunk is larger than stated.
             data = _DECOMPRESSORS[chunk.compression](chunk.data, size + 1) if size else chunk.data
         except DAMAGE_ERRORS as error:
-            reason = str(error) or type(error).__name__
-            raise ValueError(f"the chunk at byte {place} cannot be unpacked ({reason})") from error
+            raise ValueError(f"the chunk at byte {place} cannot be unpacked: {error}") from error
         if len(data) != size:
             raise ValueError(f"the chunk at byte {place} does not hold the {size} bytes it claims")
         if chunk.uncompressed_crc and zlib.crc32(data) != chunk.uncompressed_crc:
@@ -276,23 +359,17 @@ _DECOMPRESSORS: dict[str, Callable[[bytes, int], bytes]] = {
 # -- summary ----------------------------------------------------------------------------------
 
 
-def read_summary(path: Path, file: BinaryIO) -> Summary:
-    """Read schemas, channels, statistics and indexes from the end of a bag that is open.
-
-    Raises
-    ------
-    RecordingError
-        The bag has no summary.
-    ValueError
-        The summary is damaged, or contradicts the file.
+def _read_summary(path: Path, file: BinaryIO) -> tuple[Summary, Statistics]:
+    """Read schemas, channels, indexes and statistics from the end of a bag; RecordingError if it
+    has none.
     """
     size = file_size(file)
     start = read_record(file, max(size - FOOTER_SIZE - MAGIC_SIZE, 0), Footer).summary_start
     if start > size:
         raise ValueError(f"its summary begins at byte {start}, behind its end")
     summary, chunks = Summary(), ChunkUnpacker(size)
-    for place, _, record in records(file, start) if start else ():
-        match parse_record(record, place):
+    for _, _, record in records(file, start) if start else ():
+        match parse_record(record):
             case Statistics() as statistics:
                 summary.statistics = statistics
             case Schema() as schema:
@@ -313,16 +390,14 @@ def read_summary(path: Path, file: BinaryIO) -> Summary:
             f"The bag {path} has no summary: 'spacerobot salvage {shlex.quote(str(path))}' makes "
             "one."
         )
-    return summary
+    return summary, summary.statistics
 
 
 # -- messages ---------------------------------------------------------------------------------
 
-RawMessage = tuple[int, int, int, bytes]
-"""A recorded message: channel, log time and publish time in ns, serialised bytes."""
-
-MessageBlock = tuple[NDArray[np.uint64], NDArray[np.uint64], NDArray[np.uint64], list[bytes]]
-"""N recorded messages: their channels (N,), log times (N,), publish times (N,) and bytes."""
+MessageBlock = tuple[NDArray[np.intp], NDArray[np.uint64], NDArray[np.uint64], list[bytes]]
+"""N recorded messages: numbers of their topics (N,), log times (N,) and publish times (N,) in ns,
+and serialised bytes."""
 
 _MESSAGE_HEADS = np.dtype(
     [
@@ -337,21 +412,54 @@ _MESSAGE_HEADS = np.dtype(
 _LATEST_TIME_NS = 2**63 - 1
 """Latest time that an int64 of nanoseconds holds: the year 2262."""
 
-
-class _Wanted(NamedTuple):
-    """The messages to read: their channels, and their earliest and latest log time in ns."""
-
-    channel_ids: set[int]
-    start_ns: int
-    end_ns: int
+_MOST_CHANNELS = 65_536
+_NOT_WANTED = -1
 
 
-def blocks_in_file_order(file: BinaryIO, wanted: _Wanted | None = None) -> Iterator[MessageBlock]:
-    """Iterate over messages of a bag in the order they were written, chunk by chunk."""
-    chunks = ChunkUnpacker(file_size(file))
-    for place, opcode, record in records(file, MAGIC_SIZE):
+class _Wanted:
+    """The messages of a file to read: topics, whose numbers are their places in a list, and times.
+
+    ``numbers`` has the number of the topic of every channel; negative: it is not wanted.
+    """
+
+    def __init__(
+        self,
+        file: BagFile,
+        topics: Sequence[str],
+        start_ns: int = 0,
+        end_ns: int = _LATEST_TIME_NS,
+    ) -> None:
+        places = {topic: number for number, topic in enumerate(topics)}
+        self.numbers = np.full(_MOST_CHANNELS, _NOT_WANTED, np.intp)
+        for channel in file.channels:
+            if channel.topic in places:
+                self.numbers[channel.number] = places[channel.topic]
+        self.start_ns, self.end_ns = min(start_ns, _LATEST_TIME_NS), min(end_ns, _LATEST_TIME_NS)
+
+    def may_be_in(self, index: ChunkIndex) -> bool:
+        """Whether a chunk may hold such messages."""
+        channels = list(index.message_index_offsets)
+        return (
+            index.message_start_time <= self.end_ns
+            and index.message_end_time >= self.start_ns
+            and (not channels or bool((self.numbers[channels] >= 0).any()))
+        )
+
+
+def blocks_in_file_order(file: BagFile, topics: Sequence[str]) -> Iterator[MessageBlock]:
+    """Iterate over messages of a file in the order they were written, chunk by chunk.
+
+    ``topics`` are those to read; errors are those of :meth:`BagFile.open`.
+    """
+    with file.open() as opened:
+        yield from _blocks_of_records(opened, _Wanted(file, topics))
+
+
+def _blocks_of_records(opened: BinaryIO, wanted: _Wanted) -> Iterator[MessageBlock]:
+    chunks = ChunkUnpacker(file_size(opened))
+    for place, opcode, record in records(opened, MAGIC_SIZE):
         if opcode == Opcode.CHUNK:
-            chunk = cast("Chunk", parse_record(record, place))
+            chunk = cast("Chunk", parse_record(record))
             yield _messages_in(chunks.unpack(chunk, place), place, wanted)
         elif opcode == Opcode.MESSAGE:
             yield _messages_in(record, place, wanted)
@@ -359,103 +467,104 @@ def blocks_in_file_order(file: BinaryIO, wanted: _Wanted | None = None) -> Itera
             return
 
 
-def _messages_in(data: bytes, place: int, wanted: _Wanted | None = None) -> MessageBlock:
-    """Return the messages among the records of the chunk at ``place``, in their order."""
+def _messages_in(data: bytes, place: int, wanted: _Wanted) -> MessageBlock:
+    """Return the wanted messages among the records of the chunk at ``place``, in their order."""
     found = [a for a, _ in records_in_chunk(data, place) if data[a] == Opcode.MESSAGE]
     begins, size = np.array(found, np.int64), _MESSAGE_HEADS.itemsize
     within = begins[:, np.newaxis] + np.arange(size)
     heads = np.frombuffer(data, np.uint8).take(within, mode="clip").view(_MESSAGE_HEADS)[:, 0]
     if (heads["length"] < size - _RECORD_HEAD.size).any():
         raise ValueError(f"a message of the chunk at byte {place} is shorter than its head")
-    if wanted is not None:
-        rows = np.flatnonzero(
-            np.isin(heads["channel"], list(wanted.channel_ids))
-            & (heads["log_time"] >= wanted.start_ns)
-            & (heads["log_time"] <= wanted.end_ns)
-        )
-        heads, begins = heads[rows], begins[rows]
+    numbers = wanted.numbers[heads["channel"]]
+    rows = np.flatnonzero(
+        (numbers >= 0)
+        & (heads["log_time"] >= wanted.start_ns)
+        & (heads["log_time"] <= wanted.end_ns)
+    )
+    heads, begins = heads[rows], begins[rows]
     ends = begins + _RECORD_HEAD.size + heads["length"].astype(np.int64)
     spans = zip((begins + size).tolist(), ends.tolist(), strict=True)
     messages = [data[a:b] for a, b in spans]
-    return heads["channel"], heads["log_time"], heads["publish_time"], messages
+    return numbers[rows], heads["log_time"], heads["publish_time"], messages
 
 
-def messages_of(blocks: Iterable[MessageBlock]) -> Iterator[RawMessage]:
-    """Iterate over the messages of blocks, one by one."""
-    for *numbers, messages in blocks:
-        yield from zip(*(each.tolist() for each in numbers), messages, strict=True)
+class _Section(NamedTuple):
+    """A part of a file: a chunk by its index, or all of a file that has no index of chunks.
+
+    Sections are ordered by their earliest log times, those of one time as they were written.
+    """
+
+    start_ns: int
+    written: tuple[int, int]
+    """Number of the file, and byte in it."""
+    end_ns: int
+    chunk: ChunkIndex | None
 
 
 def blocks_in_time_order(
-    path: str | os.PathLike[str],
-    channel_ids: set[int],
+    files: Sequence[BagFile],
+    topics: Sequence[str],
     start_ns: int = 0,
     end_ns: int = _LATEST_TIME_NS,
-    summary: Summary | None = None,
 ) -> Iterator[MessageBlock]:
     """Iterate over messages of a bag by log time, those of one time in the order they were written.
 
-    Each block has the messages of chunks whose times overlap; only these are in memory together.
-
-    Parameters
-    ----------
-    path
-        The MCAP file; errors are those of :func:`open_bag`.
-    channel_ids
-        The channels to read.
-    start_ns, end_ns
-        Earliest and latest log time to read, in nanoseconds.
-    summary
-        Summary of the bag, where that was read before.
+    The messages are those of a bag's files on some topics, with log times in a span (ns). Each
+    block has those of chunks whose times overlap; only these are in memory together. Errors are
+    those of :meth:`BagFile.open`.
     """
-    wanted = _Wanted(channel_ids, min(start_ns, _LATEST_TIME_NS), min(end_ns, _LATEST_TIME_NS))
-    with open_bag(Path(path)) as file:
-        summary = summary or read_summary(Path(path), file)
-        if not summary.chunk_indexes:
-            yield _in_time_order(blocks_in_file_order(file, wanted))
-        for cluster in _overlapping_chunks(summary.chunk_indexes, wanted):
-            cluster.sort(key=lambda index: index.chunk_start_offset)
-            yield _in_time_order(_messages_of_chunk(file, index, wanted) for index in cluster)
+    wanted = [_Wanted(file, topics, start_ns, end_ns) for file in files]
+    sections = [
+        _Section(
+            index.message_start_time, (n, index.chunk_start_offset), index.message_end_time, index
+        )
+        for n, file in enumerate(files)
+        for index in file.summary.chunk_indexes
+        if wanted[n].may_be_in(index)
+    ]
+    sections += [
+        _Section(0, (n, 0), _LATEST_TIME_NS, None)
+        for n, file in enumerate(files)
+        if not file.summary.chunk_indexes
+    ]
+
+    def blocks(cluster: list[_Section]) -> Iterator[MessageBlock]:
+        for section in sorted(cluster, key=lambda each: each.written):
+            n = section.written[0]
+            with files[n].open() as opened:
+                if section.chunk is None:
+                    yield from _blocks_of_records(opened, wanted[n])
+                else:
+                    yield _messages_of_chunk(opened, section.chunk, wanted[n])
+
+    for cluster in _overlapping(sections):
+        yield _in_time_order(blocks(cluster))
+
+
+def _overlapping(sections: Iterable[_Section]) -> Iterator[list[_Section]]:
+    """Group sections of files; those of a group overlap in time."""
+    cluster: list[_Section] = []
+    latest, farthest = 0, (0, 0)
+    for section in sorted(sections, key=lambda each: each[:2]):
+        # Among messages of equal time, those of earlier chunks come first.
+        if cluster and section[:2] >= (latest, farthest):
+            yield cluster
+            cluster = []
+        cluster.append(section)
+        latest, farthest = max(latest, section.end_ns), max(farthest, section.written)
+    if cluster:
+        yield cluster
 
 
 def _in_time_order(blocks: Iterable[MessageBlock]) -> MessageBlock:
     """Merge blocks into one by log time; messages of one time keep their order."""
     empty = np.zeros(0, np.uint64)
-    parts = list(zip((empty, empty, empty, []), *blocks, strict=True))
-    channels, log_times, publish_times = map(np.concatenate, parts[:3])
+    parts = list(zip((empty.astype(np.intp), empty, empty, []), *blocks, strict=True))
+    numbers, log_times, publish_times = map(np.concatenate, parts[:3])
     order = np.argsort(log_times, kind="stable")
     messages = [message for part in parts[3] for message in part]
     data = [messages[k] for k in order.tolist()]
-    return channels[order], log_times[order], publish_times[order], data
-
-
-def _overlapping_chunks(
-    indexes: Sequence[ChunkIndex], wanted: _Wanted
-) -> Iterator[list[ChunkIndex]]:
-    """Group the chunks that may hold the messages; those of a group overlap in time."""
-    selected = [
-        index
-        for index in indexes
-        if not (
-            index.message_index_offsets
-            and wanted.channel_ids.isdisjoint(index.message_index_offsets)
-        )
-        and index.message_start_time <= wanted.end_ns
-        and index.message_end_time >= wanted.start_ns
-    ]
-    cluster: list[ChunkIndex] = []
-    latest = farthest = 0
-    for index in sorted(selected, key=lambda i: (i.message_start_time, i.chunk_start_offset)):
-        start = index.message_start_time, index.chunk_start_offset
-        # Among messages of equal time, those of earlier chunks come first.
-        if cluster and start >= (latest, farthest):
-            yield cluster
-            cluster = []
-        cluster.append(index)
-        latest = max(latest, index.message_end_time)
-        farthest = max(farthest, index.chunk_start_offset)
-    if cluster:
-        yield cluster
+    return numbers[order], log_times[order], publish_times[order], data
 
 
 def _messages_of_chunk(file: BinaryIO, index: ChunkIndex, wanted: _Wanted) -> MessageBlock:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import chain, islice
+from itertools import chain, islice, starmap
 
 from spacerobot_ros.bag.mcap_file import QosProfile
 from spacerobot_ros.bag.reader import Bag
@@ -196,9 +196,7 @@ class Playback:
         self._end_ns = min(end_ns, _LATEST_TIME_NS)
         self._last_ns = max(min(bag.end_time_ns, self._end_ns), self._start_ns)
         self.topics = [_replay_topic(bag, _with_slash(name)) for name in topics or bag.topics]
-        self._topic_by_channel = {
-            number: topic.name for topic in self.topics for number in bag.channel_ids(topic.name)
-        }
+        self._names = [topic.name for topic in self.topics]
         self._rate = rate
         self._bag_ns = self._start_ns
         self._clock_ns: int | None = None
@@ -279,7 +277,7 @@ class Playback:
         begins = at == self._start_ns and self._clock_ns is None
         shown = self._last_messages(at, recent, at if begins else at - 1)
         self._set_time(at, clock_ns)
-        self._set_coming(self._messages(set(self._topic_by_channel), at, self._end_ns))
+        self._set_coming(self._messages(self._names, at, self._end_ns))
         return shown
 
     @property
@@ -315,7 +313,7 @@ class Playback:
 
     def _begin(self) -> None:
         """Let all messages from the start on come, after those that were latched before it."""
-        found = self._messages(set(self._topic_by_channel), self._start_ns, self._end_ns)
+        found = self._messages(self._names, self._start_ns, self._end_ns)
         first = list(islice(found, 1))
         start = self._start_ns
         earlier = self._last_messages(start, start, start - 1) if first else []
@@ -337,21 +335,17 @@ class Playback:
 
         They are those of latched topics before that time, and of others in a span.
         """
-        latched = {n for t in self.topics if t.latched for n in self._bag.channel_ids(t.name)}
+        latched = [topic.name for topic in self.topics if topic.latched]
         last: dict[str, ReplayMessage] = {}
-        spans = (latched, 0, time_ns - 1), (set(self._topic_by_channel), since_ns, until_ns)
-        for channels, begin, end in spans:
-            last.update((each.topic, each) for each in self._messages(channels, begin, end))
+        spans = (latched, 0, time_ns - 1), (self._names, since_ns, until_ns)
+        for names, begin, end in spans:
+            last.update((each.topic, each) for each in self._messages(names, begin, end))
         ordered = sorted(last.values(), key=lambda message: message.log_time_ns)
         return [replace(message, log_time_ns=time_ns) for message in ordered]
 
-    def _messages(
-        self, channel_ids: set[int], start_ns: int, end_ns: int
-    ) -> Iterator[ReplayMessage]:
+    def _messages(self, names: list[str], start_ns: int, end_ns: int) -> Iterator[ReplayMessage]:
         if start_ns <= end_ns:
-            found = self._bag.raw_messages(channel_ids, start_ns, end_ns)
-            for channel_id, log_time_ns, _, data in found:
-                yield ReplayMessage(self._topic_by_channel[channel_id], log_time_ns, data)
+            yield from starmap(ReplayMessage, self._bag.raw_messages(names, start_ns, end_ns))
 
 
 def _with_slash(topic: str) -> str:

@@ -3,28 +3,25 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from functools import cached_property
 from html import escape
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar, overload
+from pathlib import Path, PurePath
+from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
-from mcap.records import Attachment, Channel, Metadata
+from mcap.records import Attachment, AttachmentIndex, Metadata, MetadataIndex, Statistics
 from numpy.typing import NDArray
 
 from spacerobot_ros.bag.mcap_file import QosProfile
 from spacerobot_ros.bag.mcap_reading import (
-    RawMessage,
+    BagFile,
+    RecordedChannel,
     RecordT,
     blocks_in_file_order,
     blocks_in_time_order,
-    file_size,
-    messages_of,
-    open_bag,
     read_record,
-    read_summary,
 )
 from spacerobot_ros.bag.series import TopicSeries
 from spacerobot_ros.bag.tables import (
@@ -35,7 +32,8 @@ from spacerobot_ros.bag.tables import (
     with_euler_angles,
 )
 from spacerobot_ros.errors import RecordingError, RobotDescriptionError, printable
-from spacerobot_ros.messages.definitions import MessageTypes
+from spacerobot_ros.files import load_yaml, warn_once
+from spacerobot_ros.messages.definitions import MessageType, message_type
 from spacerobot_ros.resources import suggestion
 from spacerobot_ros.times import SECOND
 from spacerobot_ros.topics import TOPICS, topic_named
@@ -45,7 +43,6 @@ if TYPE_CHECKING:
     import xarray
 
 Array = NDArray[np.float64]
-_DefaultT = TypeVar("_DefaultT")
 
 _STRING_TYPE = "std_msgs/msg/String"
 
@@ -57,14 +54,17 @@ the size of the file."""
 def read_bag(path: str | os.PathLike[str]) -> Bag:
     """Open a bag for reading; nothing but its summary is read until asked for.
 
-    ``path`` is an MCAP file, or a folder that holds one, as ``ros2 bag record`` makes it.
+    ``path`` is an MCAP file, a folder of one bag, as ``ros2 bag record`` makes it, or the name
+    ``NAME.mcap`` of a recording that was split into ``NAME_0.mcap``, ``NAME_1.mcap``, ... All files
+    of a folder or a recording are one bag.
 
     Raises
     ------
     RecordingError
         There is no such bag, it is not MCAP, was cut short or is damaged.
     """
-    return Bag(_bag_file(path))
+    given, files = Path(path), bag_files(Path(path))
+    return Bag(given if given.is_dir() and len(files) > 1 else files[0], files)
 
 
 def iterate_raw(path: str | os.PathLike[str]) -> Iterator[tuple[str, str, int, int, bytes]]:
@@ -79,22 +79,82 @@ def iterate_raw(path: str | os.PathLike[str]) -> Iterator[tuple[str, str, int, i
     RecordingError
         As of :func:`read_bag`, when the first message or a damaged one is asked for.
     """
-    file_path = _bag_file(path)
-    with open_bag(file_path) as file:
-        summary = read_summary(file_path, file)
-        names = {
-            channel.id: (channel.topic, _type_name(summary.schemas, channel))
-            for channel in summary.channels.values()
-        }
-        blocks = blocks_in_file_order(file)
-        for channel_id, log_time_ns, publish_time_ns, data in messages_of(blocks):
-            if channel_id not in names:
-                raise ValueError(f"its summary lacks channel {channel_id}")
-            topic, type_name = names[channel_id]
-            yield topic, type_name, log_time_ns, publish_time_ns, data
+    for file in map(BagFile, bag_files(Path(path))):
+        types = {channel.topic: channel.type_name for channel in file.channels}
+        topics = list(types)
+        for numbers, *times, messages in blocks_in_file_order(file, topics):
+            log_times, publish_times = (each.tolist() for each in times)
+            rows = zip(numbers.tolist(), log_times, publish_times, messages, strict=True)
+            for number, log_time_ns, publish_time_ns, data in rows:
+                topic = topics[number]
+                yield topic, types[topic], log_time_ns, publish_time_ns, data
 
 
-class Bag:
+def salvaged_copy(path: Path) -> Path:
+    """Return the name of the salvaged copy of a file."""
+    return path.with_name(f"{path.stem}-salvaged.mcap")
+
+
+def bag_files(path: Path) -> list[Path]:
+    """Return the files of a bag in order: of a folder, of a recording that was split, or one.
+
+    Of several files, salvaged copies take the place of those that were cut.
+
+    Raises
+    ------
+    RecordingError
+        A folder has no MCAP file, or several that its ``metadata.yaml`` does not list.
+    """
+    if path.is_dir():
+        return _files_of_folder(path)
+    if path.exists():
+        whole = _listed_files(path.parent)
+        if len(whole) > 1 and path.name in whole:
+            warn_once(
+                f"{path} is one of {len(whole)} files of the bag in {path.parent}: name the folder "
+                "to read all of them."
+            )
+        return [path]
+    parts: list[Path] = []
+    while (part := path.with_name(f"{path.stem}_{len(parts)}{path.suffix}")).exists():
+        parts.append(part)
+    return _salvaged(parts) or [path]
+
+
+def _salvaged(files: list[Path]) -> list[Path]:
+    copies = map(salvaged_copy, files)
+    return [copy if copy.exists() else file for file, copy in zip(files, copies, strict=True)]
+
+
+def _files_of_folder(folder: Path) -> list[Path]:
+    listed = [folder / name for name in _listed_files(folder)]
+    if listed and all(file.is_file() for file in listed):
+        return _salvaged(listed)
+    # Files of other formats are refused one by one, with what to do.
+    found = (sorted(folder.glob(f"*{suffix}")) for suffix in (".mcap", ".mcap.zst*", ".db3"))
+    files = next(filter(None, found), [])
+    if len(files) != 1:
+        raise RecordingError(
+            f"The folder {folder} holds {len(files)} MCAP files: name one of them."
+        )
+    return files
+
+
+def _listed_files(folder: Path) -> list[str]:
+    """Return the names of the files of the bag in a folder, as rosbag2's metadata list them."""
+    file = folder / "metadata.yaml"
+    if not file.is_file():
+        return []
+    try:
+        text = file.read_text("utf-8")
+        listed = load_yaml(text)["rosbag2_bagfile_information"]["relative_file_paths"]
+        # Old versions of rosbag2 list them with the folder, others may be anywhere.
+        return list(dict.fromkeys(PurePath(name).name for name in listed))
+    except (OSError, ValueError, TypeError, KeyError):
+        return []
+
+
+class Bag(Mapping[str, TopicSeries]):
     """A bag as time series: ``bag["odom"].field("pose.pose.position.x")``.
 
     It is a mapping from the names of its topics, with the slash before them or without, to their
@@ -107,33 +167,25 @@ class Bag:
         bag is damaged, or pandas or xarray is not installed.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, files: Sequence[Path] | None = None) -> None:
         self.path = path
-        with open_bag(path) as file:
-            self._summary = read_summary(path, file)
-            self._max_decoded_bytes = max(
-                _MAX_DECODED_BYTES, _MAX_DECODED_TO_FILE_RATIO * file_size(file)
-            )
-        self._message_types = MessageTypes()
+        self._files = [BagFile(file) for file in files or [path]]
+        size = sum(file.size for file in self._files)
+        self._max_decoded_bytes = max(_MAX_DECODED_BYTES, _MAX_DECODED_TO_FILE_RATIO * size)
         self._series_by_topic: dict[str, TopicSeries] = {}
         self._prismatic_by_namespace: dict[str, dict[str, bool]] = {}
 
     @cached_property
-    def _channels_by_topic(self) -> dict[str, list[Channel]]:
-        found: dict[str, list[Channel]] = {}
-        for channel in self._summary.channels.values():
+    def _channels_by_topic(self) -> dict[str, list[RecordedChannel]]:
+        found: dict[str, list[RecordedChannel]] = {}
+        for channel in (each for file in self._files for each in file.channels):
             found.setdefault(channel.topic, []).append(channel)
         return found
 
     @cached_property
     def topics(self) -> dict[str, str]:
         """Type of every recorded topic by its name, including topics without messages."""
-        channels = self._summary.channels.values()
-        return {c.topic: _type_name(self._summary.schemas, c) for c in channels}
-
-    def keys(self) -> list[str]:
-        """Return the names of all topics, as they were recorded."""
-        return list(self.topics)
+        return {name: each[-1].type_name for name, each in self._channels_by_topic.items()}
 
     def __iter__(self) -> Iterator[str]:
         return iter(self.topics)
@@ -144,26 +196,17 @@ class Bag:
     def __bool__(self) -> bool:
         return True
 
+    # Two bags are not compared message by message.
+    __eq__, __hash__ = object.__eq__, object.__hash__
+
     def __contains__(self, topic: object) -> bool:
         return isinstance(topic, str) and self._recorded_name(topic) in self.topics
 
-    def items(self) -> Iterator[tuple[str, TopicSeries]]:
-        """Iterate over names and messages of all topics."""
-        return ((topic, self[topic]) for topic in self)
-
-    def values(self) -> Iterator[TopicSeries]:
-        """Iterate over the messages of all topics."""
-        return (self[topic] for topic in self)
-
-    @overload
-    def get(self, topic: str) -> TopicSeries | None: ...
-    @overload
-    def get(self, topic: str, default: _DefaultT) -> TopicSeries | _DefaultT: ...
     def get(self, topic: str, default: Any = None) -> Any:
         """Return the messages of a topic, or ``default`` where there is no such topic."""
-        if topic not in self:
-            return default
-        return self[topic]
+        if topic in self:
+            return self[topic]
+        return default
 
     def __repr__(self) -> str:
         rows = self._topic_rows()
@@ -185,11 +228,10 @@ class Bag:
 
     def _topic_rows(self) -> list[tuple[str, int, str]]:
         """Name, number of messages and type of every topic, by name."""
-        counts = self._statistics.channel_message_counts
         return [
             (
                 printable(topic),
-                sum(counts.get(c.id, 0) for c in channels),
+                sum(c.message_count for c in channels),
                 printable(self.topics[topic]),
             )
             for topic, channels in sorted(self._channels_by_topic.items())
@@ -205,20 +247,22 @@ class Bag:
     @cached_property
     def metadata(self) -> dict[str, dict[str, str]]:
         """Keys and values of every metadata record by its name; of equal names the last counts."""
-        records = self._records(self._summary.metadata_indexes, Metadata)
-        return {metadata.name: metadata.metadata for metadata in records}
+        return {each.name: each.metadata for each in self._records(Metadata)}
 
     @cached_property
     def attachments(self) -> dict[str, bytes]:
         """Content of every attachment by its name; of equal names the last counts."""
-        records = self._records(self._summary.attachment_indexes, Attachment)
-        return {attachment.name: attachment.data for attachment in records}
+        return {each.name: each.data for each in self._records(Attachment)}
 
-    def _records(self, indexes: Sequence[Any], kind: type[RecordT]) -> list[RecordT]:
-        """Read the records that an index of the summary names, each once."""
-        with open_bag(self.path) as file:
-            places = dict.fromkeys(index.offset for index in indexes)
-            return [read_record(file, place, kind) for place in places]
+    def _records(self, kind: type[RecordT]) -> Iterator[RecordT]:
+        """Read the records of a kind that the summaries name, each once."""
+        for file in self._files:
+            indexes: Sequence[AttachmentIndex | MetadataIndex] = file.summary.attachment_indexes
+            if kind is Metadata:
+                indexes = file.summary.metadata_indexes
+            with file.open() as opened:
+                for place in dict.fromkeys(index.offset for index in indexes):
+                    yield read_record(opened, place, kind)
 
     @property
     def start_time(self) -> float:
@@ -233,39 +277,43 @@ class Bag:
     @property
     def start_time_ns(self) -> int:
         """Log time of the earliest message in nanoseconds; 0 without messages."""
-        return int(self._statistics.message_start_time)
+        return min((int(each.message_start_time) for each in self._statistics), default=0)
 
     @property
     def end_time_ns(self) -> int:
         """Log time of the latest message in nanoseconds; 0 without messages."""
-        return int(self._statistics.message_end_time)
+        return max((int(each.message_end_time) for each in self._statistics), default=0)
+
+    @property
+    def _statistics(self) -> list[Statistics]:
+        """Statistics of the files that have messages."""
+        return [file.statistics for file in self._files if file.statistics.message_count]
 
     def message_count(self, topic: str | None = None) -> int:
         """Return the number of messages of a topic, or of the whole bag."""
         if topic is None:
-            return int(self._statistics.message_count)
-        counts = self._statistics.channel_message_counts
-        return sum(counts.get(channel.id, 0) for channel in self._channels(topic))
-
-    def channel_ids(self, topic: str) -> set[int]:
-        """Return the MCAP channel numbers of a topic's messages."""
-        return {channel.id for channel in self._channels(topic)}
+            return sum(int(each.message_count) for each in self._statistics)
+        return sum(channel.message_count for channel in self._channels(topic))
 
     def raw_messages(
-        self, channel_ids: set[int], start_ns: int = 0, end_ns: int = 2**63 - 1
-    ) -> Iterator[RawMessage]:
-        """Iterate over the messages of some channels, still serialised, by log time.
+        self, topics: Sequence[str], start_ns: int = 0, end_ns: int = 2**63 - 1
+    ) -> Iterator[tuple[str, int, bytes]]:
+        """Iterate over the messages of some topics, still serialised, by log time.
 
         Yields
         ------
-        Channel, log time and publish time in nanoseconds, serialised message.
+        Topic, log time in nanoseconds, serialised message.
         """
-        blocks = blocks_in_time_order(self.path, channel_ids, start_ns, end_ns, self._summary)
-        return messages_of(blocks)
+        blocks = blocks_in_time_order(self._files, topics, start_ns, end_ns)
+        for numbers, log_times, _, messages in blocks:
+            for number, time_ns, data in zip(
+                numbers.tolist(), log_times.tolist(), messages, strict=True
+            ):
+                yield topics[number], time_ns, data
 
     def qos(self, topic: str) -> list[QosProfile]:
         """Return the recorded quality of service of the publishers of a topic."""
-        texts = [c.metadata.get("offered_qos_profiles", "") for c in self._channels(topic)]
+        texts = [c.offered_qos for c in self._channels(topic)]
         return [profile for text in texts for profile in QosProfile.from_yaml(text)]
 
     def times(self, topic: str) -> NDArray[np.float64]:
@@ -290,7 +338,7 @@ class Bag:
     def to_pandas(
         self, topic: str | None = None, *, euler: bool = False
     ) -> pandas.DataFrame | dict[str, pandas.DataFrame]:
-        """Return a topic as a table of pandas, or every topic by its name.
+        """Return a topic as a table of pandas, or every topic that can be read by its name.
 
         The index is the log time in seconds, ``attrs["units"]`` has the units of the columns; see
         :func:`~spacerobot_ros.bag.tables.table_of` for the columns. With ``euler`` the turns of
@@ -299,7 +347,7 @@ class Bag:
         """
         if topic is not None:
             return to_pandas(self.table(topic, euler=euler))
-        return {name: to_pandas(self.table(name, euler=euler)) for name in self}
+        return {name: to_pandas(table) for name, table in self.tables(euler=euler).items()}
 
     @overload
     def to_xarray(self, topic: str, *, euler: bool = False) -> xarray.Dataset: ...
@@ -310,14 +358,14 @@ class Bag:
     def to_xarray(
         self, topic: str | None = None, *, euler: bool = False
     ) -> xarray.Dataset | dict[str, xarray.Dataset]:
-        """Return a topic as a dataset of xarray, or every topic by its name.
+        """Return a topic as a dataset of xarray, or every topic that can be read by its name.
 
         Arrays stay arrays, over ``time`` and ``joint`` for joint states; every variable has its
         ``units``. ``euler`` is that of :meth:`to_pandas`.
         """
         if topic is not None:
             return to_xarray(self.table(topic, euler=euler))
-        return {name: to_xarray(self.table(name, euler=euler)) for name in self}
+        return {name: to_xarray(table) for name, table in self.tables(euler=euler).items()}
 
     def table(self, topic: str, *, euler: bool = False) -> TopicTable:
         """Return a topic as a table; the units of joints follow the URDF in the bag.
@@ -328,11 +376,41 @@ class Bag:
         found = table_of(series, self._prismatic_joints(series.topic.rpartition("/")[0]))
         return with_euler_angles(found) if euler else found
 
-    def robot_descriptions(self, namespace: str = "") -> list[bytes]:
+    def tables(self, *, euler: bool = False) -> dict[str, TopicTable]:
+        """Return every topic that can be read as a table; a warning names the others.
+
+        ``euler`` is that of :meth:`table`.
+
+        Raises
+        ------
+        RecordingError
+            No topic can be read.
+        """
+        found: dict[str, TopicTable] = {}
+        refused: dict[str, RecordingError] = {}
+        # One pass unpacks each chunk once; of a damaged bag some topics may be whole.
+        with suppress(RecordingError):
+            self.load(self)
+        for topic in self:
+            try:
+                found[topic] = self.table(topic, euler=euler)
+            except RecordingError as error:
+                refused[topic] = error
+        if refused:
+            reason = next(iter(refused.values()))
+            if not found:
+                raise reason
+            warn_once(
+                f"{len(refused)} topic(s) of the bag {self.path} are left out: "
+                f"{_format_list(list(refused))}. {reason}"
+            )
+        return found
+
+    def robot_descriptions(self, namespace: str = "", *, others: bool = True) -> list[bytes]:
         """Return texts that may be the URDF of the robot in a namespace, the likeliest first.
 
-        The file attached for the robot comes first, then its last robot_description, then other
-        files.
+        The file attached for the robot comes first, then its last robot_description, then, unless
+        they are not wanted, ``others`` that are attached.
         """
         topic = f"{namespace}/robot_description"
         attached = {n: text for n, text in self.attachments.items() if n.endswith(".urdf")}
@@ -340,7 +418,7 @@ class Bag:
         found = [] if own is None else [own]
         if self.topics.get(topic) == _STRING_TYPE:
             found += [text.encode() for text in self[topic].field("data")[-1:]]
-        return [*found, *attached.values()]
+        return [*found, *attached.values()] if others else found
 
     def _prismatic_joints(self, namespace: str) -> dict[str, bool]:
         if namespace not in self._prismatic_by_namespace:
@@ -359,7 +437,7 @@ class Bag:
     def __getitem__(self, topic: str) -> TopicSeries:
         topic = self._recorded_name(topic)
         if topic not in self._series_by_topic:
-            self._read_together({topic: self._decoder(self._channels(topic)[0])})
+            self._read_together({topic: self._message_type(topic)})
         return self._series_by_topic[topic]
 
     def load(self, topics: Iterable[str]) -> None:
@@ -367,19 +445,15 @@ class Bag:
 
         Each is in memory from then on.
         """
-        decoders = {}
+        types = {}
         wanted = {self._recorded_name(topic) for topic in topics}
         for topic in wanted - self._series_by_topic.keys():
             with suppress(RecordingError):
-                decoders[topic] = self._decoder(self._channels(topic)[0])
-        if decoders:
-            self._read_together(decoders)
+                types[topic] = self._message_type(topic)
+        if types:
+            self._read_together(types)
 
-    @property
-    def _statistics(self) -> Any:
-        return self._summary.statistics
-
-    def _channels(self, topic: str) -> list[Channel]:
+    def _channels(self, topic: str) -> list[RecordedChannel]:
         channels = self._channels_by_topic.get(self._recorded_name(topic), [])
         if not channels:
             raise RecordingError(
@@ -387,77 +461,49 @@ class Bag:
                 f"{_format_list(list(self.topics))}."
                 f"{suggestion(topic, [*self.topics, *(name[1:] for name in self.topics)])}"
             )
-        if len({channel.schema_id for channel in channels}) > 1:
+        if len({(each.type_name, each.definition) for each in channels}) > 1:
             raise RecordingError(f"The topic {topic} of the bag {self.path} has several types.")
         return channels
 
-    def _decoder(self, channel: Channel) -> Callable[[bytes], Any]:
-        type_name = self.topics[channel.topic]
-        schema = self._summary.schemas.get(channel.schema_id)
-        if schema is None or (channel.message_encoding, schema.encoding) != ("cdr", "ros2msg"):
+    def _message_type(self, topic: str) -> MessageType:
+        recorded = self._channels(topic)[0]
+        encoding, schema = recorded.encodings
+        if (encoding, schema) != ("cdr", "ros2msg"):
             raise RecordingError(
-                f"The topic {channel.topic} of the bag {self.path} is not in ROS 2's encoding "
-                "('cdr' defined by 'ros2msg')."
+                f"The topic {topic} of the bag {self.path} is not in ROS 2's encoding ('cdr' "
+                f"defined by 'ros2msg'), but in {encoding!r} defined by {schema!r}."
             )
         try:
-            return self._message_types.decoder(type_name, schema.data)
+            return message_type(recorded.type_name, recorded.definition)
         except ValueError as error:
             raise RecordingError(
-                f"The definition of {type_name} in the bag {self.path} cannot be read: {error}."
+                f"The definition of {recorded.type_name} in the bag {self.path} cannot be read: "
+                f"{error}."
             ) from error
 
-    def _read_together(self, decoders: Mapping[str, Callable[[bytes], Any]]) -> None:
-        ids = {topic: [each.id for each in self._channels(topic)] for topic in decoders}
-        times: dict[str, list[NDArray[np.uint64]]] = {topic: [] for topic in decoders}
-        data: dict[str, list[bytes]] = {topic: [] for topic in decoders}
-        wanted = {channel for channels in ids.values() for channel in channels}
-        blocks = blocks_in_time_order(self.path, wanted, summary=self._summary)
-        for channels, log_times, _, messages in blocks:
-            for topic in decoders:
-                of_topic = np.any([channels == each for each in ids[topic]], axis=0)
-                rows = np.flatnonzero(of_topic)
-                times[topic].append(log_times[rows])
-                data[topic] += [messages[row] for row in rows.tolist()]
-        for topic, decode in decoders.items():
+    def _read_together(self, types: Mapping[str, MessageType]) -> None:
+        topics = list(types)
+        times: list[list[NDArray[np.uint64]]] = [[np.zeros(0, np.uint64)] for _ in topics]
+        data: list[list[bytes]] = [[] for _ in topics]
+        for numbers, log_times, _, messages in blocks_in_time_order(self._files, topics):
+            for number in range(len(topics)):
+                rows = np.flatnonzero(numbers == number)
+                times[number].append(log_times[rows])
+                data[number] += [messages[row] for row in rows.tolist()]
+        for number, (topic, kind) in enumerate(types.items()):
             self._series_by_topic[topic] = TopicSeries(
                 topic,
                 self.topics[topic],
-                np.concatenate([np.zeros(0, np.uint64), *times[topic]]).astype(np.int64),
-                data[topic],
-                self._message_types.fields,
-                decode,
+                np.concatenate(times[number]).astype(np.int64),
+                data[number],
+                kind,
                 self._max_decoded_bytes,
             )
-
-
-def _type_name(schemas: dict[int, Any], channel: Channel) -> str:
-    schema = schemas.get(channel.schema_id)
-    return "" if schema is None else schema.name
 
 
 def _format_list(names: list[str], most: int = 40) -> str:
     more = f" and {len(names) - most} more" if len(names) > most else ""
     return ", ".join(names[:most]) + more
-
-
-_OTHER_STORAGES = {
-    "*.db3": "convert it to MCAP, by `ros2 bag convert` or `rosbags-convert`",
-    "*.mcap.zstd": "unpack it by `zstd -d`",
-}
-"""What to do with files of bags that are no MCAP files."""
-
-
-def _bag_file(path: str | os.PathLike[str]) -> Path:
-    given = Path(path)
-    if not given.is_dir():
-        return given
-    files = sorted(given.glob("*.mcap"))
-    for pattern, remedy in _OTHER_STORAGES.items():
-        if not files and (others := sorted(given.glob(pattern))):
-            raise RecordingError(f"The bag in {given} is {others[0].name}: {remedy}.")
-    if len(files) != 1:
-        raise RecordingError(f"The folder {given} holds {len(files)} MCAP files: name one of them.")
-    return files[0]
 
 
 # -- one robot --------------------------------------------------------------------------------
@@ -497,6 +543,9 @@ class RecordedRobot:
             return None
         # The summary of a damaged bag may count messages that are missing.
         return self.bag[topic] if len(self.bag[topic]) else None
+
+    def __contains__(self, name: str) -> bool:
+        return self.get(name) is not None
 
     def load(self, names: Iterable[str]) -> None:
         """Read topics of the stack together, as far as the bag has them: see :meth:`Bag.load`."""
@@ -546,9 +595,4 @@ class RecordedRobot:
     @property
     def urdf(self) -> bytes | None:
         """The description of the robot: the attached file, or else the last message about it."""
-        name = f"{self.namespace}/robot_description".strip("/").replace("/", ".")
-        attached = self.bag.attachments.get(f"{name}.urdf")
-        if attached is not None:
-            return attached
-        series = self.get("robot_description")
-        return None if series is None else str(series.field("data")[-1]).encode()
+        return next(iter(self.bag.robot_descriptions(self.namespace, others=False)), None)

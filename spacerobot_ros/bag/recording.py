@@ -36,12 +36,6 @@ class RecordingState(Enum):
     """Messages are dropped because the bag is complete."""
 
 
-# Names of the module are found faster than members of an enum: they are needed for every message.
-_WAITING, _ON_CLOCK, _ON_WALL_TIME = (
-    RecordingState.WAITING,
-    RecordingState.ON_CLOCK,
-    RecordingState.ON_WALL_TIME,
-)
 _DROPPING_STATES = (RecordingState.PAUSED, RecordingState.FAILED, RecordingState.CLOSED)
 
 
@@ -98,7 +92,8 @@ class Recording:
         self._clock_wait_ns = clock_wait * SECOND
         self._on_failure = on_failure
         self._wall_time = wall_time
-        self._early_messages: list[_EarlyMessage] = []
+        self.early_messages: list[_EarlyMessage] = []
+        """Messages that wait for the time base of the bag."""
         self._time_base: RecordingState | None = None
         self._write = writer.write
 
@@ -107,16 +102,11 @@ class Recording:
         """Whether messages are recorded."""
         return self.state not in _DROPPING_STATES
 
-    @property
-    def messages_waiting(self) -> int:
-        """Number of messages that wait for the start or for the time base of the bag."""
-        return len(self._early_messages) + sum(last is not None for last in self.latched.values())
-
     def start(self) -> None:
         """Start recording, with the last earlier message of every latched topic."""
         if self.state is not RecordingState.PAUSED:
             return
-        self.state = self._time_base or _WAITING
+        self.state = self._time_base or RecordingState.WAITING
         for channel, last in self.latched.items():
             self.latched[channel] = None
             if last is not None:
@@ -129,19 +119,19 @@ class Recording:
 
     def set_clock(self, time_ns: int) -> None:
         """Set the time of the clock; without effect once the bag uses wall time."""
-        if self._time_base is _ON_WALL_TIME:
+        if self._time_base is RecordingState.ON_WALL_TIME:
             return
         self.clock_steps_back += time_ns < self.now_ns
         self.now_ns = time_ns
-        if self.state is _WAITING:
-            self._choose_time_base(_ON_CLOCK)
+        if self.state is RecordingState.WAITING:
+            self._choose_time_base(RecordingState.ON_CLOCK)
 
     def record(self, channel: int, message: bytes, published_ns: int = 0) -> None:
         """Write a message, or keep it until the time base of the bag is chosen.
 
         ``published_ns`` is its stamp; 0: the time at which it is recorded.
         """
-        if self.state is not _ON_CLOCK:
+        if self.state is not RecordingState.ON_CLOCK:
             arrival_ns = self._wall_time()
             if not self.running:
                 if self.state is RecordingState.PAUSED and channel in self.latched:
@@ -149,8 +139,8 @@ class Recording:
                         channel, message, published_ns, arrival_ns
                     )
                 return
-            if self.state is _WAITING:
-                self._early_messages.append(
+            if self.state is RecordingState.WAITING:
+                self.early_messages.append(
                     _EarlyMessage(channel, message, published_ns, arrival_ns)
                 )
                 return
@@ -164,10 +154,10 @@ class Recording:
 
     def flush(self, clock_is_published: bool) -> None:
         """Write data in memory to the file once per flush period of wall time."""
-        if self._early_messages and not clock_is_published:
-            waited_ns = self._wall_time() - self._early_messages[0].arrival_ns
+        if self.early_messages and not clock_is_published:
+            waited_ns = self._wall_time() - self.early_messages[0].arrival_ns
             if waited_ns > self._clock_wait_ns:
-                self._choose_time_base(_ON_WALL_TIME)
+                self._choose_time_base(RecordingState.ON_WALL_TIME)
         self._fail_on_error(self.writer.flush)
 
     def check(self) -> None:
@@ -205,7 +195,7 @@ class Recording:
         """
         if self.state is RecordingState.CLOSED:
             return
-        self._choose_time_base(_ON_WALL_TIME)
+        self._choose_time_base(RecordingState.ON_WALL_TIME)
         counts = {"messages": self.messages, "messages_lost": self.lost.total()}
         self.describe("recorder", {name: str(count) for name, count in counts.items()})
         self.check()
@@ -221,10 +211,10 @@ class Recording:
         if self._time_base is not None or self.failure is not None:
             return
         self._time_base = state
-        if self.state is _WAITING:
+        if self.state is RecordingState.WAITING:
             self.state = state
-        on_clock = state is _ON_CLOCK
-        early, self._early_messages = self._early_messages, []
+        on_clock = state is RecordingState.ON_CLOCK
+        early, self.early_messages = self.early_messages, []
 
         def write_early_messages() -> None:
             for channel, message, published_ns, arrival_ns in early:

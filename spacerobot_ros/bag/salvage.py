@@ -25,18 +25,26 @@ from mcap.writer import MCAP0_MAGIC
 
 from spacerobot_ros.bag.mcap_file import METADATA_NAME, McapFile, QosProfile, RecordedTopic
 from spacerobot_ros.bag.mcap_reading import (
+    DAMAGE_ERRORS,
+    BagFile,
     ChunkUnpacker,
     blocks_in_file_order,
     file_size,
-    open_bag,
     open_file,
     parse_record,
     read_record,
-    read_summary,
     records,
     records_in_chunk,
+    require_mcap,
 )
-from spacerobot_ros.bag.reader import Array, RecordedRobot, columns, read_bag
+from spacerobot_ros.bag.reader import (
+    Array,
+    RecordedRobot,
+    bag_files,
+    columns,
+    read_bag,
+    salvaged_copy,
+)
 from spacerobot_ros.errors import RecordingError
 from spacerobot_ros.times import SECOND
 
@@ -77,7 +85,7 @@ def salvage_bag(
     """Write the readable records of a bag into a new, complete one; the old one stays as it is.
 
     ``out`` is the new file, which must not exist; by default ``NAME-salvaged.mcap`` beside the old
-    one.
+    one. Of a bag of several files the first that needs it is salvaged.
 
     Raises
     ------
@@ -85,18 +93,17 @@ def salvage_bag(
         There is no such bag, it is not MCAP, it is complete already, nothing in it
         can be read, or the new one cannot be written.
     """
-    source = Path(path)
-    target = Path(out) if out is not None else source.with_name(f"{source.stem}-salvaged.mcap")
-    if is_complete(source):
-        raise RecordingError(f"The bag {source} is complete: there is nothing to salvage.")
+    source = next((file for file in bag_files(Path(path)) if not is_complete(file)), None)
+    if source is None:
+        raise RecordingError(f"The bag {path} is complete: there is nothing to salvage.")
+    target = Path(out) if out is not None else salvaged_copy(source)
     with open_file(source) as old:
         start = old.read(MAGIC_SIZE)
+        require_mcap(source, start)
         if start != MCAP0_MAGIC:
-            empty = start == MCAP0_MAGIC[: len(start)]
-            what = "holds nothing yet" if empty else "is not an MCAP file"
-            raise RecordingError(f"{source} {what}: there is nothing to salvage.")
+            raise RecordingError(f"{source} holds nothing yet: there is nothing to salvage.")
         profile = "ros2"
-        with suppress(ValueError):
+        with suppress(*DAMAGE_ERRORS):
             profile = read_record(old, MAGIC_SIZE, Header).profile
         new = McapFile(target, overwrite=False, profile=profile)
         try:
@@ -120,12 +127,15 @@ def salvage_bag(
 def is_complete(path: Path) -> bool:
     """Whether every message of a bag can be read without a repair."""
     try:
-        with open_bag(path) as file:
-            summary = read_summary(path, file)
-            count = sum(len(messages) for *_, messages in blocks_in_file_order(file))
-            return summary.statistics is not None and summary.statistics.message_count == count
+        return all(_holds_what_it_counts(BagFile(file)) for file in bag_files(path))
     except RecordingError:
         return False
+
+
+def _holds_what_it_counts(file: BagFile) -> bool:
+    topics = [channel.topic for channel in file.channels]
+    count = sum(len(messages) for *_, messages in blocks_in_file_order(file, topics))
+    return file.statistics.message_count == count
 
 
 class _Copy:
@@ -136,10 +146,10 @@ class _Copy:
         self.lost_chunks = self.lost_bytes = 0
         self.loss_reason = ""
         self._file = file
-        self._schemas: dict[int, Schema] = {}
-        self._channels: dict[int, Channel] = {}
-        self._new_schema_ids = {0: 0}
-        self._new_channel_ids: dict[int, int] = {}
+        self._schemas: dict[int, tuple[int, str]] = {}
+        """New number and name by the number in the old file."""
+        self._channels: dict[int, tuple[int, Channel]] = {}
+        """New number and old record likewise."""
 
     def add_readable_records(self, old: BinaryIO) -> None:
         """Add what can be read of a file, up to the first record that is cut."""
@@ -155,34 +165,39 @@ class _Copy:
                 if opcode == Opcode.CHUNK:
                     self._add_chunk(record, place, chunks)
                 else:
-                    self._add(record, place)
+                    self._add(record)
         self.lost_bytes = size - whole
 
     def _add_chunk(self, record: bytes, place: int, chunks: ChunkUnpacker) -> None:
         try:
-            data = chunks.unpack(cast("Chunk", parse_record(record, place)), place)
-        except ValueError as error:
+            data = chunks.unpack(cast("Chunk", parse_record(record)), place)
+        except DAMAGE_ERRORS as error:
             self.lost_chunks += 1
             self.loss_reason = self.loss_reason or str(error)
             return
         with suppress(ValueError):
             for begin, end in records_in_chunk(data, place):
-                self._add(data[begin:end], place)
+                self._add(data[begin:end])
 
-    def _add(self, record: bytes, place: int) -> None:
+    def _add(self, record: bytes) -> None:
         """Add a record; one that cannot be read, or is of an unknown channel, is left out."""
         found = None
-        with suppress(ValueError):
-            found = parse_record(record, place)
+        with suppress(*DAMAGE_ERRORS):
+            found = parse_record(record)
         self.empty &= found is None or isinstance(found, Header)
         match found:
             case Message() as message if message.channel_id in self._channels:
-                channel_id = self._new_channel_id(message.channel_id)
-                self._file.write(channel_id, message.data, message.log_time, message.publish_time)
-            case Schema() as schema:
-                self._schemas[schema.id] = schema
-            case Channel() as channel:
-                self._channels[channel.id] = channel
+                number, _ = self._channels[message.channel_id]
+                self._file.write(number, message.data, message.log_time, message.publish_time)
+            case Schema() as schema if schema.id not in self._schemas:
+                number = self._file.add_schema(schema.name, schema.encoding, schema.data)
+                self._schemas[schema.id] = number, schema.name
+            case Channel() as channel if channel.id not in self._channels:
+                schema_id, _ = self._schemas.get(channel.schema_id, (0, ""))
+                number = self._file.add_channel(
+                    channel.topic, channel.message_encoding, schema_id, channel.metadata
+                )
+                self._channels[channel.id] = number, channel
             case Attachment() as file:
                 self._file.add_attachment(file.name, file.data, file.media_type, file.log_time)
             case Metadata() as metadata if metadata.name != METADATA_NAME:
@@ -191,32 +206,15 @@ class _Copy:
     def topics(self) -> list[RecordedTopic]:
         """Return all topics for rosbag2's record; those without a message are in the file too."""
         topics = []
-        for channel in self._channels.values():
-            count = self._file.message_counts[self._new_channel_id(channel.id)]
-            schema, words = self._schemas.get(channel.schema_id), channel.metadata
-            type_name, type_hash = schema.name if schema else "", words.get("topic_type_hash", "")
+        for number, channel in self._channels.values():
+            count, words = self._file.message_counts[number], channel.metadata
+            _, type_name = self._schemas.get(channel.schema_id, (0, ""))
+            type_hash = words.get("topic_type_hash", "")
             with suppress(RecordingError):
                 profiles = QosProfile.from_yaml(words.get("offered_qos_profiles", ""))
                 qos = profiles[0] if profiles else QosProfile()
                 topics.append(RecordedTopic(channel.topic, type_name, type_hash, qos, count))
         return topics
-
-    def _new_channel_id(self, channel_id: int) -> int:
-        if channel_id not in self._new_channel_ids:
-            channel = self._channels[channel_id]
-            number = channel.schema_id if channel.schema_id in self._schemas else 0
-            if number not in self._new_schema_ids:
-                schema = self._schemas[number]
-                self._new_schema_ids[number] = self._file.add_schema(
-                    schema.name, schema.encoding, schema.data
-                )
-            self._new_channel_ids[channel_id] = self._file.add_channel(
-                channel.topic,
-                channel.message_encoding,
-                self._new_schema_ids[number],
-                channel.metadata,
-            )
-        return self._new_channel_ids[channel_id]
 
 
 # -- the state to resume from -----------------------------------------------------------------

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from copy import copy
 from functools import cached_property
 from operator import attrgetter
@@ -16,9 +16,14 @@ from rosbags.interfaces import Nodetype
 from rosbags.serde import SerdeError
 
 from spacerobot_ros.errors import RecordingError
-from spacerobot_ros.messages.definitions import Fields
+from spacerobot_ros.messages.definitions import MessageType
 from spacerobot_ros.messages.layout import DTYPES, Columns, column_dtype, read_columns
 from spacerobot_ros.times import SECOND
+
+JOINT_STATE = "sensor_msgs/msg/JointState"
+_BY_JOINT = ("name", "position", "velocity", "effort")
+_MAX_JOINTS = 50
+"""Largest number of joints that are named on a topic, in lengths of its longest message."""
 
 _HEADER = (Nodetype.NAME, "std_msgs/msg/Header")
 
@@ -44,8 +49,7 @@ class TopicSeries:
         type_name: str,
         time_ns: NDArray[np.int64],
         data: Sequence[bytes],
-        fields: Fields,
-        decode: Callable[[bytes], Any],
+        kind: MessageType,
         max_decoded_bytes: float = math.inf,
     ) -> None:
         self.topic = topic
@@ -54,8 +58,7 @@ class TopicSeries:
         # A change in place would change the array for every reader.
         self.time_ns.flags.writeable = False
         self.data = data
-        self._fields = fields
-        self._decode = decode
+        self._kind, self._fields = kind, kind.fields
         self._max_decoded_bytes = max_decoded_bytes
 
     def __len__(self) -> int:
@@ -127,7 +130,9 @@ class TopicSeries:
         -------
         An array of shape (N,) for a number, of shape (N, k) for k numbers in each message, with
         whole numbers as 64-bit integers and others as float64. A list of N values
-        for everything else: strings, lists, messages, arrays that differ in length.
+        for everything else: strings, lists, messages, arrays that differ in length. Arrays of joint
+        states, and their names, follow :attr:`joint_names` in every message; a joint that a message
+        lacks is nan there.
 
         Raises
         ------
@@ -135,6 +140,8 @@ class TopicSeries:
             There is no such field, or a message is damaged.
         """
         dtype, is_array, in_list, type_name = self._resolve_path(path)
+        if path in _BY_JOINT and self.joint_names and not self._names_are_constant:
+            return self._values_by_joint(path)
         if self._columns is not None and path in self._columns.paths:
             try:
                 return self._columns[path]
@@ -152,12 +159,53 @@ class TopicSeries:
             return np.empty((0, 0), dtype)
         return np.array(values, dtype)
 
-    def has_constant_texts(self, path: str) -> bool:
-        """Whether a list of texts is the same in all messages, as far as the layout shows.
+    @cached_property
+    def joint_names(self) -> list[str]:
+        """Names of the joints or thrusters of joint states, in the order of their first messages.
 
-        True is certain; false may mean that messages differ elsewhere.
+        Positions, velocities and efforts have a column for each. Empty for messages of other types,
+        and where names are missing or repeated.
         """
-        return self._columns is not None and self._columns.constant(path)
+        if self.type_name != JOINT_STATE or not len(self):
+            return []
+        if self._names_are_constant:
+            named = [self._decode_message(self.data[0]).name]
+        else:
+            named = [message.name for message in self._messages]
+        joints = list(dict.fromkeys(name for names in named for name in names))
+        repeated = any(len(set(names)) < len(names) for names in named)
+        return [] if repeated or len(joints) > _MAX_JOINTS * max(map(len, named)) else joints
+
+    @cached_property
+    def _names_are_constant(self) -> bool:
+        return self._columns is not None and self._columns.constant("name")
+
+    def of_joints(self, path: str, names: Sequence[str]) -> NDArray[np.float64]:
+        """Return an array of joint states by joints: shape (N, n); nan where a joint is missing.
+
+        ``path`` is ``position``, ``velocity`` or ``effort``, and ``names`` are those of n joints.
+        """
+        found = _field_matrix(self.field(path), len(self.joint_names))
+        places = {name: k for k, name in enumerate(self.joint_names)}
+        made = np.full((len(self), len(names)), np.nan)
+        for k, name in enumerate(names):
+            if name in places:
+                made[:, k] = found[:, places[name]]
+        return made
+
+    def _values_by_joint(self, path: str) -> Any:
+        """Return an array of joint states whose names change, or their names, by joint."""
+        if path == "name":
+            return [list(self.joint_names) for _ in self.data]
+        places = {name: k for k, name in enumerate(self.joint_names)}
+        given = [getattr(message, path) for message in self._messages]
+        if not any(map(len, given)):
+            return np.empty((len(self), 0))
+        made = np.full((len(self), len(places)), np.nan)
+        for row, message, values in zip(made, self._messages, given, strict=True):
+            if len(values) == len(message.name):
+                row[[places[name] for name in message.name]] = values
+        return made
 
     def table(self, fields: Sequence[str], width: int | None = None) -> NDArray[np.float64]:
         """Return number fields of all messages as a matrix with one row for each message.
@@ -219,7 +267,7 @@ class TopicSeries:
 
     def _decode_message(self, data: bytes) -> Any:
         try:
-            return self._decode(data)
+            return self._kind.decode(data)
         except _DECODING_ERRORS as error:
             raise self._damage_error(error) from error
 

@@ -6,14 +6,15 @@ joints that the entries of an array stand for.
 
 from __future__ import annotations
 
+import csv
 import json
 import os
 import re
 import shutil
-import tempfile
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
 from enum import Enum
+from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,6 +23,7 @@ from numpy.typing import NDArray
 
 from spacerobot_ros.bag.series import TopicSeries
 from spacerobot_ros.errors import RecordingError
+from spacerobot_ros.files import write_output
 from spacerobot_ros.lazy import optional_module
 from spacerobot_ros.messages.statuses import key_values
 from spacerobot_ros.topics import TOPICS
@@ -31,7 +33,6 @@ if TYPE_CHECKING:
     import xarray
 
 _KEY_VALUES = "diagnostic_msgs/msg/KeyValue"
-_JOINT_STATE = "sensor_msgs/msg/JointState"
 _HEADER_STAMP = ("header.stamp.sec", "header.stamp.nanosec")
 _TIME_COLUMNS = ("time", "time_ns", "stamp", "stamp_ns")
 """Time columns of every table; a message field of such a name is put below ``message``."""
@@ -157,7 +158,7 @@ def table_of(series: TopicSeries, prismatic: Mapping[str, bool] | None = None) -
     RecordingError
         A message is damaged, or there is more than can be decoded.
     """
-    names = _joint_state_names(series)
+    names = series.joint_names
     found = [Field("time_ns", series.time_ns, ("ns",))]
     if series.stamped:
         found.append(Field("stamp", series.stamp, ("s",)))
@@ -169,17 +170,8 @@ def table_of(series: TopicSeries, prismatic: Mapping[str, bool] | None = None) -
     return TopicTable(series.topic, series.type_name, series.time, tuple(found))
 
 
-def _joint_state_names(series: TopicSeries) -> tuple[str, ...]:
-    """Return the joint names of a topic of joint states; empty if they differ between messages."""
-    if series.type_name != _JOINT_STATE or not len(series):
-        return ()
-    found = {tuple(names) for names in series.field("name")}
-    names = found.pop()
-    return names if not found and len(set(names)) == len(names) else ()
-
-
 def _table_fields(
-    series: TopicSeries, path: str, names: tuple[str, ...], prismatic: Mapping[str, bool]
+    series: TopicSeries, path: str, names: Sequence[str], prismatic: Mapping[str, bool]
 ) -> list[Field]:
     values = series.field(path)
     if series.element_type(path) == _KEY_VALUES:
@@ -308,8 +300,6 @@ _MATLAB_KEYWORD = re.compile(
     "persistent|return|spmd|switch|try|while"
 )
 
-_QUOTED_CHARACTERS = re.compile(r'[,"\r\n]')
-
 
 class ExportFormat(str, Enum):
     """File formats of :func:`export`."""
@@ -317,22 +307,6 @@ class ExportFormat(str, Enum):
     CSV = "csv"
     PARQUET = "parquet"
     MAT = "mat"
-
-
-@dataclass(frozen=True)
-class Export:
-    """Result of an export.
-
-    Attributes
-    ----------
-    path
-        The folder, or the file.
-    rows
-        Number of rows of each topic that is in it.
-    """
-
-    path: Path
-    rows: dict[str, int]
 
 
 def to_pandas(table: TopicTable) -> pandas.DataFrame:
@@ -377,8 +351,8 @@ def to_xarray(table: TopicTable) -> xarray.Dataset:
 
 def export(
     tables: Iterable[TopicTable], path: str | os.PathLike[str], format: ExportFormat
-) -> Export:
-    """Write tables for other programs.
+) -> dict[str, int]:
+    """Write tables for other programs; return the number of rows of each topic that is written.
 
     CSV and Parquet make a folder with a file for each topic that has messages (``odom.csv``,
     ``planner.status.csv``); MAT makes one file with a struct for each. Nothing is ever written
@@ -395,7 +369,7 @@ def export(
 
     Raises
     ------
-    RecordingError
+    SpaceRobotError
         There is something at ``path``, its name is that of another format, a file cannot be
         written, or a library is not installed.
     """
@@ -403,24 +377,20 @@ def export(
     _require_suffix(target, format)
     if os.path.lexists(target):
         raise RecordingError(f"{target} exists already: name another file or folder.")
-    write = {
-        ExportFormat.CSV: _write_csv,
-        ExportFormat.PARQUET: _write_parquet,
-        ExportFormat.MAT: _write_mat,
-    }[format]
-    try:
-        target.parent.mkdir(parents=True, exist_ok=True)
-        made = Path(tempfile.mkdtemp(prefix=f".{target.name}-", dir=target.parent))
+    named = _tables_by_file_name(tables)
+    if format is ExportFormat.MAT:
+        write_output(target, _mat_content(named))
+    else:
+        write = _write_csv if format is ExportFormat.CSV else _write_parquet
         try:
-            rows = write(_tables_by_file_name(tables), made)
-            result = made / "tables.mat" if format is ExportFormat.MAT else made
-            result.chmod(0o777 & ~_read_umask() if result.is_dir() else 0o666 & ~_read_umask())
-            _move_into_place(result, target)
-        finally:
-            shutil.rmtree(made, ignore_errors=True)
-    except OSError as error:
-        raise RecordingError(f"{target} cannot be written: {error.strerror}.") from error
-    return Export(target, rows)
+            target.mkdir(parents=True)
+            write(named, target)
+        except BaseException as error:
+            shutil.rmtree(target, ignore_errors=True)
+            if not isinstance(error, OSError):
+                raise
+            raise RecordingError(f"{target} cannot be written: {error.strerror}.") from error
+    return {table.topic: len(table) for table in named.values()}
 
 
 def _require_suffix(target: Path, format: ExportFormat) -> None:
@@ -435,23 +405,6 @@ def _require_suffix(target: Path, format: ExportFormat) -> None:
             f"Tables in {format.value} are a folder with a file for each topic; '{target.name}' is "
             "the name of one file."
         )
-
-
-def _move_into_place(made: Path, target: Path) -> None:
-    """Rename the finished file or folder, unless its name has been taken meanwhile."""
-    if made.is_dir():
-        # A rename replaces an empty folder at most.
-        made.rename(target)
-    else:
-        # A hard link would need one call, but FAT file systems have none.
-        os.close(os.open(target, os.O_CREAT | os.O_EXCL))
-        made.replace(target)
-
-
-def _read_umask() -> int:
-    mask = os.umask(0o077)
-    os.umask(mask)
-    return mask
 
 
 def _tables_by_file_name(tables: Iterable[TopicTable]) -> dict[str, TopicTable]:
@@ -473,35 +426,24 @@ def _unused_name(name: str, taken: Mapping[str, Any]) -> str:
     return next(each for each in names if each.lower() not in others)
 
 
-def _write_csv(tables: dict[str, TopicTable], folder: Path) -> dict[str, int]:
-    def rows(file: Path, head: list[str], columns: list[Iterable[str]]) -> None:
-        with file.open("w", encoding="utf-8", newline="") as stream:
-            stream.write(",".join(map(_csv_text, head)) + "\n")
-            stream.writelines(",".join(row) + "\n" for row in zip(*columns, strict=True))
-
-    about: list[tuple[str, str, str, str]] = []
+def _write_csv(tables: dict[str, TopicTable], folder: Path) -> None:
+    about: list[tuple[str, ...]] = [("topic", "file", "column", "unit")]
     for name, table in tables.items():
         columns = {"time": table.time, **table.columns}
-        file = f"{name}.csv"
-        rows(
-            folder / file,
-            list(columns),
-            # Texts are objects, and numbers keep every digit.
-            [map(_csv_text if x.dtype == object else repr, x.tolist()) for x in columns.values()],
-        )
+        rows = zip(*(values.tolist() for values in columns.values()), strict=True)
+        _write_rows(folder / f"{name}.csv", (columns, *rows))
         units = {"time": "s", **table.units}
-        about += [(table.topic, file, column, unit) for column, unit in units.items()]
-    head = ["topic", "file", "column", "unit"]
-    rows(folder / COLUMNS, head, [map(_csv_text, each) for each in zip(*about, strict=True)])
-    return {table.topic: len(table) for table in tables.values()}
+        about += [(table.topic, f"{name}.csv", column, unit) for column, unit in units.items()]
+    _write_rows(folder / COLUMNS, about)
 
 
-def _csv_text(text: str) -> str:
-    """Return a text quoted for CSV (RFC 4180), also if it has a lone carriage return."""
-    return '"' + text.replace('"', '""') + '"' if _QUOTED_CHARACTERS.search(text) else text
+def _write_rows(file: Path, rows: Iterable[Iterable[Any]]) -> None:
+    with file.open("w", encoding="utf-8", newline="") as stream:
+        # All texts are in quotes, as some have commas and line breaks. Numbers keep every digit.
+        csv.writer(stream, quoting=csv.QUOTE_NONNUMERIC, lineterminator="\n").writerows(rows)
 
 
-def _write_parquet(tables: dict[str, TopicTable], folder: Path) -> dict[str, int]:
+def _write_parquet(tables: dict[str, TopicTable], folder: Path) -> None:
     arrow, parquet = _import_library("pyarrow"), _import_library("pyarrow.parquet")
     for name, table in tables.items():
         made = arrow.Table.from_pandas(to_pandas(table), preserve_index=True)
@@ -513,10 +455,9 @@ def _write_parquet(tables: dict[str, TopicTable], folder: Path) -> dict[str, int
         about = {"topic": table.topic, "type": table.type_name, **(made.schema.metadata or {})}
         made = made.cast(arrow.schema(described, metadata=about))
         parquet.write_table(made, folder / f"{name}.parquet")
-    return {table.topic: len(table) for table in tables.values()}
 
 
-def _write_mat(tables: dict[str, TopicTable], folder: Path) -> dict[str, int]:
+def _mat_content(tables: dict[str, TopicTable]) -> bytes:
     # Importing scipy.io takes 0.1 s, and only this format needs it.
     from scipy.io import savemat
     from scipy.io.matlab import MatWriteError
@@ -533,11 +474,12 @@ def _write_mat(tables: dict[str, TopicTable], folder: Path) -> dict[str, int]:
             "units": _cell_array(["s", *table.units.values()]),
         }
     variables[_matlab_variable("about", variables)] = about
+    content = BytesIO()
     try:
-        savemat(folder / "tables.mat", variables, long_field_names=True, do_compression=True)
+        savemat(content, variables, long_field_names=True, do_compression=True)
     except (MatWriteError, ValueError, OverflowError) as error:
         raise RecordingError(f"MAT cannot hold these tables: {error}.") from error
-    return {table.topic: len(table) for table in tables.values()}
+    return content.getvalue()
 
 
 def _matlab_struct(table: TopicTable) -> dict[str, Any]:
@@ -565,9 +507,7 @@ def _matlab_variable(name: str, taken: Mapping[str, Any]) -> str:
 
 
 def _cell_array(texts: list[str]) -> Any:
-    made = np.empty((len(texts), 1), object)
-    made[:, 0] = texts
-    return made
+    return _object_array(texts)[:, np.newaxis]
 
 
 def _import_library(name: str) -> Any:

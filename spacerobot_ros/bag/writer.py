@@ -4,19 +4,14 @@ from __future__ import annotations
 
 import os
 import re
-import struct
 from collections import Counter
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
-from types import TracebackType
 
 from spacerobot_ros.bag.mcap_file import BagExistsError, McapFile, QosProfile, RecordedTopic
 from spacerobot_ros.errors import RecordingError
 from spacerobot_ros.messages.definitions import message_definition, type_hash
-
-_TIMES = struct.Struct("<QQ")
-"""The times of a message in MCAP, ns."""
 
 
 def free_name(path: Path, first: int = 0) -> Path:
@@ -29,7 +24,7 @@ def free_name(path: Path, first: int = 0) -> Path:
         number += 1
 
 
-class BagWriter:
+class BagWriter(AbstractContextManager["BagWriter"]):
     """Writes serialised ROS 2 messages into a bag that any ROS 2 tool opens.
 
     Messages gather in a chunk in memory. A chunk that is full goes to the operating system as one
@@ -93,8 +88,8 @@ class BagWriter:
         self._topics: dict[str, tuple[int, str, QosProfile]] = {}
         self._schema_ids: dict[str, int] = {}
         self._channel_ids: set[int] = set()
-        """Channels that take messages: none as soon as nothing more can be written."""
         self._refusal: str | None = None
+        """Why nothing more can be written; None: it can."""
         self._closed = False
         self._file = self._open_first_file()
         try:
@@ -153,7 +148,8 @@ class BagWriter:
             The type is not installed, the topic is known with another type, or nothing more can
             be written.
         """
-        self._require_open()
+        if self._refusal is not None:
+            raise RecordingError(self._refusal)
         if name in self._topics:
             channel_id, known_type, _ = self._topics[name]
             if type_name != known_type:
@@ -186,23 +182,22 @@ class BagWriter:
         ------
         RecordingError
             The disk refused it, nothing more can be written, the channel is unknown, or a time is
-            not a whole number of at least 0.
+            negative.
         """
-        try:
-            _TIMES.pack(log_time_ns, publish_time_ns)
-        except struct.error:
-            raise self._explain_refusal(channel_id) from None
-        if channel_id not in self._channel_ids:
-            raise self._explain_refusal(channel_id)
-        if not isinstance(data, bytes | bytearray | memoryview):
-            raise TypeError(f"A message is bytes, not {type(data).__name__}.")
+        if self._refusal is not None or channel_id not in self._channel_ids:
+            raise RecordingError(
+                self._refusal
+                or f"The bag {self.path} has no channel {channel_id}: add_topic gives the channels."
+            )
+        if log_time_ns < 0 or publish_time_ns < 0:
+            raise RecordingError(f"The bag {self.path} takes no times before zero.")
         try:
             completed_chunk = self._file.write(channel_id, data, log_time_ns, publish_time_ns)
         except RecordingError as error:
-            self._refuse_further_writes(str(error))
+            self._refusal = str(error)
             raise
         if completed_chunk and self._is_full():
-            with self._refusing_after_failure():
+            with self._adding():
                 self._begin_next_file()
 
     def add_attachment(self, name: str, data: bytes, media_type: str, log_time_ns: int) -> None:
@@ -217,15 +212,13 @@ class BagWriter:
         self._add(lambda file: file.add_metadata(name, data))
 
     def _add(self, record: Callable[[McapFile], None]) -> None:
-        self._require_open()
-        self._repeated.append(record)
-        with self._refusing_after_failure():
+        with self._adding():
+            self._repeated.append(record)
             record(self._file)
 
     def flush(self) -> None:
         """Hand the chunk in progress to the operating system: a kill loses nothing of it."""
-        self._require_open()
-        with self._refusing_after_failure():
+        with self._adding():
             if self._file.flush() and self._is_full():
                 self._begin_next_file()
 
@@ -240,23 +233,14 @@ class BagWriter:
         if self._closed:
             return
         self._closed = True
-        refusal = self._refusal
-        self._refuse_further_writes(refusal or f"The bag {self.path} is closed.")
+        refusal, self._refusal = self._refusal, self._refusal or f"The bag {self.path} is closed."
         try:
             self._file.finish(self._recorded_topics())
         except RecordingError:
             if refusal is None:
                 raise
 
-    def __enter__(self) -> BagWriter:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def _register(self, name: str, type_name: str, qos: QosProfile) -> int:
@@ -306,8 +290,7 @@ class BagWriter:
         RecordingError
             The file is gone or shorter; nothing more is written.
         """
-        self._require_open()
-        with self._refusing_after_failure():
+        with self._adding():
             self._file.check()
 
     def _open_numbered_file(self) -> McapFile:
@@ -351,29 +334,13 @@ class BagWriter:
             for name, (channel, type_name, qos) in self._topics.items()
         ]
 
-    def _require_open(self) -> None:
+    @contextmanager
+    def _adding(self) -> Iterator[None]:
+        """Refuse to add anything after a failure, and remember one."""
         if self._refusal is not None:
             raise RecordingError(self._refusal)
-
-    @contextmanager
-    def _refusing_after_failure(self) -> Iterator[None]:
         try:
             yield
         except RecordingError as error:
-            self._refuse_further_writes(str(error))
+            self._refusal = str(error)
             raise
-
-    def _refuse_further_writes(self, reason: str) -> None:
-        self._refusal = reason
-        self._channel_ids = set()
-
-    def _explain_refusal(self, channel_id: int) -> RecordingError:
-        if self._refusal is not None:
-            return RecordingError(self._refusal)
-        if channel_id not in self._channel_ids:
-            return RecordingError(
-                f"The bag {self.path} has no channel {channel_id}: add_topic gives the channels."
-            )
-        return RecordingError(
-            f"The bag {self.path} takes times only as whole, non-negative numbers of nanoseconds."
-        )

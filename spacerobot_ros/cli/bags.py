@@ -44,17 +44,15 @@ def export_command(bag: Path, format_name: str, out: Path | None, topics: tuple[
 
     opened = read_bag(bag)
     if out is None:
-        stem = opened.path.with_suffix("")
-        out = stem.with_suffix(".mat") if format_name == "mat" else Path(f"{stem}_{format_name}")
-    chosen = dict.fromkeys(opened[topic].topic for topic in topics) or opened.keys()
-    tables = (opened.table(topic) for topic in chosen)
-    exported = export(tables, out, ExportFormat(format_name))
-    for topic in chosen:
-        rows = exported.rows.get(topic)
+        out = beside(bag, ".mat" if format_name == "mat" else f"_{format_name}")
+    tables = {opened[topic].topic: opened.table(topic) for topic in topics} or opened.tables()
+    rows_by_topic = export(tables.values(), out, ExportFormat(format_name))
+    for topic in tables:
+        rows = rows_by_topic.get(topic)
         click.echo(
             f"{printable(topic):<27} {'no messages, left out' if rows is None else f'{rows} rows'}"
         )
-    click.echo(f"{'tables':<27} {exported.path}")
+    click.echo(f"{'tables':<27} {out}")
 
 
 _MILLIMETRES_BY_UNIT = {"": 1.0, "mm": 1.0, "cm": 10.0, "in": 25.4, "pt": 25.4 / 72}

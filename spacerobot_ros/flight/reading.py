@@ -12,7 +12,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import cached_property, partial
-from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
@@ -94,68 +93,52 @@ class _LazyMapping(Mapping[str, T]):
         return len(self._makers)
 
 
-class FlightBag:
+class FlightBag(RecordedRobot):
     """The topics of one robot in a bag as signals over time.
 
     Times are stamps (s), or log times where stamps are of another clock.
 
     Parameters
     ----------
-    bags
-        The files of the bag in order; one, unless the recording was split.
+    bag
+        The recording.
     namespace
         Namespace of the robot's topics, such as ``/robot_1``; empty for none.
     """
 
-    def __init__(self, bags: Sequence[Bag], namespace: str = "") -> None:
-        self.path = bags[0].path
-        self.namespace = namespace
-        self.parts = [RecordedRobot(bag, namespace) for bag in bags]
-        for part in self.parts:
-            part.load(_FLIGHT_TOPICS)
+    def __init__(self, bag: Bag, namespace: str = "") -> None:
+        super().__init__(bag, namespace)
+        self.path = bag.path
+        self.load(_FLIGHT_TOPICS)
         states = [
-            s for name in ("odom", "joint_states", "momentum") for s in self.series_of(name)[:1]
+            series for name in ("odom", "joint_states", "momentum") if (series := self.get(name))
         ]
         self.stamped = all(abs(s.stamp[0] - s.time[0]) < _SAME_CLOCK_TOLERANCE for s in states)
-        self.began = min((self._times(s)[0] for s in states), default=bags[0].start_time)
+        self.began = min((self._times(s)[0] for s in states), default=bag.start_time)
         """Time of the first state, s."""
-
-    def series_of(self, name: str) -> list[TopicSeries]:
-        """Return a topic in the files that have messages of it."""
-        return [series for part in self.parts if (series := part.get(name)) is not None]
 
     def messages(self, name: str) -> Iterator[tuple[int, Any]]:
         """Go through the messages of a topic, each with its log time in ns."""
-        for series in self.series_of(name):
-            yield from series.messages()
-
-    def names(self, topic: str) -> list[str]:
-        """Return the names in the first joint states of a topic; none where it is missing."""
-        return next((found for part in self.parts if (found := part.names(topic))), [])
-
-    @property
-    def metadata(self) -> dict[str, dict[str, str]]:
-        """Metadata records of the bag, see :attr:`RecordedRobot.metadata`."""
-        return self.parts[0].metadata
+        series = self.get(name)
+        return iter(()) if series is None else series.messages()
 
     @property
     def message_count(self) -> int:
         """Number of messages on all topics."""
-        return sum(part.bag.message_count() for part in self.parts)
+        return self.bag.message_count()
 
     @property
     def description(self) -> RobotDescription | None:
         """The first readable description of the robot, among the obstacles that came last; None
         where there is none.
         """
-        for part in self.parts:
-            for text in part.bag.robot_descriptions(self.namespace):
-                try:
-                    found = parse_robot(text.decode())
-                except (RobotDescriptionError, UnicodeDecodeError):
-                    continue
-                came = self.obstacles
-                return with_world(found, came[-1][1]) if came else found
+        for text in self.bag.robot_descriptions(self.namespace):
+            try:
+                found = parse_robot(text.decode())
+            except (RobotDescriptionError, UnicodeDecodeError):
+                continue
+            came = self.obstacles
+            return with_world(found, came[-1][1]) if came else found
         return None
 
     @cached_property
@@ -172,8 +155,8 @@ class FlightBag:
     @property
     def obstacles_change(self) -> bool:
         """Whether obstacles came after the first state."""
-        states = self.series_of("odom")
-        return bool(states) and any(time / SECOND > states[0].time[0] for time, _ in self.obstacles)
+        states = self.get("odom")
+        return states is not None and any(t / SECOND > states.time[0] for t, _ in self.obstacles)
 
     # -- signals ------------------------------------------------------------------------------
 
@@ -190,16 +173,18 @@ class FlightBag:
         width
             Number of columns.
         """
-        found = [Signal.empty(width)]
-        for series in self.series_of(name):
+        series = self.get(name)
+        if series is None:
+            return Signal.empty(width)
+        if topic_named(name).type == TOPICS["joint_states"].type:
+            names = self.names(name)
+            values = np.hstack([series.of_joints(path, names) for path in fields])
+        else:
             values = series.table(fields, width)
-            if topic_named(name).type == TOPICS["joint_states"].type:
-                values = _sort_by_name(values, series, self.names(name))
-            whole = np.isfinite(values).all(axis=1)
-            found.append(Signal(self._times(series)[whole], values[whole]))
-        time: Array = np.concatenate([each.time for each in found])
+        whole = np.isfinite(values).all(axis=1)
+        time, values = self._times(series)[whole], values[whole]
         order = np.argsort(time, kind="stable")
-        return Signal(time[order], np.concatenate([each.values for each in found])[order])
+        return Signal(time[order], values[order])
 
     def quantity(self, name: str, field: StateField) -> Signal:
         """Return the numbers of a field of a state topic over time."""
@@ -228,33 +213,32 @@ class FlightBag:
 
     def measured_signal(self, name: str, number: int) -> Signal:
         """Return a field of ``odom`` or ``joint_states`` while sensors err."""
-        true = self.series_of(f"{name}_true")
-        began, ended = self._times(true[0])[0], self._times(true[-1])[-1]
+        began, *_, ended = self._times(self[f"{name}_true"])[[0, -1]]
         return self.quantity(name, TOPICS[name].state[number]).between(began, ended)
 
     def series(self) -> Mapping[str, Signal]:
         """Return all quantities of :attr:`Flight.series` that the bag has."""
         makers: dict[str, Callable[[], Signal]] = {}
-        erring = bool(self.series_of("odom_true"))
+        erring = "odom_true" in self
         for name, quantities in {
             "odom": ("pose", "twist"),
             "joint_states": ("q", "qdot", "effort"),
         }.items():
             for number, quantity in enumerate(quantities):
-                if self.series_of(name) or self.series_of(f"{name}_true"):
+                if name in self or f"{name}_true" in self:
                     makers[quantity] = partial(self.true_signal, name, number)
-                if erring and quantity != "effort" and self.series_of(f"{name}_true"):
+                if erring and quantity != "effort" and f"{name}_true" in self:
                     makers[f"measured_{quantity}"] = partial(self.measured_signal, name, number)
         for name in _QUANTITY_TOPICS:
-            for field in TOPICS[name].state if self.series_of(name) else ():
+            for field in TOPICS[name].state if name in self else ():
                 makers[field.quantity] = partial(self.quantity, name, field)
         for topic in self._poses_of_end_effectors():
             makers[topic.state[0].quantity] = partial(self.quantity, topic.name, topic.state[0])
         return _LazyMapping(makers)
 
     def _poses_of_end_effectors(self) -> Iterator[Topic]:
-        for name in dict.fromkeys(name for part in self.parts for name in part.topic_names()):
-            if name.endswith("/pose") and self.series_of(name):
+        for name in self.topic_names():
+            if name.endswith("/pose") and name in self:
                 yield topic_named(name)
 
     def _times(self, series: TopicSeries) -> Array:
@@ -330,33 +314,20 @@ class FlightBag:
 
     def commands(self, scenario: Scenario) -> Mapping[str, Commands]:
         """Return the commands by topic."""
-        n = len(self.names("joint_states"))
+        joints = self.names("joint_states")
 
         def read(name: str) -> Commands:
             config = scenario.plant
-            fields, width = (WRENCH_COLUMNS, 6) if name == "base_wrench" else (["velocity"], n)
-            if name == "joint_commands" and config.actuation != "velocity":
-                fields = ["effort"]
-            each = self.series_of(name)
-            return Commands(
-                np.concatenate([series.stamp_ns // config.period_ns for series in each]),
-                np.concatenate([series.table(fields, width) for series in each]),
+            efforts = name == "joint_commands" and config.actuation != "velocity"
+            series = self[name]
+            values = (
+                series.table(WRENCH_COLUMNS, 6)
+                if name == "base_wrench"
+                else series.of_joints("effort" if efforts else "velocity", joints)
             )
+            return Commands(series.stamp_ns // config.period_ns, values)
 
-        return _LazyMapping(
-            {name: partial(read, name) for name in _COMMAND_TOPICS if self.series_of(name)}
-        )
-
-
-def _sort_by_name(values: Array, series: TopicSeries, names: list[str]) -> Array:
-    """Return numbers (N, n) of joints in the order of ``names``; nan of those that lack one."""
-    if series.has_constant_texts("name"):
-        return values
-    made = np.full_like(values, np.nan)
-    for row, given in enumerate(series.field("name")):
-        if sorted(given) == sorted(names):
-            made[row] = values[row, [given.index(name) for name in names]]
-    return made
+        return _LazyMapping({name: partial(read, name) for name in _COMMAND_TOPICS if name in self})
 
 
 # -- any bag ----------------------------------------------------------------------------------
@@ -368,7 +339,7 @@ def open_flight_bag(path: str | os.PathLike[str], namespace: str | None = None) 
     Parameters
     ----------
     path
-        The bag; where there is no such file, the parts ``NAME_0``, ``NAME_1``, ... of it.
+        As for :func:`~spacerobot_ros.bag.read_bag`.
     namespace
         Namespace of the robot's topics, with or without the slash before it; None: the first in
         alphabetical order of those that the bag has an ``odom`` of.
@@ -378,18 +349,17 @@ def open_flight_bag(path: str | os.PathLike[str], namespace: str | None = None) 
     RecordingError
         There is no such bag or robot, or it is damaged.
     """
-    bags = [read_bag(part) for part in _bag_files(Path(path))]
-    prefixes = sorted({name for bag in bags for name in namespaces(bag)})
+    bag = read_bag(path)
+    prefixes = namespaces(bag)
     chosen = prefixes[0] if prefixes else ""
     if namespace is not None:
         chosen = f"/{namespace.strip('/')}".rstrip("/")
         if chosen not in prefixes:
             known = ", ".join(name or "/" for name in prefixes) or "no robot"
             raise RecordingError(
-                f"The bag {bags[0].path} has no robot in the namespace '{namespace}': it has "
-                f"{known}."
+                f"The bag {bag.path} has no robot in the namespace '{namespace}': it has {known}."
             )
-    return FlightBag(bags, chosen)
+    return FlightBag(bag, chosen)
 
 
 def namespaces(bag: Bag) -> list[str]:
@@ -401,16 +371,6 @@ def namespaces(bag: Bag) -> list[str]:
     }
     # The target of a robot has an odometry, too.
     return sorted(found - {f"{name}/target" for name in found})
-
-
-def _bag_files(path: Path) -> list[Path]:
-    """Return the files of a bag in order: one, or ``NAME_0``, ``NAME_1``, ... if it was split."""
-    if path.exists():
-        return [path]
-    parts: list[Path] = []
-    while (part := path.with_name(f"{path.stem}_{len(parts)}{path.suffix}")).exists():
-        parts.append(part)
-    return parts or [path]
 
 
 def read_flight(bag: FlightBag) -> Flight:
@@ -462,7 +422,7 @@ def read_flight(bag: FlightBag) -> Flight:
         status=status,
         gait=follower.gait,
         # The distances of a flight are to one set of obstacles.
-        measures_clearance=bool(bag.series_of("clearance")) and not bag.obstacles_change,
+        measures_clearance="clearance" in bag and not bag.obstacles_change,
     )
     # A table of thrusters that is a file of its own is not looked for: a bag may name any file.
     in_urdf = scenario.in_file.get("plant", {}).get("thrusters") == IN_URDF
@@ -557,11 +517,11 @@ def _scenario_in_bag(bag: FlightBag) -> Scenario:
         if node in nodes:
             nodes[node].setdefault(parameter, 0.0)
     if nodes.get("plant", {}).get("actuation", "auto") == "auto" and "plant" in nodes:
-        nodes["plant"]["actuation"] = recorded_actuation(bag.parts[0])
-    target = recorded_target(bag.parts[0])
+        nodes["plant"]["actuation"] = recorded_actuation(bag)
+    target = recorded_target(bag)
     if target and "plant" in nodes:
         nodes["plant"] |= target_parameters(target)
-    urdf, own = bag.parts[0].urdf, nodes.get("plant", {}).get("robot", "")
+    urdf, own = bag.urdf, nodes.get("plant", {}).get("robot", "")
     for values in nodes.values():
         if urdf is not None and values.get("robot") in ("", own):
             # The text of the robot carries its obstacles.
@@ -657,7 +617,7 @@ def recorded_scenario(bag: Bag) -> Scenario:
     RecordingError
         The bag lacks the goal or the parameters.
     """
-    scenario = _scenario_in_bag(FlightBag([bag]))
+    scenario = _scenario_in_bag(FlightBag(bag))
     if not scenario.has_goal or "plant" not in scenario.in_file:
         raise RecordingError(
             f"The bag {bag.path} lacks the goal or the parameters of its flight, which bags of "
@@ -688,8 +648,8 @@ def read_run(path: str | os.PathLike[str]) -> Flight:
         Its robot is refused.
     """
     bag = open_flight_bag(path)
-    scenario = recorded_scenario(bag.parts[0].bag)
-    urdf = bag.parts[0].urdf
+    scenario = recorded_scenario(bag.bag)
+    urdf = bag.urdf
     if urdf is None:
         raise RecordingError(f"The bag {bag.path} holds no description of its robot.")
     robot = scenario.plant.assumed_robot(parse_robot(urdf.decode(errors="replace")))

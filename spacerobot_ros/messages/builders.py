@@ -10,16 +10,19 @@ from numpy.typing import NDArray
 
 from spacerobot_ros.errors import CommandError
 from spacerobot_ros.messages.layout import (
-    ENCAPSULATION,
     encode,
     encode_list,
-    layout_of,
     seconds_and_nanoseconds,
 )
-from spacerobot_ros.messages.readers import ODOMETRY, JointReader, TemplateReader
+from spacerobot_ros.messages.readers import (
+    ODOMETRY,
+    JointReader,
+    MessageTemplate,
+    TemplateReader,
+)
 from spacerobot_ros.model.description import Array, RobotDescription
 from spacerobot_ros.model.kinematics import ForwardKinematics, Frames
-from spacerobot_ros.times import LATEST_NS, SECOND
+from spacerobot_ros.times import LATEST_NS, SECOND, stamp_bytes
 from spacerobot_ros.topics import Topic
 
 if TYPE_CHECKING:
@@ -46,40 +49,19 @@ class TransformTemplate:
         transforms = [
             {"header": {"frame_id": parent}, "child_frame_id": child} for parent, child in frames
         ]
-        raw = encode(TRANSFORM_TYPE, {"transforms": transforms})
-        leaves = layout_of(raw, TRANSFORM_TYPE, elements=True).leaves
-
-        def offsets(path: str) -> NDArray[np.intp]:
-            found = [leaves[f"transforms[{i}].{path}"].offset for i in range(len(frames))]
-            return np.array(found, dtype=np.intp) - ENCAPSULATION
-
-        self._buffer = bytearray(raw)
-        count = (len(raw) - ENCAPSULATION) // 8
-        self._times = np.frombuffer(self._buffer, np.uint32, 2 * count, ENCAPSULATION)
-        self._doubles = np.frombuffer(self._buffer, np.float64, count, ENCAPSULATION)
-        self._stamps = offsets("header.stamp.sec") // 4
-        first = offsets("transform.translation.x") // 8
-        self._numbers = first[:, np.newaxis] + np.arange(_NUMBERS_PER_POSE)
+        self._template = MessageTemplate(
+            TRANSFORM_TYPE, encode(TRANSFORM_TYPE, {"transforms": transforms})
+        )
+        self._numbers = [
+            self._template.floats(f"transforms[{i}].transform.translation.x", _NUMBERS_PER_POSE)
+            for i in range(len(frames))
+        ]
 
     def serialised(self, time_ns: int, poses: Array) -> bytes:
         """Return the message with the poses (k, 7), all of one time."""
-        self._times[self._stamps], self._times[self._stamps + 1] = divmod(time_ns, SECOND)
-        self._doubles[self._numbers] = poses
-        return bytes(self._buffer)
-
-    def serialised_many(self, times_ns: NDArray[np.int64], poses: Array) -> list[bytes]:
-        """Return the messages of some times (m,) with the poses (m, k, 7)."""
-        size = 8 * len(self._doubles)
-        rows = np.tile(np.frombuffer(self._buffer, np.uint8, size, ENCAPSULATION), (len(poses), 1))
-        seconds, nanoseconds = np.divmod(times_ns[:, np.newaxis], SECOND)
-        rows.view(np.uint32)[:, self._stamps] = seconds
-        rows.view(np.uint32)[:, self._stamps + 1] = nanoseconds
-        rows.view(np.float64)[:, self._numbers] = poses
-        head, tail = (
-            bytes(self._buffer[:ENCAPSULATION]),
-            bytes(self._buffer[ENCAPSULATION + size :]),
-        )
-        return [bytes(head + row.tobytes() + tail) for row in rows]
+        for numbers, pose in zip(self._numbers, poses, strict=True):
+            numbers[:] = pose
+        return self._template.serialised(stamp_bytes(time_ns))
 
 
 class RobotTransforms:
@@ -120,7 +102,10 @@ class RobotTransforms:
         every = poses[:, np.newaxis]
         if self._links is not None:
             every = np.concatenate([every, self._links.transforms_at(q)], axis=1)
-        return self._template.serialised_many(times_ns, every)
+        return [
+            self._template.serialised(time_ns, each)
+            for time_ns, each in zip(times_ns.tolist(), every, strict=True)
+        ]
 
     def static_message(self, time_ns: int) -> bytes | None:
         """Return the message of links fixed to their parents; None without such links."""

@@ -2,8 +2,7 @@
 
 ``rosbags`` writes Python code for every type that it decodes, a line for each element of an array
 of messages, and follows types that contain themselves for ever. The definitions of a bag may be
-anybody's, so they are checked first: names, lengths, nesting, and how many fields a message has
-when all messages inside of it are written out.
+anybody's, so names, lengths, nesting and the number of fields are limited.
 """
 
 from __future__ import annotations
@@ -77,17 +76,8 @@ def message_definition(type_name: str) -> str:
     """Return the full definition of a message type as rosbag2 writes it into a schema.
 
     That is the text of the ``.msg`` file, then for every type it uses, depth first, in alphabetical
-    order and each once, a separator line, ``MSG: package/Type`` and its text.
-
-    Parameters
-    ----------
-    type_name
-        Such as ``nav_msgs/msg/Odometry``.
-
-    Returns
-    -------
-    The concatenated definition (encoding ``ros2msg``). Where a package is not installed, it is that
-    of ROS 2 Jazzy, without comments.
+    order and each once, a separator line, ``MSG: package/Type`` and its text (``ros2msg``). Types
+    of ROS 2 Jazzy that are not installed are defined without comments.
 
     Raises
     ------
@@ -95,17 +85,31 @@ def message_definition(type_name: str) -> str:
         The name is not one of a message type, or a package that it needs is neither installed nor
         one of Jazzy's.
     """
-    try:
-        return _with_dependencies(type_name, set())
-    except RecordingError:
-        name = _InterfaceName.of(type_name).full
-        if name not in _types_of_jazzy().fielddefs:
-            raise
-        return _types_of_jazzy().generate_msgdef(name, ros_version=2)[0]
+    return _of_installed_or_jazzy(
+        type_name,
+        lambda name: _with_dependencies(name, set()),
+        lambda jazzy, name: jazzy.generate_msgdef(name, ros_version=2)[0],
+    )
 
 
-def _with_dependencies(type_name: str, seen: set[str]) -> str:
+def _of_installed_or_jazzy(
+    type_name: str,
+    of_installed: Callable[[_InterfaceName], str],
+    of_jazzy: Callable[[Typestore, str], str],
+) -> str:
     name = _InterfaceName.of(type_name)
+    try:
+        return of_installed(name)
+    except RecordingError:
+        from rosbags.typesys import Stores, get_typestore
+
+        jazzy = get_typestore(Stores.ROS2_JAZZY)
+        if name.full not in jazzy.fielddefs:
+            raise
+        return of_jazzy(jazzy, name.full)
+
+
+def _with_dependencies(name: _InterfaceName, seen: set[str]) -> str:
     text = name.text()
     types = {
         found if "/" in found else f"{name.package}/{found}"
@@ -116,7 +120,7 @@ def _with_dependencies(type_name: str, seen: set[str]) -> str:
     for dependency in sorted(types):
         if dependency not in seen:
             seen.add(dependency)
-            definition = _with_dependencies(dependency, seen)
+            definition = _with_dependencies(_InterfaceName.of(dependency), seen)
             parts.append(f"\n{'=' * 80}\nMSG: {dependency}\n{definition}")
     return "".join(parts)
 
@@ -129,25 +133,17 @@ def type_hash(type_name: str) -> str:
     description of its types (``share/<package>/msg/<Type>.json``). Raises as
     :func:`message_definition` does.
     """
-    name = _InterfaceName.of(type_name)
-    try:
+
+    def of_installed(name: _InterfaceName) -> str:
         description = name.file().with_suffix(".json")
-    except RecordingError:
-        if name.full not in _types_of_jazzy().fielddefs:
-            raise
-        return _types_of_jazzy().hash_rihs01(name.full)
-    if not description.is_file():
-        return ""
-    hashes = json.loads(description.read_bytes())["type_hashes"]
-    return next((str(h["hash_string"]) for h in hashes if h["type_name"] == name.full), "")
+        if not description.is_file():
+            return ""
+        hashes = json.loads(description.read_bytes())["type_hashes"]
+        return next((str(h["hash_string"]) for h in hashes if h["type_name"] == name.full), "")
 
-
-@cache
-def _types_of_jazzy() -> Typestore:
-    """Return the types of ROS 2 Jazzy, which ``rosbags`` brings."""
-    from rosbags.typesys import Stores, get_typestore
-
-    return get_typestore(Stores.ROS2_JAZZY)
+    return _of_installed_or_jazzy(
+        type_name, of_installed, lambda jazzy, name: jazzy.hash_rihs01(name)
+    )
 
 
 def message_module(type_name: str) -> tuple[str, str, str]:
@@ -250,51 +246,49 @@ _MAX_FIELDS = 1_000
 _MAX_NESTING = 32
 
 
-class MessageTypes:
-    """Message types defined in a bag, parsed on first use."""
+class MessageType:
+    """A message type by the text of its schema in a bag.
 
-    def __init__(self) -> None:
-        self._store = _empty_store()
+    Attributes
+    ----------
+    fields
+        Definitions of the type and of all types in it.
 
-    @property
-    def fields(self) -> dict[str, Any]:
-        """Type name -> constants and fields, as ``rosbags`` parses a definition."""
-        return self._store.fielddefs
+    Raises
+    ------
+    ValueError
+        The schema cannot be parsed or exceeds a limit.
+    """
 
-    def serialise(self, message: Any) -> memoryview | bytes:
+    def __init__(self, type_name: str, text: bytes) -> None:
+        from rosbags.typesys import Stores, get_typestore
+
+        self._store = get_typestore(Stores.EMPTY)
+        try:
+            self._store.register(_parsed_within_limits(type_name, text))
+            self._definition = self._store.get_msgdef(type_name)
+        # The parser raises any kind of error, depending on the text.
+        except Exception as error:
+            words = " ".join(str(error).split()) or type(error).__name__
+            raise ValueError(words if len(words) <= 200 else f"{words[:200]} ...") from error
+        self.fields: Fields = self._store.fielddefs
+
+    def decode(self, data: bytes) -> Any:
+        """Return a message from its serialised form."""
+        # Not `Typestore.deserialize_cdr`: that one refuses what rclpy serialises with an empty
+        # list of float64, which has some meaningless bytes at its end.
+        definition = self._definition
+        little = data[1] & 1
+        decode = definition.deserialize_cdr_le if little else definition.deserialize_cdr_be
+        return decode(data[4:], 0, definition.cls, self._store)[0]
+
+    def serialise(self, message: Any) -> bytes:
         """Return a message as ROS serialises it."""
-        return self._store.serialize_cdr(message, message.__msgtype__)
+        return bytes(self._store.serialize_cdr(message, self._definition.name))
 
-    def decoder(self, type_name: str, text: bytes) -> Callable[[bytes], Any]:
-        """Return the function that decodes messages of a type, given the text of its schema.
 
-        Raises
-        ------
-        ValueError
-            The schema cannot be parsed or exceeds a limit.
-        """
-        store, definition = _type_store(type_name, text)
-        self._add_types(store)
-        little, big = definition.deserialize_cdr_le, definition.deserialize_cdr_be
-
-        def decode(data: bytes) -> Any:
-            # Not `Typestore.deserialize_cdr`: that one refuses what rclpy serialises with an empty
-            # list of float64, which has some meaningless bytes at its end.
-            deserialise = little if data[1] & 1 else big
-            return deserialise(data[4:], 0, definition.cls, store)[0]
-
-        return decode
-
-    def _add_types(self, store: Typestore) -> None:
-        """Add the types of another store; ValueError where the bag has defined one otherwise."""
-        own = self._store
-        for name, (_, fields) in store.fielddefs.items():
-            if name in own.fielddefs and _types_of_fields(
-                own.fielddefs[name][1]
-            ) != _types_of_fields(fields):
-                raise ValueError(f"Type '{name}' is already present with different definition.")
-        for name in store.fielddefs.keys() - own.fielddefs.keys():
-            own.fielddefs[name], own.types[name] = store.fielddefs[name], store.types[name]
+message_type = lru_cache(maxsize=64)(MessageType)
+"""Return a :class:`MessageType`, whose code is generated once for all bags."""
 
 
 def _parsed(text: str, type_name: str) -> Any:
@@ -307,29 +301,7 @@ def _parsed(text: str, type_name: str) -> Any:
     return {type_name if name == parsed_name else name: of for name, of in types.items()}
 
 
-def _empty_store() -> Typestore:
-    from rosbags.typesys import Stores, get_typestore
-
-    return get_typestore(Stores.EMPTY)
-
-
-def _types_of_fields(fields: Any) -> list[Any]:
-    return [(name.lower(), kind) for name, kind in fields]
-
-
-@lru_cache(maxsize=64)
-def _type_store(type_name: str, text: bytes) -> tuple[Typestore, Any]:
-    """Return the types that a schema defines and the class of one type; cached for all bags."""
-    parsed, store = _parse_definition(type_name, text), _empty_store()
-    try:
-        store.register(parsed)
-        return store, store.get_msgdef(type_name)
-    # The parser raises any kind of error, depending on the text.
-    except Exception as error:
-        raise ValueError(_error_in_one_line(error)) from error
-
-
-def _parse_definition(type_name: str, text: bytes) -> Any:
+def _parsed_within_limits(type_name: str, text: bytes) -> Any:
     if not _TYPE_NAME.fullmatch(type_name):
         raise ValueError("a type is called 'package/msg/Type'")
     if len(text) > _MAX_TEXT_BYTES or text.count(b"\n") > _MAX_LINES:
@@ -337,55 +309,38 @@ def _parse_definition(type_name: str, text: bytes) -> Any:
             f"its text is longer than {_MAX_TEXT_BYTES} bytes or {_MAX_LINES} lines, which no "
             "message needs"
         )
-    try:
-        types = _parsed(text.decode(), type_name)
-    except Exception as error:
-        raise ValueError(_error_in_one_line(error)) from error
-    if type_name not in types:
-        raise ValueError(f"it does not define {type_name}")
-    _FieldCounts(types).of(type_name, 0)
+    types = _parsed(text.decode(), type_name)
+    _count_fields(types, type_name, {})
     return types
 
 
-def _error_in_one_line(error: Exception) -> str:
-    words = " ".join(str(error).split()) or type(error).__name__
-    return words if len(words) <= 200 else f"{words[:200]} ..."
+def _count_fields(types: Fields, name: str, counts: dict[str, int], depth: int = 0) -> int:
+    """Return the number of fields of a type; ValueError if too large, unknown or recursive.
 
-
-class _FieldCounts:
-    """Number of fields of each type, with the fields of nested messages."""
-
-    def __init__(self, types: dict[str, Any]) -> None:
-        self._types = types
-        self._type_store: dict[str, int] = {}
-
-    def of(self, name: str, depth: int) -> int:
-        """Return the number of fields of a type; ValueError if too large, unknown or recursive."""
-        if name in self._type_store:
-            return self._type_store[name]
-        if name not in self._types:
-            raise ValueError(f"it does not define {name}")
-        if depth > _MAX_NESTING:
+    ``counts`` has the known numbers of other types.
+    """
+    if name in counts:
+        return counts[name]
+    if name not in types:
+        raise ValueError(f"it does not define {name}")
+    if depth > _MAX_NESTING:
+        raise ValueError(f"its types are nested more than {_MAX_NESTING} deep, or in themselves")
+    count = 0
+    for field, (kind, detail) in types[name][1]:
+        length = 1
+        if kind == Nodetype.ARRAY:
+            (kind, detail), length = detail
+            if length < 1:
+                raise ValueError(f"the array {field} of {name} has no elements")
+        elif kind == Nodetype.SEQUENCE:
+            kind, detail = detail[0]
+        if kind == Nodetype.NAME:
+            count += length * _count_fields(types, detail, counts, depth + 1)
+        else:
+            count += length if detail[0] == "string" else 1
+        if count > _MAX_FIELDS:
             raise ValueError(
-                f"its types are nested more than {_MAX_NESTING} deep, or in themselves"
+                f"{name} has more than {_MAX_FIELDS} fields, counting those of the messages in it"
             )
-        count = 0
-        for field, (kind, detail) in self._types[name][1]:
-            length = 1
-            if kind == Nodetype.ARRAY:
-                (kind, detail), length = detail
-                if length < 1:
-                    raise ValueError(f"the array {field} of {name} has no elements")
-            elif kind == Nodetype.SEQUENCE:
-                kind, detail = detail[0]
-            if kind == Nodetype.NAME:
-                count += length * self.of(detail, depth + 1)
-            else:
-                count += length if detail[0] == "string" else 1
-            if count > _MAX_FIELDS:
-                raise ValueError(
-                    f"{name} has more than {_MAX_FIELDS} fields, counting those of the messages "
-                    "in it"
-                )
-        self._type_store[name] = max(count, 1)
-        return self._type_store[name]
+    counts[name] = max(count, 1)
+    return counts[name]

@@ -113,7 +113,7 @@ class Layout:
     IndexError
         The message ends before its fields.
     TooLongError
-        A list has more texts or messages than ``max_elements``; ``leaves`` has the fields before.
+        A list has more texts or messages than ``max_elements``.
     """
 
     def __init__(
@@ -135,21 +135,21 @@ class Layout:
         self.end = ENCAPSULATION
         self._message, self._elements, self._max_elements = message, elements, max_elements
         self._fields = fields_of(type_name) if fields is None else fields
+        self._walk(type_name, "")
 
-    def walk(self, type_name: str, prefix: str | None = "") -> Layout:
+    def _walk(self, type_name: str, prefix: str | None) -> None:
         """Add the fields of a type below ``prefix``; None: the fields get no paths."""
         for name, (kind, detail) in self._fields[type_name][1]:
             path = None if prefix is None else prefix + name
             if kind == Nodetype.BASE:
                 self._add_value(detail[0], path)
             elif kind == Nodetype.NAME:
-                self.walk(detail, None if path is None else f"{path}.")
+                self._walk(detail, None if path is None else f"{path}.")
             else:
                 element, count = detail
                 self._add_list(
                     element, self._read_length() if kind == Nodetype.SEQUENCE else count, path
                 )
-        return self
 
     def _add_list(self, element: tuple[Any, Any], count: int, path: str | None) -> None:
         kind, detail = element
@@ -165,7 +165,7 @@ class Layout:
             if self._elements and path is not None:
                 inner = f"{path}[{i}]"
             if kind == Nodetype.NAME:
-                self.walk(detail, None if inner is None else f"{inner}.")
+                self._walk(detail, None if inner is None else f"{inner}.")
             else:
                 self._add_value(detail[0], inner)
             if inner is not None:
@@ -214,17 +214,6 @@ class Layout:
 
     def _align(self, size: int) -> None:
         self.end += -(self.end - ENCAPSULATION) % size
-
-
-def layout_of(
-    message: bytes | bytearray,
-    type_name: str,
-    fields: Fields | None = None,
-    *,
-    elements: bool = False,
-) -> Layout:
-    """Return the layout of one message; parameters and errors as of :class:`Layout`."""
-    return Layout(message, type_name, fields, elements=elements).walk(type_name)
 
 
 # -- making messages --------------------------------------------------------------------------
@@ -326,7 +315,7 @@ def encode_list(
         return encode(type_name, values)
     # Three elements show the layout: only the padding of the first may differ.
     raw = encode(type_name, {**values, name: [element] * 3})
-    layout = layout_of(raw, type_name, elements=True)
+    layout = Layout(raw, type_name, elements=True)
     first, second, third = (layout.ends[f"{name}[{i}]"] for i in range(3))
     head = bytearray(raw[:first])
     struct.pack_into("<I", head, layout.starts[name] - 4, count)
@@ -358,7 +347,7 @@ def stamped_copies(
     columns
         Numbers (N, size) by the path at which they begin.
     """
-    leaves = layout_of(prototype, type_name).leaves
+    leaves = Layout(prototype, type_name).leaves
     table = np.tile(np.frombuffer(prototype, np.uint8), (len(stamps_ns), 1))
     for path in ("header.stamp.sec", "clock.sec"):
         if path in leaves:
@@ -425,7 +414,7 @@ def read_columns(messages: Sequence[bytes], type_name: str, fields: Fields) -> C
     if not messages or len(set(map(len, messages))) != 1:
         return None
     try:
-        layout = layout_of(messages[0], type_name, fields)
+        layout = Layout(messages[0], type_name, fields)
     except (IndexError, KeyError):
         return None
     matrix = np.frombuffer(b"".join(messages), np.uint8).reshape(len(messages), -1)

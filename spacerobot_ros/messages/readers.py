@@ -17,14 +17,13 @@ import numpy as np
 import numpy.typing as npt
 
 from spacerobot_ros.errors import CommandError
-from spacerobot_ros.messages.definitions import MessageTypes, fields_of, message_definition
+from spacerobot_ros.messages.definitions import fields_of, message_definition, message_type
 from spacerobot_ros.messages.layout import (
     BIG_ENDIAN,
     LITTLE_ENDIAN,
     Layout,
     TooLongError,
     encode,
-    layout_of,
 )
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
@@ -47,7 +46,6 @@ _OTHER_JOINTS_BYTES = 65536
 
 _NOT_FINITE_RATES = "velocities are not finite"
 
-_MAX_ALIGNMENT = 8
 _MAX_LIST_TEXTS = 10_000
 """Largest number of texts in a list; a faulty publisher may send a million."""
 
@@ -72,7 +70,7 @@ def read_text(raw: bytes, type_name: str, path: str) -> str:
         The bytes are no message of the type.
     """
     try:
-        leaf = layout_of(raw, type_name).leaves[path]
+        leaf = Layout(raw, type_name).leaves[path]
     except IndexError as error:
         raise UnreadableError(f"its bytes are no {type_name.rpartition('/')[2]}") from error
     return raw[leaf.offset : leaf.offset + leaf.size].decode(errors="replace")
@@ -91,56 +89,31 @@ class MessageTemplate:
 
     def __init__(self, type_name: str, prototype: bytes) -> None:
         self._buffer = bytearray(prototype)
-        self._leaves = layout_of(prototype, type_name, elements=True).leaves
-        self._feeds: dict[int, memoryview] = {}
-        """Fed arrays by their place."""
-        self._times = [
-            leaf.offset
+        self._leaves = Layout(prototype, type_name, elements=True).leaves
+        self._feeds: dict[str, tuple[slice, memoryview]] = {}
+        size = HEADER_STAMP.stop - HEADER_STAMP.start
+        self._stamps = [
+            slice(leaf.offset, leaf.offset + size)
             for path, leaf in self._leaves.items()
             if path in ("header.stamp.sec", "clock.sec") or path.endswith(".header.stamp.sec")
         ]
-        self._viewed = False
-        """Whether bytes that are not fed may change."""
-        self._parts: list[bytes | memoryview] = []
-        """What the message is joined of: fed arrays, stamps, and the bytes between them."""
-        self._places_of_stamps: list[int] = []
 
     def floats(self, path: str, count: int) -> Array:
         """Return a writable view of the ``count`` float64 values from ``path`` on."""
-        self._viewed, self._parts = True, []
         return np.frombuffer(self._buffer, np.float64, count, self._leaves[path].offset)
 
     def feed(self, path: str, source: Array) -> None:
         """Copy ``source``, a contiguous array that stays in place, to ``path`` in every message."""
-        self._feeds[self._leaves[path].offset] = source.data.cast("B")
-        self._parts = []
+        data, begin = source.data.cast("B"), self._leaves[path].offset
+        self._feeds[path] = slice(begin, begin + len(data)), data
 
     def serialised(self, stamp: bytes) -> bytes:
         """Return the message as it is now, with ``stamp`` (:func:`stamp_bytes`) in every header."""
-        parts = self._parts or self._make_parts()
-        for place in self._places_of_stamps:
-            parts[place] = stamp
-        # To join takes a third of the time of writing into a copy.
-        return b"".join(parts)
-
-    def _make_parts(self) -> list[bytes | memoryview]:
-        self._parts, self._places_of_stamps, end = [], [], 0
-        whole = memoryview(self._buffer)
-        for place in sorted([*self._feeds, *self._times]):
-            self._add_part(whole[end:place])
-            if place in self._feeds:
-                self._parts.append(self._feeds[place])
-                end = place + len(self._feeds[place])
-            else:
-                self._places_of_stamps.append(len(self._parts))
-                self._parts.append(b"")
-                end = place + HEADER_STAMP.stop - HEADER_STAMP.start
-        self._add_part(whole[end:])
-        return self._parts
-
-    def _add_part(self, between: memoryview) -> None:
-        if between:
-            self._parts.append(between if self._viewed else bytes(between))
+        for place, source in self._feeds.values():
+            self._buffer[place] = source
+        for place in self._stamps:
+            self._buffer[place] = stamp
+        return bytes(self._buffer)
 
 
 def joint_template(joint_names: Sequence[str]) -> MessageTemplate:
@@ -162,16 +135,10 @@ class TemplateReader:
         an array of any length.
     max_size
         Messages of another layout that are longer are refused unread, bytes.
-    arrays
-        Arrays by path that :meth:`copy` fills, as long as the values of a message that has them.
     """
 
     def __init__(
-        self,
-        type_name: str,
-        spans: Mapping[str, int | None],
-        max_size: float = math.inf,
-        arrays: Mapping[str, Array] | None = None,
+        self, type_name: str, spans: Mapping[str, int | None], max_size: float = math.inf
     ) -> None:
         self._type_name, self._spans, self._max_size = type_name, spans, max_size
         self._fields = fields_of(type_name)
@@ -179,11 +146,7 @@ class TemplateReader:
         self.raw = bytes(2)  # The initial template matches no message.
         """The accepted message, little-endian."""
         self._fixed_spans: list[tuple[slice, bytes]] = []
-        self._joined_spans: list[tuple[slice, bytes]] = []
         self._value_spans: dict[str, tuple[int, int]] = {}
-        self._arrays = arrays or {}
-        self._copies: list[tuple[memoryview, slice]] = []
-        """Memory of the arrays, and the bytes of their values in messages of this layout."""
         self._layout: Layout | None = None
         self.layout_changes = 0
         """Number of layout changes."""
@@ -198,19 +161,9 @@ class TemplateReader:
         """
         if raw is self.raw:
             return
-        if len(raw) == self._size:
-            # Messages of one writer have equal padding: longer spans, with padding, are compared
-            # first.
-            for place, text in self._joined_spans:
-                if raw[place] != text:
-                    break
-            else:
-                self.raw = raw
-                return
-            if all(raw[place] == text for place, text in self._fixed_spans):
-                self.raw = raw
-                self._join_fixed_spans(raw)
-                return
+        if len(raw) == self._size and all(raw[place] == text for place, text in self._fixed_spans):
+            self.raw = raw
+            return
         self._learn_layout(raw)
 
     def floats(self, path: str) -> Array:
@@ -218,14 +171,8 @@ class TemplateReader:
         offset, count = self._value_spans[path]
         return np.frombuffer(self.raw, np.float64, count, offset)
 
-    def copy(self) -> None:
-        """Copy the values of the accepted message into the arrays; those that it lacks stay."""
-        raw = self.raw  # The message itself may have been big-endian.
-        for target, place in self._copies:
-            target[:] = raw[place]
-
     def value_count(self, path: str) -> int:
-        """Return the number of values at ``path`` in messages of this layout."""
+        """Return the number of values at ``path`` in messages of this layout; 0: there are none."""
         return self._value_spans[path][1] if path in self._value_spans else 0
 
     def text(self, path: str) -> str:
@@ -239,24 +186,11 @@ class TemplateReader:
         assert self._layout is not None
         return [self.text(f"{path}[{i}]") for i in range(self._layout.counts[path])]
 
-    def has_values(self, path: str) -> bool:
-        """Whether the accepted message has values at ``path``."""
-        return path in self._value_spans
-
     @property
     def stamp_ns(self) -> int:
         """Header stamp of the accepted message, ns."""
         seconds, nanoseconds = unpack_stamp(self.raw)
         return int(seconds * SECOND + nanoseconds)
-
-    def _join_fixed_spans(self, raw: bytes) -> None:
-        """Join neighbouring fixed spans that only padding separates."""
-        stretches: list[slice] = []
-        for place, _ in self._fixed_spans:
-            if stretches and place.start - stretches[-1].stop < _MAX_ALIGNMENT:
-                place = slice(stretches.pop().start, place.stop)
-            stretches.append(place)
-        self._joined_spans = [(place, raw[place]) for place in stretches]
 
     def _learn_layout(self, raw: bytes) -> None:
         if len(raw) > self._max_size:
@@ -264,16 +198,12 @@ class TemplateReader:
                 f"it has {len(raw)} bytes, of which at most {self._max_size} can be meant"
             )
         name = self._type_name
-        layout = Layout(raw, name, self._fields, elements=True, max_elements=_MAX_LIST_TEXTS)
         try:
             if raw[:2] == BIG_ENDIAN:
                 raw = _as_little_endian(raw, name)
-                layout = Layout(
-                    raw, name, self._fields, elements=True, max_elements=_MAX_LIST_TEXTS
-                )
             if raw[:2] != LITTLE_ENDIAN:
                 raise IndexError("it is not in CDR")
-            layout.walk(name)
+            layout = Layout(raw, name, self._fields, elements=True, max_elements=_MAX_LIST_TEXTS)
         except IndexError as error:
             short = name.rpartition("/")[2]
             raise UnreadableError(f"its bytes are no {short}") from error
@@ -291,22 +221,14 @@ class TemplateReader:
             count = leaf.shape[0] if wanted is None else wanted
             if count:
                 self._value_spans[path] = leaf.offset, count
-        self._copies = [
-            (array.data.cast("B"), slice(begin, begin + 8 * count))
-            for path, array in self._arrays.items()
-            for begin, count in [self._value_spans.get(path, (0, 0))]
-            if count
-        ]
-        self._join_fixed_spans(raw)
         self.layout_changes += 1
 
 
 def _as_little_endian(raw: bytes, type_name: str) -> bytes:
     """Return a big-endian message as little-endian; IndexError where it is not of the type."""
-    types = MessageTypes()
-    decode = types.decoder(type_name, message_definition(type_name).encode())
+    kind = message_type(type_name, message_definition(type_name).encode())
     try:
-        return bytes(types.serialise(decode(raw)))
+        return kind.serialise(kind.decode(raw))
     except Exception as error:  # Decoding raises any kind of error, depending on the bytes.
         raise IndexError(str(error)) from error
 
@@ -349,13 +271,12 @@ class JointReader:
             max_size = _HEADER_BYTES + 2 * own + _OTHER_JOINTS_BYTES
         self.values: dict[str, Array] = {name: np.zeros(len(joint_names)) for name in quantities}
         spans: dict[str, int | None] = dict.fromkeys(quantities)
-        self._reader = TemplateReader(JOINT_STATE, spans, max_size, self.values)
+        self._reader = TemplateReader(JOINT_STATE, spans, max_size)
         self._known_layout = 0
         self._problem = ""
         self._last_accepted: bytes | None = None
         """Last accepted message: publishers often repeat the same bytes."""
-        self._order: JointOrder | None = None
-        """Joints of the message and of the model; None: they are the same in the same order."""
+        self._order = JointOrder(np.zeros(0, np.intp), np.zeros(0, np.intp))
         self._missing = ""
         """A joint that measured states of this layout lack; empty: none."""
         self._seen = np.zeros(len(joint_names), dtype=np.bool_)
@@ -379,14 +300,10 @@ class JointReader:
 
     def _copy_values(self) -> None:
         order = self._order
-        if order is None:
-            self._reader.copy()
-        else:
-            for name, values in self.values.items():
-                if self._reader.has_values(name):
-                    values[order.of_model] = self._reader.floats(name)[order.of_message]
-            for kind in order.ignored:
-                self.ignored[kind] += 1
+        for name, values in self.values.items():
+            if self._reader.value_count(name):
+                values[order.of_model] = self._reader.floats(name)[order.of_message]
+        self.ignored.update(order.ignored)
         if self._measured and "velocity" in self.values:
             rates = self.values["velocity"]
             if not math.isfinite(sum(rates.tolist())):
@@ -410,7 +327,6 @@ class JointReader:
             pass
         else:
             return raw
-        assert self._order is not None
         self._copy_values()
         self._seen[self._order.of_model] = True
         if not self._seen.all():
@@ -457,9 +373,11 @@ class JointReader:
 
     def _check_names_and_lengths(self) -> None:
         names = self._reader.texts("name")
-        self._problem, self._missing, self._order = "", "", None
+        self._problem = self._missing = ""
         try:
-            order = JointOrder.of(self._joints, names, self._followers, partial=self._measured)
+            self._order = JointOrder.of(
+                self._joints, names, self._followers, partial=self._measured
+            )
             for i, quantity in enumerate(self._quantities):
                 count = self._reader.value_count(quantity)
                 if count or i == 0:
@@ -467,16 +385,11 @@ class JointReader:
         except CommandError as error:
             self._problem = str(error)
             return
-        if len(order.of_model) < len(self._joints):
-            present = set(order.of_model.tolist())
-            self._missing = next(n for i, n in enumerate(self._joints) if i not in present)
-            self._order = order
-            return
-        for values in self.values.values():
-            values[:] = 0.0
-        # Joints in the model's order, as nodes of the stack send them, are copied as bytes.
-        if names != self._joints:
-            self._order = order
+        present = set(self._order.of_model.tolist())
+        self._missing = next((n for i, n in enumerate(self._joints) if i not in present), "")
+        if not self._missing:
+            for values in self.values.values():
+                values[:] = 0.0
 
 
 class MissingJointError(CommandError):
@@ -555,7 +468,7 @@ class MessageDecoder:
         self._references = JointReader(joint_names, ["position", "velocity"])
         self._measured = {_POSE_PATH: np.zeros(7), _TWIST_PATH: np.zeros(6)}
         spans = {path: len(array) for path, array in self._measured.items()}
-        self._odom = TemplateReader(ODOMETRY, spans, arrays=self._measured)
+        self._odom = TemplateReader(ODOMETRY, spans)
         self._target = TemplateReader(ODOMETRY, spans)
         self.q, self.qdot = self._joints.values["position"], self._joints.values["velocity"]
         self.check_robot, self.decode_joints = self._joints.require, self._joints.accept
@@ -573,7 +486,8 @@ class MessageDecoder:
     def measured_base(self, odom: bytes) -> tuple[Array, Array]:
         """Return :meth:`decode_base` in arrays that the next call overwrites."""
         self._odom.accept(odom)
-        self._odom.copy()
+        for path, array in self._measured.items():
+            array[:] = self._odom.floats(path)
         return self._measured[_POSE_PATH], self._measured[_TWIST_PATH]
 
     def target(self, odom: bytes) -> tuple[Array, Array]:
@@ -651,7 +565,7 @@ class _WrenchReader:
     def __init__(self, base_link: str, frame_prefix: str) -> None:
         self.values: Array = np.zeros(6)
         self._base_link, self._prefix = base_link, frame_prefix
-        self._reader = TemplateReader(WRENCH, {_WRENCH_PATH: 6}, arrays={_WRENCH_PATH: self.values})
+        self._reader = TemplateReader(WRENCH, {_WRENCH_PATH: 6})
         self._known_layout = 0
 
     def accept(self, raw: bytes) -> int:
@@ -661,7 +575,7 @@ class _WrenchReader:
             # Messages of one layout name the same frame.
             require_frame(reader.text("header.frame_id"), self._base_link, self._prefix)
             self._known_layout = reader.layout_changes
-        reader.copy()
+        self.values[:] = reader.floats(_WRENCH_PATH)
         return reader.stamp_ns
 
     @property

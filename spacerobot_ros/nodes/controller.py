@@ -71,8 +71,8 @@ class CoordinatedControlNode(CommanderNode):
 
     def configure(self) -> None:
         """Create the topics; without a robot of its own the node waits for robot_description."""
-        self._joint_commands = self.send_raw(JointState, "joint_commands")
-        self._base_wrench = self.send_raw(WrenchStamped, "base_wrench")
+        self._joint_commands = self.create_publisher(JointState, "joint_commands", STREAM)
+        self._base_wrench = self.create_publisher(WrenchStamped, "base_wrench", STREAM)
         self.listen("controller/status")
         self.create_service(Trigger, "~/dump_momentum", self._on_dump_momentum)
         self.create_service(Trigger, "~/approach", partial(self._on_task, Task.APPROACH))
@@ -150,8 +150,8 @@ class CoordinatedControlNode(CommanderNode):
     def send_command(self, stamp_ns: int) -> None:
         """Publish wrench and efforts as the answer to the state of this stamp."""
         stamp = stamp_bytes(stamp_ns)
-        self._base_wrench.take(self._wrench_message.serialised(stamp))
-        self._joint_commands.take(self._joint_message.serialised(stamp))
+        self._base_wrench.publish(self._wrench_message.serialised(stamp))
+        self._joint_commands.publish(self._joint_message.serialised(stamp))
 
     def publish_status(self, status: Status) -> None:
         """Publish a status of the goal, and log it where something is wrong."""

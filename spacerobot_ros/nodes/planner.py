@@ -10,6 +10,7 @@ from typing import Any, ClassVar
 import numpy as np
 from geometry_msgs.msg import PoseStamped, TwistStamped
 from nav_msgs.msg import Path
+from rclpy.publisher import Publisher
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
@@ -32,7 +33,6 @@ from spacerobot_ros.nodes.common.messages import (
 )
 from spacerobot_ros.nodes.common.node import LATCHED, STREAM, described_robot
 from spacerobot_ros.nodes.common.process import run_node
-from spacerobot_ros.nodes.common.streams import RawOutput
 from spacerobot_ros.nodes.common.trajectory_clients import TrajectoryClients
 from spacerobot_ros.planning.core.goal import EndEffectorGoal, Goal
 from spacerobot_ros.planning.execution.config import PlannerConfig
@@ -86,10 +86,10 @@ class PlannerNode(CommanderNode):
         """Create the topics; without a robot of its own the planner waits for robot_description."""
         self._shape: Array | None = None
         self._announcement: Thread | None = None
-        self._commands: RawOutput | None = None
+        self._commands: Publisher | None = None
         if self.config.output != "trajectory":
             topic = "joint_commands" if self.config.output == "commands" else "joint_reference"
-            self._commands = self.send_raw(JointState, topic)
+            self._commands = self.create_publisher(JointState, topic, STREAM)
         self._schedule_topic = self.create_publisher(JointTrajectory, "gait_schedule", LATCHED)
         self._path_topic = self.create_publisher(Path, "planned_path", LATCHED)
         self._markers_topic = self.create_publisher(MarkerArray, "markers", STREAM)
@@ -221,7 +221,7 @@ class PlannerNode(CommanderNode):
                 self._setpoint = setpoint
                 self._message.feed("position", setpoint.position)
                 self._message.feed("velocity", setpoint.velocity)
-            self._commands.take(self._message.serialised(stamp_bytes(stamp_ns)))
+            self._commands.publish(self._message.serialised(stamp_bytes(stamp_ns)))
 
     def publish_status(self, status: Status) -> None:
         """Publish and log a status of the goal."""

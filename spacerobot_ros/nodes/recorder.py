@@ -49,11 +49,12 @@ from spacerobot_ros.nodes.common.messages import diagnostic_status, message_clas
 from spacerobot_ros.nodes.common.node import STREAM, FlightNode
 from spacerobot_ros.nodes.common.process import run_node
 from spacerobot_ros.nodes.common.ros_parameters import RemoteParameters
-from spacerobot_ros.nodes.common.streams import RawCallback
 from spacerobot_ros.nodes.common.watchdog import Role
 from spacerobot_ros.times import HEADER_STAMP, SECOND, first_time_ns, set_stamp
 from spacerobot_ros.topics import TOPICS_NOT_RECORDED
 from spacerobot_ros.version import __version__
+
+RawCallback = Callable[[bytes], None]
 
 _CLOCK_TOPIC = "/clock"
 _SHARED_TOPICS = ("/diagnostics", TRANSFORMS, STATIC_TRANSFORMS)
@@ -114,6 +115,11 @@ class RecorderNode(FlightNode):
     def configure(self) -> None:
         """Open the bag and look for topics; they are subscribed, and recorded once active."""
         config = self.config
+        # What may be refused comes before the bag, which would stay open.
+        descriptions = _read_descriptions(config.describe)
+        self._clock_topic = self.resolve_topic_name(_CLOCK_TOPIC)
+        self._chosen_topics = {self.resolve_topic_name(topic) for topic in config.topics.split()}
+        self._shared_topics = {self._clock_topic, *map(self.resolve_topic_name, _SHARED_TOPICS)}
         writer = BagWriter(
             config.bag or time.strftime("spacerobot-%Y%m%d-%H%M%S.mcap"),
             compression=config.compression,
@@ -124,9 +130,6 @@ class RecorderNode(FlightNode):
             max_duration_ns=round(config.max_duration * SECOND),
         )
         self.recording = Recording(writer, config.clock_wait, self._on_failure)
-        self._clock_topic = self.resolve_topic_name(_CLOCK_TOPIC)
-        self._chosen_topics = {self.resolve_topic_name(topic) for topic in config.topics.split()}
-        self._shared_topics = {self._clock_topic, *map(self.resolve_topic_name, _SHARED_TOPICS)}
         self._parameter_requests = {}
         self._topics_without_owner = set()
         frames = tuple(map(self.resolve_topic_name, (TRANSFORMS, STATIC_TRANSFORMS)))
@@ -156,7 +159,7 @@ class RecorderNode(FlightNode):
         if config.diagnostics_period:
             self.create_timer(config.diagnostics_period, self._publish_state, clock=steady)
         self.describe("spacerobot", {"version": __version__})
-        for title, values in _read_descriptions(config.describe):
+        for title, values in descriptions:
             self.describe(title, values)
         if self._chosen_topics and self._clock_topic not in self._chosen_topics:
             self._follow_clock(self.recording)

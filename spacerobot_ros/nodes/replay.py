@@ -28,7 +28,6 @@ from spacerobot_ros.model.visuals import MeshFolder, has_meshes
 from spacerobot_ros.nodes.common.messages import diagnostic_status, message_class
 from spacerobot_ros.nodes.common.node import LATCHED, STREAM, FlightNode
 from spacerobot_ros.nodes.common.process import run_node
-from spacerobot_ros.nodes.common.streams import raw_publish
 from spacerobot_ros.nodes.common.watchdog import Role
 from spacerobot_ros.times import LATEST_NS, SECOND, set_stamp
 
@@ -184,7 +183,7 @@ class ReplayNode(FlightNode):
                     self.get_logger().warning(message)
                 continue
             self._outputs.append(publisher)
-            send = raw_publish(publisher)
+            send: Callable[[bytes], None] = publisher.publish
             described = topic.type_name == _TEXT_TYPE and topic.name.endswith(_DESCRIPTION_TOPIC)
             if described and self._meshes is not None:
                 send = _with_mesh_files(send, self._meshes)

@@ -106,7 +106,7 @@ class FlightReport(Flight):
             A message is damaged.
         """
         flight = since(flight or read_flight(bag), bag.began)
-        attachments = bag.parts[0].bag.attachments
+        attachments = bag.bag.attachments
         return cls(
             **{each.name: getattr(flight, each.name) for each in fields(flight)},
             bag=bag,
@@ -206,7 +206,7 @@ class FlightReport(Flight):
     @property
     def other_robots(self) -> list[str]:
         """Namespaces of the other robots in the bag."""
-        others = namespaces(self.bag.parts[0].bag)
+        others = namespaces(self.bag.bag)
         return [name or "/" for name in others if name != self.bag.namespace]
 
     @cached_property

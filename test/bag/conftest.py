@@ -25,6 +25,7 @@ from std_msgs.msg import (
     MultiArrayLayout,
     String,
 )
+from support.full_disk import Disk, MakeDisk
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 from visualization_msgs.msg import Marker, MarkerArray
 
@@ -177,3 +178,9 @@ def prefix_with_package(
             path.write_bytes(text.encode())
 
     return install
+
+
+@pytest.fixture
+def make_disk(monkeypatch: pytest.MonkeyPatch) -> MakeDisk:
+    """Return what puts a small disk in place of the real one."""
+    return lambda size: Disk(monkeypatch, size)

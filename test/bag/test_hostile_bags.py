@@ -12,8 +12,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from mcap.writer import MCAP0_MAGIC
 from support.command_line import CliRunner
-from support.hostile.records import CASES, Part, bag, message, string, zstd_zeros
+from support.hostile.records import CASES, Part, bag, message, plain, raw, string, zstd_zeros
 from support.hostile_bags import QUICK
 
 import spacerobot_ros
@@ -148,3 +149,32 @@ def test_what_is_no_file_is_neither_read_nor_written(
         result = CliRunner().invoke(main, [name, str(path)])
         assert result.exit_code == 2
         assert len(result.output.splitlines()) == 1
+
+
+def test_a_message_may_hold_nothing_and_has_a_whole_head(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    path.write_bytes(bag(plain(message(string("text")), message(b""))))
+    assert [data for *_, data in iterate_raw(path)] == [string("text"), b""]
+    path.write_bytes(bag(plain(message(string("text")), raw(0x05, bytes(21)))))
+    for read in (lambda: list(iterate_raw(path)), lambda: read_bag(path)["/a"]):
+        with pytest.raises(RecordingError, match=r"is damaged: a message .* is shorter"):
+            read()
+
+
+def test_a_chunk_and_its_index_agree(tmp_path: Path) -> None:
+    path, data = tmp_path / "a.mcap", message(string("x"))
+    path.write_bytes(bag(Part("", data, len(data), indexed_size=len(data) + 1)))
+    with pytest.raises(RecordingError, match="and its index claim different sizes"):
+        read_bag(path)["/a"]
+
+
+@pytest.mark.parametrize("length", [0, 20, 21, 28])
+def test_a_file_that_is_too_short_for_a_footer_is_damaged_at_its_begin(
+    tmp_path: Path, length: int
+) -> None:
+    path = tmp_path / "a.mcap"
+    path.write_bytes(MCAP0_MAGIC + bytes([1] * length) + MCAP0_MAGIC)
+    # The footer takes 29 bytes, and what the file ends with 8.
+    place = max(8 + length - 29, 0)
+    with pytest.raises(RecordingError, match=f"is damaged: the record at byte {place} claims"):
+        read_bag(path)

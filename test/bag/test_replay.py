@@ -300,3 +300,44 @@ def test_topics_get_new_names() -> None:
     for rule in ("/odom", "/odom:=", ":=/odom", "/odom=/a", "/momentum:=/a"):
         with pytest.raises(ParameterError, match="'remap'"):
             renamed_topics(rule, topics)
+
+
+def replayed(path: Path, start: float) -> Playback:
+    """Replay /a every 0.1 s for 1 s, and /latched at 0, 0.2 and 0.3 s."""
+    with BagWriter(path) as writer:
+        a = writer.add_topic("/a", STRING)
+        latched = writer.add_topic("/latched", STRING, LATCHED)
+        for n in range(11):
+            if n in (0, 2, 3):
+                writer.write(latched, string(f"latched {n}"), 77 * S + n * S // 10, 0)
+            writer.write(a, string(f"{n}"), 77 * S + n * S // 10, 0)
+    return Playback(read_bag(path), start=start)
+
+
+@pytest.mark.parametrize(
+    ("start", "expected"),
+    [
+        (0.0, ["latched 0", "0"]),
+        (0.2, ["latched 0", "latched 2", "2"]),
+        (0.3, ["latched 2", "latched 3", "3"]),
+        (0.35, ["latched 3"]),
+    ],
+)
+def test_what_was_latched_comes_once(tmp_path: Path, start: float, expected: list[str]) -> None:
+    playback = replayed(tmp_path / "a.mcap", start)
+    playback.run(5 * S)
+    due = playback.take_due(5 * S, 100)
+    assert [message.data[8:-1].decode() for message in due] == expected
+    # What was sent before is due at the start: a clock made of it does not go back.
+    assert {message.log_time_ns for message in due} == {77 * S + round(start * S)}
+
+
+def test_the_time_of_a_late_replay_is_not_ahead_of_what_is_still_to_come(tmp_path: Path) -> None:
+    playback = replayed(tmp_path / "a.mcap", 0.0)
+    playback.run(5 * S)
+    assert playback.bag_time(9 * S) == 77 * S
+    playback.take_due(5 * S, 100)
+    assert playback.bag_time(9 * S) == 77 * S + S // 10
+    playback.take_due(9 * S, 100)
+    assert playback.ended
+    assert playback.bag_time(9 * S) == 81 * S

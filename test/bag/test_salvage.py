@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import random
 import struct
 from io import BytesIO
@@ -27,6 +28,7 @@ from spacerobot_ros.flight.reading import FlightBag
 
 STRING = "std_msgs/msg/String"
 COUNT = 900
+S = 10**9
 
 
 @pytest.fixture(scope="module")
@@ -184,6 +186,56 @@ def test_the_commands_offer_it_and_it_does(bag: Path, tmp_path: Path) -> None:
     assert run(main, ["salvage", str(bag)]).exit_code == 2
 
 
+def bag_of(path: Path, times: list[float], **options: Any) -> Path:
+    with BagWriter(path, chunk_size=1, **options) as writer:
+        writer.add_topic("/silent", STRING)
+        channel = writer.add_topic("/a", STRING)
+        for n, time in enumerate(times):
+            writer.write(channel, string(f"{n}"), round(time * S), round(time * S))
+    return path
+
+
+def ends_of_records(content: bytes | bytearray) -> list[tuple[int, int]]:
+    """Return opcode and end of every record of a file, from its bytes."""
+    ends, position = [], 8
+    while position < len(content) - 8:
+        opcode, length = struct.unpack_from("<BQ", content, position)
+        position += 9 + length
+        ends.append((opcode, position))
+    return ends
+
+
+def test_what_is_lost_behind_the_last_whole_record_is_counted(tmp_path: Path) -> None:
+    whole = bag_of(tmp_path / "a.mcap", [float(n) for n in range(6)]).read_bytes()
+    records = ends_of_records(whole)
+    data_end = next(end for opcode, end in records if opcode == 0x0F)
+    cut = tmp_path / "cut.mcap"
+    chance = random.Random(1)
+    exact = [end for _, end in records if end < data_end][-4:]
+    for length in [*exact, *(chance.randrange(exact[0], data_end - 1) for _ in range(12))]:
+        cut.write_bytes(whole[:length])
+        saved = salvage_bag(cut)
+        last = max(end for _, end in records if end <= length)
+        assert saved.lost_bytes == length - last
+        assert saved.duration == pytest.approx(saved.messages - 1)
+        with saved.path.open("rb") as file:
+            names = [metadata.name for metadata in make_reader(file).iter_metadata()]
+        assert names.count("rosbag2") == 1
+        saved.path.unlink()
+
+
+def test_a_bag_whose_statistics_are_wrong_is_salvaged(tmp_path: Path) -> None:
+    path = bag_of(tmp_path / "a.mcap", [0.0, 1.0, 2.0])
+    content = bytearray(path.read_bytes())
+    records = ends_of_records(content)
+    (end,) = (end for (_, end), (opcode, _) in itertools.pairwise(records) if opcode == 11)
+    (count,) = struct.unpack_from("<Q", content, end + 9)
+    assert count == 3
+    struct.pack_into("<Q", content, end + 9, 4)
+    path.write_bytes(content)
+    assert salvage_bag(path).messages == 3
+
+
 # -- the state that a flight goes on from ------------------------------------------------------
 
 NAMES = ["elbow", "wrist"]
@@ -307,7 +359,7 @@ def test_the_truth_is_what_was_measured_until_the_sensors_err(tmp_path: Path) ->
             if noise:
                 say("/odom_true", odometry(0.5 * k, *position(k)), 0.5 * k)
             say_odom(say, 0.5 * k, k + noise)
-    pose = FlightBag([read_bag(tmp_path / "a.mcap")]).true_signal("odom", 0)
+    pose = FlightBag(read_bag(tmp_path / "a.mcap")).true_signal("odom", 0)
     np.testing.assert_array_equal(pose.time, [0.0, 0.5, 1.0, 1.5, 2.0])
     np.testing.assert_array_equal(pose.values[:, 0], range(5))
 

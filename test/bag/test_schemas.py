@@ -1,13 +1,4 @@
-"""\
-# Where to.
-Leaf goal
----
-uint8 NONE=0
-bool arrived
----
-float64 distance
-Leaf[] passed
-"""
+"""Definitions and hashes of message types, and columns cut out of serialised messages."""
 
 from __future__ import annotations
 
@@ -32,7 +23,7 @@ from std_msgs.msg import Header
 from visualization_msgs.msg import Marker
 
 from spacerobot_ros.bag import RecordingError, message_definition, type_hash
-from spacerobot_ros.messages.definitions import MessageTypes
+from spacerobot_ros.messages.definitions import message_type
 from spacerobot_ros.messages.layout import read_columns
 from spacerobot_ros.nodes.common.messages import message_class
 
@@ -273,18 +264,12 @@ def _installed(path: str) -> Path:
     return next(p for p in (q / "share" / path for q in module.parents) if p.is_file())
 
 
-def test_code_is_made_once_for_all_bags_and_types_of_a_bag_agree() -> None:
+def test_two_topics_may_mean_other_types_by_one_name() -> None:
     text = b"float64 x\nother/Part part\n" + b"=" * 80 + b"\nMSG: other/Part\nint32 %s\n"
-    first, second = MessageTypes(), MessageTypes()
     data = bytes([0, 1, 0, 0]) + struct.pack("<di", 2.5, 7)
-    for types in (first, second):
-        message = types.decoder("own/msg/Whole", text % b"count")(data)
-        assert (message.x, message.part.count) == (2.5, 7)
-    with pytest.raises(ValueError, match="'other/msg/Part' is already present"):
-        first.decoder("own/msg/Another", text % b"number")
-    # Another bag may mean another type by the name.
-    third = MessageTypes()
-    assert third.decoder("own/msg/Another", text % b"number")(data).part.number == 7
+    one = message_type("own/msg/Whole", text % b"count").decode(data)
+    other = message_type("own/msg/Another", text % b"number").decode(data)
+    assert (one.x, one.part.count, other.part.number) == (2.5, 7, 7)
 
 
 # -- columns cut out of serialised messages ----------------------------------------------------

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import keyword
 import math
-import os
 import re
 import shlex
 import struct
@@ -87,8 +86,7 @@ def test_a_bag_is_a_mapping_of_topics_with_and_without_the_slash(bag: Bag) -> No
     assert "events" in bag
     assert "/events" in bag
     assert "event" not in bag
-    assert 7 not in bag
-    assert list(bag) == bag.keys() == list(bag.topics)
+    assert list(bag) == list(bag.keys()) == list(bag.topics)
     assert len(bag) == 6
     assert dict(bag.items())["/a/b"] is bag["a/b"]
     assert list(bag.values()) == [bag[topic] for topic in bag.topics]
@@ -127,7 +125,7 @@ def test_what_is_handed_out_is_a_copy(bag: Bag) -> None:
     assert series.time.tolist() == [0.1, 0.2]
     assert series.field("position")[0].tolist() == [0.1, 1 / 3]
     assert series.field("name")[0] == ["b", "a"]
-    assert bag["changing"].field("position")[0].tolist() == [1.0]
+    np.testing.assert_array_equal(bag["changing"].field("position")[0], [1.0, np.nan])
     assert bag["events"].field("values.key")[0] == ["event", "goal_id"]
     for kept in (series.time_ns, series.stamp_ns):
         with pytest.raises(ValueError, match="read-only"):
@@ -141,8 +139,9 @@ def test_columns_have_the_names_of_joints_and_keys(bag: Bag) -> None:
     assert frame["position[a]"].tolist()[0] == 1 / 3
     assert "name" not in frame
     changing = bag.to_pandas("changing")
-    assert list(map(json.loads, changing["position"])) == [[1.0], [2.0, 3.0]]
-    assert list(map(json.loads, changing["name"])) == [["x"], ["y", "x"]]
+    assert changing["position[x]"].tolist() == [1.0, 3.0]
+    np.testing.assert_array_equal(changing["position[y]"], [np.nan, 2.0])
+    assert "name" not in changing
     events = bag.to_pandas("events")
     assert events["values[goal_id]"].tolist() == ["7", ""]
     assert events["values[event]"].tolist() == ["goal_accepted", "fault_injected"]
@@ -211,7 +210,7 @@ def test_the_same_bag_in_three_formats_is_equal(which: str, tmp_path: Path, bag:
     tables = [opened.table(topic) for topic in opened]
     folder, parquet, mat = (tmp_path / kind.value for kind in ExportFormat)
     for path, kind in zip((folder, parquet, mat), ExportFormat, strict=True):
-        assert export(tables, path, kind).rows == {t.topic: len(t) for t in tables}
+        assert export(tables, path, kind) == {t.topic: len(t) for t in tables}
     listed = pd.read_csv(folder / "_columns.csv", keep_default_na=False)
     structs = loadmat(mat, simplify_cells=True)
     names = {each["topic"]: name for name, each in next(find_about(structs)).items()}
@@ -294,17 +293,18 @@ def test_what_cannot_be_exported_leaves_nothing_behind(tmp_path: Path, bag: Bag)
     for kind in ExportFormat:
         with pytest.raises(RecordingError, match="damaged"):
             export(damaged(), tmp_path / "out" / "x", kind)
-    assert list((tmp_path / "out").iterdir()) == []
+    assert not (tmp_path / "out").exists()
 
 
 def test_names_of_topics_make_no_paths(tmp_path: Path) -> None:
     text, kind = String(data="x"), "std_msgs/msg/String"
     topics = ["/../../up", "/.hidden", "/Odom", "/odom", "/" + "long" * 60, "/1.2", "/_columns"]
     opened = written(tmp_path / "b.mcap", [(topic, kind, 1.0, text) for topic in topics])
-    made = export((opened.table(topic) for topic in opened), tmp_path / "x", ExportFormat.CSV)
-    files = {each.name for each in made.path.iterdir()}
+    made = tmp_path / "x"
+    export((opened.table(topic) for topic in opened), made, ExportFormat.CSV)
+    files = {each.name for each in made.iterdir()}
     assert len(files) == len({name.lower() for name in files}) == len(topics) + 1
-    assert {each.parent for each in tmp_path.rglob("*.csv")} == {made.path}
+    assert {each.parent for each in tmp_path.rglob("*.csv")} == {made}
     export((opened.table(topic) for topic in opened), tmp_path / "x.mat", ExportFormat.MAT)
     found = loadmat(tmp_path / "x.mat", simplify_cells=True)
     assert all(name.isidentifier() for name in found)
@@ -509,18 +509,6 @@ def test_units_are_those_of_the_robot_whose_topic_it_is(tmp_path: Path) -> None:
     bag = foreign(tmp_path / "b.mcap", messages)
     units = {x: bag.table(f"{x}/joint_states").units["position[joint_0]"] for x in "abc"}
     assert units == {"a": "m", "b": "rad", "c": ""}
-
-
-def test_an_export_takes_no_links(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """As on a USB stick, whose file system has none."""
-
-    def refused(*words: Any, **options: Any) -> None:
-        raise PermissionError(1, "Operation not permitted")
-
-    monkeypatch.setattr(os, "link", refused)
-    bag = foreign(tmp_path / "b.mcap", [("/t", 1, Bool(data=True))])
-    export([bag.table("t")], tmp_path / "b.mat", ExportFormat.MAT)
-    assert loadmat(tmp_path / "b.mat", simplify_cells=True)["t"]["data"] == 1
 
 
 def test_the_command_names_what_it_leaves_out_and_a_topic_once(tmp_path: Path) -> None:

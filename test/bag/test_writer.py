@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import errno
-import io
-import os
 import signal
 import struct
 import subprocess
@@ -15,18 +12,21 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import yaml
 from mcap.exceptions import EndOfFile
-from mcap.reader import make_reader
+from mcap.reader import NonSeekingReader, make_reader
 from mcap.records import Message
 from mcap.stream_reader import StreamReader
 from rosbags.highlevel import AnyReader
+from support.full_disk import MakeDisk
 from support.hostile.records import string
 
 import spacerobot_ros
-from spacerobot_ros.bag import LATCHED, BagWriter, QosProfile, RecordingError
+from spacerobot_ros.bag import LATCHED, BagWriter, QosProfile, RecordingError, read_bag
 from spacerobot_ros.bag.mcap_file import INFINITE_NS
 
 STRING = "std_msgs/msg/String"
+S = 10**9
 
 
 def data_of(path: Path) -> list[bytes]:
@@ -62,16 +62,6 @@ def test_every_compression_is_read_back(tmp_path: Path, compression: str) -> Non
     }
     with AnyReader([path]) as reader:
         assert [data for _, _, data in reader.messages()] == [string(text) for text in texts]
-
-
-def test_what_is_not_bytes_leaves_no_trace(tmp_path: Path) -> None:
-    with BagWriter(tmp_path / "a.mcap") as writer:
-        channel = writer.add_topic("/a", STRING)
-        writer.write(channel, string("before"), 1, 1)
-        with pytest.raises(TypeError):
-            writer.write(channel, "text", 2, 2)  # type: ignore[arg-type]
-        writer.write(channel, bytearray(string("after")), 3, 3)  # type: ignore[arg-type]
-    assert data_of(tmp_path / "a.mcap") == [string("before"), string("after")]
 
 
 def test_messages_are_counted_by_topic(tmp_path: Path) -> None:
@@ -113,9 +103,8 @@ def test_a_type_that_is_not_installed_leaves_no_trace(tmp_path: Path) -> None:
     [
         ((99, b"", 1, 1), "has no channel 99"),
         ((70000, b"", 1, 1), "has no channel 70000"),
-        ((1, b"", -1, 1), "non-negative numbers of nanoseconds"),
-        ((1, b"", 1, 2**64), "non-negative numbers of nanoseconds"),
-        ((1, b"", 1.5, 1), "non-negative numbers of nanoseconds"),
+        ((1, b"", -1, 1), "no times before zero"),
+        ((1, b"", 1, -1), "no times before zero"),
     ],
 )
 def test_what_no_bag_can_hold_is_refused(
@@ -201,8 +190,6 @@ def test_where_no_bag_can_be_made(tmp_path: Path) -> None:
         BagWriter(tmp_path)
     with pytest.raises(RecordingError, match="Cannot make the bag"):
         BagWriter(tmp_path / "file" / "a.mcap")
-    with pytest.raises(RecordingError, match="'gzip' is not one of zstd, lz4, none"):
-        BagWriter(tmp_path / "a.mcap", compression="gzip")
 
 
 @pytest.mark.parametrize("limit", [{"max_size": 20_000}, {"max_duration_ns": 10**9}])
@@ -247,6 +234,74 @@ def test_a_bag_is_split_into_complete_files(tmp_path: Path, limit: dict[str, int
     assert found == list(range(count))
 
 
+def bag_of(path: Path, times: list[float], **options: Any) -> Path:
+    with BagWriter(path, chunk_size=1, **options) as writer:
+        writer.add_topic("/silent", STRING)
+        channel = writer.add_topic("/a", STRING)
+        for n, time in enumerate(times):
+            writer.write(channel, string(f"{n}"), round(time * S), round(time * S))
+    return path
+
+
+def test_a_file_is_full_when_it_lasts_exactly_as_long_as_it_may(tmp_path: Path) -> None:
+    bag_of(tmp_path / "a.mcap", [0.0, 0.5, 1.0, 1.5, 2.0, 2.5, 3.0], max_duration_ns=S)
+    times = []
+    for n in range(3):
+        with (tmp_path / f"a_{n}.mcap").open("rb") as file:
+            # As a stream: a message whose channel or schema did not come before is an error.
+            found = NonSeekingReader(file).iter_messages(log_time_order=False)
+            times.append([message.log_time / S for _, _, message in found])
+            file.seek(0)
+            assert list(StreamReader(file, validate_crcs=True).records)
+    assert times == [[0.0, 0.5, 1.0], [1.5, 2.0, 2.5], [3.0]]
+
+
+def test_the_statistics_of_messages_that_were_written_out_of_order(tmp_path: Path) -> None:
+    path = bag_of(tmp_path / "a.mcap", [5.0, 9.0, 3.0, 4.0])
+    with path.open("rb") as file:
+        summary = make_reader(file).get_summary()
+        content = {m.name: m.metadata for m in make_reader(file).iter_metadata()}
+    assert summary is not None
+    assert summary.statistics is not None
+    statistics = summary.statistics
+    assert (statistics.message_start_time, statistics.message_end_time) == (3 * S, 9 * S)
+    assert (statistics.channel_count, statistics.schema_count) == (2, 1)
+    assert (statistics.chunk_count, statistics.message_count) == (4, 4)
+    told = yaml.safe_load(content["rosbag2"]["serialized_metadata"])
+    assert told["starting_time"]["nanoseconds_since_epoch"] == 3 * S
+    assert told["duration"]["nanoseconds"] == 6 * S
+    bag = read_bag(path)
+    assert (bag.start_time, bag.end_time) == (3.0, 9.0)
+
+
+def test_what_waits_in_memory_is_counted_until_it_is_written(tmp_path: Path) -> None:
+    with BagWriter(tmp_path / "a.mcap") as writer:
+        channel = writer.add_topic("/a", STRING)
+        before, size = writer.bytes_waiting, writer.bytes_written
+        for _ in range(3):
+            writer.write(channel, string("x" * 91), 1, 1)
+        # A record is 9 + 22 bytes of head, 4 + 4 of the message, 91 of text and its zero.
+        assert writer.bytes_waiting - before == 3 * (9 + 22 + 4 + 4 + 91 + 1)
+        assert writer.bytes_written == size
+        writer.flush()
+        assert writer.bytes_waiting == 0
+        assert writer.bytes_written == (tmp_path / "a.mcap").stat().st_size > size
+
+
+def test_a_bag_that_cannot_be_begun_is_not_held_open(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bag = tmp_path / "a.mcap"
+
+    def full(*_: Any) -> None:
+        raise RecordingError("No space left on device.")
+
+    monkeypatch.setattr("spacerobot_ros.bag.mcap_file.McapFile.add_metadata", full)
+    with pytest.raises(RecordingError, match="No space left"):
+        BagWriter(bag)
+    assert not [path for path in Path("/proc/self/fd").iterdir() if path.resolve() == bag]
+
+
 # -- disks that fill up, and kills -------------------------------------------------------------
 
 
@@ -261,27 +316,6 @@ def salvaged(path: Path) -> list[bytes]:
             if isinstance(record, Message):
                 found.append(record.data)
     return found
-
-
-class Disk:
-    """A disk of some bytes, in place of the one that `open` opens files on."""
-
-    def __init__(self, monkeypatch: pytest.MonkeyPatch, size: int) -> None:
-        self.size = size
-        disk = self
-
-        class File(io.FileIO):
-            def write(self, data: Any) -> int:
-                free = disk.size - self.tell()
-                if free <= 0:
-                    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-                return super().write(bytes(data)[:free])
-
-        def fake_open(path: Path, mode: str, buffering: int) -> File:
-            assert buffering == 0
-            return File(path, mode)
-
-        monkeypatch.setattr("spacerobot_ros.bag.mcap_file.open", fake_open, raising=False)
 
 
 def fill(writer: BagWriter, channel: int) -> int:
@@ -299,9 +333,9 @@ def fill(writer: BagWriter, channel: int) -> int:
 
 
 def test_a_full_disk_leaves_a_complete_bag_of_what_fits(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, make_disk: MakeDisk
 ) -> None:
-    disk = Disk(monkeypatch, 1_000_000)
+    disk = make_disk(1_000_000)
     writer = BagWriter(tmp_path / "a.mcap", compression="none")
     channel = writer.add_topic("/a", STRING)
     accepted = fill(writer, channel)
@@ -335,9 +369,9 @@ def test_a_full_disk_leaves_a_complete_bag_of_what_fits(
 
 
 def test_a_disk_without_room_for_a_file_leaves_a_complete_bag(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, make_disk: MakeDisk
 ) -> None:
-    Disk(monkeypatch, 100_000)
+    make_disk(100_000)
     writer = BagWriter(tmp_path / "a.mcap")
     channel = writer.add_topic("/a", STRING)
     writer.write(channel, string("kept"), 1, 1)
@@ -362,9 +396,9 @@ def test_a_disk_without_room_for_a_file_leaves_a_complete_bag(
 
 
 def test_a_disk_without_room_for_the_summary_leaves_the_chunks(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, make_disk: MakeDisk
 ) -> None:
-    disk = Disk(monkeypatch, 1_000_000)
+    disk = make_disk(1_000_000)
     writer = BagWriter(tmp_path / "a.mcap", compression="none")
     fill(writer, writer.add_topic("/a", STRING))
     size = (tmp_path / "a.mcap").stat().st_size
@@ -378,9 +412,9 @@ def test_a_disk_without_room_for_the_summary_leaves_the_chunks(
 
 
 def test_a_disk_that_fills_up_on_closing_is_reported_once(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, make_disk: MakeDisk
 ) -> None:
-    disk = Disk(monkeypatch, 1_000_000)
+    disk = make_disk(1_000_000)
     writer = BagWriter(tmp_path / "a.mcap")
     writer.write(writer.add_topic("/a", STRING), string("kept"), 1, 1)
     writer.flush()
@@ -391,10 +425,8 @@ def test_a_disk_that_fills_up_on_closing_is_reported_once(
     assert salvaged(tmp_path / "a.mcap") == [string("kept")]
 
 
-def test_a_disk_that_is_full_from_the_start(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    Disk(monkeypatch, 10)
+def test_a_disk_that_is_full_from_the_start(tmp_path: Path, make_disk: MakeDisk) -> None:
+    make_disk(10)
     with pytest.raises(RecordingError, match=r"a\.mcap: No space left on device"):
         BagWriter(tmp_path / "a.mcap")
 
@@ -540,3 +572,13 @@ def test_numbers_of_earlier_versions_are_read() -> None:
 def test_what_is_no_profile_is_refused(text: str) -> None:
     with pytest.raises(RecordingError):
         QosProfile.from_yaml(text)
+
+
+def test_durations_beyond_the_longest_are_the_longest() -> None:
+    """Connext's infinite duration, for one, is more than a duration of ROS holds."""
+    text = "- deadline: {sec: 9223372036854775807, nsec: 4294967295}\n  lifespan: {sec: 2, nsec: 5}"
+    (profile,) = QosProfile.from_yaml(text)
+    assert profile.deadline_ns == INFINITE_NS
+    assert profile.lifespan_ns == 2 * S + 5
+    (again,) = QosProfile.from_yaml(profile.to_yaml())
+    assert again == profile

@@ -510,17 +510,6 @@ def test_topics_to_replay_are_named_with_or_without_a_slash() -> None:
     assert "has no topic /nowhere: it has " in result.stderr
 
 
-@pytest.mark.parametrize(
-    ("name", "remedy"),
-    [("b_0.db3", "convert it to MCAP"), ("b_0.mcap.zstd", "unpack it by `zstd -d`")],
-)
-def test_bags_in_other_files_are_told_apart(tmp_path: Path, name: str, remedy: str) -> None:
-    (tmp_path / name).write_bytes(b"not looked at")
-    result = CliRunner().invoke(main, ["report", str(tmp_path)])
-    assert result.exit_code == 2
-    assert_one_sentence(result.stderr, f"is {name}: {remedy}")
-
-
 def test_a_path_that_never_ends_is_no_path() -> None:
     words = ["plan", "three_joint_arm", "--end-effector-path", "/dev/zero"]
     result = CliRunner().invoke(main, words)

@@ -15,11 +15,9 @@ import pytest
 from support.command_line import CliRunner, Result
 
 import spacerobot_ros.bag
-import spacerobot_ros.bag.tables as tables
 import spacerobot_ros.flight.verification as verification
 import spacerobot_ros.report
 import spacerobot_ros.session.viewing as viewing
-from spacerobot_ros.bag.tables import ExportFormat
 from spacerobot_ros.cli import campaign
 from spacerobot_ros.cli.main import main
 from spacerobot_ros.cli.options import beside, numbers, viewer_if_requested
@@ -96,43 +94,6 @@ def test_figures_that_were_asked_for_and_not_drawn_fail(
     monkeypatch.setattr(spacerobot_ros.report, "write_figures", lambda *words, **options: results)
     done = call("figures", "a.mcap", "--only", only, "--format", "SVG")
     assert (done.stdout, done.stderr, done.exit_code) == (out, err, code)
-
-
-@pytest.mark.parametrize(
-    ("words", "out", "topics"),
-    [
-        ("", "bags/a_csv", ["/x", "/y"]),
-        ("--format MAT", "bags/a.mat", ["/x", "/y"]),
-        ("--format parquet --topic y --topic /y", "bags/a_parquet", ["/y"]),
-        ("--out there --topic x", "there", ["/x"]),
-    ],
-)
-def test_tables_are_exported_beside_their_bag(
-    monkeypatch: pytest.MonkeyPatch, words: str, out: str, topics: list[str]
-) -> None:
-    class Opened(dict[str, Any]):
-        path = Path("bags/a.mcap")
-
-        def __missing__(self, topic: str) -> Any:
-            return SimpleNamespace(topic=f"/{topic.lstrip('/')}")
-
-        def table(self, topic: str) -> str:
-            return topic
-
-    def export(tables: Iterator[str], out: Path, format: ExportFormat) -> Any:
-        exported.append((list(tables), out, format))
-        return SimpleNamespace(rows={"/x": 3}, path="written")
-
-    exported: list[Any] = []
-    kept = {topic: SimpleNamespace(topic=topic) for topic in ("/x", "/y")}
-    monkeypatch.setattr(spacerobot_ros.bag, "read_bag", lambda path: Opened(kept))
-    monkeypatch.setattr(tables, "export", export)
-    done = call("export", "bags/a.mcap", *words.split())
-    form = "csv" if "--format" not in words else words.split()[1].lower()
-    assert exported == [(topics, Path(out), ExportFormat(form))]
-    rows = {"/x": "3 rows", "/y": "no messages, left out"}
-    lines = [f"{topic:<27} {rows[topic]}" for topic in topics]
-    assert done.stdout.splitlines() == [*lines, f"{'tables':<27} written"]
 
 
 def test_a_verified_bag_and_one_that_is_not(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import numpy as np
@@ -15,12 +14,8 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Header, String
 
 from spacerobot_ros.errors import CommandError, RecordingError
-from spacerobot_ros.messages import definitions
-from spacerobot_ros.messages.definitions import fields_of
+from spacerobot_ros.messages.definitions import MessageType, fields_of, message_definition
 from spacerobot_ros.messages.layout import (
-    Layout,
-    TooLongError,
-    column_dtype,
     encode_list,
     read_columns,
     seconds_and_nanoseconds,
@@ -41,7 +36,7 @@ NAME = "a/msg/B"
 
 def refused(text: str, name: str = NAME) -> str:
     with pytest.raises(ValueError, match=r"\w") as caught:
-        definitions._parse_definition(name, text.encode())
+        MessageType(name, text.encode())
     return str(caught.value)
 
 
@@ -53,11 +48,11 @@ def test_types_have_names_of_three_parts(name: str) -> None:
 def test_texts_of_types_are_limited() -> None:
     line = "int32 x\n"
     full = line + "#" * (262_144 - len(line))
-    assert definitions._parse_definition(NAME, full.encode())
+    assert MessageType(NAME, full.encode())
     long = "its text is longer than 262144 bytes or 5000 lines, which no message needs"
     assert refused(full + "#") == long
     lines = line + "\n" * 4_999
-    assert definitions._parse_definition(NAME, lines.encode())
+    assert MessageType(NAME, lines.encode())
     assert refused(lines + "\n") == long
 
 
@@ -73,10 +68,9 @@ def test_texts_of_types_are_limited() -> None:
     ],
 )  # fmt: skip
 def test_fields_are_counted_with_those_of_messages_in_them(text: str, count: int) -> None:
-    types = definitions._parse_definition(NAME, text.encode())
-    assert definitions._FieldCounts(types).of(NAME, 0) == count
+    assert NAME in MessageType(NAME, text.encode()).fields
     if count < 1000:
-        assert definitions._parse_definition(NAME, f"string[{1000 - count}] z\n{text}".encode())
+        assert MessageType(NAME, f"string[{1000 - count}] z\n{text}".encode())
     more = f"string[{1001 - count}] z\n{text}"
     assert refused(more).startswith("a/msg/B has more than 1000 fields")
 
@@ -88,25 +82,16 @@ def chain(depth: int) -> str:
 
 
 def test_types_are_nested_at_most_32_deep_and_never_in_themselves() -> None:
-    assert definitions._parse_definition(NAME, chain(32).encode())
+    assert MessageType(NAME, chain(32).encode())
     deep = "its types are nested more than 32 deep, or in themselves"
     assert refused(chain(33)) == refused("B x\n") == deep
     assert refused("C x\n") == "it does not define a/msg/C"
 
 
-@pytest.mark.parametrize(("length", "cut"), [(200, False), (201, True)])
-def test_errors_are_one_line(length: int, cut: bool) -> None:
-    text = "x" * length
-    found = definitions._error_in_one_line(ValueError(f" {text}\n"))
-    assert found == ("x" * 200 + " ..." if cut else text)
-    assert definitions._error_in_one_line(KeyError()) == "KeyError"
-    assert definitions._error_in_one_line(ValueError("a \n  b")) == "a b"
-
-
 @pytest.mark.parametrize("wrong", ["String", "std_msgs/msg/", "a/msg/B/c", "/String"])
 def test_names_that_are_none_of_types_are_refused(wrong: str) -> None:
     with pytest.raises(RecordingError, match="is not the name of a message type"):
-        definitions.message_definition(wrong)
+        message_definition(wrong)
 
 
 # -- messages -----------------------------------------------------------------------------------
@@ -144,29 +129,6 @@ def test_the_stamp_of_a_measured_state_is_one_of_an_answer(measured: bool) -> No
         return
     with pytest.raises(UnreadableError, match="no command can carry its stamp of 2147483648 s"):
         reader.accept(late)
-
-
-def test_joints_are_taken_by_their_names_and_refused_messages_leave_nothing() -> None:
-    reader = JointReader(["a", "b", "c"], ["position", "velocity"])
-    position, velocity = reader.values["position"], reader.values["velocity"]
-    swapped = state(["c", "a", "b"], velocity=[7.0, 8.0, 9.0])
-    for _ in range(2):
-        reader.accept(swapped)
-        assert (position.tolist(), velocity.tolist()) == ([2, 3, 1], [8, 9, 7])
-    reader.accept(state(["a", "b", "c"], position=[4.0, 5.0, 6.0]))
-    assert (position.tolist(), velocity.tolist()) == ([4, 5, 6], [0, 0, 0])
-    for names, more in (
-        (["a", "b"], {}), (["a", "b", "b"], {}), (["a", "b", "x"], {}),
-        (["a", "b", "c"], {"position": []}), (["a", "b", "c"], {"velocity": [1.0]}),
-    ):  # fmt: skip
-        wrong = state(names, 5, 7, **more)
-        for _ in range(2):
-            with pytest.raises(CommandError):
-                reader.require(wrong)
-        with pytest.raises(CommandError):
-            reader.accept(wrong)
-        assert reader.stamp_ns == 5 * S + 7
-        assert position.tolist() == [4, 5, 6]
 
 
 def test_references_lack_what_they_do_not_give() -> None:
@@ -258,53 +220,3 @@ def test_copies_differ_in_stamps_and_numbers() -> None:
     assert list(found["wrench.force.y"]) == [1.5, 4.5, 7.5]
     assert list(found["wrench.torque.z"]) == [0.0] * 3
     assert found["header.frame_id"] == ["base"] * 3
-
-
-def test_messages_of_another_layout_have_no_columns() -> None:
-    name = "sensor_msgs/msg/JointState"
-    fields = fields_of(name)
-    some = [state(["a", "b"]), state(["a", "c"]), state(["a", "b"])]
-    found = read_columns(some, name, fields)
-    assert found is not None
-    assert not found.constant("name")
-    assert not found.constant("position")
-    same = read_columns([some[0], some[2]], name, fields)
-    assert same is not None
-    assert same.constant("name")
-    np.testing.assert_array_equal(same["position"], [[1.0, 2.0]] * 2)
-    # Equally long, with other lengths of their lists, in any of the messages.
-    other = state(["a", "b"], position=[1.0], velocity=[2.0])
-    assert len(other) == len(some[0])
-    for place in range(3):
-        mixed = [*some[:place], other, *some[place:]]
-        assert read_columns(mixed, name, fields) is None
-    assert read_columns([], name, fields) is None
-    assert read_columns([some[0], state(["a"])], name, fields) is None
-    assert read_columns([b"\0\0" + raw[2:] for raw in some], name, fields) is None
-    assert read_columns([raw[:-9] for raw in some], name, fields) is None
-    mixed = [some[0], b"\0\0" + some[1][2:]]
-    assert read_columns(mixed, name, fields) is None
-
-
-@pytest.mark.parametrize(
-    ("given", "wide"),
-    [("<f4", "f8"), ("<f8", "f8"), ("i1", "i8"), ("u1", "i8"), ("<u4", "i8"), ("<i4", "i8"),
-     ("<u8", "u8"), ("<i8", "i8"), ("?", "?")],
-)  # fmt: skip
-def test_columns_have_wide_numbers(given: str, wide: str) -> None:
-    assert column_dtype(np.dtype(given)) == np.dtype(wide)
-
-
-@pytest.mark.parametrize(("most", "refused"), [(math.inf, False), (3, False), (2, True)])
-def test_lists_of_a_layout_may_be_limited(most: float, refused: bool) -> None:
-    raw = state(["a", "b", "c"])
-    layout = Layout(raw, "sensor_msgs/msg/JointState", elements=True, max_elements=most)
-    if refused:
-        with pytest.raises(TooLongError, match="a list of 3 entries, more than 2"):
-            layout.walk("sensor_msgs/msg/JointState")
-        assert "header.stamp.sec" in layout.leaves
-        return
-    layout.walk("sensor_msgs/msg/JointState")
-    assert layout.end == 4 + 16 + 4 + 3 * 8 + 4 + 3 * 8 + 2 * 4
-    assert (layout.counts["name"], layout.leaves["name[2]"].size) == (3, 1)
-    assert layout.leaves["position"].shape == (3,)

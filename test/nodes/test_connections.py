@@ -5,20 +5,14 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
-import rclpy
 from lifecycle_msgs.msg import State
-from rclpy.executors import SingleThreadedExecutor
-from rclpy.qos import QoSProfile
-from rclpy.serialization import serialize_message
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 from support.ros_harness import Harness
 
 from spacerobot_ros.nodes import PlantNode
-from spacerobot_ros.nodes.common.node import LATCHED, STREAM
 from spacerobot_ros.nodes.common.streams import (
     MatchedEndpoints,
-    RawOutput,
     topics_without_all_matches,
 )
 
@@ -112,36 +106,3 @@ def test_a_plant_in_real_time_rests_before_its_process_ends(harness: Harness) ->
     np.testing.assert_array_equal(plant.plant.qdot, 0.0)
     harness.spin_until(lambda: max(probe.last("joint_states").velocity) == 0, "it is published")
     assert plant.is_active
-
-
-@pytest.mark.parametrize(("qos", "number"), [(STREAM, 1), (LATCHED, 4)])
-def test_messages_that_nobody_can_receive_are_not_published(
-    ros_context: rclpy.Context, qos: QoSProfile, number: int
-) -> None:
-    """The middleware numbers its messages: a late subscription sees what came before."""
-    sender, receiver = (
-        rclpy.create_node(name, context=ros_context) for name in ("sender", "receiver")
-    )
-    output = RawOutput(sender.create_publisher(String, "words", qos), latched=qos is LATCHED)
-    said = [serialize_message(String(data=word)) for word in ("one", "two", "three", "four")]
-    for raw in said[:3]:
-        output.take(raw)
-    heard: list[tuple[int, bytes]] = []
-    receiver.create_subscription(
-        String,
-        "words",
-        lambda raw, about: heard.append((about["publication_sequence_number"], raw)),
-        qos,
-        raw=True,
-    )
-    executor = SingleThreadedExecutor(context=ros_context)
-    executor.add_node(receiver)
-    while not output.readers():
-        executor.spin_once(timeout_sec=0.01)
-    output.take(said[3])
-    while not heard or heard[-1][1] != said[3]:
-        executor.spin_once(timeout_sec=0.1)
-    assert heard[-1] == (number, said[3])
-    for node in (sender, receiver):
-        node.destroy_node()
-    executor.shutdown()

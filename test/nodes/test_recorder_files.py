@@ -318,7 +318,8 @@ class Recorded:
         publisher.publish(message)
         self.sent += 1
         self.harness.spin_until(
-            lambda: recording.messages + recording.messages_waiting >= self.sent, "it is recorded"
+            lambda: recording.messages + len(recording.early_messages) >= self.sent,
+            "it is recorded",
         )
 
     def close(self) -> dict[str, list[tuple[float, float]]]:
@@ -403,9 +404,11 @@ def test_a_file_of_named_objects_is_in_the_bag_or_refused(harness: Harness, tmp_
     recorded.close()
     metadata = read_bag(recorded.bag).metadata
     assert (metadata["one"], metadata["two"]) == ({"a": "1", "b": "x"}, {})
-    refusing = harness.make(RecorderNode, recorded.parameters, autostart=False)
+    refused_bag = tmp_path / "refused.mcap"
+    parameters = {**recorded.parameters, "bag": str(refused_bag)}
+    refusing = harness.make(RecorderNode, parameters, autostart=False)
     for text in ("[1]", "{", '{"one": 5}'):
         file.write_text(text)
         refusing.trigger_configure()
         assert_one_sentence(str(refusing.fault), "'describe'")
-        refusing.cleanup()
+        assert not refused_bag.exists()

@@ -124,11 +124,11 @@ def test_named_objects_of_a_file_are_metadata_and_the_wait_for_a_clock_is_as_giv
     talk.publish(String(data="early"))
     recording = recorder.recording
     assert recording is not None
-    harness.spin_until(lambda: recording.messages_waiting == 1, "the message")
+    harness.spin_until(lambda: len(recording.early_messages) == 1, "the message")
     now = recording._wall_time
     recording._wall_time = lambda: now() + 3500 * 10**9
     talk.publish(String(data="late"))
-    harness.spin_until(lambda: recording.messages_waiting == 2, "the next message")
+    harness.spin_until(lambda: len(recording.early_messages) == 2, "the next message")
     recorder.flush()
     assert recorder.messages_recorded == 0
     recording._wall_time = lambda: now() + 3700 * 10**9

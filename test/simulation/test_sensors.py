@@ -483,12 +483,9 @@ class _Streams:
     def __init__(self) -> None:
         self.sent: dict[str, list[bytes]] = {}
 
-    def send_raw(self, kind: type[Any], topic: str) -> Any:
+    def create_publisher(self, kind: type[Any], topic: str, qos: Any) -> Any:
         sent = self.sent.setdefault(topic, [])
-        return type("Output", (), {"take": staticmethod(sent.append), "readers": lambda _: 0})()
-
-    def create_publisher(self, *_: Any) -> None:
-        return None
+        return type("Publisher", (), {"publish": staticmethod(sent.append)})()
 
 
 def test_a_new_topic_is_an_entry_in_the_table_and_a_quantity(

@@ -111,7 +111,7 @@ class Stack:
         # A matched subscription has not yet received what its publisher sent before.
         if "/plant/status" in self.recorder.topics:
             self.harness.spin_until(
-                lambda: recording.messages_waiting > 0 and self.probe.count("/plant/status") > 0,
+                lambda: any(recording.latched.values()) and self.probe.count("/plant/status") > 0,
                 "recorder and probe receive the plant's status",
             )
 

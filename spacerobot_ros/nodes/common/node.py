@@ -31,10 +31,7 @@ from spacerobot_ros.events import Event, EventKind
 from spacerobot_ros.messages.statuses import StatusRecord
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.nodes.common.ros_parameters import declare, fix, typed
-from spacerobot_ros.nodes.common.streams import (
-    MatchedEndpoints,
-    RawOutput,
-)
+from spacerobot_ros.nodes.common.streams import MatchedEndpoints
 from spacerobot_ros.nodes.common.watchdog import Liveness, Role, SilenceReport
 from spacerobot_ros.parameters import Parameter, Value, configured, declared, values_of
 
@@ -104,7 +101,7 @@ class FlightNode(LifecycleNode):
         """Function that a finished node calls with its exit code."""
         self._failure, self._destroyed = "", False
         self._liveness = Liveness(self, self.role, self.depends_on, self.on_silence)
-        self._event_stream = self.send_raw(DiagnosticStatus, "events")
+        self._event_stream = self.create_publisher(DiagnosticStatus, "events", STREAM)
         self._raising = False
         self._guard_transitions()
         try:
@@ -151,18 +148,13 @@ class FlightNode(LifecycleNode):
         finally:
             self._raising = False
 
-    def send_raw(self, kind: type[Any], topic: str, qos: QoSProfile = STREAM) -> RawOutput:
-        """Return a new stream whose ``take`` publishes serialised messages."""
-        latched = qos.durability == DurabilityPolicy.TRANSIENT_LOCAL
-        return RawOutput(self.create_publisher(kind, topic, qos), latched=latched)
-
     def report_event(self, event: Event) -> None:
         """Publish an event of this node; an event without a time gets the node's time."""
         if event.time_s is None:
             event = replace(event, time_s=self.simulated_time_s)
         values = event.to_values(time.time())
         name = self.get_fully_qualified_name()
-        self._event_stream.take(StatusRecord(name, event.level, event.message, values).encoded())
+        self._event_stream.publish(StatusRecord(name, event.level, event.message, values).encoded())
 
     @property
     def simulated_time_s(self) -> float | None:

@@ -1,15 +1,13 @@
-"""Streams of serialised messages through nodes, and matched publishers and subscriptions."""
+"""Matched publishers and subscriptions of nodes."""
 
 from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass
 
-from rclpy.duration import Duration
 from rclpy.node import Node
-from rclpy.publisher import Publisher
 
 _MIDDLEWARE_TOPICS = ("/rosout", "/parameter_events")
 
@@ -67,48 +65,3 @@ def _without_middleware(matches: Iterable[Iterable[object]]) -> Matches:
     return tuple(
         (str(topic), int(str(met))) for topic, met in pairs if topic not in _MIDDLEWARE_TOPICS
     )
-
-
-RawCallback = Callable[[bytes], None]
-
-
-def raw_publish(publisher: Publisher) -> RawCallback:
-    """Return the function that publishes serialised messages.
-
-    ``publisher.publish`` does the same after taking its handle and looking at the type, which
-    costs as much again as the publication; the handle lives as long as the publisher.
-    """
-    function: RawCallback = publisher.handle.publish_raw
-    return function
-
-
-class RawOutput:
-    """Serialised messages of one publisher: ``take`` publishes a message.
-
-    A message that nobody can receive is not given to the middleware: nobody is subscribed, and the
-    topic keeps no last message for late subscribers.
-
-    Parameters
-    ----------
-    publisher
-        The publisher of the messages.
-    latched
-        Whether its topic keeps the last message for late subscribers.
-    """
-
-    def __init__(self, publisher: Publisher, *, latched: bool = False) -> None:
-        publish, count_readers = raw_publish(publisher), publisher.handle.get_subscription_count
-
-        def publish_to_readers(raw: bytes) -> None:
-            # To count takes a third of the time of a publication.
-            if count_readers():
-                publish(raw)
-
-        self.topic: str = publisher.topic_name
-        """Full name of the topic."""
-        self.take: RawCallback = publish if latched else publish_to_readers
-        """Publishes a message."""
-        self.readers: Callable[[], int] = publisher.get_subscription_count
-        """Function that returns the number of matched subscriptions."""
-        self.await_readers: Callable[[Duration], bool] = publisher.wait_for_all_acked
-        """Function that waits for all readers' confirmations; returns whether all came."""

@@ -126,7 +126,7 @@ class PlantNode(FlightNode):
 
     def prepare(self) -> None:
         """Publish the status of an unconfigured plant, which is inactive."""
-        self._status = self.send_raw(DiagnosticStatus, "plant/status", LATCHED)
+        self._status = self.create_publisher(DiagnosticStatus, "plant/status", LATCHED)
         self._publish_status(PlantStatus(PlantState.INACTIVE, "The plant is not configured."))
 
     def configure(self) -> None:
@@ -376,7 +376,7 @@ class PlantNode(FlightNode):
         self.status = status
         name = self.get_fully_qualified_name()
         record = StatusRecord(name, status.level, status.message, status.to_values())
-        self._status.take(record.encoded())
+        self._status.publish(record.encoded())
 
     def _last_state(self, robot: SpaceRobot) -> LastState | None:
         path = self.config.resume_bag

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.duration import Duration
+from rclpy.publisher import Publisher
 from std_msgs.msg import String
 from visualization_msgs.msg import MarkerArray
 
@@ -24,8 +25,7 @@ from spacerobot_ros.messages.statuses import StatusRecord
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import RobotDescription
 from spacerobot_ros.nodes.common.messages import message_class, transform_class
-from spacerobot_ros.nodes.common.node import LATCHED, FlightNode
-from spacerobot_ros.nodes.common.streams import RawOutput
+from spacerobot_ros.nodes.common.node import LATCHED, STREAM, FlightNode
 from spacerobot_ros.simulation.actuators import PlantWithFaults, thrusters_in
 from spacerobot_ros.simulation.commands import (
     NO_STAMP,
@@ -73,7 +73,7 @@ class PlantReport:
         self._node, self._commands, self._plant = node, commands, plant
         name = node.get_fully_qualified_name()
         self._diagnostics = PlantDiagnostics(name, plant, commands, real_time)
-        self._stream = node.send_raw(DiagnosticArray, "/diagnostics")
+        self._stream = node.create_publisher(DiagnosticArray, "/diagnostics", STREAM)
         thrusters = thrusters_in(plant)
         if thrusters is not None and thrusters.missing:
             node.get_logger().warning(f"The thrusters cannot give {thrusters.missing}.")
@@ -130,7 +130,7 @@ class PlantReport:
 
     def publish(self, time_ns: int) -> None:
         """Publish the diagnostics."""
-        self._stream.take(encode_diagnostics(self._diagnostics.records(), time_ns))
+        self._stream.publish(encode_diagnostics(self._diagnostics.records(), time_ns))
 
 
 _TARGET = "target/odom"
@@ -159,7 +159,7 @@ class StatePublisher:
         self._node, self._robot, self._state, self._config = node, robot, state, config
         self._world = config.world_frame
         self._base = config.frame_prefix + robot.base_link
-        self._outputs: dict[str, RawOutput] = {}
+        self._outputs: dict[str, Publisher] = {}
         self._readers: frozenset[bytes] = frozenset()
         self._matched = 0
         self._description = node.create_publisher(String, "robot_description", LATCHED)
@@ -207,7 +207,7 @@ class StatePublisher:
         stamp = stamp_bytes(time_ns)
         for output, template in self._all if all_topics else self._every_tick:
             if template not in lost:
-                output.take(template.serialised(stamp))
+                output.publish(template.serialised(stamp))
 
     def has_new_readers(self) -> bool:
         """Whether the state has a subscriber that it did not have at the last call.
@@ -219,9 +219,9 @@ class StatePublisher:
         readers = frozenset(
             bytes(reader.endpoint_gid)
             for output in outputs
-            for reader in self._node.get_subscriptions_info_by_topic(output.topic)
+            for reader in self._node.get_subscriptions_info_by_topic(output.topic_name)
         )
-        matched = sum(output.readers() for output in outputs)
+        matched = sum(output.get_subscription_count() for output in outputs)
         new = bool(readers - self._readers) or matched > self._matched
         self._readers, self._matched = readers, matched
         return new
@@ -230,15 +230,17 @@ class StatePublisher:
         """Wait until all readers have received the states, or the time limit is over."""
         end = time.monotonic() + _LONGEST_WAIT
         for output in self._outputs.values():
-            if not output.readers():
+            if not output.get_subscription_count():
                 continue
             left = max(0.0, end - time.monotonic())
-            if not output.await_readers(Duration(seconds=left)):
+            if not output.wait_for_all_acked(Duration(seconds=left)):
                 return
 
-    def _output(self, topic: Topic) -> RawOutput:
+    def _output(self, topic: Topic) -> Publisher:
         if topic.name not in self._outputs:
-            self._outputs[topic.name] = self._node.send_raw(message_class(topic.type), topic.name)
+            self._outputs[topic.name] = self._node.create_publisher(
+                message_class(topic.type), topic.name, STREAM
+            )
         return self._outputs[topic.name]
 
     def _template(self, topic: Topic) -> MessageTemplate:
@@ -275,10 +277,10 @@ class TransformPublisher:
         self._frames = RobotTransforms(
             robot.description, config.world_frame, config.frame_prefix, links=config.tf_links
         )
-        self._stream = node.send_raw(self._kind, TRANSFORMS)
-        self._static: RawOutput | None = None
+        self._stream = node.create_publisher(self._kind, TRANSFORMS, STREAM)
+        self._static: Publisher | None = None
         if self._frames.static_message(0) is not None:
-            self._static = node.send_raw(self._kind, STATIC_TRANSFORMS, LATCHED)
+            self._static = node.create_publisher(self._kind, STATIC_TRANSFORMS, LATCHED)
 
     def observe(self, state: ReportedState) -> None:
         """Publish the frames of another state from now on."""
@@ -287,13 +289,13 @@ class TransformPublisher:
     def publish_static(self, time_ns: int) -> None:
         """Publish the transforms of fixed links."""
         if self._static is not None:
-            self._static.take(self._frames.static_message(time_ns) or b"")
+            self._static.publish(self._frames.static_message(time_ns) or b"")
 
     def publish(self, time_ns: int) -> None:
         """Publish the transforms of the last reported state, if it has a pose."""
         if not self._state.sensors.dropout:
             quantities = self._state.quantities
-            self._stream.take(
+            self._stream.publish(
                 self._frames.message(time_ns, quantities["measured_pose"], quantities["measured_q"])
             )
 
@@ -318,11 +320,11 @@ class ClearancePublisher:
         node: FlightNode,
         plant: Plant,
         monitor: ClearanceMonitor,
-        stream: RawOutput | None = None,
+        stream: Publisher | None = None,
     ) -> None:
         self._node, self._plant, self._monitor = node, plant, monitor
         self._name = node.get_fully_qualified_name()
-        self._stream = stream or node.send_raw(DiagnosticStatus, "clearance")
+        self._stream = stream or node.create_publisher(DiagnosticStatus, "clearance", STREAM)
 
     @classmethod
     def of(
@@ -361,7 +363,7 @@ class ClearancePublisher:
             plant.link_R, plant.link_r, plant.pose, time_ns / SECOND
         )
         record = StatusRecord(self._name, status.level, status.message, status.to_values())
-        self._stream.take(record.encoded())
+        self._stream.publish(record.encoded())
         for event in events:
             self._node.report_event(event)
             if event.level:
@@ -376,7 +378,7 @@ class LinkMarkers:
     def __init__(self, node: FlightNode, plant: PlantWithFaults, world_frame: str) -> None:
         self._plant, robot = plant, plant.robot.description
         target = None if plant.capturing is None else plant.capturing.target.description
-        self._stream = node.send_raw(MarkerArray, "markers")
+        self._stream = node.create_publisher(MarkerArray, "markers", STREAM)
         self._markers = RobotMarkers(robot, target, world_frame)
         self.use_obstacles = self._markers.use_obstacles
 
@@ -390,4 +392,4 @@ class LinkMarkers:
         target = None if plant.capturing is None else plant.capturing.target_pose
         message = self._markers.message(time_ns, plant.pose, plant.link_R, plant.link_r, target)
         if message is not None:
-            self._stream.take(message)
+            self._stream.publish(message)

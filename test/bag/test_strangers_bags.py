@@ -1,0 +1,287 @@
+"""Bags of other programs: split, compressed, in SQLite, in other encodings, of changing joints."""
+
+from __future__ import annotations
+
+import shlex
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import yaml
+import zstandard
+from mcap.reader import make_reader
+from mcap.writer import Writer as McapWriter
+from rosbags.highlevel import AnyReader
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
+from rosbags.typesys import Stores, get_typestore
+from support.command_line import CliRunner
+from support.sentences import assert_one_sentence
+
+from spacerobot_ros.bag import BagWriter, Playback, RecordingError, message_definition, read_bag
+from spacerobot_ros.bag.salvage import salvage_bag
+from spacerobot_ros.cli.main import main
+from spacerobot_ros.flight.reading import open_flight_bag
+from spacerobot_ros.flight.verification import verify_bag
+from spacerobot_ros.resources import share_directory
+
+STORE = get_typestore(Stores.ROS2_JAZZY)
+JOINT_STATE = "sensor_msgs/msg/JointState"
+FLIGHT = share_directory() / "bags" / "sliding_masses.mcap"
+
+
+def joint_states(k: int, names: Sequence[str]) -> bytes:
+    """Return joint states in which joint ``jN`` is at 100 N + k."""
+    types = STORE.types
+    time = types["builtin_interfaces/msg/Time"](sec=k, nanosec=0)
+    message = types[JOINT_STATE](
+        header=types["std_msgs/msg/Header"](stamp=time, frame_id=""),
+        name=list(names),
+        position=np.array([100.0 * int(name[1:]) + k for name in names]),
+        velocity=np.empty(0),
+        effort=np.empty(0),
+    )
+    return bytes(STORE.serialize_cdr(message, JOINT_STATE))
+
+
+def rosbag2(
+    folder: Path, counts: range, *, plugin: StoragePlugin, compressed: bool = False
+) -> Path:
+    """Write joint states by rosbags; return the folder."""
+    writer = Writer(folder, version=9, storage_plugin=plugin)
+    if compressed:
+        writer.set_compression(CompressionMode.FILE, CompressionFormat.ZSTD)
+    with writer:
+        connection = writer.add_connection("/joint_states", JOINT_STATE, typestore=STORE)
+        for k in counts:
+            writer.write(connection, k * 10**9, joint_states(k, ("j1", "j2")))
+    return folder
+
+
+@pytest.fixture
+def split_bag(tmp_path: Path) -> Path:
+    """A folder as rosbag2 leaves it after a split: eleven files, whose numbers sort as numbers."""
+    folder = tmp_path / "split"
+    folder.mkdir()
+    parts = [f"split_{n}.mcap" for n in range(11)]
+    for n, name in enumerate(parts):
+        made = rosbag2(tmp_path / f"part_{n}", range(2 * n, 2 * n + 2), plugin=StoragePlugin.MCAP)
+        (made / f"{made.name}.mcap").rename(folder / name)
+    metadata = yaml.safe_load((made / "metadata.yaml").read_text())
+    metadata["rosbag2_bagfile_information"]["relative_file_paths"] = parts
+    metadata["rosbag2_bagfile_information"]["files"] = []
+    (folder / "metadata.yaml").write_text(yaml.safe_dump(metadata))
+    return folder
+
+
+def exported(bag: Path, folder: Path) -> dict[str, pd.DataFrame]:
+    """Export by the command; return the tables as pandas reads them."""
+    result = CliRunner().invoke(main, ["export", str(bag), "-o", str(folder)])
+    assert result.exit_code == 0, result.output
+    files = [file for file in folder.glob("*.csv") if file.name != "_columns.csv"]
+    return {file.stem: pd.read_csv(file) for file in files}
+
+
+def assert_has_all_that_rosbags_reads(table: pd.DataFrame, folder: Path) -> None:
+    with AnyReader([folder]) as reader:
+        rows = [
+            (time, *vars(reader.deserialize(data, connection.msgtype))["position"])
+            for connection, time, data in reader.messages()
+        ]
+    np.testing.assert_array_equal(table[["time_ns", "position[j1]", "position[j2]"]], rows)
+
+
+def test_a_split_bag_is_one_bag(split_bag: Path, tmp_path: Path) -> None:
+    table = exported(split_bag, tmp_path / "out")["joint_states"]
+    assert len(table) == 22
+    with AnyReader([split_bag / f"split_{n}.mcap" for n in range(11)]) as reader:
+        assert table["time_ns"].tolist() == [time for _, time, _ in reader.messages()]
+    bag = read_bag(split_bag)
+    assert (bag.path, bag.message_count(), bag.start_time, bag.end_time) == (split_bag, 22, 0, 21)
+    playback = Playback(bag, start=1.5)
+    playback.run(0)
+    replayed = [playback.step(0) for _ in range(20)]
+    assert [each.log_time_ns for each in replayed if each] == [k * 10**9 for k in range(2, 22)]
+    assert playback.ended
+    for words in (["report"], ["figures", "--format", "svg"]):
+        out = str(tmp_path / words[0])
+        result = CliRunner().invoke(main, [*words, str(split_bag), "-o", out])
+        assert result.exit_code == 0, result.output
+    (split_bag / "metadata.yaml").unlink()
+    with pytest.raises(RecordingError, match="holds 11 MCAP files: name one of them"):
+        read_bag(split_bag)
+
+
+def test_a_file_of_a_split_bag_says_so(split_bag: Path, caplog: pytest.LogCaptureFixture) -> None:
+    assert read_bag(split_bag / "split_3.mcap").message_count() == 2
+    (said,) = caplog.messages
+    assert said == (
+        f"{split_bag / 'split_3.mcap'} is one of 11 files of the bag in {split_bag}: name the "
+        "folder to read all of them."
+    )
+
+
+def test_a_file_of_a_split_bag_that_was_cut_is_replaced_by_its_salvaged_copy(
+    split_bag: Path,
+) -> None:
+    last = split_bag / "split_10.mcap"
+    last.write_bytes(last.read_bytes()[:-20])
+    with pytest.raises(RecordingError, match=f"{last} was cut short.*'spacerobot salvage {last}'"):
+        read_bag(split_bag)
+    assert salvage_bag(split_bag).path == split_bag / "split_10-salvaged.mcap"
+    assert read_bag(split_bag).message_count() == 22
+    with pytest.raises(RecordingError, match="is complete: there is nothing to salvage"):
+        salvage_bag(split_bag)
+
+
+def test_a_split_flight_is_verified_as_the_whole(tmp_path: Path) -> None:
+    """Its commands, and the states between two files, are in both."""
+    folder = tmp_path / "flight"
+    folder.mkdir()
+    with FLIGHT.open("rb") as file:
+        reader = make_reader(file)
+        messages = list(reader.iter_messages(log_time_order=False))
+        attachments, records = list(reader.iter_attachments()), list(reader.iter_metadata())
+    for part in (0, 1):
+        with (folder / f"flight_{part}.mcap").open("wb") as out:
+            writer = McapWriter(out)
+            writer.start("ros2")
+            for each in attachments:
+                writer.add_attachment(0, 0, each.name, each.media_type, each.data)
+            for record in records:
+                writer.add_metadata(record.name, record.metadata)
+            # Numbers of channels differ between the files.
+            half = messages[: len(messages) // 2] if part == 0 else messages[len(messages) // 2 :]
+            channels: dict[str, int] = {}
+            for schema, channel, message in half:
+                assert schema is not None
+                if channel.topic not in channels:
+                    number = writer.register_schema(schema.name, schema.encoding, schema.data)
+                    channels[channel.topic] = writer.register_channel(
+                        channel.topic, channel.message_encoding, number, channel.metadata
+                    )
+                number = channels[channel.topic]
+                writer.add_message(number, message.log_time, message.data, message.publish_time)
+            writer.finish()
+    files = {"relative_file_paths": ["flight_0.mcap", "flight_1.mcap"]}
+    text = yaml.safe_dump({"rosbag2_bagfile_information": files})
+    (folder / "metadata.yaml").write_text(text)
+    assert verify_bag(folder) == verify_bag(FLIGHT)
+
+
+def test_the_name_of_a_split_recording_is_all_of_its_files(tmp_path: Path) -> None:
+    with BagWriter(tmp_path / "a.mcap", max_duration_ns=10**9, chunk_size=1) as writer:
+        channel = writer.add_topic("/joint_states", JOINT_STATE)
+        for k in range(5):
+            writer.write(channel, joint_states(k, ("j1",)), k * 10**9, k * 10**9)
+    assert len(list(tmp_path.iterdir())) > 2
+    bag = read_bag(tmp_path / "a.mcap")
+    assert bag["joint_states"].field("position").tolist() == [[100 + k] for k in range(5)]
+    assert bag.metadata["rosbag2"] == read_bag(sorted(tmp_path.iterdir())[-1]).metadata["rosbag2"]
+
+
+def test_a_compressed_file_is_read(tmp_path: Path) -> None:
+    folder = rosbag2(tmp_path / "zst", range(20), plugin=StoragePlugin.MCAP, compressed=True)
+    (file,) = folder.glob("*.zstd")
+    for number, path in enumerate((folder, file)):
+        table = exported(path, tmp_path / f"out_{number}")["joint_states"]
+        assert_has_all_that_rosbags_reads(table, folder)
+    assert read_bag(file).path == file
+    file.write_bytes(zstandard.compress(bytes(40_000_000)))
+    with pytest.raises(RecordingError, match="inflates to more than the 32000000 bytes"):
+        read_bag(file)
+    refused = CliRunner().invoke(main, ["salvage", str(file)]).stderr
+    assert_one_sentence(refused, "is compressed: unpack it by 'zstd -d'")
+
+
+def test_a_bag_in_sqlite_says_how_to_convert_it(tmp_path: Path) -> None:
+    folder = rosbag2(tmp_path / "a bag", range(5), plugin=StoragePlugin.SQLITE3)
+    (file,) = folder.glob("*.db3")
+    for path in (folder, file):
+        with pytest.raises(RecordingError, match=f"The bag {file} is in SQLite: ") as caught:
+            read_bag(path)
+    command = str(caught.value).split("convert it by '")[1].split("', or")[0]
+    if "'" in command:
+        command = command.partition(" --dst ")[0] + " --dst NEW_FOLDER --dst-storage mcap"
+    program, *words = shlex.split(command.replace("NEW_FOLDER", shlex.quote(f"{tmp_path}/new")))
+    subprocess.run([Path(sys.executable).with_name(program), *words], check=True)
+    table = exported(tmp_path / "new", tmp_path / "out")["joint_states"]
+    assert_has_all_that_rosbags_reads(table, folder)
+
+
+@pytest.fixture
+def mixed(tmp_path: Path) -> Path:
+    """A bag with joint states, and topics in JSON, in protobuf, and defined in IDL."""
+    path = tmp_path / "mixed.mcap"
+    with path.open("wb") as file:
+        writer = McapWriter(file)
+        writer.start("")
+        for topic, name, encoding, schema, data in (
+            ("/cfg", "Thing", "json", "jsonschema", b"{}"),
+            ("/joint_states", JOINT_STATE, "cdr", "ros2msg", joint_states(1, ("j1", "j2"))),
+            ("/proto", "a.B", "protobuf", "protobuf", b"\n\0"),
+            ("/chatter", "std_msgs/msg/String", "cdr", "ros2idl", b"\0\1\0\0\1\0\0\0\0"),
+        ):
+            text = message_definition(JOINT_STATE).encode() if schema == "ros2msg" else b"{}"
+            number = writer.register_schema(name, schema, text)
+            writer.add_message(writer.register_channel(topic, encoding, number), 1, data, 1)
+        writer.finish()
+    return path
+
+
+def test_topics_that_cannot_be_read_are_named_and_the_rest_is_written(
+    mixed: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    tables = exported(mixed, tmp_path / "out")
+    assert tables.keys() == {"joint_states"}
+    assert tables["joint_states"]["position[j2]"].tolist() == [201.0]
+    (said,) = caplog.messages
+    assert said == (
+        f"3 topic(s) of the bag {mixed} are left out: /cfg, /proto, /chatter. The topic /cfg of "
+        f"the bag {mixed} is not in ROS 2's encoding ('cdr' defined by 'ros2msg'), but in 'json' "
+        "defined by 'jsonschema'."
+    )
+    bag = read_bag(mixed)
+    assert bag.to_pandas().keys() == bag.to_xarray().keys() == {"/joint_states"}
+    refused = CliRunner().invoke(main, ["export", str(mixed), "--topic", "chatter"]).stderr
+    assert_one_sentence(refused, "in 'cdr' defined by 'ros2idl'")
+
+
+def test_columns_of_joints_follow_names(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    orders = [("j1", "j2", "j3"), ("j3", "j1", "j2"), ("j2", "j3", "j1")]
+    with BagWriter(path) as writer:
+        channel = writer.add_topic("/joint_states", JOINT_STATE)
+        for k in range(9):
+            writer.write(channel, joint_states(k, orders[k % 3]), k * 10**9, k * 10**9)
+    series = read_bag(path)["joint_states"]
+    expected = [[100 + k, 200 + k, 300 + k] for k in range(9)]
+    np.testing.assert_array_equal(series.field("position"), expected)
+    assert series.field("name") == [["j1", "j2", "j3"]] * 9
+    assert series.field("velocity").shape == (9, 0)
+    table = exported(path, tmp_path / "out")["joint_states"]
+    np.testing.assert_array_equal(table[[f"position[j{n}]" for n in (1, 2, 3)]], expected)
+    q = open_flight_bag(path).signal("joint_states", ["position"], 3)
+    np.testing.assert_array_equal(q.values, expected)
+
+
+def test_a_joint_that_a_message_lacks_is_nan(tmp_path: Path) -> None:
+    """As of two drivers that publish on one topic; a flight has the joints of the first."""
+    path = tmp_path / "a.mcap"
+    with BagWriter(path) as writer:
+        channel = writer.add_topic("/joint_states", JOINT_STATE)
+        for k in range(4):
+            names = ("j2", "j1") if k % 2 else ("j7",)
+            writer.write(channel, joint_states(k, names), k * 10**9, k * 10**9)
+    series, nan = read_bag(path)["joint_states"], np.nan
+    assert series.joint_names == ["j7", "j2", "j1"]
+    expected = [[700, nan, nan], [nan, 201, 101], [702, nan, nan], [nan, 203, 103]]
+    np.testing.assert_array_equal(series.field("position"), expected)
+    np.testing.assert_array_equal(
+        series.of_joints("position", ["j1", "j9"]), [[nan, nan], [101, nan], [nan, nan], [103, nan]]
+    )
+    q = open_flight_bag(path).signal("joint_states", ["position"], 1)
+    np.testing.assert_array_equal(q.values, [[700], [702]])
