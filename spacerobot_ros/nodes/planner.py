@@ -67,6 +67,8 @@ class PlannerNode(CommanderNode):
     commander: PlannerCommander
     _trajectories: Any = None
     """Clients of FollowJointTrajectory, for ``output: trajectory``."""
+    _announcement: Thread | None = None
+    """Publishes the latest schedule."""
 
     def __init__(self, name: str = "planner", **kwargs: Any) -> None:
         super().__init__(name, **kwargs)
@@ -85,7 +87,6 @@ class PlannerNode(CommanderNode):
     def configure(self) -> None:
         """Create the topics; without a robot of its own the planner waits for robot_description."""
         self._shape: Array | None = None
-        self._announcement: Thread | None = None
         self._commands: RawOutput | None = None
         if self.config.output != "trajectory":
             topic = "joint_commands" if self.config.output == "commands" else "joint_reference"
@@ -116,11 +117,15 @@ class PlannerNode(CommanderNode):
     def deactivate(self) -> None:
         """Drop the present goal and stop sending commands; the goal file stays."""
         super().deactivate()
+        self._await_announcement()
+
+    def _await_announcement(self) -> None:
         if self._announcement is not None:
             self._announcement.join(MAX_THREAD_END_TIME)
 
     def destroy_node(self) -> None:
-        """Destroy the node with its clients of trajectories."""
+        """Destroy the node with its clients of trajectories, in whatever state it is."""
+        self._await_announcement()
         if self._trajectories is not None:
             self._trajectories.destroy()
         super().destroy_node()
@@ -233,8 +238,7 @@ class PlannerNode(CommanderNode):
         if not self.commander.config.plan_in_background:
             self._publish_schedule(start)
             return
-        if self._announcement is not None:
-            self._announcement.join(MAX_THREAD_END_TIME)
+        self._await_announcement()
         # Serialising a long schedule takes longer than a tick, and nothing waits for it.
         self._announcement = Thread(target=self._publish_schedule, args=(start,), daemon=True)
         self._announcement.start()

@@ -26,17 +26,17 @@ from rclpy.subscription import Subscription
 from rclpy.timer import Timer
 from std_srvs.srv import Trigger
 
-from spacerobot_ros.errors import ParameterError, SpaceRobotError, describe_exception
+from spacerobot_ros.errors import ParameterError, SpaceRobotError, describe_exception, printable
 from spacerobot_ros.events import Event, EventKind
 from spacerobot_ros.messages.statuses import StatusRecord
 from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.nodes.common.ros_parameters import declare, fix, typed
+from spacerobot_ros.nodes.common.ros_parameters import declare, fix, typed, unknown_parameters
 from spacerobot_ros.nodes.common.streams import (
     MatchedEndpoints,
     RawOutput,
 )
 from spacerobot_ros.nodes.common.watchdog import Liveness, Role, SilenceReport
-from spacerobot_ros.parameters import Parameter, Value, configured, declared, values_of
+from spacerobot_ros.parameters import Parameter, configured, declared, values_of
 
 STREAM = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
 """QoS of states, commands and events: reliable, with a queue for readers that are briefly busy."""
@@ -111,13 +111,12 @@ class FlightNode(LifecycleNode):
             self._parameters_declared = {each.name: each for each in declared(self.Config)}
             values = declare(self, (AUTOSTART, *self._parameters_declared.values()))
             fix(self, [AUTOSTART], fixed=True)
-            self._autostart = bool(values[AUTOSTART.name])
             self.config = configured(self.Config, values)
             self.add_on_set_parameters_callback(self._on_set_parameters)
             self.create_service(Trigger, "~/connections", self._on_connections)
             self.prepare()
             self._permanent = set(self._entities())
-            if self._autostart if autostart is None else autostart:
+            if values[AUTOSTART.name] if autostart is None else autostart:
                 self.start()
         except SpaceRobotError:
             self.destroy_node()
@@ -249,11 +248,6 @@ class FlightNode(LifecycleNode):
             self.get_logger().error(f"Node '{self.get_name()}': {describe_exception(second)}.")
         self.report_event(Event(EventKind.FAILED, message, level=2))
 
-    @property
-    def parameter_values(self) -> dict[str, Value]:
-        """The value of every parameter by its full name."""
-        return {AUTOSTART.name: self._autostart, **values_of(self.config)}
-
     def set_parameters(self, parameter_list: list[RosParameter]) -> list[SetParametersResult]:
         """Set parameters one by one; see :meth:`set_parameters_atomically`."""
         return [self.set_parameters_atomically([each]) for each in parameter_list]
@@ -371,6 +365,8 @@ class FlightNode(LifecycleNode):
             self._destroy_configured()
         if result is TransitionCallbackReturn.SUCCESS:
             self._set_parameters_read_only(fixed=True)
+            if unknown := unknown_parameters(self):
+                self.get_logger().warning(printable(unknown), once=True)
         return self._report_transition(result, EventKind.CONFIGURED)
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
