@@ -568,10 +568,7 @@ class ControlExecutive:
             self._report_abort()
 
     def _begin_goals(self, time: float, state: ControlState, *, carried: bool = False) -> None:
-        """Start towards the pending goals.
-
-        After tasks, a goal of the base alone takes the end-effector and its load along.
-        """
+        """Start towards the pending goals, after tasks from the measured pose."""
         self._goal_id = self._latest_id()
         self._after_tasks = dict(self._pending) if carried else {}
         goals = {key: pending.goal for key, pending in self._pending.items()}
@@ -582,8 +579,9 @@ class ControlExecutive:
         shapes = [g.joint_positions for g in goals.values() if g.joint_positions is not None]
         if self.controller.wheels is not None:
             shapes = [shape[self.controller.wheels.wheels.other] for shape in shapes]
-        if carried and self.controller.law.outputs.selection.end_effector:
-            poses.setdefault(END_EFFECTOR, self._carried_pose(state, poses[BASE_GOAL_KEY]))
+        if carried:
+            # Tasks have left the earlier reference behind.
+            self.controller.hold_here(time, state)
         self.controller.set_goals(
             time,
             state,
@@ -619,20 +617,15 @@ class ControlExecutive:
         except ParameterError as error:
             self._warn(f"{error} The goal is pursued, but not resumed after a restart.")
 
-    def _carried_pose(self, state: ControlState, base: PoseReference) -> PoseReference:
-        """Return the pose of the end-effector with the base in its goal, and the shape as now."""
-        link = self.controller.law.outputs.selection.end_effector_link
-        there = replace(state, r_WB=base.position, quaternion_WB=base.quaternion)
-        pose = Reference.present(self.controller.law.robot, there, link).end_effector
-        assert pose is not None
-        return pose
-
     def _goals_to_save(self) -> dict[str, IdentifiedGoal]:
         goal, selection = self.controller.goal, self.controller.law.outputs.selection
         shape = goal.joints.q if goal.joints is not None and selection.joints else None
         if shape is not None and self.controller.wheels is not None:
             shape = self.controller.wheels.shape_with_wheels(shape)
-        poses = {BASE_GOAL_KEY: goal.base, END_EFFECTOR: goal.end_effector}
+        poses = {BASE_GOAL_KEY: goal.base}
+        profile = self.controller.profile
+        if profile is not None and not profile.carries:
+            poses[END_EFFECTOR] = goal.end_effector
         return {
             key: IdentifiedGoal(
                 Goal(pose.position, pose.quaternion, shape), self._goal_id, resumes=self._resumes

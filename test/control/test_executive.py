@@ -84,6 +84,38 @@ def test_the_other_goal_stays_when_one_is_replaced_and_the_status_is_about_the_l
     assert loop.status.goal_id == "c"
 
 
+def test_a_base_without_a_goal_of_the_hand_carries_it() -> None:
+    """The force is that of both errors; the reference of the hand turns about the base."""
+    loop = ExecutiveLoop(profile="quintic")
+    loop.answer()
+    half = math.sqrt(0.5)
+    there = Goal(AIM, np.array([0.0, 0.0, half, half]))
+    loop.aim(base=IdentifiedGoal(there, "a"))
+    loop.answer()
+    profile = loop.executive.controller.profile
+    assert profile is not None
+    for share in (0.0, 0.3, 0.7, 1.0):
+        now = profile.at(share * profile.duration)
+        assert now.base is not None
+        assert now.end_effector is not None
+        turned = Rotation.from_quat(now.base.quaternion)
+        arm = now.end_effector.position - now.base.position
+        np.testing.assert_allclose(arm, turned.apply(TIP), atol=1e-12)
+    # The next goal of the base goes on from there, a goal of the hand ends it.
+    loop.aim(base=goal_at(-AIM, "b"))
+    loop.answer()
+    hand = loop.executive.controller.goal.end_effector
+    assert hand is not None
+    np.testing.assert_allclose(hand.position, TIP - AIM, atol=1e-12)
+    loop.aim(end_effector=goal_at(TIP, "c"))
+    loop.answer()
+    loop.aim(base=goal_at(AIM, "d"))
+    loop.answer()
+    hand = loop.executive.controller.goal.end_effector
+    assert hand is not None
+    np.testing.assert_allclose(hand.position, TIP, atol=1e-12)
+
+
 def test_of_goals_between_two_states_the_latest_counts_whichever_it_is_for() -> None:
     loop = ExecutiveLoop()
     loop.aim(base=goal_at(AIM, "a"), end_effector=goal_at(TIP, "b"))
@@ -139,7 +171,8 @@ def beside(kind: str, by: float) -> tuple[dict[str, Any], dict[str, IdentifiedGo
         case "position":
             return {}, {"end_effector": goal_at(TIP + np.array([0.0, by, 0.0]))}
         case "attitude":
-            return {}, {"base": IdentifiedGoal(Goal(np.zeros(3), turned))}
+            base = IdentifiedGoal(Goal(np.zeros(3), turned))
+            return {}, {"base": base, "end_effector": goal_at(TIP)}
     return SHAPE_IS_CONTROLLED, {"base": goal_at(np.zeros(3), shape=SHAPE + np.array([0.0, -by]))}
 
 
@@ -208,10 +241,10 @@ def test_tolerances_that_change_in_flight_take_effect(key: str) -> None:
 def test_gains_that_change_in_flight_take_effect() -> None:
     loop = ExecutiveLoop()
     loop.aim(base=goal_at([1.0, 0.0, 0.0]))
-    np.testing.assert_allclose(loop.answer()[0][:3], [KP, 0.0, 0.0], atol=1e-12)
+    np.testing.assert_allclose(loop.answer()[0][:3], [2 * KP, 0.0, 0.0], atol=1e-12)
     loop.configure(gains=Gains.uniform(70.0, KD))
     loop.velocity = np.array([0.0, 0.5, 0.0])
-    np.testing.assert_allclose(loop.answer()[0][:3], [70.0, -2 * KD * 0.5, 0.0], atol=1e-12)
+    np.testing.assert_allclose(loop.answer()[0][:3], [140.0, -2 * KD * 0.5, 0.0], atol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -259,7 +292,7 @@ def test_abort_holds_the_robot_where_it_is() -> None:
     assert_one_sentence(loop.status.message, "Aborted on request")
     # A new goal is taken up from there.
     loop.aim(base=goal_at([1.25, 0.0, 0.0], "5"))
-    np.testing.assert_allclose(loop.answer()[0][:3], [KP, 0.0, 0.0], atol=1e-12)
+    np.testing.assert_allclose(loop.answer()[0][:3], [2 * KP, 0.0, 0.0], atol=1e-12)
     assert (loop.state, loop.status.goal_id) == ("tracking", "5")
 
 
@@ -278,7 +311,7 @@ def test_an_abort_gives_up_every_goal(key: str) -> None:
         assert loop.state == "aborted"
     # A goal of one alone does not bring back that of the other.
     loop.aim(base=goal_at(AIM))
-    np.testing.assert_allclose(loop.answer()[0][:3], KP * AIM, atol=1e-12)
+    np.testing.assert_allclose(loop.answer()[0][:3], 2 * KP * AIM, atol=1e-12)
 
 
 def test_an_abort_holds_the_shape_that_the_joints_have() -> None:
@@ -318,7 +351,7 @@ def test_a_goal_before_an_abort_is_dropped_and_one_after_it_is_flown(file: Path)
     loop.aim(base=goal_at(AIM))
     loop.executive.abort()
     loop.aim(base=goal_at([-0.5, 0.0, 0.0]))
-    np.testing.assert_allclose(loop.answer()[0][:3], [-0.5 * KP, 0.0, 0.0], atol=1e-12)
+    np.testing.assert_allclose(loop.answer()[0][:3], [-KP, 0.0, 0.0], atol=1e-12)
     assert json.loads(file.read_text())["base"]["position"] == [-0.5, 0.0, 0.0]
     assert [status.state.value for status in loop.statuses[-2:]] == ["aborted", "tracking"]
 
@@ -388,7 +421,7 @@ def test_a_body_twist_is_turned_into_the_world() -> None:
 
 
 def test_a_status_is_reported_on_changes_and_every_period() -> None:
-    loop = ExecutiveLoop(status_period=0.1, max_force=KP / 2)
+    loop = ExecutiveLoop(status_period=0.1, max_force=KP)
     loop.answer(25)
     assert len(loop.statuses) == 3
     loop.aim(base=goal_at([1.0, 0.0, 0.0]))
@@ -397,9 +430,9 @@ def test_a_status_is_reported_on_changes_and_every_period() -> None:
     count = len(loop.statuses)
     report = loop.status.command
     assert report is not None
-    assert report.lost_force_N == pytest.approx(KP / 2)
-    # The base pulls by 0.7 of it, the tip the other way by 0.3: within the limit, reported at once.
-    loop.place = np.array([0.3, 0.0, 0.0])
+    assert report.lost_force_N == pytest.approx(KP)
+    # Base and tip pull by 0.4 of it each: within the limit, reported at once.
+    loop.place = np.array([0.6, 0.0, 0.0])
     loop.answer()
     assert len(loop.statuses) == count + 1
     report = loop.status.command

@@ -36,7 +36,7 @@ from spacerobot_ros.simulation import EffortPlant, InitialState
 
 def test_the_base_is_estimated_for_a_while_and_then_the_thrusters_are_off() -> None:
     loop = ExecutiveLoop(estimation_time=0.05)
-    loop.aim(base=goal_at([1.0, 0.0, 0.0], "3"))
+    loop.aim(base=goal_at([1.0, 0.0, 0.0], "3"), end_effector=goal_at(TIP, "3"))
     measured = loop.answer()[0]
     for tick in range(5):
         wrench, _ = loop.answer(measured=False)
@@ -62,7 +62,7 @@ def test_the_estimate_takes_what_the_thrusters_gave_and_not_what_was_wanted() ->
     """Of 300 N that a far goal wants they give 5: so much the momentum grows, and no more."""
     robot, force = planar_manipulator(), 5.0
     loop = ExecutiveLoop(estimation_time=1.0, max_force=force)
-    loop.aim(base=goal_at([10.0, 0.0, 0.0]))
+    loop.aim(base=goal_at([10.0, 0.0, 0.0]), end_effector=goal_at(TIP))
     assert np.linalg.norm(loop.answer()[0][:3]) == pytest.approx(force)
     for ticks in range(1, 6):
         loop.answer(measured=False)
@@ -97,7 +97,7 @@ def test_without_odom_from_the_beginning_nothing_is_thrust_and_the_goal_waits() 
         np.testing.assert_array_equal(loop.answer(measured=False)[0], np.zeros(6))
     assert (loop.state, loop.status.state.level) == ("waiting", 0)
     assert_one_sentence(loop.status.message, "Waiting for states on 'odom'")
-    np.testing.assert_allclose(loop.answer()[0][:3], [KP, 0.0, 0.0], atol=1e-12)
+    np.testing.assert_allclose(loop.answer()[0][:3], [2 * KP, 0.0, 0.0], atol=1e-12)
     assert loop.state == "tracking"
 
 
@@ -182,10 +182,10 @@ def test_it_goes_on_from_where_the_robot_is_and_what_was_held_is_still_held(file
     first.aim(base=goal_at(AIM, "9.000000001"))
     first.answer()
     loop = resumed(file)
-    # Meanwhile all of it has drifted: the base, that has a goal, and the tip, that had none.
+    # Meanwhile all of it has drifted: the base, that has a goal, and the tip, that it carries.
     loop.place = np.array([0.125, -0.25, 0.0])
     wrench, _ = loop.answer()
-    np.testing.assert_allclose(wrench[:3], KP * ((AIM - loop.place) - loop.place), atol=1e-12)
+    np.testing.assert_allclose(wrench[:3], 2 * KP * (AIM - loop.place), atol=1e-12)
     assert (loop.state, loop.status.goal_id) == ("tracking", "9.000000001")
 
 
@@ -249,7 +249,7 @@ def test_goals_of_another_robot_or_law_are_refused(
 def test_where_nothing_can_be_written_the_goal_is_flown(tmp_path: Path) -> None:
     loop = ExecutiveLoop(tmp_path / "nowhere" / "goals.json")
     loop.aim(base=goal_at(AIM))
-    np.testing.assert_allclose(loop.answer()[0][:3], KP * AIM, atol=1e-12)
+    np.testing.assert_allclose(loop.answer()[0][:3], 2 * KP * AIM, atol=1e-12)
     assert loop.state == "tracking"
     (warning,) = loop.warnings
     assert "not resumed after a restart" in warning

@@ -384,7 +384,7 @@ def test_a_group_with_gains_keeps_them() -> None:
     """At rest the force on the base is the sum of those on both poses."""
     others = [group for group in vars(Gains()) if group != "base_position"]
     loop = ExecutiveLoop(**automatic_gains(*others))
-    loop.aim(base=goal_at(AIM))
+    loop.aim(base=goal_at(AIM), end_effector=goal_at(TIP))
     np.testing.assert_allclose(loop.answer()[0][:3], STEP_KP * AIM, rtol=1e-9, atol=1e-9)
 
 
