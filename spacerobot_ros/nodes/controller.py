@@ -87,7 +87,7 @@ class CoordinatedControlNode(CommanderNode):
             self.create_subscription(DiagnosticStatus, HEARTBEAT, self._on_heartbeat, HEARTBEAT_QOS)
         for kind, topic in ((JointState, JOINT_REFERENCE), (Odometry, BASE_REFERENCE)):
             take = partial(self._on_reference, topic)
-            self._inputs[topic] = self.create_subscription(kind, topic, take, STREAM, raw=True)
+            self.inputs[topic] = self.create_subscription(kind, topic, take, STREAM, raw=True)
 
     def start_message(self) -> str:
         """Return a log message with robot, law and goal topic."""

@@ -181,7 +181,7 @@ class PlannerNode(CommanderNode):
         aim = EndEffectorGoal.along(link, path_poses(message, frame, what, self._pose_of))
         if link == DEFAULT_END_EFFECTOR:
             aim = replace(aim, link="")
-        return Goal.of_end_effectors([aim], joint_positions=self._goal_shape())
+        return Goal.of_end_effectors([aim], joint_positions=self.goal_shape())
 
     def read_goal(self, key: str, message: PoseStamped) -> Goal:
         """Return the goal of a message for the base or an end-effector.
@@ -194,9 +194,10 @@ class PlannerNode(CommanderNode):
         aim = end_effector_goal(key, message, frame, what, self._pose_of)
         if key == DEFAULT_END_EFFECTOR:
             aim = replace(aim, link="")
-        return Goal.of_end_effectors([aim], joint_positions=self._goal_shape())
+        return Goal.of_end_effectors([aim], joint_positions=self.goal_shape())
 
-    def _goal_shape(self) -> Array | None:
+    def goal_shape(self) -> Array | None:
+        """Return the joint positions (n,) of the last message about them; None: any."""
         return self._shape
 
     def _on_goal_shape(self, message: JointState) -> None:

@@ -211,7 +211,7 @@ def test_a_law_without_an_integral_term_says_so() -> None:
         name = "proportional"
         gain_units = ("N/m", "N s/m")
 
-        def _results(self, symbols: dict[str, object]) -> dict[str, object]:
+        def results(self, symbols: dict[str, object]) -> dict[str, object]:
             z1 = self.outputs
             return {"actuation": (z1.J_z @ z1.J_q_inverse).T @ (symbols["kp"] * z1.error)}
 
@@ -394,7 +394,7 @@ class _Spring(ControlLaw):
     name = "spring"
     gain_units = ("N/m", "N s/m")
 
-    def _results(self, symbols: dict[str, ca.SX]) -> dict[str, ca.SX]:
+    def results(self, symbols: dict[str, ca.SX]) -> dict[str, ca.SX]:
         z1 = self.outputs
         pull = symbols["kp"] * z1.error + symbols["kd"] * z1.error_rate
         return {"actuation": (z1.J_z @ z1.J_q_inverse).T @ pull}

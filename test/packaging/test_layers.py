@@ -240,7 +240,7 @@ def test_parameters_can_be_given_by_name() -> None:
 
 HOOKS = {
     "commanding.commander": ["_report_waiting_goal", "_forward_outputs"],
-    "planning.core.method": ["_setup", "require_suitable"],
+    "planning.core.method": ["setup", "require_suitable"],
 }
 """Methods of abstract classes that do nothing unless they are overridden, by module."""
 
