@@ -206,7 +206,7 @@ MUTABLE = {
     "spacerobot_ros.commanding.fly_to._ActionGoal",
     "spacerobot_ros.control.goal_monitor.GoalMonitor",
     "spacerobot_ros.planning.execution.executive.ActiveGoal",
-    "spacerobot_ros.planning.execution.executive.Teleoperation",
+    "spacerobot_ros.planning.execution.teleoperation._Following",
     "spacerobot_ros.planning.methods.optimal.search._SearchState",
     "spacerobot_ros.report.solids.Solids",
     "spacerobot_ros.flight.verification._Resimulation",

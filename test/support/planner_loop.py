@@ -142,7 +142,7 @@ class HeldWorker(PlanningWorker):
     def is_busy(self) -> bool:
         return self.task is not None
 
-    def submit(self, task: PlanningTask) -> None:
+    def start(self, task: PlanningTask) -> None:
         assert self.task is None
         self.task, self.cancelled, self.released = task, False, False
         self.tasks.append(task)
@@ -151,7 +151,7 @@ class HeldWorker(PlanningWorker):
         """Let the plan be there at the next look."""
         self.released = True
 
-    def poll(self) -> Planned | Refused | None:
+    def take_result(self) -> Planned | Refused | None:
         if self.task is None or not self.released:
             return None
         task, self.task = self.task, None
