@@ -17,7 +17,7 @@ from spacerobot_ros.commanding.commander import (
     StateDecoder,
 )
 from spacerobot_ros.commanding.goal_follower import Status
-from spacerobot_ros.commanding.plant_state import Pairing, PlantChange, Stamped
+from spacerobot_ros.commanding.plant_state import Pairing, Stamped
 from spacerobot_ros.control import ControlState, NotFiniteError, PoseReference, Reference
 from spacerobot_ros.control.config import ControllerConfig
 from spacerobot_ros.control.controller import OwnLaw, build_controller
@@ -92,10 +92,6 @@ class ControllerCommander(Commander):
 
     def _make_status(self, state: str, message: str, goal_id: str) -> ControllerStatus:
         return ControllerStatus(ControllerState(state), message, goal_id)
-
-    def _configure_executive(self) -> None:
-        if self.executive is not None:
-            self.executive.configure(self.config)
 
     def _follow_goal(self, goal_id: str) -> None:
         # Goals of base and end-effector are pursued together, under the id of the later one: a
@@ -232,7 +228,7 @@ class ControllerCommander(Commander):
         if robot is None:
             return
         controller = build_controller(robot, self.config, self._own_law)
-        executive = ControlExecutive(controller, self.config, lambda status: None)
+        executive = ControlExecutive(controller, self.config)
         q, rates = np.clip(np.zeros(robot.n), robot.lower, robot.upper), np.zeros(robot.n)
         upright = np.array([0.0, 0.0, 0.0, 1.0])
         state = ControlState.at_rest(np.zeros(3), upright, q)
@@ -245,14 +241,8 @@ class ControllerCommander(Commander):
             executive.evaluate(now, executive.command(now, measured, q, rates))
 
     def _build_executive(self, robot: SpaceRobot, decoder: StateDecoder) -> None:
-        self.executive = ControlExecutive(
-            build_controller(robot, self.config, self._own_law),
-            self.config,
-            self._publish_status,
-            self._goal_file,
-            lambda message: self.host.log("error", message),
-            self.host.report_event,
-        )
+        controller = build_controller(robot, self.config, self._own_law)
+        self.executive = ControlExecutive(controller, self.config)
         self.executive.servicing.hold(self._held)
         if self._target is not None:
             self.use_target(self._target)
@@ -327,24 +317,8 @@ class ControllerCommander(Commander):
         of_action = not goal.resumes
         return not (controlled or of_action) and self.host.has_publisher(JOINT_REFERENCE)
 
-    def _refuse_goal(self, message: str, goal_id: str) -> None:
-        if self.executive is None:
-            super()._refuse_goal(message, goal_id)
-        else:
-            self.executive.refuse(message, goal_id)
-
-    def _abort_goal(self, why: str) -> str | None:
-        if self.executive is None:
-            return None
-        self.executive.abort(why)
-        return "The robot holds where it is."
-
-    def _react_to_change(self, change: PlantChange) -> None:
-        assert self.executive is not None
-        if change is PlantChange.RESET:
-            self.executive.plant_reset()
-        else:
-            self.executive.on_plant_obeying()
+    def _forward(self, output: Any) -> None:
+        self._publish_status(output)
 
     def _forward_plant_state(self) -> None:
         if self.executive is not None:
@@ -382,6 +356,7 @@ class ControllerCommander(Commander):
             now = stamp / SECOND
             self._read_target(decoder)
             result = executive.command(now, measured, q, qdot, self._reference(decoder))
+            self._forward_outputs()
         except (CommandError, NotFiniteError) as error:
             self._log_fault("state", f"The state is refused: {error}")
             return
@@ -389,6 +364,7 @@ class ControllerCommander(Commander):
         if send:
             self.host.send_command(stamp)
         executive.evaluate(now, result)
+        self._forward_outputs()
 
     def _measured_state(self, *arrays: Array) -> ControlState:
         """Return the state of a pose (7,), a twist (6,), q and qdot (n,)."""

@@ -37,14 +37,14 @@ from spacerobot_ros.control import (
 )
 from spacerobot_ros.control.config import ControllerConfig
 from spacerobot_ros.control.controller import build_controller
-from spacerobot_ros.control.executive import GOAL_KEYS, ControlExecutive
+from spacerobot_ros.control.executive import ControlExecutive
 from spacerobot_ros.control.reference import HeldVelocityReference
 from spacerobot_ros.control.status import CommandReport, ControllerState, ControllerStatus
 from spacerobot_ros.errors import ParameterError, PlanningError, SpaceRobotError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.parameters import configured
 from spacerobot_ros.planning import Goal
-from spacerobot_ros.planning.execution.goal_file import GoalFile, IdentifiedGoal
+from spacerobot_ros.planning.execution.goal_file import IdentifiedGoal
 from spacerobot_ros.resources import robot_file
 
 # -- goals ------------------------------------------------------------------------------------
@@ -607,13 +607,12 @@ def test_force_and_torque_that_thrusters_cannot_give_are_reported_apart() -> Non
             ControllerConfig,
             {"status_period": 0.01, "profile": "step", "tick_rate": 100.0, **limits},
         )
-        executive = ControlExecutive(
-            build_controller(robot, config), config, statuses.append, GoalFile("", GOAL_KEYS)
-        )
+        executive = ControlExecutive(build_controller(robot, config), config)
         executive.submit("base", IdentifiedGoal(turned))
         result = executive.command(0.01, rest, rest.q, rest.qdot, None)
         executive.evaluate(0.01, result)
         wrenches.append(result.realised.wrench_B)
+        statuses += [each for each in executive.outputs if isinstance(each, ControllerStatus)]
     lost, report = wrenches[0] - wrenches[1], statuses[-1].command
     assert report is not None
     assert np.linalg.norm(wrenches[1][:3]) == pytest.approx(0.5)

@@ -221,6 +221,7 @@ def test_a_goal_that_is_decided_is_not_kept(file: Path, end: str) -> None:
     assert file.exists()
     if end == "aborted":
         loop.executive.abort()
+        loop.answer()
         assert not file.exists()
     loop.answer(25)
     assert loop.state == end

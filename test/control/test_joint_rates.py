@@ -225,16 +225,19 @@ class LateFlight:
     def __init__(self, name: str, start: ControlState, late: float, **settings: Any) -> None:
         robot = load(name)
         self.config = configured(ControllerConfig, {"tick_rate": 1 / PERIOD, **settings})
-        self.statuses: list[ControllerStatus] = []
-        self.events: list[Event] = []
-        self.executive = ControlExecutive(
-            build_controller(robot, self.config), self.config, self.statuses.append,
-            report_event=self.events.append,
-        )  # fmt: skip
+        self.executive = ControlExecutive(build_controller(robot, self.config), self.config)
         self.plant = plant_of(robot, start, PERIOD / 2)
         self.past = [start] * (1 + round(late / PERIOD))
         self.rates = robot.velocity_limit
         self.fastest, self.tick = 0.0, 0
+
+    @property
+    def statuses(self) -> list[ControllerStatus]:
+        return [each for each in self.executive.outputs if isinstance(each, ControllerStatus)]
+
+    @property
+    def events(self) -> list[Event]:
+        return [each for each in self.executive.outputs if isinstance(each, Event)]
 
     def fly(self, seconds: float) -> None:
         for _ in range(round(seconds / PERIOD)):

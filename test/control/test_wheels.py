@@ -479,13 +479,16 @@ class Loop:
     """An executive whose reports are kept."""
 
     def __init__(self, robot: SpaceRobot = ROBOT, **changes: object) -> None:
-        self.statuses: list[ControllerStatus] = []
-        self.events: list[Event] = []
         settings = config(**changes)
-        self.executive = ControlExecutive(
-            build_controller(robot, settings), settings, self.statuses.append,
-            report_event=self.events.append,
-        )  # fmt: skip
+        self.executive = ControlExecutive(build_controller(robot, settings), settings)
+
+    @property
+    def statuses(self) -> list[ControllerStatus]:
+        return [each for each in self.executive.outputs if isinstance(each, ControllerStatus)]
+
+    @property
+    def events(self) -> list[Event]:
+        return [each for each in self.executive.outputs if isinstance(each, Event)]
 
     def tick(
         self, time: float, qdot: list[float], omega: tuple[float, ...] = (0, 0, 0)

@@ -137,7 +137,7 @@ def test_a_goal_is_reached_when_it_is_held_for_the_settling_time(harness: Harnes
 
 def test_gains_that_change_in_flight_take_effect(harness: Harness) -> None:
     loop = Loop(harness)
-    loop.aim(base=pose([1.0, 0.0, 0.0]))
+    loop.aim(base=pose([1.0, 0.0, 0.0]), end_effector=pose(TIP))
     np.testing.assert_allclose(loop.answer()[0][:3], [KP, 0.0, 0.0], atol=1e-12)
     assert loop.set("gains.base_position.kp", 70.0).successful
     np.testing.assert_allclose(loop.answer()[0][:3], [70.0, 0.0, 0.0], atol=1e-12)
@@ -224,7 +224,7 @@ def test_goals_are_taken_in_the_frame_that_the_world_is_called(harness: Harness)
 def test_a_goal_without_a_frame_is_taken(harness: Harness) -> None:
     loop = Loop(harness)
     loop.aim(base=pose([1.0, 0.0, 0.0], frame=""))
-    np.testing.assert_allclose(loop.answer()[0][:3], [KP, 0.0, 0.0], atol=1e-12)
+    np.testing.assert_allclose(loop.answer()[0][:3], [2 * KP, 0.0, 0.0], atol=1e-12)
 
 
 # -- abort, life ------------------------------------------------------------------------------
@@ -246,7 +246,7 @@ def test_abort_holds_the_robot_where_it_is(harness: Harness) -> None:
     assert loop.status["state"] == "aborted"
     # A new goal is taken up from there.
     loop.aim(base=pose([1.25, 0.0, 0.0]))
-    np.testing.assert_allclose(loop.answer()[0][:3], [KP, 0.0, 0.0], atol=1e-12)
+    np.testing.assert_allclose(loop.answer()[0][:3], [2 * KP, 0.0, 0.0], atol=1e-12)
     loop.wait_for("tracking")
 
 
@@ -270,7 +270,7 @@ def test_an_inactive_node_commands_nothing_and_then_answers_the_waiting_state(
 def test_goals_are_forgotten_by_a_deactivation(harness: Harness) -> None:
     loop = Loop(harness)
     loop.aim(base=pose([1.0, 0.0, 0.0]))
-    assert loop.answer()[0][0] == pytest.approx(KP)
+    assert loop.answer()[0][0] == pytest.approx(2 * KP)
     loop.node.trigger_deactivate()
     loop.wait_for("aborted")
     count = loop.probe.count("base_wrench")
@@ -298,4 +298,4 @@ def test_the_robot_is_taken_from_the_description(harness: Harness) -> None:
     description.publish(String(data=URDF.read_text("utf-8")))
     harness.spin_until(lambda: loop.probe.count("joint_commands"), "the state that waited")
     loop.aim(base=pose([1.0, 0.0, 0.0]))
-    np.testing.assert_allclose(loop.answer()[0][:3], [KP, 0.0, 0.0], atol=1e-12)
+    np.testing.assert_allclose(loop.answer()[0][:3], [2 * KP, 0.0, 0.0], atol=1e-12)

@@ -21,13 +21,18 @@ from spacerobot_ros.planning.core.method import GaitMethod, PlanRequest
 from spacerobot_ros.planning.core.schedule import BasePath
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.execution.executive import Executive, Output, Transition
-from spacerobot_ros.planning.execution.goal_file import GoalFile, IdentifiedGoal
+from spacerobot_ros.planning.execution.goal_file import (
+    GoalFile,
+    IdentifiedGoal,
+    PursuedGoals,
+)
 from spacerobot_ros.planning.execution.state_average import BaseMeasurement
 from spacerobot_ros.planning.execution.status import (
     Notice,
     PlannerState,
     PlannerStatus,
     ScheduleStart,
+    Severity,
 )
 from spacerobot_ros.planning.execution.worker import (
     Planned,
@@ -223,7 +228,8 @@ class Loop:
         self.method = method
         self.held = HeldWorker(model, self.config, method)
         worker = self.held if held else PlanningWorker(model, self.config, method)
-        self.executive = Executive(model, self.config, worker, goal_file)
+        self.executive = Executive(model, self.config, worker)
+        self.goal_file = goal_file or GoalFile("")
         self.measured = PlantState(self.plant)
         self.outputs: list[Output] = []
         self.shapes: list[Array] = [self.plant.q.copy()]
@@ -298,7 +304,15 @@ class Loop:
         raise AssertionError(f"not decided: {self.statuses[before:]}")
 
     def _take(self) -> None:
-        self.outputs += self.executive.outputs
+        for output in self.executive.outputs:
+            match output:
+                case PursuedGoals() as pursued:
+                    if problem := self.goal_file.pursue(pursued):
+                        output = Notice(Severity.ERROR, problem)
+                case PlannerStatus() as status if status.state.decided:
+                    refused = status.state is PlannerState.REFUSED
+                    self.goal_file.end(status.goal_id, refused=refused)
+            self.outputs.append(output)
         self.executive.outputs.clear()
 
     # -- looking ------------------------------------------------------------------------------

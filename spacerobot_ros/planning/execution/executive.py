@@ -17,7 +17,7 @@ from dataclasses import dataclass, field, replace
 from enum import Enum
 from typing import Any, NamedTuple
 
-from spacerobot_ros.errors import ParameterError, PlanningError, sentence_case
+from spacerobot_ros.errors import PlanningError, sentence_case
 from spacerobot_ros.events import Event as FlightEvent
 from spacerobot_ros.events import EventKind
 from spacerobot_ros.model import SpaceRobot
@@ -31,7 +31,11 @@ from spacerobot_ros.planning.core.goal import (
 from spacerobot_ros.planning.core.method import PlanRequest
 from spacerobot_ros.planning.core.schedule import GaitSchedule
 from spacerobot_ros.planning.execution.config import PlannerConfig
-from spacerobot_ros.planning.execution.goal_file import BASE_GOAL_KEY, GoalFile, IdentifiedGoal
+from spacerobot_ros.planning.execution.goal_file import (
+    BASE_GOAL_KEY,
+    IdentifiedGoal,
+    PursuedGoals,
+)
 from spacerobot_ros.planning.execution.path_deviation import TrackingError
 from spacerobot_ros.planning.execution.state_average import MeasuredState, StateAverage
 from spacerobot_ros.planning.execution.status import (
@@ -177,7 +181,7 @@ class IllegalTransitionError(RuntimeError):
     """A defect of the executive: a transition that is not in :data:`TRANSITIONS`."""
 
 
-Output = PlannerStatus | ScheduleStart | Notice | Transition | FlightEvent
+Output = PlannerStatus | ScheduleStart | Notice | Transition | FlightEvent | PursuedGoals
 """An output of an executive other than its setpoints."""
 
 
@@ -224,11 +228,9 @@ class Executive:
     robot
         The model.
     config
-        Of the planner. It may be replaced: tolerances and corrections then apply from now on.
+        Of the planner.
     worker
         Makes the plans; None: a :class:`PlanningWorker`.
-    goal_file
-        Where the present goal is saved; None: nowhere.
 
     Raises
     ------
@@ -241,11 +243,9 @@ class Executive:
         robot: SpaceRobot,
         config: PlannerConfig,
         worker: PlanningWorker | None = None,
-        goal_file: GoalFile | None = None,
     ) -> None:
         self._robot, self.config = robot, config
         self._worker = worker or PlanningWorker(robot, config)
-        self._goal_file = goal_file or GoalFile("")
         self._average = StateAverage(robot, config.averaging, config.rest_tolerance)
         self._tracker = TrajectoryTracker(robot, config)
         self._max_gap_ns = _max_gap_ns(config)
@@ -337,7 +337,6 @@ class Executive:
         Returns a message about the joints; None where there is no goal.
         """
         goal_id, message = self._latest_goal_id(), "The joints rest."
-        self._goal_file.delete()
         match self.phase:
             case Phase.IDLE:
                 return None
@@ -368,24 +367,9 @@ class Executive:
     ) -> bool:
         """Give up every goal at once: the plant does not obey commands any more.
 
-        The goal file is deleted, and nothing is tracked or planned until there is a new goal.
-
-        Parameters
-        ----------
-        why
-            The message of the plant; it becomes part of the status.
-        commanded_until_ns
-            For a plant that rests because commands did not come: the stamp of the last one that it
-            had. None: it obeys nothing.
-        rests_since_ns
-            Stamp since which it rests then, ns. A goal goes on for which nothing was commanded
-            until then, and one whose plan has taken so long that no state was answered. A goal that
-            was to replace it is planned for from rest.
-
-        Returns
-        -------
-        bool
-            Whether a goal was given up.
+        Where it rests because commands did not come, a goal goes on for which nothing was commanded
+        until then, and one whose plan has taken so long that no state was answered. A goal that was
+        to replace it is planned for from rest.
         """
         if commanded_until_ns is not None and not self._commands_were_obeyed(
             commanded_until_ns, rests_since_ns
@@ -395,8 +379,6 @@ class Executive:
         if commanded_until_ns is not None:
             self._drop_plan()
             successor = self._new_goal
-        if successor is None:
-            self._goal_file.delete()
         if self.phase is Phase.IDLE:
             return False
         goal_id = self._latest_goal_id() if successor is None else self._pursued_id()
@@ -438,6 +420,13 @@ class Executive:
         elif why:
             self._add_notice(Severity.WARNING, f"{sentence_case(why)}.")
         self._tracker.end_by_result()
+
+    def configure(self, config: PlannerConfig) -> None:
+        """Use other tolerances and corrections from now on."""
+        self.config = config
+
+    def on_plant_obeying(self) -> None:
+        """Do nothing: the next goal begins from the measured state anyway."""
 
     def plant_reset(self) -> None:
         """Plan again for the present goal, if any: the robot is in another state than
@@ -531,7 +520,7 @@ class Executive:
         self._worker.cancel()
 
     def stop(self) -> None:
-        """Give up all goals at once and wait for the worker to end; the goal file stays."""
+        """Give up all goals at once, without a status, and wait for the worker to end."""
         self._tracker.stop()
         self._forget_goals()
         self._worker.close()
@@ -979,11 +968,7 @@ class Executive:
     def _accept_goal(self, active: ActiveGoal) -> None:
         self._active_goal, self._tracker.stuck = active, []
         self._add_event(EventKind.GOAL_ACCEPTED, "The goal is accepted.", active.identified)
-        try:
-            self._goal_file.save({BASE_GOAL_KEY: active.identified})
-        except ParameterError as error:
-            message = f"{error} The goal is pursued, but would not be resumed."
-            self._add_notice(Severity.ERROR, message)
+        self.outputs.append(PursuedGoals({BASE_GOAL_KEY: active.identified}))
 
     def _execute_schedule(
         self,
@@ -1123,8 +1108,6 @@ class Executive:
         self._end_goal(event)
 
     def _end_goal(self, event: Event) -> None:
-        """End the active goal: nothing is to be resumed."""
-        self._goal_file.delete()
         self._active_goal = None
         self._change_phase(event, self._phase_at_rest())
 
