@@ -398,7 +398,7 @@ class Commander(ABC):
             self._refuse_goal(str(error), goal_id)
             return None
         accepted = IdentifiedGoal(goal, goal_id)
-        self._follow_goal(goal_id)
+        self._fly_to.begin(goal_id)
         self._accept_goal(key, accepted)
         return accepted
 
@@ -472,10 +472,6 @@ class Commander(ABC):
             self._submit_goal(key, goal)
         self._fly_to.end_dropped_goals(self._active_goal_ids())
 
-    def _follow_goal(self, goal_id: str) -> None:
-        """Report the end of a goal that came by topic, whatever ends it."""
-        self._fly_to.begin(goal_id)
-
     def _refuse_goal(self, message: str, goal_id: str) -> None:
         self._publish_decision(self._make_status("refused", message, goal_id))
 
@@ -509,6 +505,9 @@ class Commander(ABC):
         pursued = {goal.goal_id for goal in self._waiting_goals.values()}
         if self.active and self.executive is not None:
             pursued |= self.executive.unfinished_goals
+            # A status that waits for its publication tells the end of its own goal.
+            outputs = self.executive.outputs
+            pursued |= {each.goal_id for each in outputs if isinstance(each, Status)}
         return pursued
 
     def _watch_fly_to(self) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import replace
 from operator import is_not
@@ -72,8 +72,6 @@ class ControllerCommander(Commander):
     ) -> None:
         super().__init__(config, host, GOAL_KEYS, pose_required=True, clock=clock)
         self._own_law, self._partner_is_busy = own_law, partner_is_busy
-        self._ids_by_key: dict[str, str] = {}
-        """Ids of the last goals that came by topic, by the part of the robot that they are for."""
         self._silent: set[str] = set()
         """Topics of references that are silent: no state waits for them."""
         self._missed_since: dict[str, int] = {}
@@ -92,11 +90,6 @@ class ControllerCommander(Commander):
 
     def _make_status(self, state: str, message: str, goal_id: str) -> ControllerStatus:
         return ControllerStatus(ControllerState(state), message, goal_id)
-
-    def _follow_goal(self, goal_id: str) -> None:
-        # Goals of base and end-effector are pursued together, under the id of the later one: a
-        # goal is replaced by one for the same part alone.
-        pass
 
     def activate(self) -> None:
         """Answer states from now on, each with the references that have a publisher."""
@@ -276,10 +269,7 @@ class ControllerCommander(Commander):
 
     def _stop_executive(self, why: str) -> None:
         assert self.executive is not None
-        unfinished = self.executive.unfinished_goals
         self.executive.reset()
-        for goal_id in sorted(unfinished.intersection(self._ids_by_key.values())):
-            self._report_aborted(goal_id, why)
 
     def _resume_goals(self, saved: Mapping[str, IdentifiedGoal]) -> None:
         if self.executive is None:
@@ -291,22 +281,14 @@ class ControllerCommander(Commander):
 
     def _submit_goal(self, key: str, goal: IdentifiedGoal) -> None:
         assert self.executive is not None
-        pursued = self.executive.unfinished_goals
         try:
             self.executive.submit(key, goal)
-            self._report_replaced(key, goal, pursued)
         except PlanningError as error:
             if self._leaves_to_planner(key, goal):
+                self._fly_to.leave(goal.goal_id)
                 self.host.log("info", f"The goal is left to the planner. {error}")
             else:
                 self._refuse_goal(str(error), goal.goal_id)
-
-    def _report_replaced(self, key: str, goal: IdentifiedGoal, pursued: Collection[str]) -> None:
-        """Report the end of a goal by topic that a later one for the same part replaces."""
-        earlier = self._ids_by_key.get(key, "")
-        self._ids_by_key[key] = goal.goal_id if goal.resumes else ""
-        if earlier in pursued and earlier not in self._ids_by_key.values():
-            self._report_aborted(earlier, f"Aborted: replaced by goal {goal.goal_id}.")
 
     def _leaves_to_planner(self, key: str, goal: IdentifiedGoal) -> bool:
         """Whether a goal that was sent to all commanders is for the planner whose reference the law

@@ -243,6 +243,10 @@ class FlyToGoals:
         self._accepted = [each for each in self._accepted if each in self._served]
         self._accepted.append(goal_id)
 
+    def leave(self, goal_id: str) -> None:
+        """Follow a goal by topic no more: another commander pursues it."""
+        self._served.pop(goal_id, None)
+
     def request_abort(self, goal_id: str, why: str = "on request") -> None:
         """Request that a goal is aborted; :meth:`abort_reason` then returns the reason."""
         served = self._served.get(goal_id)

@@ -209,14 +209,6 @@ class PlannerCommander(Commander):
             "coordinated_control."
         )
 
-    def _active_goal_ids(self) -> set[str]:
-        pursued = super()._active_goal_ids()
-        if self.executive is not None:
-            # A status that waits for its publication tells the end of its own goal.
-            outputs = self.executive.outputs
-            pursued |= {each.goal_id for each in outputs if isinstance(each, PlannerStatus)}
-        return pursued
-
     def _stop_executive(self, why: str) -> None:
         assert self.executive is not None
         if self.trajectories is None:

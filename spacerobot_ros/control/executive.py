@@ -115,7 +115,10 @@ class ControlExecutive:
         self._pending: dict[str, IdentifiedGoal] = {}
         """Accepted goals that wait for the next measured state."""
         self._goal_state = self._reported_state = ControllerState.HOLDING
+        self._goals: dict[str, IdentifiedGoal] = {}
+        """Goals that are pursued together, by part of the robot."""
         self._goal_id = ""
+        """Id of the latest of them, which statuses have."""
         self._monitor, self._stall = GoalMonitor(), StallMonitor()
         self._was_measured = False
         self.servicing.end()
@@ -164,8 +167,8 @@ class ControlExecutive:
     def unfinished_goals(self) -> frozenset[str]:
         """Ids of the goals that are pursued or wait, also those whose abort is not reported yet."""
         present = self._next is _Next.ABORT or self._goal_state is ControllerState.TRACKING
-        waiting = frozenset(goal.goal_id for goal in self._pending.values())
-        return waiting | {self._goal_id} if present else waiting
+        goals = {**self._goals, **self._pending} if present else self._pending
+        return frozenset(goal.goal_id for goal in goals.values())
 
     def progress(self, goal_id: str) -> tuple[str, float | None]:
         """Return the work that is done for a goal, and the predicted time until its end, s."""
@@ -339,6 +342,7 @@ class ControlExecutive:
         pursued = self._pending or self._goal_state is ControllerState.TRACKING
         # A decided goal stays decided: an abort without an undecided goal has no goal id.
         self._goal_id = self._latest_id() if pursued else ""
+        self._goals = {**self._goals, **self._pending} if pursued else {}
         self._requested = None
         if self.servicing.task is not None:
             self.servicing.end()
@@ -348,6 +352,7 @@ class ControlExecutive:
 
     def _report_abort(self) -> None:
         self._goal_state = self._reported_state = ControllerState.ABORTED
+        self._end_goals(EventKind.GOAL_ABORTED, self._goal_state, self._abort_message)
         self._publish(ControllerState.ABORTED, self._abort_message)
         self._report_decision(EventKind.GOAL_ABORTED, self._abort_message, ControllerState.ABORTED)
 
@@ -452,7 +457,16 @@ class ControlExecutive:
         decision = monitor.decide_by_errors(time, at_rest, ends, controller.errors(), config)
         if decision != _NO_DECISION:
             self._goal_state, kind = _STATE_AND_EVENT_OF_DECISION[Decision(int(decision))]
-            self._report_decision(kind, self._message(self._goal_state), self._goal_state)
+            message = self._message(self._goal_state)
+            self._end_goals(kind, self._goal_state, message)
+            self._report_decision(kind, message, self._goal_state)
+
+    def _end_goals(self, kind: EventKind, state: ControllerState, message: str) -> None:
+        """Report the end of all goals but the latest, whose status goes on."""
+        for goal_id in sorted({goal.goal_id for goal in self._goals.values()} - {self._goal_id}):
+            self._publish(state, message, goal_id)
+            self._report_decision(kind, message, state, goal_id)
+        self._goals = {}
 
     # -- control that is lost -----------------------------------------------------------------
 
@@ -533,7 +547,7 @@ class ControlExecutive:
 
     def _begin_tasks(self, time: float, tasks: tuple[Task, ...]) -> None:
         self.servicing.begin(tasks)
-        self._goal_id = self._latest_id() if self._pending else ""
+        self._goals, self._goal_id = {}, self._latest_id() if self._pending else ""
         if self._pending:
             self._report_acceptance()
         self._goal_state = ControllerState.TRACKING
@@ -549,6 +563,7 @@ class ControlExecutive:
         self._goal_id = goal_id
         self.controller.hold_here(time, state)
         if progress.state is TaskState.REFUSED:
+            self._end_goals(EventKind.GOAL_REFUSED, ControllerState.REFUSED, progress.message)
             self._goal_state, self._goal_id = ControllerState.HOLDING, ""
             self.refuse(progress.message, goal_id)
         else:
@@ -557,6 +572,8 @@ class ControlExecutive:
     def _begin_goals(self, time: float, state: ControlState, *, carried: bool = False) -> None:
         """Start towards the pending goals, after tasks from the measured pose."""
         self._goal_id = self._latest_id()
+        pursued = self._goals if self._goal_state is ControllerState.TRACKING else {}
+        self._goals = {**pursued, **self._pending}
         self._after_tasks = dict(self._pending) if carried else {}
         goals = {key: pending.goal for key, pending in self._pending.items()}
         self._resumes = all(pending.resumes for pending in self._pending.values())

@@ -41,6 +41,7 @@ from spacerobot_ros.control.executive import ControlExecutive
 from spacerobot_ros.control.reference import HeldVelocityReference
 from spacerobot_ros.control.status import CommandReport, ControllerState, ControllerStatus
 from spacerobot_ros.errors import ParameterError, PlanningError, SpaceRobotError
+from spacerobot_ros.events import EventKind
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.parameters import configured
 from spacerobot_ros.planning import Goal
@@ -114,6 +115,27 @@ def test_a_base_without_a_goal_of_the_hand_carries_it() -> None:
     hand = loop.executive.controller.goal.end_effector
     assert hand is not None
     np.testing.assert_allclose(hand.position, TIP, atol=1e-12)
+
+
+@pytest.mark.parametrize("end", ["reached", "failed", "aborted"])
+def test_goals_of_base_and_hand_end_together_and_each_once(end: str) -> None:
+    loop = ExecutiveLoop(settle_time=0.02, time_limit=0.2)
+    loop.aim(base=goal_at(AIM, "a"))
+    loop.answer(2)
+    loop.aim(end_effector=goal_at(TIP + AIM, "b"))
+    loop.answer(2)
+    assert loop.executive.unfinished_goals == {"a", "b"}
+    if end == "reached":
+        loop.place = AIM
+    if end == "aborted":
+        loop.executive.abort()
+    loop.answer(30)
+    ended = [each for each in loop.events if each.kind is EventKind(f"goal_{end}")]
+    assert [each.goal_id for each in ended] == ["a", "b"]
+    decided = [each.goal_id for each in loop.statuses if each.state.value == end]
+    assert decided[:2] == ["a", "b"]
+    assert "a" not in decided[1:]
+    assert not loop.executive.unfinished_goals
 
 
 def test_of_goals_between_two_states_the_latest_counts_whichever_it_is_for() -> None:
