@@ -100,22 +100,38 @@ class ControllerCommander(Commander):
         self._waited.clear()
         super().activate()
 
-    def dump_momentum(self) -> tuple[bool, str]:
-        """Dump the momentum of the reaction wheels; return whether it is done, and a sentence."""
-        if self.executive is None or not self.active:
-            return False, "The controller is not active, or has no robot yet."
-        return self.executive.dump_momentum()
+    def dump_momentum(self) -> str:
+        """Dump the momentum of the reaction wheels; return a sentence.
 
-    def request(self, task: Task) -> tuple[bool, str]:
-        """Do a task without a goal after it; return whether it is accepted, and a sentence."""
-        if self.executive is None or not self.active:
-            return False, "The controller is not active, or has no robot yet."
+        Raises
+        ------
+        CommandError
+            It is not dumped; the message says why.
+        """
+        return self._active_executive().dump_momentum()
+
+    def request(self, task: Task) -> str:
+        """Do a task without a goal after it; return a sentence.
+
+        Raises
+        ------
+        CommandError
+            It is refused; the message says why.
+        """
+        executive = self._active_executive()
         if self.plant.refusal_of_goals:
-            return False, self.plant.refusal_of_goals
+            raise CommandError(self.plant.refusal_of_goals)
         if task is Task.APPROACH and self._target is None:
-            return False, "There is no target to approach: none is on 'target/robot_description'."
-        self.executive.request(task)
-        return True, f"The task '{task.value}' begins; controller/status tells its course."
+            raise CommandError(
+                "There is no target to approach: none is on 'target/robot_description'."
+            )
+        executive.request(task)
+        return f"The task '{task.value}' begins; controller/status tells its course."
+
+    def _active_executive(self) -> ControlExecutive:
+        if self.executive is None or not self.active:
+            raise CommandError("The controller is not active, or has no robot yet.")
+        return self.executive
 
     def use_target(self, target: RobotDescription) -> None:
         """Take the description of the target."""

@@ -19,7 +19,7 @@ from spacerobot_ros.control.servicing import Servicing, Task, TaskProgress, Task
 from spacerobot_ros.control.stall_monitor import StallMonitor
 from spacerobot_ros.control.state import Actuation, ControlState, PoseReference, Reference
 from spacerobot_ros.control.status import CommandReport, ControllerState, ControllerStatus
-from spacerobot_ros.errors import ParameterError, PlanningError
+from spacerobot_ros.errors import CommandError, ParameterError, PlanningError
 from spacerobot_ros.events import Event, EventKind
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.grasp import Payload
@@ -413,11 +413,11 @@ class ControlExecutive:
         excess = Actuation(result.excess.wrench_B, wheels.shape_with_wheels(result.excess.tau))
         return Saturated(wheels.actuation(result.realised), excess)
 
-    def dump_momentum(self) -> tuple[bool, str]:
-        """Dump the momentum of the reaction wheels; return whether it is done, and a sentence."""
+    def dump_momentum(self) -> str:
+        """Dump the momentum of the reaction wheels, and return a sentence; or CommandError."""
         if self.controller.wheels is None:
             name = self.controller.law.robot.description.name
-            return False, f"Robot '{name}' has no reaction wheels."
+            raise CommandError(f"Robot '{name}' has no reaction wheels.")
         return self.controller.wheels.request_dump()
 
     def evaluate(self, time: float, result: Saturated) -> None:

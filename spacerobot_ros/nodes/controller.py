@@ -11,7 +11,6 @@ from geometry_msgs.msg import WrenchStamped
 from nav_msgs.msg import Odometry
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
-from std_srvs.srv import Trigger
 
 from spacerobot_ros.commanding.controller import (
     BASE_REFERENCE,
@@ -74,9 +73,10 @@ class CoordinatedControlNode(CommanderNode):
         self._joint_commands = self.send_raw(JointState, "joint_commands")
         self._base_wrench = self.send_raw(WrenchStamped, "base_wrench")
         self.listen("controller/status")
-        self.create_service(Trigger, "~/dump_momentum", self._on_dump_momentum)
-        self.create_service(Trigger, "~/approach", partial(self._on_task, Task.APPROACH))
-        self.create_service(Trigger, "~/detumble", partial(self._on_task, Task.DETUMBLE))
+        commander = self.commander
+        self.offer("~/dump_momentum", commander.dump_momentum)
+        self.offer("~/approach", lambda: commander.request(Task.APPROACH))
+        self.offer("~/detumble", lambda: commander.request(Task.DETUMBLE))
         self.create_subscription(
             String, "target/robot_description", self._on_target_description, LATCHED
         )
@@ -125,16 +125,6 @@ class CoordinatedControlNode(CommanderNode):
 
     def _on_reference(self, topic: str, raw: bytes) -> None:
         self.commander.receive_reference(topic, first_time_ns(raw), raw)
-
-    def _on_dump_momentum(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        response.success, response.message = self.commander.dump_momentum()
-        return response
-
-    def _on_task(
-        self, task: Task, _: Trigger.Request, response: Trigger.Response
-    ) -> Trigger.Response:
-        response.success, response.message = self.commander.request(task)
-        return response
 
     def _on_target(self, raw: bytes) -> None:
         self.commander.receive_target(first_time_ns(raw), raw)

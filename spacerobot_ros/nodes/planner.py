@@ -12,7 +12,6 @@ from geometry_msgs.msg import PoseStamped, TwistStamped
 from nav_msgs.msg import Path
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
-from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory
 from visualization_msgs.msg import MarkerArray
 
@@ -104,7 +103,7 @@ class PlannerNode(CommanderNode):
             self._take_paths(name)
         self.create_subscription(JointState, "goal_joint_states", self._on_goal_shape, STREAM)
         self.create_subscription(String, "obstacles", self._on_obstacles, LATCHED)
-        self.create_service(Trigger, "~/statistics", self._on_statistics)
+        self.offer("~/statistics", lambda: self.statistics.to_json())
 
     def start_message(self) -> str:
         """Return a log message with method, robot and goal topic."""
@@ -212,10 +211,6 @@ class PlannerNode(CommanderNode):
             self._shape = shape_of(message, robot.joint_names) if message.name else None
         except PlanningError as error:
             self.publish_status(PlannerStatus(PlannerState.REFUSED, str(error)))
-
-    def _on_statistics(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        response.success, response.message = True, self.statistics.to_json()
-        return response
 
     # -- outputs ------------------------------------------------------------------------------
 

@@ -18,7 +18,6 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
-from std_srvs.srv import Trigger
 
 from spacerobot_ros.commanding.commander import Commander, LogLevel
 from spacerobot_ros.commanding.goal_follower import Status
@@ -113,7 +112,7 @@ class CommanderNode(FlightNode):
             self._process_waiting_messages,
             clock=Clock(clock_type=ClockType.STEADY_TIME),
         )
-        self.create_service(Trigger, "~/abort", self._on_abort)
+        self.offer("~/abort", self._abort)
         self._description, self._decoder = "", None
         robot = robot_of(config)
         if robot is None:
@@ -279,11 +278,11 @@ class CommanderNode(FlightNode):
                 own = robot_frames(robot.description, state)
         return self._known_frames.pose(frame, self.config.world_frame, own)
 
-    def _on_abort(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+    def _abort(self) -> str:
         answer = self.commander.abort()
-        response.success = answer is not None
-        response.message = answer or "There is no goal to abort."
-        return response
+        if answer is None:
+            raise CommandError("There is no goal to abort.")
+        return answer
 
     def _subscribe_plant_status(self) -> None:
         """Subscribe anew to plant/status, whose present publishers first send their last status."""

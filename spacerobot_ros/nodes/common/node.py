@@ -26,7 +26,13 @@ from rclpy.subscription import Subscription
 from rclpy.timer import Timer
 from std_srvs.srv import Trigger
 
-from spacerobot_ros.errors import ParameterError, SpaceRobotError, describe_exception, printable
+from spacerobot_ros.errors import (
+    CommandError,
+    ParameterError,
+    SpaceRobotError,
+    describe_exception,
+    printable,
+)
 from spacerobot_ros.events import Event, EventKind
 from spacerobot_ros.messages.statuses import StatusRecord
 from spacerobot_ros.model import SpaceRobot
@@ -113,7 +119,8 @@ class FlightNode(LifecycleNode):
             fix(self, [AUTOSTART], fixed=True)
             self.config = configured(self.Config, values)
             self.add_on_set_parameters_callback(self._on_set_parameters)
-            self.create_service(Trigger, "~/connections", self._on_connections)
+            # A supervisor starts time once all nodes have met.
+            self.offer("~/connections", lambda: MatchedEndpoints.of(self).to_json())
             self.prepare()
             self._permanent = set(self._entities())
             if values[AUTOSTART.name] if autostart is None else autostart:
@@ -206,6 +213,21 @@ class FlightNode(LifecycleNode):
                 return response
 
         return super().create_service(srv_type, srv_name, answer, *args, **kwargs)
+
+    def offer(self, name: str, act: Callable[[], str]) -> None:
+        """Create a service without arguments that answers with the message of a function.
+
+        The answer to a CommandError is its message, without success.
+        """
+
+        def answer(_: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+            try:
+                response.success, response.message = True, act()
+            except CommandError as refusal:
+                response.success, response.message = False, str(refusal)
+            return response
+
+        self.create_service(Trigger, name, answer)
 
     def guarded(self, callback: Callable[..., Any], what: str) -> Callable[..., None]:
         """Return a callback whose exceptions end in :meth:`on_failure`."""
@@ -404,11 +426,6 @@ class FlightNode(LifecycleNode):
             with suppress(Exception):
                 self.on_failure(self._failure, self.fault)
         return TransitionCallbackReturn.SUCCESS
-
-    def _on_connections(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        """Return the node's connections; a supervisor starts time once all nodes have met."""
-        response.success, response.message = True, MatchedEndpoints.of(self).to_json()
-        return response
 
     def _run(self, hook: Callable[[], None]) -> TransitionCallbackReturn:
         try:
