@@ -111,6 +111,10 @@ class GoalExecutive(Protocol):
     def unfinished_goals(self) -> frozenset[str]:
         """Ids of the goals that are pursued or wait."""
 
+    @property
+    def waiting_goals(self) -> frozenset[str]:
+        """Ids of the goals that wait to be pursued, such as for their plan."""
+
     def progress(self, goal_id: str) -> tuple[str, float | None]:
         """Return the work that is done for a goal, and the predicted time until its end, s.
 
@@ -518,7 +522,10 @@ class Commander(ABC):
 
     def _abort_fly_to(self) -> None:
         """Give up all goals where the client of one, or its time limit, asks for it."""
-        why = self._fly_to.abort_reason(self._active_goal_ids())
+        waiting = {goal.goal_id for goal in self._waiting_goals.values()}
+        if self.executive is not None:
+            waiting |= self.executive.waiting_goals
+        why = self._fly_to.abort_reason(waiting)
         if why:
             self.abort(why)
 

@@ -253,14 +253,15 @@ class FlyToGoals:
         if served is not None:
             served.give_up = served.give_up or why
 
-    def abort_reason(self, pursued: Collection[str]) -> str:
+    def abort_reason(self, waiting: Collection[str]) -> str:
         """Return the reason to abort all goals now; empty: they are not.
 
         An abort gives up every goal. So one that is about to be replaced waits until it is
-        replaced, or until the goal that came later is refused.
+        replaced, or until the goal that came later is refused: while another one is among the ids
+        of the goals that are ``waiting``.
         """
         for goal_id, served in self._served.items():
-            alone = self._accepted[-1:] == [goal_id] or set(pursued) <= {goal_id}
+            alone = self._accepted[-1:] == [goal_id] or set(waiting) <= {goal_id}
             if served.give_up and not served.aborted and alone:
                 served.aborted = True
                 return served.give_up

@@ -167,8 +167,13 @@ class ControlExecutive:
     def unfinished_goals(self) -> frozenset[str]:
         """Ids of the goals that are pursued or wait, also those whose abort is not reported yet."""
         present = self._next is _Next.ABORT or self._goal_state is ControllerState.TRACKING
-        goals = {**self._goals, **self._pending} if present else self._pending
-        return frozenset(goal.goal_id for goal in goals.values())
+        pursued = self._goals.values() if present else ()
+        return self.waiting_goals.union(goal.goal_id for goal in pursued)
+
+    @property
+    def waiting_goals(self) -> frozenset[str]:
+        """Ids of the goals that begin at the next measured state, or after tasks."""
+        return frozenset(goal.goal_id for goal in self._pending.values())
 
     def progress(self, goal_id: str) -> tuple[str, float | None]:
         """Return the work that is done for a goal, and the predicted time until its end, s."""

@@ -315,7 +315,13 @@ class Executive:
     @property
     def unfinished_goals(self) -> frozenset[str]:
         """Ids of the goals that are pursued, planned for, or wait to be."""
-        goals = (self._new_goal, self._planned_goal(), self._pursued_goal())
+        pursued = self._pursued_goal()
+        return self.waiting_goals | ({pursued.goal_id} if pursued is not None else set())
+
+    @property
+    def waiting_goals(self) -> frozenset[str]:
+        """Ids of the goals that are planned for, or wait to be; also a goal that is replanned."""
+        goals = (self._new_goal, self._planned_goal())
         return frozenset(goal.goal_id for goal in goals if goal is not None)
 
     def progress(self, goal_id: str) -> tuple[str, float | None]:
