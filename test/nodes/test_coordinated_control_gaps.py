@@ -63,19 +63,6 @@ def test_without_odom_the_base_is_estimated_and_then_the_thrusters_are_off(
     np.testing.assert_allclose(wrench[:3], [KP, 0.0, 0.0], atol=1e-12)
 
 
-def test_without_odom_from_the_beginning_nothing_is_thrust(harness: Harness) -> None:
-    loop = Loop(harness)
-    loop.aim(base=pose([1.0, 0.0, 0.0]))
-    loop.show(odom=False)
-    harness.settle(loop.probe)
-    for _ in range(3):
-        np.testing.assert_array_equal(loop.answer(odom=False)[0], np.zeros(6))
-    assert loop.wait_for("waiting").level == DiagnosticStatus.OK
-    loop.show(odom=True)
-    loop.wait_for("tracking")
-    np.testing.assert_allclose(loop.answer()[0][:3], [2 * KP, 0.0, 0.0], atol=1e-12)
-
-
 def test_a_pose_that_was_never_met_is_not_lost(harness: Harness) -> None:
     node = harness.make(
         CoordinatedControlNode, {"robot": "planar_manipulator", "tick_rate": 100.0}, name="control"

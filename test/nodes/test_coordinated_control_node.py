@@ -118,20 +118,6 @@ def test_the_status_carries_the_stamp_of_the_goal_as_its_id(harness: Harness) ->
         assert (loop.status["state"], loop.status["goal_id"]) == ("reached", f"unstamped-{n}")
 
 
-def test_a_goal_is_reached_when_it_is_held_for_the_settling_time(harness: Harness) -> None:
-    loop = Loop(harness, settle_time=0.03, time_limit=1.0)
-    loop.aim(base=pose([0.5, 0.0, 0.0]), end_effector=pose(TIP + np.array([0.5, 0.0, 0.0])))
-    loop.answer()
-    loop.wait_for("tracking")
-    loop.place = np.array([0.5, 0.0, 0.0])
-    for _ in range(3):
-        loop.answer()
-        harness.settle(loop.probe)
-        assert loop.status["state"] == "tracking"
-    loop.answer()
-    assert_one_sentence(loop.wait_for("reached").message, "is reached")
-
-
 # -- gains ------------------------------------------------------------------------------------
 
 
