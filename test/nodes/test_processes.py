@@ -112,8 +112,8 @@ def test_a_parameter_that_a_node_does_not_have_is_named_with_the_nearest(
         robot = {} if node != "plant" else {"robot": "sliding_masses"}
         processes.append((start(node, robot, arguments=words), given, meant))
     for process, given, meant in processes:
-        active = partial(lambda process: "[INFO]" in process.said, process)
-        harness.spin_until(active, "the node is active", timeout=START)
+        warned = partial(lambda process: "[WARN]" in process.said, process)
+        harness.spin_until(warned, "a warning", timeout=START)
         (warning,) = (line for line in process.said.splitlines() if line.startswith("[WARN]"))
         assert_one_sentence(warning.partition("]: ")[2], f"'{given}'", f"'{meant}'", "'fuel'")
 
