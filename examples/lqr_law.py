@@ -54,8 +54,8 @@ class LqrLaw(NumpyLaw):
         self._K = np.linalg.solve(R, B.T @ solve_continuous_are(A, B, Q, R))
         self._M = M
 
-    def actuation(self, state: ControlState, reference: Reference) -> Actuation:
-        """Return the command; see :meth:`NumpyLaw.actuation`."""
+    def compute(self, state: ControlState, reference: Reference) -> Actuation:
+        """Return the command; see :meth:`NumpyLaw.compute`."""
         base, joints = reference.base, reference.joints
         assert base is not None
         assert joints is not None

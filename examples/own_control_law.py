@@ -31,7 +31,8 @@ class SoftLaw(ControlLaw):
     gain_units = ("N/m or N m/rad", "N s/m or N m s/rad")
     Options = SoftOptions
 
-    def _results(self, symbols: dict[str, ca.SX]) -> dict[str, ca.SX]:
+    def results(self, symbols: dict[str, ca.SX]) -> dict[str, ca.SX]:
+        """Return the command's expressions; see :meth:`ControlLaw.results`."""
         z1, d = self.outputs, self.options.reach
         pull = symbols["kp"] * d * ca.tanh(z1.error / d) + symbols["kd"] * z1.error_rate
         return {"actuation": (z1.J_z @ z1.J_q_inverse).T @ pull}

@@ -35,7 +35,7 @@ class StowGait(GaitMethod):
 
     def plan(self, request: PlanRequest, cancellation: Cancellation = NEVER) -> GaitSchedule:
         """Return the schedule; see :meth:`GaitMethod.plan`."""
-        end = self._goal_shape(request.goal)
+        end = self.goal_shape(request.goal)
         if end is None:
             raise PlanningError("stow needs a goal with joint positions.")
         ticks = round(self.options.duration / self.control_period)
@@ -44,7 +44,7 @@ class StowGait(GaitMethod):
         positions = request.state.q + way * (end - request.state.q)
         prediction = BasePrediction(self.robot, self.control_period, self.integration_step)
         path = prediction.path(request.state, positions)
-        return self._schedule_of(request.goal, positions, path, {})
+        return self.schedule_of(request.goal, positions, path, {})
 
 
 def main() -> None:

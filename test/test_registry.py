@@ -138,7 +138,7 @@ class _Clash(TransposedJacobianLaw):
 @pytest.mark.parametrize(
     ("entry", "sentence"),
     [
-        (_Plain, "The control law '_Plain' lacks actuation."),
+        (_Plain, "The control law '_Plain' lacks compute."),
         (_Unnamed, "needs a name of letters, digits and underscores"),
         (_Clash, "has the name of the package's own 'transposed_jacobian'"),
         (METHODS["optimal"], "'OptimalGait' is no class derived from ControlLaw."),

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import time
 from abc import ABC, abstractmethod
+from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from enum import Enum
@@ -31,7 +32,6 @@ from spacerobot_ros.commanding.plant_state import (
     StateSynchroniser,
 )
 from spacerobot_ros.control.config import ControllerConfig
-from spacerobot_ros.control.executive import ControlExecutive
 from spacerobot_ros.errors import CommandError, PlanningError, RobotDescriptionError
 from spacerobot_ros.events import Event
 from spacerobot_ros.model import SpaceRobot
@@ -41,12 +41,12 @@ from spacerobot_ros.model.shared_parameters import DEFAULT_POSITION_TOLERANCE
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.core.goal import Tolerance
 from spacerobot_ros.planning.execution.config import PlannerConfig
-from spacerobot_ros.planning.execution.executive import Executive
 from spacerobot_ros.planning.execution.goal_file import (
     BASE_GOAL_KEY,
     GoalFile,
     GoalIds,
     IdentifiedGoal,
+    PursuedGoals,
 )
 from spacerobot_ros.planning.execution.status import ScheduleStart
 from spacerobot_ros.simulation.status import PlantState, PlantStatus
@@ -99,6 +99,60 @@ class CommanderHost(Protocol):
 
     def waiting_states(self) -> tuple[Sequence[Stamped], Sequence[Stamped]]:
         """Return received odoms and joints that the commander does not have yet."""
+
+
+class GoalExecutive(Protocol):
+    """What executives have in common: goals, and what a plant does to them."""
+
+    outputs: deque[Any]
+    """Statuses, events and the like to publish, in order; the commander removes them."""
+
+    @property
+    def unfinished_goals(self) -> frozenset[str]:
+        """Ids of the goals that are pursued or wait."""
+
+    @property
+    def waiting_goals(self) -> frozenset[str]:
+        """Ids of the goals that wait to be pursued, such as for their plan."""
+
+    def progress(self, goal_id: str) -> tuple[str, float | None]:
+        """Return the work that is done for a goal, and the predicted time until its end, s.
+
+        None: there is no prediction.
+        """
+
+    def configure(self, config: Any) -> None:
+        """Use the live parameters of another configuration from the next state on."""
+
+    def abort(self, why: str) -> str | None:
+        """Give up all goals; return a message about the robot, None without a goal."""
+
+    def plant_stopped(
+        self, why: str, commanded_until_ns: int | None = None, rests_since_ns: int = 0
+    ) -> bool:
+        """Give up every goal at once, because the plant ignores commands from now on.
+
+        Parameters
+        ----------
+        why
+            The message of the plant; it becomes part of the status.
+        commanded_until_ns
+            For a plant that rests because commands did not come: the stamp of the last one that it
+            received. Goals that were begun later go on. None: the plant obeys nothing.
+        rests_since_ns
+            Stamp since which it rests then, ns.
+
+        Returns
+        -------
+        bool
+            Whether a goal was given up.
+        """
+
+    def on_plant_obeying(self) -> None:
+        """React to a plant that obeys again."""
+
+    def plant_reset(self) -> None:
+        """Begin the present goal anew: the robot is in another state than before."""
 
 
 class StateDecoder(Protocol):
@@ -198,7 +252,7 @@ class Commander(ABC):
         Returns the wall time, s.
     """
 
-    executive: Executive | ControlExecutive | None = None
+    executive: GoalExecutive | None = None
 
     def __init__(
         self,
@@ -348,7 +402,7 @@ class Commander(ABC):
             self._refuse_goal(str(error), goal_id)
             return None
         accepted = IdentifiedGoal(goal, goal_id)
-        self._follow_goal(goal_id)
+        self._fly_to.begin(goal_id)
         self._accept_goal(key, accepted)
         return accepted
 
@@ -397,7 +451,10 @@ class Commander(ABC):
             message = f"Aborted {why}, before the robot was known."
             self._abort_waiting(message)
             return message
-        answer = self._abort_goal(why) if self.active else None
+        answer = None
+        if self.active and self.executive is not None:
+            answer = self.executive.abort(why)
+            self._forward_outputs()
         self._goal_file.delete()
         return answer
 
@@ -419,17 +476,12 @@ class Commander(ABC):
             self._submit_goal(key, goal)
         self._fly_to.end_dropped_goals(self._active_goal_ids())
 
-    def _follow_goal(self, goal_id: str) -> None:
-        """Report the end of a goal that came by topic, whatever ends it."""
-        self._fly_to.begin(goal_id)
-
     def _refuse_goal(self, message: str, goal_id: str) -> None:
         self._publish_decision(self._make_status("refused", message, goal_id))
 
     def _abort_waiting(self, message: str) -> None:
         *_, goal = self._waiting_goals.values()
         self._waiting_goals = {}
-        self._goal_file.delete()
         self._publish_decision(self._make_status("aborted", message, goal.goal_id))
 
     def _publish_decision(self, status: Status) -> None:
@@ -445,6 +497,8 @@ class Commander(ABC):
         self.host.publish_status(status)
         if status.state.value != "waiting":
             self._last_status = status
+        if status.state.decided:
+            self._goal_file.end(status.goal_id, refused=status.state.value == "refused")
         self._fly_to.update(status)
         if status.state.decided and self.config.stop_when_decided and self.active:
             self.activity = CommanderActivity.DECIDED
@@ -455,6 +509,9 @@ class Commander(ABC):
         pursued = {goal.goal_id for goal in self._waiting_goals.values()}
         if self.active and self.executive is not None:
             pursued |= self.executive.unfinished_goals
+            # A status that waits for its publication tells the end of its own goal.
+            outputs = self.executive.outputs
+            pursued |= {each.goal_id for each in outputs if isinstance(each, Status)}
         return pursued
 
     def _watch_fly_to(self) -> None:
@@ -465,7 +522,10 @@ class Commander(ABC):
 
     def _abort_fly_to(self) -> None:
         """Give up all goals where the client of one, or its time limit, asks for it."""
-        why = self._fly_to.abort_reason(self._active_goal_ids())
+        waiting = {goal.goal_id for goal in self._waiting_goals.values()}
+        if self.executive is not None:
+            waiting |= self.executive.waiting_goals
+        why = self._fly_to.abort_reason(waiting)
         if why:
             self.abort(why)
 
@@ -671,8 +731,11 @@ class Commander(ABC):
                 continue
             if change is PlantChange.RESET:
                 self.states.forget_pose()
-            if self.executive is not None:
-                self._react_to_change(change)
+                if self.executive is not None:
+                    self.executive.plant_reset()
+            elif self.executive is not None:
+                self.executive.on_plant_obeying()
+        self._forward_outputs()
         self._forward_plant_state()
         if self._actuation_refusal:
             self._log_fault("actuation", self._actuation_refusal)
@@ -699,6 +762,8 @@ class Commander(ABC):
         self._give_up_goals(PlantStopped(message))
 
     def _give_up_goals(self, stopped: PlantStopped) -> None:
+        if stopped.commanded_until_ns is None:
+            self._goal_file.delete()
         if self.executive is not None:
             self.executive.plant_stopped(
                 stopped.reason, stopped.commanded_until_ns, stopped.rests_since_ns
@@ -724,7 +789,8 @@ class Commander(ABC):
     def reconfigure(self, config: Any) -> None:
         """Use the live parameters of another configuration from now on."""
         self._given, self.config = config, self._adapted(config)
-        self._configure_executive()
+        if self.executive is not None:
+            self.executive.configure(self.config)
 
     def _adapted(self, config: Any) -> Any:
         config = replace(config, tick_rate=self.config.tick_rate)
@@ -733,10 +799,6 @@ class Commander(ABC):
     @property
     def _knows_rate(self) -> bool:
         return self.config.tick_rate > 0
-
-    @abstractmethod
-    def _configure_executive(self) -> None:
-        """Have the executive use the live parameters of the present configuration."""
 
     @abstractmethod
     def _change_rate(self, robot: SpaceRobot) -> None:
@@ -778,16 +840,8 @@ class Commander(ABC):
         """Give a goal to the executive."""
 
     @abstractmethod
-    def _abort_goal(self, why: str) -> str | None:
-        """Abort the executive's goals for a reason; return the robot's reaction as a message."""
-
-    @abstractmethod
     def answer(self) -> None:
         """Answer the ready state, if any, while the commander is active."""
-
-    @abstractmethod
-    def _react_to_change(self, change: PlantChange) -> None:
-        """Have the executive react to a change."""
 
     @abstractmethod
     def _forward_plant_state(self) -> None:
@@ -800,8 +854,21 @@ class Commander(ABC):
     def _report_waiting_goal(self, goal: IdentifiedGoal, message: str) -> None:  # noqa: B027
         """Report that a goal waits, by a status with a message."""
 
-    def _forward_outputs(self) -> None:  # noqa: B027
-        """Pass the collected outputs of the executive to the host."""
+    def _forward_outputs(self) -> None:
+        """Publish the outputs that the executive has collected, and keep its goals on file."""
+        while self.executive is not None and self.executive.outputs:
+            match self.executive.outputs.popleft():
+                case Event() as event:
+                    self.host.report_event(event)
+                case PursuedGoals() as pursued:
+                    if problem := self._goal_file.pursue(pursued):
+                        self.host.log("error", problem)
+                case output:
+                    self._forward(output)
+
+    @abstractmethod
+    def _forward(self, output: Any) -> None:
+        """Publish a status, or another output that this executive alone has."""
 
 
 def _quoted(topics: Iterable[str]) -> str:

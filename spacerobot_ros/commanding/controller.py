@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import replace
 from operator import is_not
@@ -17,7 +17,7 @@ from spacerobot_ros.commanding.commander import (
     StateDecoder,
 )
 from spacerobot_ros.commanding.goal_follower import Status
-from spacerobot_ros.commanding.plant_state import Pairing, PlantChange, Stamped
+from spacerobot_ros.commanding.plant_state import Pairing, Stamped
 from spacerobot_ros.control import ControlState, NotFiniteError, PoseReference, Reference
 from spacerobot_ros.control.config import ControllerConfig
 from spacerobot_ros.control.controller import build_controller
@@ -69,8 +69,6 @@ class ControllerCommander(Commander):
     ) -> None:
         super().__init__(config, host, GOAL_KEYS, pose_required=True, clock=clock)
         self._partner_is_busy = partner_is_busy
-        self._ids_by_key: dict[str, str] = {}
-        """Ids of the last goals that came by topic, by the part of the robot that they are for."""
         self._silent: set[str] = set()
         """Topics of references that are silent: no state waits for them."""
         self._missed_since: dict[str, int] = {}
@@ -90,15 +88,6 @@ class ControllerCommander(Commander):
     def _make_status(self, state: str, message: str, goal_id: str) -> ControllerStatus:
         return ControllerStatus(ControllerState(state), message, goal_id)
 
-    def _configure_executive(self) -> None:
-        if self.executive is not None:
-            self.executive.configure(self.config)
-
-    def _follow_goal(self, goal_id: str) -> None:
-        # Goals of base and end-effector are pursued together, under the id of the later one: a
-        # goal is replaced by one for the same part alone.
-        pass
-
     def activate(self) -> None:
         """Answer states from now on, each with the references that have a publisher."""
         for topic in (JOINT_REFERENCE, BASE_REFERENCE):
@@ -108,22 +97,38 @@ class ControllerCommander(Commander):
         self._waited.clear()
         super().activate()
 
-    def dump_momentum(self) -> tuple[bool, str]:
-        """Dump the momentum of the reaction wheels; return whether it is done, and a sentence."""
-        if self.executive is None or not self.active:
-            return False, "The controller is not active, or has no robot yet."
-        return self.executive.dump_momentum()
+    def dump_momentum(self) -> str:
+        """Dump the momentum of the reaction wheels; return a sentence.
 
-    def request(self, task: Task) -> tuple[bool, str]:
-        """Do a task without a goal after it; return whether it is accepted, and a sentence."""
-        if self.executive is None or not self.active:
-            return False, "The controller is not active, or has no robot yet."
+        Raises
+        ------
+        CommandError
+            It is not dumped; the message says why.
+        """
+        return self._active_executive().dump_momentum()
+
+    def request(self, task: Task) -> str:
+        """Do a task without a goal after it; return a sentence.
+
+        Raises
+        ------
+        CommandError
+            It is refused; the message says why.
+        """
+        executive = self._active_executive()
         if self.plant.refusal_of_goals:
-            return False, self.plant.refusal_of_goals
+            raise CommandError(self.plant.refusal_of_goals)
         if task is Task.APPROACH and self._target is None:
-            return False, "There is no target to approach: none is on 'target/robot_description'."
-        self.executive.request(task)
-        return True, f"The task '{task.value}' begins; controller/status tells its course."
+            raise CommandError(
+                "There is no target to approach: none is on 'target/robot_description'."
+            )
+        executive.request(task)
+        return f"The task '{task.value}' begins; controller/status tells its course."
+
+    def _active_executive(self) -> ControlExecutive:
+        if self.executive is None or not self.active:
+            raise CommandError("The controller is not active, or has no robot yet.")
+        return self.executive
 
     def use_target(self, target: RobotDescription) -> None:
         """Take the description of the target."""
@@ -229,7 +234,7 @@ class ControllerCommander(Commander):
         if robot is None:
             return
         controller = build_controller(robot, self.config)
-        executive = ControlExecutive(controller, self.config, lambda status: None)
+        executive = ControlExecutive(controller, self.config)
         q, rates = np.clip(np.zeros(robot.n), robot.lower, robot.upper), np.zeros(robot.n)
         upright = np.array([0.0, 0.0, 0.0, 1.0])
         state = ControlState.at_rest(np.zeros(3), upright, q)
@@ -242,14 +247,8 @@ class ControllerCommander(Commander):
             executive.evaluate(now, executive.command(now, measured, q, rates))
 
     def _build_executive(self, robot: SpaceRobot, decoder: StateDecoder) -> None:
-        self.executive = ControlExecutive(
-            build_controller(robot, self.config),
-            self.config,
-            self._publish_status,
-            self._goal_file,
-            lambda message: self.host.log("error", message),
-            self.host.report_event,
-        )
+        controller = build_controller(robot, self.config)
+        self.executive = ControlExecutive(controller, self.config)
         self.executive.servicing.hold(self._held)
         if self._target is not None:
             self.use_target(self._target)
@@ -283,10 +282,7 @@ class ControllerCommander(Commander):
 
     def _stop_executive(self, why: str) -> None:
         assert self.executive is not None
-        unfinished = self.executive.unfinished_goals
         self.executive.reset()
-        for goal_id in sorted(unfinished.intersection(self._ids_by_key.values())):
-            self._report_aborted(goal_id, why)
 
     def _resume_goals(self, saved: Mapping[str, IdentifiedGoal]) -> None:
         if self.executive is None:
@@ -298,22 +294,14 @@ class ControllerCommander(Commander):
 
     def _submit_goal(self, key: str, goal: IdentifiedGoal) -> None:
         assert self.executive is not None
-        pursued = self.executive.unfinished_goals
         try:
             self.executive.submit(key, goal)
-            self._report_replaced(key, goal, pursued)
         except PlanningError as error:
             if self._leaves_to_planner(key, goal):
+                self._fly_to.leave(goal.goal_id)
                 self.host.log("info", f"The goal is left to the planner. {error}")
             else:
                 self._refuse_goal(str(error), goal.goal_id)
-
-    def _report_replaced(self, key: str, goal: IdentifiedGoal, pursued: Collection[str]) -> None:
-        """Report the end of a goal by topic that a later one for the same part replaces."""
-        earlier = self._ids_by_key.get(key, "")
-        self._ids_by_key[key] = goal.goal_id if goal.resumes else ""
-        if earlier in pursued and earlier not in self._ids_by_key.values():
-            self._report_aborted(earlier, f"Aborted: replaced by goal {goal.goal_id}.")
 
     def _leaves_to_planner(self, key: str, goal: IdentifiedGoal) -> bool:
         """Whether a goal that was sent to all commanders is for the planner whose reference the law
@@ -324,24 +312,8 @@ class ControllerCommander(Commander):
         of_action = not goal.resumes
         return not (controlled or of_action) and self.host.has_publisher(JOINT_REFERENCE)
 
-    def _refuse_goal(self, message: str, goal_id: str) -> None:
-        if self.executive is None:
-            super()._refuse_goal(message, goal_id)
-        else:
-            self.executive.refuse(message, goal_id)
-
-    def _abort_goal(self, why: str) -> str | None:
-        if self.executive is None:
-            return None
-        self.executive.abort(why)
-        return "The robot holds where it is."
-
-    def _react_to_change(self, change: PlantChange) -> None:
-        assert self.executive is not None
-        if change is PlantChange.RESET:
-            self.executive.plant_reset()
-        else:
-            self.executive.on_plant_obeying()
+    def _forward(self, output: Any) -> None:
+        self._publish_status(output)
 
     def _forward_plant_state(self) -> None:
         if self.executive is not None:
@@ -379,6 +351,7 @@ class ControllerCommander(Commander):
             now = stamp / SECOND
             self._read_target(decoder)
             result = executive.command(now, measured, q, qdot, self._reference(decoder))
+            self._forward_outputs()
         except (CommandError, NotFiniteError) as error:
             self._log_fault("state", f"The state is refused: {error}")
             return
@@ -386,6 +359,7 @@ class ControllerCommander(Commander):
         if send:
             self.host.send_command(stamp)
         executive.evaluate(now, result)
+        self._forward_outputs()
 
     def _measured_state(self, *arrays: Array) -> ControlState:
         """Return the state of a pose (7,), a twist (6,), q and qdot (n,)."""

@@ -243,20 +243,25 @@ class FlyToGoals:
         self._accepted = [each for each in self._accepted if each in self._served]
         self._accepted.append(goal_id)
 
+    def leave(self, goal_id: str) -> None:
+        """Follow a goal by topic no more: another commander pursues it."""
+        self._served.pop(goal_id, None)
+
     def request_abort(self, goal_id: str, why: str = "on request") -> None:
         """Request that a goal is aborted; :meth:`abort_reason` then returns the reason."""
         served = self._served.get(goal_id)
         if served is not None:
             served.give_up = served.give_up or why
 
-    def abort_reason(self, pursued: Collection[str]) -> str:
+    def abort_reason(self, waiting: Collection[str]) -> str:
         """Return the reason to abort all goals now; empty: they are not.
 
         An abort gives up every goal. So one that is about to be replaced waits until it is
-        replaced, or until the goal that came later is refused.
+        replaced, or until the goal that came later is refused: while another one is among the ids
+        of the goals that are ``waiting``.
         """
         for goal_id, served in self._served.items():
-            alone = self._accepted[-1:] == [goal_id] or set(pursued) <= {goal_id}
+            alone = self._accepted[-1:] == [goal_id] or set(waiting) <= {goal_id}
             if served.give_up and not served.aborted and alone:
                 served.aborted = True
                 return served.give_up

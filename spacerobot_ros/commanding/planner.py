@@ -13,7 +13,7 @@ from spacerobot_ros.commanding.commander import (
     CommanderHost,
     StateDecoder,
 )
-from spacerobot_ros.commanding.plant_state import Pairing, PlantChange
+from spacerobot_ros.commanding.plant_state import Pairing
 from spacerobot_ros.commanding.trajectory_output import TrajectoryEnd, TrajectoryOutput
 from spacerobot_ros.errors import (
     CommandError,
@@ -133,10 +133,6 @@ class PlannerCommander(Commander):
             return adapted
         return replace(adapted, plan_in_background=False)
 
-    def _configure_executive(self) -> None:
-        if self.executive is not None:
-            self.executive.config = self.config
-
     def interrupt(self) -> None:
         """Cancel the requested plan; any thread may call this."""
         if self.executive is not None:
@@ -144,7 +140,7 @@ class PlannerCommander(Commander):
 
     def _build_executive(self, robot: SpaceRobot, decoder: StateDecoder) -> None:
         worker = self._make_worker(robot, self._method)
-        self.executive = Executive(robot, self.config, worker, self._goal_file)
+        self.executive = Executive(robot, self.config, worker)
         self._measured = _MeasuredState(decoder)
 
     def _make_worker(self, robot: SpaceRobot, method: GaitMethod | None) -> PlanningWorker:
@@ -212,14 +208,6 @@ class PlannerCommander(Commander):
             "actuation:=velocity, or the planner with output:=reference beside a "
             "coordinated_control."
         )
-
-    def _active_goal_ids(self) -> set[str]:
-        pursued = super()._active_goal_ids()
-        if self.executive is not None:
-            # A status that waits for its publication tells the end of its own goal.
-            outputs = self.executive.outputs
-            pursued |= {each.goal_id for each in outputs if isinstance(each, PlannerStatus)}
-        return pursued
 
     def _stop_executive(self, why: str) -> None:
         assert self.executive is not None
@@ -292,19 +280,6 @@ class PlannerCommander(Commander):
         )
         self._publish_status(status)
 
-    def _abort_goal(self, why: str) -> str | None:
-        if self.executive is None:
-            return None
-        message = self.executive.abort(why)
-        self._forward_outputs()
-        return message
-
-    def _react_to_change(self, change: PlantChange) -> None:
-        assert self.executive is not None
-        if change is PlantChange.RESET:
-            self.executive.plant_reset()
-            self._forward_outputs()
-
     def receive_plant_status(self, status: PlantStatus, name: str = "plant") -> None:
         """React to a status of the named plant."""
         super().receive_plant_status(status, name)
@@ -367,24 +342,20 @@ class PlannerCommander(Commander):
             self._log_fault("odom", f"odom: {measured.base_error}.")
             measured.base_error = None
 
-    def _forward_outputs(self) -> None:
-        assert self.executive is not None
-        outputs, host = self.executive.outputs, self.host
-        while outputs:
-            match outputs.popleft():
-                case PlannerStatus() as status:
-                    self._status = status
-                    self._publish_decision(status)
-                case ScheduleStart() as start:
-                    host.publish_start(start)
-                    if self.trajectories is not None:
-                        self.trajectories.start(start)
-                    self._warn_of_disturbances(self._disturbances)
-                case Event() as event:
-                    host.report_event(event)
-                case Notice(severity, message):
-                    host.log(severity.value, message)
-                case Transition(source, event, target):
-                    host.log("debug", f"{source.value} -> {target.value}: {event.value}")
-                    if self.trajectories is not None:
-                        self.trajectories.on_phase_change(target)
+    def _forward(self, output: Any) -> None:
+        host = self.host
+        match output:
+            case PlannerStatus() as status:
+                self._status = status
+                self._publish_decision(status)
+            case ScheduleStart() as start:
+                host.publish_start(start)
+                if self.trajectories is not None:
+                    self.trajectories.start(start)
+                self._warn_of_disturbances(self._disturbances)
+            case Notice(severity, message):
+                host.log(severity.value, message)
+            case Transition(source, event, target):
+                host.log("debug", f"{source.value} -> {target.value}: {event.value}")
+                if self.trajectories is not None:
+                    self.trajectories.on_phase_change(target)

@@ -101,11 +101,6 @@ class TrajectoryOutput:
         self._looked_ns = 0
         """Stamp of the last check for the server, ns."""
 
-    @property
-    def awaits_result(self) -> bool:
-        """Whether a schedule has no result yet."""
-        return self._sent is not None
-
     def start(self, start: ScheduleStart) -> None:
         """Send a schedule; it replaces the one that is followed."""
         self._number += 1

@@ -41,6 +41,7 @@ from spacerobot_ros.control.wheels import WheelControl
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.grasp import Payload
+from spacerobot_ros.model.rotations import compose_poses, matrix_from_quaternion, relative_pose
 from spacerobot_ros.model.space_robot import SpaceRobot
 
 _BRAKE_RATE = 2.0
@@ -149,31 +150,65 @@ class CoordinatedController:
     ) -> None:
         """Start towards new goals; a group without a new goal keeps its earlier goal.
 
-        A robot that was brought to rest has no earlier goals: such a group stays where it is. The
-        integral of the errors begins anew.
+        An end-effector without a goal since the robot was held or brought to rest has none: the
+        base carries it, so that the arm keeps its shape. The integral of the errors begins anew.
         """
         if self.coming_to_rest:
             self.profile, self.coming_to_rest = None, False
         start = self._present_reference(time, state)
         goal = start if self.profile is None else self.profile.goal
+        carries = end_effector is None and (self.profile is None or self.profile.carries)
         if base is not None:
+            if carries:
+                goal = replace(goal, end_effector=self._carried_end_effector(goal, base, state))
             goal = replace(goal, base=base)
         if end_effector is not None:
             goal = replace(goal, end_effector=end_effector)
         if joints is not None:
             goal = replace(goal, joints=JointReference.at_rest(joints))
+        self._begin_motion(time, state, start, goal, carries=carries)
+
+    def _begin_motion(
+        self, time: float, state: ControlState, start: Reference, goal: Reference, *, carries: bool
+    ) -> None:
+        self.law.reset_integral()
         motion = self._motion.within_thruster_limits(self._limits, self.law.robot, state.q)
         if self.wheels is not None:
             motion = self.wheels.limits_with_wheels(motion, state.q)
-        self.profile = self._profile_type(start, goal, motion)
+        self.profile = self._profile_type(start, goal, motion, carries=carries)
         self._began = time
         self.law.start(time, start, goal)
 
+    def _carried_end_effector(
+        self, before: Reference, base: PoseReference, state: ControlState
+    ) -> PoseReference | None:
+        """Return the pose that an end-effector has with the base in a goal, and the arm as before.
+
+        A base whose position is not controlled turns about the system's centre of mass.
+        """
+        carrier, carried = before.base, before.end_effector
+        if carrier is None or carried is None:
+            return carried
+        position = base.position
+        if all(axis.startswith("r") for axis in self.law.outputs.selection.base):
+            c_B = self.law.robot.center_of_mass(state.q)
+            turned = matrix_from_quaternion(base.quaternion)
+            present = matrix_from_quaternion(carrier.quaternion)
+            position = carrier.position + (present - turned) @ c_B
+        poses = (
+            np.concatenate([position, base.quaternion]),
+            np.concatenate([carrier.position, carrier.quaternion]),
+            np.concatenate([carried.position, carried.quaternion]),
+        )
+        pose = compose_poses(poses[0], relative_pose(*poses[1:]))
+        return PoseReference(pose[:3], pose[3:])
+
     def restart_motion(self, time: float, state: ControlState) -> None:
         """Restart towards the present goals from the measured pose instead of the reference."""
-        goal, self.profile = self.goal, None
-        joints = None if goal.joints is None else goal.joints.q
-        self.set_goals(time, state, base=goal.base, end_effector=goal.end_effector, joints=joints)
+        profile, self.profile, self.coming_to_rest = self.profile, None, False
+        start = self._present_reference(time, state)
+        goal, carries = (start, True) if profile is None else (profile.goal, profile.carries)
+        self._begin_motion(time, state, start, goal, carries=carries)
 
     def hold_here(self, time: float, state: ControlState) -> None:
         """Hold the measured pose and shape; the earlier reference is dropped."""
@@ -252,6 +287,7 @@ class CoordinatedController:
                     self._present_reference(time, state),
                     self._present_reference(time, state),
                     self._motion,
+                    carries=True,
                 )
                 self._began = time
             # The law is always evaluated, for its errors and status.

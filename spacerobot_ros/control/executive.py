@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections import deque
+from collections.abc import Mapping
 from dataclasses import replace
+from enum import IntEnum
 
 import numpy as np
 
@@ -17,12 +19,16 @@ from spacerobot_ros.control.servicing import Servicing, Task, TaskProgress, Task
 from spacerobot_ros.control.stall_monitor import StallMonitor
 from spacerobot_ros.control.state import Actuation, ControlState, PoseReference, Reference
 from spacerobot_ros.control.status import CommandReport, ControllerState, ControllerStatus
-from spacerobot_ros.errors import ParameterError, PlanningError
+from spacerobot_ros.errors import CommandError, ParameterError, PlanningError
 from spacerobot_ros.events import Event, EventKind
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.grasp import Payload
 from spacerobot_ros.planning.core.goal import Controlled, Goal, Tolerance
-from spacerobot_ros.planning.execution.goal_file import BASE_GOAL_KEY, GoalFile, IdentifiedGoal
+from spacerobot_ros.planning.execution.goal_file import (
+    BASE_GOAL_KEY,
+    IdentifiedGoal,
+    PursuedGoals,
+)
 from spacerobot_ros.times import SECOND
 
 END_EFFECTOR = "end_effector"
@@ -30,6 +36,22 @@ END_EFFECTOR = "end_effector"
 
 GOAL_KEYS = (BASE_GOAL_KEY, END_EFFECTOR)
 """Keys of goals: frames of the robot that goal poses are for."""
+
+
+Output = ControllerStatus | Event | PursuedGoals
+"""An output of an executive other than its commands."""
+
+
+class _Next(IntEnum):
+    """Reaction to the next measured state; a greater one counts for more."""
+
+    GO_ON = 0
+    BEGIN_ANEW = 1
+    """The goal restarts from the measured pose."""
+    HOLD = 2
+    """The robot holds the measured pose, without a goal."""
+    ABORT = 3
+    """Likewise, and the abort is reported."""
 
 
 # Names of the module are found faster than members of an enum: they are needed for every state.
@@ -63,56 +85,40 @@ class ControlExecutive:
         The controller.
     config
         Tolerances, times and gains; :meth:`configure` changes them.
-    report
-        Called with every status: whenever the state changes, when commands begin or cease to be
-        limited, and every ``status_period``.
-    goal_file
-        File of the present goals, from which a controller that is restarted resumes.
-    warn
-        Called with a message if the goals cannot be saved.
-    report_event
-        Called with every event of a goal.
     """
 
-    def __init__(
-        self,
-        controller: CoordinatedController,
-        config: ControllerConfig,
-        report: Callable[[ControllerStatus], None],
-        goal_file: GoalFile | None = None,
-        warn: Callable[[str], None] = lambda message: None,
-        report_event: Callable[[Event], None] = lambda event: None,
-    ) -> None:
+    def __init__(self, controller: CoordinatedController, config: ControllerConfig) -> None:
         self.controller = controller
         config = config.for_robot(controller.law.robot.description)
         self._config = self._goal_config = config
         self._goal_tolerance: Tolerance | None = None
         """Tolerances of the present goal; None: those of the parameters."""
-        self._report, self._warn, self._report_event = report, warn, report_event
-        self._file = goal_file if goal_file is not None else GoalFile("", GOAL_KEYS)
+        self.outputs: deque[Output] = deque()
+        """Outputs to publish, in order; the owner removes published outputs. There is a status
+        whenever the state changes, when commands begin or cease to be limited, and every
+        ``status_period``."""
         self.servicing = Servicing(config)
         """The tasks before goals, with the target; the owner tells it the body that is held."""
         self._longest_gap = _longest_gap(config)
         self.reset()
 
     def reset(self) -> None:
-        """Drop goals and measurements: the next state is the first. The goal file stays."""
+        """Drop goals and measurements, without a status: the next state is the first."""
         self.controller.reset()
         self._time: float | None = None
         """Time of the last state, s."""
-        self._hold_here = False
-        """Whether the robot holds the pose of the next measured state, without a goal."""
-        self._begin_anew = False
-        """Whether the goal restarts at the next measured state."""
+        self._next = _Next.GO_ON
         self.plant_blocked = False
         """Whether the plant ignores commands, set by the owner. Each command then holds the pose of
         its state, so that none of them moves the robot when the plant obeys again."""
         self._abort_message = ""
         self._pending: dict[str, IdentifiedGoal] = {}
         """Accepted goals that wait for the next measured state."""
-        self._abort_requested = False
         self._goal_state = self._reported_state = ControllerState.HOLDING
+        self._goals: dict[str, IdentifiedGoal] = {}
+        """Goals that are pursued together, by part of the robot."""
         self._goal_id = ""
+        """Id of the latest of them, which statuses have."""
         self._monitor, self._stall = GoalMonitor(), StallMonitor()
         self._was_measured = False
         self.servicing.end()
@@ -160,15 +166,17 @@ class ControlExecutive:
     @property
     def unfinished_goals(self) -> frozenset[str]:
         """Ids of the goals that are pursued or wait, also those whose abort is not reported yet."""
-        present = self._abort_requested or self._goal_state is ControllerState.TRACKING
-        waiting = frozenset(goal.goal_id for goal in self._pending.values())
-        return waiting | {self._goal_id} if present else waiting
+        present = self._next is _Next.ABORT or self._goal_state is ControllerState.TRACKING
+        pursued = self._goals.values() if present else ()
+        return self.waiting_goals.union(goal.goal_id for goal in pursued)
+
+    @property
+    def waiting_goals(self) -> frozenset[str]:
+        """Ids of the goals that begin at the next measured state, or after tasks."""
+        return frozenset(goal.goal_id for goal in self._pending.values())
 
     def progress(self, goal_id: str) -> tuple[str, float | None]:
-        """Return the work that is done for a goal, and the predicted time until its end, s.
-
-        None: there is no prediction.
-        """
+        """Return the work that is done for a goal, and the predicted time until its end, s."""
         task, ends = self.servicing.task, self.controller.reference_ends
         if task is not None:
             return task.value, None
@@ -271,46 +279,33 @@ class ControlExecutive:
                 f"Parameter 'resume_file' holds goals of another robot or law: {error}"
             ) from error
 
-    def abort(self, why: str = "on request") -> None:
-        """Give up every goal; the robot holds the pose of the next measured state."""
+    def abort(self, why: str = "on request") -> str:
+        """Give up every goal; the robot holds the pose of the next measured state.
+
+        Returns a message about the robot.
+        """
         self._give_up(f"Aborted {why}; the robot holds.")
-        self._abort_requested = True
+        self._next = _Next.ABORT
+        return "The robot holds where it is."
 
     def plant_stopped(
         self, why: str, commanded_until_ns: int | None = None, rests_since_ns: int = 0
     ) -> bool:
-        """Give up every goal at once, because the plant ignores commands from now on.
-
-        Parameters
-        ----------
-        why
-            The message of the plant; it becomes part of the status.
-        commanded_until_ns
-            For a plant that rests because commands did not come: the stamp of the last one that it
-            received. Goals that were begun later go on. None: the plant obeys nothing.
-        rests_since_ns
-            Time since which it rests then, ns; the executive of the planner needs it.
-
-        Returns
-        -------
-        bool
-            Whether a goal was given up.
-        """
+        """Give up every goal at once, because the plant ignores commands from now on."""
         pursued = self._goal_state is ControllerState.TRACKING
         if commanded_until_ns is not None:
             if not pursued or commanded_until_ns < round(self._monitor.started * SECOND):
                 return False
         elif not (pursued or self._pending):
-            self._file.delete()
             return False
         self._give_up(f"Aborted by the plant: {why}")
-        self._hold_here = True
+        self._plan_next(_Next.HOLD)
         self._report_abort()  # Reported at once: the next measured state may come late.
         return True
 
     def on_plant_obeying(self) -> None:
         """Hold the pose of the next measured state, not an earlier one."""
-        self._hold_here = True
+        self._plan_next(_Next.HOLD)
 
     def reference_ended(self, remaining: Reference) -> None:
         """Go on with the references that remain: to a goal anew, else hold the measured pose."""
@@ -326,10 +321,12 @@ class ControlExecutive:
 
     def _begin_anew_or_hold(self) -> None:
         """Begin the goal anew at the next measured state; without a goal, hold its pose."""
-        if self._goal_state is ControllerState.TRACKING:
-            self._begin_anew = True
-        else:
-            self._hold_here = True
+        tracking = self._goal_state is ControllerState.TRACKING
+        self._plan_next(_Next.BEGIN_ANEW if tracking else _Next.HOLD)
+
+    def _plan_next(self, reaction: _Next) -> None:
+        """Have the robot react to the next measured state, unless more was asked for before."""
+        self._next = max(self._next, reaction)
 
     def use_controller(
         self, controller: CoordinatedController, payload: Payload | None = None
@@ -342,23 +339,25 @@ class ControlExecutive:
         controller.take_over_goals(self.controller)
         self.controller = controller
         self.servicing.hold(payload)
-        self._begin_anew = self._goal_state is ControllerState.TRACKING
+        if self._goal_state is ControllerState.TRACKING:
+            self._plan_next(_Next.BEGIN_ANEW)
 
     def _give_up(self, message: str) -> None:
-        """Drop every goal and its file; the message is that of the status from now on."""
+        """Drop every goal; the message is that of the status from now on."""
         pursued = self._pending or self._goal_state is ControllerState.TRACKING
         # A decided goal stays decided: an abort without an undecided goal has no goal id.
         self._goal_id = self._latest_id() if pursued else ""
+        self._goals = {**self._goals, **self._pending} if pursued else {}
         self._requested = None
         if self.servicing.task is not None:
             self.servicing.end()
             self.controller.follow(Reference())
         self._pending.clear()
         self._abort_message = message
-        self._file.delete()
 
     def _report_abort(self) -> None:
         self._goal_state = self._reported_state = ControllerState.ABORTED
+        self._end_goals(EventKind.GOAL_ABORTED, self._goal_state, self._abort_message)
         self._publish(ControllerState.ABORTED, self._abort_message)
         self._report_decision(EventKind.GOAL_ABORTED, self._abort_message, ControllerState.ABORTED)
 
@@ -399,14 +398,14 @@ class ControlExecutive:
         self._guided = reference is not None
         if measured is not None:
             self._was_measured = True
-            if self._abort_requested or self._hold_here or self.plant_blocked:
-                self._hold_pose(time, measured)
-            elif self._begin_anew:
+            reaction, self._next = self._next, _Next.GO_ON
+            if reaction >= _Next.HOLD or self.plant_blocked:
+                self._hold_pose(time, measured, aborted=reaction is _Next.ABORT)
+            elif reaction is _Next.BEGIN_ANEW:
                 self.controller.restart_motion(time, measured)
                 self._monitor.restart_settling()
                 self._stall.restart()
                 self._error_bounds = None
-            self._begin_anew = False
             too_fast = self.controller.coming_to_rest and self._monitor.fast_states
             if not too_fast:
                 self._follow_goals(time, measured)
@@ -419,18 +418,18 @@ class ControlExecutive:
         excess = Actuation(result.excess.wrench_B, wheels.shape_with_wheels(result.excess.tau))
         return Saturated(wheels.actuation(result.realised), excess)
 
-    def dump_momentum(self) -> tuple[bool, str]:
-        """Dump the momentum of the reaction wheels; return whether it is done, and a sentence."""
+    def dump_momentum(self) -> str:
+        """Dump the momentum of the reaction wheels, and return a sentence; or CommandError."""
         if self.controller.wheels is None:
             name = self.controller.law.robot.description.name
-            return False, f"Robot '{name}' has no reaction wheels."
+            raise CommandError(f"Robot '{name}' has no reaction wheels.")
         return self.controller.wheels.request_dump()
 
     def evaluate(self, time: float, result: Saturated) -> None:
         """Evaluate the errors after the command ``result``, and report a change of state."""
         if self.controller.wheels is not None:
             for event in self.controller.wheels.events():
-                self._report_event(event)
+                self.outputs.append(event)
                 self._next_report = time
         if self.controller.mode is _MEASURED and self._goal_state is _TRACKING:
             self._watch_errors()
@@ -463,8 +462,16 @@ class ControlExecutive:
         decision = monitor.decide_by_errors(time, at_rest, ends, controller.errors(), config)
         if decision != _NO_DECISION:
             self._goal_state, kind = _STATE_AND_EVENT_OF_DECISION[Decision(int(decision))]
-            self._file.delete()
-            self._report_decision(kind, self._message(self._goal_state), self._goal_state)
+            message = self._message(self._goal_state)
+            self._end_goals(kind, self._goal_state, message)
+            self._report_decision(kind, message, self._goal_state)
+
+    def _end_goals(self, kind: EventKind, state: ControllerState, message: str) -> None:
+        """Report the end of all goals but the latest, whose status goes on."""
+        for goal_id in sorted({goal.goal_id for goal in self._goals.values()} - {self._goal_id}):
+            self._publish(state, message, goal_id)
+            self._report_decision(kind, message, state, goal_id)
+        self._goals = {}
 
     # -- control that is lost -----------------------------------------------------------------
 
@@ -505,14 +512,13 @@ class ControlExecutive:
         self.controller.come_to_rest()
         self._report_abort()
 
-    def _hold_pose(self, time: float, state: ControlState) -> None:
+    def _hold_pose(self, time: float, state: ControlState, *, aborted: bool) -> None:
         """Hold the measured pose, after an abort or when the plant obeys again."""
         self.controller.hold_here(time, state)
-        if self._abort_requested:
+        if aborted:
             self._report_abort()
         elif self._goal_state is not ControllerState.ABORTED:
             self._goal_state, self._goal_id = ControllerState.HOLDING, ""
-        self._abort_requested = self._hold_here = False
 
     def _follow_goals(self, time: float, state: ControlState) -> None:
         """Go on with the tasks before the pending goals, and start towards the goals after them."""
@@ -529,7 +535,7 @@ class ControlExecutive:
             return
         progress = servicing.step(time, state, self.controller)
         for event in servicing.events():
-            self._report_event(replace(event, goal_id=self._goal_id))
+            self.outputs.append(replace(event, goal_id=self._goal_id))
             self._next_report = time
         match progress.state:
             case TaskState.ACTIVE:
@@ -546,14 +552,14 @@ class ControlExecutive:
 
     def _begin_tasks(self, time: float, tasks: tuple[Task, ...]) -> None:
         self.servicing.begin(tasks)
-        self._goal_id = self._latest_id() if self._pending else ""
+        self._goals, self._goal_id = {}, self._latest_id() if self._pending else ""
         if self._pending:
             self._report_acceptance()
         self._goal_state = ControllerState.TRACKING
         self._monitor.begin(time)
         self._stall.restart()
         self._next_report, self._error_bounds = time, None
-        self._save(self._pending)
+        self.outputs.append(PursuedGoals(dict(self._pending)))
 
     def _end_tasks(self, time: float, state: ControlState, progress: TaskProgress) -> None:
         """Give up the tasks, and the goals after them, and hold the measured pose."""
@@ -562,17 +568,17 @@ class ControlExecutive:
         self._goal_id = goal_id
         self.controller.hold_here(time, state)
         if progress.state is TaskState.REFUSED:
+            self._end_goals(EventKind.GOAL_REFUSED, ControllerState.REFUSED, progress.message)
             self._goal_state, self._goal_id = ControllerState.HOLDING, ""
             self.refuse(progress.message, goal_id)
         else:
             self._report_abort()
 
     def _begin_goals(self, time: float, state: ControlState, *, carried: bool = False) -> None:
-        """Start towards the pending goals.
-
-        After tasks, a goal of the base alone takes the end-effector and its load along.
-        """
+        """Start towards the pending goals, after tasks from the measured pose."""
         self._goal_id = self._latest_id()
+        pursued = self._goals if self._goal_state is ControllerState.TRACKING else {}
+        self._goals = {**pursued, **self._pending}
         self._after_tasks = dict(self._pending) if carried else {}
         goals = {key: pending.goal for key, pending in self._pending.items()}
         self._resumes = all(pending.resumes for pending in self._pending.values())
@@ -582,8 +588,9 @@ class ControlExecutive:
         shapes = [g.joint_positions for g in goals.values() if g.joint_positions is not None]
         if self.controller.wheels is not None:
             shapes = [shape[self.controller.wheels.wheels.other] for shape in shapes]
-        if carried and self.controller.law.outputs.selection.end_effector:
-            poses.setdefault(END_EFFECTOR, self._carried_pose(state, poses[BASE_GOAL_KEY]))
+        if carried:
+            # Tasks have left the earlier reference behind.
+            self.controller.hold_here(time, state)
         self.controller.set_goals(
             time,
             state,
@@ -597,7 +604,7 @@ class ControlExecutive:
         self._monitor.begin(time)
         self._stall.restart()
         self._next_report, self._error_bounds = time, None
-        self._save(self._goals_to_save())
+        self.outputs.append(PursuedGoals(self._goals_to_save()))
 
     def _take_tolerance(self, tolerance: Tolerance | None) -> None:
         self._goal_tolerance, self._goal_config = tolerance, self._config
@@ -611,28 +618,17 @@ class ControlExecutive:
 
     def _report_acceptance(self) -> None:
         message, goal_id = "The goal is accepted.", self._goal_id
-        self._report_event(Event(EventKind.GOAL_ACCEPTED, message, goal_id=goal_id))
-
-    def _save(self, goals: Mapping[str, IdentifiedGoal]) -> None:
-        try:
-            self._file.save(goals)
-        except ParameterError as error:
-            self._warn(f"{error} The goal is pursued, but not resumed after a restart.")
-
-    def _carried_pose(self, state: ControlState, base: PoseReference) -> PoseReference:
-        """Return the pose of the end-effector with the base in its goal, and the shape as now."""
-        link = self.controller.law.outputs.selection.end_effector_link
-        there = replace(state, r_WB=base.position, quaternion_WB=base.quaternion)
-        pose = Reference.present(self.controller.law.robot, there, link).end_effector
-        assert pose is not None
-        return pose
+        self.outputs.append(Event(EventKind.GOAL_ACCEPTED, message, goal_id=goal_id))
 
     def _goals_to_save(self) -> dict[str, IdentifiedGoal]:
         goal, selection = self.controller.goal, self.controller.law.outputs.selection
         shape = goal.joints.q if goal.joints is not None and selection.joints else None
         if shape is not None and self.controller.wheels is not None:
             shape = self.controller.wheels.shape_with_wheels(shape)
-        poses = {BASE_GOAL_KEY: goal.base, END_EFFECTOR: goal.end_effector}
+        poses = {BASE_GOAL_KEY: goal.base}
+        profile = self.controller.profile
+        if profile is not None and not profile.carries:
+            poses[END_EFFECTOR] = goal.end_effector
         return {
             key: IdentifiedGoal(
                 Goal(pose.position, pose.quaternion, shape), self._goal_id, resumes=self._resumes
@@ -655,14 +651,14 @@ class ControlExecutive:
         if state is ControllerState.TRACKING and task is None and ends is not None:
             settled = ends + self._config.settle_time
         report = self._command_report
-        self._report(ControllerStatus(state, message, about, report, name, settled))
+        self.outputs.append(ControllerStatus(state, message, about, report, name, settled))
 
     def _report_decision(
         self, kind: EventKind, message: str, state: ControllerState, goal_id: str | None = None
     ) -> None:
         """Report the decision about a goal as an event; by default, about the present goal."""
         about = self._goal_id if goal_id is None else goal_id
-        self._report_event(Event(kind, message, state.level, goal_id=about))
+        self.outputs.append(Event(kind, message, state.level, goal_id=about))
 
     def _message(self, state: ControllerState) -> str:
         match state:

@@ -53,6 +53,9 @@ class ReferenceProfile(ABC):
         Desired poses and joint positions; groups that it lacks are not controlled.
     limits
         Largest speeds and accelerations.
+    carries
+        Whether the end-effector has no goal of its own: the base takes it along, so that the arm
+        keeps its shape on the way.
 
     Raises
     ------
@@ -62,7 +65,9 @@ class ReferenceProfile(ABC):
 
     name: ClassVar[str]
 
-    def __init__(self, start: Reference, goal: Reference, limits: MotionLimits) -> None:
+    def __init__(
+        self, start: Reference, goal: Reference, limits: MotionLimits, *, carries: bool = False
+    ) -> None:
         for group in fields(goal):
             wanted = getattr(goal, group.name) is not None
             if wanted and getattr(start, group.name) is None:
@@ -71,6 +76,7 @@ class ReferenceProfile(ABC):
         self.start = start
         self.goal = goal
         self.limits = limits
+        self.carries = carries
         self.duration = 0.0
         """Time after which the reference is the goal, s."""
 
@@ -83,19 +89,22 @@ class ReferenceProfile(ABC):
         start, goal, joints = self.start, self.goal, 0.0
         if start.joints is not None and goal.joints is not None:
             joints = float(np.abs(goal.joints.q - start.joints.q).max(initial=0.0))
-        lines = [
-            line
-            for line in (
-                _PoseInterpolation.between(start.base, goal.base),
-                _PoseInterpolation.between(start.end_effector, goal.end_effector),
-            )
-            if line is not None
-        ]
+        lines = [line for line in self.lines() if line is not None]
         return OutputErrors(
             max((line.length for line in lines), default=0.0),
             max((line.angle for line in lines), default=0.0),
             joints,
         )
+
+    def lines(self) -> tuple[_PoseInterpolation | None, _PoseInterpolation | None]:
+        """Return the ways of base and end-effector, None for a group that is not controlled."""
+        start, goal, base, hand = self.start, self.goal, None, None
+        if start.base is not None and goal.base is not None:
+            base = _PoseInterpolation(start.base, goal.base)
+        if start.end_effector is not None and goal.end_effector is not None:
+            carrier = start.base if self.carries else None
+            hand = _PoseInterpolation(start.end_effector, goal.end_effector, carrier)
+        return base, hand
 
 
 class StepReference(ReferenceProfile):
@@ -111,6 +120,7 @@ class StepReference(ReferenceProfile):
 class QuinticReference(ReferenceProfile):
     """Positions along straight lines, attitudes along geodesics (one fixed axis), in W.
 
+    An end-effector that the base carries turns about the base's origin, which is on its line.
     All share one profile, ``s = 10 u^3 - 15 u^4 + 6 u^5`` of ``u = t / T``: rest to rest, without
     a jump in acceleration. T is the shortest time in which all are within their limits: the one
     that needs longest sets the pace, and all reach their goals together.
@@ -118,10 +128,11 @@ class QuinticReference(ReferenceProfile):
 
     name: ClassVar[str] = "quintic"
 
-    def __init__(self, start: Reference, goal: Reference, limits: MotionLimits) -> None:
-        super().__init__(start, goal, limits)
-        self._base = _PoseInterpolation.between(start.base, goal.base)
-        self._end_effector = _PoseInterpolation.between(start.end_effector, goal.end_effector)
+    def __init__(
+        self, start: Reference, goal: Reference, limits: MotionLimits, *, carries: bool = False
+    ) -> None:
+        super().__init__(start, goal, limits, carries=carries)
+        self._base, self._end_effector = self.lines()
         self._joints = np.zeros(0)
         if goal.joints is not None and start.joints is not None:
             self._joints = goal.joints.q - start.joints.q
@@ -173,11 +184,10 @@ def profile_numbers(profile: ReferenceProfile, base: bool, end_effector: bool, n
         Number of joints with references; 0: joints are not controlled.
     """
     start, goal = profile.start, profile.goal
-    poses = (base, start.base, goal.base), (end_effector, start.end_effector, goal.end_effector)
     parts: list[npt.ArrayLike] = [[profile.duration]]
-    for wanted, begin, end in poses:
-        if wanted and begin is not None and end is not None:
-            parts += _PoseInterpolation(begin, end).numbers
+    for wanted, line in zip((base, end_effector), profile.lines(), strict=True):
+        if wanted and line is not None:
+            parts += line.numbers
     if n and start.joints is not None and goal.joints is not None:
         parts += [start.joints.q, goal.joints.q - start.joints.q, goal.joints.q]
     return np.concatenate(parts)
@@ -197,11 +207,16 @@ def profile_expression(
     s, rate, acceleration = _quintic(time / duration, duration)
     moving, resting = [], []
     for k in range(base + end_effector):
-        r, d, quaternion, half_turn, turn_W, angle, goal, attitude = rest[8 * k : 8 * k + 8]
+        r, d, e, c, quaternion, half_turn, turn_W, angle, *end = rest[10 * k : 10 * k + 10]
         half = s * angle / 2
-        moving += [r + s * d, ca.sin(half) * half_turn + ca.cos(half) * quaternion]
-        moving += [rate * d, rate * turn_W, acceleration * d, acceleration * turn_W]
-        resting += [goal, attitude, ca.SX.zeros(12)]
+        sine, cosine = ca.sin(s * angle), ca.cos(s * angle)
+        arm, beside = cosine * e + sine * c, cosine * c - sine * e
+        speed = rate * angle
+        moving += [r + s * d + arm, ca.sin(half) * half_turn + ca.cos(half) * quaternion]
+        moving += [rate * d + speed * beside, rate * turn_W]
+        moving += [acceleration * d + acceleration * angle * beside - speed**2 * arm]
+        moving += [acceleration * turn_W]
+        resting += [*end, ca.SX.zeros(12)]
     if n:
         r, d, goal = rest[-3:]
         moving += [r + s * d, rate * d, acceleration * d]
@@ -215,7 +230,7 @@ def profile_size(base: bool, end_effector: bool, n: int) -> int:
 
 
 def _profile_sizes(base: bool, end_effector: bool, n: int) -> list[int]:
-    return [1, *([3, 3, 4, 4, 3, 1, 3, 4] * (base + end_effector)), *([n, n, n] if n else [])]
+    return [1, *([3, 3, 3, 3, 4, 4, 3, 1, 3, 4] * (base + end_effector)), *([n, n, n] if n else [])]
 
 
 class HeldVelocityReference:
@@ -252,40 +267,52 @@ PROFILES: dict[str, type[ReferenceProfile]] = {
 
 
 class _PoseInterpolation:
-    """A straight line and a geodesic; ``d`` (3,) in m and ``rotvec`` (3,) in rad, both in W."""
+    """A straight line and a geodesic in W, from one pose to another, m and rad.
 
-    def __init__(self, start: PoseReference, goal: PoseReference) -> None:
+    With the pose of a ``carrier`` at the start, the line is that of the carrier's origin, about
+    which the pose turns: ``r(s) = r_C + s d + e cos(s phi) + c sin(s phi)``.
+    """
+
+    def __init__(
+        self, start: PoseReference, goal: PoseReference, carrier: PoseReference | None = None
+    ) -> None:
         self._start, self._goal = start, goal
-        self._d = goal.position - start.position
         turn_B = attitude_error(start.quaternion, goal.quaternion)
         # The axis of the turn is fixed in the body and in W alike.
         self._turn_W: Array = matrix_from_quaternion(start.quaternion) @ turn_B
-        self.length = float(np.linalg.norm(self._d))
         self.angle = float(np.linalg.norm(turn_B))
         # The quaternion of a turn by phi is linear in sin(phi/2) and cos(phi/2).
         axis = self._turn_W / self.angle if self.angle > 0 else np.zeros(3)
+        self._r, self._d = start.position, goal.position - start.position
+        self._e, self._c = np.zeros(3), np.zeros(3)
+        if carrier is not None:
+            arm = start.position - carrier.position
+            self._e, self._c = arm - axis * (axis @ arm), np.cross(axis, arm)
+            self._r = start.position - self._e
+            self._d = goal.position - self._r - self._arm(1.0)[0]
+        self.length = float(np.linalg.norm(self._d))
         self._half_turn = quaternion_multiply(np.append(axis, 0.0), start.quaternion)
 
     @property
     def numbers(self) -> list[npt.ArrayLike]:
         """All numbers of the line, and the pose of its end."""
-        line = [self._start.position, self._d, self._start.quaternion, self._half_turn]
+        line = [self._r, self._d, self._e, self._c, self._start.quaternion, self._half_turn]
         return [*line, self._turn_W, [self.angle], self._goal.position, self._goal.quaternion]
 
-    @classmethod
-    def between(
-        cls, start: PoseReference | None, goal: PoseReference | None
-    ) -> _PoseInterpolation | None:
-        return None if start is None or goal is None else cls(start, goal)
+    def _arm(self, s: float) -> tuple[Array, Array]:
+        """Return the arm (3,) from the carrier that turns, and its derivative by the angle."""
+        sine, cosine = math.sin(s * self.angle), math.cos(s * self.angle)
+        return cosine * self._e + sine * self._c, cosine * self._c - sine * self._e
 
     def at(self, s: float, rate: float, acceleration: float) -> PoseReference:
-        half = s * self.angle / 2
+        half, speed = s * self.angle / 2, rate * self.angle
+        arm, beside = self._arm(s)
         return PoseReference(
-            self._start.position + s * self._d,
+            self._r + s * self._d + arm,
             math.sin(half) * self._half_turn + math.cos(half) * self._start.quaternion,
-            rate * self._d,
+            rate * self._d + speed * beside,
             rate * self._turn_W,
-            acceleration * self._d,
+            acceleration * self._d + acceleration * self.angle * beside - speed**2 * arm,
             acceleration * self._turn_W,
         )
 

@@ -137,10 +137,11 @@ class StallMonitor:
         if stop and limited:
             return stop
         if law.singular_error_share > _SINGULAR_SHARE:
-            return (
-                "the arm is stretched out or folded (singular); end-effectors without a goal of "
-                "their own stay where they are"
-            )
+            cause = "the arm is stretched out or folded (singular)"
+            profile = controller.profile
+            if profile is not None and not profile.carries:
+                cause += "; the end-effector keeps a goal of its own until ~/abort"
+            return cause
         if limited:
             for part, name in (
                 (result.excess.wrench_B[:3], "the force of the thrusters is at its limit"),

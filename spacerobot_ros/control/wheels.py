@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from spacerobot_ros.control.limits import MotionLimits
 from spacerobot_ros.control.state import Actuation, ControlState, Reference
-from spacerobot_ros.errors import ParameterError
+from spacerobot_ros.errors import CommandError, ParameterError
 from spacerobot_ros.events import Event, EventKind
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.rotations import cross
@@ -306,19 +306,25 @@ class WheelControl:
 
     # -- momentum -----------------------------------------------------------------------------
 
-    def request_dump(self) -> tuple[bool, str]:
-        """Begin to dump the momentum of the wheels; return whether, and a sentence."""
+    def request_dump(self) -> str:
+        """Begin to dump the momentum of the wheels; return a sentence.
+
+        Raises
+        ------
+        CommandError
+            Nothing could take it.
+        """
         if not self.has_thrusters:
-            return False, (
+            raise CommandError(
                 "There are no thrusters (use_thrusters is false) that could take the momentum of "
                 "the wheels."
             )
         if self.dumping:
-            return True, "Momentum is being dumped already."
+            return "Momentum is being dumped already."
         if self._is_dumped:
-            return True, "The wheels hold no momentum."
+            return "The wheels hold no momentum."
         self._begin_dump("on request")
-        return True, "The momentum of the wheels is dumped to the thrusters."
+        return "The momentum of the wheels is dumped to the thrusters."
 
     def budget(self, q: Array, qdot: Array) -> dict[str, float]:
         """Return the parts of the angular momentum about the centre of mass by name, N m s: see

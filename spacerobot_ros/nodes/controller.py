@@ -11,7 +11,6 @@ from geometry_msgs.msg import WrenchStamped
 from nav_msgs.msg import Odometry
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
-from std_srvs.srv import Trigger
 
 from spacerobot_ros.commanding.controller import (
     BASE_REFERENCE,
@@ -74,9 +73,10 @@ class CoordinatedControlNode(CommanderNode):
         self._joint_commands = self.create_publisher(JointState, "joint_commands", STREAM)
         self._base_wrench = self.create_publisher(WrenchStamped, "base_wrench", STREAM)
         self.listen("controller/status")
-        self.create_service(Trigger, "~/dump_momentum", self._on_dump_momentum)
-        self.create_service(Trigger, "~/approach", partial(self._on_task, Task.APPROACH))
-        self.create_service(Trigger, "~/detumble", partial(self._on_task, Task.DETUMBLE))
+        commander = self.commander
+        self.offer("~/dump_momentum", commander.dump_momentum)
+        self.offer("~/approach", lambda: commander.request(Task.APPROACH))
+        self.offer("~/detumble", lambda: commander.request(Task.DETUMBLE))
         self.create_subscription(
             String, "target/robot_description", self._on_target_description, LATCHED
         )
@@ -87,7 +87,7 @@ class CoordinatedControlNode(CommanderNode):
             self.create_subscription(DiagnosticStatus, HEARTBEAT, self._on_heartbeat, HEARTBEAT_QOS)
         for kind, topic in ((JointState, JOINT_REFERENCE), (Odometry, BASE_REFERENCE)):
             take = partial(self._on_reference, topic)
-            self._inputs[topic] = self.create_subscription(kind, topic, take, STREAM, raw=True)
+            self.inputs[topic] = self.create_subscription(kind, topic, take, STREAM, raw=True)
 
     def start_message(self) -> str:
         """Return a log message with robot, law and goal topic."""
@@ -125,16 +125,6 @@ class CoordinatedControlNode(CommanderNode):
 
     def _on_reference(self, topic: str, raw: bytes) -> None:
         self.commander.receive_reference(topic, first_time_ns(raw), raw)
-
-    def _on_dump_momentum(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        response.success, response.message = self.commander.dump_momentum()
-        return response
-
-    def _on_task(
-        self, task: Task, _: Trigger.Request, response: Trigger.Response
-    ) -> Trigger.Response:
-        response.success, response.message = self.commander.request(task)
-        return response
 
     def _on_target(self, raw: bytes) -> None:
         self.commander.receive_target(first_time_ns(raw), raw)

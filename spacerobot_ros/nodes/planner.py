@@ -13,7 +13,6 @@ from nav_msgs.msg import Path
 from rclpy.publisher import Publisher
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
-from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory
 from visualization_msgs.msg import MarkerArray
 
@@ -67,6 +66,8 @@ class PlannerNode(CommanderNode):
     commander: PlannerCommander
     _trajectories: Any = None
     """Clients of FollowJointTrajectory, for ``output: trajectory``."""
+    _announcement: Thread | None = None
+    """Publishes the latest schedule."""
 
     def __init__(self, name: str = "planner", **kwargs: Any) -> None:
         super().__init__(name, **kwargs)
@@ -85,7 +86,6 @@ class PlannerNode(CommanderNode):
     def configure(self) -> None:
         """Create the topics; without a robot of its own the planner waits for robot_description."""
         self._shape: Array | None = None
-        self._announcement: Thread | None = None
         self._commands: Publisher | None = None
         if self.config.output != "trajectory":
             topic = "joint_commands" if self.config.output == "commands" else "joint_reference"
@@ -103,7 +103,7 @@ class PlannerNode(CommanderNode):
             self._take_paths(name)
         self.create_subscription(JointState, "goal_joint_states", self._on_goal_shape, STREAM)
         self.create_subscription(String, "obstacles", self._on_obstacles, LATCHED)
-        self.create_service(Trigger, "~/statistics", self._on_statistics)
+        self.offer("~/statistics", lambda: self.statistics.to_json())
 
     def start_message(self) -> str:
         """Return a log message with method, robot and goal topic."""
@@ -116,11 +116,15 @@ class PlannerNode(CommanderNode):
     def deactivate(self) -> None:
         """Drop the present goal and stop sending commands; the goal file stays."""
         super().deactivate()
+        self._await_announcement()
+
+    def _await_announcement(self) -> None:
         if self._announcement is not None:
             self._announcement.join(MAX_THREAD_END_TIME)
 
     def destroy_node(self) -> None:
-        """Destroy the node with its clients of trajectories."""
+        """Destroy the node with its clients of trajectories, in whatever state it is."""
+        self._await_announcement()
         if self._trajectories is not None:
             self._trajectories.destroy()
         super().destroy_node()
@@ -176,7 +180,7 @@ class PlannerNode(CommanderNode):
         aim = EndEffectorGoal.along(link, path_poses(message, frame, what, self._pose_of))
         if link == DEFAULT_END_EFFECTOR:
             aim = replace(aim, link="")
-        return Goal.of_end_effectors([aim], joint_positions=self._goal_shape())
+        return Goal.of_end_effectors([aim], joint_positions=self.goal_shape())
 
     def read_goal(self, key: str, message: PoseStamped) -> Goal:
         """Return the goal of a message for the base or an end-effector.
@@ -189,9 +193,10 @@ class PlannerNode(CommanderNode):
         aim = end_effector_goal(key, message, frame, what, self._pose_of)
         if key == DEFAULT_END_EFFECTOR:
             aim = replace(aim, link="")
-        return Goal.of_end_effectors([aim], joint_positions=self._goal_shape())
+        return Goal.of_end_effectors([aim], joint_positions=self.goal_shape())
 
-    def _goal_shape(self) -> Array | None:
+    def goal_shape(self) -> Array | None:
+        """Return the joint positions (n,) of the last message about them; None: any."""
         return self._shape
 
     def _on_goal_shape(self, message: JointState) -> None:
@@ -206,10 +211,6 @@ class PlannerNode(CommanderNode):
             self._shape = shape_of(message, robot.joint_names) if message.name else None
         except PlanningError as error:
             self.publish_status(PlannerStatus(PlannerState.REFUSED, str(error)))
-
-    def _on_statistics(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        response.success, response.message = True, self.statistics.to_json()
-        return response
 
     # -- outputs ------------------------------------------------------------------------------
 
@@ -233,8 +234,7 @@ class PlannerNode(CommanderNode):
         if not self.commander.config.plan_in_background:
             self._publish_schedule(start)
             return
-        if self._announcement is not None:
-            self._announcement.join(MAX_THREAD_END_TIME)
+        self._await_announcement()
         # Serialising a long schedule takes longer than a tick, and nothing waits for it.
         self._announcement = Thread(target=self._publish_schedule, args=(start,), daemon=True)
         self._announcement.start()

@@ -219,11 +219,6 @@ class RecorderNode(FlightNode):
         return set(self._recorded)
 
     @property
-    def questions(self) -> list[str]:
-        """Names of the parameter records whose node has not answered yet."""
-        return [name for name, question in self._parameter_requests.items() if question is not None]
-
-    @property
     def messages_recorded(self) -> int:
         """Number of messages written."""
         return self.recording.messages if self.recording is not None else 0

@@ -17,12 +17,12 @@ from rclpy.serialization import deserialize_message, serialize_message
 from rclpy.timer import Timer
 from rosgraph_msgs.msg import Clock as ClockMessage
 from std_msgs.msg import Float64, String
-from std_srvs.srv import SetBool, Trigger
+from std_srvs.srv import SetBool
 
 from spacerobot_ros.bag import Playback, QosProfile, ReplayMessage, read_bag
 from spacerobot_ros.bag.config import ReplayConfig
 from spacerobot_ros.bag.playback import ReplayStatus, SubscriberWait, renamed_topics
-from spacerobot_ros.errors import ParameterError, RecordingError, SpaceRobotError
+from spacerobot_ros.errors import CommandError, ParameterError, RecordingError, SpaceRobotError
 from spacerobot_ros.messages.builders import TRANSFORM_TYPE
 from spacerobot_ros.model.visuals import MeshFolder, has_meshes
 from spacerobot_ros.nodes.common.messages import diagnostic_status, message_class
@@ -101,8 +101,8 @@ class ReplayNode(FlightNode):
         self._paused = config.paused
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_service(SetBool, "~/pause", self._on_pause)
-        self.create_service(Trigger, "~/resume", self._on_resume)
-        self.create_service(Trigger, "~/step", self._on_step)
+        self.offer("~/resume", lambda: self._set_paused(False))
+        self.offer("~/step", self._step)
         self._status_topic = self.create_publisher(DiagnosticStatus, _STATUS_TOPIC, LATCHED)
         self.create_subscription(Float64, _SEEK_TOPIC, self._on_seek, STREAM)
 
@@ -287,10 +287,6 @@ class ReplayNode(FlightNode):
         response.success, response.message = True, self._set_paused(bool(request.data))
         return response
 
-    def _on_resume(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        response.success, response.message = True, self._set_paused(False)
-        return response
-
     def _on_seek(self, message: Float64) -> None:
         if not math.isfinite(message.data):
             self.get_logger().warning(f"A replay cannot go to {message.data} s.")
@@ -323,24 +319,18 @@ class ReplayNode(FlightNode):
         name = self.get_fully_qualified_name()
         self._status_topic.publish(diagnostic_status(name, b"\0", message, status.to_values()))
 
-    def _on_step(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+    def _step(self) -> str:
         if not (self._paused and self._begun):
-            response.message = "Only a paused replay goes step by step; call ~/pause first."
-            return response
+            raise CommandError("Only a paused replay goes step by step; call ~/pause first.")
         try:
             message = self._playback.step(self._now())
-            if message is not None:
-                self._send(message)
         except RecordingError as error:
-            response.message = str(error)
-            return response
+            raise CommandError(str(error)) from error
         if message is None:
-            response.message = "The replay has ended."
-            return response
-        response.success = True
-        response.message = f"{message.topic} at {message.log_time_ns / SECOND:.9f} s"
+            raise CommandError("The replay has ended.")
+        self._send(message)
         self._end_if_done()
-        return response
+        return f"{message.topic} at {message.log_time_ns / SECOND:.9f} s"
 
 
 def _with_mesh_files(send: Callable[[bytes], None], meshes: MeshFolder) -> Callable[[bytes], None]:

@@ -161,6 +161,7 @@ def test_automatic_gains_in_lanes_are_those_of_the_controller() -> None:
 @needs_compiler
 def test_what_the_law_cannot_give_in_one_step_is_given_by_the_controller() -> None:
     """Through a singularity, and with joints that are held within a small rate."""
+    planar = share_directory() / "urdf" / "planar_manipulator.urdf"
     cases: tuple[dict[str, Any], ...] = (
         {"law": "model_based", "shape": np.array([0.3, 0.02]), "gains": Gains.uniform(4.0, 4.0)},
         {
@@ -170,7 +171,9 @@ def test_what_the_law_cannot_give_in_one_step_is_given_by_the_controller() -> No
     )
     for case in cases:
         shape = case.pop("shape")
-        flights = controlled("planar_manipulator", shape, ticks=120, **case)
+        tip = SpaceRobot.from_file(planar).link_pose("end_effector", shape)[1]
+        held = np.array([*tip, *BASE[3:]])
+        flights = controlled("planar_manipulator", shape, ticks=120, end_effector=held, **case)
         here, there = fly_lanes(flights), fly_one_by_one(flights)
         assert_same(here, there)
         assert 0 < here.fallback_ticks.sum() <= 9 * 120

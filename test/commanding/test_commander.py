@@ -20,6 +20,7 @@ from spacerobot_ros.commanding.fly_to import FlyTo
 from spacerobot_ros.commanding.planner import PlannerCommander
 from spacerobot_ros.commanding.trajectory_output import TrajectoryOutput
 from spacerobot_ros.control.config import ControllerConfig
+from spacerobot_ros.control.executive import END_EFFECTOR
 from spacerobot_ros.errors import PlanningError
 from spacerobot_ros.events import EventKind
 from spacerobot_ros.model import SpaceRobot
@@ -330,6 +331,28 @@ def test_a_goal_of_an_action_that_a_later_one_replaces_is_reported_as_aborted(
     (result,) = first.end.call_args.args
     assert result.outcome == "aborted"
     second.end.assert_not_called()
+
+
+def test_goals_that_are_pursued_together_are_aborted_together(arm: SpaceRobot) -> None:
+    rig = Rig(ControllerCommander, config(ControllerConfig), arm.n)
+    rig.use(arm)
+    rig.commander.activate()
+    rig.state(1)
+    client = MagicMock()
+    rig.commander.receive_fly_to("a", lambda: FlyTo(GOAL), client)
+    rig.state(2)
+    rig.commander.receive_goal(END_EFFECTOR, 8, 0, lambda: GOAL)
+    for tick in (3, 4):
+        rig.state(tick)
+    client.end.assert_not_called()
+    rig.commander.cancel_fly_to("a")
+    rig.state(5)
+    decided = [(each.state.value, each.goal_id) for each in rig.host.statuses]
+    assert ("aborted", "a") in decided
+    assert ("aborted", "8.000000000") in decided
+    (result,) = client.end.call_args.args
+    assert result.outcome == "aborted"
+    assert "replaced" not in result.message
 
 
 def test_goals_on_file_are_resumed_and_deleted_when_they_are_aborted(

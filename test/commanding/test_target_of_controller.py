@@ -15,7 +15,7 @@ from spacerobot_ros.commanding.commander import ArrayDecoder, StateArrays
 from spacerobot_ros.commanding.controller import ControllerCommander
 from spacerobot_ros.control.config import ControllerConfig
 from spacerobot_ros.control.servicing import Task
-from spacerobot_ros.errors import ParameterError
+from spacerobot_ros.errors import CommandError, ParameterError
 from spacerobot_ros.model.urdf import load_robot
 from spacerobot_ros.parameters import configured
 from spacerobot_ros.planning import Goal
@@ -51,20 +51,16 @@ class TargetRig(Rig):
 
 def test_a_task_is_asked_of_an_active_controller() -> None:
     rig = TargetRig()
-    accepted, message = rig.commander.request(Task.DETUMBLE)
-    assert not accepted
-    assert_one_sentence(message, "not active")
+    with pytest.raises(CommandError, match="not active"):
+        rig.commander.request(Task.DETUMBLE)
     rig.begin()
-    accepted, message = rig.commander.request(Task.DETUMBLE)
-    assert accepted
-    assert_one_sentence(message, "'detumble' begins")
+    assert_one_sentence(rig.commander.request(Task.DETUMBLE), "'detumble' begins")
     rig.state(1)
     assert rig.host.statuses[-1].task == "detumble"  # type: ignore[union-attr]
     latched = PlantStatus(PlantState.LATCHED, "Nothing moves.", "abort", "a fuse is blown")
     rig.commander.receive_plant_status(latched)
-    accepted, message = rig.commander.request(Task.APPROACH)
-    assert not accepted
-    assert "latched: a fuse is blown" in message
+    with pytest.raises(CommandError, match="latched: a fuse is blown"):
+        rig.commander.request(Task.APPROACH)
 
 
 def test_a_task_that_does_not_exist_is_refused_with_the_robot() -> None:

@@ -55,11 +55,9 @@ def test_a_schedule_is_sent_and_ends_with_its_result() -> None:
     sent = Sent()
     number = sent.start("first")
     assert sent.server.sent == [(number, "first")]
-    assert sent.output.awaits_result
     sent.output.on_phase_change(Phase.EXECUTING)
     sent.output.ended(number, Outcome.SUCCEEDED, 0, "")
     assert sent.ends == [TrajectoryEnd()]
-    assert not sent.output.awaits_result
     # Each schedule ends once, and nothing that has ended is cancelled.
     sent.output.ended(number, Outcome.ABORTED, -4, "")
     sent.output.rejected(number)
@@ -104,7 +102,6 @@ def test_what_is_left_is_cancelled_and_its_result_does_not_count() -> None:
             Phase.EXECUTING, Phase.PLANNING, Phase.REPLANNING, Phase.TAKING_OVER
         )  # fmt: skip
         assert sent.server.cancelled == ([] if goes_on else [number])
-        assert sent.output.awaits_result is goes_on
         sent.output.ended(number, Outcome.CANCELED, 0, "")
         assert len(sent.ends) == (1 if goes_on else 0)
 
@@ -136,7 +133,6 @@ def test_a_server_that_is_not_there_or_does_not_answer_ends_the_goal() -> None:
     sent.output.start(lost)
     assert sent.server.sent == []
     assert sent.ends.pop() == TrajectoryEnd("no server of the action '/arm/follow' is there", True)
-    assert not sent.output.awaits_result
     sent.server.present = True
     number = sent.start(accepted=False)
     for second in range(6):

@@ -1,4 +1,4 @@
-"""What becomes of a controller's goals: every decision of its executive, without ROS."""
+"""What becomes of a controller's goals: its executive, without measurements too, and restarted."""
 
 from __future__ import annotations
 
@@ -37,15 +37,17 @@ from spacerobot_ros.control import (
 )
 from spacerobot_ros.control.config import ControllerConfig
 from spacerobot_ros.control.controller import build_controller
-from spacerobot_ros.control.executive import GOAL_KEYS, ControlExecutive
+from spacerobot_ros.control.executive import ControlExecutive
 from spacerobot_ros.control.reference import HeldVelocityReference
 from spacerobot_ros.control.status import CommandReport, ControllerState, ControllerStatus
 from spacerobot_ros.errors import ParameterError, PlanningError, SpaceRobotError
+from spacerobot_ros.events import EventKind
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.parameters import configured
 from spacerobot_ros.planning import Goal
-from spacerobot_ros.planning.execution.goal_file import GoalFile, IdentifiedGoal
+from spacerobot_ros.planning.execution.goal_file import IdentifiedGoal
 from spacerobot_ros.resources import robot_file
+from spacerobot_ros.simulation import EffortPlant, InitialState
 
 # -- goals ------------------------------------------------------------------------------------
 
@@ -82,6 +84,59 @@ def test_the_other_goal_stays_when_one_is_replaced_and_the_status_is_about_the_l
     loop.aim(base=goal_at(-AIM, "c"))
     np.testing.assert_allclose(loop.answer()[0][:3], KP * (up - AIM), atol=1e-12)
     assert loop.status.goal_id == "c"
+
+
+def test_a_base_without_a_goal_of_the_hand_carries_it() -> None:
+    """The force is that of both errors; the reference of the hand turns about the base."""
+    loop = ExecutiveLoop(profile="quintic")
+    loop.answer()
+    half = math.sqrt(0.5)
+    there = Goal(AIM, np.array([0.0, 0.0, half, half]))
+    loop.aim(base=IdentifiedGoal(there, "a"))
+    loop.answer()
+    profile = loop.executive.controller.profile
+    assert profile is not None
+    for share in (0.0, 0.3, 0.7, 1.0):
+        now = profile.at(share * profile.duration)
+        assert now.base is not None
+        assert now.end_effector is not None
+        turned = Rotation.from_quat(now.base.quaternion)
+        arm = now.end_effector.position - now.base.position
+        np.testing.assert_allclose(arm, turned.apply(TIP), atol=1e-12)
+    # The next goal of the base goes on from there, a goal of the hand ends it.
+    loop.aim(base=goal_at(-AIM, "b"))
+    loop.answer()
+    hand = loop.executive.controller.goal.end_effector
+    assert hand is not None
+    np.testing.assert_allclose(hand.position, TIP - AIM, atol=1e-12)
+    loop.aim(end_effector=goal_at(TIP, "c"))
+    loop.answer()
+    loop.aim(base=goal_at(AIM, "d"))
+    loop.answer()
+    hand = loop.executive.controller.goal.end_effector
+    assert hand is not None
+    np.testing.assert_allclose(hand.position, TIP, atol=1e-12)
+
+
+@pytest.mark.parametrize("end", ["reached", "failed", "aborted"])
+def test_goals_of_base_and_hand_end_together_and_each_once(end: str) -> None:
+    loop = ExecutiveLoop(settle_time=0.02, time_limit=0.2)
+    loop.aim(base=goal_at(AIM, "a"))
+    loop.answer(2)
+    loop.aim(end_effector=goal_at(TIP + AIM, "b"))
+    loop.answer(2)
+    assert loop.executive.unfinished_goals == {"a", "b"}
+    if end == "reached":
+        loop.place = AIM
+    if end == "aborted":
+        loop.executive.abort()
+    loop.answer(30)
+    ended = [each for each in loop.events if each.kind is EventKind(f"goal_{end}")]
+    assert [each.goal_id for each in ended] == ["a", "b"]
+    decided = [each.goal_id for each in loop.statuses if each.state.value == end]
+    assert decided[:2] == ["a", "b"]
+    assert "a" not in decided[1:]
+    assert not loop.executive.unfinished_goals
 
 
 def test_of_goals_between_two_states_the_latest_counts_whichever_it_is_for() -> None:
@@ -139,7 +194,8 @@ def beside(kind: str, by: float) -> tuple[dict[str, Any], dict[str, IdentifiedGo
         case "position":
             return {}, {"end_effector": goal_at(TIP + np.array([0.0, by, 0.0]))}
         case "attitude":
-            return {}, {"base": IdentifiedGoal(Goal(np.zeros(3), turned))}
+            base = IdentifiedGoal(Goal(np.zeros(3), turned))
+            return {}, {"base": base, "end_effector": goal_at(TIP)}
     return SHAPE_IS_CONTROLLED, {"base": goal_at(np.zeros(3), shape=SHAPE + np.array([0.0, -by]))}
 
 
@@ -208,10 +264,10 @@ def test_tolerances_that_change_in_flight_take_effect(key: str) -> None:
 def test_gains_that_change_in_flight_take_effect() -> None:
     loop = ExecutiveLoop()
     loop.aim(base=goal_at([1.0, 0.0, 0.0]))
-    np.testing.assert_allclose(loop.answer()[0][:3], [KP, 0.0, 0.0], atol=1e-12)
+    np.testing.assert_allclose(loop.answer()[0][:3], [2 * KP, 0.0, 0.0], atol=1e-12)
     loop.configure(gains=Gains.uniform(70.0, KD))
     loop.velocity = np.array([0.0, 0.5, 0.0])
-    np.testing.assert_allclose(loop.answer()[0][:3], [70.0, -2 * KD * 0.5, 0.0], atol=1e-12)
+    np.testing.assert_allclose(loop.answer()[0][:3], [140.0, -2 * KD * 0.5, 0.0], atol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -259,7 +315,7 @@ def test_abort_holds_the_robot_where_it_is() -> None:
     assert_one_sentence(loop.status.message, "Aborted on request")
     # A new goal is taken up from there.
     loop.aim(base=goal_at([1.25, 0.0, 0.0], "5"))
-    np.testing.assert_allclose(loop.answer()[0][:3], [KP, 0.0, 0.0], atol=1e-12)
+    np.testing.assert_allclose(loop.answer()[0][:3], [2 * KP, 0.0, 0.0], atol=1e-12)
     assert (loop.state, loop.status.goal_id) == ("tracking", "5")
 
 
@@ -278,7 +334,7 @@ def test_an_abort_gives_up_every_goal(key: str) -> None:
         assert loop.state == "aborted"
     # A goal of one alone does not bring back that of the other.
     loop.aim(base=goal_at(AIM))
-    np.testing.assert_allclose(loop.answer()[0][:3], KP * AIM, atol=1e-12)
+    np.testing.assert_allclose(loop.answer()[0][:3], 2 * KP * AIM, atol=1e-12)
 
 
 def test_an_abort_holds_the_shape_that_the_joints_have() -> None:
@@ -318,7 +374,7 @@ def test_a_goal_before_an_abort_is_dropped_and_one_after_it_is_flown(file: Path)
     loop.aim(base=goal_at(AIM))
     loop.executive.abort()
     loop.aim(base=goal_at([-0.5, 0.0, 0.0]))
-    np.testing.assert_allclose(loop.answer()[0][:3], [-0.5 * KP, 0.0, 0.0], atol=1e-12)
+    np.testing.assert_allclose(loop.answer()[0][:3], [-KP, 0.0, 0.0], atol=1e-12)
     assert json.loads(file.read_text())["base"]["position"] == [-0.5, 0.0, 0.0]
     assert [status.state.value for status in loop.statuses[-2:]] == ["aborted", "tracking"]
 
@@ -388,7 +444,7 @@ def test_a_body_twist_is_turned_into_the_world() -> None:
 
 
 def test_a_status_is_reported_on_changes_and_every_period() -> None:
-    loop = ExecutiveLoop(status_period=0.1, max_force=KP / 2)
+    loop = ExecutiveLoop(status_period=0.1, max_force=KP)
     loop.answer(25)
     assert len(loop.statuses) == 3
     loop.aim(base=goal_at([1.0, 0.0, 0.0]))
@@ -397,9 +453,9 @@ def test_a_status_is_reported_on_changes_and_every_period() -> None:
     count = len(loop.statuses)
     report = loop.status.command
     assert report is not None
-    assert report.lost_force_N == pytest.approx(KP / 2)
-    # The base pulls by 0.7 of it, the tip the other way by 0.3: within the limit, reported at once.
-    loop.place = np.array([0.3, 0.0, 0.0])
+    assert report.lost_force_N == pytest.approx(KP)
+    # Base and tip pull by 0.4 of it each: within the limit, reported at once.
+    loop.place = np.array([0.6, 0.0, 0.0])
     loop.answer()
     assert len(loop.statuses) == count + 1
     report = loop.status.command
@@ -574,16 +630,240 @@ def test_force_and_torque_that_thrusters_cannot_give_are_reported_apart() -> Non
             ControllerConfig,
             {"status_period": 0.01, "profile": "step", "tick_rate": 100.0, **limits},
         )
-        executive = ControlExecutive(
-            build_controller(robot, config), config, statuses.append, GoalFile("", GOAL_KEYS)
-        )
+        executive = ControlExecutive(build_controller(robot, config), config)
         executive.submit("base", IdentifiedGoal(turned))
         result = executive.command(0.01, rest, rest.q, rest.qdot, None)
         executive.evaluate(0.01, result)
         wrenches.append(result.realised.wrench_B)
+        statuses += [each for each in executive.outputs if isinstance(each, ControllerStatus)]
     lost, report = wrenches[0] - wrenches[1], statuses[-1].command
     assert report is not None
     assert np.linalg.norm(wrenches[1][:3]) == pytest.approx(0.5)
     assert report.lost_force_N == pytest.approx(np.linalg.norm(lost[:3]))
     assert report.lost_torque_Nm == pytest.approx(np.linalg.norm(lost[3:]))
     assert abs(lost[3]) > 1e-3
+
+
+# -- without odom -----------------------------------------------------------------------------
+
+
+def test_the_base_is_estimated_for_a_while_and_then_the_thrusters_are_off() -> None:
+    loop = ExecutiveLoop(estimation_time=0.05)
+    loop.aim(base=goal_at([1.0, 0.0, 0.0], "3"), end_effector=goal_at(TIP, "3"))
+    measured = loop.answer()[0]
+    for tick in range(5):
+        wrench, _ = loop.answer(measured=False)
+        np.testing.assert_allclose(wrench, measured, atol=0.15 * np.abs(measured).max())
+        # A single pose may be late.
+        reported = ("estimating", 1) if tick else ("tracking", 0)
+        assert (loop.state, loop.status.state.level) == reported
+        assert loop.status.goal_id == "3"
+    loop.rates = np.array([0.1, -0.2])
+    for _ in range(4):
+        wrench, effort = loop.answer(measured=False)
+        np.testing.assert_array_equal(wrench, np.zeros(6))
+    # The joints are slowed: their efforts take energy out of them.
+    assert effort @ loop.rates < 0.0
+    assert (loop.state, loop.status.state.level) == ("stopped", 2)
+    assert_one_sentence(loop.status.message, "thrusters off")
+    loop.rates = np.zeros(2)
+    np.testing.assert_allclose(loop.answer()[0][:3], [KP, 0.0, 0.0], atol=1e-12)
+    assert loop.state == "tracking"
+
+
+def test_the_estimate_takes_what_the_thrusters_gave_and_not_what_was_wanted() -> None:
+    """Of 300 N that a far goal wants they give 5: so much the momentum grows, and no more."""
+    robot, force = planar_manipulator(), 5.0
+    loop = ExecutiveLoop(estimation_time=1.0, max_force=force)
+    loop.aim(base=goal_at([10.0, 0.0, 0.0]), end_effector=goal_at(TIP))
+    assert np.linalg.norm(loop.answer()[0][:3]) == pytest.approx(force)
+    for ticks in range(1, 6):
+        loop.answer(measured=False)
+        state = loop.executive.controller.law.state
+        momentum, _, _ = robot.momentum(
+            state.quaternion_WB, state.q, state.v_WB_B, state.omega_WB_B, state.qdot
+        )
+        np.testing.assert_allclose(momentum, [force * ticks * PERIOD, 0.0, 0.0], atol=1e-3)
+
+
+def test_joints_that_are_stopped_do_not_swing_back() -> None:
+    """Critically damped from where they are: the rates decay as exp(-2 t/s), over qdot / 2."""
+    loop = ExecutiveLoop()
+    rates = np.array([0.3, -0.2])
+    plant = EffortPlant(
+        planar_manipulator(), PERIOD, InitialState(joint_positions=SHAPE, joint_velocities=rates)
+    )
+    for tick in range(300):
+        result = loop.executive.command(tick * PERIOD, None, plant.q, plant.qdot)
+        assert not result.realised.wrench_B.any()
+        plant.step(result.realised.tau, np.zeros(6))
+        expected = rates * math.exp(-2.0 * (tick + 1) * PERIOD)
+        np.testing.assert_allclose(plant.qdot, expected, atol=0.01)
+        assert np.all(plant.qdot * rates > 0.0), "no joint turns back"
+    np.testing.assert_allclose(plant.q, SHAPE + rates / 2.0, atol=0.01)
+
+
+def test_without_odom_from_the_beginning_nothing_is_thrust_and_the_goal_waits() -> None:
+    loop = ExecutiveLoop()
+    loop.aim(base=goal_at([1.0, 0.0, 0.0]))
+    for _ in range(3):
+        np.testing.assert_array_equal(loop.answer(measured=False)[0], np.zeros(6))
+    assert (loop.state, loop.status.state.level) == ("waiting", 0)
+    assert_one_sentence(loop.status.message, "Waiting for states on 'odom'")
+    np.testing.assert_allclose(loop.answer()[0][:3], [2 * KP, 0.0, 0.0], atol=1e-12)
+    assert loop.state == "tracking"
+
+
+def test_an_abort_without_odom_holds_where_the_robot_is_seen_again() -> None:
+    loop = ExecutiveLoop()
+    loop.aim(base=goal_at([1.0, 0.0, 0.0]))
+    loop.answer()
+    loop.executive.abort()
+    loop.answer(2, measured=False)
+    assert loop.state == "estimating"
+    loop.place = np.array([0.25, 0.0, 0.0])
+    np.testing.assert_allclose(np.concatenate(loop.answer()), 0.0, atol=1e-12)
+    assert loop.state == "aborted"
+
+
+def test_a_robot_that_held_still_holds_after_a_gap() -> None:
+    loop = ExecutiveLoop()
+    loop.answer()
+    loop.answer(2, measured=False)
+    assert loop.state == "estimating"
+    loop.answer()
+    assert loop.state == "holding"
+
+
+def test_an_aborted_goal_is_not_reached_after_a_gap() -> None:
+    loop = ExecutiveLoop(settle_time=0.0)
+    loop.aim(base=goal_at([1.0, 0.0, 0.0]))
+    loop.answer()
+    loop.executive.abort()
+    loop.answer()
+    loop.answer(measured=False)
+    loop.answer(4)
+    assert loop.state == "aborted"
+
+
+def test_a_reached_goal_does_not_fail_after_a_gap() -> None:
+    loop = ExecutiveLoop(settle_time=0.01, time_limit=0.1)
+    loop.aim(base=goal_at([0.0, 0.0, 0.0]))
+    loop.answer(20)
+    assert loop.state == "reached"
+    loop.answer(2, measured=False)
+    assert loop.state == "estimating"
+    # It has drifted in the meantime.
+    loop.place = np.array([0.01, 0.0, 0.0])
+    loop.answer(4)
+    assert loop.state == "reached"
+    assert "failed" not in [status.state.value for status in loop.statuses]
+
+
+def test_the_estimate_begins_at_the_last_measured_state_whatever_becomes_of_its_memory() -> None:
+    """A node reads every state into the same arrays: what is kept of one must be a copy."""
+    commands = []
+    for reused in (False, True):
+        controller = build_controller(planar_manipulator(), ControllerConfig())
+        q, qdot = np.zeros(2), np.array([0.4, -0.3])
+        for tick in range(4):
+            joints = SHAPE + PERIOD * tick * qdot
+            if reused:
+                q[:] = joints
+            else:
+                q = joints
+            base = np.array([0.1, 0.0, 0.0])
+            state = ControlState(base, UPRIGHT, np.zeros(3), np.zeros(3), q, qdot)
+            result = controller.command(PERIOD * tick, state if tick < 2 else None, q, qdot)
+        commands.append(np.concatenate([result.realised.wrench_B, result.realised.tau]))
+    np.testing.assert_array_equal(commands[0], commands[1])
+
+
+# -- the file ---------------------------------------------------------------------------------
+
+
+def resumed(file: Path, **settings: Any) -> ExecutiveLoop:
+    """Return another loop that resumes the goals of the file."""
+    loop = ExecutiveLoop(file, **settings)
+    loop.executive.resume(loop.file.load())
+    return loop
+
+
+def test_it_goes_on_from_where_the_robot_is_and_what_was_held_is_still_held(file: Path) -> None:
+    first = ExecutiveLoop(file)
+    first.answer()
+    first.aim(base=goal_at(AIM, "9.000000001"))
+    first.answer()
+    loop = resumed(file)
+    # Meanwhile all of it has drifted: the base, that has a goal, and the tip, that it carries.
+    loop.place = np.array([0.125, -0.25, 0.0])
+    wrench, _ = loop.answer()
+    np.testing.assert_allclose(wrench[:3], 2 * KP * (AIM - loop.place), atol=1e-12)
+    assert (loop.state, loop.status.goal_id) == ("tracking", "9.000000001")
+
+
+def test_a_law_that_holds_the_shape_goes_on_to_the_shape(file: Path) -> None:
+    first = ExecutiveLoop(file, **SHAPE_IS_CONTROLLED)
+    first.aim(base=goal_at(AIM))
+    first.answer()
+    assert json.loads(file.read_text())["base"]["joint_positions"] == SHAPE.tolist()
+    resumed(file, **SHAPE_IS_CONTROLLED).answer()
+    kept = json.loads(file.read_text())["base"]
+    assert (kept["position"], kept["joint_positions"]) == (AIM.tolist(), SHAPE.tolist())
+
+
+def test_a_goal_that_comes_at_once_replaces_the_saved_one(file: Path) -> None:
+    far = TIP + np.array([0.0, 1.0, 0.0])
+    first = ExecutiveLoop(file)
+    first.aim(base=goal_at(AIM), end_effector=goal_at(far))
+    first.answer()
+    loop = resumed(file)
+    loop.aim(base=goal_at([-0.5, 0.0, 0.0]))
+    np.testing.assert_allclose(loop.answer()[0][:3], KP * np.array([-0.5, 1.0, 0.0]), atol=1e-12)
+    kept = json.loads(file.read_text())
+    assert kept["base"]["position"] == [-0.5, 0.0, 0.0]
+    assert kept["end_effector"]["position"] == far.tolist()
+
+
+@pytest.mark.parametrize("end", ["aborted", "reached", "failed"])
+def test_a_goal_that_is_decided_is_not_kept(file: Path, end: str) -> None:
+    loop = ExecutiveLoop(file, settle_time=0.02, time_limit=0.2)
+    # The tip is to stay where it was: at another goal of the base the robot would not be at rest.
+    loop.aim(base=goal_at(np.zeros(3) if end == "reached" else AIM))
+    loop.answer()
+    assert file.exists()
+    if end == "aborted":
+        loop.executive.abort()
+        loop.answer()
+        assert not file.exists()
+    loop.answer(25)
+    assert loop.state == end
+    assert not file.exists()
+    assert loop.file.load() == {}
+
+
+@pytest.mark.parametrize(
+    ("key", "shape", "settings", "mentions"),
+    [
+        ("end_effector", None, {"law": "computed_torque"}, ("computed_torque", "end-effector")),
+        ("base", np.zeros(3), {}, ("3 joints", "planar_manipulator", "2")),
+    ],
+)
+def test_goals_of_another_robot_or_law_are_refused(
+    key: str, shape: np.ndarray | None, settings: dict[str, Any], mentions: tuple[str, ...]
+) -> None:
+    loop = ExecutiveLoop(**settings)
+    with pytest.raises(ParameterError) as refusal:
+        loop.executive.resume({key: goal_at(AIM, shape=shape)})
+    assert_one_sentence(str(refusal.value), "resume_file", *mentions)
+    loop.answer()
+    assert loop.state == "holding"
+
+
+def test_where_nothing_can_be_written_the_goal_is_flown(tmp_path: Path) -> None:
+    loop = ExecutiveLoop(tmp_path / "nowhere" / "goals.json")
+    loop.aim(base=goal_at(AIM))
+    np.testing.assert_allclose(loop.answer()[0][:3], 2 * KP * AIM, atol=1e-12)
+    assert loop.state == "tracking"
+    (warning,) = loop.warnings
+    assert "not resumed after a restart" in warning

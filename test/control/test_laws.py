@@ -179,10 +179,10 @@ class _Damping(ControlLaw):
     gain_units = ("N m/rad", "N m s/rad")
     Options = _DampingOptions
 
-    def _inputs(self) -> dict[str, float]:
+    def inputs(self) -> dict[str, float]:
         return {"strength": self.options.strength}
 
-    def _results(self, symbols: dict[str, ca.SX]) -> dict[str, ca.SX]:
+    def results(self, symbols: dict[str, ca.SX]) -> dict[str, ca.SX]:
         tau = -symbols["strength"] * self.outputs.qdot
         return {"actuation": ca.vertcat(ca.SX(6, 1), tau)}
 

@@ -239,7 +239,7 @@ def test_the_expression_of_a_profile_is_the_profile(kind: type) -> None:
     for base, hand, n in ((True, True, 2), (True, False, 0), (False, True, 2), (False, False, 2)):
         given = reference.profile_numbers(made, base, hand, n)
         size = reference.profile_size(base, hand, n)
-        assert len(given) == size == 1 + 25 * (base + hand) + 3 * n
+        assert len(given) == size == 1 + 31 * (base + hand) + 3 * n
         symbols, time = ca.SX.sym("p", size), ca.SX.sym("t")
         expression = reference.profile_expression(symbols, time, base, hand, n)
         function = ca.Function("f", [symbols, time], [expression])

@@ -211,7 +211,7 @@ def test_a_law_without_an_integral_term_says_so() -> None:
         name = "proportional"
         gain_units = ("N/m", "N s/m")
 
-        def _results(self, symbols: dict[str, object]) -> dict[str, object]:
+        def results(self, symbols: dict[str, object]) -> dict[str, object]:
             z1 = self.outputs
             return {"actuation": (z1.J_z @ z1.J_q_inverse).T @ (symbols["kp"] * z1.error)}
 
@@ -384,7 +384,7 @@ def test_a_group_with_gains_keeps_them() -> None:
     """At rest the force on the base is the sum of those on both poses."""
     others = [group for group in vars(Gains()) if group != "base_position"]
     loop = ExecutiveLoop(**automatic_gains(*others))
-    loop.aim(base=goal_at(AIM))
+    loop.aim(base=goal_at(AIM), end_effector=goal_at(TIP))
     np.testing.assert_allclose(loop.answer()[0][:3], STEP_KP * AIM, rtol=1e-9, atol=1e-9)
 
 
@@ -394,7 +394,7 @@ class _Spring(ControlLaw):
     name = "spring"
     gain_units = ("N/m", "N s/m")
 
-    def _results(self, symbols: dict[str, ca.SX]) -> dict[str, ca.SX]:
+    def results(self, symbols: dict[str, ca.SX]) -> dict[str, ca.SX]:
         z1 = self.outputs
         pull = symbols["kp"] * z1.error + symbols["kd"] * z1.error_rate
         return {"actuation": (z1.J_z @ z1.J_q_inverse).T @ pull}

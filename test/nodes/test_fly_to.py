@@ -295,7 +295,7 @@ def test_a_goal_is_cancelled_while_it_is_planned(
             cancellation.raise_if_requested()
 
     monkeypatch.setattr(LieBracketGait, "plan", wait)
-    flight = ActionFlight(harness, {"plan_in_background": True})
+    flight = ActionFlight(harness, plant={"time_mode": "realtime"})
     flight.start()
     sent = flight.fly_to.send(**base_at(goal_at(NEAR)))
     harness.spin_until(planned.is_set, "the planner plans")

@@ -36,7 +36,7 @@ from spacerobot_ros.nodes.common.node import FlightNode
 from spacerobot_ros.nodes.common.ros_parameters import RemoteParameters, declare
 from spacerobot_ros.nodes.replay import ReplayNode
 from spacerobot_ros.parameters import Parameter as Declaration
-from spacerobot_ros.parameters import declared
+from spacerobot_ros.parameters import declared, values_of
 
 KINDS: dict[str, Any] = {**NODE_TYPES, "replay": ReplayNode}
 
@@ -78,9 +78,9 @@ def test_all_parameters_are_answered_at_once(harness: Harness, name: str) -> Non
     node = harness.add(KINDS[name](autostart=False, context=harness.context))
     remote = Remote(harness, node)
     values = remote.values(remote.names())
-    declared = node.parameter_values
-    assert len(declared) >= 8
-    for each, value in declared.items():
+    configured = values_of(node.config)
+    assert len(configured) >= 7
+    for each, value in configured.items():
         assert values[each] == (list(value) if isinstance(value, tuple) else value)
 
 
@@ -198,11 +198,11 @@ def test_what_is_set_is_checked_and_leaves_the_rest(harness: Harness) -> None:
         (result,) = remote.set(**{name: value})
         assert not result.successful
         assert f"'{name}'" in result.reason
-    assert plant.parameter_values == KINDS["plant"](
+    assert plant.config == KINDS["plant"](
         autostart=False, context=harness.context, parameter_overrides=[
             Parameter(key, value=value) for key, value in LOCKSTEP.items()
         ],
-    ).parameter_values  # fmt: skip
+    ).config  # fmt: skip
 
 
 def test_a_bad_robot_fails_the_configuration_and_may_be_mended(harness: Harness) -> None:
@@ -298,7 +298,7 @@ def set_everything(node: FlightNode, fly: Any) -> tuple[int, int]:
                 refused += 1
                 assert result.reason
             assert node.is_active
-            assert node.parameter_values[parameter.name] == pytest.approx(
+            assert values_of(node.config)[parameter.name] == pytest.approx(
                 node.get_parameter(parameter.name).value
             )
         assert node.set_parameters([before])[0].successful

@@ -7,6 +7,7 @@ import resource
 import signal
 from collections.abc import Callable, Iterator
 from contextlib import suppress
+from functools import partial
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
@@ -90,6 +91,31 @@ def test_a_bad_start_ends_with_a_sentence_and_exit_code_2(
         # What ROS itself refuses, it says in its own words.
         sentence = ended.stderr.strip().splitlines()[-1].removesuffix(".") + "."
         assert_one_sentence(sentence, *mentions)
+
+
+NO_SUCH_PARAMETER = {
+    "plant": ("tick_rat", "tick_rate"),
+    "planner": ("robott", "robot"),
+    "coordinated_control": ("gains.base_positon.kp", "gains.base_position.kp"),
+}
+"""By node a misspelt parameter, and the one that is meant."""
+
+
+def test_a_parameter_that_a_node_does_not_have_is_named_with_the_nearest(
+    start: Start, tmp_path: Path, harness: Harness
+) -> None:
+    processes = []
+    for node, (given, meant) in NO_SUCH_PARAMETER.items():
+        file = tmp_path / f"{node}.yaml"
+        file.write_text(f"{node}:\n  ros__parameters:\n    {given}: 1.0\n    fuel: 2\n", "utf-8")
+        words = ["--params-file", str(file), "-p", "use_sim_time:=false"]
+        robot = {} if node != "plant" else {"robot": "sliding_masses"}
+        processes.append((start(node, robot, arguments=words), given, meant))
+    for process, given, meant in processes:
+        warned = partial(lambda process: "[WARN]" in process.said, process)
+        harness.spin_until(warned, "a warning", timeout=START)
+        (warning,) = (line for line in process.said.splitlines() if line.startswith("[WARN]"))
+        assert_one_sentence(warning.partition("]: ")[2], f"'{given}'", f"'{meant}'", "'fuel'")
 
 
 @pytest.mark.slow

@@ -13,6 +13,7 @@ from geometry_msgs.msg import PoseStamped
 from rclpy.publisher import Publisher
 from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Float64
+from support.recorded_stack import has_parameters
 from support.ros_harness import Harness, Probe, nanoseconds
 
 from spacerobot_ros.bag import RecordedRobot, read_bag
@@ -85,7 +86,8 @@ class NamedStack:
 
     def parameters_are_there(self) -> bool:
         self.recorder.scan()
-        return not self.recorder.questions
+        self.recorder.flush()
+        return has_parameters(self.bag, "plant", "planner")
 
 
 @pytest.mark.slow

@@ -19,7 +19,7 @@ from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 from support.altered_bags import altered
 from support.command_line import CliRunner, Result
-from support.recorded_stack import Stack, parameters_of
+from support.recorded_stack import Stack, has_parameters, parameters_of
 from support.ros_harness import Harness
 from support.sentences import assert_one_sentence
 
@@ -252,7 +252,12 @@ def recorded(harness: Harness, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     stack.configure("/odom", "/planner/status", "/joint_commands", "/clock", "/goal_pose")
     stack.recorder.trigger_activate()
     stack.fly()
-    harness.spin_until(lambda: not stack.recorder.questions, "the nodes' parameters")
+
+    def has_all() -> bool:
+        stack.recorder.flush()
+        return has_parameters(stack.bag, "plant", "planner")
+
+    harness.spin_until(has_all, "the nodes' parameters")
     stack.stop()
     nodes = (stack.plant, stack.planner, stack.recorder)
     dump = tmp_path / "dump.yaml"

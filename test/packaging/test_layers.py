@@ -206,7 +206,7 @@ MUTABLE = {
     "spacerobot_ros.commanding.fly_to._ActionGoal",
     "spacerobot_ros.control.goal_monitor.GoalMonitor",
     "spacerobot_ros.planning.execution.executive.ActiveGoal",
-    "spacerobot_ros.planning.execution.executive.Teleoperation",
+    "spacerobot_ros.planning.execution.teleoperation._Following",
     "spacerobot_ros.planning.methods.optimal.search._SearchState",
     "spacerobot_ros.report.solids.Solids",
     "spacerobot_ros.flight.verification._Resimulation",
@@ -240,7 +240,7 @@ def test_parameters_can_be_given_by_name() -> None:
 
 HOOKS = {
     "commanding.commander": ["_report_waiting_goal", "_forward_outputs"],
-    "planning.core.method": ["_setup", "require_suitable"],
+    "planning.core.method": ["setup", "require_suitable"],
 }
 """Methods of abstract classes that do nothing unless they are overridden, by module."""
 

@@ -161,7 +161,7 @@ class Made(GaitMethod):
         path = BasePath(np.zeros(1), ends[np.newaxis], goal.quaternion[np.newaxis])
         q = np.tile(request.state.q, (1 + self.ticks, 1))
         partial = self.left > 0
-        return self._schedule_of(goal, q, path, {}, partial=partial, remaining=self.left)
+        return self.schedule_of(goal, q, path, {}, partial=partial, remaining=self.left)
 
 
 def made(

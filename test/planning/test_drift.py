@@ -225,7 +225,7 @@ def test_a_momentum_counts_where_a_method_for_robots_at_rest_refuses_it(
         state = replace(RobotState(np.zeros(3), ATTITUDE, ARM_START), **{kind: momentum})
         refused = False
         try:
-            method._require_rest(state)
+            method.require_rest(state)
         except PlanningError:
             refused = True
         np.testing.assert_array_equal(method.significant(momentum), refused * momentum)

@@ -183,8 +183,8 @@ def test_a_plant_that_stops_ends_the_goal_with_its_reason(
     start: Callable[[], Loop], tmp_path: Path
 ) -> None:
     loop = start()
-    loop.executive._goal_file = GoalFile(str(tmp_path / "goal.json"))
-    loop.executive._goal_file.save({BASE_GOAL_KEY: IdentifiedGoal(goal_at(NEAR), "goal-1")})
+    loop.goal_file = GoalFile(str(tmp_path / "goal.json"))
+    loop.goal_file.save({BASE_GOAL_KEY: IdentifiedGoal(goal_at(NEAR), "goal-1")})
     assert loop.executive.plant_stopped("The plant is latched: a fuse is blown.")
     loop.tick()
     status = loop.statuses[-1]

@@ -20,6 +20,7 @@ from spacerobot_ros.planning.execution.goal_file import (
     GoalFile,
     GoalIds,
     IdentifiedGoal,
+    PursuedGoals,
 )
 from spacerobot_ros.planning.execution.status import (
     PlannerState,
@@ -200,6 +201,24 @@ def test_a_goal_that_others_could_have_written_is_not_flown_to(
         monkeypatch.setattr("os.geteuid", lambda: os.getuid() + 1)
     with pytest.raises(ParameterError, match="belongs to user"):
         file.load()
+
+
+def test_a_goal_stays_on_file_until_it_is_decided(tmp_path: Path) -> None:
+    path = tmp_path / "goal.json"
+    file = GoalFile(str(path))
+    assert not file.pursue(PursuedGoals({BASE_GOAL_KEY: IdentifiedGoal(GOAL, "1.0")}))
+    file.end("2.0", refused=True)
+    assert path.exists()
+    file.end("1.0", refused=True)
+    assert not path.exists()
+    file.pursue(PursuedGoals({BASE_GOAL_KEY: IdentifiedGoal(GOAL, "3.0")}))
+    restarted = GoalFile(str(path))
+    restarted.load()
+    restarted.end("2.0", refused=True)
+    assert path.exists()
+    # An abort is about all goals, also under the id of one that waits.
+    restarted.end("2.0", refused=False)
+    assert not path.exists()
 
 
 def test_a_goal_file_is_replaced_as_a_whole(

@@ -44,15 +44,15 @@ class SlowWorker(HeldWorker):
         super().__init__(*arguments, **options)
         self._states, self._left = states, 0
 
-    def submit(self, task: PlanningTask) -> None:
-        super().submit(task)
+    def start(self, task: PlanningTask) -> None:
+        super().start(task)
         self._left = self._states
 
-    def poll(self) -> Planned | Refused | None:
+    def take_result(self) -> Planned | Refused | None:
         self._left -= 1
         if self._left < 0 or self.cancelled:
             self.release()
-        return super().poll()
+        return super().take_result()
 
 
 class BalancedLoop(Loop):

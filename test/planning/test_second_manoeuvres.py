@@ -208,10 +208,10 @@ def test_a_goal_shape_is_held_against_the_limits_of_its_own_joint(
     method = planner_of("square_path", robot, TICK, TOLERANCE, TICK).method
     name = robot.joint_names[joint]
     with pytest.raises(UnreachableError, match="beyond limits") as refusal:
-        method._goal_shape(replace(goal_at(NEAR), joint_positions=np.array(shape)))
+        method.goal_shape(replace(goal_at(NEAR), joint_positions=np.array(shape)))
     assert f"joint '{name}' at {at} rad, and its limits are {limits} rad" in str(refusal.value)
     within = np.array([-2.85, 2.55])
-    found = method._goal_shape(replace(goal_at(NEAR), joint_positions=within))
+    found = method.goal_shape(replace(goal_at(NEAR), joint_positions=within))
     np.testing.assert_array_equal(found, within)
 
 

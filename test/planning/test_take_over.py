@@ -219,10 +219,10 @@ def test_a_plan_for_an_earlier_goal_is_cancelled_at_once() -> None:
 
 def test_the_present_goal_once_more_goes_on_under_its_new_id(tmp_path: Path) -> None:
     loop = flying()
-    loop.executive._goal_file = GoalFile(str(tmp_path / "goal.json"))
+    loop.goal_file = GoalFile(str(tmp_path / "goal.json"))
     loop.propose_goal(NEAR)
     loop.tick()
-    assert loop.executive._goal_file.load()[BASE_GOAL_KEY].goal_id == "goal-2"
+    assert loop.goal_file.load()[BASE_GOAL_KEY].goal_id == "goal-2"
     assert loop.until(PlannerState.REACHED).goal_id == "goal-2"
     assert len(loop.starts) == 1
     assert [(s.state.value, s.goal_id) for s in loop.statuses] == [
@@ -236,7 +236,7 @@ def test_the_present_goal_once_more_goes_on_under_its_new_id(tmp_path: Path) -> 
 def test_what_is_planned_for_another_goal_is_aborted_with_all_goals(tmp_path: Path) -> None:
     for ticks in (1, 4):
         loop = flying(held=True)
-        loop.executive._goal_file = GoalFile(str(tmp_path / "goal.json"))
+        loop.goal_file = GoalFile(str(tmp_path / "goal.json"))
         loop.propose_goal(OTHER)
         loop.tick()
         if ticks > 1:

@@ -176,13 +176,12 @@ def test_a_limit_is_over_when_it_has_not_come_for_the_timeout_of_twists(
 ) -> None:
     loop = loop_of(twist_timeout=0.3)
     fly(loop, 5)
-    follower = loop.executive._teleoperation.follower  # type: ignore[union-attr]
-    rates, limits = follower.rates, iter([*"ll....l", *40 * "."])
+    rates, limits = TwistFollower.rates, iter([*"ll....l", *40 * "."])
 
     def limited(*given: Any) -> tuple[Array, str]:
         return rates(*given)[0], "Joint 'wrist' is slow." if next(limits) == "l" else ""
 
-    monkeypatch.setattr(follower, "rates", limited)
+    monkeypatch.setattr(TwistFollower, "rates", limited)
     begun = len(loop.statuses)
     told = []
     for _ in range(20):

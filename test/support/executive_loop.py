@@ -15,12 +15,16 @@ from spacerobot_ros.control import ControlState, Reference
 from spacerobot_ros.control.config import ControllerConfig
 from spacerobot_ros.control.controller import build_controller
 from spacerobot_ros.control.executive import GOAL_KEYS, ControlExecutive
-from spacerobot_ros.control.status import ControllerStatus
+from spacerobot_ros.control.status import ControllerState, ControllerStatus
 from spacerobot_ros.events import Event
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.parameters import configured
 from spacerobot_ros.planning import Goal
-from spacerobot_ros.planning.execution.goal_file import GoalFile, IdentifiedGoal
+from spacerobot_ros.planning.execution.goal_file import (
+    GoalFile,
+    IdentifiedGoal,
+    PursuedGoals,
+)
 
 Array = npt.NDArray[np.float64]
 
@@ -73,18 +77,12 @@ class ExecutiveLoop:
     def __init__(self, goal_file: Path | None = None, **settings: Any) -> None:
         defaults = {"tick_rate": 1 / PERIOD, "status_period": 0.01, **STEP}
         self.config = configured(ControllerConfig, {**defaults, **settings})
-        self.statuses: list[ControllerStatus] = []
+        self._statuses: list[ControllerStatus] = []
+        self._events: list[Event] = []
         self.warnings: list[str] = []
-        self.events: list[Event] = []
         self.file = GoalFile(str(goal_file or ""), GOAL_KEYS)
-        self.executive = ControlExecutive(
-            build_controller(planar_manipulator(), self.config),
-            self.config,
-            self.statuses.append,
-            self.file,
-            self.warnings.append,
-            self.events.append,
-        )
+        controller = build_controller(planar_manipulator(), self.config)
+        self.executive = ControlExecutive(controller, self.config)
         self.tick = 0
         self.place, self.velocity, self.rates = np.zeros(3), np.zeros(3), np.zeros(2)
 
@@ -107,7 +105,34 @@ class ExecutiveLoop:
                 self.tick * PERIOD, state if measured else None, SHAPE, self.rates, reference
             )
             self.executive.evaluate(self.tick * PERIOD, result)
+            self._take()
         return result.realised.wrench_B, result.realised.tau
+
+    def _take(self) -> None:
+        while self.executive.outputs:
+            match self.executive.outputs.popleft():
+                case Event() as event:
+                    self._events.append(event)
+                case PursuedGoals() as pursued:
+                    if problem := self.file.pursue(pursued):
+                        self.warnings.append(problem)
+                case ControllerStatus() as status:
+                    self._statuses.append(status)
+                    if status.state.decided:
+                        refused = status.state is ControllerState.REFUSED
+                        self.file.end(status.goal_id, refused=refused)
+
+    @property
+    def statuses(self) -> list[ControllerStatus]:
+        """What was reported of goals so far."""
+        self._take()
+        return self._statuses
+
+    @property
+    def events(self) -> list[Event]:
+        """The events so far."""
+        self._take()
+        return self._events
 
     @property
     def status(self) -> ControllerStatus:

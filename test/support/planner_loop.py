@@ -21,13 +21,18 @@ from spacerobot_ros.planning.core.method import GaitMethod, PlanRequest
 from spacerobot_ros.planning.core.schedule import BasePath
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.execution.executive import Executive, Output, Transition
-from spacerobot_ros.planning.execution.goal_file import GoalFile, IdentifiedGoal
+from spacerobot_ros.planning.execution.goal_file import (
+    GoalFile,
+    IdentifiedGoal,
+    PursuedGoals,
+)
 from spacerobot_ros.planning.execution.state_average import BaseMeasurement
 from spacerobot_ros.planning.execution.status import (
     Notice,
     PlannerState,
     PlannerStatus,
     ScheduleStart,
+    Severity,
 )
 from spacerobot_ros.planning.execution.worker import (
     Planned,
@@ -142,7 +147,7 @@ class HeldWorker(PlanningWorker):
     def is_busy(self) -> bool:
         return self.task is not None
 
-    def submit(self, task: PlanningTask) -> None:
+    def start(self, task: PlanningTask) -> None:
         assert self.task is None
         self.task, self.cancelled, self.released = task, False, False
         self.tasks.append(task)
@@ -151,7 +156,7 @@ class HeldWorker(PlanningWorker):
         """Let the plan be there at the next look."""
         self.released = True
 
-    def poll(self) -> Planned | Refused | None:
+    def take_result(self) -> Planned | Refused | None:
         if self.task is None or not self.released:
             return None
         task, self.task = self.task, None
@@ -223,7 +228,8 @@ class Loop:
         self.method = method
         self.held = HeldWorker(model, self.config, method)
         worker = self.held if held else PlanningWorker(model, self.config, method)
-        self.executive = Executive(model, self.config, worker, goal_file)
+        self.executive = Executive(model, self.config, worker)
+        self.goal_file = goal_file or GoalFile("")
         self.measured = PlantState(self.plant)
         self.outputs: list[Output] = []
         self.shapes: list[Array] = [self.plant.q.copy()]
@@ -298,7 +304,15 @@ class Loop:
         raise AssertionError(f"not decided: {self.statuses[before:]}")
 
     def _take(self) -> None:
-        self.outputs += self.executive.outputs
+        for output in self.executive.outputs:
+            match output:
+                case PursuedGoals() as pursued:
+                    if problem := self.goal_file.pursue(pursued):
+                        output = Notice(Severity.ERROR, problem)
+                case PlannerStatus() as status if status.state.decided:
+                    refused = status.state is PlannerState.REFUSED
+                    self.goal_file.end(status.goal_id, refused=refused)
+            self.outputs.append(output)
         self.executive.outputs.clear()
 
     # -- looking ------------------------------------------------------------------------------

@@ -18,6 +18,7 @@ from support.ros_harness import Harness, Probe
 
 from spacerobot_ros.nodes import PlannerNode, PlantNode, RecorderNode
 from spacerobot_ros.nodes.common.node import FlightNode
+from spacerobot_ros.parameters import values_of
 
 PLANT = {
     "robot": "sliding_masses",
@@ -40,7 +41,14 @@ WRITTEN_BY_THE_RECORDER = ("/tf", "/tf_static")
 
 def parameters_of(node: FlightNode) -> dict[str, str]:
     """Return a node's parameters as JSON texts by name, for a bag's metadata."""
-    return {name: json.dumps(value) for name, value in node.parameter_values.items()}
+    values = {"autostart": True, **values_of(node.config)}
+    return {name: json.dumps(value) for name, value in values.items()}
+
+
+def has_parameters(bag: Path, *nodes: str) -> bool:
+    """Whether a file that is being written has the parameters of nodes; records are as they are."""
+    written = bag.read_bytes()
+    return all(f"parameters/{node}".encode() in written for node in nodes)
 
 
 def message_class(type_name: str) -> Any:

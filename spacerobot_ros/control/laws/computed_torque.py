@@ -48,7 +48,8 @@ class ComputedTorqueLaw(ControlLaw):
         """Return all the joints."""
         return OutputSelection(joints=robot.joint_names)
 
-    def _results(self, symbols: dict[str, ca.SX]) -> dict[str, ca.SX]:
+    def results(self, symbols: dict[str, ca.SX]) -> dict[str, ca.SX]:
+        """Return the command's expressions; see :meth:`ControlLaw.results`."""
         z1 = self.outputs
         H = z1.model("inertia_matrix", z1.q)
         C = z1.model("bias", z1.q, z1.v_cm, z1.omega, z1.qdot)

@@ -147,9 +147,6 @@ class Gains:
         ]
 
 
-_NO_REFERENCE = Reference()
-
-
 @dataclass(frozen=True)
 class LawStatus:
     """Conditioning of the last command.
@@ -179,7 +176,7 @@ class ControlLaw(ABC):
     """A way to turn errors of the outputs into thruster forces and joint efforts.
 
     A law is constructed once for a robot and commands once every control period. A subclass gives
-    ``name``, ``gain_units`` and :meth:`_results`, and where it has options, ``Options``: a frozen
+    ``name``, ``gain_units`` and :meth:`results`, and where it has options, ``Options``: a frozen
     dataclass derived from :class:`LawOptions`, whose fields become the parameters
     ``<name>.<option>`` of the controller node. A line in
     :mod:`spacerobot_ros.control.laws.registry` makes it available.
@@ -243,7 +240,7 @@ class ControlLaw(ABC):
         """Build the function of the law; one that ``weighs`` outputs computes automatic gains."""
         self._weighs, robot = weighs, self.robot
         self._mobility: ca.SX | None = None
-        inputs = {name: np.asarray(value) for name, value in self._inputs().items()}
+        inputs = {name: np.asarray(value) for name, value in self.inputs().items()}
         key: tuple[Any, ...] = (
             type(self),
             self.outputs.selection,
@@ -284,7 +281,7 @@ class ControlLaw(ABC):
             "error": self.outputs.error,
             "error_rate": self.outputs.error_rate,
             "J_z": self.outputs.J_z,
-            **self._results(symbols),
+            **self.results(symbols),
         }
         if self._mobility is not None:
             results["mobility"] = self._mobility
@@ -432,7 +429,7 @@ class ControlLaw(ABC):
         """
         self.outputs.pack_state(state, self._in["state"])
         self.outputs.pack_reference(reference, self._in["reference"])
-        return self._actuation(reference)
+        return self.actuation(reference)
 
     def slowest_decay(self) -> float:
         """Return the rate (1/s) at which the slowest error decays, near the last state at rest."""
@@ -516,10 +513,10 @@ class ControlLaw(ABC):
     def _damping(self, singular_value: float) -> float:
         return 0.0
 
-    def _inputs(self) -> Mapping[str, npt.ArrayLike]:
+    def inputs(self) -> Mapping[str, npt.ArrayLike]:
         """Return the law's own arguments of its function, by name, with their initial values.
 
-        They follow state, reference and gains; :meth:`_actuation` may change them, in ``self._in``.
+        They follow state, reference and gains; :meth:`actuation` may change them, in ``self._in``.
         """
         return {}
 
@@ -529,24 +526,24 @@ class ControlLaw(ABC):
         every flight; None: some depend on the flight.
         """
         integral = {"integral": np.zeros(self.outputs.m)}
-        return {**integral, **self._inputs(), **self.robot.mass_arguments}
+        return {**integral, **self.inputs(), **self.robot.mass_arguments}
 
     def is_complete(self, results: Mapping[str, ca.SX]) -> ca.SX:
         """Return whether the results of :attr:`function` are the command without further steps."""
         return ca.SX(1)
 
     @abstractmethod
-    def _results(self, symbols: dict[str, ca.SX]) -> dict[str, ca.SX]:
+    def results(self, symbols: dict[str, ca.SX]) -> dict[str, ca.SX]:
         """Return the expressions of the law's results beside the errors and ``J_z``, by name.
 
         ``actuation`` (6 + n,) is the command: force (N) and torque (N m) at the origin of the base
         link in base components, then the joint efforts; other results are the law's own.
         ``symbols`` has ``kp`` and ``kd`` (m,), ``integral`` (m,), to be added to ``kp`` times the
-        error, and one for each name of :meth:`_inputs`; all else is in ``self.outputs``. A law
+        error, and one for each name of :meth:`inputs`; all else is in ``self.outputs``. A law
         whose ``actuation`` does not depend on ``integral`` refuses integral gains.
         """
 
-    def _actuation(self, reference: Reference) -> Actuation:
+    def actuation(self, reference: Reference) -> Actuation:
         """Evaluate the function and return the command; its inputs are in ``self._in``."""
         self._function.evaluate()
         actuation = self._out["actuation"].copy()

@@ -75,7 +75,8 @@ class ModelBasedLaw(ControlLaw):
     def _damping(self, singular_value: float) -> float:
         return math.sqrt(max(0.0, self.singular_value_threshold**2 - singular_value**2))
 
-    def _inputs(self) -> Mapping[str, npt.ArrayLike]:
+    def inputs(self) -> Mapping[str, npt.ArrayLike]:
+        """Return arguments of the law's own; see :meth:`ControlLaw.inputs`."""
         return {
             "null_space": (self.options.posture_stiffness, self.options.null_space_damping),
             "posture": np.zeros(self.robot.n),
@@ -91,7 +92,8 @@ class ModelBasedLaw(ControlLaw):
         """Return whether the outputs are far enough from a singularity."""
         return results["margin"] >= self.singular_value_threshold
 
-    def _results(self, symbols: dict[str, ca.SX]) -> dict[str, ca.SX]:
+    def results(self, symbols: dict[str, ca.SX]) -> dict[str, ca.SX]:
+        """Return the command's expressions; see :meth:`ControlLaw.results`."""
         z1 = self.outputs
         H = z1.model("inertia_matrix", z1.q)
         C = z1.model("bias", z1.q, z1.v_cm, z1.omega, z1.qdot)
@@ -123,7 +125,8 @@ class ModelBasedLaw(ControlLaw):
             "z0dot": z1.z0dot,
         }
 
-    def _actuation(self, reference: Reference) -> Actuation:
+    def actuation(self, reference: Reference) -> Actuation:
+        """Return the command; see :meth:`ControlLaw.actuation`."""
         # Without a joint reference the posture is the present one, and pulls at nothing.
         q = self._in["state"][13 : 13 + self.robot.n]
         self._in["posture"][:] = q if reference.joints is None else reference.joints.q

@@ -15,7 +15,7 @@ from spacerobot_ros.model.description import Array
 class NumpyLaw(ControlLaw):
     """A law that computes its command in Python, from a state and a reference.
 
-    A subclass gives ``name`` and :meth:`actuation`. Before each call the base class evaluates
+    A subclass gives ``name`` and :meth:`compute`. Before each call the base class evaluates
     :attr:`error`, :attr:`error_rate` and :attr:`J_z` of the outputs; :attr:`gain_diagonals` are the
     parameters ``gains``. A law with a state keeps it in its attributes, and starts it anew in
     :meth:`start`. All engines but the lanes of campaigns fly such a law.
@@ -26,7 +26,7 @@ class NumpyLaw(ControlLaw):
     gain_units: ClassVar[tuple[str, str]] = ACCELERATION_GAINS
 
     @abstractmethod
-    def actuation(self, state: ControlState, reference: Reference) -> Actuation:
+    def compute(self, state: ControlState, reference: Reference) -> Actuation:
         """Return the wrench on the base and the joint efforts, not limited.
 
         Parameters
@@ -50,14 +50,15 @@ class NumpyLaw(ControlLaw):
         return self._out["J_z"].copy()
 
     def command(self, state: ControlState, reference: Reference) -> Actuation:
-        """Return :meth:`actuation`, after the errors of the outputs; see :class:`ControlLaw`."""
+        """Return :meth:`compute`, after the errors of the outputs; see :class:`ControlLaw`."""
         super().command(state, reference)
-        return self.actuation(state, reference)
+        return self.compute(state, reference)
 
     @property
     def fixed_inputs(self) -> None:
         """None: the command is more than a function of numbers."""
         return None
 
-    def _results(self, symbols: dict[str, ca.SX]) -> dict[str, ca.SX]:
+    def results(self, symbols: dict[str, ca.SX]) -> dict[str, ca.SX]:
+        """Return no command: :meth:`compute` does."""
         return {"actuation": ca.SX(6 + self.robot.n, 1)}

@@ -48,10 +48,12 @@ class TransposedJacobianLaw(ControlLaw):
     gain_units: ClassVar[tuple[str, str]] = FORCE_GAINS
     Options: ClassVar[Any] = TransposedJacobianOptions
 
-    def _inputs(self) -> Mapping[str, npt.ArrayLike]:
+    def inputs(self) -> Mapping[str, npt.ArrayLike]:
+        """Return arguments of the law's own; see :meth:`ControlLaw.inputs`."""
         return {"joint_damping": self.options.joint_damping}
 
-    def _results(self, symbols: dict[str, ca.SX]) -> dict[str, ca.SX]:
+    def results(self, symbols: dict[str, ca.SX]) -> dict[str, ca.SX]:
+        """Return the command's expressions; see :meth:`ControlLaw.results`."""
         z1 = self.outputs
         effort = symbols["kp"] * z1.error + symbols["kd"] * z1.error_rate + symbols["integral"]
         effort += self.automatic_effort(symbols)

@@ -18,7 +18,6 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
-from std_srvs.srv import Trigger
 
 from spacerobot_ros.commanding.commander import Commander, LogLevel
 from spacerobot_ros.commanding.goal_follower import Status
@@ -106,14 +105,14 @@ class CommanderNode(FlightNode):
         self._best_effort = config.state_reliability == "best_effort"
         self._unheard = ""
         """Name of a state topic with a publisher whose QoS the subscription does not match."""
-        self._inputs: dict[str, Subscription] = {}
+        self.inputs: dict[str, Subscription] = {}
         self._subscribe_states()
         self.create_timer(
             _WAITING_STATE_CHECK_PERIOD,
             self._process_waiting_messages,
             clock=Clock(clock_type=ClockType.STEADY_TIME),
         )
-        self.create_service(Trigger, "~/abort", self._on_abort)
+        self.offer("~/abort", self._abort)
         self._description, self._decoder = "", None
         robot = robot_of(config)
         if robot is None:
@@ -199,7 +198,7 @@ class CommanderNode(FlightNode):
 
     def has_publisher(self, topic: str) -> bool:
         """Whether a publisher of a topic of the state, or of a reference, is connected."""
-        return bool(self._inputs[topic].get_publisher_count())
+        return bool(self.inputs[topic].get_publisher_count())
 
     def waiting_states(self) -> tuple[list[Stamped], list[Stamped]]:
         """Return the messages that wait in the subscriptions of odom and joint_states.
@@ -216,7 +215,7 @@ class CommanderNode(FlightNode):
     def _waiting(self, topic: str) -> list[bytes]:
         """Take and return the messages that wait in a subscription."""
         found: list[bytes] = []
-        handle, kind = self._inputs[topic].handle, self._inputs[topic].msg_type
+        handle, kind = self.inputs[topic].handle, self.inputs[topic].msg_type
         with handle:
             while (taken := handle.take_message(kind, True)) is not None:
                 found.append(taken[0])
@@ -259,9 +258,9 @@ class CommanderNode(FlightNode):
         """
         what = f"The goal of the {key.replace('_', '-')}"
         frame = self.config.world_frame
-        return goal_of(message, frame, what, self._goal_shape(), self._pose_of)
+        return goal_of(message, frame, what, self.goal_shape(), self._pose_of)
 
-    def _goal_shape(self) -> Array | None:
+    def goal_shape(self) -> Array | None:
         """Return the joint positions (n,) required at the end of goals; None: any."""
         return None
 
@@ -279,11 +278,11 @@ class CommanderNode(FlightNode):
                 own = robot_frames(robot.description, state)
         return self._known_frames.pose(frame, self.config.world_frame, own)
 
-    def _on_abort(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+    def _abort(self) -> str:
         answer = self.commander.abort()
-        response.success = answer is not None
-        response.message = answer or "There is no goal to abort."
-        return response
+        if answer is None:
+            raise CommandError("There is no goal to abort.")
+        return answer
 
     def _subscribe_plant_status(self) -> None:
         """Subscribe anew to plant/status, whose present publishers first send their last status."""
@@ -364,7 +363,7 @@ class CommanderNode(FlightNode):
             def on_incompatible(_: Any, topic: str = topic) -> None:
                 self._unheard = topic
 
-            self._inputs[topic] = self.create_subscription(
+            self.inputs[topic] = self.create_subscription(
                 kind,
                 topic,
                 callback,
@@ -382,7 +381,7 @@ class CommanderNode(FlightNode):
         )
         self._unheard, self._best_effort = "", True
         for topic in ("odom", "joint_states"):
-            self.destroy_subscription(self._inputs[topic])
+            self.destroy_subscription(self.inputs[topic])
         self._subscribe_states()
 
     def _process_waiting_messages(self) -> None:

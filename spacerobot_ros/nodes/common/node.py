@@ -26,14 +26,20 @@ from rclpy.subscription import Subscription
 from rclpy.timer import Timer
 from std_srvs.srv import Trigger
 
-from spacerobot_ros.errors import ParameterError, SpaceRobotError, describe_exception
+from spacerobot_ros.errors import (
+    CommandError,
+    ParameterError,
+    SpaceRobotError,
+    describe_exception,
+    printable,
+)
 from spacerobot_ros.events import Event, EventKind
 from spacerobot_ros.messages.statuses import StatusRecord
 from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.nodes.common.ros_parameters import declare, fix, typed
+from spacerobot_ros.nodes.common.ros_parameters import declare, fix, typed, unknown_parameters
 from spacerobot_ros.nodes.common.streams import MatchedEndpoints
 from spacerobot_ros.nodes.common.watchdog import Liveness, Role, SilenceReport
-from spacerobot_ros.parameters import Parameter, Value, configured, declared, values_of
+from spacerobot_ros.parameters import Parameter, configured, declared, values_of
 
 STREAM = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
 """QoS of states, commands and events: reliable, with a queue for readers that are briefly busy."""
@@ -108,13 +114,13 @@ class FlightNode(LifecycleNode):
             self._parameters_declared = {each.name: each for each in declared(self.Config)}
             values = declare(self, (AUTOSTART, *self._parameters_declared.values()))
             fix(self, [AUTOSTART], fixed=True)
-            self._autostart = bool(values[AUTOSTART.name])
             self.config = configured(self.Config, values)
             self.add_on_set_parameters_callback(self._on_set_parameters)
-            self.create_service(Trigger, "~/connections", self._on_connections)
+            # A supervisor starts time once all nodes have met.
+            self.offer("~/connections", lambda: MatchedEndpoints.of(self).to_json())
             self.prepare()
             self._permanent = set(self._entities())
-            if self._autostart if autostart is None else autostart:
+            if values[AUTOSTART.name] if autostart is None else autostart:
                 self.start()
         except SpaceRobotError:
             self.destroy_node()
@@ -200,6 +206,21 @@ class FlightNode(LifecycleNode):
 
         return super().create_service(srv_type, srv_name, answer, *args, **kwargs)
 
+    def offer(self, name: str, act: Callable[[], str]) -> None:
+        """Create a service without arguments that answers with the message of a function.
+
+        The answer to a CommandError is its message, without success.
+        """
+
+        def answer(_: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+            try:
+                response.success, response.message = True, act()
+            except CommandError as refusal:
+                response.success, response.message = False, str(refusal)
+            return response
+
+        self.create_service(Trigger, name, answer)
+
     def guarded(self, callback: Callable[..., Any], what: str) -> Callable[..., None]:
         """Return a callback whose exceptions end in :meth:`on_failure`."""
 
@@ -240,11 +261,6 @@ class FlightNode(LifecycleNode):
         except Exception as second:
             self.get_logger().error(f"Node '{self.get_name()}': {describe_exception(second)}.")
         self.report_event(Event(EventKind.FAILED, message, level=2))
-
-    @property
-    def parameter_values(self) -> dict[str, Value]:
-        """The value of every parameter by its full name."""
-        return {AUTOSTART.name: self._autostart, **values_of(self.config)}
 
     def set_parameters(self, parameter_list: list[RosParameter]) -> list[SetParametersResult]:
         """Set parameters one by one; see :meth:`set_parameters_atomically`."""
@@ -363,6 +379,8 @@ class FlightNode(LifecycleNode):
             self._destroy_configured()
         if result is TransitionCallbackReturn.SUCCESS:
             self._set_parameters_read_only(fixed=True)
+            if unknown := unknown_parameters(self):
+                self.get_logger().warning(printable(unknown), once=True)
         return self._report_transition(result, EventKind.CONFIGURED)
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -400,11 +418,6 @@ class FlightNode(LifecycleNode):
             with suppress(Exception):
                 self.on_failure(self._failure, self.fault)
         return TransitionCallbackReturn.SUCCESS
-
-    def _on_connections(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        """Return the node's connections; a supervisor starts time once all nodes have met."""
-        response.success, response.message = True, MatchedEndpoints.of(self).to_json()
-        return response
 
     def _run(self, hook: Callable[[], None]) -> TransitionCallbackReturn:
         try:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import json
 import math
 import sys
@@ -87,6 +88,9 @@ def _json_value(value: Any) -> Any:
     return value if value is None or isinstance(value, (bool, int, float, str)) else list(value)
 
 
+_QOS_OVERRIDES = "qos_overrides."
+"""Beginning of the parameters that rclpy declares with some publishers and subscriptions."""
+
 _LARGEST_FLOAT = sys.float_info.max
 _INTEGER_BOUNDS = -(2**63), 2**63 - 1
 
@@ -151,6 +155,26 @@ def _given_value(node: Node, name: str) -> Any:
     value = node.get_parameter(name).value
     node.undeclare_parameter(name)
     return value
+
+
+def unknown_parameters(node: Node) -> str:
+    """Return a sentence about values that were given for parameters which a node does not have.
+
+    Each is named with the nearest name that exists; empty: all are known.
+    """
+    given = getattr(node, "_parameter_overrides", {})
+    unknown = [
+        name
+        for name in given
+        if not node.has_parameter(name) and not name.startswith(_QOS_OVERRIDES)
+    ]
+    if not unknown:
+        return ""
+    known = node.list_parameters([], 0).names
+    nearest = [difflib.get_close_matches(name, known, 1) for name in unknown]
+    hints = [f" (did you mean '{each[0]}'?)" if each else "" for each in nearest]
+    listed = ", ".join(f"'{name}'{hint}" for name, hint in zip(unknown, hints, strict=True))
+    return f"Node '{node.get_name()}' has no parameter {listed}: what is given for it is ignored."
 
 
 def fix(node: Node, parameters: Iterable[Parameter], *, fixed: bool) -> None:

@@ -16,7 +16,7 @@ from rclpy.serialization import deserialize_message
 from rclpy.timer import Timer
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
-from std_srvs.srv import SetBool, Trigger
+from std_srvs.srv import SetBool
 
 from spacerobot_ros.errors import (
     CommandError,
@@ -198,12 +198,12 @@ class PlantNode(FlightNode):
             ("disturbance_injection", lambda text: self.plant.disturb(text)),
         ):
             self.create_subscription(String, topic, partial(self._on_injection, inject), STREAM)
-        self.create_service(Trigger, "~/reset", self._on_reset)
         self.create_service(SetBool, "~/pause", self._on_pause)
-        self.create_service(Trigger, "~/abort", self._on_abort)
-        self.create_service(Trigger, "~/rearm", self._on_rearm)
-        self.create_service(Trigger, "~/capture", self._on_capture)
-        self.create_service(Trigger, "~/release", self._on_release)
+        self.offer("~/reset", self._reset)
+        self.offer("~/abort", self._abort)
+        self.offer("~/rearm", self._rearm)
+        self.offer("~/capture", lambda: self._grasp(lambda capturing: capturing.capture()))
+        self.offer("~/release", lambda: self._grasp(lambda capturing: capturing.release()))
         self._publish_status(self._monitor.status)
 
     def _use_plant(self, plant: PlantWithFaults, config: PlantConfig) -> None:
@@ -576,67 +576,43 @@ class PlantNode(FlightNode):
 
     # -- services -----------------------------------------------------------------------------
 
-    def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+    def _reset(self) -> str:
         self.plant.reset()
         self._commands.reset(self.time_ns)
         assert self._monitor is not None
         self._monitor.resets += 1
-        response.success = True
-        response.message = "The robot is back in its initial state; time goes on."
         # Commanders must know of the reset before they answer a state after it.
         self._publish_changed_status()
         if self._is_running_or_paused:
             self._publish()
-        return response
+        return "The robot is back in its initial state; time goes on."
 
-    def _on_abort(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+    def _abort(self) -> str:
         self._commands.latch("abort", "stopped on request", self.time_ns)
         self._report.latched()
         self._publish_changed_status()
-        response.success = True
-        response.message = "The joints come to rest; nothing moves until '~/rearm' is called."
-        return response
+        return "The joints come to rest; nothing moves until '~/rearm' is called."
 
-    def _on_rearm(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+    def _rearm(self) -> str:
         fault = self._commands.rearm()
-        if fault:
-            assert self._monitor is not None
-            self._monitor.rearms += 1
-            self._publish_changed_status()
-        response.success = True
-        response.message = (
-            f"Commands pass again after: {fault}." if fault else "No fault was latched."
-        )
-        return response
-
-    def _on_capture(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        return self._grasp(response, lambda capturing: capturing.capture())
-
-    def _on_release(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        return self._grasp(response, lambda capturing: capturing.release())
-
-    def _grasp(
-        self,
-        response: Trigger.Response,
-        act: Callable[[CapturePlant], CaptureReport | ReleaseReport],
-    ) -> Trigger.Response:
-        """Capture or release the target; it takes effect in the next tick."""
-        try:
-            if self._capturing is None:
-                raise CommandError("There is no target: set parameter 'target.robot' to its URDF.")
-            if not self._is_running_or_paused:
-                raise CommandError(f"The plant is {self._active.value}: nothing moves.")
-            if self._commands.fault:
-                raise CommandError(
-                    f"A fault is latched: {self._commands.fault}; call '~/rearm' first."
-                )
-            report = act(self._capturing)
-        except CommandError as error:
-            response.success, response.message = False, str(error)
-            return response
-        response.success, response.message = True, report.event(self.time_ns / SECOND).message
+        if not fault:
+            return "No fault was latched."
+        assert self._monitor is not None
+        self._monitor.rearms += 1
         self._publish_changed_status()
-        return response
+        return f"Commands pass again after: {fault}."
+
+    def _grasp(self, act: Callable[[CapturePlant], CaptureReport | ReleaseReport]) -> str:
+        """Capture or release the target; it takes effect in the next tick."""
+        if self._capturing is None:
+            raise CommandError("There is no target: set parameter 'target.robot' to its URDF.")
+        if not self._is_running_or_paused:
+            raise CommandError(f"The plant is {self._active.value}: nothing moves.")
+        if self._commands.fault:
+            raise CommandError(f"A fault is latched: {self._commands.fault}; call '~/rearm' first.")
+        report = act(self._capturing)
+        self._publish_changed_status()
+        return report.event(self.time_ns / SECOND).message
 
     def _on_pause(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
         self._when_active = PlantState.PAUSED if request.data else PlantState.RUNNING

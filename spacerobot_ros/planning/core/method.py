@@ -159,15 +159,15 @@ class GaitMethod(ABC):
         self.options = self.Options() if options is None else options
         self._setup_refusal: PlanningError | None = None
         try:
-            self._setup()
+            self.setup()
         except PlanningError as refusal:
             # A planner exists before its first goal, whose request refuses an unsuitable robot.
             self._setup_refusal = refusal
 
-    def _setup(self) -> None:  # noqa: B027 - methods that delegate have nothing to set up here
+    def setup(self) -> None:  # noqa: B027 - methods that delegate have nothing to set up here
         """Compute all attributes that depend on robot and options alone; called once.
 
-        A `PlanningError` refuses the robot: :meth:`_require_rest` raises it for every goal.
+        A `PlanningError` refuses the robot: :meth:`require_rest` raises it for every goal.
         """
 
     @cached_property
@@ -202,7 +202,7 @@ class GaitMethod(ABC):
             The cancellation was requested meanwhile.
         """
 
-    def _schedule_of(
+    def schedule_of(
         self,
         goal: Goal,
         positions: Array,
@@ -229,7 +229,7 @@ class GaitMethod(ABC):
             Links come too near to each other or to obstacles; ``is_clear``: that has been checked.
         """
         if not self.plans_for_end_effectors:
-            self._require_goal_of_base(goal)
+            self.require_goal_of_base(goal)
         if not self.follows_paths:
             self._require_no_path(goal)
         if not is_clear:
@@ -254,7 +254,7 @@ class GaitMethod(ABC):
             end_velocities=end_velocities,
         )
 
-    def _goal_shape(self, goal: Goal) -> Array | None:
+    def goal_shape(self, goal: Goal) -> Array | None:
         """Return the goal shape (n,) within the joint limits, None for a goal without shape.
 
         Raises
@@ -285,7 +285,7 @@ class GaitMethod(ABC):
         return np.clip(wanted, robot.lower, robot.upper)
 
     def _clear_goal_shape(self, request: PlanRequest) -> Array | None:
-        """Return the goal shape (n,) as :meth:`_goal_shape`, and refuse one in collision.
+        """Return the goal shape (n,) as :meth:`goal_shape`, and refuse one in collision.
 
         Raises
         ------
@@ -294,13 +294,14 @@ class GaitMethod(ABC):
         PlanningError
             Links are too near at the start.
         """
-        shape = self._goal_shape(request.goal)
+        shape = self.goal_shape(request.goal)
         if shape is not None and self.clearance is not None:
             # Where the base will be among obstacles depends on the motion.
             self.clearance.require_shape(shape, self.clearance.required(request.state.q))
         return shape
 
-    def _require_goal_of_base(self, goal: Goal) -> None:
+    def require_goal_of_base(self, goal: Goal) -> None:
+        """Refuse a goal of end-effectors, or of a path: PlanningError."""
         self._require_no_path(goal)
         if goal.end_effectors:
             names = " and ".join(f"'{each.link}'" for each in goal.end_effectors)
@@ -358,7 +359,7 @@ class GaitMethod(ABC):
         if self._setup_refusal is not None:
             raise PlanningError(str(self._setup_refusal))
 
-    def _require_rest(self, state: RobotState) -> None:
+    def require_rest(self, state: RobotState) -> None:
         """Refuse an unsuitable robot, and a robot whose total momentum is not zero."""
         self._require_suitable_setup()
         p, L = np.linalg.norm(state.linear_momentum), np.linalg.norm(state.angular_momentum)

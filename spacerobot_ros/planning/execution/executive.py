@@ -11,21 +11,16 @@ Other modules do the work of a phase: :mod:`.tracker` computes the commands alon
 
 from __future__ import annotations
 
-import math
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
 from typing import Any, NamedTuple
 
-import numpy as np
-
-from spacerobot_ros.collision import BasePoses
-from spacerobot_ros.errors import ParameterError, PlanningError, sentence_case
+from spacerobot_ros.errors import PlanningError, sentence_case
 from spacerobot_ros.events import Event as FlightEvent
 from spacerobot_ros.events import EventKind
 from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.model.description import Array
 from spacerobot_ros.planning.core.goal import (
     Controlled,
     PoseError,
@@ -36,7 +31,11 @@ from spacerobot_ros.planning.core.goal import (
 from spacerobot_ros.planning.core.method import PlanRequest
 from spacerobot_ros.planning.core.schedule import GaitSchedule
 from spacerobot_ros.planning.execution.config import PlannerConfig
-from spacerobot_ros.planning.execution.goal_file import BASE_GOAL_KEY, GoalFile, IdentifiedGoal
+from spacerobot_ros.planning.execution.goal_file import (
+    BASE_GOAL_KEY,
+    IdentifiedGoal,
+    PursuedGoals,
+)
 from spacerobot_ros.planning.execution.path_deviation import TrackingError
 from spacerobot_ros.planning.execution.state_average import MeasuredState, StateAverage
 from spacerobot_ros.planning.execution.status import (
@@ -51,7 +50,7 @@ from spacerobot_ros.planning.execution.status import (
     goal_values,
     waypoint_counts,
 )
-from spacerobot_ros.planning.execution.teleoperation import TwistCommand, TwistFollower
+from spacerobot_ros.planning.execution.teleoperation import Teleoperation, TwistCommand
 from spacerobot_ros.planning.execution.tracker import Setpoint, TakeOver, TrajectoryTracker
 from spacerobot_ros.planning.execution.worker import (
     PlanFromRestJob,
@@ -61,11 +60,11 @@ from spacerobot_ros.planning.execution.worker import (
     PlanningWorker,
     PlanReason,
     PlanWithBrakingJob,
+    Postponed,
     ReadyPlan,
     Refused,
     TakeOverJob,
 )
-from spacerobot_ros.planning.methods.resolved_rate import ResolvedRateGait, ResolvedRateOptions
 
 _MAX_GAP, _MAX_GAP_PERIODS = 1.0, 10
 """Times between two states above these, or below zero, are jumps of time: s, control periods."""
@@ -73,13 +72,6 @@ _MAX_GAP, _MAX_GAP_PERIODS = 1.0, 10
 _MAX_IN_MOTION_ATTEMPTS = 2
 """Largest number of plans in motion for one goal: each takes over twice as late as the one
 before."""
-
-_COASTING_TIME, _COASTING_FACTOR = 2.0, 2.0
-"""Rest with which a plan in the background begins where the robot drifts, s, and, where that was
-too short, the factor of the time from its start to the end of planning."""
-
-_MAX_COASTING_TIME = 600.0
-"""Longest such time, s."""
 
 _LATE_TIME_SHARE = 1 / 3
 """Share of a motion's duration that remains when the motion counts as late."""
@@ -189,7 +181,7 @@ class IllegalTransitionError(RuntimeError):
     """A defect of the executive: a transition that is not in :data:`TRANSITIONS`."""
 
 
-Output = PlannerStatus | ScheduleStart | Notice | Transition | FlightEvent
+Output = PlannerStatus | ScheduleStart | Notice | Transition | FlightEvent | PursuedGoals
 """An output of an executive other than its setpoints."""
 
 
@@ -221,48 +213,6 @@ class ActiveGoal:
     """Clause that tells why no schedule is flown any more; empty: schedules are flown."""
 
 
-@dataclass
-class Teleoperation:
-    """The twists that an end-effector follows."""
-
-    follower: TwistFollower
-    twist: TwistCommand | None
-    """The last one; None: the joints brake."""
-    received_ns: int
-    """Stamp of the state before it, ns."""
-    reported: str | None = None
-    """Beginning of the reason that was reported last; empty: the twist is followed."""
-    limited_ns: int = 0
-    """Stamp of the last state at which it was not followed, ns."""
-    pose: Array | None = None
-    """(7,) the last measured pose of the base."""
-    pose_ns: int = 0
-    """Stamp of that state, ns."""
-
-
-@dataclass(frozen=True)
-class _PlannedRest:
-    """A rest at the start of a plan that is made while the robot drifts.
-
-    ``begins_ns`` is the stamp of the state that the ``planned`` task begins from, ``duration`` that
-    of the rest, s: the gait begins where the base has drifted to by then.
-    """
-
-    planned: PlanningTask
-    begins_ns: int
-    duration: float
-
-    def task(self, period: float) -> PlanningTask:
-        """Return the task of a plan that begins with the rest, in control periods, s."""
-        ticks, state = math.ceil(self.duration / period - 1e-9), self.planned.request.state
-        shapes = np.tile(state.q, (ticks + 1, 1))
-        if self.planned.rates_after_braking is not None:
-            shapes += (
-                period * np.arange(ticks + 1)[:, np.newaxis] * self.planned.rates_after_braking
-            )
-        return replace(self.planned, braking=shapes)
-
-
 class Executive:
     """Brings a robot to successive goals, and answers every state with a setpoint.
 
@@ -278,11 +228,9 @@ class Executive:
     robot
         The model.
     config
-        Of the planner. It may be replaced: tolerances and corrections then apply from now on.
+        Of the planner.
     worker
         Makes the plans; None: a :class:`PlanningWorker`.
-    goal_file
-        Where the present goal is saved; None: nowhere.
 
     Raises
     ------
@@ -295,11 +243,9 @@ class Executive:
         robot: SpaceRobot,
         config: PlannerConfig,
         worker: PlanningWorker | None = None,
-        goal_file: GoalFile | None = None,
     ) -> None:
         self._robot, self.config = robot, config
         self._worker = worker or PlanningWorker(robot, config)
-        self._goal_file = goal_file or GoalFile("")
         self._average = StateAverage(robot, config.averaging, config.rest_tolerance)
         self._tracker = TrajectoryTracker(robot, config)
         self._max_gap_ns = _max_gap_ns(config)
@@ -315,20 +261,13 @@ class Executive:
         self._in_motion_attempts = 0
         self._pending_plan: PlanJob | ReadyPlan | None = None
         """The requested plan, or the plan that waits for its tick (``TAKING_OVER``)."""
-        self._coasting: _PlannedRest | None = None
-        """The rest that the requested plan begins with, because the base drifts meanwhile."""
         self._active_goal: ActiveGoal | None = None
         self._replan_ns = 0
         """Stamp from which on the remaining motion is planned again, ns."""
         self._commanded_from_ns = 0
         """Stamp of the first state that the present schedule or plan answers, ns."""
         self._total_plan_time, self._plan_count, self._command_count = 0.0, 0, 0
-        self._followers: dict[str, TwistFollower] = {}
-        """By link."""
-        self._teleoperation: Teleoperation | None = None
-        """That of the phase ``TELEOPERATING``."""
-        self._refused_twist_ns: int | None = None
-        """Stamp of the state before the last twist that was refused, ns."""
+        self._teleoperation = Teleoperation(robot, config, self._worker.clearance)
 
     @property
     def setpoint(self) -> Setpoint:
@@ -361,52 +300,28 @@ class Executive:
     def propose_twist(self, twist: TwistCommand) -> None:
         """Let an end-effector follow a twist from the next state on, until twists stop.
 
-        After a refusal, and after an abort, twists are refused until none has come for
-        ``twist_timeout``: so an operator who goes on sending moves nothing by surprise.
-
         Raises
         ------
         PlanningError
-            A goal is pursued, another link is moved, or the joints cannot move the link so.
+            A goal is pursued, or the twist is refused by :class:`Teleoperation`.
         """
-        try:
-            self._require_no_goal(twist.link)
-            follower = self._follower_of(twist.link)
-        except PlanningError:
-            self._refused_twist_ns = self._stamp_ns
-            raise
-        if self.phase is Phase.IDLE:
-            self._teleoperation = Teleoperation(follower, twist, self._stamp_ns)
-            self._change_phase(Event.TWIST, Phase.TELEOPERATING)
-        assert self._teleoperation is not None
-        self._teleoperation.twist, self._teleoperation.received_ns = twist, self._stamp_ns
-
-    def _require_no_goal(self, link: str) -> None:
-        teleoperation, refused = self._teleoperation, self._refused_twist_ns
         if self.phase not in (Phase.IDLE, Phase.TELEOPERATING) or self._new_goal is not None:
+            self._teleoperation.refuse(self._stamp_ns)
             raise PlanningError("Twists are not followed while a goal is pursued: abort it first.")
-        if refused is not None and self._stamp_ns - refused <= self.config.twist_timeout * 1e9:
-            raise PlanningError(
-                f"Twists are not followed until none has come for {self.config.twist_timeout:g} s."
-            )
-        if teleoperation is not None and teleoperation.follower.link != link:
-            raise PlanningError(
-                f"'{teleoperation.follower.link}' follows twists: '{link}' waits until they stop."
-            )
-
-    def _follower_of(self, link: str) -> TwistFollower:
-        if link not in self._followers:
-            config = self.config
-            options = config.options.get(ResolvedRateGait.name, ResolvedRateOptions())
-            self._followers[link] = TwistFollower(
-                self._robot, link, options, config.control_period, self._worker.clearance
-            )
-        return self._followers[link]
+        self._teleoperation.receive(twist, self._stamp_ns)
+        if self.phase is Phase.IDLE:
+            self._change_phase(Event.TWIST, Phase.TELEOPERATING)
 
     @property
     def unfinished_goals(self) -> frozenset[str]:
         """Ids of the goals that are pursued, planned for, or wait to be."""
-        goals = (self._new_goal, self._planned_goal(), self._pursued_goal())
+        pursued = self._pursued_goal()
+        return self.waiting_goals | ({pursued.goal_id} if pursued is not None else set())
+
+    @property
+    def waiting_goals(self) -> frozenset[str]:
+        """Ids of the goals that are planned for, or wait to be; also a goal that is replanned."""
+        goals = (self._new_goal, self._planned_goal())
         return frozenset(goal.goal_id for goal in goals if goal is not None)
 
     def progress(self, goal_id: str) -> tuple[str, float | None]:
@@ -428,14 +343,12 @@ class Executive:
         Returns a message about the joints; None where there is no goal.
         """
         goal_id, message = self._latest_goal_id(), "The joints rest."
-        self._goal_file.delete()
         match self.phase:
             case Phase.IDLE:
                 return None
             case Phase.TELEOPERATING:
-                assert self._teleoperation is not None
-                self._new_goal, self._refused_twist_ns = None, self._stamp_ns
-                self._teleoperation.twist = None
+                self._new_goal = None
+                self._teleoperation.abort(self._stamp_ns)
                 message = "The joints brake."
                 aborted = PlannerStatus(PlannerState.TELEOPERATING, f"Aborted {why}. {message}")
                 self.outputs.append(aborted)
@@ -460,24 +373,9 @@ class Executive:
     ) -> bool:
         """Give up every goal at once: the plant does not obey commands any more.
 
-        The goal file is deleted, and nothing is tracked or planned until there is a new goal.
-
-        Parameters
-        ----------
-        why
-            The message of the plant; it becomes part of the status.
-        commanded_until_ns
-            For a plant that rests because commands did not come: the stamp of the last one that it
-            had. None: it obeys nothing.
-        rests_since_ns
-            Stamp since which it rests then, ns. A goal goes on for which nothing was commanded
-            until then, and one whose plan has taken so long that no state was answered. A goal that
-            was to replace it is planned for from rest.
-
-        Returns
-        -------
-        bool
-            Whether a goal was given up.
+        Where it rests because commands did not come, a goal goes on for which nothing was commanded
+        until then, and one whose plan has taken so long that no state was answered. A goal that was
+        to replace it is planned for from rest.
         """
         if commanded_until_ns is not None and not self._commands_were_obeyed(
             commanded_until_ns, rests_since_ns
@@ -487,8 +385,6 @@ class Executive:
         if commanded_until_ns is not None:
             self._drop_plan()
             successor = self._new_goal
-        if successor is None:
-            self._goal_file.delete()
         if self.phase is Phase.IDLE:
             return False
         goal_id = self._latest_goal_id() if successor is None else self._pursued_id()
@@ -531,6 +427,13 @@ class Executive:
             self._add_notice(Severity.WARNING, f"{sentence_case(why)}.")
         self._tracker.end_by_result()
 
+    def configure(self, config: PlannerConfig) -> None:
+        """Use other tolerances and corrections from now on."""
+        self.config = config
+
+    def on_plant_obeying(self) -> None:
+        """Do nothing: the next goal begins from the measured state anyway."""
+
     def plant_reset(self) -> None:
         """Plan again for the present goal, if any: the robot is in another state than
         before."""
@@ -557,10 +460,10 @@ class Executive:
         self._average = StateAverage(robot, self.config.averaging, self.config.rest_tolerance)
         if config is None:
             self._tracker.use_robot(robot)
-            return
-        self.config, self._tracker = config, TrajectoryTracker(robot, config)
-        self._max_gap_ns = _max_gap_ns(config)
-        self._followers.clear()
+        else:
+            self.config, self._tracker = config, TrajectoryTracker(robot, config)
+            self._max_gap_ns = _max_gap_ns(config)
+        self._teleoperation = Teleoperation(robot, self.config, worker.clearance)
 
     def plan_at_once(self) -> None:
         """Make later plans while states wait for them: the plant is in lockstep."""
@@ -581,10 +484,7 @@ class Executive:
         self._drop_plan()
         self._worker.close()
         self._worker = make_worker()
-        self._followers.clear()
-        if self._teleoperation is not None:
-            link = self._teleoperation.follower.link
-            self._teleoperation.follower = self._follower_of(link)
+        self._teleoperation.use_clearance(self._worker.clearance)
         active = self._active_goal
         match self.phase:
             case Phase.PLANNING:
@@ -595,7 +495,8 @@ class Executive:
             case Phase.REPLANNING | Phase.TAKING_OVER:
                 self._change_phase(Event.OBSTACLES, Phase.EXECUTING)
         if self.phase is Phase.EXECUTING and active is not None:
-            clause = self._obstacle_clause(active)
+            begins = active.ends_at - active.schedule.duration
+            clause = self._worker.approach_ahead(active.schedule, begins, self._stamp_ns / 1e9)
             if clause:
                 message = (
                     f"{sentence_case(clause)}: the joints brake, and the remaining motion is "
@@ -605,25 +506,9 @@ class Executive:
                 self._add_status(PlannerState.EXECUTING, message, active.identified, active)
                 self._brake_for_replan(Event.OBSTACLES)
 
-    def _obstacle_clause(self, active: ActiveGoal) -> str:
-        """Return the clause that says where the rest of a schedule comes too near; else nothing."""
-        clearance, schedule = self._worker.clearance, active.schedule
-        if clearance is None or not clearance.has_obstacles:
-            return ""
-        period = self.config.control_period
-        begins = active.ends_at - schedule.duration
-        first = min(max(int((self._stamp_ns / 1e9 - begins) / period), 0), schedule.ticks)
-        ticks = np.arange(first, schedule.ticks + 1, dtype=float)
-        base = schedule.path.at(period * ticks)
-        try:
-            found = clearance.approaches(schedule.positions[first:], base=BasePoses(*base))
-        except PlanningError as refusal:
-            return str(refusal).removesuffix(".")
-        return clearance.clause(found[0], period) if found else ""
-
     def _plan_again(self, message: str) -> None:
         self._average.forget()
-        if self._teleoperation is not None:
+        if self.phase is Phase.TELEOPERATING:
             self._end_teleoperation(Event.PLANT_RESET, "The plant was reset: the joints rest.")
         # The held shape and the schedule belong to the time before the reset.
         self._tracker.stop()
@@ -641,7 +526,7 @@ class Executive:
         self._worker.cancel()
 
     def stop(self) -> None:
-        """Give up all goals at once and wait for the worker to end; the goal file stays."""
+        """Give up all goals at once, without a status, and wait for the worker to end."""
         self._tracker.stop()
         self._forget_goals()
         self._worker.close()
@@ -651,8 +536,8 @@ class Executive:
 
     def add_base_measurement(self, measured: MeasuredState) -> None:
         """Use a base measurement that arrives after its state was answered."""
-        if self._teleoperation is not None:
-            self._keep_base_pose(self._teleoperation, measured)
+        if self.phase is Phase.TELEOPERATING:
+            self._teleoperation.keep_base_pose(measured)
         elif self.measuring:
             if self._tracker.is_active:
                 # A moving robot has no average: only its last state counts.
@@ -665,7 +550,7 @@ class Executive:
         if not 0 <= stamp - self._stamp_ns <= self._max_gap_ns:
             if tracker.is_active:
                 self._handle_time_jump(stamp)
-            elif self._teleoperation is not None:
+            elif self.phase is Phase.TELEOPERATING:
                 self._end_teleoperation(Event.TIME_JUMPED, "The time of the states has jumped.")
         self._stamp_ns = stamp
         if tracker.has_ended(stamp, q):
@@ -681,8 +566,8 @@ class Executive:
             stuck = tracker.track(stamp, q, obeyed=not self.plant_rests)
             if stuck and self._active_goal is not None:
                 self._handle_stuck_joints(self._active_goal, stuck)
-        if self._teleoperation is not None:
-            self._follow_twist(self._teleoperation, measured)
+        if self.phase is Phase.TELEOPERATING:
+            self._follow_twist(measured)
         elif not tracker.is_active:
             base = measured.base() if tracker.needs_wheel_rates else None
             qdot = None if base is None else base.qdot
@@ -715,51 +600,27 @@ class Executive:
     def _worker_is_free(self) -> bool:
         """Whether a plan can be requested: the thread of a cancelled plan may still run."""
         if self._worker.is_busy:
-            self._worker.poll()
+            self._worker.poll(self._stamp_ns)
             return False
         return True
 
     # -- TELEOPERATING ------------------------------------------------------------------------
 
-    def _keep_base_pose(self, teleoperation: Teleoperation, measured: MeasuredState) -> None:
-        base = measured.base()
-        if base is not None and np.all(np.isfinite(base.pose)):
-            teleoperation.pose, teleoperation.pose_ns = base.pose, measured.stamp_ns
-
-    def _follow_twist(self, teleoperation: Teleoperation, measured: MeasuredState) -> None:
-        """Write the rates for the last twist; brake where it is old, and end at rest."""
-        stamp, q, timeout = measured.stamp_ns, measured.q, self.config.twist_timeout * 1e9
-        self._keep_base_pose(teleoperation, measured)
-        twist, reason = teleoperation.twist, ""
-        if self._new_goal is not None or stamp - teleoperation.received_ns > timeout:
-            twist = teleoperation.twist = None
-        if teleoperation.pose is None or stamp - teleoperation.pose_ns > timeout:
-            twist, reason = None, "The base is not measured."
-        if not np.all(np.isfinite(q)):
-            self._end_teleoperation(Event.AT_REST, "The joints are not measured.")
-            self._tracker.hold(q)
-            return
-        pose = np.eye(7)[6] if teleoperation.pose is None else teleoperation.pose
+    def _follow_twist(self, measured: MeasuredState) -> None:
+        goal_waits = self._new_goal is not None
         before = self._tracker.setpoint.velocity
-        rates, limited = teleoperation.follower.rates(twist, pose, q, before)
-        self._tracker.follow_velocity(q, rates)
-        if teleoperation.twist is None and not np.any(rates):
-            self._end_teleoperation(Event.AT_REST, "No twists come any more: the joints rest.")
-            return
-        reason = reason or limited
-        # A reason is told when it begins and when it is over for a while; its numbers change.
-        beginning = reason.split(":")[0].split(" come within ")[0].split(" touch,")[0]
-        if reason:
-            teleoperation.limited_ns = stamp
-        lasts = bool(teleoperation.reported) and stamp - teleoperation.limited_ns <= timeout
-        if beginning != teleoperation.reported and (reason or not lasts):
-            teleoperation.reported = beginning
-            followed = f"'{teleoperation.follower.link}' follows twists."
-            message = f"{reason} The twist is followed as far as possible." if reason else followed
-            self.outputs.append(PlannerStatus(PlannerState.TELEOPERATING, message))
+        step = self._teleoperation.step(measured, before, goal_waits=goal_waits)
+        if step.rates is not None:
+            self._tracker.follow_velocity(measured.q, step.rates)
+        if step.ended:
+            self._end_teleoperation(Event.AT_REST, step.message)
+        elif step.message:
+            self.outputs.append(PlannerStatus(PlannerState.TELEOPERATING, step.message))
+        if step.rates is None:
+            self._tracker.hold(measured.q)
 
     def _end_teleoperation(self, event: Event, message: str) -> None:
-        self._teleoperation = None
+        self._teleoperation.end()
         self._tracker.stop()
         self._average.restart()
         self._change_phase(event, self._phase_at_rest())
@@ -965,7 +826,7 @@ class Executive:
             method=schedule.method,
             duration_s=f"{schedule.duration:.9g}",
         )
-        self._execute_schedule(schedule, take_over_ns=begins_ns)
+        self._execute_schedule(schedule, begins_ns, in_motion=True)
 
     def _handle_late_plan(self, job: TakeOverJob) -> None:
         """Continue along the present schedule; plan for a new goal once more."""
@@ -1034,41 +895,24 @@ class Executive:
             task = replace(
                 task, stuck_joint_positions=active.stuck_positions, required=active.required
             )
-        self._pending_plan, self._coasting = job, None
-        at_rest = braking is None and take_over is None
-        if at_rest and self._worker.plans_in_background and self._worker.drifts(state):
-            self._coasting = _PlannedRest(task, self._stamp_ns, _COASTING_TIME)
-            task = self._coasting.task(self.config.control_period)
-        self._worker.submit(task)
+        self._pending_plan = job
+        self._worker.submit(task, self._stamp_ns)
         self._take_plan_result()
 
     def _take_plan_result(self) -> None:
-        result = self._worker.poll()
+        result = self._worker.poll(self._stamp_ns)
         if result is None:
             return
-        job, coasting = self._pending_plan, self._coasting
-        assert isinstance(job, PlanJob)
-        if isinstance(result, Planned) and coasting is not None:
-            elapsed = (self._stamp_ns - coasting.begins_ns) / 1e9
-            if elapsed > coasting.duration and elapsed <= _MAX_COASTING_TIME:
-                # The base has drifted past the start of the plan.
-                self._coasting = replace(coasting, duration=_COASTING_FACTOR * elapsed)
-                self._total_plan_time += result.wall_time
-                self._add_notice(
-                    Severity.INFO,
-                    f"The plan came {elapsed - coasting.duration:.3g} s after its start, while the "
-                    "robot drifts: it is made again, to begin later.",
-                )
-                self._worker.submit(self._coasting.task(self.config.control_period))
-                return
-            if elapsed > coasting.duration:
-                result = Refused(
-                    f"The robot drifts, and {elapsed:.3g} s of planning were not enough for a plan "
-                    "that begins in time; smaller optimal.starts take less",
-                    result.wall_time,
-                )
-        self._pending_plan = None
         self._total_plan_time += result.wall_time
+        if isinstance(result, Postponed):
+            self._add_notice(
+                Severity.INFO,
+                f"The plan came {result.late:.3g} s after its start, while the robot drifts: it is "
+                "made again, to begin later.",
+            )
+            return
+        job, self._pending_plan = self._pending_plan, None
+        assert isinstance(job, PlanJob)
         self._plan_count += 1
         self._add_notice(Severity.INFO, f"Planned in {result.wall_time:.6f} s.")
         if isinstance(result, Planned):
@@ -1106,22 +950,22 @@ class Executive:
                 message = f"The remaining motion is not planned again: {reason}"
                 self._add_notice(Severity.INFO, message)
                 self._change_phase(Event.REFUSED, Phase.EXECUTING)
-            case PlanWithBrakingJob(error=error), Planned(schedule=schedule):
+            case PlanWithBrakingJob(error=error), Planned(schedule=schedule, begins_ns=begins):
                 assert active is not None
                 self._report_path_correction(active, error)
-                self._execute_schedule(schedule)
+                self._execute_schedule(schedule, begins)
             case PlanWithBrakingJob(error=error), Refused(reason=reason):
                 message = f"{error}, and the remaining motion cannot be planned again: {reason}"
                 self._add_notice(Severity.WARNING, message)
                 self._change_phase(Event.REFUSED, self._phase_without_plan())
-            case PlanFromRestJob(error=remaining), Planned(schedule=schedule):
-                self._execute_schedule(schedule, remaining)
+            case PlanFromRestJob(error=remaining), Planned(schedule=schedule, begins_ns=begins):
+                self._execute_schedule(schedule, begins, remaining)
             case PlanFromRestJob(error=remaining), Refused(reason=reason):
                 assert active is not None
                 self._fail_goal(active, remaining, f", and {reason}", Event.REFUSED)
-            case _, Planned(schedule=schedule):
+            case _, Planned(schedule=schedule, begins_ns=begins):
                 self._accept_goal(ActiveGoal(job.identified, schedule, self._stamp_ns))
-                self._execute_schedule(schedule)
+                self._execute_schedule(schedule, begins)
             case _, Refused(reason=reason):
                 earlier = " The earlier goal is still pursued." if active is not None else ""
                 self._add_status(PlannerState.REFUSED, f"{reason}{earlier}", job.identified)
@@ -1130,30 +974,26 @@ class Executive:
     def _accept_goal(self, active: ActiveGoal) -> None:
         self._active_goal, self._tracker.stuck = active, []
         self._add_event(EventKind.GOAL_ACCEPTED, "The goal is accepted.", active.identified)
-        try:
-            self._goal_file.save({BASE_GOAL_KEY: active.identified})
-        except ParameterError as error:
-            message = f"{error} The goal is pursued, but would not be resumed."
-            self._add_notice(Severity.ERROR, message)
+        self.outputs.append(PursuedGoals({BASE_GOAL_KEY: active.identified}))
 
     def _execute_schedule(
         self,
         schedule: GaitSchedule,
+        begins: int,
         remaining: PoseError | None = None,
-        take_over_ns: int | None = None,
+        *,
+        in_motion: bool = False,
     ) -> None:
-        """Track a schedule for the active goal.
+        """Track a schedule for the active goal, from the stamp of its first tick on.
 
-        ``remaining`` is the error to the goal at its start; ``take_over_ns`` the stamp of its first
-        tick where it takes over in motion.
+        ``remaining`` is the error to the goal at its start; ``in_motion``: it takes over from
+        another schedule.
         """
         active, config = self._active_goal, self.config
         assert active is not None
-        begins, event, start = self._stamp_ns, Event.PLANNED, ""
-        if self._coasting is not None:
-            begins, self._coasting = self._coasting.begins_ns, None
-        if take_over_ns is not None:
-            begins, event, start = take_over_ns, Event.TAKEN_OVER, ", which begins in motion"
+        event, start = Event.PLANNED, ""
+        if in_motion:
+            event, start = Event.TAKEN_OVER, ", which begins in motion"
         self._subtract_remainder(active, begins)
         active.schedule = schedule
         self._replan_ns = begins + round(config.replanning * 1e9)
@@ -1274,14 +1114,13 @@ class Executive:
         self._end_goal(event)
 
     def _end_goal(self, event: Event) -> None:
-        """End the active goal: nothing is to be resumed."""
-        self._goal_file.delete()
         self._active_goal = None
         self._change_phase(event, self._phase_at_rest())
 
     def _forget_goals(self) -> None:
         self._drop_plan()
-        self._new_goal = self._active_goal = self._teleoperation = None
+        self._teleoperation.end()
+        self._new_goal = self._active_goal = None
 
     def _latest_goal(self) -> IdentifiedGoal | None:
         """Return the latest proposed goal that is not decided."""

@@ -50,6 +50,13 @@ class IdentifiedGoal:
     required: Tolerance = NO_TOLERANCE
 
 
+@dataclass(frozen=True)
+class PursuedGoals:
+    """Report of an executive: the goals that it pursues from now on, by part of the robot."""
+
+    goals: Mapping[str, IdentifiedGoal]
+
+
 class GoalIds:
     """Assigns ids to the goal poses that a node receives."""
 
@@ -71,7 +78,8 @@ class GoalIds:
 class GoalFile:
     """A file with the present goals of a commander; reached and abandoned goals are removed.
 
-    A commander that is restarted loads them and continues.
+    A commander that is restarted loads them and continues. The file follows what an executive
+    reports: :meth:`pursue` and :meth:`end`.
 
     Parameters
     ----------
@@ -84,6 +92,21 @@ class GoalFile:
     def __init__(self, path: str, keys: tuple[str, ...] = (BASE_GOAL_KEY,)) -> None:
         self._path = Path(path) if path else None
         self._keys = keys
+        self._ids: frozenset[str] = frozenset()
+        """Ids of the goals in the file."""
+
+    def pursue(self, pursued: PursuedGoals) -> str:
+        """Save goals; return a message if they cannot be saved, empty if all is well."""
+        try:
+            self.save(pursued.goals)
+        except ParameterError as error:
+            return f"{error} The goal is pursued, but not resumed after a restart."
+        return ""
+
+    def end(self, goal_id: str, *, refused: bool) -> None:
+        """Delete the file with a decision, unless it is the refusal of another goal."""
+        if self._ids and (goal_id in self._ids or not refused):
+            self.delete()
 
     def save(self, goals: Mapping[str, IdentifiedGoal]) -> None:
         """Replace the content of the file by the goals that resume, in one atomic step.
@@ -95,7 +118,9 @@ class GoalFile:
         """
         if self._path is None:
             return
-        entries = {key: _encode_goal(goal) for key, goal in goals.items() if goal.resumes}
+        kept = {key: goal for key, goal in goals.items() if goal.resumes}
+        entries = {key: _encode_goal(goal) for key, goal in kept.items()}
+        self._ids = frozenset(goal.goal_id for goal in kept.values())
         if not entries:
             self.delete()
             return
@@ -110,6 +135,7 @@ class GoalFile:
 
     def delete(self) -> None:
         """Delete the file: its goals are reached, failed or given up."""
+        self._ids = frozenset()
         if self._path is not None:
             with suppress(OSError):
                 self._path.unlink()
@@ -125,7 +151,9 @@ class GoalFile:
         if self._path is None:
             return {}
         try:
-            return self._parse_goals(read_private(self._path).decode())
+            goals = self._parse_goals(read_private(self._path).decode())
+            self._ids = frozenset(goal.goal_id for goal in goals.values())
+            return goals
         except FileNotFoundError:
             return {}
         except UntrustedFileError as error:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import Enum
+from typing import NamedTuple
 
 import numpy as np
 
@@ -23,13 +24,20 @@ from spacerobot_ros.model.rotations import (
     quaternion_multiply,
 )
 from spacerobot_ros.planning.core.clearance import Clearance
+from spacerobot_ros.planning.execution.config import PlannerConfig
+from spacerobot_ros.planning.execution.state_average import MeasuredState
 from spacerobot_ros.planning.methods.optimal.end_effectors import (
     EndEffectorRows,
     reach_of_end_effector,
 )
 from spacerobot_ros.planning.methods.optimal.goal_specification import BaseRotations
 from spacerobot_ros.planning.methods.optimal.problem import MotionLimits
-from spacerobot_ros.planning.methods.resolved_rate import MIN_PROGRESS_RATE, ResolvedRateOptions
+from spacerobot_ros.planning.methods.resolved_rate import (
+    MIN_PROGRESS_RATE,
+    ResolvedRateGait,
+    ResolvedRateOptions,
+)
+from spacerobot_ros.times import SECOND
 
 _SLOW_PROGRESS_RATE = 2 * MIN_PROGRESS_RATE
 """Progress below which the end-effector slows down before a singularity."""
@@ -107,6 +115,164 @@ class TwistCommand:
             TwistFrame.LINK: R_BE,
         }[self.frame]
         return R @ self.linear, R @ self.angular
+
+
+class TwistStep(NamedTuple):
+    """The answer to one state while an end-effector follows twists.
+
+    ``rates`` (n,) are those of the joints; None: they keep their shape. ``message`` is for the
+    status, empty if it says nothing new. ``ended``: the joints rest, and twists are over.
+    """
+
+    rates: Array | None
+    message: str
+    ended: bool = False
+
+
+@dataclass
+class _Following:
+    """The twists that one end-effector follows."""
+
+    follower: TwistFollower
+    twist: TwistCommand | None
+    """The last one; None: the joints brake."""
+    received_ns: int
+    """Stamp of the state before it, ns."""
+    reported: str | None = None
+    """Beginning of the reason that was reported last; empty: the twist is followed."""
+    limited_ns: int = 0
+    """Stamp of the last state at which it was not followed, ns."""
+    pose: Array | None = None
+    """(7,) the last measured pose of the base."""
+    pose_ns: int = 0
+    """Stamp of that state, ns."""
+
+
+class Teleoperation:
+    """End-effectors that follow twists, one at a time, until none has come for ``twist_timeout``.
+
+    After a refusal, and after an abort, twists are refused until none has come for that time: so
+    an operator who goes on sending moves nothing by surprise.
+
+    Parameters
+    ----------
+    robot, config
+        The model, and the parameters of the planner.
+    clearance
+        Distances that are kept; None: any.
+    """
+
+    def __init__(
+        self, robot: SpaceRobot, config: PlannerConfig, clearance: Clearance | None
+    ) -> None:
+        self._robot, self._config, self._clearance = robot, config, clearance
+        self._timeout_ns = config.twist_timeout * SECOND
+        self._followers: dict[str, TwistFollower] = {}
+        """By link."""
+        self._following: _Following | None = None
+        self._refused_ns: int | None = None
+        """Stamp of the state before the last twist that was refused, ns."""
+
+    def use_clearance(self, clearance: Clearance | None) -> None:
+        """Keep other distances from now on."""
+        self._clearance = clearance
+        self._followers.clear()
+        if self._following is not None:
+            self._following.follower = self._follower_of(self._following.follower.link)
+
+    def receive(self, twist: TwistCommand, stamp_ns: int) -> None:
+        """Follow a twist from the next state on; ``stamp_ns`` is that of the state before it.
+
+        Raises
+        ------
+        PlanningError
+            It is refused; the message says why.
+        """
+        refused, following = self._refused_ns, self._following
+        try:
+            if refused is not None and stamp_ns - refused <= self._timeout_ns:
+                timeout = self._config.twist_timeout
+                raise PlanningError(
+                    f"Twists are not followed until none has come for {timeout:g} s."
+                )
+            if following is not None and following.follower.link != twist.link:
+                raise PlanningError(
+                    f"'{following.follower.link}' follows twists: '{twist.link}' waits until they "
+                    "stop."
+                )
+            follower = self._follower_of(twist.link)
+        except PlanningError:
+            self.refuse(stamp_ns)
+            raise
+        if following is None:
+            self._following = _Following(follower, twist, stamp_ns)
+        else:
+            following.twist, following.received_ns = twist, stamp_ns
+
+    def refuse(self, stamp_ns: int) -> None:
+        """Note that a twist after the state of a stamp is refused."""
+        self._refused_ns = stamp_ns
+
+    def abort(self, stamp_ns: int) -> None:
+        """Let the joints brake, and refuse the twists that still come."""
+        self.refuse(stamp_ns)
+        if self._following is not None:
+            self._following.twist = None
+
+    def end(self) -> None:
+        """Follow no twist any more."""
+        self._following = None
+
+    def _follower_of(self, link: str) -> TwistFollower:
+        if link not in self._followers:
+            config = self._config
+            options = config.options.get(ResolvedRateGait.name, ResolvedRateOptions())
+            self._followers[link] = TwistFollower(
+                self._robot, link, options, config.control_period, self._clearance
+            )
+        return self._followers[link]
+
+    def keep_base_pose(self, measured: MeasuredState) -> None:
+        """Keep the pose of a base that is measured."""
+        following, base = self._following, measured.base()
+        if following is not None and base is not None and np.all(np.isfinite(base.pose)):
+            following.pose, following.pose_ns = base.pose, measured.stamp_ns
+
+    def step(self, measured: MeasuredState, before: Array, *, goal_waits: bool) -> TwistStep:
+        """Return the answer to a state: braking where the twist is old, or while a goal waits.
+
+        ``before`` (n,) are the rates that were commanded last.
+        """
+        following, stamp, q = self._following, measured.stamp_ns, measured.q
+        assert following is not None
+        self.keep_base_pose(measured)
+        if goal_waits or stamp - following.received_ns > self._timeout_ns:
+            following.twist = None
+        twist, reason = following.twist, ""
+        if following.pose is None or stamp - following.pose_ns > self._timeout_ns:
+            twist, reason = None, "The base is not measured."
+        if not np.all(np.isfinite(q)):
+            return TwistStep(None, "The joints are not measured.", ended=True)
+        pose = np.eye(7)[6] if following.pose is None else following.pose
+        rates, limited = following.follower.rates(twist, pose, q, before)
+        if following.twist is None and not np.any(rates):
+            return TwistStep(rates, "No twists come any more: the joints rest.", ended=True)
+        return TwistStep(rates, self._news(following, reason or limited, stamp))
+
+    def _news(self, following: _Following, reason: str, stamp: int) -> str:
+        """Return the message about a reason that begins, or is over for a while; its numbers
+        change.
+        """
+        beginning = reason.split(":")[0].split(" come within ")[0].split(" touch,")[0]
+        if reason:
+            following.limited_ns = stamp
+        lasts = bool(following.reported) and stamp - following.limited_ns <= self._timeout_ns
+        if beginning == following.reported or (lasts and not reason):
+            return ""
+        following.reported = beginning
+        if reason:
+            return f"{reason} The twist is followed as far as possible."
+        return f"'{following.follower.link}' follows twists."
 
 
 class TwistFollower:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, nullcontext
@@ -11,6 +12,7 @@ from threading import Thread
 
 import numpy as np
 
+from spacerobot_ros.collision import BasePoses
 from spacerobot_ros.errors import PlanningError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array, RobotDescription
@@ -26,9 +28,17 @@ from spacerobot_ros.planning.execution.path_deviation import TrackingError
 from spacerobot_ros.planning.execution.tracker import TakeOver
 from spacerobot_ros.planning.methods.registry import METHODS, build_method
 from spacerobot_ros.planning.methods.remaining_joints import RemainingJointsGait
+from spacerobot_ros.times import SECOND
 
 MAX_THREAD_END_TIME = 1.5
 """Largest wall time for a planning thread to end after its cancellation, s."""
+
+_COASTING_TIME, _COASTING_FACTOR = 2.0, 2.0
+"""Rest with which a plan in the background begins where the robot drifts, s, and, where that was
+too short, the factor of the time from its start to the end of planning."""
+
+_MAX_COASTING_TIME = 600.0
+"""Longest such time, s."""
 
 
 class PlanReason(Enum):
@@ -121,9 +131,18 @@ class PlanningTask:
 
 @dataclass(frozen=True)
 class Planned:
-    """A plan, and the wall time for planning, s."""
+    """A plan, the wall time for planning, s, and the stamp of its first tick, ns."""
 
     schedule: GaitSchedule
+    wall_time: float
+    begins_ns: int = 0
+
+
+@dataclass(frozen=True)
+class Postponed:
+    """A plan that was ready too late, by a time in s, and is made again to begin later."""
+
+    late: float
     wall_time: float
 
 
@@ -135,12 +154,37 @@ class Refused:
     wall_time: float = 0.0
 
 
+@dataclass(frozen=True)
+class _Coasting:
+    """A rest at the start of a plan that is made while the robot drifts.
+
+    ``begins_ns`` is the stamp of the state that the ``planned`` task begins from, ``duration`` that
+    of the rest, s: the gait begins where the base has drifted to by then.
+    """
+
+    planned: PlanningTask
+    begins_ns: int
+    duration: float
+
+    def task(self, period: float) -> PlanningTask:
+        """Return the task of a plan that begins with the rest, in control periods, s."""
+        ticks, state = math.ceil(self.duration / period - 1e-9), self.planned.request.state
+        shapes = np.tile(state.q, (ticks + 1, 1))
+        if self.planned.rates_after_braking is not None:
+            shapes += (
+                period * np.arange(ticks + 1)[:, np.newaxis] * self.planned.rates_after_braking
+            )
+        return replace(self.planned, braking=shapes)
+
+
 class PlanningWorker:
     """Plans with the method of a planner, one plan at a time.
 
     With ``plan_in_background`` a thread plans: CasADi and numpy release Python's lock for most of
-    it. The thread uses the robot's functions, whose buffers are shared: as long as the worker is
-    :attr:`busy`, nothing else may use them.
+    it. A robot that drifts meanwhile is not where the plan began: such plans begin with a rest,
+    which is longer the next time if planning took longer than it. The thread uses the robot's
+    functions, whose buffers are shared: as long as the worker is :attr:`busy`, nothing else may use
+    them.
 
     Parameters
     ----------
@@ -185,13 +229,15 @@ class PlanningWorker:
         self._remaining_joints: tuple[PlanningTask, GaitMethod] | None = None
         """The latest method without stuck joints, and its task."""
         self._job: _PlanThread | None = None
+        self._coasting: _Coasting | None = None
+        """The rest that the requested plan begins with, because the base drifts meanwhile."""
 
     @property
     def is_busy(self) -> bool:
         """Whether a plan is in work, its result waits, or its thread still runs."""
         return self._job is not None
 
-    def drifts(self, state: RobotState) -> bool:
+    def _drifts(self, state: RobotState) -> bool:
         """Whether the base moves on while the joints of a robot rest."""
         momenta = state.linear_momentum, state.angular_momentum
         return any(self._method.significant(each).any() for each in momenta)
@@ -201,8 +247,17 @@ class PlanningWorker:
         maker = METHODS.get(schedule.method, type(self._method))
         return self._method.starts_in_motion and maker.starts_in_motion
 
-    def submit(self, task: PlanningTask) -> None:
-        """Make a plan: at once, or in a thread."""
+    def submit(self, task: PlanningTask, stamp_ns: int) -> None:
+        """Make a plan from the state of a stamp: at once, or in a thread."""
+        self._coasting = None
+        at_rest = task.braking is None and task.take_over is None
+        if at_rest and self.plans_in_background and self._drifts(task.request.state):
+            self._coasting = _Coasting(task, stamp_ns, _COASTING_TIME)
+            task = self._coasting.task(self._config.control_period)
+        self.start(task)
+
+    def start(self, task: PlanningTask) -> None:
+        """Start the work on a task."""
         assert self._job is None, "one plan at a time"
         self._job = job = _PlanThread(self, task)
         if self.plans_in_background:
@@ -211,11 +266,32 @@ class PlanningWorker:
             with self._long_work():
                 job.run()
 
-    def poll(self) -> Planned | Refused | None:
-        """Return the finished result; None before the end and for a cancelled plan.
+    def poll(self, stamp_ns: int) -> Planned | Refused | Postponed | None:
+        """Return the result at a state of a stamp; None before the end and for a cancelled plan.
 
         A defect of the method is raised here.
         """
+        result, coasting = self.take_result(), self._coasting
+        if not isinstance(result, Planned):
+            return result
+        if coasting is None:
+            return replace(result, begins_ns=stamp_ns)
+        elapsed = (stamp_ns - coasting.begins_ns) / SECOND
+        if elapsed <= coasting.duration:
+            return replace(result, begins_ns=coasting.begins_ns)
+        if elapsed > _MAX_COASTING_TIME:
+            return Refused(
+                f"The robot drifts, and {elapsed:.3g} s of planning were not enough for a plan "
+                "that begins in time; smaller optimal.starts take less",
+                result.wall_time,
+            )
+        # The base has drifted past the start of the plan.
+        self._coasting = replace(coasting, duration=_COASTING_FACTOR * elapsed)
+        self.start(self._coasting.task(self._config.control_period))
+        return Postponed(elapsed - coasting.duration, result.wall_time)
+
+    def take_result(self) -> Planned | Refused | None:
+        """Return the result of the work once; None before its end and after its cancellation."""
         job = self._job
         if job is None or not job.done:
             return None
@@ -236,6 +312,23 @@ class PlanningWorker:
         if self._job is not None and self._job.is_alive():
             # A thread inside CasADi would crash a process that ends.
             self._job.join(MAX_THREAD_END_TIME)
+
+    def approach_ahead(self, schedule: GaitSchedule, begins: float, now: float) -> str:
+        """Return the clause that says where the rest of a schedule comes too near to obstacles.
+
+        ``begins`` and ``now`` are times, s. Empty: nowhere, or there are no obstacles.
+        """
+        if self.clearance is None or not self.clearance.has_obstacles:
+            return ""
+        period = self._config.control_period
+        first = min(max(int((now - begins) / period), 0), schedule.ticks)
+        ticks = np.arange(first, schedule.ticks + 1, dtype=float)
+        base = BasePoses(*schedule.path.at(period * ticks))
+        try:
+            found = self.clearance.approaches(schedule.positions[first:], base=base)
+        except PlanningError as refusal:
+            return str(refusal).removesuffix(".")
+        return self.clearance.clause(found[0], period) if found else ""
 
     def plan(self, task: PlanningTask, cancellation: Cancellation) -> GaitSchedule:
         """Plan in the calling thread.

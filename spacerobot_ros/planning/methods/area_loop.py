@@ -115,7 +115,8 @@ class AreaLoopGait(GaitMethod):
     Options: ClassVar[type[AreaLoopOptions]] = AreaLoopOptions
     options: AreaLoopOptions
 
-    def _setup(self) -> None:
+    def setup(self) -> None:
+        """Compute what robot and options decide; see :meth:`GaitMethod.setup`."""
         robot, chosen = self.robot, self.options
         self._nominal = NominalShapeChooser(
             robot,
@@ -144,8 +145,8 @@ class AreaLoopGait(GaitMethod):
         ``longest`` bound the cycles for the goal, with those before (``request.previous``).
         """
         state, goal, tolerance = request.state, request.goal, request.tolerance
-        self._require_rest(state)
-        self._require_goal_of_base(goal)
+        self.require_rest(state)
+        self.require_goal_of_base(goal)
         final = self._clear_goal_shape(request)
         gait = _PlannedMotion(state.q[np.newaxis], state.quaternion[np.newaxis])
         notes: Notes = {"cycles": 0.0}
@@ -404,7 +405,7 @@ class AreaLoopGait(GaitMethod):
         left = PoseError.between(path.position[-1], path.quaternion[-1], goal, gait.positions[-1])
         notes = {**notes, "predicted_attitude_error": left.angle}
         partial = not request.tolerance.admits(left, self.controls)
-        return self._schedule_of(
+        return self.schedule_of(
             goal,
             gait.positions,
             path,

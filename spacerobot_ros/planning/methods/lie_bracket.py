@@ -94,7 +94,8 @@ class LieBracketGait(GaitMethod):
     Options: ClassVar[type[LieBracketOptions]] = LieBracketOptions
     options: LieBracketOptions
 
-    def _setup(self) -> None:
+    def setup(self) -> None:
+        """Compute what robot and options decide; see :meth:`GaitMethod.setup`."""
         robot = self.robot
         # A cycle is a whole number of ticks, so all cycles have the same commands and rotation.
         self.ticks_a_cycle = max(
@@ -111,8 +112,8 @@ class LieBracketGait(GaitMethod):
         """Plan steps 1 to 3; see :meth:`GaitMethod.plan`."""
         cancellation.raise_if_requested()
         state, goal = request.state, request.goal
-        self._require_rest(state)
-        self._require_goal_of_base(goal)
+        self.require_rest(state)
+        self.require_goal_of_base(goal)
         z_f = self.final_shape(state, goal, POSITION_SLACK * request.tolerance.position)
         slide = self._slide_shapes(state.q, z_f)
         t1 = (len(slide) - 1) * self.control_period or self.options.t1
@@ -128,7 +129,7 @@ class LieBracketGait(GaitMethod):
         positions = np.vstack([slide, turn])
         # In every cycle the base is elsewhere.
         is_clear = not self._has_obstacles
-        return self._schedule_of(goal, positions, path, symbols | notes, is_clear=is_clear)
+        return self.schedule_of(goal, positions, path, symbols | notes, is_clear=is_clear)
 
     def final_shape(self, state: RobotState, goal: Goal, enough: float = 0.0) -> Array:
         """Step 1: the shape ``zf`` (n,) that solves eq. (9), nearest to the present one.

@@ -531,7 +531,8 @@ class ResolvedRateGait(GaitMethod):
 
     controls: frozenset[Controlled] = frozenset({"end_effectors"})
 
-    def _setup(self) -> None:
+    def setup(self) -> None:
+        """Compute what robot and options decide; see :meth:`GaitMethod.setup`."""
         self._limits = MotionLimits.of(self.robot, self.options, self.name)
         if len(self.options.waypoints) % 3:
             raise ParameterError(
@@ -548,7 +549,7 @@ class ResolvedRateGait(GaitMethod):
 
     def plan(self, request: PlanRequest, cancellation: Cancellation = NEVER) -> GaitSchedule:
         """Plan the motion along the lines; see :meth:`GaitMethod.plan`."""
-        self._require_rest(request.state)
+        self.require_rest(request.state)
         self.require_suitable(self.robot)
         q = np.clip(request.state.q, self.robot.lower, self.robot.upper)
         state = replace(request.state, q=q)
@@ -888,4 +889,4 @@ class ResolvedRateGait(GaitMethod):
         for each in goal.end_effectors:
             r_WE, quaternion = end_effector_pose(self.robot, each.link, *end, positions[-1])
             notes[f"final_pose_of_{each.link}"] = [*r_WE.tolist(), *quaternion.tolist()]
-        return self._schedule_of(goal, positions, path, notes, progress=progress)
+        return self.schedule_of(goal, positions, path, notes, progress=progress)

@@ -111,7 +111,8 @@ class SquarePathGait(GaitMethod):
     Options: ClassVar[type[SquarePathOptions]] = SquarePathOptions
     options: SquarePathOptions
 
-    def _setup(self) -> None:
+    def setup(self) -> None:
+        """Compute what robot and options decide; see :meth:`GaitMethod.setup`."""
         robot, chosen = self.robot, self.options
         t1, t2, t3, t4 = chosen.t1, chosen.t2, chosen.t3, chosen.t4
         instants = (0.0, t1, t2, t3, t4)
@@ -140,8 +141,8 @@ class SquarePathGait(GaitMethod):
         """Plan steps 1 to 4; see :meth:`GaitMethod.plan`."""
         cancellation.raise_if_requested()
         state, goal, tolerance = request.state, request.goal, request.tolerance
-        self._require_rest(state)
-        self._require_goal_of_base(goal)
+        self.require_rest(state)
+        self.require_goal_of_base(goal)
         turn = self._requested_turn(request)
         psi_e = self._clear_goal_shape(request)
         if psi_e is None:
@@ -175,7 +176,7 @@ class SquarePathGait(GaitMethod):
             "final_position": path.position[-1].tolist(),
             "predicted_attitude_error": left.angle,
         }
-        return self._schedule_of(goal, positions, path, notes)
+        return self.schedule_of(goal, positions, path, notes)
 
     def _requested_turn(self, request: PlanRequest) -> float:
         """Return the angle to the goal attitude about the robot's axis, in [-pi, pi]."""

@@ -400,7 +400,7 @@ class Goals:
             if before is not None and not (self._repeats and before == state):
                 self._report(f"goal {goal_id} was {before} and is {state}: {sentence}")
             self.decided[goal_id] = state
-            if goal_id == self.pursued or state == "aborted":
+            if goal_id == self.pursued:
                 self.pursued = ""
         elif state in ("planning", "executing", "tracking"):
             if before is not None:
@@ -409,7 +409,7 @@ class Goals:
                 if self.pursued not in ("", goal_id):
                     self.decided[self.pursued] = "replaced"
                 self.pursued = goal_id
-        if state == "aborted":
+        if state == "aborted" and not goal_id:
             self.pursued = ""
 
     def drop(self) -> None:

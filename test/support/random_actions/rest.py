@@ -7,6 +7,7 @@ from support.random_actions.expectations import SECOND, Goals, Situation, State
 from support.random_actions.setups import Setup
 
 from spacerobot_ros.model.thrusters import find_thrusters
+from spacerobot_ros.model.wheels import ReactionWheels
 from spacerobot_ros.simulation.status import PlantState
 
 
@@ -16,6 +17,7 @@ class RestCheck:
     def __init__(self, setup: Setup, situation: Situation, goals: Goals) -> None:
         self._setup, self._situation, self._goals = setup, situation, goals
         self._names = setup.model.joint_names
+        self._braked = ReactionWheels.of(setup.model.description).other
         self._fastest: float | None = None
         """Largest joint rate since motors began to brake."""
         self._since = 0
@@ -64,7 +66,7 @@ class RestCheck:
         if not situation.latched or disturbed or now.time_ns <= situation.latched_at:
             self._fastest = None
             return None
-        rate = float(np.abs(now.qdot).max(initial=0.0))
+        rate = float(np.abs(now.qdot[self._braked]).max(initial=0.0))  # Wheels spin on.
         if self._fastest is None:
             self._fastest, self._since = rate, now.time_ns
         elapsed = (now.time_ns - self._since) / SECOND
@@ -97,7 +99,8 @@ class EnergyCheck:
     take energy away. After the rearm a controller holds the robot where it is: thrusters may brake
     the base, and the arm may swing with it, but a spring that begins where the robot is and a
     damper never give more than there was. Thrusters that are on or off push too much, and so do
-    commands that a busy machine holds longer than their control period, in real time.
+    commands that a busy machine holds longer than their control period, in real time. Reaction
+    wheels hold a base still with the energy of their motors.
     """
 
     FLOOR = 1e-12
@@ -116,6 +119,7 @@ class EnergyCheck:
 
     def __init__(self, setup: Setup, situation: Situation, *, lockstep: bool) -> None:
         self._setup, self._situation = setup, situation
+        self._has_wheels = len(ReactionWheels.of(setup.model.description).index) > 0
         self._floor = self.FLOOR if lockstep else self.FLOOR_OF_LATENESS
         if setup.plant.get("thrusters"):
             self._floor += energy_of_pulses(setup)
@@ -129,7 +133,9 @@ class EnergyCheck:
         """Compare the kinetic energy with that under the latch."""
         situation = self._situation
         stopped = situation.latched or not situation.goal_since_stop
-        if self._setup.servos or self._disturbed(now) or self._latched_at != situation.latched_at:
+        if self._setup.servos or self._has_wheels:
+            return None
+        if self._disturbed(now) or self._latched_at != situation.latched_at:
             self._most, self._latched_at = None, situation.latched_at
             return None
         if not stopped:

@@ -228,5 +228,32 @@ SETUPS: dict[str, Setup] = {
         nozzles=("plus_x_1", "plus_x_4"),
         patience=150.0,
     ),
+    # Reaction wheels that spin from the beginning, and a target that drifts by.
+    "wheels_and_target": Setup(
+        robot="tender",
+        plant=_of(
+            "wheels",
+            "plant",
+            **_QUIET,
+            **{
+                "target.robot": str(_ROOT / "config/targets/block.urdf"),
+                "target.position": [6.0, 3.0, 2.0],
+            },
+            **{"target.velocity": [-0.01, 0.0, 0.0]},
+        ),
+        controller=_of(
+            "wheels",
+            "coordinated_control",
+            settle_time=0.2,
+            position_tolerance=0.01,
+            attitude_tolerance=0.01,
+            time_limit=100.0,
+        ),
+        real_time={**_WALL, "real_time_factor": 1.0, "command_timeout": 1.0},
+        reach=(0.05, 0.05, 0.05),
+        turn=(0.05, 0.05, 0.05),
+        tip=True,
+        patience=150.0,
+    ),
 }
 """By name."""

@@ -189,7 +189,8 @@ class OptimalGait(GaitMethod):
     Options: ClassVar[type[OptimalOptions]] = OptimalOptions
     options: OptimalOptions
 
-    def _setup(self) -> None:
+    def setup(self) -> None:
+        """Compute what robot and options decide; see :meth:`GaitMethod.setup`."""
         # A plan calls the model's functions a few times each.
         self.robot = robot = self.robot.interpreted
         chosen = self.options
@@ -397,7 +398,7 @@ class OptimalGait(GaitMethod):
         state, goal, correction = request.state, request.goal, request.correction
         q = state.q
         margin = np.zeros(self.robot.n) if correction else self._margin
-        shape, kind = self._goal_shape(goal), self._kind_of(goal)
+        shape, kind = self.goal_shape(goal), self._kind_of(goal)
         same_shape = self._specification.same_shape and not goal.end_effectors
         if request.motion is not None and shape is None and same_shape:
             # The present shape is a shape on the path.
@@ -644,7 +645,7 @@ class OptimalGait(GaitMethod):
         aimed = self._kind_of(request.goal).specification.boundary_conditions(
             self.robot,
             later,
-            self._goal_shape(request.goal),
+            self.goal_shape(request.goal),
             self._limits,
             self._constraints.direction_W,
         )
@@ -840,7 +841,7 @@ class OptimalGait(GaitMethod):
             end_velocities = np.broadcast_to(after, self.robot.n).copy()
             notes["final_wheel_rates"] = end_velocities[self._wheels.index].tolist()
         notes["limited_by"] = self._list_active_limits(positions, velocity, L_B, after)
-        schedule = self._schedule_of(
+        schedule = self.schedule_of(
             goal,
             positions,
             path,
