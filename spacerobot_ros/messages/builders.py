@@ -207,7 +207,7 @@ def goal_message(goal: Goal, frame: str, stamp_ns: int = 0) -> bytes:
     return encode(
         POSE_STAMPED,
         {
-            "header": {"stamp": stamp_ns, "frame_id": frame},
+            "header": {"stamp": min(stamp_ns, LATEST_NS), "frame_id": frame},
             "pose": {"position": position, "orientation": orientation},
         },
     )
@@ -216,11 +216,11 @@ def goal_message(goal: Goal, frame: str, stamp_ns: int = 0) -> bytes:
 def given_path_message(poses: Array, frame: str, stamp_ns: int) -> bytes:
     """Return a path of poses (K, 7), or of positions (K, 3), as nav_msgs/Path.
 
-    Positions alone have quaternions of zeros.
+    Positions alone have quaternions of zeros, which mean any attitude.
     """
     numbers = np.zeros((len(poses), 7))
     numbers[:, : poses.shape[1]] = poses
-    header = {"header": {"stamp": stamp_ns, "frame_id": frame}}
+    header = {"header": {"stamp": min(stamp_ns, LATEST_NS), "frame_id": frame}}
     columns = {"pose.position.x": numbers}
     return encode_list("nav_msgs/msg/Path", header, "poses", header, columns)
 

@@ -20,14 +20,16 @@ from spacerobot_ros.commanding.goal_follower import STATUS_TOPICS, GoalFollower,
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.events import EventKind
 from spacerobot_ros.measures import Outcome
+from spacerobot_ros.messages.builders import given_path_message, goal_message
 from spacerobot_ros.messages.statuses import read_status
 from spacerobot_ros.model.description import DEFAULT_END_EFFECTOR
-from spacerobot_ros.nodes.common.messages import goal_message, path_message, shape_message
+from spacerobot_ros.nodes.common.messages import shape_message
 from spacerobot_ros.nodes.common.node import LATCHED, STREAM
 from spacerobot_ros.nodes.common.process import spin_until
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.execution.goal_file import GoalIds
 from spacerobot_ros.planning.execution.status import PlannerStatus
+from spacerobot_ros.times import LATEST_NS, SECOND
 from spacerobot_ros.topics import goal_topic, path_topic
 
 _STATUS_CHECK_PERIOD = 0.2  # wall s
@@ -166,18 +168,16 @@ class MissionClient:
         """
         self._sent += 1
         time_ns = self._now() + self._sent
-        message = goal_message(goal, self._frame, time_ns)
-        stamp = message.header.stamp
-        self._follower = GoalFollower(GoalIds().of(stamp.sec, stamp.nanosec))
+        self._follower = GoalFollower(GoalIds().of(*divmod(min(time_ns, LATEST_NS), SECOND)))
         self.message = ""
         if self._shape_topic is not None and self._joint_names is not None:
             self._shape_topic.publish(shape_message(goal, self._joint_names()))
         if goal.base:
-            self._goal_topic.publish(message)
+            self._goal_topic.publish(goal_message(goal, self._frame, time_ns))
         of_links = {
             each.link: goal_message(each.as_goal(), self._frame, time_ns)
             if each.waypoints is None
-            else path_message(each.path_values, self._frame, time_ns)
+            else given_path_message(each.path_values, self._frame, time_ns)
             for each in goal.end_effectors
         }
         if end_effector is not None:

@@ -12,16 +12,18 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from geometry_msgs.msg import PoseStamped
 from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.action.server import ServerGoalHandle
 from rclpy.clock import Clock, ClockType
+from rclpy.serialization import deserialize_message
 
 from spacerobot_ros.commanding.fly_to import FlyTo, FlyToResult, Progress
 from spacerobot_ros.errors import PlanningError
+from spacerobot_ros.messages.builders import goal_message
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.nodes.common.messages import (
     end_effector_goal,
-    goal_message,
     goal_of,
     interface_class,
     shape_of,
@@ -189,7 +191,8 @@ class NavigateToPoseAction(GoalAction):
         message = self.kind.Feedback()
         if progress.pose is not None:
             here = Goal(progress.pose[:3], progress.pose[3:])
-            message.current_pose = goal_message(here, world_frame, progress.stamp_ns)
+            raw = goal_message(here, world_frame, progress.stamp_ns)
+            message.current_pose = deserialize_message(raw, PoseStamped)
         set_duration(message.navigation_time, progress.elapsed_time)
         set_duration(message.estimated_time_remaining, progress.remaining_time or 0.0)
         distance = progress.errors.position

@@ -25,7 +25,7 @@ from spacerobot_ros.model.rotations import (
     matrix_from_quaternion,
     quaternion_multiply,
 )
-from spacerobot_ros.times import SECOND, set_stamp
+from spacerobot_ros.times import SECOND
 
 if TYPE_CHECKING:
     from spacerobot_ros.planning import Goal
@@ -87,31 +87,6 @@ def diagnostic_status(
     )
 
 
-def goal_message(goal: Goal, frame: str, time_ns: int) -> PoseStamped:
-    """Return the pose of a goal in ``frame`` as a message."""
-    return _pose_message(goal.position, goal.quaternion, frame, time_ns)
-
-
-def _pose_message(position: Array, quaternion: Array, frame: str, time_ns: int) -> PoseStamped:
-    message = PoseStamped()
-    message.header.frame_id = frame
-    set_stamp(message.header.stamp, time_ns)
-    set_pose(message.pose, position, quaternion)
-    return message
-
-
-def path_message(poses: Array, frame: str, time_ns: int) -> Path:
-    """Return a path of poses (K, 7), or of positions (K, 3), in ``frame``: the inverse of
-    :func:`path_poses`. Positions alone have quaternions of zeros.
-    """
-    quaternions = poses[:, 3:] if poses.shape[1] == 7 else np.zeros((len(poses), 4))
-    given = zip(poses[:, :3], quaternions, strict=True)
-    message = Path(poses=[_pose_message(r, x, frame, time_ns) for r, x in given])
-    message.header.frame_id = frame
-    set_stamp(message.header.stamp, time_ns)
-    return message
-
-
 def shape_message(goal: Goal, joint_names: Sequence[str]) -> JointState:
     """Return a message of the joint positions required at a goal; empty without a requirement."""
     positions = goal.joint_positions
@@ -132,13 +107,6 @@ def pose_array(position: Any, orientation: Any) -> Array | None:
         return None
     pose[3:] /= length
     return pose
-
-
-def set_pose(pose: Any, position: Array, quaternion: Array) -> None:
-    """Set the numbers of a geometry_msgs/Pose."""
-    p, o = pose.position, pose.orientation
-    p.x, p.y, p.z = position.tolist()
-    o.x, o.y, o.z, o.w = quaternion.tolist()
 
 
 def goal_of(

@@ -25,12 +25,13 @@ from std_srvs.srv import SetBool, Trigger
 
 from spacerobot_ros.errors import SpaceRobotError, printable
 from spacerobot_ros.events import Event, EventKind
+from spacerobot_ros.messages.builders import goal_message
 from spacerobot_ros.messages.statuses import read_status
 from spacerobot_ros.model.description import DEFAULT_END_EFFECTOR, RobotDescription
 from spacerobot_ros.model.thrusters import ThrusterTable, find_thrusters
 from spacerobot_ros.model.urdf import parse_robot
 from spacerobot_ros.model.world import obstacles_from_topic
-from spacerobot_ros.nodes.common.messages import goal_message, shape_message
+from spacerobot_ros.nodes.common.messages import shape_message
 from spacerobot_ros.nodes.common.node import LATCHED, STREAM, FlightNode
 from spacerobot_ros.nodes.common.process import run_node
 from spacerobot_ros.nodes.common.ros_parameters import RemoteParameters
@@ -40,6 +41,7 @@ from spacerobot_ros.planning.execution.goal_file import BASE_GOAL_KEY, GoalIds
 from spacerobot_ros.planning.execution.status import PlannerState
 from spacerobot_ros.simulation.faults import FaultTargets
 from spacerobot_ros.simulation.status import PlantState
+from spacerobot_ros.times import LATEST_NS, SECOND
 from spacerobot_ros.topics import goal_topic
 from spacerobot_ros.viewer import content
 from spacerobot_ros.viewer.page import Page
@@ -453,8 +455,7 @@ class ViewerNode(FlightNode):
         readers = 0
         for part, goal in goals.items():
             aim = goal.end_effectors[0].as_goal() if goal.end_effectors else goal
-            message = goal_message(aim, self.config.world_frame, time_ns)
-            self._goal_topics[part].publish(message)
+            self._goal_topics[part].publish(goal_message(aim, self.config.world_frame, time_ns))
             # Where this node hears the goal too, one of the readers is its own.
             own = 1 if part in _PARTS_WITH_RECEIVED_GOALS else 0
             readers = max(readers, self._goal_topics[part].get_subscription_count() - own)
@@ -462,8 +463,7 @@ class ViewerNode(FlightNode):
             self._note("No planner or controller takes the goal: none is running.", 2, "page")
         else:
             self._note("Goal sent.", source="page")
-            stamp = message.header.stamp
-            goal_id = GoalIds().of(stamp.sec, stamp.nanosec)
+            goal_id = GoalIds().of(*divmod(min(time_ns, LATEST_NS), SECOND))
             self._unanswered_goal = goal_id, time.monotonic() + _LONGEST_GOAL_ANSWER_WAIT
         editor = self._page.editor
         editor.note_sent()
