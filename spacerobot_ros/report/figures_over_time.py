@@ -16,7 +16,8 @@ from matplotlib.axes import Axes
 
 from spacerobot_ros.errors import RobotDescriptionError, sentence_case
 from spacerobot_ros.flight.captures import BUDGET_PARTS
-from spacerobot_ros.flight.flight import Signal
+from spacerobot_ros.flight.series import Signal
+from spacerobot_ros.measures import momentum_change
 from spacerobot_ros.model.description import Array, Joint
 from spacerobot_ros.model.rotations import (
     quaternion_inverse,
@@ -25,7 +26,6 @@ from spacerobot_ros.model.rotations import (
 )
 from spacerobot_ros.report.events import EVENT_STRIP_HEIGHT, draw_events
 from spacerobot_ros.report.figures import (
-    LARGEST_VALUE_SLICES,
     LIMIT,
     LINE_COLOUR,
     PALETTE,
@@ -124,10 +124,13 @@ def _draw_decades(axes: Axes, flight: FlightReport, group: TraceGroup) -> None:
     axes.set_yscale("log")
     axes.set_ylim(floor, top)
     shown = Signal(signal.time, np.maximum(signal.values, floor))
+    several = len(group.names) > 1
     for index, tint in enumerate(group.colours):
         axes.plot(
             *largest_over_time(shown, index),
             color=tint,
+            # Traces that lie on each other are both seen.
+            lw=2.6 - 1.3 * index if several else None,
             marker="o" if len(signal) < 3 else "",
             ms=4,
             clip_on=False,
@@ -135,12 +138,16 @@ def _draw_decades(axes: Axes, flight: FlightReport, group: TraceGroup) -> None:
     for index, bound in group.limits:
         if floor < bound < top:
             axes.axhline(bound, color=group.colours[index], lw=1.0, ls=(0, DOTS), zorder=1.8)
-    if group.limits:
-        legend_above(axes, [legend_entry(SECONDARY_COLOUR, group.limit_name, DOTS)])
+    keys = [legend_entry(SECONDARY_COLOUR, group.limit_name, DOTS)] if group.limits else []
+    named = zip(group.colours, group.names, strict=True)
+    keys += [legend_entry(*each) for each in named] if several else []
+    legend_above(axes, keys)
     axes.minorticks_off()
     axes.yaxis.set_major_formatter(lambda value, _: power_of_ten(value))
     set_time(axes, 0.0, flight.end)
-    axes.set_ylabel(f"{group.label} ({group.unit})")
+    if several:
+        axes.set_title("" if narrow() else group.label)
+    axes.set_ylabel(group.unit if several else f"{group.label} ({group.unit})")
 
 
 ONE_STATE_TEXT = "The bag holds one state: there are no figures over time."
@@ -570,69 +577,34 @@ def thrusters_figure(flight: FlightReport) -> ReportFigure | str | None:
 
 def momentum_figure(flight: FlightReport) -> ReportFigure | str:
     """Change of the total momenta, and the kinetic energy."""
-    if not len(flight.unexplained_momentum):
+    balance = flight.unexplained_momentum
+    if not len(balance):
         return "The bag holds no momentum."
-    if len(flight.unexplained_momentum) < 2:
-        return ONE_STATE_TEXT
-    time, balance = flight.unexplained_momentum.time, flight.unexplained_momentum.values
-    changes = np.column_stack(
-        [np.linalg.norm(balance[:, k : k + 3] - balance[0, k : k + 3], axis=1) for k in (0, 3)]
-    )
-    bottom = 0.5 + (EVENT_STRIP_HEIGHT if flight.timed_events else 0.0)
-    figure, ((above,), (below,)) = sheet([[1.0], [1.0]], [1.6, 1.1], bottom=bottom)
-    floor, top = log_range(changes, _MOMENTUM_DECADES)
-    above.set_yscale("log")
-    above.set_ylim(floor, top)
-    # Values below the axis, such as zero, are drawn on its lower edge.
-    shown = np.maximum(changes, floor)
-    for i in range(2):
-        above.plot(
-            *largest_over_time(Signal(time, shown), i),
-            color=colour(i),
-            lw=2.6 - 1.3 * i,
-            marker="o" if len(time) == 1 else "",
-            clip_on=False,
-        )
-    set_time(above, 0.0, flight.end, label=False)
-    if not narrow():
-        above.set_title("change of the total momenta since the start")
-    above.set_ylabel("kg m/s, kg m²/s")
-    above.minorticks_off()
-    above.yaxis.set_major_formatter(lambda value, _: power_of_ten(value))
-    names = ("|p − p₀| (kg m/s)", "|L − L₀| (kg m²/s)")
-    legend_above(above, [legend_entry(colour(i), name) for i, name in enumerate(names)])
-    energy = balance[:, 6:7]
-    set_range(below, np.append(energy, 0.0))
-    dense = draw_traces(below, Signal(time, energy), [colour(2)])
-    below.set_title("kinetic energy")
-    below.set_ylabel("J")
-    set_time(below, 0.0, flight.end)
-    if flight.timed_events:
-        draw_events(below, flight.timed_events)
-    largest_of = (
-        ", the largest in each slice of time" if len(time) > 2 * LARGEST_VALUE_SLICES else ""
-    )
-    caption = (
-        "The momentum balance of the whole system. Top: change of the linear momentum p and of the "
-        "angular momentum L about the centre of mass since the start, less the impulse of the "
-        f"thrusters{largest_of}, on a logarithmic axis; smaller changes and zero lie on its lower "
-        "edge. Bottom: kinetic energy."
-    )
-    aside = f" {BAND_CAPTION}" if dense else ""
-    aside += f" {EVENTS_CAPTION}" if flight.timed_events else ""
-    caption += aside
+    changes = momentum_change(balance.values[:, :6], balance.values[0, :6])
     groups = [
         TraceGroup(
-            Signal(time, changes),
+            Signal(balance.time, changes),
             ["|p − p₀| (kg m/s)", "|L − L₀| (kg m²/s)"],
             "change of the total momenta",
             "kg m/s, kg m²/s",
             PALETTE[:2],
             decades=_MOMENTUM_DECADES,
         ),
-        TraceGroup(Signal(time, energy), ["energy"], "kinetic energy", "J", [colour(2)]),
+        TraceGroup(
+            Signal(balance.time, balance.values[:, 6:7]),
+            ["energy"],
+            "kinetic energy",
+            "J",
+            [colour(2)],
+        ),
     ]
-    return ReportFigure("momentum", "Momentum balance", caption, figure, groups, aside)
+    caption = (
+        "The momentum balance of the whole system. Top: change of the linear momentum p and of the "
+        "angular momentum L about the centre of mass since the start, less the impulse of the "
+        "thrusters, on a logarithmic axis; smaller changes and zero lie on its lower edge. Bottom: "
+        "kinetic energy"
+    )
+    return time_figure(flight, "momentum", "Momentum balance", caption, groups)
 
 
 def momentum_budget_figure(flight: FlightReport) -> ReportFigure | str | None:

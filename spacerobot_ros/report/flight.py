@@ -19,7 +19,7 @@ from spacerobot_ros.flight.captures import (
     momentum_budget_over_time,
 )
 from spacerobot_ros.flight.clearance import FlightClearance
-from spacerobot_ros.flight.flight import Flight, SentGoal, Signal, pose_error, reported_goal
+from spacerobot_ros.flight.flight import Flight
 from spacerobot_ros.flight.reading import (
     WRENCH_COLUMNS,
     FlightBag,
@@ -29,6 +29,7 @@ from spacerobot_ros.flight.reading import (
     read_flight,
     since,
 )
+from spacerobot_ros.flight.series import SentGoal, Signal, pose_error, reported_goal
 from spacerobot_ros.measures import flown_time
 from spacerobot_ros.model.description import DEFAULT_END_EFFECTOR, Array, Joint, Pose, Shape
 from spacerobot_ros.model.kinematics import ForwardKinematics
@@ -38,14 +39,13 @@ from spacerobot_ros.model.rotations import (
     rotation_angles,
     rotvec_from_quaternion,
 )
-from spacerobot_ros.model.visuals import Visual, meshes_from_attachments, visuals_of
+from spacerobot_ros.model.visuals import Visual, meshes_from_attachments
 from spacerobot_ros.planning import Goal, PoseError
 from spacerobot_ros.planning.core.goal import EndEffectorGoal
 from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus, time_to_end
 from spacerobot_ros.planning.methods.registry import METHODS
 from spacerobot_ros.report.events import FlightEvent, timed_events
 from spacerobot_ros.report.signals import Cycles, find_cycles, nearest_rotvec, rotvecs
-from spacerobot_ros.report.solids import MAX_MESH_FACES, SolidRobot, Solids, obstacle_color, rgb
 from spacerobot_ros.scenario import COMMANDERS
 from spacerobot_ros.times import SECOND
 
@@ -324,6 +324,17 @@ class FlightReport(Flight):
         """The goal of the base that counts at the end; None: there is none, or the base is free."""
         return self.goal if self.goal is not None and self.goal.base else None
 
+    @property
+    def other_goal(self) -> bool:
+        """Whether the base was sent to another goal than that of its scenario."""
+        own = self.scenario.goal
+        return self.scenario.has_goal and any(
+            not np.allclose(sent.goal.position, own.position)
+            or not np.allclose(sent.goal.quaternion, own.quaternion)
+            for sent in self.goals
+            if own.base
+        )
+
     @cached_property
     def link_goals(self) -> dict[str, EndEffectorGoal]:
         """The goals of links that count at the end, of a planner."""
@@ -437,26 +448,6 @@ class FlightReport(Flight):
         planned = [(time, each) for time, each in self.reports if isinstance(each, PlannerStatus)]
         return time_to_end(planned, self.end)
 
-    @cached_property
-    def drawn(self) -> SolidRobot | None:
-        """The robot as something to draw; None if the bag lacks its description or its states."""
-        if self.robot is None or self.hidden_links_text:
-            return None
-        return SolidRobot(self.robot, self.meshes, self.obstacles)
-
-    def target_solids_at(self, time: float) -> Solids:
-        """Return the target in its pose at a time, s; empty where there is none."""
-        solids, poses = Solids(), self.target_pose
-        if self.target is None or not len(poses):
-            return solids
-        index = min(int(np.searchsorted(poses.time, time - 1e-9)), len(poses) - 1)
-        values = poses.values[index]
-        pose = Pose(matrix_from_quaternion(values[3:]), values[:3])
-        for visual in visuals_of(self.target, {}, MAX_MESH_FACES):
-            placed = pose @ self.target.frames[visual.link][1]
-            solids.add(visual, placed, rgb(obstacle_color(visual)))
-        return solids
-
     @property
     def hidden_links_text(self) -> str:
         """A message about data missing for a picture of the robot; empty: none is missing."""
@@ -489,28 +480,10 @@ class FlightReport(Flight):
         count = f"{len(missing)} of {len(named)} meshes" if self.meshes else "Meshes"
         return f" {count} are not drawn. The bag does not carry them."
 
-    def base_at(self, index: int) -> Pose:
-        """Pose of the base link in the world at a recorded state."""
-        R_WB = matrix_from_quaternion(self.quaternion[index])
-        return Pose(R_WB, self.position.values[index])
-
     def samples(self, count: int) -> list[int]:
         """Recorded states at about equal intervals, the first and the last among them."""
         last = len(self.position) - 1
         return np.unique(np.linspace(0, last, count).astype(int)).tolist()
-
-    @cached_property
-    def flat(self) -> bool:
-        """Whether every link stays in a plane z = const of the world."""
-        assert self.drawn is not None
-        shapes = self.joints
-        poses = [
-            list(self.drawn.link_poses(shapes[index], self.base_at(index)).values())
-            for index in self.samples(25)
-        ]
-        upright = all(abs(pose.R[2, 2]) > 1 - 1e-9 for links in poses for pose in links)
-        heights = np.array([[pose.r[2] for pose in links] for links in poses])
-        return upright and float(np.ptp(heights, axis=0).max()) < 1e-6
 
     @cached_property
     def joints(self) -> Array:

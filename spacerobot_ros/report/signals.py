@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from spacerobot_ros.flight.flight import Signal
+from spacerobot_ros.flight.series import Signal
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.rotations import rotvecs_from_quaternions
 
@@ -154,6 +154,8 @@ def find_cycles(rates: Signal) -> Cycles | None:
     first, stop = int(bounds[enough[-1]]) + 1, int(bounds[enough[-1] + 1]) + lag
     last = min(stop, len(rates) - 1)
     start, end = float(rates.time[first]), float(rates.time[last])
+    if end <= start:
+        return None  # Log times that are the same for all messages.
     return Cycles(start, end, lag * (end - start) / (last - first))
 
 

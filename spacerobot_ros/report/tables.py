@@ -103,8 +103,11 @@ def _momentum_label(flight: FlightReport) -> str:
 
 
 def runs_table(flights: Sequence[FlightReport]) -> Table:
-    """Return the headline numbers of several flights, a row each."""
-    found = [{label: value for label, value, _ in headline(flight)} for flight in flights]
+    """Return outcome and headline numbers of several flights, a row each."""
+    found = [
+        {"Outcome": flight.verdict.word} | {label: value for label, value, _ in headline(flight)}
+        for flight in flights
+    ]
     labels = list(dict.fromkeys(label for values in found for label in values))
     rows = [
         (flight.bag.path.name, *(values.get(label, _NO_VALUE) for label in labels))

@@ -20,7 +20,7 @@ from spacerobot_ros.control.controller import build_controller
 from spacerobot_ros.control.laws.transposed_jacobian import TransposedJacobianLaw
 from spacerobot_ros.errors import GoalError, ParameterError, PlanningError, RecordingError
 from spacerobot_ros.flight import api
-from spacerobot_ros.flight.flight import Signal
+from spacerobot_ros.flight.series import Signal
 from spacerobot_ros.measures import Outcome
 from spacerobot_ros.model import SpaceRobot, load_robot
 from spacerobot_ros.planning import Goal

@@ -16,9 +16,10 @@ from spacerobot_ros.bag import read_bag
 from spacerobot_ros.bag.salvage import salvage_bag
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.events import Event, EventKind
-from spacerobot_ros.flight.flight import Flight, Signal
+from spacerobot_ros.flight.flight import Flight
 from spacerobot_ros.flight.lockstep import fly_scenario
 from spacerobot_ros.flight.reading import namespaces, read_run
+from spacerobot_ros.flight.series import Signal
 from spacerobot_ros.flight.verification import verify_bag
 from spacerobot_ros.scenario import load_scenario
 
@@ -169,7 +170,10 @@ def test_mujoco_does_not_capture(bag: Path) -> None:
 
 def test_a_block_that_passes_is_missed() -> None:
     flight = fly_scenario(load_scenario("faults/missed_capture"))
-    assert flight.summary()["capture"] == {"captured": False}
+    summary = flight.summary()
+    assert summary["capture"] == {"captured": False}
+    assert (summary["succeeded"], summary["succeeded_by_measurement"]) == (False, True)
+    assert summary["verdict"].startswith("The goal is reached, but the target is not captured: ")
     assert EventKind.CAPTURED not in {each.kind for each in flight.events}
     # It drifts past the end-effector.
     x = flight.signal("target_pose").values[:, 0]

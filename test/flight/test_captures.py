@@ -21,8 +21,9 @@ from spacerobot_ros.flight.captures import (
     momentum_budget_over_time,
     payload_estimates,
 )
-from spacerobot_ros.flight.flight import Flight, Signal
+from spacerobot_ros.flight.flight import Flight
 from spacerobot_ros.flight.reading import open_flight_bag, read_run
+from spacerobot_ros.flight.series import Signal
 from spacerobot_ros.model.kinematics import ForwardKinematics
 from spacerobot_ros.model.payload_estimation import PAYLOAD_PARAMETERS, payload_parameters
 from spacerobot_ros.report.flight import FlightReport

@@ -21,7 +21,7 @@ from support.sentences import assert_one_sentence
 from spacerobot_ros.cli.main import main
 from spacerobot_ros.collision.geometry import obstacle_visuals
 from spacerobot_ros.errors import MeshError
-from spacerobot_ros.flight.flight import SentGoal, Signal, goal_at_end, reported_goal
+from spacerobot_ros.flight.series import SentGoal, Signal, goal_at_end, reported_goal
 from spacerobot_ros.model.description import Array, Shape
 from spacerobot_ros.model.meshes import TriangleMesh
 from spacerobot_ros.model.rotations import quaternion_from_rotvec, rotation_angles
@@ -39,9 +39,10 @@ from spacerobot_ros.report.figures_space import (
 )
 from spacerobot_ros.report.flight import FlightReport, GoalSpan, read_report
 from spacerobot_ros.report.page import _chart_data, _numbers_html
-from spacerobot_ros.report.scene import WORLD, Scene, scene_of
+from spacerobot_ros.report.player import WORLD, View3D, view_of_flight
+from spacerobot_ros.report.scene import obstacles_of
 from spacerobot_ros.report.signals import Cycles, envelope, find_cycles, rotvecs
-from spacerobot_ros.report.solids import Canvas, Edge, Face, View
+from spacerobot_ros.report.solids import Canvas, PlacedSolid, View, corner_points, placed_solids
 from spacerobot_ros.report.tables import headline, result_table
 
 BAGS = Path(__file__).parents[2] / "bags"
@@ -256,24 +257,25 @@ def test_a_status_names_goals_of_links_and_of_the_base() -> None:
 
 
 def test_obstacles_stand_in_the_3d_view_where_the_world_has_them(strut: FlightReport) -> None:
-    scene = scene_of(strut)
-    assert isinstance(scene, Scene)
+    scene = view_of_flight(strut)
+    assert isinstance(scene, View3D)
     path = f"{WORLD}/obstacle 0 strut"
     (placed,) = [c for c in scene.commands if c["type"] == "set_transform" and c["path"] == path]
     matrix = np.reshape(placed["matrix"], (4, 4)).T
     np.testing.assert_allclose(matrix[:3, 3], [1.6, 0.1, 0.0])
     turned = Rotation.from_euler("xyz", [1.2, 0.3, 0.1]).as_matrix()
     np.testing.assert_allclose(matrix[:3, :3], turned, atol=1e-8)
-    (drawn,) = [c for c in scene.commands if c.get("path") == f"{path}/solid" and "object" in c]
+    (drawn,) = [c for c in scene.commands if c.get("path") == f"{path}/0/solid" and "object" in c]
     (cylinder,) = drawn["object"]["geometries"]
-    assert (cylinder["radiusTop"], cylinder["height"]) == (0.06, 0.8)
+    corners = np.reshape(cylinder["data"]["attributes"]["position"]["array"], (-1, 3))
+    np.testing.assert_allclose(np.ptp(corners, axis=0), [0.12, 0.12, 0.8], atol=1e-5)
     assert drawn["object"]["materials"][0]["color"] == 0x9999A6, "the color of its shape"
     assert "obstacles have the shapes by which distances are measured" in scene.caption
 
 
 def test_a_flight_without_obstacles_says_nothing_of_them(hands: FlightReport) -> None:
-    scene = scene_of(hands)
-    assert isinstance(scene, Scene)
+    scene = view_of_flight(hands)
+    assert isinstance(scene, View3D)
     assert "obstacle" not in scene.caption
     assert not any("/obstacle" in command.get("path", "") for command in scene.commands)
     # The goals of links have marks, and axes where the attitude counts.
@@ -292,16 +294,10 @@ def test_a_flight_without_obstacles_says_nothing_of_them(hands: FlightReport) ->
 
 
 def test_pictures_of_configurations_have_the_obstacles(strut: FlightReport) -> None:
-    assert strut.drawn is not None
-    around = strut.drawn.surroundings
-    center = around.corner_points().mean(axis=0)
-    np.testing.assert_allclose(center, [1.6, 0.1, 0.0], atol=1e-9)
-    fills = np.array([face.fill for face in around.faces])
+    around = placed_solids(obstacles_of(strut), 0)
+    np.testing.assert_allclose(corner_points(around).mean(axis=0), [1.6, 0.1, 0.0], atol=1e-9)
+    fills = np.array([solid.fill for solid in around])
     np.testing.assert_allclose(fills - [0.6, 0.6, 0.65], 0.0, atol=0.003)
-    robot = strut.drawn.at(strut.joints[0], strut.base_at(0))
-    whole = robot + around
-    assert len(whole.faces) == len(robot.faces) + len(around.faces)
-    assert len(whole.edges) == len(robot.edges) + len(around.edges)
     figure = configurations_figure(strut)
     assert isinstance(figure, ReportFigure)
     assert "Obstacles have the shapes by which distances are measured." in figure.caption
@@ -431,21 +427,20 @@ def test_what_is_behind_is_hidden() -> None:
     view = View()
     right, up = view.paper_axes
 
-    def square(nearness: float, half: float, fill: tuple[float, float, float]) -> Face:
-        corners = [x * right + y * up for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
-        return Face(
-            half * np.array(corners) + nearness * view.viewing_direction,
-            view.viewing_direction,
-            fill,
-        )
+    none = np.empty((0, 2, 3))
 
-    near, far = square(1.0, 0.5, (1.0, 0.0, 0.0)), square(0.0, 1.0, (0.0, 0.0, 1.0))
-    backwards = Face(
-        near.corners + view.viewing_direction, -view.viewing_direction, (0.0, 1.0, 0.0)
-    )
-    behind = Edge(np.array([-right, right]) * 0.9, np.empty((0, 2, 3)), (0.0, 0.0, 0.0))
+    def square(nearness: float, half: float, fill: list[float], facing: float = 1.0) -> PlacedSolid:
+        corners = [x * right + y * up for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
+        normal = view.viewing_direction
+        placed = half * np.array([corners]) + nearness * normal
+        return PlacedSolid(placed, facing * normal[np.newaxis], none, none, np.array(fill))
+
+    near, far = square(1.0, 0.5, [1.0, 0.0, 0.0]), square(0.0, 1.0, [0.0, 0.0, 1.0])
+    backwards = square(2.0, 0.5, [0.0, 1.0, 0.0], facing=-1.0)
+    line, normals = np.array([[-right, right]]) * 0.9, np.array([[view.viewing_direction] * 2])
+    edged = PlacedSolid(np.empty((0, 3, 3)), np.empty((0, 3)), line, normals, np.zeros(3))
     canvas = Canvas(view, np.full(2, -2.0), np.full(2, 2.0), 80)
-    canvas.draw([near, far, backwards], [behind])
+    canvas.draw([near, far, backwards, edged])
     image = canvas.image()
     assert image.shape == (80, 80, 4)
     assert image[40, 40, 0] > 0.5

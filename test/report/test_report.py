@@ -8,13 +8,15 @@ import math
 import re
 import struct
 import xml.etree.ElementTree as ET
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from hashlib import sha256
 from pathlib import Path
 
 import matplotlib as mpl
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
+from support.altered_bags import altered
 from support.flight_bags import (
     EXECUTING,
     FINAL,
@@ -291,6 +293,20 @@ def test_what_was_sent_and_is_no_pose(tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("blank")
+def test_the_head_says_that_the_goal_is_not_that_of_the_scenario(tmp_path: Path) -> None:
+    position, rotvec = GOAL
+    pose = {
+        "goal_position": " ".join(map(str, position)),
+        "goal_orientation": " ".join(map(str, Rotation.from_rotvec(rotvec).as_quat())),
+    }
+    record = {"scenario": {"name": "test", "description": "It turns by 30 degrees.", **pose}}
+    for goals, remark in (([(0.0, *GOAL)], ""), ([(0.0, *FINAL)], " (flown to another goal)")):
+        folder = tmp_path / f"with{len(remark)}"
+        folder.mkdir()
+        page = report_of(folder, Story(still(), goals=goals, metadata=record))
+        assert f"It turns by 30 degrees.{remark}\n" in page.text
+
+
 def test_several_schedules(tmp_path: Path) -> None:
     other = ([0.0, 0.0, 1.0], [0.0, 0.0, 0.1])
     statuses = [
@@ -324,6 +340,24 @@ def test_the_goal_of_a_status_is_found_by_its_id(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(
+    "log_time",
+    [lambda t: round(t, -8) // 2 * 2, lambda _: 0, lambda t: -t],
+    ids=["rounded", "equal", "decreasing"],
+)
+def test_log_times_that_are_no_clock_make_a_page(
+    tmp_path: Path, folder: Path, flown: Page, log_time: Callable[[int], int]
+) -> None:
+    """Stamps are of another clock, so that log times count; cycles have no period then."""
+    offset = 10**18
+    bag, html = tmp_path / "odd.mcap", tmp_path / "odd.html"
+    altered(folder / "flight.mcap", bag, log_time=lambda t: offset + log_time(t))
+    write_report(bag, html)
+    page = Page(html.read_text(encoding="utf-8"))
+    assert page.figures.keys() <= flown.figures.keys()
+    assert "shape" in page.figures
+
+
 def test_cut_short_right_after_the_start(tmp_path: Path) -> None:
     statuses = [(0.0, "Flying a gait.", EXECUTING | goal_value())]
     page = report_of(tmp_path, Story(still(count=1), statuses, goals=[(0.0, *GOAL)]))

@@ -22,7 +22,7 @@ from support.made_bags import array, joint_states, made_bag, odometry, pose, sta
 
 from spacerobot_ros.bag import read_bag
 from spacerobot_ros.control.status import CommandReport, ControllerState, ControllerStatus
-from spacerobot_ros.flight.flight import Commands, Signal
+from spacerobot_ros.flight.series import Commands, Signal
 from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus
 from spacerobot_ros.report.figures import ReportFigure
 from spacerobot_ros.report.figures_over_time import (
@@ -273,13 +273,13 @@ def test_flights_side_by_side(tmp_path: Path) -> None:
     ]
     table = runs_table(others)
     assert table.head == (
-        *("Bag", "Position error", "Attitude error", "Manoeuvre"),
+        *("Bag", "Outcome", "Position error", "Attitude error", "Manoeuvre"),
         *("Method", "Momentum drift", "Recorded"),
     )
     drift = "2.0e-08 kg m/s"
     assert table.rows == [
-        ("flight.mcap", "0.5 m", "0.3 rad", "1.5 s", "lie_bracket", drift, "3 ticks"),
-        ("bare.mcap", "–", "–", "–", "–", drift, "3 ticks"),
+        ("flight.mcap", "Reached", "0.5 m", "0.3 rad", "1.5 s", "lie_bracket", drift, "3 ticks"),
+        ("bare.mcap", "Interrupted", "–", "–", "–", "–", drift, "3 ticks"),
     ]
     assert [each.label for each in others] == ["flight (lie_bracket)", "bare.mcap"]
 
