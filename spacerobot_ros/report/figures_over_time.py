@@ -30,7 +30,6 @@ from spacerobot_ros.report.figures import (
     LINE_COLOUR,
     PALETTE,
     SECONDARY_COLOUR,
-    TEXT_COLOUR,
     TRACE_TIME_SLICES,
     ReportFigure,
     TraceGroup,
@@ -154,46 +153,54 @@ ONE_STATE_TEXT = "The bag holds one state: there are no figures over time."
 
 
 def time_figure(
-    flight: FlightReport, name: str, heading: str, caption: str, groups: list[TraceGroup]
+    flight: FlightReport,
+    name: str,
+    heading: str,
+    caption: str,
+    groups: list[TraceGroup],
+    *,
+    small: bool = False,
 ) -> ReportFigure | str:
     """Return a figure with a panel for each group, and close-ups of a gait of equal cycles; a
     sentence where nothing was recorded over time.
 
-    ``caption`` is its beginning.
+    ``caption`` is its beginning. ``small``: panels are low and share a time axis; beside them are
+    the last cycles.
     """
     if all(len(group.signal) < 2 for group in groups):
         return ONE_STATE_TEXT
     groups = [group.in_unit_of_angles() for group in groups]
-    cycles = flight.cycles
-    rows, heights = [[1.0]], [2.3]
-    if any(group.decades for group in groups):
-        cycles = None
-        heights = [1.3]
-    elif any(group.rows for group in groups):
-        cycles = None
-        heights = [0.4 + 0.14 * len(group.names) if group.rows else 1.6 for group in groups]
-    elif cycles is not None and narrow():
-        rows, heights = [[1.0]] * 3, [2.0, 1.35, 1.35]
-    elif cycles is not None:
-        rows, heights = [[1.0], [1.0, 1.0]], [2.0, 1.35]
-    if len(heights) != len(rows) * len(groups):
-        heights = heights * len(groups)
-    right = room_for([name for group in groups for name in group.names])
+    cycles = None if any(group.decades or group.rows for group in groups) else flight.cycles
     lane = EVENT_STRIP_HEIGHT if flight.timed_events else 0.0
+    right = room_for([name for group in groups for name in group.names])
     left = max([0.72, *(room_for(group.names) + 0.1 for group in groups if group.rows)])
-    figure, panels = sheet(rows * len(groups), heights, left=left, right=right, lane=lane)
+    if small:
+        rows = [[1.0] if cycles is None else [2.2, 1.0]] * len(groups)
+        low, below = 1.0 if len(groups) <= 4 else 0.75, 0.5 + lane
+        sizes = {"left": 0.85, "right": right, "gap": 0.36, "bottom": below}
+        figure, panels = sheet(rows, [low] * len(groups), **sizes)
+    else:
+        rows, heights = _layout(groups, with_cycles=cycles is not None)
+        figure, panels = sheet(rows * len(groups), heights, left=left, right=right, lane=lane)
     share = min(1.0, 4 / len(groups))
     dense = []
     for number, group in enumerate(groups):
-        whole, *below = panels[number * len(rows) : (number + 1) * len(rows)]
+        count = 1 if small else len(rows)
+        whole, *below_it = panels[number * count : (number + 1) * count]
         dense.append(draw_whole_flight(whole[0], flight, group, share))
-        if cycles is not None:
+        if small:
+            whole[0].set_ylabel(group.unit)
+        elif cycles is not None:
             whole[0].set_title("whole flight")
-            first, last = (axes for row in below for axes in row)
+            first, last = (axes for row in below_it for axes in row)
             dense.append(_draw_before_cycles(first, group, cycles))
-            _draw_last_cycles(last, group, cycles)
+        if cycles is not None:
+            _draw_last_cycles(whole[1] if small else last, group, cycles)
+        for axes in whole if small and number < len(groups) - 1 else ():
+            axes.set_xlabel("")
+            axes.tick_params(labelbottom=False)
     if flight.timed_events:
-        for axes in (each for row in panels for each in row):
+        for axes in (each for row in (panels[-1:] if small else panels) for each in row):
             draw_events(axes, flight.timed_events)
     if any(group.goals for group in groups):
         caption += "; dashed, the goal"
@@ -202,15 +209,30 @@ def time_figure(
     caption += "."
     aside = ""
     if cycles is not None:
+        where = "beside it," if small else "below, the part before them, and"
         aside += (
-            f" The flight ends with {cycles.count} equal cycles of {cycles.period:.4g} s; below, "
-            f"the part before them, and the last {SHOWN_CYCLES} of them, as change since the "
-            "first instant shown."
+            f" The flight ends with {cycles.count} equal cycles of {cycles.period:.4g} s; {where} "
+            f"the last {SHOWN_CYCLES} of them, as change since the first instant shown."
         )
     aside += f" {BAND_CAPTION}" if any(dense) else ""
     aside += f" {EVENTS_CAPTION}" if flight.timed_events else ""
     caption += aside
     return ReportFigure(name, heading, caption, figure, groups, aside)
+
+
+def _layout(
+    groups: Sequence[TraceGroup], *, with_cycles: bool
+) -> tuple[list[list[float]], list[float]]:
+    """Return the widths of the rows of panels that each group has, and the heights of all rows."""
+    if any(group.decades for group in groups):
+        return [[1.0]], [1.3] * len(groups)
+    if any(group.rows for group in groups):
+        return [[1.0]], [0.4 + 0.14 * len(each.names) if each.rows else 1.6 for each in groups]
+    if not with_cycles:
+        return [[1.0]], [2.3] * len(groups)
+    if narrow():
+        return [[1.0]] * 3, [2.0, 1.35, 1.35] * len(groups)
+    return [[1.0], [1.0, 1.0]], [2.0, 1.35] * len(groups)
 
 
 def _draw_rows(axes: Axes, flight: FlightReport, group: TraceGroup, share: float) -> bool:
@@ -308,9 +330,6 @@ def shape_groups(flight: FlightReport) -> list[TraceGroup]:
     def bounds(joint: Joint) -> list[float]:
         return [joint.limits.lower, joint.limits.upper]
 
-    def rate_bounds(joint: Joint) -> list[float]:
-        return [-joint.limits.velocity, joint.limits.velocity]
-
     units, most = {"m": "m", "rad": "rad"}, JOINTS_PER_PANEL
     positions, rates = flight.shape, flight.rates
     groups = joint_groups(
@@ -319,7 +338,7 @@ def shape_groups(flight: FlightReport) -> list[TraceGroup]:
     if len(rates):
         of_wheels = flight.wheel_columns
         units = {"rad": "rad/s"}
-        groups += joint_groups(flight, rates, "wheel rate", units, rate_bounds, most, of_wheels)
+        groups += joint_groups(flight, rates, "wheel rate", units, _rate_bounds, most, of_wheels)
     return groups
 
 
@@ -422,62 +441,14 @@ def rates_figure(flight: FlightReport) -> ReportFigure | str:
         return _why_no_joints(flight)
     if not len(flight.rates):
         return "The bag holds no joint velocities."
-    if len(flight.rates) < 2:
-        return ONE_STATE_TEXT
-    names, cycles = flight.joint_names, flight.cycles
-    height = 1.0 if len(names) <= 4 else 0.75
-    widths = [1.0] if cycles is None else [2.2, 1.0]
-    lane = EVENT_STRIP_HEIGHT if flight.timed_events else 0.0
-    bottom = 0.5 + lane
-    figure, panels = sheet([widths] * len(names), [height] * len(names), gap=0.36, bottom=bottom)
-    dense, groups = [], []
-    for i, (row, name) in enumerate(zip(panels, names, strict=True)):
-        signal = Signal(flight.rates.time, flight.rates.values[:, i : i + 1])
-        spans = [(0.0, flight.end)]
-        if cycles is not None:
-            spans.append(cycles.last(SHOWN_CYCLES))
-        joint = flight.joint(name)
-        limit = joint.limits.velocity if joint is not None else np.inf
-        unit = f"{joint_unit(flight, name)}/s"
-        bounds = [(0, limit), (0, -limit)]
-        group = TraceGroup(signal, [name], short(name), unit, [colour(i)], limits=bounds)
-        group = group.in_unit_of_angles()
-        groups.append(group)
-        signal, unit, limit = group.signal, group.unit, group.limits[0][1]
-        for axes, (start, end) in zip(row, spans, strict=True):
-            set_range(axes, signal.values, [limit, -limit])
-            low, high = axes.get_ylim()
-            for bound in (limit, -limit):
-                if low < bound < high:
-                    axes.axhline(bound, color=SECONDARY_COLOUR, lw=1.0, ls=(0, DOTS), zorder=1.8)
-            part = signal.between(start, end)
-            dense.append(draw_traces(axes, part, [colour(i)], min(1.0, 6 / len(names))))
-            last = i == len(names) - 1
-            set_time(axes, start, end, last)
-            if not last:
-                axes.tick_params(labelbottom=False)
-        peak = float(np.abs(signal.values).max())
-        text = f"peak {peak:.4g} {unit}"
-        if np.isfinite(limit) and limit > 0:
-            text += f", {100 * peak / limit:.3g} % of the limit {limit:.4g} {unit}"
-        row[0].set_title(name, color=colour(i))
-        if not narrow():
-            row[0].set_title(text, loc="right", color=TEXT_COLOUR)
-        row[0].set_ylabel(unit)
-    figure.align_ylabels([row[0] for row in panels])
-    if cycles is not None:
-        panels[0][1].set_title(f"last {SHOWN_CYCLES} cycles")
-    if flight.timed_events:
-        for axes in panels[-1]:
-            draw_events(axes, flight.timed_events)
-    caption = "Velocity of each joint; dotted, its limit in the URDF, where that is in range."
-    aside = ""
-    if cycles is not None:
-        aside += f" Right: the last {SHOWN_CYCLES} of {cycles.count} cycles, to the same scale."
-    aside += f" {BAND_CAPTION}" if any(dense) else ""
-    aside += f" {EVENTS_CAPTION}" if flight.timed_events else ""
-    caption += aside
-    return ReportFigure("velocities", "Joint velocities", caption, figure, groups, aside)
+    units = {"m": "m/s", "rad": "rad/s"}
+    groups = joint_groups(flight, flight.rates, "velocity", units, _rate_bounds, most=1)
+    caption = "Velocity of each joint"
+    return time_figure(flight, "velocities", "Joint velocities", caption, groups, small=True)
+
+
+def _rate_bounds(joint: Joint) -> list[float]:
+    return [-joint.limits.velocity, joint.limits.velocity]
 
 
 def twist_figure(flight: FlightReport) -> ReportFigure | str | None:

@@ -89,24 +89,8 @@ FIGURES: dict[str, Callable[[FlightReport], ReportFigure | str | None]] = {
 }
 """The figures of :func:`write_figures`, by name."""
 
-_REPORT_FIGURES = (
-    configurations_figure,
-    position_figure,
-    attitude_figure,
-    cycles_figure,
-    shape_figure,
-    rates_figure,
-    loops_figure,
-    errors_figure,
-    link_errors_figure,
-    sensors_figure,
-    efforts_figure,
-    thrusters_figure,
-    twist_figure,
-    clearance_figure,
-    momentum_figure,
-    momentum_budget_figure,
-)
+_REPORT_FIGURES = tuple(draw for name, draw in FIGURES.items() if name not in ("pose", "path"))
+"""Figures of a report, which has position and attitude apart, and a figure of all paths."""
 
 
 def write_report(
