@@ -48,7 +48,7 @@ from spacerobot_ros.report.figures import (
     sheet,
     short,
 )
-from spacerobot_ros.report.flight import FlightReport, GoalSpan, joint_unit
+from spacerobot_ros.report.flight import FlightReport, joint_unit, pose_errors
 from spacerobot_ros.report.signals import Cycles, Indices, envelope
 
 SHOWN_CYCLES = 3
@@ -758,20 +758,6 @@ def _error_decades(values: Array, tolerance: float | None) -> int:
     _, top = log_range(values, 0)
     down_to = 0.1 * tolerance if tolerance else 1e-4 * top
     return int(np.clip(np.ceil(np.log10(top / down_to)), 3, _MAX_DECADES))
-
-
-def pose_errors(pose: Signal, targets: Sequence[GoalSpan]) -> Signal:
-    """Return the goal minus poses (N, 7) while there is one: position, rotation vector (M, 6)."""
-    times, values = [np.empty(0)], [np.empty((0, 6))]
-    for target in targets:
-        part = pose.between(target.start, target.end)
-        if len(part):
-            inverse = quaternion_inverse(part.values[:, 3:])
-            turn = quaternion_multiply(target.goal.quaternion, inverse)
-            left = target.goal.position - part.values[:, :3]
-            times.append(part.time)
-            values.append(np.hstack([left, rotvecs_from_quaternions(turn)]))
-    return Signal(np.concatenate(times), np.concatenate(values))
 
 
 def sensors_figure(flight: FlightReport) -> ReportFigure | str | None:

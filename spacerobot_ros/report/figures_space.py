@@ -214,9 +214,9 @@ def path_figure(flight: FlightReport, beside: Sequence[FlightReport] = ()) -> Re
     if shows_tool:
         paths.append((flight.tool.values[:, :3], _TOOL_COLOUR))
         keys.append(legend_entry(_TOOL_COLOUR, "end-effector"))
-    for number, (link, positions) in enumerate(flight.link_positions.items()):
+    for number, (link, poses) in enumerate(flight.link_poses.items()):
         tint = _LINK_COLOURS[number % len(_LINK_COLOURS)]
-        paths.append((positions, tint))
+        paths.append((poses.values[:, :3], tint))
         keys.append(legend_entry(tint, short(link)))
     if flight.planned:
         keys.append(legend_entry(_PLANNED_COLOUR, "planned", DASHES))
@@ -259,7 +259,7 @@ def path_figure(flight: FlightReport, beside: Sequence[FlightReport] = ()) -> Re
     caption = (
         "Path of the base origin"
         + (" and of the end-effector" if shows_tool else "")
-        + (" and of links with goals" if flight.link_positions else "")
+        + (" and of links with goals" if flight.link_poses else "")
         + f" in the world frame{', three views to one scale' if len(views) > 1 else ''}: open "
         "circle, start; full circle, end"
         + ("; cross, goal" if goals else "")

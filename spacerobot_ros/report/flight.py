@@ -32,12 +32,12 @@ from spacerobot_ros.flight.reading import (
 from spacerobot_ros.flight.series import SentGoal, Signal, pose_error, reported_goal
 from spacerobot_ros.measures import flown_time
 from spacerobot_ros.model.description import DEFAULT_END_EFFECTOR, Array, Joint, Pose, Shape
-from spacerobot_ros.model.kinematics import ForwardKinematics
 from spacerobot_ros.model.meshes import TriangleMesh
 from spacerobot_ros.model.rotations import (
-    matrix_from_quaternion,
-    rotation_angles,
+    quaternion_inverse,
+    quaternion_multiply,
     rotvec_from_quaternion,
+    rotvecs_from_quaternions,
 )
 from spacerobot_ros.model.visuals import Visual, meshes_from_attachments
 from spacerobot_ros.planning import Goal, PoseError
@@ -45,7 +45,14 @@ from spacerobot_ros.planning.core.goal import EndEffectorGoal
 from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus, time_to_end
 from spacerobot_ros.planning.methods.registry import METHODS
 from spacerobot_ros.report.events import FlightEvent, timed_events
-from spacerobot_ros.report.signals import Cycles, find_cycles, nearest_rotvec, rotvecs
+from spacerobot_ros.report.signals import (
+    Cycles,
+    continuous,
+    find_cycles,
+    link_poses,
+    nearest_rotvec,
+    rotvecs,
+)
 from spacerobot_ros.scenario import COMMANDERS
 from spacerobot_ros.times import SECOND
 
@@ -345,49 +352,37 @@ class FlightReport(Flight):
         """Errors of the true poses of links with goals, at up to two thousand states; none where
         the bag lacks the robot's description or its states.
         """
-        robot, targets = self.robot, [each for each in self._all_targets if each.goal.end_effectors]
-        if robot is None or self.hidden_links_text or not targets:
-            return {}
-        links = [each.link for target in targets for each in target.goal.end_effectors]
-        found = {}
-        for link in dict.fromkeys(links):
-            if link in self.link_positions:
-                found[link] = self._errors_of_link(link, targets)
-        return found
+        return {link: self._errors_of_link(link) for link in self.link_poses}
 
     @cached_property
-    def link_positions(self) -> dict[str, Array]:
-        """Positions in the world (k, 3), m, of links that had goals, at the states of
-        :attr:`link_errors`.
-        """
-        return {link: r for link, (_, r) in self._link_poses.items()}
-
-    @cached_property
-    def _link_poses(self) -> dict[str, tuple[Array, Array]]:
-        """R_WL (k, 3, 3) and r_WL (k, 3) of links that had goals."""
-        links = {each.link for target in self._all_targets for each in target.goal.end_effectors}
+    def link_poses(self) -> dict[str, Signal]:
+        """Poses in the world (k, 7) of links that had goals, at up to two thousand states."""
+        aims = (each for target in self._all_targets for each in target.goal.end_effectors)
+        links = list(dict.fromkeys(each.link for each in aims))
         if self.robot is None or self.hidden_links_text or not links:
             return {}
-        rows, kinematics = self.samples(_MAX_LINK_ERROR_STATES), ForwardKinematics(self.robot)
-        R_WL, r_WL = kinematics.poses_in_world(self.pose[rows], self.joints[rows])
-        numbers = {link: k for k, link in enumerate(kinematics.links) if link in links}
-        return {link: (R_WL[:, k], r_WL[:, k]) for link, k in numbers.items()}
+        rows = self.samples(_MAX_LINK_ERROR_STATES)
+        poses = link_poses(self.robot, continuous(self.pose)[rows], self.joints[rows])
+        time = self.position.time[rows]
+        return {link: Signal(time, poses[link]) for link in links if link in poses}
 
-    def _errors_of_link(self, link: str, targets: Sequence[GoalSpan]) -> LinkErrors:
-        time = self.position.time[self.samples(_MAX_LINK_ERROR_STATES)]
-        R_WL, r_WL = self._link_poses[link]
-        distances, angles = [Signal.empty(1)], [Signal.empty(1)]
-        for target in targets:
-            aim = next((each for each in target.goal.end_effectors if each.link == link), None)
-            if aim is None:
-                continue
-            now = (time >= target.start) & (time <= target.end)
-            off = np.linalg.norm(aim.position - r_WL[now], axis=1)
-            distances.append(Signal(time[now], off[:, np.newaxis]))
-            if aim.quaternion is not None:
-                turned = rotation_angles(matrix_from_quaternion(aim.quaternion).T @ R_WL[now])
-                angles.append(Signal(time[now], turned[:, np.newaxis]))
-        return LinkErrors(_joined(distances), _joined(angles))
+    def _errors_of_link(self, link: str) -> LinkErrors:
+        aims = [
+            (target, aim)
+            for target in self._all_targets
+            for aim in target.goal.end_effectors
+            if aim.link == link
+        ]
+        norms = []
+        for columns, counted in (
+            (slice(0, 3), aims),
+            (slice(3, 6), [(target, aim) for target, aim in aims if aim.quaternion is not None]),
+        ):
+            spans = [GoalSpan(target.start, target.end, aim.as_goal()) for target, aim in counted]
+            errors = pose_errors(self.link_poses[link], spans)
+            off = np.linalg.norm(errors.values[:, columns], axis=1)
+            norms.append(Signal(errors.time, off[:, np.newaxis]))
+        return LinkErrors(*norms)
 
     @property
     def tool_goals(self) -> tuple[SentGoal, ...]:
@@ -560,17 +555,23 @@ def _timed_goals(goals: Sequence[SentGoal]) -> list[tuple[float, Goal]]:
     return [(sent.time, sent.goal) for sent in goals]
 
 
-def _joined(parts: Sequence[Signal]) -> Signal:
-    """Return signals of one width one after the other."""
-    return Signal(
-        np.concatenate([each.time for each in parts]),
-        np.concatenate([each.values for each in parts]),
-    )
-
-
 def _shift_time(signal: Signal, start: float) -> Signal:
     """Return a signal over the time since ``start``, s."""
     return Signal(signal.time - start, signal.values)
+
+
+def pose_errors(pose: Signal, targets: Sequence[GoalSpan]) -> Signal:
+    """Return the goal minus poses (N, 7) while there is one: position, rotation vector (M, 6)."""
+    times, values = [np.empty(0)], [np.empty((0, 6))]
+    for target in targets:
+        part = pose.between(target.start, target.end)
+        if len(part):
+            inverse = quaternion_inverse(part.values[:, 3:])
+            turn = quaternion_multiply(target.goal.quaternion, inverse)
+            left = target.goal.position - part.values[:, :3]
+            times.append(part.time)
+            values.append(np.hstack([left, rotvecs_from_quaternions(turn)]))
+    return Signal(np.concatenate(times), np.concatenate(values))
 
 
 def read_report(path: Path, namespace: str | None = None) -> FlightReport:

@@ -410,9 +410,9 @@ def _path_commands(flight: FlightReport) -> list[Command]:
         lines.append(("path of the end-effector", flight.tool.values[:, :3], PALETTE[4]))
     assert flight.robot is not None
     tool = flight.robot.end_effector(flight.parameter("plant", "end_effector_frame") or "")
-    for link, positions in flight.link_positions.items():
+    for link, poses in flight.link_poses.items():
         if link != tool or not len(flight.tool):
-            lines.append((f"path of {link}", positions, PALETTE[4]))
+            lines.append((f"path of {link}", poses.values[:, :3], PALETTE[4]))
     commands = []
     for name, points, tint in lines:
         step = max(1, len(points) // _MAX_LINE_POINTS)
@@ -461,10 +461,10 @@ def _caption_text(flight: FlightReport, frames: KeyFrames, radius: float, ghosts
         "The robot from the shapes of its URDF, each moving link in the color of its joint in the "
         "figures below; lines are the paths of the base (blue)"
     )
-    several = len(flight.link_positions) > 1
+    several = len(flight.link_poses) > 1
     if several:
         text += " and of the end-effectors (orange)"
-    elif len(flight.tool) or flight.link_positions:
+    elif len(flight.tool) or flight.link_poses:
         text += " and of the end-effector (orange)"
     text += "; the ghost is the goal" if ghosts else ""
     text += "; obstacles have the shapes by which distances are measured" * bool(flight.obstacles)

@@ -13,16 +13,12 @@ import numpy as np
 from matplotlib.colors import to_hex
 
 from spacerobot_ros.model.description import Array, Pose, RobotDescription
-from spacerobot_ros.model.kinematics import ForwardKinematics, joints_outward
 from spacerobot_ros.model.meshes import TriangleMesh
-from spacerobot_ros.model.rotations import (
-    matrices_from_quaternions,
-    quaternion_from_matrix,
-    quaternion_multiply,
-)
+from spacerobot_ros.model.rotations import quaternion_from_matrix
 from spacerobot_ros.model.visuals import Visual, visuals_of
 from spacerobot_ros.report.figures import GHOST_COLOUR, colour
 from spacerobot_ros.report.flight import FlightReport
+from spacerobot_ros.report.signals import continuous, link_poses
 
 _BASE_COLOUR = "#c4c9d2"
 
@@ -77,14 +73,7 @@ def robot_bodies(
     most
         Largest number of faces of a mesh.
     """
-    kinematics = ForwardKinematics(robot)
-    transforms = kinematics.transforms_at(q)
-    steps = {child: transforms[:, i] for i, (_, child) in enumerate(kinematics.moving)}
-    fixed = zip(kinematics.fixed, kinematics.fixed_transforms, strict=True)
-    steps |= {child: pose[np.newaxis] for (_, child), pose in fixed}
-    poses = {robot.base_link: base}
-    for joint in joints_outward(robot):
-        poses[joint.child] = _composed(poses[joint.parent], steps[joint.child])
+    poses = link_poses(robot, base, q)
     visuals = visuals_of(robot, meshes, most)
     found = []
     for link, of_link in poses.items():
@@ -103,12 +92,12 @@ def bodies_of(flight: FlightReport, rows: Sequence[int], most: int) -> list[Body
     """
     assert flight.robot is not None
     at = np.asarray(rows)
-    base = _continuous(flight.pose)[at]
+    base = continuous(flight.pose)[at]
     found = robot_bodies(flight.robot, flight.meshes, base, flight.joints[at], most)
     target, seen = flight.target, flight.target_pose
     if target is not None and len(seen):
         times = np.searchsorted(seen.time, flight.position.time[at] - 1e-9)
-        poses = _continuous(seen.values)[np.minimum(times, len(seen) - 1)]
+        poses = continuous(seen.values)[np.minimum(times, len(seen) - 1)]
         solids = (
             _moved(each, target.frames[each.link][1]) for each in visuals_of(target, {}, most)
         )
@@ -157,18 +146,5 @@ def _moved(visual: Visual, frame: Pose) -> Visual:
     return replace(visual, shape=shape, mesh=visual.mesh.moved(frame))
 
 
-def _composed(outer: Array, inner: Array) -> Array:
-    """Return the compositions (K, 7) of poses (K, 7) with inner ones, (K, 7) or (1, 7)."""
-    turned = (matrices_from_quaternions(outer[:, 3:]) @ inner[:, :3, np.newaxis])[..., 0]
-    return np.hstack([outer[:, :3] + turned, quaternion_multiply(outer[:, 3:], inner[:, 3:])])
-
-
 def _as_values(pose: Pose) -> Array:
     return np.concatenate([pose.r, quaternion_from_matrix(pose.R)])[np.newaxis]
-
-
-def _continuous(poses: Array) -> Array:
-    """Return poses (N, 7) whose quaternions keep their sign from one to the next."""
-    flips = np.cumsum((poses[1:, 3:] * poses[:-1, 3:]).sum(axis=1) < 0) % 2
-    signs = np.append(1, 1 - 2 * flips)[: len(poses), np.newaxis]
-    return np.hstack([poses[:, :3], poses[:, 3:] * signs])

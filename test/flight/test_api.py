@@ -6,8 +6,7 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -16,14 +15,13 @@ from support.sentences import assert_one_sentence
 
 import spacerobot_ros
 from spacerobot_ros import fly, load_scenario, plan, read_bag
-from spacerobot_ros.control.controller import build_controller
 from spacerobot_ros.control.laws.transposed_jacobian import TransposedJacobianLaw
 from spacerobot_ros.errors import GoalError, ParameterError, PlanningError, RecordingError
-from spacerobot_ros.flight import api
+from spacerobot_ros.flight.api import scenario_to_fly
 from spacerobot_ros.flight.series import Signal
-from spacerobot_ros.measures import Outcome
 from spacerobot_ros.model import SpaceRobot, load_robot
 from spacerobot_ros.planning import Goal
+from spacerobot_ros.planning.api import end_effector_goals
 from spacerobot_ros.resources import robot_file
 
 QUICK = {"planner.lie_bracket.t1": 2.0, "planner.lie_bracket.cycle_period": 1.0}
@@ -213,39 +211,24 @@ def test_a_flight_is_saved_once_unless_it_may_replace_what_is_there(tmp_path: Pa
 
 
 class _HalfLaw(TransposedJacobianLaw):
-    """A law that is in no registry."""
+    """A law that is in no registry; ``thresholds`` are those of the laws that were built."""
 
     name = "half"
+    thresholds: ClassVar[list[float]] = []
+
+    def __init__(self, *given: Any, **options: Any) -> None:
+        super().__init__(*given, **options)
+        self.thresholds.append(self.singular_value_threshold)
 
 
-@pytest.fixture
-def asked(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Any, Any]]:
-    """Scenario and robots of flights, which are not flown."""
-    found: list[tuple[Any, Any]] = []
-
-    def fly_none(scenario: Any, robots: Any = None) -> SimpleNamespace:
-        found.append((scenario, robots))
-        return SimpleNamespace(outcome=Outcome.REACHED)
-
-    monkeypatch.setattr(api, "fly_scenario", fly_none)
-    return found
-
-
-def test_a_flight_takes_a_law_that_is_in_no_registry(asked: list[tuple[Any, Any]]) -> None:
-    fly("coordinated_control", law=_HalfLaw, law_options={"singular_value_threshold": 0.25})
-    fly("coordinated_control", law=_HalfLaw)
-    fly("coordinated_control")
-    (_, first), (_, second), (_, third) = asked
-    assert [robots.own_law[0] for robots in (first, second)] == [_HalfLaw] * 2
-    thresholds = [robots.own_law[1].singular_value_threshold for robots in (first, second)]
-    assert thresholds == [0.25, 0.1]
-    assert third is None
-    controller = build_controller(
-        first.controller, asked[0][0].controller, (_HalfLaw, first.own_law[1])
-    )
-    assert type(controller.law) is _HalfLaw
-    assert controller.law.options.singular_value_threshold == 0.25
-    assert build_controller(first.controller, asked[0][0].controller).law.name != "half"
+def test_a_flight_takes_a_law_that_is_in_no_registry() -> None:
+    short = {"coordinated_control.time_limit": 0.05}
+    for options in ({"singular_value_threshold": 0.25}, None):
+        flight = fly("coordinated_control", law=_HalfLaw, law_options=options, parameters=short)
+        assert flight.method == "half"
+    assert _HalfLaw.thresholds == [0.25, 0.1]
+    assert fly("coordinated_control", parameters=short).method == "transposed_jacobian"
+    assert len(_HalfLaw.thresholds) == 2
 
 
 @pytest.mark.slow
@@ -275,14 +258,18 @@ def test_a_law_that_nothing_can_use_is_refused(
     assert_one_sentence(str(refused.value), *words)
 
 
-def test_a_flight_takes_the_goals_that_a_plan_takes(asked: list[tuple[Any, Any]]) -> None:
+def test_a_flight_takes_the_goals_that_a_plan_takes() -> None:
     at, hand = (0.25, -0.5, 0.125), (1.0, 2.0, 3.0)
-    fly("sliding_masses", position=at)
-    fly("reach", end_effector_position=hand, end_effector="hand")
-    fly("reach", end_effector_position=hand, end_effector="hand", position=at)
-    fly("reach", end_effector_position=hand, end_effector="hand", rotvec=(0.0, 0.0, 0.5))
-    fly("reach", (*at, 0.0, 0.0, 0.0, 1.0), end_effector_position=hand, end_effector="hand")
-    goals = [scenario.goal for scenario, _ in asked]
+    hands = end_effector_goals(hand, None, "hand")
+    turn, pose = (0.0, 0.0, 0.5), (*at, 0.0, 0.0, 0.0, 1.0)
+    scenarios = [
+        scenario_to_fly("sliding_masses", position=at),
+        scenario_to_fly("reach", hands=hands),
+        scenario_to_fly("reach", position=at, hands=hands),
+        scenario_to_fly("reach", rotvec=turn, hands=hands),
+        scenario_to_fly("reach", pose, hands=hands),
+    ]
+    goals = [scenario.goal for scenario in scenarios]
     np.testing.assert_allclose(goals[0].position, at)
     for goal in goals[1:]:
         (aim,) = goal.end_effectors

@@ -18,10 +18,11 @@ from support.flight_bags import GOAL, TICK, Story, goal_value, tell
 from support.html_page import leave_blank
 
 from spacerobot_ros.flight.series import Signal
-from spacerobot_ros.report import player, write_report
+from spacerobot_ros.report import write_report
 from spacerobot_ros.report.figures_over_time import shape_figure
 from spacerobot_ros.report.flight import FlightReport, read_report
 from spacerobot_ros.report.page import charts_of, thin_out
+from spacerobot_ros.report.player import View3D, player_of
 
 with_browser = pytest.mark.skipif(chromium() is None, reason="no Chromium to look at the page with")
 
@@ -266,7 +267,7 @@ def test_licences_of_the_programs_are_with_them(window: Browser) -> None:
 
 def test_every_licence_is_there_once_with_its_words() -> None:
     """And not its name alone, with who has the copyright."""
-    found = player._licence_notices()
+    found = player_of(View3D([], [], "")).notices
     assert len({name for name, _ in found}) == len(found) >= 9
     for name, licence in found:
         assert len(licence) > 600, name

@@ -27,7 +27,6 @@ from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus
 from spacerobot_ros.report.figures import ReportFigure
 from spacerobot_ros.report.figures_over_time import (
     attitude_group,
-    pose_errors,
     position_figure,
     position_group,
     sensors_figure,
@@ -35,7 +34,7 @@ from spacerobot_ros.report.figures_over_time import (
     thrusters_figure,
 )
 from spacerobot_ros.report.figures_space import cycles_figure
-from spacerobot_ros.report.flight import FlightReport, joint_unit, read_report
+from spacerobot_ros.report.flight import FlightReport, joint_unit, pose_errors, read_report
 from spacerobot_ros.report.page import page
 from spacerobot_ros.report.page_parts import PagePart, table, tiles
 from spacerobot_ros.report.tables import (
