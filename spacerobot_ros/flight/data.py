@@ -31,8 +31,9 @@ from spacerobot_ros.measures import (
     peak_wrench,
 )
 from spacerobot_ros.messages.statuses import StatusRecord
-from spacerobot_ros.model.description import Array, RobotDescription
+from spacerobot_ros.model.description import Array, RobotDescription, Shape
 from spacerobot_ros.model.kinematics import ForwardKinematics
+from spacerobot_ros.model.meshes import TriangleMesh, shape_mesh
 from spacerobot_ros.model.rotations import (
     matrices_from_quaternions,
     quaternion_inverse,
@@ -468,8 +469,22 @@ class FlightData:
             return None
         q, pose = self.signal("q"), self.signal("pose")
         return FlightClearance.of(
-            self.robot, self.joint_names, (q.time, q.values), (pose.time, pose.values)
+            self.robot,
+            self.joint_names,
+            (q.time, q.values),
+            (pose.time, pose.values),
+            mesh_of=self.mesh_of,
         )
+
+    def mesh_of(self, shape: Shape) -> TriangleMesh:
+        """Return the triangles of a shape, from a file if it is a mesh.
+
+        Raises
+        ------
+        MeshError
+            The file cannot be read.
+        """
+        return shape_mesh(shape)
 
     @cached_property
     def measures(self) -> Measures:

@@ -189,6 +189,7 @@ def time_figure(
         whole, *below_it = panels[number * count : (number + 1) * count]
         dense.append(draw_whole_flight(whole[0], flight, group, share))
         if small:
+            whole[0].set_title("" if number else group.label)
             whole[0].set_ylabel(group.unit)
         elif cycles is not None:
             whole[0].set_title("whole flight")

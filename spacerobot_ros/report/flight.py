@@ -18,7 +18,6 @@ from spacerobot_ros.flight.captures import (
     BUDGET_PARTS,
     momentum_budget_over_time,
 )
-from spacerobot_ros.flight.clearance import FlightClearance
 from spacerobot_ros.flight.flight import Flight
 from spacerobot_ros.flight.reading import (
     WRENCH_COLUMNS,
@@ -216,23 +215,7 @@ class FlightReport(Flight):
         others = namespaces(self.bag.parts[0].bag)
         return [name or "/" for name in others if name != self.bag.namespace]
 
-    @cached_property
-    def clearance(self) -> FlightClearance | None:
-        """The smallest distance between links, by the meshes that the bag carries; None where the
-        plant did not measure it, or there are no states.
-        """
-        if self.robot is None or not self.measures_clearance:
-            return None
-        shape, pose = self.shape, self.signal("pose")
-        return FlightClearance.of(
-            self.robot,
-            self.joint_names,
-            (shape.time, shape.values),
-            (pose.time, pose.values),
-            mesh_of=self._carried_mesh,
-        )
-
-    def _carried_mesh(self, shape: Shape) -> TriangleMesh:
+    def mesh_of(self, shape: Shape) -> TriangleMesh:
         """Return a mesh that the bag carries; files that a bag names are not read."""
         if shape.resource not in self.meshes:
             raise MeshError(f"The bag does not carry the mesh '{shape.resource}'.")
@@ -241,7 +224,7 @@ class FlightReport(Flight):
     @cached_property
     def obstacles(self) -> tuple[tuple[Visual, Pose], ...]:
         """The solids of the obstacles, each with the pose of its link in the world."""
-        return () if self.robot is None else obstacle_visuals(self.robot.world, self._carried_mesh)
+        return () if self.robot is None else obstacle_visuals(self.robot.world, self.mesh_of)
 
     @property
     def target_pose(self) -> Signal:

@@ -221,8 +221,9 @@ def test_axes_name_their_quantity_and_its_unit(name: str) -> None:
         for group in drawn.groups:
             unit = unit_of(name, figure, group.label)
             both = {f"{group.label} ({unit})"}
-            title = f"{group.label} since the start" if "change" in group.label else group.label
-            assert both & set(texts) or {unit, title} <= set(texts), f"{figure}: {group.label}"
+            assert both & set(texts) or {unit, group.label} <= set(texts), (
+                f"{figure}: {group.label}"
+            )
         if drawn.groups:
             assert "time (s)" in {each.get_xlabel() for each in axes}, figure
 
