@@ -81,8 +81,8 @@ def chart(window: Browser, number: int, expression: str) -> Any:
 @pytest.mark.slow
 @with_browser
 def test_charts_have_the_numbers_of_the_bag(window: Browser, flight: FlightReport) -> None:
-    assert window.evaluate("flightCharts.charts.length") == 9
-    assert window.evaluate("document.querySelectorAll('figure.live').length") == 5
+    assert window.evaluate("flightCharts.charts.length") == 11
+    assert window.evaluate("document.querySelectorAll('figure.live').length") == 6
     assert window.evaluate("getComputedStyle(document.querySelector('.live .scroll')).display") == (
         "none"
     )
