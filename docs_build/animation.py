@@ -7,6 +7,7 @@ Light and camera are those of the reports' pictures.
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import matplotlib
@@ -15,10 +16,17 @@ from PIL import Image, ImageDraw, ImageFont
 
 from spacerobot_ros import fly
 from spacerobot_ros.flight.flight import Flight
-from spacerobot_ros.model.description import Array, Pose
-from spacerobot_ros.model.rotations import matrix_from_quaternion
+from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.visuals import meshes_from_files
-from spacerobot_ros.report.solids import MAX_MESH_FACES, Canvas, SolidRobot, View
+from spacerobot_ros.report.scene import robot_bodies
+from spacerobot_ros.report.solids import (
+    MAX_MESH_FACES,
+    Canvas,
+    View,
+    corner_points,
+    outlines,
+    placed_solids,
+)
 
 OUT = Path(__file__).parents[1] / "docs" / "images" / "turning.gif"
 
@@ -37,32 +45,31 @@ _SKY, _INK, _GHOST = (13, 17, 28), (226, 232, 240), (94, 200, 160)
 def frames_of(flight: Flight) -> list[Image.Image]:
     """Return the pictures of a flight, at equal intervals of time."""
     meshes = meshes_from_files(flight.required_robot(), MAX_MESH_FACES)
-    robot = SolidRobot(flight.required_robot(), meshes)
     rows = np.linspace(0, len(flight.time) - 1, _FRAMES).round().astype(int)
-    bodies = [robot.at(flight.q[row], _pose(flight, row)) for row in rows]
-    points = _VIEW(np.concatenate([body.corner_points() for body in bodies]))
+    robot, q = flight.required_robot(), flight.q[rows]
+    of_base = [link for link, (body, _) in robot.frames.items() if body == 0]
+    bodies = robot_bodies(robot, meshes, flight.pose[rows], q, MAX_MESH_FACES)
+    instants = [placed_solids(bodies, instant) for instant in range(len(rows))]
+    points = _VIEW(np.concatenate([corner_points(solids) for solids in instants]))
     middle, extent = (points.max(axis=0) + points.min(axis=0)) / 2, np.ptp(points, axis=0)
     scale = _MARGIN * float((extent / _SIZE).max())
     low, high = (middle + side * scale * np.array(_SIZE) / 2 for side in (-1, 1))
-    outlines = [_VIEW(line) for line in robot.base_outlines(_pose(flight, -1))]
+    base = [replace(each, poses=each.poses[-1:]) for each in bodies if each.name in of_base]
+    ghost = [_VIEW(line) for body in base for line in outlines(body)]
     sky, frames = _sky(), []
-    for row, body in zip(rows, bodies, strict=True):
+    for row, solids in zip(rows, instants, strict=True):
         canvas = Canvas(_VIEW, low, high, _SIZE[0])
-        canvas.draw(body.faces, body.edges)
+        canvas.draw(solids)
         picture = Image.fromarray(np.round(255 * canvas.image()).astype(np.uint8), "RGBA")
         frame = sky.copy()
         pen = ImageDraw.Draw(frame)
-        for line in outlines:
+        for line in ghost:
             at = (line - low) / scale
             pen.line([(x, _SIZE[1] - y) for x, y in at.tolist()], fill=_GHOST, width=1)
         frame.paste(picture, (0, 0), picture)
         _write(frame, flight, int(row))
         frames.append(frame)
     return frames
-
-
-def _pose(flight: Flight, row: int) -> Pose:
-    return Pose(matrix_from_quaternion(flight.pose[row, 3:]), flight.pose[row, :3])
 
 
 def _sky() -> Image.Image:

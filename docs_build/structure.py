@@ -26,8 +26,8 @@ ROOT = Path(__file__).resolve().parents[1]
 
 DRAWING = {
     "robot in pictures": ("report/solids.py",),
-    "robot in pages": ("report/scene.py",),
-    "robot, shared by both": ("model/visuals.py",),
+    "robot in pages": ("report/player.py",),
+    "robot, shared by both": ("report/scene.py", "model/visuals.py"),
 }
 """The modules that draw a robot; viewers use the shared one, too."""
 

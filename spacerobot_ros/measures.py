@@ -15,7 +15,7 @@ from operator import attrgetter
 
 import numpy as np
 
-from spacerobot_ros.control.status import ControllerStatus, tracking_time
+from spacerobot_ros.control.status import ControllerState, ControllerStatus, tracking_time
 from spacerobot_ros.model.description import Array, RobotDescription
 from spacerobot_ros.parameters import replaced
 from spacerobot_ros.planning.core.goal import PoseError
@@ -184,7 +184,7 @@ def flown_time(
 
     With a planner it is the duration of the schedules that were flown
     (:func:`~spacerobot_ros.planning.execution.status.manoeuvre_time`); otherwise the time from the
-    first state that a controller tracked to the end of its last goal.
+    first state that a controller tracked for the last goal it decided to that decision.
 
     Parameters
     ----------
@@ -202,10 +202,14 @@ def flown_time(
     planner = [(time, each) for time, each in all_statuses if isinstance(each, PlannerStatus)]
     if planner:
         end = max(end, planner[-1][0])
-    controller = (
-        (time, each.state) for time, each in all_statuses if isinstance(each, ControllerStatus)
-    )
-    return manoeuvre_time(planner, end) or tracking_time(controller)
+    controller = [(time, each) for time, each in all_statuses if isinstance(each, ControllerStatus)]
+    decided = [
+        each.goal_id
+        for _, each in controller
+        if each.state.decided and each.state is not ControllerState.REFUSED
+    ]
+    of_last = [(time, each.state) for time, each in controller if each.goal_id in decided[-1:]]
+    return manoeuvre_time(planner, end) or tracking_time(of_last)
 
 
 # -- the measures by name ---------------------------------------------------------------------

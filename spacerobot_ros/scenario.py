@@ -78,6 +78,8 @@ _SCENARIO_KEYS = (
 
 _LONGEST_TF_PERIOD = 0.1  # wall s
 
+_OTHER_GOAL = " (flown to another goal)"
+
 
 @dataclass(frozen=True)
 class Published:
@@ -383,8 +385,8 @@ class Scenario:
         """Return the scenario with another pose (7,) or position (3,), and then another attitude
         (3,), if given.
 
-        The attitude is a rotation vector (rad), or roll, pitch and yaw about fixed axes (deg). The
-        published figures, which hold for the published goal, are dropped.
+        The attitude is a rotation vector (rad), or roll, pitch and yaw about fixed axes (deg). See
+        :meth:`with_other_goal`.
 
         Raises
         ------
@@ -405,8 +407,20 @@ class Scenario:
             goal = replace(goal, quaternion=given.quaternion)
         if goal is self.goal:
             return self
-        goal = replace(goal, end_effectors=(), base=POSE)
-        return replace(self, goal=goal, published=(), has_goal=True)
+        return self.with_other_goal(replace(goal, end_effectors=(), base=POSE))
+
+    def with_other_goal(self, goal: Goal) -> Scenario:
+        """Return the scenario with another goal, as the description says then.
+
+        The published figures, which hold for the published goal, are dropped.
+        """
+        made = replace(self, goal=goal, published=(), has_goal=True)
+        return made.described_for_other_goal() if self.has_goal else made
+
+    def described_for_other_goal(self) -> Scenario:
+        """Return the scenario, its description with the remark that another goal was flown to."""
+        text = self.description.removesuffix(_OTHER_GOAL)
+        return replace(self, description=text and text + _OTHER_GOAL)
 
     def with_end_effectors(
         self, goals: Sequence[EndEffectorGoal], base: frozenset[Controlled] = frozenset()
@@ -421,7 +435,7 @@ class Scenario:
         made = Goal.of_end_effectors(goals)
         goal = replace(self.goal, joint_positions=None, base=base)
         aimed = replace(goal, end_effectors=made.end_effectors)
-        return replace(self, goal=aimed, published=(), has_goal=True)._with_goal_topics()
+        return self.with_other_goal(aimed)._with_goal_topics()
 
     def _with_goal_topics(self) -> Scenario:
         """Return the scenario with a planner that takes goals of all its end-effectors, whose poses
@@ -723,27 +737,35 @@ def read_sections(path: Path) -> dict[str, dict[str, Any]]:
 
 
 def different_parameters(scenarios: Sequence[Scenario]) -> list[tuple[str, ...]]:
-    """Return node and name of each parameter that is not the same in all scenarios, and its values.
+    """Return each parameter that is not the same in all scenarios, with its unit, and its values.
 
     Values are texts; ``–`` where a scenario does not give the parameter, which has its default
     then. Texts of robots are left out.
     """
     given = [{(n, p): v for n in CONFIGS for p, v in s.parameters(n).items()} for s in scenarios]
-    defaults = {(n, each.name): each.default for n in CONFIGS for each in declared(CONFIGS[n])}
+    known = {(n, each.name): each for n in CONFIGS for each in declared(CONFIGS[n])}
     rows = []
     for key in dict.fromkeys(key for each in given for key in each):
-        values = {_comparable(each.get(key, defaults.get(key))) for each in given}
+        parameter = known.get(key)
+        default = None if parameter is None else parameter.default
+        values = {_value_text(each.get(key, default)) for each in given}
         if len(values) > 1 and not key[1].endswith("robot_description"):
-            texts = (str(each[key]) if key in each else "–" for each in given)
-            rows.append((f"{key[0]}.{key[1]}", *texts))
+            unit = f" ({parameter.unit})" if parameter is not None and parameter.unit else ""
+            texts = (_value_text(each[key]) if key in each else "–" for each in given)
+            rows.append((f"{key[0]}.{key[1]}{unit}", *texts))
     return rows
 
 
-def _comparable(value: Any) -> str:
+def _value_text(value: Any) -> str:
     """Return a text that is the same for a list and a tuple, a number and the same integer."""
-    if isinstance(value, list | tuple):
-        return str([_comparable(each) for each in value])
-    return str(float(value)) if isinstance(value, int | float) else str(value)
+    match value:
+        case bool():
+            return "yes" if value else "no"
+        case list() | tuple():
+            return ", ".join(map(_value_text, value)) or "none"
+        case int() | float():
+            return f"{value:.9g}"
+    return str(value)
 
 
 def _sections(content: Mapping[Any, Any], path: Path) -> dict[str, dict[str, Any]]:

@@ -19,6 +19,7 @@ import yaml
 
 from spacerobot_ros import errors, measures, resources, times
 from spacerobot_ros.bag import message_definition
+from spacerobot_ros.control.status import ControllerState, ControllerStatus
 from spacerobot_ros.errors import (
     GoalError,
     NotFoundError,
@@ -232,6 +233,28 @@ def test_data_files_are_in_the_checkout_or_installed(
 
 
 # -- measures ----------------------------------------------------------------------------------
+
+
+def test_the_time_of_a_session_with_several_goals_is_that_of_the_last_one() -> None:
+    def status(state: ControllerState, goal_id: str) -> ControllerStatus:
+        return ControllerStatus(state, goal_id=goal_id)
+
+    tracking, reached, failed = (
+        *(ControllerState.TRACKING, ControllerState.REACHED),
+        ControllerState.FAILED,
+    )
+    session = [
+        (1.0, status(tracking, "first")),
+        (5.0, status(reached, "first")),
+        (20.0, status(tracking, "second")),
+        (23.5, status(failed, "second")),
+        (25.0, status(ControllerState.REFUSED, "third")),
+    ]
+    assert measures.flown_time(session, 30.0) == 3.5
+    assert measures.flown_time(session[:2], 30.0) == 4.0
+    # Bags of version 0.1 have no ids.
+    unnamed = [(time, replace(each, goal_id="")) for time, each in session[:2]]
+    assert measures.flown_time(unnamed, 30.0) == 4.0
 
 
 def test_momenta_of_a_flight() -> None:

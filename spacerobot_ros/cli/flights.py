@@ -117,6 +117,8 @@ def run_command(
             result.summary["bag"] = None
         if json_file is not None:
             write_json(json_file, result.summary)
+        if report is not None:
+            _write_report(path, report)
         fail(result.message)
     if json_file is not None:
         write_json(json_file, result.summary)
@@ -132,12 +134,16 @@ def run_command(
         click.echo(f"report      none of an interrupted flight: `{shlex.join(words)}` makes one")
     exit_if_terminated()
     if report is not None:
-        from spacerobot_ros.report import write_report
-
-        write_report(path, report)
-        click.echo(f"report      {report}")
+        _write_report(path, report)
     if not result.succeeded:
-        fail(result.message)
+        fail(result.summary["verdict"])
+
+
+def _write_report(bag: Path, html: Path) -> None:
+    from spacerobot_ros.report import write_report
+
+    write_report(bag, html)
+    click.echo(f"report      {html}")
 
 
 def _changed_scenario(

@@ -701,17 +701,16 @@ def decided_message(
     reached = "reached"
     if state is not ControllerState.REACHED:
         reached = f"not reached in time, as {cause}" if cause else "not reached in time"
-    tolerance = OutputDistance(
-        *(
-            math.nan if math.isnan(off) else largest
-            for off, largest in (
-                (distance.position, config.position_tolerance),
-                (distance.attitude, config.attitude_tolerance),
-                (distance.joints, config.joint_tolerance),
-            )
-        )
+    limits = (
+        (distance.position, config.position_tolerance),
+        (distance.attitude, config.attitude_tolerance),
+        (distance.joints, config.joint_tolerance),
     )
-    return f"The goal is {reached}: {distance} from it (tolerance {tolerance})."
+    tolerance = OutputDistance(*(math.nan if math.isnan(off) else most for off, most in limits))
+    message = f"The goal is {reached}: {distance} from it (tolerance {tolerance})"
+    if state is ControllerState.FAILED and not any(off > most for off, most in limits):
+        message += f", within tolerance for less than the settling time of {config.settle_time:g} s"
+    return f"{message}."
 
 
 _MAX_STATE_GAP, _MAX_STATE_GAP_PERIODS = 1.0, 10

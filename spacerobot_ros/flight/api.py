@@ -272,10 +272,9 @@ def _with_goals(
 
 
 def _with_goal(scenario: Scenario, *given: Any) -> Scenario:
-    """Return a scenario with another goal, without published figures."""
     if all(each is None for each in given):
         return scenario
-    return replace(scenario, goal=_changed_goal(scenario.goal, *given), published=(), has_goal=True)
+    return scenario.with_other_goal(_changed_goal(scenario.goal, *given))
 
 
 def _changed_goal(

@@ -11,7 +11,8 @@ import numpy.typing as npt
 from spacerobot_ros.control.wheels import momentum_budget
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.events import EventKind
-from spacerobot_ros.flight.flight import Flight, Signal
+from spacerobot_ros.flight.flight import Flight
+from spacerobot_ros.flight.series import Signal
 from spacerobot_ros.model.description import Array, Pose, RobotDescription
 from spacerobot_ros.model.grasp import Payload, RobotMotion, frame_motion
 from spacerobot_ros.model.kinematics import ForwardKinematics

@@ -36,7 +36,8 @@ from spacerobot_ros.commanding.plant_state import Stamped
 from spacerobot_ros.control.executive import END_EFFECTOR
 from spacerobot_ros.errors import ParameterError, SpaceRobotError
 from spacerobot_ros.events import CONTACTS, Event, EventKind
-from spacerobot_ros.flight.flight import Flight, FlightLog
+from spacerobot_ros.flight.flight import Flight
+from spacerobot_ros.flight.log import FlightLog
 from spacerobot_ros.measures import Outcome
 from spacerobot_ros.messages.diagnostics import PlantDiagnostics, state_diagnostics
 from spacerobot_ros.messages.statuses import StatusRecord

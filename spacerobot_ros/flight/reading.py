@@ -26,7 +26,8 @@ from spacerobot_ros.errors import (
     SpaceRobotError,
 )
 from spacerobot_ros.events import Event
-from spacerobot_ros.flight.flight import Commands, Flight, SentGoal, Signal, goal_at_end
+from spacerobot_ros.flight.flight import Flight
+from spacerobot_ros.flight.series import Commands, SentGoal, Signal, goal_at_end
 from spacerobot_ros.measures import Outcome
 from spacerobot_ros.messages.statuses import read_status
 from spacerobot_ros.model.description import Array, RobotDescription

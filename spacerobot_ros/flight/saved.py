@@ -8,7 +8,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +23,7 @@ from spacerobot_ros.bag.tables import (
 )
 from spacerobot_ros.commanding.goal_follower import STATUS_TOPICS, Status
 from spacerobot_ros.control.status import ControllerStatus
+from spacerobot_ros.flight.data import FlightData
 from spacerobot_ros.messages.builders import (
     RobotTransforms,
     given_path_message,
@@ -39,7 +40,9 @@ from spacerobot_ros.model.description import DEFAULT_END_EFFECTOR, Array
 from spacerobot_ros.model.kinematics import ForwardKinematics
 from spacerobot_ros.model.thrusters import IN_URDF, find_thrusters
 from spacerobot_ros.model.visuals import meshes_for_bag
+from spacerobot_ros.planning import GaitSchedule
 from spacerobot_ros.planning.execution.status import PlannerStatus
+from spacerobot_ros.scenario import Scenario
 from spacerobot_ros.times import SECOND
 from spacerobot_ros.topics import (
     TOPICS,
@@ -51,11 +54,6 @@ from spacerobot_ros.topics import (
     topic_named,
 )
 from spacerobot_ros.version import __version__
-
-if TYPE_CHECKING:
-    from spacerobot_ros.flight.flight import Flight
-    from spacerobot_ros.planning import GaitSchedule
-    from spacerobot_ros.scenario import Scenario
 
 _GOAL_STAMP_NS = 1
 """Stamp of the goals of a mission at time zero, ns."""
@@ -95,7 +93,9 @@ class _Stream:
         return cls(topic, times, lambda rows: found[rows], stamp_ns)
 
 
-def save_flight(flight: Flight, path: str | os.PathLike[str], *, overwrite: bool = False) -> None:
+def save_flight(
+    flight: FlightData, path: str | os.PathLike[str], *, overwrite: bool = False
+) -> None:
     """Write a bag that ``spacerobot verify`` and ``spacerobot report`` take.
 
     Raises
@@ -130,7 +130,7 @@ def open_bag(
     )
 
 
-def write_flight(flight: Flight, writer: BagWriter) -> None:
+def write_flight(flight: FlightData, writer: BagWriter) -> None:
     """Write a flight into an empty bag: every topic that the nodes publish.
 
     Raises
@@ -173,7 +173,7 @@ def write_flight(flight: Flight, writer: BagWriter) -> None:
     writer.add_metadata("recorder", counts)
 
 
-def _streams(flight: Flight) -> Iterator[_Stream]:
+def _streams(flight: FlightData) -> Iterator[_Stream]:
     """Yield all topics; those of one time in this order."""
     yield from _description_streams(flight)
     yield from _goal_streams(flight)
@@ -185,7 +185,7 @@ def _streams(flight: Flight) -> Iterator[_Stream]:
     yield from _status_streams(flight)
 
 
-def _state_streams(flight: Flight) -> Iterator[_Stream]:
+def _state_streams(flight: FlightData) -> Iterator[_Stream]:
     period = round(flight.control_period * SECOND)
     stamps: NDArray[np.int64] = np.arange(len(flight.time), dtype=np.int64) * period
     config, robot = flight.scenario.plant, flight.required_robot()
@@ -237,7 +237,7 @@ def _stamped_stream(
     return _Stream(topic, stamps, copies)
 
 
-def _clearance_streams(flight: Flight) -> Iterator[_Stream]:
+def _clearance_streams(flight: FlightData) -> Iterator[_Stream]:
     """Yield the clearances, where distances are exact, as those of the plant's node are."""
     if flight.clearance is None or not flight.clearance.geometry.exact:
         return
@@ -254,7 +254,7 @@ def _clearance_streams(flight: Flight) -> Iterator[_Stream]:
     )
 
 
-def _frame_streams(flight: Flight) -> Iterator[_Stream]:
+def _frame_streams(flight: FlightData) -> Iterator[_Stream]:
     """Yield the transforms of the measured frames, and the markers of the true ones."""
     config, robot = flight.scenario.plant, flight.required_robot()
     period, quantities = config.period_ns, topic_quantities(flight)
@@ -284,7 +284,7 @@ def _frame_streams(flight: Flight) -> Iterator[_Stream]:
 
 
 def _marker_maker(
-    flight: Flight, markers: RobotMarkers, ticks: NDArray[np.int64]
+    flight: FlightData, markers: RobotMarkers, ticks: NDArray[np.int64]
 ) -> Callable[[slice], list[bytes]]:
     robot, period = flight.required_robot(), flight.scenario.plant.period_ns
     kinematics = ForwardKinematics(robot)
@@ -311,7 +311,7 @@ def _marker_maker(
     return make
 
 
-def topic_quantities(flight: Flight) -> dict[str, Array]:
+def topic_quantities(flight: FlightData) -> dict[str, Array]:
     """Return all quantities by the names of the table of topics."""
     true = {"pose": flight.pose, "twist": flight.twist, "q": flight.q, "qdot": flight.qdot}
     found = {**flight.quantities, "effort": flight.effort, "momentum": flight.momentum}
@@ -323,7 +323,7 @@ def topic_quantities(flight: Flight) -> dict[str, Array]:
     return {**found, "pose": flight.pose}
 
 
-def _description_streams(flight: Flight) -> Iterator[_Stream]:
+def _description_streams(flight: FlightData) -> Iterator[_Stream]:
     robots = {"robot_description": flight.required_robot()}
     if flight.target is not None:
         robots["target/robot_description"] = flight.target
@@ -331,7 +331,7 @@ def _description_streams(flight: Flight) -> Iterator[_Stream]:
         yield _Stream.of(TOPICS[name], [(0, encode(TOPICS[name].type, {"data": robot.urdf}))])
 
 
-def _goal_streams(flight: Flight) -> Iterator[_Stream]:
+def _goal_streams(flight: FlightData) -> Iterator[_Stream]:
     """Yield the goals as the client of a mission sends them: before the first state."""
     scenario = flight.scenario
     world, goal = scenario.plant.world_frame, scenario.goal
@@ -355,7 +355,7 @@ def _goal_streams(flight: Flight) -> Iterator[_Stream]:
             yield _Stream.of(topic_named(name), [(0, message)], _GOAL_STAMP_NS)
 
 
-def _command_streams(flight: Flight) -> Iterator[_Stream]:
+def _command_streams(flight: FlightData) -> Iterator[_Stream]:
     period = flight.scenario.plant.period_ns
     velocity = flight.scenario.plant.actuation == "velocity"
     for name, commands in flight.commands.items():
@@ -378,7 +378,7 @@ def _command_streams(flight: Flight) -> Iterator[_Stream]:
         yield _stamped_stream(TOPICS[name], stamps, encode(kind, values), columns)
 
 
-def _plan_streams(flight: Flight) -> Iterator[_Stream]:
+def _plan_streams(flight: FlightData) -> Iterator[_Stream]:
     robot, world = flight.required_robot(), flight.scenario.plant.world_frame
     schedules = flight.schedules
     makers: dict[str, Callable[[int, GaitSchedule], bytes]] = {
@@ -390,7 +390,7 @@ def _plan_streams(flight: Flight) -> Iterator[_Stream]:
         yield _Stream.of(TOPICS[name], [(time, make(time, plan)) for time, plan in schedules])
 
 
-def _status_streams(flight: Flight) -> Iterator[_Stream]:
+def _status_streams(flight: FlightData) -> Iterator[_Stream]:
     yield _Stream.of(
         TOPICS["plant/status"],
         (
@@ -437,7 +437,7 @@ _UNITS = {"propellant": "kg"}
 """Units of quantities that are in no topic."""
 
 
-def table_of_flight(flight: Flight, *, euler: bool = False) -> TopicTable:
+def table_of_flight(flight: FlightData, *, euler: bool = False) -> TopicTable:
     """Return a row a state: the true state by the columns of ``odom`` and ``joint_states``.
 
     The columns of other topics have the topic before them, as ``momentum.data[linear_x]``. Where
@@ -484,7 +484,7 @@ def _prefix(topic: Topic, *, erred: bool) -> str | None:
     return f"{topic.name}."
 
 
-def _names(flight: Flight, topic: Topic) -> Sequence[str]:
+def _names(flight: FlightData, topic: Topic) -> Sequence[str]:
     """Return the names in the messages of a topic, of joints or thrusters."""
     if topic.short_type != "sensor_msgs/JointState":
         return ()
@@ -495,12 +495,12 @@ def _names(flight: Flight, topic: Topic) -> Sequence[str]:
     return find_thrusters(source, robot).names if robot is not None and source == IN_URDF else ()
 
 
-def _prismatic(flight: Flight) -> dict[str, bool]:
+def _prismatic(flight: FlightData) -> dict[str, bool]:
     joints = flight.robot.movable_joints if flight.robot is not None else ()
     return {joint.name: joint.unit == "m" for joint in joints}
 
 
-def _single_numbers(flight: Flight, names: set[str]) -> Iterator[Field]:
+def _single_numbers(flight: FlightData, names: set[str]) -> Iterator[Field]:
     """Yield the quantities of one number that no topic has."""
     for name, values in flight.quantities.items():
         if name in names and values.shape == (len(flight.time), 1):

@@ -7,7 +7,7 @@ import math
 import os
 import re
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -15,12 +15,10 @@ from matplotlib.figure import Figure
 
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.files import write_output
+from spacerobot_ros.flight.data import FlightData
 from spacerobot_ros.model.description import Array, RobotDescription
 from spacerobot_ros.model.kinematics import ForwardKinematics
 from spacerobot_ros.model.rotations import rotvec_from_quaternion
-
-if TYPE_CHECKING:
-    from spacerobot_ros.flight.flight import Flight
 
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 _DASHES = ("-", "--", "-.", ":")
@@ -67,7 +65,7 @@ class Animation:
         write_output(Path(path), f'<!DOCTYPE html>\n<meta charset="utf-8">\n{self.html}\n')
 
 
-def figure(flight: Flight) -> Picture:
+def figure(flight: FlightData) -> Picture:
     """Draw the pose of the base beside its goal, the joints, and their efforts or rates."""
     efforts = flight.scenario.plant.actuation == "effort"
     wrench = flight.commands.get("base_wrench")
@@ -112,7 +110,7 @@ def _plot_lines(
         axes.legend(fontsize=8, loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False)
 
 
-def animation(flight: Flight, seconds: float, frames: int) -> Animation:
+def animation(flight: FlightData, seconds: float, frames: int) -> Animation:
     """Draw the robot in motion: its joints as points, the links between them as lines."""
     from matplotlib.animation import FuncAnimation
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -37,11 +38,14 @@ class FlightEvent:
 
     @property
     def text(self) -> str:
-        """The event in a few words, such as ``fault on: joint_stuck elbow at 5``."""
+        """The event in a few words, such as ``fault on: joint_stuck elbow at 5 s``."""
         label, about = _MARKS[self.event.kind].label, self.event.about
-        details = [about[key] for key in _DETAIL_KEYS if about.get(key)]
+        details = [_TIME.sub(r"\g<0> s", about[key]) for key in _DETAIL_KEYS if about.get(key)]
         return f"{label}: {', '.join(details)}" if details else label
 
+
+_TIME = re.compile(r"\b(at|until) [\d.e+-]+")
+"""A time in the line of a fault or of a disturbance, s."""
 
 _DETAIL_KEYS = (
     "fault",

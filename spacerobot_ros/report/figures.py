@@ -26,7 +26,7 @@ from matplotlib.text import Annotation
 from matplotlib.ticker import MaxNLocator
 
 from spacerobot_ros.errors import SpaceRobotError
-from spacerobot_ros.flight.flight import Signal
+from spacerobot_ros.flight.series import Signal
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.report.signals import envelope, simplified
 

@@ -16,7 +16,8 @@ from matplotlib.axes import Axes
 
 from spacerobot_ros.errors import RobotDescriptionError, sentence_case
 from spacerobot_ros.flight.captures import BUDGET_PARTS
-from spacerobot_ros.flight.flight import Signal
+from spacerobot_ros.flight.series import Signal
+from spacerobot_ros.measures import momentum_change
 from spacerobot_ros.model.description import Array, Joint
 from spacerobot_ros.model.rotations import (
     quaternion_inverse,
@@ -25,12 +26,10 @@ from spacerobot_ros.model.rotations import (
 )
 from spacerobot_ros.report.events import EVENT_STRIP_HEIGHT, draw_events
 from spacerobot_ros.report.figures import (
-    LARGEST_VALUE_SLICES,
     LIMIT,
     LINE_COLOUR,
     PALETTE,
     SECONDARY_COLOUR,
-    TEXT_COLOUR,
     TRACE_TIME_SLICES,
     ReportFigure,
     TraceGroup,
@@ -49,7 +48,7 @@ from spacerobot_ros.report.figures import (
     sheet,
     short,
 )
-from spacerobot_ros.report.flight import FlightReport, GoalSpan, joint_unit
+from spacerobot_ros.report.flight import FlightReport, joint_unit, pose_errors
 from spacerobot_ros.report.signals import Cycles, Indices, envelope
 
 SHOWN_CYCLES = 3
@@ -124,10 +123,13 @@ def _draw_decades(axes: Axes, flight: FlightReport, group: TraceGroup) -> None:
     axes.set_yscale("log")
     axes.set_ylim(floor, top)
     shown = Signal(signal.time, np.maximum(signal.values, floor))
+    several = len(group.names) > 1
     for index, tint in enumerate(group.colours):
         axes.plot(
             *largest_over_time(shown, index),
             color=tint,
+            # Traces that lie on each other are both seen.
+            lw=2.6 - 1.3 * index if several else None,
             marker="o" if len(signal) < 3 else "",
             ms=4,
             clip_on=False,
@@ -135,58 +137,71 @@ def _draw_decades(axes: Axes, flight: FlightReport, group: TraceGroup) -> None:
     for index, bound in group.limits:
         if floor < bound < top:
             axes.axhline(bound, color=group.colours[index], lw=1.0, ls=(0, DOTS), zorder=1.8)
-    if group.limits:
-        legend_above(axes, [legend_entry(SECONDARY_COLOUR, group.limit_name, DOTS)])
+    keys = [legend_entry(SECONDARY_COLOUR, group.limit_name, DOTS)] if group.limits else []
+    named = zip(group.colours, group.names, strict=True)
+    keys += [legend_entry(*each) for each in named] if several else []
+    legend_above(axes, keys)
     axes.minorticks_off()
     axes.yaxis.set_major_formatter(lambda value, _: power_of_ten(value))
     set_time(axes, 0.0, flight.end)
-    axes.set_ylabel(f"{group.label} ({group.unit})")
+    if several:
+        axes.set_title("" if narrow() else group.label)
+    axes.set_ylabel(group.unit if several else f"{group.label} ({group.unit})")
 
 
 ONE_STATE_TEXT = "The bag holds one state: there are no figures over time."
 
 
 def time_figure(
-    flight: FlightReport, name: str, heading: str, caption: str, groups: list[TraceGroup]
+    flight: FlightReport,
+    name: str,
+    heading: str,
+    caption: str,
+    groups: list[TraceGroup],
+    *,
+    small: bool = False,
 ) -> ReportFigure | str:
     """Return a figure with a panel for each group, and close-ups of a gait of equal cycles; a
     sentence where nothing was recorded over time.
 
-    ``caption`` is its beginning.
+    ``caption`` is its beginning. ``small``: panels are low and share a time axis; beside them are
+    the last cycles.
     """
     if all(len(group.signal) < 2 for group in groups):
         return ONE_STATE_TEXT
     groups = [group.in_unit_of_angles() for group in groups]
-    cycles = flight.cycles
-    rows, heights = [[1.0]], [2.3]
-    if any(group.decades for group in groups):
-        cycles = None
-        heights = [1.3]
-    elif any(group.rows for group in groups):
-        cycles = None
-        heights = [0.4 + 0.14 * len(group.names) if group.rows else 1.6 for group in groups]
-    elif cycles is not None and narrow():
-        rows, heights = [[1.0]] * 3, [2.0, 1.35, 1.35]
-    elif cycles is not None:
-        rows, heights = [[1.0], [1.0, 1.0]], [2.0, 1.35]
-    if len(heights) != len(rows) * len(groups):
-        heights = heights * len(groups)
-    right = room_for([name for group in groups for name in group.names])
+    cycles = None if any(group.decades or group.rows for group in groups) else flight.cycles
     lane = EVENT_STRIP_HEIGHT if flight.timed_events else 0.0
+    right = room_for([name for group in groups for name in group.names])
     left = max([0.72, *(room_for(group.names) + 0.1 for group in groups if group.rows)])
-    figure, panels = sheet(rows * len(groups), heights, left=left, right=right, lane=lane)
+    if small:
+        rows = [[1.0] if cycles is None else [2.2, 1.0]] * len(groups)
+        low, below = 1.0 if len(groups) <= 4 else 0.75, 0.5 + lane
+        sizes = {"left": 0.85, "right": right, "gap": 0.36, "bottom": below}
+        figure, panels = sheet(rows, [low] * len(groups), **sizes)
+    else:
+        rows, heights = _layout(groups, with_cycles=cycles is not None)
+        figure, panels = sheet(rows * len(groups), heights, left=left, right=right, lane=lane)
     share = min(1.0, 4 / len(groups))
     dense = []
     for number, group in enumerate(groups):
-        whole, *below = panels[number * len(rows) : (number + 1) * len(rows)]
+        count = 1 if small else len(rows)
+        whole, *below_it = panels[number * count : (number + 1) * count]
         dense.append(draw_whole_flight(whole[0], flight, group, share))
-        if cycles is not None:
+        if small:
+            whole[0].set_title("" if number else group.label)
+            whole[0].set_ylabel(group.unit)
+        elif cycles is not None:
             whole[0].set_title("whole flight")
-            first, last = (axes for row in below for axes in row)
+            first, last = (axes for row in below_it for axes in row)
             dense.append(_draw_before_cycles(first, group, cycles))
-            _draw_last_cycles(last, group, cycles)
+        if cycles is not None:
+            _draw_last_cycles(whole[1] if small else last, group, cycles)
+        for axes in whole if small and number < len(groups) - 1 else ():
+            axes.set_xlabel("")
+            axes.tick_params(labelbottom=False)
     if flight.timed_events:
-        for axes in (each for row in panels for each in row):
+        for axes in (each for row in (panels[-1:] if small else panels) for each in row):
             draw_events(axes, flight.timed_events)
     if any(group.goals for group in groups):
         caption += "; dashed, the goal"
@@ -195,15 +210,30 @@ def time_figure(
     caption += "."
     aside = ""
     if cycles is not None:
+        where = "beside it," if small else "below, the part before them, and"
         aside += (
-            f" The flight ends with {cycles.count} equal cycles of {cycles.period:.4g} s; below, "
-            f"the part before them, and the last {SHOWN_CYCLES} of them, as change since the "
-            "first instant shown."
+            f" The flight ends with {cycles.count} equal cycles of {cycles.period:.4g} s; {where} "
+            f"the last {SHOWN_CYCLES} of them, as change since the first instant shown."
         )
     aside += f" {BAND_CAPTION}" if any(dense) else ""
     aside += f" {EVENTS_CAPTION}" if flight.timed_events else ""
     caption += aside
     return ReportFigure(name, heading, caption, figure, groups, aside)
+
+
+def _layout(
+    groups: Sequence[TraceGroup], *, with_cycles: bool
+) -> tuple[list[list[float]], list[float]]:
+    """Return the widths of the rows of panels that each group has, and the heights of all rows."""
+    if any(group.decades for group in groups):
+        return [[1.0]], [1.3] * len(groups)
+    if any(group.rows for group in groups):
+        return [[1.0]], [0.4 + 0.14 * len(each.names) if each.rows else 1.6 for each in groups]
+    if not with_cycles:
+        return [[1.0]], [2.3] * len(groups)
+    if narrow():
+        return [[1.0]] * 3, [2.0, 1.35, 1.35] * len(groups)
+    return [[1.0], [1.0, 1.0]], [2.0, 1.35] * len(groups)
 
 
 def _draw_rows(axes: Axes, flight: FlightReport, group: TraceGroup, share: float) -> bool:
@@ -301,9 +331,6 @@ def shape_groups(flight: FlightReport) -> list[TraceGroup]:
     def bounds(joint: Joint) -> list[float]:
         return [joint.limits.lower, joint.limits.upper]
 
-    def rate_bounds(joint: Joint) -> list[float]:
-        return [-joint.limits.velocity, joint.limits.velocity]
-
     units, most = {"m": "m", "rad": "rad"}, JOINTS_PER_PANEL
     positions, rates = flight.shape, flight.rates
     groups = joint_groups(
@@ -312,7 +339,7 @@ def shape_groups(flight: FlightReport) -> list[TraceGroup]:
     if len(rates):
         of_wheels = flight.wheel_columns
         units = {"rad": "rad/s"}
-        groups += joint_groups(flight, rates, "wheel rate", units, rate_bounds, most, of_wheels)
+        groups += joint_groups(flight, rates, "wheel rate", units, _rate_bounds, most, of_wheels)
     return groups
 
 
@@ -415,62 +442,14 @@ def rates_figure(flight: FlightReport) -> ReportFigure | str:
         return _why_no_joints(flight)
     if not len(flight.rates):
         return "The bag holds no joint velocities."
-    if len(flight.rates) < 2:
-        return ONE_STATE_TEXT
-    names, cycles = flight.joint_names, flight.cycles
-    height = 1.0 if len(names) <= 4 else 0.75
-    widths = [1.0] if cycles is None else [2.2, 1.0]
-    lane = EVENT_STRIP_HEIGHT if flight.timed_events else 0.0
-    bottom = 0.5 + lane
-    figure, panels = sheet([widths] * len(names), [height] * len(names), gap=0.36, bottom=bottom)
-    dense, groups = [], []
-    for i, (row, name) in enumerate(zip(panels, names, strict=True)):
-        signal = Signal(flight.rates.time, flight.rates.values[:, i : i + 1])
-        spans = [(0.0, flight.end)]
-        if cycles is not None:
-            spans.append(cycles.last(SHOWN_CYCLES))
-        joint = flight.joint(name)
-        limit = joint.limits.velocity if joint is not None else np.inf
-        unit = f"{joint_unit(flight, name)}/s"
-        bounds = [(0, limit), (0, -limit)]
-        group = TraceGroup(signal, [name], short(name), unit, [colour(i)], limits=bounds)
-        group = group.in_unit_of_angles()
-        groups.append(group)
-        signal, unit, limit = group.signal, group.unit, group.limits[0][1]
-        for axes, (start, end) in zip(row, spans, strict=True):
-            set_range(axes, signal.values, [limit, -limit])
-            low, high = axes.get_ylim()
-            for bound in (limit, -limit):
-                if low < bound < high:
-                    axes.axhline(bound, color=SECONDARY_COLOUR, lw=1.0, ls=(0, DOTS), zorder=1.8)
-            part = signal.between(start, end)
-            dense.append(draw_traces(axes, part, [colour(i)], min(1.0, 6 / len(names))))
-            last = i == len(names) - 1
-            set_time(axes, start, end, last)
-            if not last:
-                axes.tick_params(labelbottom=False)
-        peak = float(np.abs(signal.values).max())
-        text = f"peak {peak:.4g} {unit}"
-        if np.isfinite(limit) and limit > 0:
-            text += f", {100 * peak / limit:.3g} % of the limit {limit:.4g} {unit}"
-        row[0].set_title(name, color=colour(i))
-        if not narrow():
-            row[0].set_title(text, loc="right", color=TEXT_COLOUR)
-        row[0].set_ylabel(unit)
-    figure.align_ylabels([row[0] for row in panels])
-    if cycles is not None:
-        panels[0][1].set_title(f"last {SHOWN_CYCLES} cycles")
-    if flight.timed_events:
-        for axes in panels[-1]:
-            draw_events(axes, flight.timed_events)
-    caption = "Velocity of each joint; dotted, its limit in the URDF, where that is in range."
-    aside = ""
-    if cycles is not None:
-        aside += f" Right: the last {SHOWN_CYCLES} of {cycles.count} cycles, to the same scale."
-    aside += f" {BAND_CAPTION}" if any(dense) else ""
-    aside += f" {EVENTS_CAPTION}" if flight.timed_events else ""
-    caption += aside
-    return ReportFigure("velocities", "Joint velocities", caption, figure, groups, aside)
+    units = {"m": "m/s", "rad": "rad/s"}
+    groups = joint_groups(flight, flight.rates, "velocity", units, _rate_bounds, most=1)
+    caption = "Velocity of each joint"
+    return time_figure(flight, "velocities", "Joint velocities", caption, groups, small=True)
+
+
+def _rate_bounds(joint: Joint) -> list[float]:
+    return [-joint.limits.velocity, joint.limits.velocity]
 
 
 def twist_figure(flight: FlightReport) -> ReportFigure | str | None:
@@ -570,69 +549,34 @@ def thrusters_figure(flight: FlightReport) -> ReportFigure | str | None:
 
 def momentum_figure(flight: FlightReport) -> ReportFigure | str:
     """Change of the total momenta, and the kinetic energy."""
-    if not len(flight.unexplained_momentum):
+    balance = flight.unexplained_momentum
+    if not len(balance):
         return "The bag holds no momentum."
-    if len(flight.unexplained_momentum) < 2:
-        return ONE_STATE_TEXT
-    time, balance = flight.unexplained_momentum.time, flight.unexplained_momentum.values
-    changes = np.column_stack(
-        [np.linalg.norm(balance[:, k : k + 3] - balance[0, k : k + 3], axis=1) for k in (0, 3)]
-    )
-    bottom = 0.5 + (EVENT_STRIP_HEIGHT if flight.timed_events else 0.0)
-    figure, ((above,), (below,)) = sheet([[1.0], [1.0]], [1.6, 1.1], bottom=bottom)
-    floor, top = log_range(changes, _MOMENTUM_DECADES)
-    above.set_yscale("log")
-    above.set_ylim(floor, top)
-    # Values below the axis, such as zero, are drawn on its lower edge.
-    shown = np.maximum(changes, floor)
-    for i in range(2):
-        above.plot(
-            *largest_over_time(Signal(time, shown), i),
-            color=colour(i),
-            lw=2.6 - 1.3 * i,
-            marker="o" if len(time) == 1 else "",
-            clip_on=False,
-        )
-    set_time(above, 0.0, flight.end, label=False)
-    if not narrow():
-        above.set_title("change of the total momenta since the start")
-    above.set_ylabel("kg m/s, kg m²/s")
-    above.minorticks_off()
-    above.yaxis.set_major_formatter(lambda value, _: power_of_ten(value))
-    names = ("|p − p₀| (kg m/s)", "|L − L₀| (kg m²/s)")
-    legend_above(above, [legend_entry(colour(i), name) for i, name in enumerate(names)])
-    energy = balance[:, 6:7]
-    set_range(below, np.append(energy, 0.0))
-    dense = draw_traces(below, Signal(time, energy), [colour(2)])
-    below.set_title("kinetic energy")
-    below.set_ylabel("J")
-    set_time(below, 0.0, flight.end)
-    if flight.timed_events:
-        draw_events(below, flight.timed_events)
-    largest_of = (
-        ", the largest in each slice of time" if len(time) > 2 * LARGEST_VALUE_SLICES else ""
-    )
-    caption = (
-        "The momentum balance of the whole system. Top: change of the linear momentum p and of the "
-        "angular momentum L about the centre of mass since the start, less the impulse of the "
-        f"thrusters{largest_of}, on a logarithmic axis; smaller changes and zero lie on its lower "
-        "edge. Bottom: kinetic energy."
-    )
-    aside = f" {BAND_CAPTION}" if dense else ""
-    aside += f" {EVENTS_CAPTION}" if flight.timed_events else ""
-    caption += aside
+    changes = momentum_change(balance.values[:, :6], balance.values[0, :6])
     groups = [
         TraceGroup(
-            Signal(time, changes),
+            Signal(balance.time, changes),
             ["|p − p₀| (kg m/s)", "|L − L₀| (kg m²/s)"],
             "change of the total momenta",
             "kg m/s, kg m²/s",
             PALETTE[:2],
             decades=_MOMENTUM_DECADES,
         ),
-        TraceGroup(Signal(time, energy), ["energy"], "kinetic energy", "J", [colour(2)]),
+        TraceGroup(
+            Signal(balance.time, balance.values[:, 6:7]),
+            ["energy"],
+            "kinetic energy",
+            "J",
+            [colour(2)],
+        ),
     ]
-    return ReportFigure("momentum", "Momentum balance", caption, figure, groups, aside)
+    caption = (
+        "The momentum balance of the whole system. Top: change of the linear momentum p and of the "
+        "angular momentum L about the centre of mass since the start, less the impulse of the "
+        "thrusters, on a logarithmic axis; smaller changes and zero lie on its lower edge. Bottom: "
+        "kinetic energy"
+    )
+    return time_figure(flight, "momentum", "Momentum balance", caption, groups)
 
 
 def momentum_budget_figure(flight: FlightReport) -> ReportFigure | str | None:
@@ -815,20 +759,6 @@ def _error_decades(values: Array, tolerance: float | None) -> int:
     _, top = log_range(values, 0)
     down_to = 0.1 * tolerance if tolerance else 1e-4 * top
     return int(np.clip(np.ceil(np.log10(top / down_to)), 3, _MAX_DECADES))
-
-
-def pose_errors(pose: Signal, targets: Sequence[GoalSpan]) -> Signal:
-    """Return the goal minus poses (N, 7) while there is one: position, rotation vector (M, 6)."""
-    times, values = [np.empty(0)], [np.empty((0, 6))]
-    for target in targets:
-        part = pose.between(target.start, target.end)
-        if len(part):
-            inverse = quaternion_inverse(part.values[:, 3:])
-            turn = quaternion_multiply(target.goal.quaternion, inverse)
-            left = target.goal.position - part.values[:, :3]
-            times.append(part.time)
-            values.append(np.hstack([left, rotvecs_from_quaternions(turn)]))
-    return Signal(np.concatenate(times), np.concatenate(values))
 
 
 def sensors_figure(flight: FlightReport) -> ReportFigure | str | None:

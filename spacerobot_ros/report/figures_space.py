@@ -10,9 +10,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
-from spacerobot_ros.flight.flight import Signal
-from spacerobot_ros.model.description import Array, Pose
-from spacerobot_ros.model.rotations import matrix_from_quaternion
+from spacerobot_ros.flight.series import Signal
+from spacerobot_ros.model.description import Array
 from spacerobot_ros.planning import PoseError
 from spacerobot_ros.report.figures import (
     GHOST_COLOUR,
@@ -40,8 +39,17 @@ from spacerobot_ros.report.figures_over_time import (
     power_of_ten,
 )
 from spacerobot_ros.report.flight import FlightReport, joint_unit
+from spacerobot_ros.report.scene import bodies_of, goal_of_base, is_flat, obstacles_of
 from spacerobot_ros.report.signals import Indices
-from spacerobot_ros.report.solids import Canvas, Solids, View
+from spacerobot_ros.report.solids import (
+    MAX_MESH_FACES,
+    Canvas,
+    PlacedSolid,
+    View,
+    corner_points,
+    outlines,
+    placed_solids,
+)
 
 PIXELS = 420
 """Width of the picture of a robot, pixels."""
@@ -50,27 +58,25 @@ _MAX_SHOWN_POSES = 6
 
 def configurations_figure(flight: FlightReport) -> ReportFigure | str:
     """The robot at several instants from the first state to the last, and the goal."""
-    if flight.drawn is None:
+    if flight.hidden_links_text:
         return flight.hidden_links_text
     indices = _choose_instants(flight)
-    scenes = [
-        flight.drawn.at(flight.joints[index], flight.base_at(index))
-        + flight.target_solids_at(flight.position.time[index])
-        for index in indices
-    ]
+    bodies = bodies_of(flight, indices, MAX_MESH_FACES)
+    scenes = [placed_solids(bodies, instant) for instant in range(len(indices))]
+    around = placed_solids(obstacles_of(flight), 0)
     across = min(len(indices), 2 if narrow() else 3)
     rows = [[1.0] * across for _ in range(0, len(indices), across)]
     sizes = {"bottom": 0.15, "left": 0.2, "gap": 0.42}
     height = 2.0 if narrow() else 2.9 if across > 2 else 3.9
     figure, panels = sheet(rows, [height] * len(rows), **sizes)
-    points = np.concatenate([scene.corner_points() for scene in scenes])
+    points = np.concatenate([corner_points(scene) for scene in scenes])
     view = view_of(flight)
     places = [axes for row in panels for axes in row]
     for axes in places[len(indices) :]:
         axes.set_visible(False)
     places = places[: len(indices)]
     for axes, scene, index in zip(places, scenes, indices, strict=True):
-        draw_robot(axes, scene + flight.drawn.surroundings, points, view)
+        draw_robot(axes, [*scene, *around], points, view)
         axes.set_title(f"t = {flight.position.time[index]:.5g} s")
     keys = draw_goal_and_path(places[-1], flight, view)
     if not narrow():
@@ -91,7 +97,7 @@ def configurations_figure(flight: FlightReport) -> ReportFigure | str:
 
 def view_of(flight: FlightReport) -> View:
     """Return the direction of view: from above if the flight is planar."""
-    return View(-90.0, 90.0) if flight.flat else View()
+    return View(-90.0, 90.0) if is_flat(flight) else View()
 
 
 def _choose_instants(flight: FlightReport) -> list[int]:
@@ -119,7 +125,7 @@ def _indices_ending_at(last: int, found: Indices) -> list[int]:
     return np.unique([*np.minimum(found[:-1], last), last]).tolist()
 
 
-def draw_robot(axes: Axes, solids: Solids, points: Array, view: View) -> None:
+def draw_robot(axes: Axes, solids: Sequence[PlacedSolid], points: Array, view: View) -> None:
     """Draw a robot to scale in axes around ``points`` (k, 3), with a triad and a scale bar."""
     box = axes.get_window_extent()
     size = np.array([box.width, box.height])
@@ -128,7 +134,7 @@ def draw_robot(axes: Axes, solids: Solids, points: Array, view: View) -> None:
     span = 1.06 * max(float((np.ptp(flat, axis=0) / size).max()), 1e-6) * size
     low, high = middle - span / 2, middle + span / 2
     canvas = Canvas(view, low, high, PIXELS)
-    canvas.draw(solids.faces, solids.edges)
+    canvas.draw(solids)
     axes.imshow(canvas.image(), extent=(low[0], high[0], low[1], high[1]), aspect="auto")
     axes.axis("off")
     across = float(span[0])
@@ -165,11 +171,8 @@ def draw_goal_and_path(axes: Axes, flight: FlightReport, view: View) -> list[Lin
         dense = len(path) > 2 * TRACE_TIME_SLICES
         axes.plot(flat[:, 0], flat[:, 1], color=TEXT_COLOUR, lw=0.8, zorder=5, rasterized=dense)
         keys.append(legend_entry(TEXT_COLOUR, "path of the base"))
-    if flight.base_goal is not None and flight.drawn is not None:
-        # Without a goal of the position, the ghost shows the attitude alone.
-        r = flight.base_goal.position if flight.position_counts else path[-1]
-        pose = Pose(matrix_from_quaternion(flight.base_goal.quaternion), r)
-        for line in flight.drawn.base_outlines(pose):
+    if (goal := goal_of_base(flight, MAX_MESH_FACES)) is not None:
+        for line in outlines(goal):
             flat = view(line)
             axes.plot(flat[:, 0], flat[:, 1], color=GHOST_COLOUR, lw=0.9, ls=(0, DASHES), zorder=6)
         keys.append(legend_entry(GHOST_COLOUR, "goal", DASHES))
@@ -211,9 +214,9 @@ def path_figure(flight: FlightReport, beside: Sequence[FlightReport] = ()) -> Re
     if shows_tool:
         paths.append((flight.tool.values[:, :3], _TOOL_COLOUR))
         keys.append(legend_entry(_TOOL_COLOUR, "end-effector"))
-    for number, (link, positions) in enumerate(flight.link_positions.items()):
+    for number, (link, poses) in enumerate(flight.link_poses.items()):
         tint = _LINK_COLOURS[number % len(_LINK_COLOURS)]
-        paths.append((positions, tint))
+        paths.append((poses.values[:, :3], tint))
         keys.append(legend_entry(tint, short(link)))
     if flight.planned:
         keys.append(legend_entry(_PLANNED_COLOUR, "planned", DASHES))
@@ -256,7 +259,7 @@ def path_figure(flight: FlightReport, beside: Sequence[FlightReport] = ()) -> Re
     caption = (
         "Path of the base origin"
         + (" and of the end-effector" if shows_tool else "")
-        + (" and of links with goals" if flight.link_positions else "")
+        + (" and of links with goals" if flight.link_poses else "")
         + f" in the world frame{', three views to one scale' if len(views) > 1 else ''}: open "
         "circle, start; full circle, end"
         + ("; cross, goal" if goals else "")

@@ -18,8 +18,7 @@ from spacerobot_ros.flight.captures import (
     BUDGET_PARTS,
     momentum_budget_over_time,
 )
-from spacerobot_ros.flight.clearance import FlightClearance
-from spacerobot_ros.flight.flight import Flight, SentGoal, Signal, pose_error, reported_goal
+from spacerobot_ros.flight.flight import Flight
 from spacerobot_ros.flight.reading import (
     WRENCH_COLUMNS,
     FlightBag,
@@ -29,23 +28,30 @@ from spacerobot_ros.flight.reading import (
     read_flight,
     since,
 )
+from spacerobot_ros.flight.series import SentGoal, Signal, pose_error, reported_goal
 from spacerobot_ros.measures import flown_time
 from spacerobot_ros.model.description import DEFAULT_END_EFFECTOR, Array, Joint, Pose, Shape
-from spacerobot_ros.model.kinematics import ForwardKinematics
 from spacerobot_ros.model.meshes import TriangleMesh
 from spacerobot_ros.model.rotations import (
-    matrix_from_quaternion,
-    rotation_angles,
+    quaternion_inverse,
+    quaternion_multiply,
     rotvec_from_quaternion,
+    rotvecs_from_quaternions,
 )
-from spacerobot_ros.model.visuals import Visual, meshes_from_attachments, visuals_of
+from spacerobot_ros.model.visuals import Visual, meshes_from_attachments
 from spacerobot_ros.planning import Goal, PoseError
 from spacerobot_ros.planning.core.goal import EndEffectorGoal
 from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus, time_to_end
 from spacerobot_ros.planning.methods.registry import METHODS
 from spacerobot_ros.report.events import FlightEvent, timed_events
-from spacerobot_ros.report.signals import Cycles, find_cycles, nearest_rotvec, rotvecs
-from spacerobot_ros.report.solids import MAX_MESH_FACES, SolidRobot, Solids, obstacle_color, rgb
+from spacerobot_ros.report.signals import (
+    Cycles,
+    continuous,
+    find_cycles,
+    link_poses,
+    nearest_rotvec,
+    rotvecs,
+)
 from spacerobot_ros.scenario import COMMANDERS
 from spacerobot_ros.times import SECOND
 
@@ -209,23 +215,7 @@ class FlightReport(Flight):
         others = namespaces(self.bag.bag)
         return [name or "/" for name in others if name != self.bag.namespace]
 
-    @cached_property
-    def clearance(self) -> FlightClearance | None:
-        """The smallest distance between links, by the meshes that the bag carries; None where the
-        plant did not measure it, or there are no states.
-        """
-        if self.robot is None or not self.measures_clearance:
-            return None
-        shape, pose = self.shape, self.signal("pose")
-        return FlightClearance.of(
-            self.robot,
-            self.joint_names,
-            (shape.time, shape.values),
-            (pose.time, pose.values),
-            mesh_of=self._carried_mesh,
-        )
-
-    def _carried_mesh(self, shape: Shape) -> TriangleMesh:
+    def mesh_of(self, shape: Shape) -> TriangleMesh:
         """Return a mesh that the bag carries; files that a bag names are not read."""
         if shape.resource not in self.meshes:
             raise MeshError(f"The bag does not carry the mesh '{shape.resource}'.")
@@ -234,7 +224,7 @@ class FlightReport(Flight):
     @cached_property
     def obstacles(self) -> tuple[tuple[Visual, Pose], ...]:
         """The solids of the obstacles, each with the pose of its link in the world."""
-        return () if self.robot is None else obstacle_visuals(self.robot.world, self._carried_mesh)
+        return () if self.robot is None else obstacle_visuals(self.robot.world, self.mesh_of)
 
     @property
     def target_pose(self) -> Signal:
@@ -324,6 +314,17 @@ class FlightReport(Flight):
         """The goal of the base that counts at the end; None: there is none, or the base is free."""
         return self.goal if self.goal is not None and self.goal.base else None
 
+    @property
+    def other_goal(self) -> bool:
+        """Whether the base was sent to another goal than that of its scenario."""
+        own = self.scenario.goal
+        return self.scenario.has_goal and any(
+            not np.allclose(sent.goal.position, own.position)
+            or not np.allclose(sent.goal.quaternion, own.quaternion)
+            for sent in self.goals
+            if own.base
+        )
+
     @cached_property
     def link_goals(self) -> dict[str, EndEffectorGoal]:
         """The goals of links that count at the end, of a planner."""
@@ -334,49 +335,37 @@ class FlightReport(Flight):
         """Errors of the true poses of links with goals, at up to two thousand states; none where
         the bag lacks the robot's description or its states.
         """
-        robot, targets = self.robot, [each for each in self._all_targets if each.goal.end_effectors]
-        if robot is None or self.hidden_links_text or not targets:
-            return {}
-        links = [each.link for target in targets for each in target.goal.end_effectors]
-        found = {}
-        for link in dict.fromkeys(links):
-            if link in self.link_positions:
-                found[link] = self._errors_of_link(link, targets)
-        return found
+        return {link: self._errors_of_link(link) for link in self.link_poses}
 
     @cached_property
-    def link_positions(self) -> dict[str, Array]:
-        """Positions in the world (k, 3), m, of links that had goals, at the states of
-        :attr:`link_errors`.
-        """
-        return {link: r for link, (_, r) in self._link_poses.items()}
-
-    @cached_property
-    def _link_poses(self) -> dict[str, tuple[Array, Array]]:
-        """R_WL (k, 3, 3) and r_WL (k, 3) of links that had goals."""
-        links = {each.link for target in self._all_targets for each in target.goal.end_effectors}
+    def link_poses(self) -> dict[str, Signal]:
+        """Poses in the world (k, 7) of links that had goals, at up to two thousand states."""
+        aims = (each for target in self._all_targets for each in target.goal.end_effectors)
+        links = list(dict.fromkeys(each.link for each in aims))
         if self.robot is None or self.hidden_links_text or not links:
             return {}
-        rows, kinematics = self.samples(_MAX_LINK_ERROR_STATES), ForwardKinematics(self.robot)
-        R_WL, r_WL = kinematics.poses_in_world(self.pose[rows], self.joints[rows])
-        numbers = {link: k for k, link in enumerate(kinematics.links) if link in links}
-        return {link: (R_WL[:, k], r_WL[:, k]) for link, k in numbers.items()}
+        rows = self.samples(_MAX_LINK_ERROR_STATES)
+        poses = link_poses(self.robot, continuous(self.pose)[rows], self.joints[rows])
+        time = self.position.time[rows]
+        return {link: Signal(time, poses[link]) for link in links if link in poses}
 
-    def _errors_of_link(self, link: str, targets: Sequence[GoalSpan]) -> LinkErrors:
-        time = self.position.time[self.samples(_MAX_LINK_ERROR_STATES)]
-        R_WL, r_WL = self._link_poses[link]
-        distances, angles = [Signal.empty(1)], [Signal.empty(1)]
-        for target in targets:
-            aim = next((each for each in target.goal.end_effectors if each.link == link), None)
-            if aim is None:
-                continue
-            now = (time >= target.start) & (time <= target.end)
-            off = np.linalg.norm(aim.position - r_WL[now], axis=1)
-            distances.append(Signal(time[now], off[:, np.newaxis]))
-            if aim.quaternion is not None:
-                turned = rotation_angles(matrix_from_quaternion(aim.quaternion).T @ R_WL[now])
-                angles.append(Signal(time[now], turned[:, np.newaxis]))
-        return LinkErrors(_joined(distances), _joined(angles))
+    def _errors_of_link(self, link: str) -> LinkErrors:
+        aims = [
+            (target, aim)
+            for target in self._all_targets
+            for aim in target.goal.end_effectors
+            if aim.link == link
+        ]
+        norms = []
+        for columns, counted in (
+            (slice(0, 3), aims),
+            (slice(3, 6), [(target, aim) for target, aim in aims if aim.quaternion is not None]),
+        ):
+            spans = [GoalSpan(target.start, target.end, aim.as_goal()) for target, aim in counted]
+            errors = pose_errors(self.link_poses[link], spans)
+            off = np.linalg.norm(errors.values[:, columns], axis=1)
+            norms.append(Signal(errors.time, off[:, np.newaxis]))
+        return LinkErrors(*norms)
 
     @property
     def tool_goals(self) -> tuple[SentGoal, ...]:
@@ -437,26 +426,6 @@ class FlightReport(Flight):
         planned = [(time, each) for time, each in self.reports if isinstance(each, PlannerStatus)]
         return time_to_end(planned, self.end)
 
-    @cached_property
-    def drawn(self) -> SolidRobot | None:
-        """The robot as something to draw; None if the bag lacks its description or its states."""
-        if self.robot is None or self.hidden_links_text:
-            return None
-        return SolidRobot(self.robot, self.meshes, self.obstacles)
-
-    def target_solids_at(self, time: float) -> Solids:
-        """Return the target in its pose at a time, s; empty where there is none."""
-        solids, poses = Solids(), self.target_pose
-        if self.target is None or not len(poses):
-            return solids
-        index = min(int(np.searchsorted(poses.time, time - 1e-9)), len(poses) - 1)
-        values = poses.values[index]
-        pose = Pose(matrix_from_quaternion(values[3:]), values[:3])
-        for visual in visuals_of(self.target, {}, MAX_MESH_FACES):
-            placed = pose @ self.target.frames[visual.link][1]
-            solids.add(visual, placed, rgb(obstacle_color(visual)))
-        return solids
-
     @property
     def hidden_links_text(self) -> str:
         """A message about data missing for a picture of the robot; empty: none is missing."""
@@ -489,28 +458,10 @@ class FlightReport(Flight):
         count = f"{len(missing)} of {len(named)} meshes" if self.meshes else "Meshes"
         return f" {count} are not drawn. The bag does not carry them."
 
-    def base_at(self, index: int) -> Pose:
-        """Pose of the base link in the world at a recorded state."""
-        R_WB = matrix_from_quaternion(self.quaternion[index])
-        return Pose(R_WB, self.position.values[index])
-
     def samples(self, count: int) -> list[int]:
         """Recorded states at about equal intervals, the first and the last among them."""
         last = len(self.position) - 1
         return np.unique(np.linspace(0, last, count).astype(int)).tolist()
-
-    @cached_property
-    def flat(self) -> bool:
-        """Whether every link stays in a plane z = const of the world."""
-        assert self.drawn is not None
-        shapes = self.joints
-        poses = [
-            list(self.drawn.link_poses(shapes[index], self.base_at(index)).values())
-            for index in self.samples(25)
-        ]
-        upright = all(abs(pose.R[2, 2]) > 1 - 1e-9 for links in poses for pose in links)
-        heights = np.array([[pose.r[2] for pose in links] for links in poses])
-        return upright and float(np.ptp(heights, axis=0).max()) < 1e-6
 
     @cached_property
     def joints(self) -> Array:
@@ -587,17 +538,23 @@ def _timed_goals(goals: Sequence[SentGoal]) -> list[tuple[float, Goal]]:
     return [(sent.time, sent.goal) for sent in goals]
 
 
-def _joined(parts: Sequence[Signal]) -> Signal:
-    """Return signals of one width one after the other."""
-    return Signal(
-        np.concatenate([each.time for each in parts]),
-        np.concatenate([each.values for each in parts]),
-    )
-
-
 def _shift_time(signal: Signal, start: float) -> Signal:
     """Return a signal over the time since ``start``, s."""
     return Signal(signal.time - start, signal.values)
+
+
+def pose_errors(pose: Signal, targets: Sequence[GoalSpan]) -> Signal:
+    """Return the goal minus poses (N, 7) while there is one: position, rotation vector (M, 6)."""
+    times, values = [np.empty(0)], [np.empty((0, 6))]
+    for target in targets:
+        part = pose.between(target.start, target.end)
+        if len(part):
+            inverse = quaternion_inverse(part.values[:, 3:])
+            turn = quaternion_multiply(target.goal.quaternion, inverse)
+            left = target.goal.position - part.values[:, :3]
+            times.append(part.time)
+            values.append(np.hstack([left, rotvecs_from_quaternions(turn)]))
+    return Signal(np.concatenate(times), np.concatenate(values))
 
 
 def read_report(path: Path, namespace: str | None = None) -> FlightReport:

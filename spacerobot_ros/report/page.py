@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from spacerobot_ros.events import EventKind
-from spacerobot_ros.flight.flight import Signal
+from spacerobot_ros.flight.series import Signal
 from spacerobot_ros.report.events import FlightEvent, event_style
 from spacerobot_ros.report.figures import ReportFigure, TraceGroup, log_range
 from spacerobot_ros.report.flight import FlightReport
@@ -65,7 +65,8 @@ def page(
 ) -> str:
     """Return the whole page; flights ``beside`` this one get a row in a table."""
     charts = charts_of(flight, figures)
-    name, description = flight.scenario.name, flight.scenario.description
+    scenario = flight.scenario.described_for_other_goal() if flight.other_goal else flight.scenario
+    name, description = scenario.name, scenario.description
     robot_name = "" if flight.robot is None else flight.robot.name
     title = ", ".join(filter(None, (name, flight.flown_method, robot_name)))
     body = [

@@ -26,25 +26,6 @@
   pane.addEventListener("pointerdown", () => { viewer.controls.enableZoom = true; });
   pane.addEventListener("pointerleave", () => { viewer.controls.enableZoom = false; });
 
-  // The viewer's own controls have texts beside them, no names, and open by a click alone.
-  function describeControls() {
-    for (const field of box.querySelectorAll(".dg :is(input, select):not([aria-label])")) {
-      const title = field.closest(".folder")?.querySelector(".title")?.textContent ?? "scene";
-      const visibility = field.closest(".meshcat-visibility-checkbox") !== null;
-      const property = field.closest(".cr")?.querySelector(".property-name")?.textContent;
-      field.setAttribute("aria-label", visibility ? `Show ${title}` : `${title}: ${property}`);
-    }
-    for (const opener of box.querySelectorAll(".dg :is(.title, .close-button):not([tabindex])")) {
-      if (opener.tagName !== "LI") opener.setAttribute("role", "button");
-      opener.tabIndex = 0;
-      opener.addEventListener("keydown", (event) => {
-        if (event.key !== "Enter" && event.key !== " ") return;
-        event.preventDefault();
-        opener.click();
-      });
-    }
-  }
-
   let span = scene.parts[0];
   let time = 0;
   let playing = false;
@@ -113,8 +94,6 @@
     }
   });
   choose(0);
-  describeControls();
-  new MutationObserver(describeControls).observe(box, { childList: true, subtree: true });
   box.className = "ready";
   window.flightViewer = viewer;
 })();

@@ -9,9 +9,14 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from spacerobot_ros.flight.flight import Signal
-from spacerobot_ros.model.description import Array
-from spacerobot_ros.model.rotations import rotvecs_from_quaternions
+from spacerobot_ros.flight.series import Signal
+from spacerobot_ros.model.description import Array, RobotDescription
+from spacerobot_ros.model.kinematics import ForwardKinematics, joints_outward
+from spacerobot_ros.model.rotations import (
+    matrices_from_quaternions,
+    quaternion_multiply,
+    rotvecs_from_quaternions,
+)
 
 Indices = npt.NDArray[np.int64]
 
@@ -130,6 +135,39 @@ def nearest_rotvec(rotvec: Array, near: Array) -> Array:
     return rotvec * (1 + 2 * np.pi * turns / length)
 
 
+def continuous(poses: Array) -> Array:
+    """Return poses (N, 7) whose quaternions keep their sign from one to the next."""
+    flips = np.cumsum((poses[1:, 3:] * poses[:-1, 3:]).sum(axis=1) < 0) % 2
+    signs = np.append(1, 1 - 2 * flips)[: len(poses), np.newaxis]
+    return np.hstack([poses[:, :3], poses[:, 3:] * signs])
+
+
+def link_poses(robot: RobotDescription, base: Array, q: Array) -> dict[str, Array]:
+    """Return the poses (K, 7) in the world of all links, the base link first.
+
+    Their quaternions are as continuous as those of the base.
+
+    Parameters
+    ----------
+    robot
+        The robot.
+    base, q
+        (K, 7) poses of the base in the world, and (K, n) joint positions, m or rad.
+    """
+    kinematics = ForwardKinematics(robot)
+    transforms = kinematics.transforms_at(q)
+    steps = {child: transforms[:, i] for i, (_, child) in enumerate(kinematics.moving)}
+    fixed = zip(kinematics.fixed, kinematics.fixed_transforms, strict=True)
+    steps |= {child: pose[np.newaxis] for (_, child), pose in fixed}
+    poses = {robot.base_link: base}
+    for joint in joints_outward(robot):
+        outer, step = poses[joint.parent], steps[joint.child]
+        turned = (matrices_from_quaternions(outer[:, 3:]) @ step[:, :3, np.newaxis])[..., 0]
+        attitude = quaternion_multiply(outer[:, 3:], step[:, 3:])
+        poses[joint.child] = np.hstack([outer[:, :3] + turned, attitude])
+    return poses
+
+
 def find_cycles(rates: Signal) -> Cycles | None:
     """Find out whether a gait ends with many equal cycles, from its joint velocities.
 
@@ -154,6 +192,8 @@ def find_cycles(rates: Signal) -> Cycles | None:
     first, stop = int(bounds[enough[-1]]) + 1, int(bounds[enough[-1] + 1]) + lag
     last = min(stop, len(rates) - 1)
     start, end = float(rates.time[first]), float(rates.time[last])
+    if end <= start:
+        return None  # Log times that are the same for all messages.
     return Cycles(start, end, lag * (end - start) / (last - first))
 
 

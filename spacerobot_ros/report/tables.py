@@ -11,6 +11,7 @@ import numpy as np
 
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.flight.captures import payload_estimates
+from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.inertial_parameters import INERTIA_ENTRIES
 from spacerobot_ros.model.payload_estimation import PayloadEstimate
 from spacerobot_ros.model.rotations import rotvec_from_quaternion
@@ -41,32 +42,32 @@ def headline(flight: FlightReport) -> list[tuple[str, str, str]]:
         measured = "" if sensed is None else f"measured: {sensed.distance:.3g} m"
         near = f"{error.distance:.3g} m", measured
         rows.append(("Position error", *_error_with_tolerance(flight, "position", *near)))
-        degrees = f"{math.degrees(error.angle):.3g}°"
-        measured = degrees + ("" if sensed is None else f"; measured: {sensed.angle:.3g} rad")
+        measured = f"{math.degrees(error.angle):.3g}°"
+        measured += "" if sensed is None else f"; measured: {sensed.angle:.3g} rad"
+        turned = f"{error.angle:.3g} rad", measured
+        rows.append(("Attitude error", *_error_with_tolerance(flight, "attitude", *turned)))
+    if tool is not None:
+        turns = bool(set(flight.controls("end_effector")) & {3, 4, 5})
+        rows.append(_end_effector_row(flight, "End-effector error", tool, turns))
+    for link, left in flight.end_effector_errors.items():
+        turns = flight.link_goals[link].quaternion is not None
+        rows.append(_end_effector_row(flight, f"Error of {link}", left, turns))
+    if flight.time_flown is not None:
+        schedules = len(flight.executing)
+        notes = [f"{schedules} schedules in the whole flight"] if schedules > 1 else []
         rows.append(
             (
-                "Attitude error",
-                *_error_with_tolerance(flight, "attitude", f"{error.angle:.3g} rad", measured),
+                "Manoeuvre",
+                f"{flight.time_flown:.6g} s",
+                "; ".join([*notes, *_time_to_end_texts(flight)]),
             )
         )
-    if tool is not None:
-        turned = set(flight.controls("end_effector")) & {3, 4, 5}
-        turn = f"{tool.angle:.3g} rad" if turned else ""
-        note = _end_effector_note(flight, turn)
-        rows.append(("End-effector error", f"{tool.distance:.3g} m", note))
-    for link, left in flight.end_effector_errors.items():
-        turn = f"{left.angle:.3g} rad" if flight.link_goals[link].quaternion is not None else ""
-        rows.append(
-            (f"Error of {link}", f"{left.distance:.3g} m", _end_effector_note(flight, turn))
-        )
-    if flight.time_flown is not None:
-        rows.append(("Manoeuvre", f"{flight.time_flown:.6g} s", _time_to_end_text(flight)))
     if flight.flown_method:
         rows.append(("Method", flight.flown_method, ""))
     if len(flight.unexplained_momentum) > 1:
         linear, angular = flight.momentum_drift.tolist()
-        values = f"{linear:.1e} kg m/s", f"angular {angular:.1e} kg m²/s"
-        rows.append((_momentum_label(flight), *values))
+        label = "Momentum not explained by thrusters" if flight.has_thrust else "Momentum drift"
+        rows.append((label, f"{linear:.1e} kg m/s", f"angular {angular:.1e} kg m²/s"))
     if (propellant := flight.propellant) is not None:
         rows.append(("Propellant", f"{1e3 * propellant:.3g} g", ""))
     if capture := flight.capture:
@@ -74,19 +75,22 @@ def headline(flight: FlightReport) -> list[tuple[str, str, str]]:
         done = f"at {about.time:.4g} s" if capture["captured"] else "no"
         nearest = "" if math.isnan(about.distance) else f"{about.distance:.3g} m from the grapple"
         rows.append(("Target captured", done, nearest))
-    if len(flight.position) > 1:
-        time = flight.position.time
-        rows.append(("Recorded", f"{len(time) - 1} ticks", f"{time[-1] - time[0]:.6g} s"))
+    if len(time := flight.position.time) > 1:
+        ticks = f"{time[-1] - time[0]:.6g} s, ticks of {flight.tick:.4g} s"
+        rows.append(("Recorded", f"{len(time) - 1} ticks", ticks))
     return rows
 
 
-def _end_effector_note(flight: FlightReport, turn: str) -> str:
-    """Return the note below the distance of an end-effector: its angle, and the tolerances."""
-    units = ("position", "m"), ("attitude", "rad")
-    parts = units if turn else units[:1]
-    found = [_tolerance_text(flight, part, unit).strip(" ()") for part, unit in parts]
-    limits = ", ".join(text.removeprefix("tolerance ") for text in found if text)
-    return "; ".join(filter(None, (turn, limits and f"tolerance {limits}")))
+def _end_effector_row(
+    flight: FlightReport, label: str, error: PoseError, turns: bool
+) -> tuple[str, str, str]:
+    """Return the row of an end-effector: its distance, its angle if that counts, tolerances."""
+    limits = _tolerance_text(flight, "position")
+    if limits and turns:
+        limits += f", {_tolerance_text(flight, 'attitude')}"
+    notes = [f"{error.angle:.3g} rad"] if turns else []
+    notes += [f"tolerance {limits}"] if limits else []
+    return label, f"{error.distance:.3g} m", "; ".join(notes)
 
 
 def _error_with_tolerance(
@@ -94,17 +98,16 @@ def _error_with_tolerance(
 ) -> tuple[str, str]:
     if part in flight.not_controlled:
         return "not controlled", f"{error} from the goal"
-    tolerance = _tolerance_text(flight, part, "m" if part == "position" else "rad").strip(" ()")
-    return error, "; ".join(filter(None, (note, tolerance)))
-
-
-def _momentum_label(flight: FlightReport) -> str:
-    return "Momentum not explained by thrusters" if flight.has_thrust else "Momentum drift"
+    limit = _tolerance_text(flight, part)
+    return error, "; ".join(filter(None, (note, limit and f"tolerance {limit}")))
 
 
 def runs_table(flights: Sequence[FlightReport]) -> Table:
-    """Return the headline numbers of several flights, a row each."""
-    found = [{label: value for label, value, _ in headline(flight)} for flight in flights]
+    """Return outcome and headline numbers of several flights, a row each."""
+    found = [
+        {"Outcome": flight.verdict.word} | {label: value for label, value, _ in headline(flight)}
+        for flight in flights
+    ]
     labels = list(dict.fromkeys(label for values in found for label in values))
     rows = [
         (flight.bag.path.name, *(values.get(label, _NO_VALUE) for label in labels))
@@ -114,52 +117,30 @@ def runs_table(flights: Sequence[FlightReport]) -> Table:
 
 
 def result_table(flight: FlightReport) -> Table:
-    """Return goal, final state, errors, times and momentum drift, as far as the bag has them."""
+    """Return goals and final poses, an estimated body, and the clearance, if the bag has them."""
     rows: list[tuple[str, ...]] = []
-    error = flight.error
     last = flight.reports[-1][1].state.value if flight.reports else ""
     refused = " (refused)" if last == "refused" and not flight.executing else ""
     for part, text in _base_goal_texts(flight).items():
-        pose = part != _FREE_BASE
-        rows.append((f"Goal {part}{refused if pose else ''}", text))
+        rows.append((f"Goal {part}{refused if part != _FREE_BASE else ''}", text))
     if len(flight.position):
-        rows.append(("Final position", f"({_format_vector(flight.position.values[-1])}) m"))
-        rows.append(
-            ("Final attitude", _format_attitude(rotvec_from_quaternion(flight.quaternion[-1])))
-        )
-    if error is not None:
-        angle = f"{error.angle:.3g} rad = {math.degrees(error.angle):.3g}°"
-        for part, unit, left in (
-            ("position", "m", f"{error.distance:.3g} m"),
-            ("attitude", "rad", angle),
-        ):
-            text = f"{left}{_tolerance_text(flight, part, unit)}"
-            if part in flight.not_controlled:
-                text = f"not controlled; {left} from the goal"
-            rows.append((f"{part.capitalize()} error", text))
-    if (sensed := flight.measured_error) is not None:
-        parts = [f"{sensed.distance:.3g} m"] if flight.position_counts else []
-        rows.append(("Errors as measured", ", ".join([*parts, f"{sensed.angle:.3g} rad"])))
+        rows.append(("Final position", _position_text(flight.position.values[-1])))
+        attitude = rotvec_from_quaternion(flight.quaternion[-1])
+        rows.append(("Final attitude", _format_attitude(attitude)))
     if flight.tool_error is not None:
-        rows += _tool_rows(flight, flight.tool_error)
-    rows += _link_rows(flight)
-    if flight.time_flown is not None:
-        rows.append(("Manoeuvre time", f"{flight.time_flown:.6g} s{_schedules_text(flight)}"))
-        if to_end := _time_to_end_text(flight):
-            rows.append(("First schedule to the end", to_end.partition(" from ")[0]))
-    if len(flight.position):
-        rows.append(("Recorded", _recorded_text(flight)))
-    if len(flight.unexplained_momentum) > 1:
-        linear, angular = flight.momentum_drift.tolist()
-        drifts = f"linear {linear:.3g} kg m/s, angular {angular:.3g} kg m²/s"
-        rows.append((_momentum_label(flight), drifts))
-    if (propellant := flight.propellant) is not None:
-        rows.append(("Propellant", f"{1e3 * propellant:.4g} g"))
+        goal = flight.tool_goals[-1].goal
+        rows.append(("End-effector goal", _position_text(goal.position)))
+        rows.append(("End-effector, final", _position_text(flight.tool.values[-1, :3])))
+    for link, aim in flight.link_goals.items():
+        rows.append((f"Goal of {link}", _link_goal_text(aim)))
+        if (error := flight.end_effector_errors.get(link)) is not None:
+            at = aim.position - error.position
+            rows.append((f"Final position of {link}", _position_text(at)))
     rows += _payload_rows(flight)
     if (clearance := flight.clearance) is not None:
         nearest = clearance.nearest
-        at = f"links {nearest.links} at {clearance.nearest_time:.6g} s"
-        rows.append(("Clearance", f"{nearest.distance:.4g} m, {at}"))
+        at_links = f"links {nearest.links} at {clearance.nearest_time:.6g} s"
+        rows.append(("Clearance", f"{nearest.distance:.4g} m, {at_links}"))
     return Table(("Quantity", "Value"), rows)
 
 
@@ -174,14 +155,14 @@ def _base_goal_texts(flight: FlightReport) -> dict[str, str]:
     if not flight.controls("base") and flight.outputs:
         return {}
     attitude = _format_attitude(rotvec_from_quaternion(goal.quaternion))
-    return {"position": f"({_format_vector(goal.position)}) m", "attitude": attitude}
+    return {"position": _position_text(goal.position), "attitude": attitude}
 
 
 def _link_goal_text(goal: EndEffectorGoal) -> str:
     attitude = "any attitude"
     if goal.quaternion is not None:
         attitude = _format_attitude(rotvec_from_quaternion(goal.quaternion))
-    return f"({_format_vector(goal.position)}) m, {attitude}"
+    return f"{_position_text(goal.position)}, {attitude}"
 
 
 def different_goals(flights: Sequence[FlightReport]) -> list[tuple[str, ...]]:
@@ -222,40 +203,6 @@ def payload_text(estimate: PayloadEstimate) -> str:
     if estimate.corrected:
         parts.append("corrected to the nearest parameters of a body")
     return "; ".join(parts)
-
-
-def _tool_rows(flight: FlightReport, error: PoseError) -> list[tuple[str, ...]]:
-    goal, last = flight.tool_goals[-1].goal, flight.tool.values[-1]
-    rows: list[tuple[str, ...]] = [
-        ("End-effector goal", f"({_format_vector(goal.position)}) m"),
-        ("End-effector, final", f"({_format_vector(last[:3])}) m"),
-        ("End-effector error", f"{error.distance:.3g} m{_tolerance_text(flight, 'position', 'm')}"),
-    ]
-    if set(flight.controls("end_effector")) & {3, 4, 5}:
-        angle = f"{error.angle:.3g} rad = {math.degrees(error.angle):.3g}°"
-        rows.append(
-            ("End-effector attitude error", angle + _tolerance_text(flight, "attitude", "rad"))
-        )
-    return rows
-
-
-def _link_rows(flight: FlightReport) -> list[tuple[str, ...]]:
-    rows: list[tuple[str, ...]] = []
-    errors = flight.end_effector_errors
-    for link, goal in flight.link_goals.items():
-        rows.append((f"Goal of {link}", _link_goal_text(goal)))
-        if link not in errors:
-            continue
-        error = errors[link]
-        at = goal.position - error.position
-        rows.append((f"Final position of {link}", f"({_format_vector(at)}) m"))
-        distance = f"{error.distance:.3g} m{_tolerance_text(flight, 'position', 'm')}"
-        rows.append((f"Position error of {link}", distance))
-        if goal.quaternion is not None:
-            angle = f"{error.angle:.3g} rad = {math.degrees(error.angle):.3g}°"
-            tolerance = _tolerance_text(flight, "attitude", "rad")
-            rows.append((f"Attitude error of {link}", f"{angle}{tolerance}"))
-    return rows
 
 
 def joint_table(flight: FlightReport) -> Table | None:
@@ -341,6 +288,10 @@ def _count_decimals(x: float) -> int:
     return 0 if "e" in text or text.endswith(".0") else len(text.partition(".")[2])
 
 
+def _position_text(position: Array) -> str:
+    return f"({_format_vector(position)}) m"
+
+
 def _format_vector(values: Iterable[float]) -> str:
     return ", ".join(_format_number(x) for x in values)
 
@@ -355,27 +306,14 @@ def _format_attitude(rotvec: Iterable[float]) -> str:
     return f"rotation vector ({_format_vector(rotvec)}) rad, {angle:.3f}° in all"
 
 
-def _tolerance_text(flight: FlightReport, part: str, unit: str) -> str:
-    value = flight.tolerance("position" if part == "position" else "attitude")
-    return "" if value is None else f" (tolerance {value:.3g} {unit})"
+def _tolerance_text(flight: FlightReport, part: Literal["position", "attitude"]) -> str:
+    value, unit = flight.tolerance(part), "m" if part == "position" else "rad"
+    return "" if value is None else f"{value:.3g} {unit}"
 
 
-def _schedules_text(flight: FlightReport) -> str:
-    count = len(flight.executing)
-    return f", {count} schedules in the whole flight" if count > 1 else ""
-
-
-def _time_to_end_text(flight: FlightReport) -> str:
+def _time_to_end_texts(flight: FlightReport) -> list[str]:
     """Return the time to the end if it differs from that of the schedules; else nothing."""
     whole, flown = flight.time_to_end, flight.time_flown
     if whole is None or flown is None or abs(whole - flown) < _EQUAL_TIME_TICKS * flight.tick:
-        return ""
-    return f"{whole:.6g} s from the first schedule to the end"
-
-
-def _recorded_text(flight: FlightReport) -> str:
-    time = flight.position.time
-    if len(time) < 2:
-        return "1 state"
-    tick = flight.tick
-    return f"{time[-1] - time[0]:.6g} s, {len(time) - 1} ticks of {tick:.4g} s"
+        return []
+    return [f"{whole:.6g} s from the first schedule to the end"]

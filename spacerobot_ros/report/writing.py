@@ -54,7 +54,9 @@ from spacerobot_ros.report.figures_space import (
 )
 from spacerobot_ros.report.flight import FlightReport, read_report
 from spacerobot_ros.report.page import page
-from spacerobot_ros.report.scene import player_of, scene_of
+from spacerobot_ros.report.player import player_of, view_of_flight
+from spacerobot_ros.report.scene import bodies_of
+from spacerobot_ros.report.solids import MAX_MESH_FACES, corner_points, placed_solids
 from spacerobot_ros.resources import suggestion
 
 _PAPER_WIDTHS = (40.0, 400.0)
@@ -87,24 +89,8 @@ FIGURES: dict[str, Callable[[FlightReport], ReportFigure | str | None]] = {
 }
 """The figures of :func:`write_figures`, by name."""
 
-_REPORT_FIGURES = (
-    configurations_figure,
-    position_figure,
-    attitude_figure,
-    cycles_figure,
-    shape_figure,
-    rates_figure,
-    loops_figure,
-    errors_figure,
-    link_errors_figure,
-    sensors_figure,
-    efforts_figure,
-    thrusters_figure,
-    twist_figure,
-    clearance_figure,
-    momentum_figure,
-    momentum_budget_figure,
-)
+_REPORT_FIGURES = tuple(draw for name, draw in FIGURES.items() if name not in ("pose", "path"))
+"""Figures of a report, which has position and attitude apart, and a figure of all paths."""
 
 
 def write_report(
@@ -125,7 +111,7 @@ def write_report(
     others = [read_report(other) for other in beside]
     with drawing():
         figures = [*(draw(flight) for draw in _REPORT_FIGURES), path_figure(flight, others)]
-        text = page(flight, player_of(scene_of(flight)), figures, others)
+        text = page(flight, player_of(view_of_flight(flight)), figures, others)
     write_output(html, text)
 
 
@@ -236,8 +222,10 @@ def _overview_figure(flight: FlightReport) -> Figure:
     groups = [position_group(flight), attitude_group(flight)]
     if len(flight.shape):
         groups += shape_groups(flight)[:1]
-    drawn = flight.drawn
-    robot = drawn.at(flight.joints[-1], flight.base_at(-1)) if drawn is not None else None
+    robot = None
+    if not flight.hidden_links_text:
+        last = [len(flight.position) - 1]
+        robot = placed_solids(bodies_of(flight, last, MAX_MESH_FACES), 0)
     height, gap, left = 1.25, 0.42, 0.72
     up = 0.5 + (height + gap) * len(groups) + 0.35
     figure = new_figure(up)
@@ -254,7 +242,7 @@ def _overview_figure(flight: FlightReport) -> Figure:
         size = _ROBOT_PANEL_WIDTH - 0.15
         axes = panel(figure, WIDTH - size - 0.1, 0.2, size, up - 1.0)
         view = view_of(flight)
-        draw_robot(axes, robot, robot.corner_points(), view)
+        draw_robot(axes, robot, corner_points(robot), view)
         legend_above(axes, draw_goal_and_path(axes, flight, view))
     title = ": ".join(filter(None, (flight.scenario.name, flight.scenario.description)))
     figure.text(0.1 / WIDTH, 1 - 0.24 / up, title, size=10.5, weight="bold")

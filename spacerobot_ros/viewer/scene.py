@@ -8,6 +8,7 @@ some, stay out of them.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from enum import Enum
 from typing import TYPE_CHECKING, Any
 
@@ -110,7 +111,7 @@ class RobotDrawing:
         self._names: list[Any] | None = None
         meshes = meshes_from_files(robot, _MAX_MESH_TRIANGLES, on_note)
         self._solids = [
-            self._add_visual(f"{paths[visual.link]}/{number}", visual)
+            _draw_solid(scene, f"{paths[visual.link]}/{number}", visual, color)
             for number, visual in enumerate(visuals_of(robot, meshes, _MAX_MESH_TRIANGLES))
         ]
         self._robot, self._paths = robot, paths
@@ -122,34 +123,14 @@ class RobotDrawing:
             paths[joint.child] = f"{paths[joint.parent]}/link{len(paths)}"
         return paths
 
-    def _add_visual(self, path: str, visual: Visual) -> Any:
-        red, green, blue, alpha = visual.shape.rgba
-        solid = self._color is None
-        look: dict[str, Any] = {"cast_shadow": solid, "receive_shadow": solid}
-        look["color"] = self._color or tuple(round(255 * x) for x in (red, green, blue))
-        if not solid:
-            look["opacity"] = GHOST_OPACITY
-        elif alpha < 1.0:
-            look["opacity"] = alpha
-        mesh = visual.mesh
-        faces = mesh.faces.astype(np.uint32)
-        return self._scene.add_mesh_simple(path, mesh.vertices, faces, flat_shading=True, **look)
-
     def show_collision_shapes(self, *, visible: bool) -> None:
         """Show or hide the shapes by which distances between links are measured."""
         if self._collision_shapes is None:
             if not visible:
                 return
             self._collision_shapes = [
-                self._scene.add_mesh_simple(
-                    f"{self._paths[visual.link]}/collision{number}",
-                    visual.mesh.vertices,
-                    visual.mesh.faces.astype(np.uint32),
-                    color=_COLLISION,
-                    opacity=GHOST_OPACITY,
-                    flat_shading=True,
-                    cast_shadow=False,
-                    receive_shadow=False,
+                _draw_solid(
+                    self._scene, f"{self._paths[visual.link]}/collision{number}", visual, _COLLISION
                 )
                 for number, visual in enumerate(collision_visuals(self._robot))
                 if len(visual.mesh.faces)
@@ -206,19 +187,29 @@ def draw_obstacles(
     list[viser.MeshHandle]
         The meshes.
     """
-    drawn = []
-    for number, (visual, pose) in enumerate(obstacle_visuals(world)):
-        red, green, blue, _ = visual.shape.rgba
-        drawn.append(
-            scene.add_mesh_simple(
-                f"{path}/{number}",
-                visual.mesh.vertices @ pose.R.T + pose.r,
-                visual.mesh.faces.astype(np.uint32),
-                color=(round(255 * red), round(255 * green), round(255 * blue)),
-                flat_shading=True,
-            )
-        )
-    return drawn
+    return [
+        _draw_solid(scene, f"{path}/{number}", replace(visual, mesh=visual.mesh.moved(pose)))
+        for number, (visual, pose) in enumerate(obstacle_visuals(world))
+    ]
+
+
+def _draw_solid(
+    scene: viser.SceneApi, path: str, visual: Visual, color: Color | None = None
+) -> viser.MeshHandle:
+    """Draw a solid in the color of its shape, with shadows; or see-through in another color."""
+    red, green, blue, alpha = visual.shape.rgba
+    own = round(255 * red), round(255 * green), round(255 * blue)
+    opacity = (alpha if alpha < 1.0 else None) if color is None else GHOST_OPACITY
+    return scene.add_mesh_simple(
+        path,
+        visual.mesh.vertices,
+        visual.mesh.faces.astype(np.uint32),
+        color=color or own,
+        opacity=opacity,
+        flat_shading=True,
+        cast_shadow=color is None,
+        receive_shadow=color is None,
+    )
 
 
 def reach_of(robot: RobotDescription) -> float:

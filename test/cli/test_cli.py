@@ -6,6 +6,7 @@ import json
 import os
 import subprocess
 import sys
+from html import escape
 from pathlib import Path
 
 import click
@@ -454,6 +455,16 @@ def test_goals_and_flights_that_are_refused(words: list[str], sentence: str) -> 
     result = CliRunner().invoke(main, words)
     assert result.exit_code == 2
     assert sentence in " ".join(result.stderr.split())
+
+
+def test_a_refused_goal_has_its_report_if_asked(tmp_path: Path) -> None:
+    bag, html = tmp_path / "a.mcap", tmp_path / "a.html"
+    goal = ("--goal", "50", "0", "0", "0", "0", "0", "1")
+    words = ["run", "sliding_masses", *goal, "--bag", str(bag), "--report", str(html)]
+    result = CliRunner().invoke(main, words)
+    assert result.exit_code == 1
+    assert result.stdout == f"report      {html}\n"
+    assert escape(result.stderr.strip()) in html.read_text("utf-8")
 
 
 @pytest.mark.parametrize(

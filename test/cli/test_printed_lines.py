@@ -232,10 +232,10 @@ def test_the_clearance_has_a_line(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_flight_that_misses_its_goal_is_exit_1_and_the_sentence(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    missed = {"succeeded": False, "state": "failed", "message": "The goal is not reached."}
+    missed = {"succeeded": False, "state": "reached", "verdict": "The true pose is 0.1 m off."}
     result = run(monkeypatch, SUMMARY | missed, *GOAL)
     assert result.exit_code == 1
-    assert result.stderr == "The goal is not reached.\n"
+    assert result.stderr == "The true pose is 0.1 m off.\n"
 
 
 def test_an_interrupted_flight_says_how_its_report_is_made(

@@ -44,7 +44,7 @@ HELD_BY_TESTS = [
         "docs/theory/square_path.md",
         "The paper's laws also start from joint rates that are not zero (its property 3), and so "
         "do these",
-        "flight/test_from_joint_rates.py::test_the_chain_is_turned_from_moving_joints",
+        "flight/test_lockstep_flight.py::test_the_chain_is_turned_from_moving_joints",
     ),
     (
         "docs/theory/wheels.md",

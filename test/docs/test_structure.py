@@ -36,7 +36,7 @@ def test_what_draws_a_robot_is_counted_in_modules_that_are_there(tmp_path: Path)
         copy.parent.mkdir(parents=True, exist_ok=True)
         copy.write_text("x = 1\n" * 3)
     counts = structure(tmp_path)
-    assert [counts[what] for what in DRAWING] == [3, 3, 3]
+    assert [counts[what] for what in DRAWING] == [3, 3, 6]
     assert prepared("{{ lines report/solids.py model/visuals.py }}") == str(
         sum(file.read_bytes().count(b"\n") for file in (files[0], files[-1]))
     )

@@ -7,8 +7,7 @@ import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -20,13 +19,12 @@ from spacerobot_ros import fly, load_scenario, plan, read_bag
 from spacerobot_ros.control.laws.registry import LAWS
 from spacerobot_ros.control.laws.transposed_jacobian import TransposedJacobianLaw
 from spacerobot_ros.errors import GoalError, ParameterError, PlanningError, RecordingError
-from spacerobot_ros.flight import api
-from spacerobot_ros.flight.flight import Signal
-from spacerobot_ros.measures import Outcome
+from spacerobot_ros.flight.api import scenario_to_fly
+from spacerobot_ros.flight.series import Signal
 from spacerobot_ros.model import SpaceRobot, load_robot
 from spacerobot_ros.planning import Goal
+from spacerobot_ros.planning.api import end_effector_goals
 from spacerobot_ros.resources import robot_file
-from spacerobot_ros.scenario import Scenario
 
 QUICK = {"planner.lie_bracket.t1": 2.0, "planner.lie_bracket.cycle_period": 1.0}
 
@@ -215,9 +213,14 @@ def test_a_flight_is_saved_once_unless_it_may_replace_what_is_there(tmp_path: Pa
 
 
 class _HalfLaw(TransposedJacobianLaw):
-    """A law that is in no registry."""
+    """A law that is in no registry; ``thresholds`` are those of the laws that were built."""
 
     name = "half"
+    thresholds: ClassVar[list[float]] = []
+
+    def __init__(self, *given: Any, **options: Any) -> None:
+        super().__init__(*given, **options)
+        self.thresholds.append(self.singular_value_threshold)
 
 
 @pytest.fixture
@@ -230,12 +233,14 @@ def _laws() -> Iterator[None]:
 
 
 @pytest.mark.usefixtures("_laws")
-def test_a_flight_takes_a_law_of_ones_own_and_its_options() -> None:
-    short = QUICK | {"coordinated_control.time_limit": 0.3}
-    options = {"singular_value_threshold": 0.25}
-    flight = fly("coordinated_control", law=_HalfLaw, law_options=options, parameters=short)
-    assert flight.method == "half"
-    assert flight.scenario.controller.options["half"].singular_value_threshold == 0.25
+def test_a_flight_takes_a_law_that_is_in_no_registry() -> None:
+    short = {"coordinated_control.time_limit": 0.05}
+    for options in ({"singular_value_threshold": 0.25}, None):
+        flight = fly("coordinated_control", law=_HalfLaw, law_options=options, parameters=short)
+        assert flight.method == "half"
+    assert _HalfLaw.thresholds == [0.25, 0.1]
+    assert fly("coordinated_control", parameters=short).method == "transposed_jacobian"
+    assert len(_HalfLaw.thresholds) == 2
 
 
 @pytest.mark.slow
@@ -267,27 +272,18 @@ def test_a_law_that_nothing_can_use_is_refused(
     assert_one_sentence(str(refused.value), *words)
 
 
-@pytest.fixture
-def asked(monkeypatch: pytest.MonkeyPatch) -> list[Scenario]:
-    """Scenarios of flights, which are not flown."""
-    found: list[Scenario] = []
-
-    def fly_none(scenario: Scenario) -> SimpleNamespace:
-        found.append(scenario)
-        return SimpleNamespace(outcome=Outcome.REACHED)
-
-    monkeypatch.setattr(api, "fly_scenario", fly_none)
-    return found
-
-
-def test_a_flight_takes_the_goals_that_a_plan_takes(asked: list[Scenario]) -> None:
+def test_a_flight_takes_the_goals_that_a_plan_takes() -> None:
     at, hand = (0.25, -0.5, 0.125), (1.0, 2.0, 3.0)
-    fly("sliding_masses", position=at)
-    fly("reach", end_effector_position=hand, end_effector="hand")
-    fly("reach", end_effector_position=hand, end_effector="hand", position=at)
-    fly("reach", end_effector_position=hand, end_effector="hand", rotvec=(0.0, 0.0, 0.5))
-    fly("reach", (*at, 0.0, 0.0, 0.0, 1.0), end_effector_position=hand, end_effector="hand")
-    goals = [scenario.goal for scenario in asked]
+    hands = end_effector_goals(hand, None, "hand")
+    turn, pose = (0.0, 0.0, 0.5), (*at, 0.0, 0.0, 0.0, 1.0)
+    scenarios = [
+        scenario_to_fly("sliding_masses", position=at),
+        scenario_to_fly("reach", hands=hands),
+        scenario_to_fly("reach", position=at, hands=hands),
+        scenario_to_fly("reach", rotvec=turn, hands=hands),
+        scenario_to_fly("reach", pose, hands=hands),
+    ]
+    goals = [scenario.goal for scenario in scenarios]
     np.testing.assert_allclose(goals[0].position, at)
     for goal in goals[1:]:
         (aim,) = goal.end_effectors

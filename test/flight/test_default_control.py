@@ -119,6 +119,18 @@ def test_a_way_that_ends_early_is_no_stall(tmp_path: Path) -> None:
     assert not [each for _, each in statuses(flight) if each.state is ControllerState.STALLED]
 
 
+def test_a_goal_that_only_the_settling_time_misses_says_so(tmp_path: Path) -> None:
+    flight = flown(
+        tmp_path, "cube", 5.0, base=np.array([0.1, 0.0, 0.0]), settle_time=50.0, time_limit=40.0
+    )
+    assert flight.outcome is Outcome.FAILED
+    assert np.linalg.norm(flight.pose[-1][:3] - [0.1, 0.0, 0.0]) < 1e-3
+    words = ", within tolerance for less than the settling time of 50 s."
+    for sentence in (flight.message, flight.verdict.sentence):
+        assert sentence.startswith("The goal is not reached in time: ")
+        assert sentence.endswith(words)
+
+
 # -- robots that come no nearer ---------------------------------------------------------------
 
 
@@ -128,7 +140,11 @@ def stalls(flight: Flight) -> tuple[float, ControllerStatus]:
     assert {each.state.level for _, each in found} == {1}
     assert flight.outcome is Outcome.FAILED, flight.message
     cause = found[-1][1].message.removesuffix(".").split("reference: ")[1]
-    assert flight.message.startswith(f"The goal is not reached in time, as {cause}: ")
+    beginning = f"The goal is not reached in time, as {cause}: "
+    assert flight.message.startswith(beginning)
+    assert flight.verdict.sentence.startswith(beginning)
+    if "at the joints" in flight.message:
+        assert "at the joints" in flight.verdict.sentence
     return found[0]
 
 

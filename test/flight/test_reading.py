@@ -17,7 +17,7 @@ from support.flight_bags import urdf_of
 from support.made_bags import array, joint_states, made_bag, odometry, pose, stamped
 
 from spacerobot_ros.errors import RecordingError
-from spacerobot_ros.flight.flight import Flight, Signal
+from spacerobot_ros.flight.flight import Flight
 from spacerobot_ros.flight.reading import (
     FlightBag,
     impulse,
@@ -26,6 +26,7 @@ from spacerobot_ros.flight.reading import (
     read_run,
     recorded_scenario,
 )
+from spacerobot_ros.flight.series import Signal
 from spacerobot_ros.measures import Outcome
 
 TURNED = (0.5, -0.1, 0.7, 0.5)

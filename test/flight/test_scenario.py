@@ -239,11 +239,13 @@ def test_a_misspelt_name_gets_a_suggestion(name: str, suggested: str) -> None:
 def test_parameters_that_differ_between_scenarios() -> None:
     first = load_scenario("sliding_masses")
     second = first.with_overrides("planner", {"position_tolerance": 0.125, "max_corrections": 7})
+    second = second.with_overrides("plant", {"sensors.position_bias": [0.25, 0, 1e-3]})
     third = second.with_overrides("plant", {"robot_description": "<robot/>"})
     base = str(first.parameters("planner")["position_tolerance"])
     assert different_parameters([first, second, third]) == [
-        ("planner.position_tolerance", base, "0.125", "0.125"),
+        ("planner.position_tolerance (m)", base, "0.125", "0.125"),
         ("planner.max_corrections", "3", "7", "7"),
+        ("plant.sensors.position_bias (m)", "–", "0.25, 0, 0.001", "0.25, 0, 0.001"),
     ]
     assert different_parameters([first, first]) == []
     # What one alone gives, as its default, is no difference.

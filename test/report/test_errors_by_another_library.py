@@ -19,10 +19,12 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from support.command_line import CliRunner
 from support.html_page import Page
 
 from spacerobot_ros import fly, read_run
 from spacerobot_ros.cli.flights import _summary_lines
+from spacerobot_ros.cli.main import main
 from spacerobot_ros.flight.flight import Flight
 from spacerobot_ros.flight.reading import open_flight_bag, read_flight
 from spacerobot_ros.measures import Outcome, metrics_of_each
@@ -292,7 +294,7 @@ def test_errors_of_recorded_flights(name: str, position_counts: bool) -> None:
 def test_a_goal_that_only_the_measured_pose_reaches_is_not_called_reached(tmp_path: Path) -> None:
     """The position is measured 0.1 m off; its tolerance is 0.001 m."""
     flight, bag = fly("faults/biased_pose"), tmp_path / "biased.mcap"
-    assert flight.succeeded
+    assert (flight.succeeded, flight.succeeded_by_measurement) == (False, True)
     flight.save(bag)
     assert truth_in(bag).distance == pytest.approx(0.1, abs=1e-3)
     read = read_flight(open_flight_bag(bag))
@@ -302,6 +304,8 @@ def test_a_goal_that_only_the_measured_pose_reaches_is_not_called_reached(tmp_pa
     assert_all_say(bag, read, position_counts=True)
     report = page(FlightReport.of(open_flight_bag(bag)), PagePart(""), [])
     assert '<p class="outcome reached partly"><b>Reached by the measured pose</b>' in report
+    command = CliRunner().invoke(main, ["run", "faults/biased_pose", "--bag", f"{bag}.again"])
+    assert (command.exit_code, command.stderr) == (1, f"{flight.verdict.sentence}\n")
     # With sensors that do not err the same goal is reached.
     believed = fly(load_scenario("faults/biased_pose").with_overrides("plant", {"faults": [""]}))
     assert (believed.verdict.word, believed.verdict.complete) == ("Reached", True)

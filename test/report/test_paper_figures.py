@@ -17,7 +17,7 @@ from support.sentences import assert_one_sentence
 
 from spacerobot_ros.cli.main import main
 from spacerobot_ros.errors import SpaceRobotError
-from spacerobot_ros.flight.flight import Signal
+from spacerobot_ros.flight.series import Signal
 from spacerobot_ros.report import write_figures, write_picture
 from spacerobot_ros.report.figures import PictureFormat, TraceGroup, angle_unit, drawing, sheet
 from spacerobot_ros.report.figures_over_time import range_without_peaks

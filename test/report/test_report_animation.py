@@ -14,13 +14,14 @@ from support.chromium import Browser, browser, chromium
 from support.flight_bags import FINAL, GOAL, Story, cyclic_shapes, tell, urdf_of
 from support.html_page import leave_blank
 
-from spacerobot_ros.flight.flight import Signal
+from spacerobot_ros.flight.series import Signal
 from spacerobot_ros.model.description import Array, Pose, Shape
 from spacerobot_ros.model.rotations import matrix_from_quaternion, quaternion_from_rotvec
 from spacerobot_ros.model.visuals import solid_mesh
-from spacerobot_ros.report import scene, write_report
+from spacerobot_ros.report import player, write_report
 from spacerobot_ros.report.flight import FlightReport, read_report
-from spacerobot_ros.report.scene import Command, Scene, key_frames, scene_of
+from spacerobot_ros.report.player import WORLD, View3D, key_frames, view_of_flight
+from spacerobot_ros.report.scene import bodies_of
 from spacerobot_ros.report.signals import Cycles
 
 N = 6
@@ -88,67 +89,39 @@ def test_fast_cycles_are_shown_at_one_phase() -> None:
 
 
 def test_links_are_where_pinocchio_has_them(flight: FlightReport) -> None:
-    scene = scene_of(flight)
-    assert isinstance(scene, Scene)
-    tree = Tree(scene.commands)
+    view = view_of_flight(flight)
+    assert isinstance(view, View3D)
+    (animation,) = [each for each in view.commands if each["type"] == "set_animation"]
     model = pin.buildModelFromXML(urdf_of(N), pin.JointModelFreeFlyer())
     data = model.createData()
     order = [model.joints[model.getJointId(f"joint_{i}")].idx_q for i in range(N)]
-    for k, time in enumerate(tree.times):
-        index = int(np.argmin(np.abs(flight.position.time - time)))
-        q = pin.neutral(model)
-        q[:3], q[3:7] = flight.position.values[index], flight.quaternion[index]
-        q[order] = flight.shape.values[index]
-        pin.framesForwardKinematics(model, data, q)
-        for i in range(N):
-            expected = data.oMf[model.getFrameId(f"link_{i}")].homogeneous
-            np.testing.assert_allclose(tree.pose(f"link link_{i}", k), expected, atol=5e-5)
-
-
-class Tree:
-    """What a viewer makes of the commands: a tree of transforms, some of which move."""
-
-    def __init__(self, commands: list[Command]) -> None:
-        self._still: dict[str, Array] = {}
-        self._moving: dict[str, dict[str, Array]] = {}
-        for command in commands:
-            if command["type"] == "set_transform":
-                self._still[command["path"]] = np.reshape(command["matrix"], (4, 4)).T
-            elif command["type"] == "set_animation":
-                for each in command["animations"]:
-                    tracks = each["clip"]["tracks"]
-                    self.times = np.array(tracks[0]["times"])
-                    self._moving[each["path"]] = {
-                        track["name"]: np.reshape(track["values"], (len(self.times), -1))
-                        for track in tracks
-                    }
-
-    def pose(self, name: str, frame: int) -> Array:
-        """Pose in the world of the one path that ends so."""
-        (path,) = [path for path in self._still if path.endswith(f"/{name}")]
-        parts = path.split("/")
-        pose = np.eye(4)
-        # Below "/flight", which moves and scales the world to fit the picture.
-        for depth in range(3, len(parts) + 1):
-            here = "/".join(parts[:depth])
-            local = self._still.get(here, np.eye(4)).copy()
-            tracks = self._moving.get(here, {})
-            if ".position" in tracks:
-                local[:3, 3] = tracks[".position"][frame]
-            if ".quaternion" in tracks:
-                local[:3, :3] = matrix_from_quaternion(tracks[".quaternion"][frame])
-            pose = pose @ local
-        return pose
+    moved = {each["path"]: each["clip"]["tracks"] for each in animation["animations"]}
+    assert moved.keys() == {f"{WORLD}/base_link", *(f"{WORLD}/link_{i}" for i in range(N))}
+    for path, (position, quaternion) in moved.items():
+        assert (position["name"], quaternion["name"]) == (".position", ".quaternion")
+        places = np.reshape(position["values"], (-1, 3))
+        turns = np.reshape(quaternion["values"], (-1, 4))
+        for time, r, attitude in zip(position["times"], places, turns, strict=True):
+            index = int(np.argmin(np.abs(flight.position.time - time)))
+            q = pin.neutral(model)
+            q[:3], q[3:7] = flight.position.values[index], flight.quaternion[index]
+            q[order] = flight.shape.values[index]
+            pin.framesForwardKinematics(model, data, q)
+            expected = data.oMf[model.getFrameId(path.rpartition("/")[2])]
+            np.testing.assert_allclose(r, expected.translation, atol=2e-5)
+            np.testing.assert_allclose(
+                matrix_from_quaternion(attitude), expected.rotation, atol=5e-5
+            )
 
 
 def test_a_gait_can_be_looked_at_in_parts(tmp_path: Path) -> None:
     shapes = cyclic_shapes(slide=100, cycles=40)
-    scene = scene_of(read_report(tell(tmp_path / "flight.mcap", Story(shapes))))
-    assert isinstance(scene, Scene)
-    names = [name for name, _, _ in scene.parts]
+    view = view_of_flight(read_report(tell(tmp_path / "flight.mcap", Story(shapes))))
+    assert isinstance(view, View3D)
+    names = [name for name, _, _ in view.parts]
     assert names == ["whole flight", "first 5 s", "first 3 cycles", "last 3 cycles"]
-    assert [end - start for _, start, end in scene.parts[2:]] == pytest.approx([4.5, 4.5])
-    assert "always at the same phase" in scene.caption
+    assert [end - start for _, start, end in view.parts[2:]] == pytest.approx([4.5, 4.5])
+    assert "always at the same phase" in view.caption
 
 
 def test_meshes_that_a_bag_carries_are_drawn(tmp_path: Path) -> None:
@@ -158,29 +131,28 @@ def test_meshes_that_a_bag_carries_are_drawn(tmp_path: Path) -> None:
     assert "Meshes are not drawn." in bare.missing_meshes
     carried = replace(bare, meshes={"package://robot/dish.stl": mesh})
     assert carried.missing_meshes == ""
-    faces = []
+    drawn = []
     for each in (bare, carried):
-        assert each.drawn is not None
-        faces.append(len(each.drawn.at(each.joints[0], each.base_at(0)).faces))
-    assert faces[1] == faces[0] + 12
-    geometries = []
-    for each in (bare, carried):
-        scene = scene_of(each)
-        assert isinstance(scene, Scene)
-        objects = [c["object"] for c in scene.commands if c["type"] == "set_object"]
-        geometries.append([o["geometries"][0] for o in objects if o["object"]["type"] == "Mesh"])
-    (drawn,) = [g for g in geometries[1] if g["type"] == "BufferGeometry"]
-    corners = np.reshape(drawn["data"]["attributes"]["position"]["array"], (-1, 3))
-    index = np.reshape(drawn["data"]["index"]["array"], (-1, 3))
+        bodies = bodies_of(each, [0], 10_000)
+        view = view_of_flight(each)
+        assert isinstance(view, View3D)
+        objects = [c["object"] for c in view.commands if c["type"] == "set_object"]
+        geometries = [o["geometries"][0] for o in objects if o["object"]["type"] == "Mesh"]
+        drawn.append((sum(len(body.visuals) for body in bodies), geometries))
+    # The ghost at the goal, too, has the mesh.
+    assert drawn[1][0] == drawn[0][0] + 1
+    more = [each for each in drawn[1][1] if each["uuid"] not in {g["uuid"] for g in drawn[0][1]}]
+    (geometry,) = more
+    corners = np.reshape(geometry["data"]["attributes"]["position"]["array"], (-1, 3))
+    index = np.reshape(geometry["data"]["index"]["array"], (-1, 3))
     np.testing.assert_allclose(corners[index], mesh.vertices[mesh.faces], atol=1e-5)
-    assert len(geometries[1]) == len(geometries[0]) + 1
 
 
 @pytest.mark.slow
 def test_without_the_viewer_a_sentence_says_so(
     bag: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(scene, "viewer_script", lambda: None)
+    monkeypatch.setattr(player, "viewer_script", lambda: None)
     leave_blank(monkeypatch)
     write_report(bag, tmp_path / "report.html")
     text = (tmp_path / "report.html").read_text(encoding="utf-8")
@@ -237,6 +209,8 @@ def test_the_robot_is_seen_to_move(page: Path, window: Browser) -> None:
     final[:3, :3] = matrix_from_quaternion(quaternion_from_rotvec(FINAL[1]))
     final[:3, 3] = FINAL[0]
     np.testing.assert_allclose(base_in(window), final, atol=1e-4)
+    # The page has one player: that of the viewer does not show.
+    assert window.evaluate("[...document.querySelectorAll('.dg')].every(e => !e.offsetHeight)")
     assert window.complaints == []
     assert [url for url in window.requests if not url.startswith("data:")] == [page.as_uri()]
 
@@ -245,7 +219,8 @@ def base_in(window: Browser) -> Any:
     """Pose of the base link in the world frame, as the viewer has it."""
     matrix = window.evaluate(
         "(() => { const at = (path) => flightViewer.scene_tree.find(path).object.matrixWorld;"
-        "return at(['flight']).clone().invert().multiply(at(['flight', 'robot'])).toArray(); })()"
+        "return at(['flight']).clone().invert()"
+        ".multiply(at(['flight', 'base_link'])).toArray(); })()"
     )
     return np.reshape(matrix, (4, 4)).T
 

@@ -17,11 +17,12 @@ from support.chromium import Browser, browser, chromium
 from support.flight_bags import GOAL, TICK, Story, goal_value, tell
 from support.html_page import leave_blank
 
-from spacerobot_ros.flight.flight import Signal
-from spacerobot_ros.report import scene, write_report
+from spacerobot_ros.flight.series import Signal
+from spacerobot_ros.report import write_report
 from spacerobot_ros.report.figures_over_time import shape_figure
 from spacerobot_ros.report.flight import FlightReport, read_report
 from spacerobot_ros.report.page import charts_of, thin_out
+from spacerobot_ros.report.player import View3D, player_of
 
 with_browser = pytest.mark.skipif(chromium() is None, reason="no Chromium to look at the page with")
 
@@ -80,8 +81,8 @@ def chart(window: Browser, number: int, expression: str) -> Any:
 @pytest.mark.slow
 @with_browser
 def test_charts_have_the_numbers_of_the_bag(window: Browser, flight: FlightReport) -> None:
-    assert window.evaluate("flightCharts.charts.length") == 9
-    assert window.evaluate("document.querySelectorAll('figure.live').length") == 5
+    assert window.evaluate("flightCharts.charts.length") == 11
+    assert window.evaluate("document.querySelectorAll('figure.live').length") == 6
     assert window.evaluate("getComputedStyle(document.querySelector('.live .scroll')).display") == (
         "none"
     )
@@ -108,10 +109,10 @@ def test_events_of_one_kind_at_once_are_counted(tmp_path: Path) -> None:
     figure = shape_figure(flight)
     data = charts_of(flight, [figure]).data["charts"]["events"]
     assert [event["text"] for event in data] == [
-        "fault on: joint_slow j 0.5 at 1",
-        "fault on: actuator_bias j 0.01 at 1 (+1)",
+        "fault on: joint_slow j 0.5 at 1 s",
+        "fault on: actuator_bias j 0.01 at 1 s (+1)",
         "stuck joint: j",
-        "fault on: joint_stuck j at 2",
+        "fault on: joint_stuck j at 2 s",
     ]
 
 
@@ -133,7 +134,7 @@ def test_what_happened_stands_once_below_the_first_chart(window: Browser) -> Non
     rows = {mark[1].split(":")[0]: mark[3] for mark in marks}
     assert rows["fault on"] == rows["fault off"] != rows["stuck joint"] != rows["takeover"]
     seen = window.evaluate("document.querySelector('.lane').innerText")
-    for words in ("fault on: joint_stuck j at 4", "stuck joint: j", "fault off", "takeover"):
+    for words in ("fault on: joint_stuck j at 4 s", "stuck joint: j", "fault off", "takeover"):
         assert words in seen
     table = window.evaluate("document.getElementById('events').innerText")
     assert all(words in table for _, _, words in EVENTS)
@@ -266,7 +267,7 @@ def test_licences_of_the_programs_are_with_them(window: Browser) -> None:
 
 def test_every_licence_is_there_once_with_its_words() -> None:
     """And not its name alone, with who has the copyright."""
-    found = scene._licence_notices()
+    found = player_of(View3D([], [], "")).notices
     assert len({name for name, _ in found}) == len(found) >= 9
     for name, licence in found:
         assert len(licence) > 600, name

@@ -29,7 +29,9 @@ from spacerobot_ros.report.figures import ReportFigure, drawing, short
 from spacerobot_ros.report.figures_over_time import momentum_budget_figure, shape_groups
 from spacerobot_ros.report.figures_space import configurations_figure
 from spacerobot_ros.report.flight import FlightReport, read_report
-from spacerobot_ros.report.scene import TARGET, Scene, scene_of
+from spacerobot_ros.report.player import WORLD, View3D, view_of_flight
+from spacerobot_ros.report.scene import bodies_of
+from spacerobot_ros.report.solids import corner_points, placed_solids
 from spacerobot_ros.report.tables import joint_table, payload_text, result_table
 from spacerobot_ros.report.writing import _REPORT_FIGURES, FIGURES
 
@@ -246,12 +248,13 @@ def test_a_robot_without_inertia_has_a_sentence(monkeypatch: pytest.MonkeyPatch)
 
 
 BAG = Path(__file__).parents[2] / "bags" / "capture.mcap"
+TARGET = f"{WORLD}/target"
 
 
 @pytest.fixture(scope="module")
-def scene() -> Scene:
-    made = scene_of(read_report(BAG))
-    assert isinstance(made, Scene)
+def scene() -> View3D:
+    made = view_of_flight(read_report(BAG))
+    assert isinstance(made, View3D)
     return made
 
 
@@ -272,7 +275,7 @@ def odometry() -> tuple[Any, Any, Any]:
     return odometry_in(BAG)
 
 
-def test_the_target_has_the_solids_of_its_urdf(scene: Scene) -> None:
+def test_the_target_has_the_solids_of_its_urdf(scene: View3D) -> None:
     (described,) = (
         message.data for _, message in read_bag(BAG).messages("/target/robot_description")
     )
@@ -280,15 +283,13 @@ def test_the_target_has_the_solids_of_its_urdf(scene: Scene) -> None:
     drawn = [
         command
         for command in scene.commands
-        if command.get("path", "").startswith(f"{TARGET}/")
-        and "object" in command
-        and command["object"]["geometries"][0]["type"] not in ("BufferGeometry", "LineSegments")
+        if command.get("path", "").startswith(TARGET) and command["path"].endswith("/solid")
     ]
     assert len(drawn) == len(visuals) > 0
     assert "the target moves as target/odom says" in scene.caption
 
 
-def test_the_target_moves_as_its_odometry_says(scene: Scene, odometry: Any) -> None:
+def test_the_target_moves_as_its_odometry_says(scene: View3D, odometry: Any) -> None:
     times, positions, attitudes = odometry
     (animation,) = [c for c in scene.commands if c["type"] == "set_animation"]
     (moved,) = [c for c in animation["animations"] if c["path"] == TARGET]
@@ -316,8 +317,8 @@ def test_other_flights_have_no_target() -> None:
     report = read_report(BAG.with_name("planar_chain.mcap"))
     assert report.target is None
     assert len(report.target_pose) == 0
-    made = scene_of(report)
-    assert isinstance(made, Scene)
+    made = view_of_flight(report)
+    assert isinstance(made, View3D)
     assert "target" not in made.caption
     assert not any(command.get("path") == TARGET for command in made.commands)
 
@@ -336,8 +337,10 @@ def test_pictures_draw_the_target_where_it_is_held() -> None:
     )
     gone = np.linalg.norm(positions - positions[0], axis=1)
     assert gone[-1] > 0.5
-    for k in (0, len(times) // 2, len(times) - 1):
-        drawn = np.concatenate([face.corners for face in report.target_solids_at(times[k]).faces])
+    rows = (0, len(times) // 2, len(times) - 1)
+    target = [each for each in bodies_of(report, rows, 10_000) if each.name == "target"]
+    for instant, k in enumerate(rows):
+        drawn = corner_points(placed_solids(target, instant))
         wanted = positions[k] + attitudes[k].apply(corners)
         assert np.abs(drawn[:, None] - wanted[None]).max(axis=2).min(axis=1).max() < 1e-9
     figure = configurations_figure(report)

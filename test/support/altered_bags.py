@@ -32,12 +32,14 @@ def altered(
     injected: dict[int, str] | None = None,
     begin_ns: int = 0,
     node: str = "plant",
+    log_time: Callable[[int], int] = lambda time_ns: time_ns,
 ) -> Path:
     """Copy a bag with something changed.
 
     The message of that number on a topic, some of the parameters of a ``node``, or one text in the
     URDF that another takes the place of. ``injected`` adds messages on /fault_injection, by log
-    time; what was logged before ``begin_ns`` is left out.
+    time; what was logged before ``begin_ns`` is left out. ``log_time`` gives messages other log
+    times, ns.
     """
     count = 0
     with bag.open("rb") as source, out.open("wb") as target:
@@ -74,7 +76,11 @@ def altered(
                         continue
                     data = bytes(serialize_message(new))
             writer.add_message(
-                channels[channel.id], message.log_time, data, message.publish_time, message.sequence
+                channels[channel.id],
+                log_time(message.log_time),
+                data,
+                message.publish_time,
+                message.sequence,
             )
         if injected:
             text = writer.register_schema("std_msgs/msg/String", "ros2msg", b"string data")

@@ -13,7 +13,7 @@ import base64
 import hashlib
 import json
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from functools import cache, partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -57,8 +57,8 @@ from spacerobot_ros.report.flight import FlightReport, read_report
 from spacerobot_ros.report.page import charts_of, page
 from spacerobot_ros.report.page_parts import PagePart
 from spacerobot_ros.report.planning_figures import _planar_figure, _spatial_figure
-from spacerobot_ros.report.scene import scene_of
-from spacerobot_ros.report.solids import Edge, Face, View
+from spacerobot_ros.report.player import view_of_flight
+from spacerobot_ros.report.solids import PlacedSolid, View
 from spacerobot_ros.report.tables import (
     headline,
     joint_table,
@@ -120,7 +120,7 @@ PARTS: dict[str, Callable[[FlightReport], Any]] = {
     "page": _page,
     "charts": _charts,
     "3D view": lambda flight: _digest(
-        map(_command, getattr(scene_of(flight), "commands", ["none"]))
+        map(_command, getattr(view_of_flight(flight), "commands", ["none"]))
     ),
     "overview": lambda flight: prints_of(_overview_figure(flight)),
     **{
@@ -149,15 +149,13 @@ class _RecordingCanvas:
     def __init__(self, view: View, low: Any, high: Any, width: int) -> None:
         self.found.append(f"{_numbers(view.paper_axes)} {_numbers(low)} {_numbers(high)} {width}")
 
-    def draw(self, faces: list[Face], edges: list[Edge]) -> None:
-        for parts in (
-            [(f.corners, f.normal, f.fill) for f in faces],
-            [(e.line, e.normals, e.fill) for e in edges],
-        ):
+    def draw(self, solids: Sequence[PlacedSolid]) -> None:
+        for solid in solids:
+            parts = (solid.corners, solid.normals, solid.edges, solid.edge_normals, solid.fill)
             # A sum with weights of their own for all numbers.
-            numbers = np.concatenate([np.ravel(each) for part in parts for each in part])
+            numbers = np.concatenate([np.ravel(each) for each in parts])
             weights = 1.0 + np.arange(len(numbers)) % 101
-            self.found.append(f"{len(parts)} {_numbers(numbers @ weights)}")
+            self.found.append(f"{len(solid.corners)} {_numbers(numbers @ weights)}")
 
     def image(self) -> Any:
         return np.zeros((1, 1, 4))

@@ -23,7 +23,9 @@ def leave_blank(patch: pytest.MonkeyPatch) -> None:
 
 
 class Page(HTMLParser):
-    """A parsed report: its tables as rows of cells, its figures as SVG, all text and attributes."""
+    """A parsed report: its tables as rows of cells, its main numbers with their notes, its figures
+    as SVG, all text and attributes.
+    """
 
     _VOID = ("meta", "link", "img", "input", "br", "wbr")
 
@@ -35,7 +37,8 @@ class Page(HTMLParser):
         self.figures: dict[str, bytes] = {}
         self.scripts: list[str] = []
         self.text = ""
-        self._table = self._figure = ""
+        self.tiles: dict[str, str] = {}
+        self._table = self._figure = self._tile = ""
         self.feed(text)
         self.close()
         assert not self.open, f"left open: {self.open}"
@@ -71,8 +74,13 @@ class Page(HTMLParser):
         if {"style", "script"} & set(self.open):
             return
         self.text += data
+        if self.open[-1:] == ["dt"]:
+            self._tile = data
+            self.tiles[data] = ""
+        elif "dd" in self.open:
+            self.tiles[self._tile] += f"{data} "
         if {"td", "th"} & set(self.open[-2:]):
             self.tables[self._table][-1][-1] += data
 
     def number(self, label: str) -> str:
-        return {row[0]: row[1] for row in self.tables["numbers"]}[label]
+        return ({row[0]: row[1] for row in self.tables["numbers"]} | self.tiles)[label]

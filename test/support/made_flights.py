@@ -22,7 +22,8 @@ from spacerobot_ros.collision.geometry import LinkPair
 from spacerobot_ros.collision.nearest import Approach
 from spacerobot_ros.control.status import CommandReport, ControllerState, ControllerStatus
 from spacerobot_ros.events import Event, EventKind
-from spacerobot_ros.flight.flight import Flight, SentGoal, Signal
+from spacerobot_ros.flight.flight import Flight
+from spacerobot_ros.flight.series import SentGoal, Signal
 from spacerobot_ros.measures import Outcome
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.urdf import parse_robot
@@ -93,7 +94,7 @@ def _report(
         stamped=True,
         path=Path(f"{name}.mcap"),
         namespace=namespace,
-        parts=[SimpleNamespace(bag=SimpleNamespace(topics=kinds, attachments={}))],
+        bag=SimpleNamespace(topics=kinds, attachments={}),
         metadata=metadata,
         message_count=1234,
         names=lambda topic: named[topic],

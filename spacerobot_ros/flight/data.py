@@ -1,0 +1,627 @@
+"""The data of one flight: its arrays over time, the reports about it, its measures and verdict.
+
+A bag need not hold everything: parts are optional. A commander judges its goal by the measured
+state, at the moment of its decision. The verdict judges by the true state at the end, with the
+errors of :attr:`FlightData.error`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Literal
+
+import numpy as np
+
+from spacerobot_ros.commanding.goal_follower import Status
+from spacerobot_ros.control.status import CommandReport, ControllerStatus
+from spacerobot_ros.errors import RecordingError
+from spacerobot_ros.events import Event, EventKind
+from spacerobot_ros.flight.clearance import FlightClearance
+from spacerobot_ros.flight.series import Commands, SentGoal, Signal, pose_error
+from spacerobot_ros.measures import (
+    CaptureMeasures,
+    Measures,
+    Outcome,
+    flown_time,
+    momentum_drift,
+    peak,
+    peak_wrench,
+)
+from spacerobot_ros.messages.statuses import StatusRecord
+from spacerobot_ros.model.description import Array, RobotDescription, Shape
+from spacerobot_ros.model.kinematics import ForwardKinematics
+from spacerobot_ros.model.meshes import TriangleMesh, shape_mesh
+from spacerobot_ros.model.rotations import (
+    matrices_from_quaternions,
+    quaternion_inverse,
+    quaternion_multiply,
+    rotvecs_from_quaternions,
+)
+from spacerobot_ros.planning import METHODS, GaitSchedule, Goal, PoseError
+from spacerobot_ros.planning.core.goal import Controlled, Tolerance, uncontrolled_parts
+from spacerobot_ros.planning.execution.status import (
+    PlannerState,
+    PlannerStatus,
+    describe_remaining_error,
+)
+from spacerobot_ros.scenario import Scenario
+from spacerobot_ros.simulation.capture import capture_values, load_target
+from spacerobot_ros.simulation.commands import Refusal
+from spacerobot_ros.simulation.status import PlantStatus
+from spacerobot_ros.times import SECOND
+
+_QUANTITY_SIZES = {
+    **dict.fromkeys(("pose", "momentum", "measured_pose", "end_effector_pose"), 7),
+    **dict.fromkeys(("target_pose", "true_target_pose"), 7),
+    **dict.fromkeys(("twist", "measured_twist", "expected_momenta"), 6),
+    **dict.fromkeys(("target_twist", "true_target_twist"), 6),
+}
+"""Numbers per sample by quantity; other quantities have one number per joint."""
+
+_TRUE_QUANTITIES = ("pose", "twist", "q", "qdot", "effort", "momentum")
+
+_PARTS: frozenset[Controlled] = frozenset(("position", "attitude", "shape", "end_effectors"))
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """The end of a flight for people, by its last true state.
+
+    Attributes
+    ----------
+    word
+        The outcome in some words, such as ``Reached, but for the position``.
+    sentence
+        The message of the commander; of a goal that is reached, or not in time, the true errors
+        with their tolerances.
+    succeeded
+        Whether the goal is reached in truth, in the parts that are controlled, and the target
+        captured where that was to be automatic.
+    complete
+        Whether in addition every part of the goal was controlled.
+    """
+
+    word: str
+    sentence: str
+    succeeded: bool = False
+    complete: bool = False
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class FlightData:
+    """The data of a flight, from :func:`spacerobot_ros.fly` or from a bag.
+
+    All arrays are copies; those of a missing part have no rows.
+
+    Attributes
+    ----------
+    scenario
+        The scenario that was flown.
+    robot
+        The robot of the plant; None where a bag holds no description of it.
+    joint_names
+        The joints, in the order of columns.
+    series
+        All quantities of the plant by name, each with its times (s). The true ones are ``pose``
+        (N, 7), position (m) and quaternion (x, y, z, w) of the base in the world; ``twist`` (N, 6),
+        its velocities in its own frame, m/s and rad/s; ``q``, ``qdot``, ``effort`` (N, n), joint
+        positions (m or rad), rates and actuator efforts; ``momentum`` (N, 7), linear (kg m/s) and
+        angular momentum (kg m^2/s) in the world and kinetic energy (J). For the others see
+        :attr:`quantities`.
+    commands
+        The commands by topic.
+    statuses
+        Statuses of the commanders, with the stamp of the state that they answered, ns.
+    events
+        Events of the nodes.
+    outcome, message
+        The end of the goal, and the same for people.
+    goal, end_effector_goal
+        The goals that count at the end; None: there is none.
+    goals, end_effector_goals
+        All goals that were sent.
+    schedules
+        The gaits that were flown, each with the stamp of its beginning, ns; none of a bag.
+    plant_statuses, diagnostics, covariances
+        Statuses of the plant, diagnostics of plant and commanders, and covariances (72,) of
+        measured pose and twist, each with the time from which on it is published, ns; none of a
+        bag, nor covariances of sensors without errors.
+    status, gait
+        The last status of the commander that decides, and the planner's when its first gait began.
+    plan_time, wall_time
+        Wall time of planning, and of the whole flight, s; NaN where it is not known.
+    refusals
+        Commands that were refused: time (s), topic, reason.
+    measures_clearance
+        Whether the distances between links are measured: false where ``plant.clearance_period`` is
+        0, and of bags without the topic ``clearance``.
+    """
+
+    scenario: Scenario
+    robot: RobotDescription | None
+    joint_names: tuple[str, ...]
+    series: Mapping[str, Signal]
+    commands: Mapping[str, Commands]
+    statuses: tuple[tuple[int, Status], ...]
+    events: tuple[Event, ...]
+    outcome: Outcome
+    message: str
+    goal: Goal | None
+    end_effector_goal: Goal | None
+    goals: tuple[SentGoal, ...] = ()
+    end_effector_goals: tuple[SentGoal, ...] = ()
+    schedules: tuple[tuple[int, GaitSchedule], ...] = ()
+    plant_statuses: tuple[tuple[int, PlantStatus], ...] = ()
+    diagnostics: tuple[tuple[int, tuple[StatusRecord, ...]], ...] = ()
+    covariances: tuple[tuple[int, Array], ...] = ()
+    status: Status | None = None
+    gait: PlannerStatus | None = None
+    plan_time: float = math.nan
+    wall_time: float = math.nan
+    refusals: tuple[tuple[float, str, Refusal], ...] = ()
+    measures_clearance: bool = False
+
+    # -- arrays -------------------------------------------------------------------------------
+
+    def signal(self, name: str) -> Signal:
+        """Return a quantity over time; without samples where the flight does not have it."""
+        found = self.series.get(name)
+        if found is not None:
+            return found
+        usual = 7 if name.startswith("pose_of_") else len(self.joint_names)
+        return Signal.empty(_QUANTITY_SIZES.get(name, usual))
+
+    @property
+    def time(self) -> Array:
+        """(N,) times of the poses, s."""
+        return self.signal("pose").time
+
+    @property
+    def pose(self) -> Array:
+        """(N, 7) true positions (m) and quaternions (x, y, z, w) of the base in the world."""
+        return self.signal("pose").values
+
+    @property
+    def twist(self) -> Array:
+        """(N, 6) true velocities of the base in its own frame, m/s and rad/s."""
+        return self.signal("twist").values
+
+    @property
+    def q(self) -> Array:
+        """(N, n) true joint positions, m or rad."""
+        return self.signal("q").values
+
+    @property
+    def qdot(self) -> Array:
+        """(N, n) true joint rates, m/s or rad/s."""
+        return self.signal("qdot").values
+
+    @property
+    def effort(self) -> Array:
+        """(N, n) efforts of the joints' actuators, N or N m."""
+        return self.signal("effort").values
+
+    @property
+    def momentum(self) -> Array:
+        """(N, 7) linear (kg m/s) and angular momentum (kg m^2/s) in the world, energy (J)."""
+        return self.signal("momentum").values
+
+    @property
+    def quantities(self) -> dict[str, Array]:
+        """The quantities without an attribute of their own, (N, size) each.
+
+        Names are those of :class:`~spacerobot_ros.simulation.sensors.ReportedState`:
+        measured states (only where sensors err), the end-effector, thrusters, expected momenta.
+        """
+        return {
+            name: self.series[name].values for name in self.series if name not in _TRUE_QUANTITIES
+        }
+
+    def required_robot(self) -> RobotDescription:
+        """Return the robot.
+
+        Raises
+        ------
+        RecordingError
+            The flight has no description of it.
+        """
+        if self.robot is None:
+            raise RecordingError(
+                f"The flight of '{self.scenario.name}' has no description of its robot."
+            )
+        return self.robot
+
+    @cached_property
+    def target(self) -> RobotDescription | None:
+        """The body that floats beside the robot; None: there is none."""
+        return load_target(self.scenario.plant.target)
+
+    @cached_property
+    def capture(self) -> dict[str, Any]:
+        """The first capture of the target, by the keys of ``spacerobot run --json``.
+
+        Without a capture, ``captured`` is false; empty where there is no target.
+        """
+        for event in self.events:
+            if event.kind is EventKind.CAPTURED:
+                return {"time_s": event.time_s, **capture_values(event.about)}
+        return {} if self.target is None else {"captured": False}
+
+    @cached_property
+    def detumbling(self) -> dict[str, float]:
+        """The first detumbling after a capture, by the keys of ``spacerobot run --json``; empty:
+        there was none.
+        """
+        for event in self.events:
+            if event.kind is EventKind.DETUMBLED:
+                numbers = {name: float(text) for name, text in event.about.items()}
+                return {"time_s": event.time_s or 0.0, **numbers}
+        return {}
+
+    @cached_property
+    def capture_measures(self) -> CaptureMeasures:
+        """The measures of the flight to the target; all are NaN where there is none."""
+        capture, detumbling = self.capture, self.detumbling
+        if not capture:
+            return CaptureMeasures()
+        time = capture.get("time_s", math.nan)
+        impulse = np.array(capture.get("impulse_Ns", [math.nan] * 6))
+        joints = np.abs(capture.get("joint_impulses_Nms", ()))
+        return CaptureMeasures(
+            captured=float(capture["captured"]),
+            placed=float(self.succeeded and self._holds_target),
+            time=time,
+            distance=self._capture_distance(time),
+            impulse=float(np.linalg.norm(impulse[:3])),
+            angular_impulse=float(np.linalg.norm(impulse[3:])),
+            joint_impulse=float(joints.max()) if joints.size else math.nan,
+            detumbling_time=detumbling.get("took_s", math.nan),
+            detumbling_bound=detumbling.get("shortest_s", math.nan),
+        )
+
+    @property
+    def _holds_target(self) -> bool:
+        changes = (EventKind.CAPTURED, EventKind.RELEASED)
+        last = [event.kind for event in self.events if event.kind in changes][-1:]
+        return last == [EventKind.CAPTURED]
+
+    def _capture_distance(self, capture: float) -> float:
+        """Return the distance of the end-effector from the grapple frame at the time of a capture,
+        s; the smallest of the flight, where that is NaN. NaN where the flight does not have it.
+        """
+        config = self.scenario.plant
+        hand, body = self.signal("end_effector_pose"), self.signal("true_target_pose")
+        body = body or self.signal("target_pose")
+        of_link = config.capture.end_effector in ("", config.end_effector_frame)
+        if self.target is None or not of_link or not len(hand) or len(hand) != len(body):
+            return math.nan
+        grapple = self.target.frames[config.target.grapple_frame][1].r
+        R_WT = matrices_from_quaternions(body.values[:, 3:])
+        gaps = body.values[:, :3] + R_WT @ grapple - hand.values[:, :3]
+        distances = np.linalg.norm(gaps, axis=1)
+        if math.isnan(capture):
+            return float(distances.min())
+        return float(distances[int(np.searchsorted(hand.time, capture - 1e-9))])
+
+    @property
+    def control_period(self) -> float:
+        """Duration of a tick, s."""
+        return self.scenario.plant.control_period
+
+    # -- measures -----------------------------------------------------------------------------
+
+    @property
+    def succeeded(self) -> bool:
+        """Whether the goal was reached, by the true state and by the capture if there is one."""
+        return self.verdict.succeeded
+
+    @property
+    def succeeded_by_measurement(self) -> bool:
+        """Whether the goal was reached within tolerance by the measured state."""
+        return self.outcome is Outcome.REACHED
+
+    @property
+    def sentence(self) -> str:
+        """Earlier name of :attr:`message`; deprecated."""
+        return self.message
+
+    @property
+    def duration(self) -> float:
+        """Simulated time of the flight, s."""
+        return float(self.time[-1] - self.time[0]) if len(self.time) else 0.0
+
+    @property
+    def manoeuvre_time(self) -> float:
+        """Time flown for the goal, s, see :func:`~spacerobot_ros.measures.flown_time`; where no
+        status reports it, the duration of the flight.
+        """
+        reports = [(stamp_ns / SECOND, status) for stamp_ns, status in self.statuses]
+        last = self.status.manoeuvre_time_s if isinstance(self.status, PlannerStatus) else 0.0
+        end = float(self.time[-1]) if len(self.time) else 0.0
+        return flown_time(reports, end) or last or self.duration
+
+    @property
+    def corrections(self) -> int:
+        """Number of new plans that count as corrections."""
+        return self.status.corrections if isinstance(self.status, PlannerStatus) else 0
+
+    @property
+    def method(self) -> str:
+        """The gait method that was flown, or the control law."""
+        if self.gait is not None and self.gait.method:
+            return self.gait.method
+        scenario = self.scenario
+        if "planner" in scenario.commanders:
+            return scenario.planner.method
+        for _, status in reversed(self.statuses):
+            if isinstance(status, ControllerStatus) and status.command is not None:
+                return status.command.law
+        return scenario.controller.law
+
+    def tolerance(self, part: Literal["position", "attitude", "joint"]) -> float | None:
+        """Return the largest error of a part of a reached goal, m or rad; None where a bag has no
+        parameters of the commander.
+        """
+        scenario, name = self.scenario, f"{part}_tolerance"
+        node = "planner" if "planner" in scenario.commanders else "coordinated_control"
+        given = scenario.parameters(node)
+        if not given:
+            return None
+        value = given[name] if name in given else getattr(scenario.config(node), name)
+        return float(value) if isinstance(value, float | int) else None
+
+    @cached_property
+    def not_controlled(self) -> tuple[Controlled, ...]:
+        """Parts of the goal's base and shape that the method or the law does not control."""
+        if self.goal is None:
+            return ()
+        match self.status:
+            case ControllerStatus(command=CommandReport(errors=errors) as command) if errors:
+                return uncontrolled_parts(self.goal, command.controls())
+            case PlannerStatus(not_controlled=parts) if parts:
+                return parts
+            case PlannerStatus(state=PlannerState.REACHED, position_error_m=float(left)) if left > (
+                self.tolerance("position") or math.inf
+            ):
+                # Bags of earlier versions do not name the parts.
+                return ("position",)
+        method = METHODS.get(self.method)
+        if method is None:
+            return ()
+        return tuple(x for x in uncontrolled_parts(self.goal, method.controls) if x != "shape")
+
+    @property
+    def turns_end_effector(self) -> bool:
+        """Whether a controller turns the end-effector to an attitude."""
+        command = self.status.command if isinstance(self.status, ControllerStatus) else None
+        return command is not None and "attitude" in command.controls("end_effector")
+
+    @property
+    def has_thrust(self) -> bool:
+        """Whether forces or torques were commanded of thrusters."""
+        wrench = self.commands.get("base_wrench")
+        return wrench is not None and bool(wrench.values.any())
+
+    @property
+    def error(self) -> PoseError | None:
+        """Error of the last true pose to the goal; None without a pose or a goal of the base."""
+        goal = self.goal
+        return None if goal is None or not goal.base else pose_error(self.signal("pose"), goal)
+
+    @property
+    def errors(self) -> Array:
+        """(N, 2) distances (m) and angles (rad) of the true poses from the goal that counts at the
+        end; without rows where there is no goal of the base.
+        """
+        if self.goal is None or not self.goal.base:
+            return np.empty((0, 2))
+        gaps = self.goal.position - self.pose[:, :3]
+        turns = quaternion_multiply(quaternion_inverse(self.pose[:, 3:]), self.goal.quaternion)
+        norms = [np.linalg.norm(each, axis=1) for each in (gaps, rotvecs_from_quaternions(turns))]
+        return np.column_stack(norms)
+
+    @property
+    def end_effector_error(self) -> PoseError | None:
+        """Error of the end-effector's last pose to its goal; None without a pose or a goal.
+
+        Of several it is that of the farthest.
+        """
+        if errors := self.end_effector_errors:
+            return max(errors.values(), key=lambda error: error.distance)
+        return pose_error(self.signal("end_effector_pose"), self.end_effector_goal)
+
+    @property
+    def end_effector_errors(self) -> dict[str, PoseError]:
+        """Errors of the last true poses of the end-effectors that the planner's goal names."""
+        goal, robot = self.goal, self.robot
+        if goal is None or not goal.end_effectors or not len(self.q) or not len(self.pose):
+            return {}
+        if robot is None or set(robot.joint_names) - set(self.joint_names):
+            return {}
+        q = self.q[-1, [self.joint_names.index(name) for name in robot.joint_names]]
+        kinematics, errors = ForwardKinematics(robot), {}
+        for each in goal.for_robot(robot).end_effectors:
+            pose = kinematics.link_in_world(each.link, self.pose[-1], q)
+            errors[each.link] = PoseError.of_link(pose, each)
+        return errors
+
+    @property
+    def propellant(self) -> float | None:
+        """Propellant used, kg; None without thrusters."""
+        used = self.signal("propellant")
+        return float(used.values[-1, 0]) if len(used) else None
+
+    @cached_property
+    def momentum_drift(self) -> Array:
+        """(2,) see :func:`~spacerobot_ros.measures.momentum_drift`; kg m/s and kg m^2/s."""
+        expected = self.series.get("expected_momenta")
+        return momentum_drift(self.momentum, None if expected is None else expected.values)
+
+    @cached_property
+    def clearance(self) -> FlightClearance | None:
+        """The smallest distance between links over time; None where it is not measured, without
+        joint states, or of a robot without links that could touch.
+        """
+        if self.robot is None or not self.measures_clearance:
+            return None
+        q, pose = self.signal("q"), self.signal("pose")
+        return FlightClearance.of(
+            self.robot,
+            self.joint_names,
+            (q.time, q.values),
+            (pose.time, pose.values),
+            mesh_of=self.mesh_of,
+        )
+
+    def mesh_of(self, shape: Shape) -> TriangleMesh:
+        """Return the triangles of a shape, from a file if it is a mesh.
+
+        Raises
+        ------
+        MeshError
+            The file cannot be read.
+        """
+        return shape_mesh(shape)
+
+    @cached_property
+    def measures(self) -> Measures:
+        """The measures of the flight, which has states."""
+        return self.measured()
+
+    def measured(self, *, clearance: bool = True) -> Measures:
+        """Return the measures of the flight, which has states.
+
+        ``clearance``: whether the smallest distance between links is measured, which takes a while.
+        """
+        wrench = self.commands.get("base_wrench")
+        distance, angle = self._largest_end_effector_errors
+        return Measures(
+            outcome=self.outcome,
+            message=self.message,
+            duration=self.duration,
+            manoeuvre_time=self.manoeuvre_time,
+            error=self.error,
+            peak_rate=peak(self.qdot),
+            peak_effort=peak(self.effort),
+            peak_wrench=np.zeros(2) if wrench is None else peak_wrench(wrench.values),
+            lowest=self.q.min(axis=0),
+            highest=self.q.max(axis=0),
+            momentum_drift=self.momentum_drift,
+            end_effector_distance=distance,
+            end_effector_angle=angle,
+            corrections=self.corrections,
+            propellant=math.nan if self.propellant is None else self.propellant,
+            plan_time=self.plan_time,
+            wall_time=self.wall_time,
+            clearance=self._smallest_distance if clearance else math.nan,
+            capture=self.capture_measures,
+        )
+
+    @property
+    def _largest_end_effector_errors(self) -> tuple[float, float]:
+        """Distance (m) and angle (rad) as :class:`Measures` has them."""
+        if errors := self.end_effector_errors:
+            angles = [errors[link].angle for link in self._turned_links]
+            return max(each.distance for each in errors.values()), max(angles, default=math.nan)
+        error = self.end_effector_error
+        if error is None:
+            return math.nan, math.nan
+        return error.distance, error.angle if self.turns_end_effector else math.nan
+
+    @property
+    def _turned_links(self) -> list[str]:
+        assert self.goal is not None
+        assert self.robot is not None
+        aims = self.goal.for_robot(self.robot).end_effectors
+        return [aim.link for aim in aims if aim.quaternion is not None]
+
+    @property
+    def _smallest_distance(self) -> float:
+        if self.clearance is not None:
+            return self.clearance.nearest.distance
+        return math.inf if self.measures_clearance else math.nan
+
+    # -- verdict ------------------------------------------------------------------------------
+
+    @cached_property
+    def verdict(self) -> Verdict:
+        """The end of the flight in a word and a sentence, by its last true state."""
+        late = self.outcome is Outcome.FAILED and isinstance(self.status, ControllerStatus)
+        reached = self.outcome is Outcome.REACHED
+        if not (reached or late):
+            return Verdict(self.outcome.value.capitalize(), self.message)
+        left_out, missed = self.not_controlled, reached and self._automatic_capture_is_missing
+        word = "Reached" if reached else "Failed"
+        if reached and left_out:
+            word += f", but for the {' and '.join(left_out)}"
+        if missed:
+            word += ", but the target is not captured"
+        succeeded = reached and not missed
+        error, tolerance = self._last_error, self._tolerances
+        if error is None or tolerance is None or self.goal is None:
+            sentence = self.message
+            if left_out and "not controlled" not in sentence:
+                sentence += f" Not controlled: {' and '.join(left_out)}."
+            if missed:
+                sentence += " The target is not captured."
+            return Verdict(word, sentence, succeeded, succeeded and not left_out)
+        controls = _PARTS - set(left_out)
+        if self.error is None:
+            controls -= {"position", "attitude"}
+        if not error.end_effectors:
+            controls -= {"end_effectors"}
+        errors = describe_remaining_error(error, controls, tolerance, self.goal)
+        within = tolerance.admits(error, controls)
+        if late and within:
+            settling = f"{self.scenario.controller.settle_time:g} s"
+            errors += f", within tolerance for less than the settling time of {settling}"
+        if reached and not within and "measured_pose" in self.series:
+            sentence = (
+                f"The measured pose is within tolerance of the goal; the true one is {errors}."
+            )
+            return Verdict("Reached by the measured pose", sentence)
+        fact = "The goal is reached" if reached else "The goal is not reached in time"
+        if late and self.message.startswith(fact):
+            # The message of a controller names what kept it from the goal, if that is known.
+            fact = self.message.partition(": ")[0]
+        fact += ", but the target is not captured" * missed
+        return Verdict(word, f"{fact}: {errors}.", succeeded, succeeded and not left_out)
+
+    @property
+    def _automatic_capture_is_missing(self) -> bool:
+        automatic = self.scenario.plant.capture.mode == "automatic"
+        return automatic and self.capture == {"captured": False}
+
+    @property
+    def _last_error(self) -> PoseError | None:
+        """The true error at the end, of base, joints and end-effectors; None without any."""
+        base, links = self.error, tuple(self.end_effector_errors.values())
+        hand = self.end_effector_error
+        if not links and hand is not None:
+            # A controller that does not turn the end-effector leaves its attitude free.
+            turn = hand.rotvec if self.turns_end_effector else np.zeros(3)
+            links = (PoseError(hand.position, turn),)
+        if base is None and not links:
+            return None
+        position, rotvec = (np.zeros(3),) * 2 if base is None else (base.position, base.rotvec)
+        return PoseError(position, rotvec, self._joint_errors, links)
+
+    @property
+    def _joint_errors(self) -> Array:
+        """Errors (k,) of joints with goals, m or rad; of a controller, those of its outputs."""
+        wanted = None if self.goal is None else self.goal.joint_positions
+        if wanted is not None and len(self.q) and wanted.shape == self.q[-1].shape:
+            return wanted - self.q[-1]
+        command = self.status.command if isinstance(self.status, ControllerStatus) else None
+        errors = {} if command is None else command.errors
+        return np.array([x for name, x in errors.items() if name.startswith("joint.")])
+
+    @property
+    def _tolerances(self) -> Tolerance | None:
+        position, attitude = self.tolerance("position"), self.tolerance("attitude")
+        if position is None or attitude is None:
+            return None
+        return Tolerance(position, attitude, self.tolerance("joint") or Tolerance(0.0, 0.0).shape)

@@ -1,0 +1,490 @@
+"""The 3D view of a flight on its page: its scene as the commands that MeshCat's viewer takes."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+from html import escape
+from importlib.metadata import distribution
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from spacerobot_ros.flight.series import Signal
+from spacerobot_ros.model.description import Array, Pose, Shape
+from spacerobot_ros.model.rotations import matrix_from_quaternion
+from spacerobot_ros.model.visuals import Visual, solid_mesh
+from spacerobot_ros.report.figures import GHOST_COLOUR, LINE_COLOUR, PALETTE
+from spacerobot_ros.report.flight import FlightReport
+from spacerobot_ros.report.page_parts import PagePart, package_file
+from spacerobot_ros.report.scene import Body, bodies_of, goal_of_base, is_flat, obstacles_of
+from spacerobot_ros.report.signals import Cycles, Indices, simplified
+from spacerobot_ros.report.solids import EDGE_COLOUR, corner_points, placed_solids
+
+Command = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class View3D:
+    """Commands of the viewer, spans of time to choose from (name, start, end), and a caption."""
+
+    commands: list[Command]
+    parts: list[tuple[str, float, float]]
+    caption: str
+
+
+def viewer_script() -> str | None:
+    """Return MeshCat's viewer; None where the package ``meshcat`` is not installed."""
+    spec = find_spec("meshcat")
+    for folder in (spec.submodule_search_locations or ()) if spec is not None else ():
+        path = Path(folder) / "viewer" / "dist" / "main.min.js"
+        if path.is_file():
+            return path.read_text(encoding="utf-8")
+    return None
+
+
+NO_VIEWER = "The 3D view needs the Python package meshcat: pip install meshcat."
+
+_MARKUP = """<section id="animation" class="loading">
+<div id="stage"><div id="pane" role="img" aria-label="The robot in motion"></div></div>
+<div id="bar"><button id="play" type="button">Play</button>
+<input id="time" type="range" min="0" max="1" step="any" value="0" aria-label="Time">
+<output id="now"></output>
+<select id="part" aria-label="Span of time"></select>
+<select id="speed" aria-label="Speed"></select></div>
+<p class="missing">The 3D view needs WebGL, which this browser does not offer; the figures below \
+do not.</p>
+<noscript><p class="missing">The 3D view needs JavaScript; the figures below do not.</p>\
+</noscript>
+<p class="caption"><b>The flight.</b> {caption} Drag to turn the view, with the right button to \
+move it; click it first to zoom with the wheel.</p>
+</section>
+"""
+
+
+def player_of(scene: View3D | str) -> PagePart:
+    """Return the player of a scene, or the reason why there is none."""
+    viewer = viewer_script()
+    if isinstance(scene, str) or viewer is None:
+        sentence = scene if isinstance(scene, str) else NO_VIEWER
+        return PagePart(f'<p class="missing">{escape(sentence)}</p>')
+    parts = [{"name": name, "start": start, "end": end} for name, start, end in scene.parts]
+    return PagePart(
+        markup=_MARKUP.format(caption=escape(scene.caption)),
+        data={"flight": {"parts": parts, "commands": scene.commands}},
+        programs=(viewer, package_file("player.js")),
+        notices=_licence_notices(),
+    )
+
+
+def _licence_notices() -> tuple[tuple[str, str], ...]:
+    """Return the licences of MeshCat and of the libraries in its viewer, such as three.js."""
+    own, others = "", []
+    for file in distribution("meshcat").files or ():
+        if file.name in ("LICENSE.txt", "LICENSE", "LICENCE"):
+            own = file.read_text()
+        elif file.name.endswith("THIRD_PARTY_LICENSES.json"):
+            others += json.loads(file.read_text())
+    # A library without the text of its licence has the MIT licence, as in MeshCat's own.
+    mit = own[own.find("Permission is hereby granted") :]
+    found = [("MeshCat", own)]
+    for each in others:
+        name, licence = f"{each.get('name', '')} {each.get('version', '')}", each.get("license", "")
+        holder = f"Copyright (c) {each.get('author', '')}"
+        words = f"{licence}\n\n{holder}\n\n{mit if licence == 'MIT' else ''}"
+        found.append((name, each.get("licenseText") or words))
+    return tuple(found)
+
+
+# -- key frames ---------------------------------------------------------------------------------
+
+FULL_CYCLES = 3
+"""Cycles at the beginning and at the end of a gait that are shown in full."""
+
+_MAX_KEY_FRAMES = 1000
+_MAX_CYCLE_INSTANTS = 300
+"""Instants of equal phase between the cycles that are shown in full."""
+
+
+@dataclass(frozen=True)
+class KeyFrames:
+    """Recorded states to show, between which motion is interpolated.
+
+    Attributes
+    ----------
+    indices
+        Their indices, ascending, with the first and the last state of the recording.
+    error
+        Largest distance of an omitted state from the interpolation, in tolerances.
+    every
+        Between the cycles shown in full, one state is shown per so many cycles, always at the same
+        phase; 0: all cycles are shown in full.
+    """
+
+    indices: Indices
+    error: float
+    every: int = 0
+
+
+def key_frames(motion: Signal, cycles: Cycles | None) -> KeyFrames:
+    """Choose at most a thousand key frames between which linear interpolation is good enough.
+
+    Parameters
+    ----------
+    motion
+        The visible motion, (N, k), each column divided by its tolerance.
+    cycles
+        Its equal cycles. All but the first and the last few are sampled at equal phase: otherwise
+        fast loops would look like slow ones (aliasing).
+    """
+    shown, every = np.arange(len(motion)), 0
+    if cycles is not None and cycles.count > 2 * FULL_CYCLES:
+        start = cycles.start + FULL_CYCLES * cycles.period
+        count = cycles.count - 2 * FULL_CYCLES
+        end = start + count * cycles.period
+        every = max(1, -(-count // _MAX_CYCLE_INSTANTS))
+        instants = start + cycles.period * np.arange(0, count + 1, every)
+        full = (motion.time <= start) | (motion.time >= end - 1e-9)
+        places = np.searchsorted(motion.time, instants - 1e-9)
+        shown = np.union1d(np.flatnonzero(full), np.minimum(places, len(motion) - 1))
+    chosen, error = simplified(Signal(motion.time[shown], motion.values[shown]), _MAX_KEY_FRAMES)
+    return KeyFrames(shown[chosen], error, every)
+
+
+# -- commands -----------------------------------------------------------------------------------
+
+
+def _set_property(path: str, name: str, value: Any) -> Command:
+    """Set a property of the object at a path, such as ``visible``."""
+    return {"type": "set_property", "path": path, "property": name, "value": value}
+
+
+def _set_transform(path: str, matrix: Array) -> Command:
+    """Set a matrix (4, 4), which is sent column by column."""
+    flat = [round(float(x), 9) for x in matrix.T.ravel()]
+    return {"type": "set_transform", "path": path, "matrix": flat}
+
+
+def _place(path: str, pose: Array) -> Command:
+    """Set a pose (7,)."""
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = matrix_from_quaternion(pose[3:]), pose[:3]
+    return _set_transform(path, matrix)
+
+
+def _set_object(path: str, points: Array, material: Command, kind: str, index: Any = ()) -> Command:
+    """Set the object at a path: points (k, 3), and how they are connected."""
+    names = {"geometry": f"{path} geometry", "material": f"{path} material"}
+    position = {"itemSize": 3, "normalized": False, **_array("Float32Array", _rounded(points))}
+    data: Command = {"attributes": {"position": position}}
+    if len(index):
+        data["index"] = _array("Uint32Array", np.ravel(index).tolist())
+    return {
+        "type": "set_object",
+        "path": path,
+        "object": {
+            "metadata": {"version": 4.5, "type": "Object"},
+            "geometries": [{"uuid": names["geometry"], "type": "BufferGeometry", "data": data}],
+            "materials": [{"uuid": names["material"], **material}],
+            "object": {"uuid": path, "type": kind, "matrix": np.eye(4).ravel().tolist(), **names},
+        },
+    }
+
+
+def _array(kind: str, values: list[Any]) -> Command:
+    return {"type": kind, "array": values}
+
+
+def _lines(path: str, points: Array, color: str, opacity: float = 1.0) -> Command:
+    """Draw a line through points (k, 3), or separate ones between ends (k, 2, 3)."""
+    look = {"type": "LineBasicMaterial", "color": _color_number(color), **_see_through(opacity)}
+    kind = "Line" if points.ndim == 2 else "LineSegments"
+    return _set_object(path, points.reshape(-1, 3), look, kind)
+
+
+def _triad(path: str, length: float) -> list[Command]:
+    """Draw the axes of a frame."""
+    return [
+        _lines(f"{path}/{name}", np.array([[0.0] * 3, length * unit]), tint)
+        for name, unit, tint in zip("xyz", np.eye(3), _AXIS_COLOURS, strict=True)
+    ]
+
+
+def _solid(path: str, visual: Visual, color: str, opacity: float = 1.0) -> list[Command]:
+    """Draw a solid and its sharp edges, if it has any."""
+    ghost = opacity < 1.0
+    # Keep edges and ghosts visible in the surface of a solid.
+    offset = {"polygonOffset": True, "polygonOffsetFactor": -1 if ghost else 1}
+    look = {"type": "MeshPhongMaterial", "color": _color_number(color), "shininess": 15}
+    # Both sides are drawn, because files of meshes differ in which one is outside.
+    look |= {"flatShading": True, "side": 2, **offset, "polygonOffsetUnits": -1 if ghost else 1}
+    look |= _see_through(opacity) | ({"depthWrite": False} if ghost else {})
+    mesh, edges = visual.mesh, visual.edges.lines
+    commands = [_set_object(f"{path}/solid", mesh.vertices, look, "Mesh", mesh.faces)]
+    if len(edges) and visual.shape.kind not in ("mesh", "capsule"):
+        tint = color if ghost else EDGE_COLOUR
+        commands.append(_lines(f"{path}/edges", edges, tint, 1.0 if ghost else 0.5))
+    return commands
+
+
+def _see_through(opacity: float) -> Command:
+    return {} if opacity == 1.0 else {"transparent": True, "opacity": opacity}
+
+
+def _clip(path: str, time: Array, poses: Array) -> Command:
+    """Return the motion of an object through poses (k, 7) at times (k,)."""
+    tracks = [
+        {
+            "name": f".{name}",
+            "type": kind,
+            "times": np.round(time, 4).tolist(),
+            "values": _rounded(values),
+        }
+        for name, kind, values in (
+            ("position", "vector3", poses[:, :3]),
+            ("quaternion", "quaternion", poses[:, 3:]),
+        )
+    ]
+    return {"path": path, "clip": {"fps": 1, "name": "flight", "tracks": tracks}}
+
+
+def _rounded(values: Array) -> list[float]:
+    return np.round(values.ravel(), 5).tolist()
+
+
+def _color_number(color: str) -> int:
+    return int(color[1:], 16)
+
+
+# -- the view of a flight -----------------------------------------------------------------------
+
+_POSITION_TOLERANCE = 0.001
+"""Tolerance of positions between key frames, as a share of the size of the scene."""
+
+_ANGLE_TOLERANCE = 0.005  # rad
+_MAX_LINE_POINTS = 4000
+_MAX_MESH_FACES = 20_000
+"""Largest number of faces of all meshes together: some 0.6 MB."""
+
+_BACKGROUND = [246 / 255, 247 / 255, 249 / 255]
+_FIELD_OF_VIEW = 30.0
+"""Field of view of the camera from top to bottom, deg."""
+
+_MIN_ASPECT = 1.3
+"""Width of the picture over its height, on narrow screens."""
+
+_MARGIN = 1.06
+"""Distance of the camera over the least from which the whole scene is seen."""
+
+_AXIS_COLOURS = ("#d55e00", "#009e73", "#0072b2")
+WORLD = "/flight"
+
+
+def view_of_flight(flight: FlightReport) -> View3D | str:
+    """Return the 3D view of a flight, or the reason why there is none."""
+    if flight.hidden_links_text:
+        return flight.hidden_links_text
+    most = _MAX_MESH_FACES // max(len(flight.meshes), 1)
+    points, flat = _visible_points(flight), is_flat(flight)
+    low, high = points.min(axis=0), points.max(axis=0)
+    center, radius = (low + high) / 2, max(0.5 * float(np.linalg.norm(high - low)), 1e-3)
+    moving = bodies_of(flight, range(len(flight.position)), most)
+    ghosts = _goal_commands(flight, most, radius)
+    frames = [_key_frames_of(flight, each, radius) for each in moving]
+    clips = [
+        _clip(_path_of(each), flight.position.time[found.indices], each.poses[found.indices])
+        for each, found in zip(moving, frames, strict=True)
+    ]
+    commands = [
+        *_stage_commands(points, center, radius, flat),
+        *_body_commands([*moving, *obstacles_of(flight)]),
+        *_path_commands(flight),
+        *ghosts,
+        {"type": "set_animation", "animations": clips, "options": {"play": True}},
+    ]
+    caption = _caption_text(flight, _worst_of(frames), radius, bool(ghosts))
+    return View3D(commands, _time_spans(flight), caption)
+
+
+def _path_of(body: Body) -> str:
+    # Slashes separate nodes of the viewer's tree.
+    return f"{WORLD}/{body.name.replace('/', chr(0x2215))}"
+
+
+def _body_commands(bodies: Iterable[Body], opacity: float = 1.0) -> list[Command]:
+    commands: list[Command] = []
+    for body in bodies:
+        path = _path_of(body)
+        commands.append(_place(path, body.poses[0]))
+        for number, visual in enumerate(body.visuals):
+            commands += _solid(f"{path}/{number}", visual, body.color_of(visual), opacity)
+    return commands
+
+
+def _visible_points(flight: FlightReport) -> Array:
+    """Return points (N, 3) of robot, paths, goals and target in W, m, which are to be seen."""
+    clouds = [flight.position.values, flight.tool.values[:, :3], flight.target_pose.values[:, :3]]
+    rows = flight.samples(12)
+    bodies = bodies_of(flight, rows, _MAX_MESH_FACES)
+    clouds += [corner_points(placed_solids(bodies, instant)) for instant in range(len(rows))]
+    targets = flight.targets if flight.position_counts else []
+    goals = [each.goal.position for each in (*targets, *flight.tool_targets)]
+    goals += [each.position for each in flight.link_goals.values()]
+    clouds.append(np.array(goals).reshape(-1, 3))
+    return np.concatenate(clouds)
+
+
+def _key_frames_of(flight: FlightReport, body: Body, radius: float) -> KeyFrames:
+    # A quaternion's numbers change by half as much as the angle.
+    tolerances = np.repeat([_POSITION_TOLERANCE * radius, _ANGLE_TOLERANCE / 2], [3, 4])
+    return key_frames(Signal(flight.position.time, body.poses / tolerances), flight.cycles)
+
+
+def _worst_of(frames: list[KeyFrames]) -> KeyFrames:
+    """Return the key frames of the body that has most, with the largest error of all."""
+    most = max(frames, key=lambda each: len(each.indices))
+    return KeyFrames(most.indices, max(each.error for each in frames), most.every)
+
+
+def _camera_position(points: Array, flat: bool) -> Array:
+    """Return the position (3,) from which the origin is looked at and all points (N, 3) are seen.
+
+    It is the nearest one in the direction of the view, with a margin.
+    """
+    azimuth, elevation = math.radians(-90 if flat else -58), math.radians(89.9 if flat else 24)
+    backwards = np.array(
+        [
+            math.cos(elevation) * math.cos(azimuth),
+            math.cos(elevation) * math.sin(azimuth),
+            math.sin(elevation),
+        ]
+    )
+    right = np.array([-math.sin(azimuth), math.cos(azimuth), 0.0])
+    up = np.cross(backwards, right)
+    slope = math.tan(math.radians(_FIELD_OF_VIEW / 2))
+    sideways = np.maximum(np.abs(points @ up), np.abs(points @ right) / _MIN_ASPECT) / slope
+    return _MARGIN * float((points @ backwards + sideways).max()) * backwards
+
+
+def _stage_commands(points: Array, center: Array, radius: float, flat: bool) -> list[Command]:
+    """Background, camera, world axes and grid; the scene is moved and scaled to radius 1."""
+    world = np.eye(4)
+    world[:3, :3] /= radius
+    world[:3, 3] = -center / radius
+    x, y, z = _camera_position((points - center) / radius, flat).tolist()
+    camera = "/Cameras/default/rotated/<object>"
+    spacing = 10.0 ** math.floor(math.log10(radius))
+    spacing *= 1.0 if radius / spacing > 4 else 0.5
+    return [
+        _set_property("/Background", "top_color", _BACKGROUND),
+        _set_property("/Background", "bottom_color", _BACKGROUND),
+        _set_property("/Grid", "visible", False),
+        _set_property("/Axes", "visible", False),
+        _set_property(camera, "fov", _FIELD_OF_VIEW),
+        # The camera's own y axis is up.
+        _set_property(camera, "position", [x, z, -y]),
+        _set_transform(WORLD, world),
+        _lines(f"{WORLD}/grid", _grid_lines(center, radius, spacing, flat), LINE_COLOUR, 0.6),
+        *_triad(f"{WORLD}/world", 0.25 * radius),
+    ]
+
+
+def _grid_lines(center: Array, radius: float, spacing: float, flat: bool) -> Array:
+    """Ends (k, 2, 3) of lines parallel to x and y, on whole multiples of ``spacing``."""
+    z = center[2] - (0.0 if flat else 0.8 * radius)
+    first = np.floor((center[:2] - 1.3 * radius) / spacing)
+    last = np.ceil((center[:2] + 1.3 * radius) / spacing)
+    (x0, y0), (x1, y1) = first * spacing, last * spacing
+    lines = [[(x, y0, z), (x, y1, z)] for x in spacing * np.arange(first[0], last[0] + 1)]
+    lines += [[(x0, y, z), (x1, y, z)] for y in spacing * np.arange(first[1], last[1] + 1)]
+    return np.array(lines)
+
+
+def _path_commands(flight: FlightReport) -> list[Command]:
+    lines = [("path of the base", flight.position.values, PALETTE[0])]
+    if len(flight.tool):
+        lines.append(("path of the end-effector", flight.tool.values[:, :3], PALETTE[4]))
+    assert flight.robot is not None
+    tool = flight.robot.end_effector(flight.parameter("plant", "end_effector_frame") or "")
+    for link, poses in flight.link_poses.items():
+        if link != tool or not len(flight.tool):
+            lines.append((f"path of {link}", poses.values[:, :3], PALETTE[4]))
+    commands = []
+    for name, points, tint in lines:
+        step = max(1, len(points) // _MAX_LINE_POINTS)
+        shown = np.concatenate([points[:-1:step], points[-1:]])
+        if len(shown) > 1 and float(np.ptp(shown, axis=0).max()) > 0.0:
+            commands.append(_lines(f"{WORLD}/{name.replace('/', ' ')}", shown, tint))
+    return commands
+
+
+def _goal_commands(flight: FlightReport, most: int, radius: float) -> list[Command]:
+    """Draw the base at its goal as a ghost, and marks at the goals of end-effectors."""
+    ghost = goal_of_base(flight, most // 4)
+    commands = [] if ghost is None else _body_commands([ghost], 0.25)
+    marks: list[tuple[str, Array, Array | None]] = []
+    for target in flight.tool_targets[-1:]:
+        turned = bool(set(flight.controls("end_effector")) & {3, 4, 5})
+        quaternion = target.goal.quaternion if turned else None
+        marks.append(("end-effector goal", target.goal.position, quaternion))
+    for link, goal in flight.link_goals.items():
+        marks.append((f"goal of {link}".replace("/", " "), goal.position, goal.quaternion))
+    ball = Shape("sphere", (0.03 * radius,), Pose())
+    for mark, position, quaternion in marks:
+        path = f"{WORLD}/{mark}"
+        attitude = [0.0, 0.0, 0.0, 1.0] if quaternion is None else quaternion
+        commands.append(_place(path, np.concatenate([position, attitude])))
+        commands += _solid(f"{path}/mark", Visual("", 0, ball, solid_mesh(ball)), GHOST_COLOUR, 0.4)
+        commands += [] if quaternion is None else _triad(path, 0.12 * radius)
+    return commands
+
+
+def _time_spans(flight: FlightReport) -> list[tuple[str, float, float]]:
+    end = float(flight.position.time[-1])
+    parts = [("whole flight", 0.0, end)]
+    cycles = flight.cycles
+    if cycles is not None and cycles.count > 2 * FULL_CYCLES:
+        if cycles.start > 0.0:
+            parts.append((f"first {cycles.start:.4g} s", 0.0, cycles.start))
+        full = FULL_CYCLES * cycles.period
+        parts.append((f"first {FULL_CYCLES} cycles", cycles.start, cycles.start + full))
+        parts.append((f"last {FULL_CYCLES} cycles", cycles.end - full, cycles.end))
+    return parts
+
+
+def _caption_text(flight: FlightReport, frames: KeyFrames, radius: float, ghosts: bool) -> str:
+    text = (
+        "The robot from the shapes of its URDF, each moving link in the color of its joint in the "
+        "figures below; lines are the paths of the base (blue)"
+    )
+    several = len(flight.link_poses) > 1
+    if several:
+        text += " and of the end-effectors (orange)"
+    elif len(flight.tool) or flight.link_poses:
+        text += " and of the end-effector (orange)"
+    text += "; the ghost is the goal" if ghosts else ""
+    text += "; obstacles have the shapes by which distances are measured" * bool(flight.obstacles)
+    text += "; the target moves as target/odom says" * (flight.target is not None)
+    if len(flight.position) < 2:
+        return f"{text}.{flight.missing_meshes}"
+    text += (
+        f". {len(frames.indices)} key frames of {len(flight.position)} recorded states; in between "
+        "the motion is interpolated"
+    )
+    within = max(frames.error, 1.0)
+    text += (
+        f" and within {within * _POSITION_TOLERANCE * radius:.2g} m and "
+        f"{within * _ANGLE_TOLERANCE:.2g} rad of the recorded states."
+    )
+    if frames.every:
+        which = "every cycle" if frames.every == 1 else f"every {frames.every}th cycle"
+        text += (
+            f" The first and the last {FULL_CYCLES} cycles are shown in full; of those "
+            f"between, one instant of {which}, always at the same phase, so that fast loops do not "
+            "look like slow ones."
+        )
+    return text + flight.missing_meshes
