@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -90,12 +90,15 @@ class StopRule:
     deadline, last_call
         ``time.monotonic()``, s, at which it stops with a feasible iterate, and without one;
         infinite where no wall time limits the search.
+    watch
+        Called at every iterate.
     """
 
     iterations: int
     cancellation: Cancellation = NEVER
     deadline: float = math.inf
     last_call: float = math.inf
+    watch: Callable[[], None] = lambda: None
 
     def is_expired(self, *, found: bool) -> bool:
         """Whether the wall time is used up; ``found``: there is a feasible iterate."""
@@ -398,6 +401,7 @@ class _SolverMonitor(ca.Callback):
             if worst <= _FEASIBILITY_TOLERANCE:
                 self.best, self._least = x.copy(), float(f[0])
         self._iterates += 1
+        self._stop.watch()
         stops = (
             # The first iterate is the guess itself.
             self._iterates > self._stop.iterations
