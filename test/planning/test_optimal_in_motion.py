@@ -83,6 +83,7 @@ def test_another_goal_is_reached_from_moving_joints_within_the_limits(angle: flo
     _, state, motion = halfway(first())
     assert np.abs(motion.velocity).max() > 0.2, "the joints move"
     schedule = planar().plan(PlanRequest(state, turned(angle), TOLERANCE, motion=motion))
+    assert "braking_time" not in schedule.notes
     np.testing.assert_array_equal(schedule.positions[0], state.q)
     require_smooth(motion.velocity, schedule)
     assert flown_angle(state, schedule) == pytest.approx(angle, abs=1e-6)

@@ -691,8 +691,10 @@ class OptimalGait(GaitMethod):
         try:
             found = self._begin_now(replace(task, options=budget), motion=motion)
         except NotFoundError as refusal:
-            # The present manoeuvre goes on where the same goal is planned for again.
-            if again or duration > 0 or len(self._wheels) or not motion.velocity.any():
+            # The present manoeuvre goes on where the same goal is planned for again; a base that
+            # drifts would have to pass its goal later.
+            rests = not (task.boundary.drifts or len(self._wheels))
+            if again or duration > 0 or not rests or not motion.velocity.any():
                 raise
             return self._plan_with_braking(task, motion, refusal)
         return self._schedule(task, found)

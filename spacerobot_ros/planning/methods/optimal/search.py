@@ -10,7 +10,7 @@
 5. **Clear**: if held commands bring links too near to each other or to obstacles, clear paths are
    looked for near to them, then near to other solutions, then near to guesses, and made fast.
 
-Each step is a method of :class:`ManoeuvreSearch`; the last one is :class:`_PathClearing`.
+Each step is a few methods of :class:`ManoeuvreSearch`.
 
 J. Schulman et al., "Motion planning with sequential convex optimization and convex collision
 checking", International Journal of Robotics Research 33, 2014, clear paths by steps that are
@@ -172,7 +172,8 @@ the largest reach at which paths are not made faster any more."""
 
 _MAX_CLEAR_STARTS, _MAX_CLEAR_STARTS_IN_MOTION, _CLEAR_ANSWERS = 16, 1, 2
 """Guesses near which, or near whose solutions, manoeuvres that keep clear are looked for at most
-(in motion, the rest of the motion is one), and the number of clear paths that ends the search."""
+(in motion, the rest of the motion is the one: from rest, after braking, others are found sooner),
+and the number of clear paths on a coarse grid that ends the search."""
 
 _REPORT_PERIOD = 1.0
 """Wall time after which a solver reports that it is still busy, s."""
@@ -369,6 +370,17 @@ class _SearchState:
             self.rejection = str(reason)
             self.report(self.rejection)
         self.cancellation.raise_if_requested()
+
+
+class _Apart(NamedTuple):
+    """Pairs that are kept apart on a grid; those that come too near on the way are added.
+
+    ``hold`` makes the held commands that are to keep clear; None: the path itself is.
+    """
+
+    kept: KeptDistances
+    grid: _Grid
+    hold: Callable[[Trajectory], Manoeuvre] | None = None
 
 
 class ManoeuvreSearch:
@@ -701,14 +713,15 @@ class ManoeuvreSearch:
                 freed.append(each)
                 continue
             with state.attempt():
-                coarse = self._clear_coarsely(state, kept.anew(), each.solution)
-                freed.append(self._clear_finely(state, *coarse))
+                freed.append(self._make_clear(state, kept.anew(), each.solution))
         # A robot that drifts finds others sooner after it has coasted.
         if freed or (problem.boundary.drifts and problem.motion is None):
             return freed
         clear: list[tuple[KeptDistances, Trajectory]] = []
         for path in self._other_paths(state, [each.solution for each in found]):
             with state.attempt():
+                if not self._has_coarse_paths(state):
+                    return [self._clear_finely(state, kept.anew(), path)]
                 clear.append(self._clear_coarsely(state, kept.anew(), path))
             if len(clear) == _CLEAR_ANSWERS:
                 break
@@ -743,23 +756,33 @@ class ManoeuvreSearch:
                 yield solution
         yield from unused
 
+    def _has_coarse_paths(self, state: _SearchState) -> bool:
+        """Whether paths are made clear on the coarse grid first."""
+        problem = state.problem
+        # A motion that is timed is too far off on it: joints run on in long intervals.
+        return problem.hastens and state.coarse != state.full and not problem.is_timed
+
+    def _make_clear(self, state: _SearchState, kept: KeptDistances, path: Trajectory) -> Manoeuvre:
+        """Return a manoeuvre near to a path that keeps clear; UnusableCandidateError if none was
+        found."""
+        if self._has_coarse_paths(state):
+            kept, path = self._clear_coarsely(state, kept, path)
+        return self._clear_finely(state, kept, path)
+
     def _clear_coarsely(
         self, state: _SearchState, kept: KeptDistances, path: Trajectory
     ) -> tuple[KeptDistances, Trajectory]:
         """Return a fast path near to another one that keeps clear on the coarse grid, with the
-        pairs that it keeps apart; the same path where it is for the full grid alone.
+        pairs that it keeps apart.
 
         Raises
         ------
         UnusableCandidateError
             None was found.
         """
-        # A motion that is timed is too far off on a coarse grid: joints run on in long intervals.
-        if not state.problem.hastens or state.coarse == state.full or state.problem.is_timed:
-            return kept, path
-        clearing = _PathClearing(state, kept, partial(self._solve_apart, state, kept, state.coarse))
-        slow, _ = clearing.clear(path, _CLEARING_TIME_FACTOR * path.duration)
-        fast, _ = clearing.shorten(slow, None)
+        apart = _Apart(kept, state.coarse)
+        slow, _ = self._clear(state, apart, path, _CLEARING_TIME_FACTOR * path.duration)
+        fast, _ = self._shorten(state, apart, slow, None)
         return kept, fast.stretched(_RESAMPLED_TIME_FACTOR)
 
     def _clear_finely(
@@ -774,8 +797,7 @@ class ManoeuvreSearch:
         """
         problem, options = state.problem, state.problem.options
         hold = partial(self._make_held_commands, state, kept=kept)
-        solve = partial(self._solve_apart, state, kept, state.full)
-        clearing = _PathClearing(state, kept, solve, self._period, hold)
+        apart = _Apart(kept, state.full, hold)
         shortest = self._shortest_duration(problem)
         duration = path.duration if kept.pairs else _CLEARING_TIME_FACTOR * path.duration
         if options.duration > 0:
@@ -783,9 +805,9 @@ class ManoeuvreSearch:
         elif problem.gentle:
             path = self._slow_to_effort_limits(path, problem.boundary)
             duration = max(_GENTLE_DURATION_FACTOR * path.duration, shortest)
-        path, made = clearing.clear(path, duration)
+        path, made = self._clear(state, apart, path, duration)
         if problem.hastens:
-            path, made = clearing.shorten(path, made)
+            path, made = self._shorten(state, apart, path, made)
         elif problem.gentle:
             fast = path.at_full_speed(problem.limits, shortest)
             made = hold(self._slow_to_effort_limits(fast, problem.boundary))
@@ -797,11 +819,81 @@ class ManoeuvreSearch:
         state.report(f"manoeuvre of {made.duration:.6g} s", made.duration)
         return made
 
+    def _clear(
+        self, state: _SearchState, apart: _Apart, path: Trajectory, duration: float
+    ) -> tuple[Trajectory, Manoeuvre | None]:
+        """Return a clear path near to one, in a given duration (s), and its held commands.
+
+        Raises
+        ------
+        UnusableCandidateError
+            None was found.
+        """
+        state.phase = SearchPhase.CLEARING
+        kept, limits, lacks = apart.kept, state.problem.limits, [math.inf, math.inf]
+        near, made = kept.approaches_of(path), None
+        for _ in range(_MAX_CLEARING_ROUNDS):
+            (kept.widen if lacks[-1] < _NO_LACK else kept.add)(near)
+            guess = path.stretched(duration / path.duration)
+            deepest = min((each.distance for each in near), default=0.0)
+            largest_lack = max(_MIN_LARGEST_LACK, -_LACK_PER_DEPTH * deepest)
+            around = Neighbourhood.within(limits, largest_lack=largest_lack)
+            path, lack = self._solve_apart(state, apart, guess, duration, around)
+            near, made = self._approaches(apart, path)
+            if not near:
+                return path, made
+            lacks.append(lack)
+            if lack >= _NO_LACK and lack > _PROGRESS_SHARE * lacks[-3]:
+                break
+        period = None if made is None else self._period
+        raise UnusableCandidateError(kept.message(near[0], period))
+
+    def _shorten(
+        self, state: _SearchState, apart: _Apart, path: Trajectory, made: Manoeuvre | None
+    ) -> tuple[Trajectory, Manoeuvre | None]:
+        """Return a faster path near to a clear one, and its held commands; else that one itself."""
+        state.phase = SearchPhase.SHORTENING
+        reach, limits = 1.0, state.problem.limits
+        for _ in range(_MAX_SHORTENING_ROUNDS):
+            state.report("clear path", path.duration)
+            if reach < _MIN_REACH_SHARE or state.clock.is_over(found=True):
+                break
+            try:
+                faster, _ = self._solve_apart(
+                    state, apart, path, None, Neighbourhood.within(limits, reach)
+                )
+                near, found = self._approaches(apart, faster)
+            except UnusableCandidateError:
+                reach /= _REACH_DIVISOR
+                continue
+            if near:
+                # A pair that is new has no planes yet.
+                if all(each.pair in apart.kept.pairs for each in near):
+                    reach /= _REACH_DIVISOR
+                apart.kept.add(near)
+                continue
+            gain = 1 - faster.duration / path.duration
+            if gain > 0:
+                path, made = faster, found
+            if gain < _MIN_GAIN * reach:
+                break
+            reach = min(_REACH_FACTOR * reach, 1.0)
+        return path, made
+
+    def _approaches(
+        self, apart: _Apart, path: Trajectory
+    ) -> tuple[list[Approach], Manoeuvre | None]:
+        """Return the pairs that come too near along a path, or else along its held commands."""
+        near = apart.kept.approaches_of(path)
+        if near or apart.hold is None:
+            return near, None
+        made = apart.hold(path)
+        return apart.kept.approaches(made.held.positions, made.held.quaternions), made
+
     def _solve_apart(
         self,
         state: _SearchState,
-        kept: KeptDistances,
-        grid: _Grid,
+        apart: _Apart,
         guess: Trajectory,
         duration: float | None,
         near: Neighbourhood,
@@ -814,11 +906,11 @@ class ManoeuvreSearch:
         UnusableCandidateError
             No such solution was found.
         """
-        problem, boundary = state.problem, state.problem.boundary
+        problem, boundary, kept = state.problem, state.problem.boundary, apart.kept
         given = problem.options.duration > 0
         limits = self._planned_limits(problem, problem.limits, in_given_time=given)[-1]
-        solver = self._solver(problem, grid, kept.pairs)
-        if len(guess.shapes) != grid.intervals + 1:
+        solver = self._solver(problem, apart.grid, kept.pairs)
+        if len(guess.shapes) != apart.grid.intervals + 1:
             guess = self._guesses_on(solver, boundary).resample(guess)
         shortest = self._shortest_duration(problem)
         bounds = DurationBounds(shortest, problem.options.longest)
@@ -958,95 +1050,3 @@ class ManoeuvreSearch:
     ) -> Trajectory:
         efforts = self._model.efforts
         return trajectory if efforts is None else efforts.slowed(trajectory, boundary)
-
-
-@dataclass(frozen=True)
-class _PathClearing:
-    """Makes paths clear, and clear paths fast, on one grid.
-
-    Attributes
-    ----------
-    state
-        The search.
-    kept
-        The pairs that are kept apart; those that come too near on the way are added.
-    solve
-        Returns the solution near a guess, in a given duration (s; None: the fastest one) and its
-        lack of distance, m; raises an :class:`.UnusableCandidateError` where there is none.
-    control_period
-        s.
-    hold
-        Returns a path as held commands, which are what is to keep clear; raises the same. None:
-        the path itself is.
-    """
-
-    state: _SearchState
-    kept: KeptDistances
-    solve: Callable[[Trajectory, float | None, Neighbourhood], tuple[Trajectory, float]]
-    control_period: float | None = None
-    hold: Callable[[Trajectory], Manoeuvre] | None = None
-
-    def clear(self, path: Trajectory, duration: float) -> tuple[Trajectory, Manoeuvre | None]:
-        """Return a clear path near to one, in a given duration (s), and its held commands.
-
-        Raises
-        ------
-        UnusableCandidateError
-            None was found.
-        """
-        self.state.phase = SearchPhase.CLEARING
-        kept, limits, lacks = self.kept, self.state.problem.limits, [math.inf, math.inf]
-        near, made = kept.approaches_of(path), None
-        for _ in range(_MAX_CLEARING_ROUNDS):
-            (kept.widen if lacks[-1] < _NO_LACK else kept.add)(near)
-            guess = path.stretched(duration / path.duration)
-            deepest = min((each.distance for each in near), default=0.0)
-            largest_lack = max(_MIN_LARGEST_LACK, -_LACK_PER_DEPTH * deepest)
-            around = Neighbourhood.within(limits, largest_lack=largest_lack)
-            path, lack = self.solve(guess, duration, around)
-            near, made = self._approaches(path)
-            if not near:
-                return path, made
-            lacks.append(lack)
-            if lack >= _NO_LACK and lack > _PROGRESS_SHARE * lacks[-3]:
-                break
-        period = None if made is None else self.control_period
-        raise UnusableCandidateError(kept.message(near[0], period))
-
-    def shorten(
-        self, path: Trajectory, made: Manoeuvre | None
-    ) -> tuple[Trajectory, Manoeuvre | None]:
-        """Return a faster path near to a clear one, and its held commands; else that one itself."""
-        self.state.phase = SearchPhase.SHORTENING
-        reach, limits = 1.0, self.state.problem.limits
-        for _ in range(_MAX_SHORTENING_ROUNDS):
-            self.state.report("clear path", path.duration)
-            if reach < _MIN_REACH_SHARE or self.state.clock.is_over(found=True):
-                break
-            try:
-                faster, _ = self.solve(path, None, Neighbourhood.within(limits, reach))
-                near, found = self._approaches(faster)
-            except UnusableCandidateError:
-                reach /= _REACH_DIVISOR
-                continue
-            if near:
-                # A pair that is new has no planes yet.
-                if all(each.pair in self.kept.pairs for each in near):
-                    reach /= _REACH_DIVISOR
-                self.kept.add(near)
-                continue
-            gain = 1 - faster.duration / path.duration
-            if gain > 0:
-                path, made = faster, found
-            if gain < _MIN_GAIN * reach:
-                break
-            reach = min(_REACH_FACTOR * reach, 1.0)
-        return path, made
-
-    def _approaches(self, path: Trajectory) -> tuple[list[Approach], Manoeuvre | None]:
-        """Return the pairs that come too near along a path, or else along its held commands."""
-        near = self.kept.approaches_of(path)
-        if near or self.hold is None:
-            return near, None
-        made = self.hold(path)
-        return self.kept.approaches(made.held.positions, made.held.quaternions), made
