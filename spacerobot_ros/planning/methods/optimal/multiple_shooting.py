@@ -38,6 +38,8 @@ _IPOPT_OPTIONS = {
     "ipopt.print_level": 0,
     "ipopt.sb": "yes",
     "ipopt.linear_solver": "mumps",
+    # Approximate minimum degree: the matrices are banded, and the choice of MUMPS fills them in.
+    "ipopt.mumps_pivot_order": 0,
     "ipopt.mu_strategy": "monotone",
     "ipopt.constr_viol_tol": 1e-6,
     # Iterative refinement of steps is off.
