@@ -41,7 +41,6 @@ from spacerobot_ros.planning.core.goal import (
     PoseError,
     RobotState,
     Tolerance,
-    end_effector_pose,
 )
 from spacerobot_ros.planning.core.method import GaitMethod, InitialMotion, PlanRequest
 from spacerobot_ros.planning.core.schedule import GaitSchedule, Notes
@@ -762,24 +761,9 @@ class OptimalGait(GaitMethod):
         (true_position,) = self._prediction.positions(
             state, path.time[-1:], positions[-1:], true_end[np.newaxis]
         )
-        end = true_position, true_end
-        left = PoseError.between(*end, goal, positions[-1], self.robot)
         controls = self._kind_of(goal).specification.controls
-        notes = {
-            **notes,
-            "final_shape": positions[-1].tolist(),
-            "final_position": path.position[-1].tolist(),
-        }
-        if not goal.end_effectors or "attitude" in controls:
-            notes["predicted_attitude_error"] = left.angle
-        if not goal.end_effectors or "position" in controls:
-            notes["predicted_position_error"] = left.distance
-        for each in goal.end_effectors:
-            r_WE, quaternion = end_effector_pose(self.robot, each.link, *end, positions[-1])
-            notes[f"final_pose_of_{each.link}"] = [*r_WE.tolist(), *quaternion.tolist()]
-        if goal.end_effectors:
-            notes["predicted_end_effector_position_error"] = left.largest_end_effector_distance
-            notes["predicted_end_effector_attitude_error"] = left.largest_end_effector_angle
+        at_end = self._end_notes(goal, positions[-1], true_position, true_end, controls)
+        notes = {**notes, **at_end}
         if L_B is not None:
             momenta = state.linear_momentum, state.angular_momentum
             kept = np.broadcast_to(after, self.robot.n).copy()
