@@ -116,7 +116,8 @@ _MAX_ITERATIONS_OF_STOPS = 120
 """Steps of the solver from a guess in which wheels stop the base: most take twenty."""
 
 _MAX_FULL_GRID_STARTS = 3
-"""Number of guesses on the full grid after a coarse grid without solutions: it costs the most."""
+"""Number of guesses on the full grid after a coarse grid without solutions, and of other paths that
+are made clear on it alone: it costs the most."""
 
 _LIMIT_SHARE_IN_GIVEN_TIME = 0.99
 """Share of velocity and acceleration limits for manoeuvres of a given duration: held commands take
@@ -625,12 +626,8 @@ class ManoeuvreSearch:
     def _make_held_commands(
         self, state: _SearchState, trajectory: Trajectory, kept: KeptDistances | None = None
     ) -> Manoeuvre:
-        """Return a solution as held commands; they stay near to one that keeps pairs apart.
-
-        Raises
-        ------
-        UnusableCandidateError
-            None reach the goal within the constraints.
+        """Return a solution as held commands, near to it if pairs are kept apart;
+        UnusableCandidateError if none reach the goal within the constraints.
         """
         problem, constraints = state.problem, self._model.constraints
         fixed = problem.options.duration > 0
@@ -717,11 +714,15 @@ class ManoeuvreSearch:
         # A robot that drifts finds others sooner after it has coasted.
         if freed or (problem.boundary.drifts and problem.motion is None):
             return freed
-        clear: list[tuple[KeptDistances, Trajectory]] = []
-        for path in self._other_paths(state, [each.solution for each in found]):
-            with state.attempt():
-                if not self._has_coarse_paths(state):
+        others = self._other_paths(state, [each.solution for each in found])
+        if not self._has_coarse_paths(state):
+            for path in itertools.islice(others, _MAX_FULL_GRID_STARTS):
+                with state.attempt():
                     return [self._clear_finely(state, kept.anew(), path)]
+            return []
+        clear: list[tuple[KeptDistances, Trajectory]] = []
+        for path in others:
+            with state.attempt():
                 clear.append(self._clear_coarsely(state, kept.anew(), path))
             if len(clear) == _CLEAR_ANSWERS:
                 break
@@ -773,12 +774,7 @@ class ManoeuvreSearch:
         self, state: _SearchState, kept: KeptDistances, path: Trajectory
     ) -> tuple[KeptDistances, Trajectory]:
         """Return a fast path near to another one that keeps clear on the coarse grid, with the
-        pairs that it keeps apart.
-
-        Raises
-        ------
-        UnusableCandidateError
-            None was found.
+        pairs that it keeps apart; UnusableCandidateError if none was found.
         """
         apart = _Apart(kept, state.coarse)
         slow, _ = self._clear(state, apart, path, _CLEARING_TIME_FACTOR * path.duration)
@@ -788,12 +784,8 @@ class ManoeuvreSearch:
     def _clear_finely(
         self, state: _SearchState, kept: KeptDistances, path: Trajectory
     ) -> Manoeuvre:
-        """Return a manoeuvre near to a path that keeps clear, by the full grid.
-
-        Raises
-        ------
-        UnusableCandidateError
-            None was found.
+        """Return a manoeuvre near to a path that keeps clear, by the full grid;
+        UnusableCandidateError if none was found.
         """
         problem, options = state.problem, state.problem.options
         hold = partial(self._make_held_commands, state, kept=kept)
@@ -822,12 +814,8 @@ class ManoeuvreSearch:
     def _clear(
         self, state: _SearchState, apart: _Apart, path: Trajectory, duration: float
     ) -> tuple[Trajectory, Manoeuvre | None]:
-        """Return a clear path near to one, in a given duration (s), and its held commands.
-
-        Raises
-        ------
-        UnusableCandidateError
-            None was found.
+        """Return a clear path near to one, in a given duration (s), and its held commands;
+        UnusableCandidateError if none was found.
         """
         state.phase = SearchPhase.CLEARING
         kept, limits, lacks = apart.kept, state.problem.limits, [math.inf, math.inf]
@@ -899,12 +887,8 @@ class ManoeuvreSearch:
         near: Neighbourhood,
     ) -> tuple[Trajectory, float]:
         """Return a solution near to a guess that keeps pairs of links apart, in a duration, s
-        (None: the fastest one), and by how much they are too near all the same, m.
-
-        Raises
-        ------
-        UnusableCandidateError
-            No such solution was found.
+        (None: the fastest one), and by how much they are too near all the same, m;
+        UnusableCandidateError if none was found.
         """
         problem, boundary, kept = state.problem, state.problem.boundary, apart.kept
         given = problem.options.duration > 0
