@@ -21,7 +21,6 @@ from typing import ClassVar
 import casadi as ca
 import numpy as np
 
-from spacerobot_ros.collision import BasePoses
 from spacerobot_ros.errors import NotFoundError, PlanningError, UnreachableError
 from spacerobot_ros.files import Cache
 from spacerobot_ros.model import SpaceRobot
@@ -576,7 +575,7 @@ class OptimalGait(GaitMethod):
             try:
                 found = kind.within_efforts.search(problem, task.cancellation, task.clock)
             except NotFoundError:
-                if self.options.effort_limits != 0 or self.options.max_effort:
+                if self._efforts_are_strict:
                     raise
         notes: Notes = {
             "starts": float(found.starts),
@@ -718,8 +717,14 @@ class OptimalGait(GaitMethod):
         times = period * np.arange(len(braking), dtype=np.float64)
         positions = self._prediction.positions(state, times, braking, attitudes)
         beyond = np.any(braking < limits.lower) or np.any(braking > limits.upper)
-        if beyond or self._too_near(braking, BasePoses(positions, attitudes)):
+        if self._efforts is not None and self._efforts_are_strict:
+            beyond |= self._efforts.excess(braking, motion.velocity) > 1 + _LIMIT_ROUNDING
+        if beyond or self._too_near(braking, self._base_poses(state, braking)):
             raise refusal
+        try:
+            self._constraints.check(braking, attitudes, period)
+        except UnusableCandidateError:
+            raise refusal from None
         at_rest = replace(state, position=positions[-1], quaternion=attitudes[-1], q=braking[-1])
         request = replace(task.request, state=at_rest, motion=None)
         gait = self._plan_about_center(request, task.cancellation, task.clock)
@@ -727,6 +732,11 @@ class OptimalGait(GaitMethod):
         shapes = np.vstack([braking[:-1], gait.positions])
         after = task.boundary.final_velocity
         return self._build_schedule(state, request.goal, shapes, notes, motion.velocity, after)
+
+    @property
+    def _efforts_are_strict(self) -> bool:
+        """Whether limits of efforts are asked for: others are kept where a manoeuvre is found."""
+        return self.options.effort_limits != 0 or bool(self.options.max_effort)
 
     def _is_within_efforts(self, task: _Task, found: Manoeuvre) -> bool:
         if self._efforts is None:
