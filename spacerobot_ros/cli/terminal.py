@@ -123,10 +123,11 @@ class Display:
         with self._lock:
             if self._flies or not self._visible:
                 return
-            if self._bar is None or progress.starts <= self._bar.pos:
+            if self._bar is None or progress.starts < self._bar.pos:
                 self._begin_bar(f"planning {self._label}", progress.max_starts)
             self._bar.length = progress.max_starts
             self._bar.update(progress.starts - self._bar.pos, progress.message)
+            self._bar.render_progress()
 
     def fly(self, now: float, end: float) -> None:
         """Show simulated time against the end of the schedule, s; 0: there is none yet."""

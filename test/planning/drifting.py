@@ -36,11 +36,13 @@ def angle_between(first: Array, second: Array) -> float:
     return float(4 * np.arcsin(apart / 2))
 
 
-def flown_by_pinocchio(name: str, schedule: GaitSchedule, state: RobotState) -> tuple[Array, Array]:
+def flown_by_pinocchio(
+    name: str, schedule: GaitSchedule, state: RobotState, longest_step: float = _LONGEST_STEP
+) -> tuple[Array, Array]:
     """Return position (3,) and attitude (4,) of the base after a schedule.
 
     The momenta of the state stay; the twist of the base follows from them and the joint rates.
-    ``name`` is that of a robot, or its URDF.
+    ``name`` is that of a robot, or its URDF; Runge-Kutta steps are at most so long, s.
     """
     urdf = name if name.startswith("<") else robot_file(name).read_text()
     oracle = PinocchioOracle(urdf, schedule.joint_names)
@@ -57,7 +59,7 @@ def flown_by_pinocchio(name: str, schedule: GaitSchedule, state: RobotState) -> 
         return np.concatenate([turned, spin])
 
     x = np.concatenate([state.position, state.quaternion])
-    steps = max(1, int(np.ceil(schedule.control_period / _LONGEST_STEP)))
+    steps = max(1, int(np.ceil(schedule.control_period / longest_step)))
     h = schedule.control_period / steps
     for q, qdot in zip(schedule.positions, schedule.velocities, strict=False):
         for step in range(steps):

@@ -31,6 +31,7 @@ from spacerobot_ros.planning import (
 from spacerobot_ros.planning.core.clearance import Clearance
 from spacerobot_ros.planning.core.method import InitialMotion
 from spacerobot_ros.planning.core.prediction import BasePrediction
+from spacerobot_ros.planning.core.progress import SearchPhase, SearchProgress, report_progress
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.methods.optimal import OptimalGait
 from spacerobot_ros.planning.methods.optimal.kept_distances import DistanceLibrary
@@ -85,7 +86,14 @@ def test_optimal_goes_round_a_contact(arm: SpaceRobot, distance: float) -> None:
     clearance = Clearance(arm.description, distance)
     plain = planned(arm, "optimal", *goal, None, **QUICK)
     assert nearest_of(clearance.geometry, plain.positions) < -0.01
-    clear = planned(arm, "optimal", *goal, clearance, **QUICK)
+    seen: list[SearchProgress] = []
+    with report_progress(seen.append):
+        clear = planned(arm, "optimal", *goal, clearance, **QUICK)
+    phases = [each.phase for each in seen]
+    assert list(dict.fromkeys(phases)) == list(SearchPhase), "each begins after the one before"
+    shortened = [each.best_s for each in seen if each.phase is SearchPhase.SHORTENING]
+    assert shortened == sorted(shortened, reverse=True)
+    assert shortened[-1] == pytest.approx(clear.duration, rel=0.05), "the best is a clear one"
     assert nearest_of(clearance.geometry, clear.positions) >= distance
     assert clear.duration < 1.3 * plain.duration
     error = clear.notes["predicted_attitude_error"]

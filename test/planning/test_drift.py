@@ -73,6 +73,19 @@ def test_a_robot_that_drifts_ends_where_its_plan_says(schedule: GaitSchedule) ->
     assert np.abs(schedule.velocities).max() < limit
 
 
+def test_the_predicted_error_is_that_of_the_motion_and_not_of_the_integrator() -> None:
+    """A joint turns by a fifth of a radian in a step of the integration, which is off."""
+    turn = np.array([0.2, 0.1, -0.15])
+    few = {**QUICK, "clearance": 0.0, "integration_step": 0.05}
+    schedule = plan("quadruped", rotvec=turn, **few)
+    state = RobotState(np.zeros(3), NO_TURN, schedule.positions[0])
+    _, quaternion = flown_by_pinocchio("quadruped", schedule, state, longest_step=0.005)
+    goal = quaternion_from_rotvec(turn)
+    missed = angle_between(quaternion, goal)
+    assert angle_between(schedule.path.quaternion[-1], goal) < 1e-10 < 1e-7 < missed
+    assert schedule.notes["predicted_attitude_error"] == pytest.approx(missed, rel=0.05)
+
+
 def test_the_base_turns_on_at_the_rate_that_the_momentum_gives(
     arm: SpaceRobot, schedule: GaitSchedule
 ) -> None:

@@ -7,24 +7,29 @@ import statistics
 import time
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import median
 from typing import Any
 
+import coal
 import numpy as np
 import pinocchio
 import pytest
+from planning.test_obstacles import ball_at, distances_to
 from scipy.spatial.transform import Rotation
 
 from spacerobot_ros import fly
+from spacerobot_ros.collision import BasePoses, CollisionGeometry
 from spacerobot_ros.errors import PlanningError
 from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.model.description import Array
+from spacerobot_ros.model.description import Array, Pose
 from spacerobot_ros.model.rotations import matrix_from_quaternion, quaternion_from_rotvec
+from spacerobot_ros.model.world import with_world
 from spacerobot_ros.planning import (
     GaitSchedule,
     Goal,
+    InitialMotion,
     PlanRequest,
     RobotState,
     Tolerance,
@@ -32,6 +37,7 @@ from spacerobot_ros.planning import (
     plan,
 )
 from spacerobot_ros.planning.core.clearance import Clearance
+from spacerobot_ros.planning.core.prediction import BasePrediction, coasting_positions
 from spacerobot_ros.planning.methods.optimal import OptimalGait
 from spacerobot_ros.planning.methods.optimal.problem import MotionLimits, OptimalOptions
 from spacerobot_ros.resources import robot_file, share_directory
@@ -433,3 +439,170 @@ def test_flown_times_are_those_of_the_solutions() -> None:
     )
     assert np.mean(np.array(beyond) <= 0.03) >= 0.95
     assert max(ticks) <= 3
+
+
+# -- plans that begin while the joints move keep clear, of links and of a rock on the way ---------
+
+
+MOVING_CASES = int(os.environ.get("SPACEROBOT_MOVING_CASES", "1"))
+"""Cases of each robot in which the fastest way to another goal is not clear."""
+
+MOVING_SEED = int(os.environ.get("SPACEROBOT_MOVING_SEED", "1"))
+
+MOVING_ROBOTS = ("three_joint_arm", "surveyor", "quadruped")
+
+BRAKING_TICKS, ROCK_RADIUS = 11, 0.05
+
+NO_TURN = np.array([0.0, 0.0, 0.0, 1.0])
+
+
+@dataclass(frozen=True)
+class MovingCase:
+    """A request in motion, the duration of its fastest plan, s, and a rock on its way, r_W (3,)."""
+
+    number: int
+    request: PlanRequest
+    fastest: float
+    rock: Array | None
+
+
+def moving_cases(robot: SpaceRobot, count: int) -> Iterator[MovingCase]:
+    """Yield cases: another goal comes in flight; the base drifts if the number leaves 2 by 3.
+
+    What was flown so far, and where the joints would come to rest, is clear.
+    """
+    geometry = Clearance(robot.description, CLEARANCE).geometry
+    low, high = np.maximum(robot.lower, -1.0), np.minimum(robot.upper, 1.0)
+    quick, free = (
+        OptimalGait(robot, PERIOD, 0.01, method_options("optimal", {"cache": 0, **options}))
+        for options in ({"answers": 1, "intervals": 40}, {})
+    )
+    found = number = 0
+    while found < count:
+        number += 1
+        rng = np.random.default_rng(
+            [MOVING_SEED, MOVING_ROBOTS.index(robot.description.name), number]
+        )
+
+        def clear_shape(rng: np.random.Generator = rng) -> Array:
+            while True:
+                q = np.asarray(rng.uniform(low, high))
+                nearest = geometry.nearest(q)
+                if nearest is None or nearest[0] >= CLEARANCE:
+                    return q
+
+        start, goals = clear_shape(), []
+        for _ in range(2):
+            turn = rng.normal(size=3)
+            turn *= rng.uniform(0.1, 0.5) / np.linalg.norm(turn)
+            shape = clear_shape() if rng.uniform() < 0.4 else None
+            goals.append(Goal.checked(np.zeros(3), quaternion_from_rotvec(turn), shape))
+        omega = rng.normal(size=3) * 0.005 * (number % 3 == 2)
+        L = robot.momentum(NO_TURN, start, np.zeros(3), omega, np.zeros(robot.n))[1]
+        state = RobotState(np.zeros(3), NO_TURN, start, angular_momentum=L)
+        tolerance = Tolerance(1e-6, 1e-6, 1e-6)
+        try:
+            first = quick.plan(PlanRequest(state, goals[0], tolerance))
+            tick = max(1, round(rng.uniform(0.2, 0.7) * first.ticks))
+            flown = first.positions[: tick + BRAKING_TICKS]
+            if geometry_nearest(geometry, flown) < CLEARANCE:
+                continue
+            prediction = BasePrediction(robot.interpreted, PERIOD, 0.01)
+            attitudes = prediction.attitudes(first.positions, NO_TURN, L)
+            times = PERIOD * np.arange(tick + 1, dtype=np.float64)
+            upto = first.positions[: tick + 1]
+            places = prediction.positions(state, times, upto, attitudes[: tick + 1])
+            now = replace(
+                state, position=places[-1], quaternion=attitudes[tick], q=first.positions[tick]
+            )
+            motion = InitialMotion(first.velocities[tick - 1], first.positions[tick:])
+            request = PlanRequest(now, goals[1], tolerance, motion=motion)
+            fastest = free.plan(request)
+        except PlanningError:
+            continue
+        rock = rock_on_the_way(robot, now, fastest, flown) if number % 3 == 1 else None
+        if rock is None and geometry_nearest(geometry, fastest.positions) >= CLEARANCE:
+            continue
+        found += 1
+        yield MovingCase(number, request, fastest.duration, rock)
+
+
+def geometry_nearest(geometry: CollisionGeometry, positions: Array) -> float:
+    """Return the smallest distance of links along shapes (N + 1, n), m."""
+    ticks = np.linspace(0, len(positions) - 1, 200)
+    at = np.column_stack([np.interp(ticks, np.arange(len(positions)), x) for x in positions.T])
+    poses = geometry.poses(at)
+    return min(float(geometry.distances(p, poses).min()) for p in range(len(geometry.pairs)))
+
+
+def rock_on_the_way(
+    robot: SpaceRobot, state: RobotState, schedule: GaitSchedule, flown: Array
+) -> Array | None:
+    """Return the place (3,) of a rock that the last link passes half-way; None: it is near an end
+    or to what was flown.
+    """
+
+    def last_link(q: Array, r_WB: Array, quaternion: Array) -> Array:
+        _, r_BL = (np.array(each) for each in robot.function("link_poses", compile=False)(q))
+        return np.asarray(r_WB + matrix_from_quaternion(quaternion) @ r_BL[:, -1])
+
+    attitudes = BasePrediction(robot.interpreted, PERIOD, 0.01).attitudes(
+        schedule.positions, state.quaternion, state.angular_momentum
+    )
+    times = PERIOD * np.arange(len(attitudes), dtype=np.float64)
+    places = coasting_positions(robot, state, times, schedule.positions, attitudes)
+    k = len(attitudes) // 2
+    rock = last_link(schedule.positions[k], places[k], attitudes[k])
+    world = with_world(robot.description, ball_at(rock, ROCK_RADIUS))
+    geometry = Clearance(world, CLEARANCE).geometry
+    ends = np.array([schedule.positions[0], flown[-1], schedule.positions[-1]])
+    bases = BasePoses(places[[0, 0, -1]], attitudes[[0, 0, -1]])
+    poses = geometry.poses(ends, bases)
+    nearest = min(float(geometry.distances(p, poses).min()) for p in range(len(geometry.pairs)))
+    return rock if nearest >= 2 * CLEARANCE else None
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", MOVING_ROBOTS)
+def test_plans_in_motion_keep_clear(name: str, tmp_path: Path) -> None:
+    robot = SpaceRobot.from_file(robot_file(name))
+    refused, longer = 0, []
+    for case in moving_cases(robot, MOVING_CASES):
+        described, state = robot.description, case.request.state
+        if case.rock is not None:
+            described = with_world(described, ball_at(case.rock, ROCK_RADIUS))
+        clearance = Clearance(described, CLEARANCE)
+        method = OptimalGait(
+            robot, PERIOD, 0.01, method_options("optimal", {"cache": 0}), clearance
+        )
+        began = time.process_time()
+        drifts = bool(state.angular_momentum.any())
+        kind = "a rock" if case.rock is not None else "links, drifting" if drifts else "links"
+        try:
+            schedule = method.plan(case.request)
+        except PlanningError as refusal:
+            cpu = time.process_time() - began
+            print(f"  {name} {case.number}, {kind}: {cpu:.1f} s of CPU time, {refusal}", flush=True)
+            assert drifts
+            refused += 1
+            continue
+        cpu = time.process_time() - began
+        folder = tmp_path / str(case.number)
+        folder.mkdir()
+        distances = Distances(robot, Clearance(robot.description, CLEARANCE), state.q, folder)
+        nearest = distances.nearest(schedule)
+        if case.rock is not None:
+            rock = Pose(np.eye(3), case.rock), coal.Sphere(ROCK_RADIUS)
+            nearest = min(nearest, *distances_to(*rock, robot, schedule, state))
+        longer.append(schedule.duration / case.fastest)
+        braking = schedule.notes.get("braking_time", 0.0)
+        print(
+            f"  {name} {case.number}, {kind}: {schedule.duration:.4g} s, {case.fastest:.4g} s "
+            f"without clearance, braking {braking:.3g} s; {nearest:.4f} m; {cpu:.1f} s of CPU time",
+            flush=True,
+        )
+        assert nearest >= CLEARANCE - 1e-4
+        np.testing.assert_array_equal(schedule.positions[0], state.q)
+    print(f"{name}: {MOVING_CASES - refused} of {MOVING_CASES} planned, in the median ", end="")
+    print(f"{median(longer or [np.nan]):.3g} times as long as without clearance")
+    assert refused <= 0.1 * MOVING_CASES + 1

@@ -18,7 +18,12 @@ from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.compilation import ANNOUNCEMENT_ATTRIBUTE
 from spacerobot_ros.planning import BasePath, GaitSchedule, Goal, RobotState
 from spacerobot_ros.planning.core.prediction import BasePrediction
-from spacerobot_ros.planning.core.progress import SearchProgress, log_progress, report_progress
+from spacerobot_ros.planning.core.progress import (
+    SearchPhase,
+    SearchProgress,
+    log_progress,
+    report_progress,
+)
 from spacerobot_ros.planning.execution.path_deviation import (
     MassEstimate,
     PathDeviation,
@@ -299,6 +304,7 @@ def test_what_is_shown_of_a_search_and_of_a_flight(monkeypatch: pytest.MonkeyPat
     shown.show_line("Compiling.")
     shown.search(SearchProgress(1, 8))
     shown.search(SearchProgress(8, 8, 12.34567))
+    shown.search(SearchProgress(8, 8, 12.1, SearchPhase.SHORTENING, 3.2))
     shown.fly(0.0, 0.0)
     shown.fly(5.0, 20.0)
     shown.search(SearchProgress(1, 8))
@@ -308,6 +314,7 @@ def test_what_is_shown_of_a_search_and_of_a_flight(monkeypatch: pytest.MonkeyPat
     assert text.startswith("Compiling.\n")
     assert "start 1 of at most 8, none found yet" in text
     assert "start 8 of at most 8, best 12.35 s" in text
+    assert "shortening, start 8 of at most 8, best 12.1 s, 3 s" in text
     assert "5.0 of 20.0 s" in text
     assert text.index("planning arm") < text.index("flying arm")
     assert "planning" not in text[text.index("flying arm") :], "corrections disturb no flight"

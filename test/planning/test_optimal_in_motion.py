@@ -83,6 +83,7 @@ def test_another_goal_is_reached_from_moving_joints_within_the_limits(angle: flo
     _, state, motion = halfway(first())
     assert np.abs(motion.velocity).max() > 0.2, "the joints move"
     schedule = planar().plan(PlanRequest(state, turned(angle), TOLERANCE, motion=motion))
+    assert "braking_time" not in schedule.notes
     np.testing.assert_array_equal(schedule.positions[0], state.q)
     require_smooth(motion.velocity, schedule)
     assert flown_angle(state, schedule) == pytest.approx(angle, abs=1e-6)
@@ -102,6 +103,18 @@ def test_it_begins_as_fast_as_the_joints_move_and_not_faster_than_they_may() -> 
     fast = InitialMotion(np.array([0.0, 0.6]), motion.remaining)
     with pytest.raises(PlanningError, match="faster than the velocity limits"):
         planar().plan(PlanRequest(state, turned(0.4), TOLERANCE, motion=fast))
+
+
+def test_joints_brake_first_where_no_plan_in_motion_is_found() -> None:
+    """So few steps of the solver are enough from rest alone."""
+    _, state, motion = halfway(first())
+    method = planar(starts=2, intervals=20, iterations=12)
+    schedule = method.plan(PlanRequest(state, turned(-0.1), TOLERANCE, motion=motion))
+    braking = round(float(str(schedule.notes["braking_time"])) / PERIOD)
+    assert braking >= np.abs(motion.velocity / ACCELERATION).max() / PERIOD
+    np.testing.assert_array_equal(schedule.positions[braking], schedule.positions[braking - 1])
+    require_smooth(motion.velocity, schedule)
+    assert flown_angle(state, schedule) == pytest.approx(-0.1, abs=1e-6)
 
 
 def test_methods_say_whether_they_start_in_motion() -> None:

@@ -140,6 +140,19 @@ def test_a_search_cut_short_gives_the_best_so_far(arm: SpaceRobot) -> None:
     assert_within(hasty, arm.velocity_limit, arm.velocity_limit / 0.5)
 
 
+def test_all_searches_of_a_plan_share_its_time(
+    arm: SpaceRobot, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A base that drifts is planned for at once, then for its passes of the goal, then for any."""
+    clock = SlowClock(0.02)
+    for module in (multiple_shooting, search):
+        monkeypatch.setattr(module, "time", clock)
+    few: dict[str, Any] = {"iterations": 6, "starts": 24, "angular_momentum": [1.5, -0.6, 1.1]}
+    with pytest.raises(PlanningError, match=r"within optimal\.time_budget 0\.5 s"):
+        of_arm(arm, [0.5, -0.6, 0.4], time_budget=0.5, **few)
+    assert 2.5 < clock.now < 4.0
+
+
 def test_a_plan_is_the_same_on_a_busy_machine(
     arm: SpaceRobot, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -17,7 +17,15 @@ from spacerobot_ros.model.integration import DEFAULT_INTEGRATION_STEP
 from spacerobot_ros.model.wheels import ReactionWheels
 from spacerobot_ros.planning.core.cancellation import NEVER, Cancellation
 from spacerobot_ros.planning.core.clearance import Clearance
-from spacerobot_ros.planning.core.goal import POSE, Controlled, Goal, RobotState, Tolerance
+from spacerobot_ros.planning.core.goal import (
+    POSE,
+    Controlled,
+    Goal,
+    PoseError,
+    RobotState,
+    Tolerance,
+    end_effector_pose,
+)
 from spacerobot_ros.planning.core.joint_efforts import JointEfforts, given_effort_limits
 from spacerobot_ros.planning.core.prediction import BasePrediction
 from spacerobot_ros.planning.core.schedule import BasePath, GaitSchedule, Notes
@@ -253,6 +261,31 @@ class GaitMethod(ABC):
             progress=progress,
             end_velocities=end_velocities,
         )
+
+    def _end_notes(
+        self,
+        goal: Goal,
+        q: Array,
+        position: Array,
+        quaternion: Array,
+        controls: frozenset[Controlled],
+    ) -> Notes:
+        """Return notes on the end of a gait: the shape (n,), the pose of the base (3,), (4,) and of
+        links that the goal names, and the errors of the parts that are controlled.
+        """
+        left = PoseError.between(position, quaternion, goal, q, self.robot)
+        notes: Notes = {"final_shape": q.tolist(), "final_position": position.tolist()}
+        if not goal.end_effectors or "attitude" in controls:
+            notes["predicted_attitude_error"] = left.angle
+        if not goal.end_effectors or "position" in controls:
+            notes["predicted_position_error"] = left.distance
+        for each in goal.end_effectors:
+            r_WE, turned = end_effector_pose(self.robot, each.link, position, quaternion, q)
+            notes[f"final_pose_of_{each.link}"] = [*r_WE.tolist(), *turned.tolist()]
+        if goal.end_effectors:
+            notes["predicted_end_effector_position_error"] = left.largest_end_effector_distance
+            notes["predicted_end_effector_attitude_error"] = left.largest_end_effector_angle
+        return notes
 
     def goal_shape(self, goal: Goal) -> Array | None:
         """Return the goal shape (n,) within the joint limits, None for a goal without shape.

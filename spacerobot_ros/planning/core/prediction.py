@@ -8,7 +8,13 @@ from spacerobot_ros.collision import BasePoses
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.integration import count_steps
-from spacerobot_ros.model.rotations import matrices_from_quaternions, matrix_from_quaternion
+from spacerobot_ros.model.rotations import (
+    attitude_error,
+    matrices_from_quaternions,
+    matrix_from_quaternion,
+    quaternion_from_rotvec,
+    quaternion_multiply,
+)
 from spacerobot_ros.planning.core.goal import RobotState
 from spacerobot_ros.planning.core.schedule import BasePath
 
@@ -62,18 +68,33 @@ class BasePrediction:
         self._control_period = control_period
         substeps = count_steps(control_period, integration_step)
         self._step = robot.velocity_step(substeps)
-        self._step.inputs[3][:] = control_period
 
     def attitudes(self, positions: Array, quaternion: Array, L_W: Array) -> Array:
         """Return the attitude (N + 1, 4) at every tick of the shapes ``positions`` (N + 1, n)."""
+        return self._integrate(positions, quaternion, L_W, self._control_period)
+
+    def true_end(self, positions: Array, attitudes: Array, L_W: Array) -> Array:
+        """Return the attitude (4,) at the end of the shapes (N + 1, n), whatever their speed.
+
+        The ``attitudes`` (N + 1, 4) are those of the plant's steps. Their error, which is of order
+        four, is estimated from half of the steps (Richardson's extrapolation).
+        """
+        halves = np.empty((2 * len(positions) - 1, positions.shape[1]))
+        halves[::2], halves[1::2] = positions, (positions[1:] + positions[:-1]) / 2
+        finer = self._integrate(halves, attitudes[0], L_W, self._control_period / 2)[-1]
+        error = attitude_error(attitudes[-1], finer) / 15
+        return quaternion_multiply(finer, quaternion_from_rotvec(error))
+
+    def _integrate(self, positions: Array, quaternion: Array, L_W: Array, period: float) -> Array:
+        """Return the attitude (N + 1, 4) at shapes (N + 1, n) that are a period, s, apart."""
         state, qdot, momentum, h = self._step.inputs
         result = self._step.outputs[0]
-        momentum[:] = L_W
+        momentum[:], h[:] = L_W, period
         n = self._robot.n
         attitudes = np.empty((len(positions), 4))
         attitudes[0] = quaternion
         state[n:] = quaternion
-        rates = np.diff(positions, axis=0) / h[0]
+        rates = np.diff(positions, axis=0) / period
         for k, rate in enumerate(rates):
             state[:n] = positions[k]
             qdot[:] = rate

@@ -11,11 +11,25 @@ import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from enum import Enum
 
 from spacerobot_ros.model.compilation import ANNOUNCEMENT_ATTRIBUTE
 
 _RECORD_ATTRIBUTE = "search_progress"
 _PACKAGE = "spacerobot_ros"
+
+_TIMED_FROM = 1.0  # s
+
+
+class SearchPhase(Enum):
+    """What a search does: it searches for solutions, refines them, and makes them clear, and clear
+    ones short.
+    """
+
+    SEARCHING = "searching"
+    REFINING = "refining"
+    CLEARING = "clearing"
+    SHORTENING = "shortening"
 
 
 @dataclass(frozen=True)
@@ -29,17 +43,26 @@ class SearchProgress:
         where enough solutions agree.
     best_s
         Duration of the best manoeuvre so far, s; infinite before the first.
+    phase
+        What the search does.
+    elapsed_s
+        Wall time since it began, s.
     """
 
     starts: int
     max_starts: int
     best_s: float = math.inf
+    phase: SearchPhase = SearchPhase.SEARCHING
+    elapsed_s: float = 0.0
 
     @property
     def message(self) -> str:
         """The progress as a message, without a full stop."""
         best = f"best {self.best_s:.4g} s" if math.isfinite(self.best_s) else "none found yet"
-        return f"start {self.starts} of at most {self.max_starts}, {best}"
+        elapsed = f", {self.elapsed_s:.0f} s" if self.elapsed_s >= _TIMED_FROM else ""
+        return (
+            f"{self.phase.value}, start {self.starts} of at most {self.max_starts}, {best}{elapsed}"
+        )
 
 
 def log_progress(logger: logging.Logger, progress: SearchProgress, line: str) -> None:

@@ -878,15 +878,5 @@ class ResolvedRateGait(GaitMethod):
     ) -> GaitSchedule:
         path = self._prediction.path(state, positions)
         end = path.position[-1], path.quaternion[-1]
-        left = PoseError.between(*end, goal, positions[-1], self.robot)
-        notes = {
-            **notes,
-            "final_shape": positions[-1].tolist(),
-            "final_position": path.position[-1].tolist(),
-            "predicted_end_effector_position_error": left.largest_end_effector_distance,
-            "predicted_end_effector_attitude_error": left.largest_end_effector_angle,
-        }
-        for each in goal.end_effectors:
-            r_WE, quaternion = end_effector_pose(self.robot, each.link, *end, positions[-1])
-            notes[f"final_pose_of_{each.link}"] = [*r_WE.tolist(), *quaternion.tolist()]
+        notes = {**notes, **self._end_notes(goal, positions[-1], *end, self.controls)}
         return self.schedule_of(goal, positions, path, notes, progress=progress)

@@ -4,21 +4,14 @@ without has brought near.
 Rows for all pairs would be dear, and few of them matter. So a problem is solved without any first.
 Where held commands bring links too near, by the exact check, the pairs get rows: their distances
 from planes between them (:mod:`spacerobot_ros.collision.planes`), which hold near the path that
-they are made for alone. So a clear path is looked for in small changes, in more time and with
-little effort; links may be nearer than they ought to be at first, at a cost. A clear path is then
-made faster in the same way, by changes that keep it clear.
-
-J. Schulman et al., "Motion planning with sequential convex optimization and convex collision
-checking", International Journal of Robotics Research 33, 2014, whose steps are quadratic programs;
-here they are the manoeuvre's own problem.
+they are made for alone.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from typing import Generic, Protocol, TypeVar
+from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -30,12 +23,10 @@ from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.rotations import matrix_from_quaternion, quaternion_multiply
 from spacerobot_ros.planning.core.clearance import Clearance
 from spacerobot_ros.planning.core.prediction import BasePrediction
-from spacerobot_ros.planning.methods.optimal.multiple_shooting import Neighbourhood
 from spacerobot_ros.planning.methods.optimal.problem import (
     BoundaryConditions,
     MotionLimits,
     Trajectory,
-    UnusableCandidateError,
 )
 
 _INITIAL_MARGIN = 2e-3
@@ -49,26 +40,6 @@ coarse one they would come too near."""
 
 _SHARE_OF_ENDS = 0.1
 """Share of a path at either end where pairs need not have room."""
-
-_MAX_CLEARING_ROUNDS, _MAX_SHORTENING_ROUNDS = 15, 10
-"""Paths on the way to a clear one, and from there to a fast one, at most."""
-
-_MIN_LARGEST_LACK, _LACK_PER_DEPTH = 0.1, 2.0
-"""Distance by which links on the way to a clear path may be nearer than they ought to be, m: at
-least, and as a multiple of the depth of their contact."""
-
-_NO_LACK = 1e-3
-"""Lack of distance below which all planes are kept, m."""
-
-_PROGRESS_SHARE = 0.9
-"""Largest ratio of the lack of distance to the one two paths before at which it is going on."""
-
-_MIN_GAIN = 0.01
-"""Relative gain of time below which a clear path is not made faster any more, at the full reach."""
-
-_REACH_DIVISOR, _REACH_FACTOR, _MIN_REACH_SHARE = 3.0, 2.0, 0.02
-"""Divisor of the reach where a faster path is not clear, its factor where it is, and the share of
-the largest reach at which paths are not made faster any more."""
 
 
 def instants_of(intervals: int) -> int:
@@ -246,107 +217,3 @@ class KeptDistances:
                 left_as_it_is &= at_ends
             found[:, number, 3] += np.where(left_as_it_is, np.minimum(distances, wanted), wanted)
         return replace(limits, distances=found.reshape(len(path.shapes) - 1, -1))
-
-
-class Held(Protocol):
-    """A path as held commands (:class:`.HeldCommands`)."""
-
-    @property
-    def positions(self) -> Array:
-        """(N + 1, n) shapes at the ticks, m or rad."""
-        ...
-
-    @property
-    def quaternions(self) -> Array:
-        """(N + 1, 4) turns of the base since the start there."""
-        ...
-
-
-H = TypeVar("H", bound=Held)
-
-
-@dataclass(frozen=True)
-class PathClearing(Generic[H]):
-    """Makes paths clear, and clear paths fast, on one grid.
-
-    Attributes
-    ----------
-    kept
-        The pairs that are kept apart; those that come too near on the way are added.
-    limits
-        Limits of the joints.
-    solve
-        Returns the solution near a guess, in a given duration (s; None: the fastest one) and its
-        lack of distance, m; raises an :class:`.UnusableCandidateError` where there is none.
-    control_period
-        s.
-    hold
-        Returns a path as held commands, which are what is to keep clear; raises the same. None:
-        the path itself is.
-    """
-
-    kept: KeptDistances
-    limits: MotionLimits
-    solve: Callable[[Trajectory, float | None, Neighbourhood], tuple[Trajectory, float]]
-    control_period: float
-    hold: Callable[[Trajectory], H] | None = None
-
-    def clear(self, path: Trajectory, duration: float) -> tuple[Trajectory, H | None]:
-        """Return a clear path near to one, in a given duration (s), and its held commands.
-
-        Raises
-        ------
-        UnusableCandidateError
-            None was found.
-        """
-        kept, lacks = self.kept, [math.inf, math.inf]
-        near, held = kept.approaches_of(path), None
-        for _ in range(_MAX_CLEARING_ROUNDS):
-            (kept.widen if lacks[-1] < _NO_LACK else kept.add)(near)
-            guess = path.stretched(duration / path.duration)
-            deepest = min((each.distance for each in near), default=0.0)
-            largest_lack = max(_MIN_LARGEST_LACK, -_LACK_PER_DEPTH * deepest)
-            around = Neighbourhood.within(self.limits, largest_lack=largest_lack)
-            path, lack = self.solve(guess, duration, around)
-            near, held = self._approaches(path)
-            if not near:
-                return path, held
-            lacks.append(lack)
-            if lack >= _NO_LACK and lack > _PROGRESS_SHARE * lacks[-3]:
-                break
-        period = None if held is None else self.control_period
-        raise UnusableCandidateError(kept.message(near[0], period))
-
-    def shorten(self, path: Trajectory, held: H | None) -> tuple[Trajectory, H | None]:
-        """Return a faster path near to a clear one, and its held commands; else that one itself."""
-        reach = 1.0
-        for _ in range(_MAX_SHORTENING_ROUNDS):
-            if reach < _MIN_REACH_SHARE:
-                break
-            try:
-                faster, _ = self.solve(path, None, Neighbourhood.within(self.limits, reach))
-                near, found = self._approaches(faster)
-            except UnusableCandidateError:
-                reach /= _REACH_DIVISOR
-                continue
-            if near:
-                # A pair that is new has no planes yet.
-                if all(each.pair in self.kept.pairs for each in near):
-                    reach /= _REACH_DIVISOR
-                self.kept.add(near)
-                continue
-            gain = 1 - faster.duration / path.duration
-            if gain > 0:
-                path, held = faster, found
-            if gain < _MIN_GAIN * reach:
-                break
-            reach = min(_REACH_FACTOR * reach, 1.0)
-        return path, held
-
-    def _approaches(self, path: Trajectory) -> tuple[list[Approach], H | None]:
-        """Return the pairs that come too near along a path, or else along its held commands."""
-        near = self.kept.approaches_of(path)
-        if near or self.hold is None:
-            return near, None
-        held = self.hold(path)
-        return self.kept.approaches(held.positions, held.quaternions), held

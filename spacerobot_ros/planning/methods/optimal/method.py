@@ -12,7 +12,7 @@ import io
 import json
 import math
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -40,7 +40,6 @@ from spacerobot_ros.planning.core.goal import (
     PoseError,
     RobotState,
     Tolerance,
-    end_effector_pose,
 )
 from spacerobot_ros.planning.core.method import GaitMethod, InitialMotion, PlanRequest
 from spacerobot_ros.planning.core.schedule import GaitSchedule, Notes
@@ -67,7 +66,8 @@ from spacerobot_ros.planning.methods.optimal.problem import (
 from spacerobot_ros.planning.methods.optimal.search import (
     Manoeuvre,
     ManoeuvreSearch,
-    MotionSearch,
+    SearchClock,
+    SearchProblem,
 )
 from spacerobot_ros.version import __version__
 
@@ -144,16 +144,21 @@ class _CoastingMotion:
 
 
 @dataclass(frozen=True)
-class _Searches:
-    """The searches for manoeuvres that begin at rest, and for those that begin in motion."""
+class _Task:
+    """A request with what a search takes; the options are those of this search."""
 
-    from_rest: ManoeuvreSearch
-    in_motion: MotionSearch
+    request: PlanRequest
+    boundary: BoundaryConditions
+    limits: MotionLimits
+    options: OptimalOptions
+    cancellation: Cancellation
+    clock: SearchClock
 
-    @classmethod
-    def of(cls, model: ManoeuvreModel) -> _Searches:
-        search = ManoeuvreSearch(model)
-        return cls(search, MotionSearch(model, search.solver))
+    @property
+    def velocity(self) -> Array | float:
+        """The velocities (n,) of the joints that are held before."""
+        motion = self.request.motion
+        return self.boundary.velocity if motion is None else motion.velocity
 
 
 @dataclass(frozen=True)
@@ -164,13 +169,13 @@ class _GoalKind:
     model: ManoeuvreModel
 
     @cached_property
-    def without_effort_limits(self) -> _Searches:
-        return _Searches.of(replace(self.model, efforts=None))
+    def without_effort_limits(self) -> ManoeuvreSearch:
+        return ManoeuvreSearch(replace(self.model, efforts=None))
 
     @cached_property
-    def within_efforts(self) -> _Searches:
-        """The searches with effort limits: most manoeuvres of most robots do not need them."""
-        return _Searches.of(self.model)
+    def within_efforts(self) -> ManoeuvreSearch:
+        """The search with effort limits: most manoeuvres of most robots do not need them."""
+        return ManoeuvreSearch(self.model)
 
 
 class OptimalGait(GaitMethod):
@@ -267,9 +272,10 @@ class OptimalGait(GaitMethod):
             base: frozenset[Controlled] = goal.base | {"attitude"}
             goal = replace(goal, quaternion=state.quaternion, base=base)
         request = replace(request, state=state, goal=goal)
+        clock = SearchClock(self.options.time_budget)
         if not state.linear_momentum.any():
-            return self._plan_about_center(request, cancellation)
-        schedule = self._plan_while_coasting(request, cancellation)
+            return self._plan_about_center(request, cancellation, clock)
+        schedule = self._plan_while_coasting(request, cancellation, clock)
         velocity: Array | float = self._wheel_rates(state.qdot)
         if request.motion is not None:
             velocity = request.motion.velocity
@@ -337,7 +343,7 @@ class OptimalGait(GaitMethod):
         return replace(boundary, velocity=begin, final_velocity=end, final=final)
 
     def _plan_while_coasting(
-        self, request: PlanRequest, cancellation: Cancellation
+        self, request: PlanRequest, cancellation: Cancellation, clock: SearchClock
     ) -> GaitSchedule:
         """Return the schedule of a robot whose centre of mass coasts, in the frame of that.
 
@@ -352,7 +358,7 @@ class OptimalGait(GaitMethod):
             )
         in_frame = replace(request, state=replace(state, linear_momentum=np.zeros(3)))
         if not goal.end_effectors and "position" not in self._specification.controls:
-            return self._plan_about_center(in_frame, cancellation)
+            return self._plan_about_center(in_frame, cancellation, clock)
         if goal.joint_positions is not None and not goal.end_effectors:
             raise PlanningError(
                 "The robot drifts: its centre of mass moves at "
@@ -364,7 +370,7 @@ class OptimalGait(GaitMethod):
         def plan_for_end(end: float, duration: float | None) -> GaitSchedule:
             moved = goal.displaced(-velocity * end)
             aimed = replace(in_frame, goal=moved)
-            return self._plan_about_center(aimed, cancellation, duration)
+            return self._plan_about_center(aimed, cancellation, clock, duration)
 
         if self.options.duration > 0:
             ticks = max(round(self.options.duration / self.control_period), 1)
@@ -392,33 +398,32 @@ class OptimalGait(GaitMethod):
         )
 
     def _plan_about_center(
-        self, request: PlanRequest, cancellation: Cancellation, duration: float | None = None
+        self,
+        request: PlanRequest,
+        cancellation: Cancellation,
+        clock: SearchClock,
+        duration: float | None = None,
     ) -> GaitSchedule:
         """Plan where the centre of mass rests; in a ``duration``, s, or that of the options."""
         state, goal, correction = request.state, request.goal, request.correction
-        q = state.q
+        q, motion, shape = state.q, request.motion, self.goal_shape(goal)
         margin = np.zeros(self.robot.n) if correction else self._margin
-        shape, kind = self.goal_shape(goal), self._kind_of(goal)
         same_shape = self._specification.same_shape and not goal.end_effectors
-        if request.motion is not None and shape is None and same_shape:
+        if motion is not None and shape is None and same_shape:
             # The present shape is a shape on the path.
-            shape = request.motion.remaining[-1]
-        boundary = kind.specification.boundary_conditions(
-            self.robot,
-            request,
-            shape,
-            self._limits,
-            self._constraints.direction_W,
-        )
+            shape = motion.remaining[-1]
+        boundary = self._boundary(request, shape)
         L_0 = matrix_from_quaternion(state.quaternion).T @ state.angular_momentum
         boundary = replace(boundary, state=state, angular_momentum=L_0)
         boundary = self._with_wheels(boundary, request)
         # A manoeuvre ends within the margin if its goal does.
         limits = self._limits.within(margin, q, boundary.likely_final_shape)
-        if request.motion is not None:
-            return self._plan_in_motion(
-                request, request.motion, boundary, limits, cancellation, duration
-            )
+        chosen = replace(self.options, duration=0.0, answers=1) if correction else self.options
+        if duration is not None:
+            chosen = replace(chosen, duration=duration)
+        task = _Task(request, boundary, limits, chosen, cancellation, clock)
+        if motion is not None:
+            return self._plan_in_motion(task, motion, given=duration is not None)
         end = boundary.final_velocity
         if self._is_reached(state, goal) and np.allclose(end, boundary.velocity, rtol=_ZERO_ERROR):
             return self._build_schedule(state, goal, q[np.newaxis], {"starts": 0.0}, 0.0, end)
@@ -436,58 +441,57 @@ class OptimalGait(GaitMethod):
                 return self._build_schedule(
                     state, goal, plan.positions, notes, boundary.velocity, end
                 )
-        chosen = replace(self.options, duration=0.0, answers=1) if correction else self.options
-        if duration is not None:
-            chosen = replace(chosen, duration=duration)
-        searched = request, boundary, limits, chosen, cancellation
-        bound = self._require_enough_time(
-            request, boundary, chosen, final_is_given=shape is not None or same_shape
-        )
+        bound = self._require_enough_time(task, final_is_given=shape is not None or same_shape)
         # The clearance of a base that coasts on among obstacles is not checked.
         coasts = boundary.drifts and not len(self._wheels)
         try:
             if coasts and chosen.duration == 0 and not self._has_obstacles:
-                found = self._begin_now_or_coast(*searched)
+                found = self._begin_now_or_coast(task)
             elif correction or boundary.is_timed or chosen.time_budget > 0:
-                found = self._begin_now(*searched)
+                found = self._begin_now(task)
             else:
-                found = self._begin_in_asked_time(*searched)
+                found = self._begin_in_asked_time(task)
         except NotFoundError as refusal:
             if bound.seconds == 0:
                 raise
             raise NotFoundError(f"{refusal} It is proved that {bound}.") from None
-        schedule = self._build_schedule(
-            state, goal, found.positions, found.notes, boundary.velocity, end
-        )
+        schedule = self._schedule(task, found)
         # A result of a busy machine is not cached, as an idle machine finds a better one.
         if (
             self._cache is not None
             and key is not None
             and not found.manoeuvre.cut_short
-            and self._is_within_efforts(found.manoeuvre, boundary.velocity, boundary)
+            and self._is_within_efforts(task, found.manoeuvre)
         ):
             kept_plan = _CachedPlan(schedule.positions, found.notes)
             self._cache.store(f"{key[:32]}.npz", key, kept_plan.to_bytes())
         return schedule
 
+    def _boundary(self, request: PlanRequest, shape: Array | None) -> BoundaryConditions:
+        """Return the ends of a request whose goal shape (n,) is another one; None: any."""
+        specification = self._kind_of(request.goal).specification
+        direction_W = self._constraints.direction_W
+        return specification.boundary_conditions(
+            self.robot, request, shape, self._limits, direction_W
+        )
+
+    def _schedule(self, task: _Task, found: _PlanResult) -> GaitSchedule:
+        request, after = task.request, task.boundary.final_velocity
+        return self._build_schedule(
+            request.state, request.goal, found.positions, found.notes, task.velocity, after
+        )
+
     @cached_property
     def _connection_bounds(self) -> ConnectionBounds:
         return ConnectionBounds.of(self.robot, self._specification.base_rotations.axes)
 
-    def _require_enough_time(
-        self,
-        request: PlanRequest,
-        boundary: BoundaryConditions,
-        chosen: OptimalOptions,
-        *,
-        final_is_given: bool,
-    ) -> DurationBound:
+    def _require_enough_time(self, task: _Task, *, final_is_given: bool) -> DurationBound:
         """Return a bound of the duration of all manoeuvres from rest to the goal.
 
         ``final_is_given``: the goal has the last shape of the boundary conditions. PlanningError if
         the bound is longer than the time that the options give.
         """
-        robot = self.robot
+        robot, boundary, bounds = self.robot, task.boundary, self._connection_bounds
         # The slots of three sliders determine the shape.
         only_sliders = self._specification.position and len(sliders_of(robot)) == robot.n == 3
         bound = DurationBound.of(
@@ -495,13 +499,13 @@ class OptimalGait(GaitMethod):
             boundary,
             self._limits,
             self.control_period,
-            self._kind_of(request.goal).specification.axes,
-            self._connection_bounds,
+            self._kind_of(task.request.goal).specification.axes,
+            bounds,
             final_is_given=final_is_given or only_sliders,
-            base_rate_limit=chosen.max_base_rate,
-            demands=link_demands(robot, request, boundary, self._connection_bounds),
+            base_rate_limit=task.options.max_base_rate,
+            demands=link_demands(robot, task.request, boundary, bounds),
         )
-        name, given = _asked_time(chosen)
+        name, given = _asked_time(task.options)
         if bound.seconds > given + self.control_period / 2:
             raise PlanningError(
                 f"The goal cannot be reached within optimal.{name} = {given:g} s: {bound}. Allow "
@@ -509,35 +513,28 @@ class OptimalGait(GaitMethod):
             )
         return bound
 
-    def _begin_in_asked_time(
-        self,
-        request: PlanRequest,
-        boundary: BoundaryConditions,
-        limits: MotionLimits,
-        chosen: OptimalOptions,
-        cancellation: Cancellation,
-    ) -> _PlanResult:
+    def _begin_in_asked_time(self, task: _Task) -> _PlanResult:
         """Return a manoeuvre from rest that takes no longer than the options ask for.
 
         NotFoundError if none was found; if a longer one was, the message has its duration.
         """
-        searched = request, boundary, limits
+        chosen = task.options
         unlimited = replace(chosen, duration=0.0, longest=OptimalOptions().longest)
         name, given = _asked_time(chosen)
         if given >= unlimited.longest:
-            return self._begin_now(*searched, chosen, cancellation)
+            return self._begin_now(task)
         with suppress(NotFoundError):
-            return self._begin_now(*searched, chosen, cancellation, _STARTS_BEFORE_FASTEST)
+            return self._begin_now(task, _STARTS_BEFORE_FASTEST)
         fastest = math.inf
         with suppress(NotFoundError):
-            found = self._begin_now(*searched, unlimited, cancellation)
+            found = self._begin_now(replace(task, options=unlimited))
             fastest = found.manoeuvre.duration
             if chosen.duration == 0 and fastest <= given:
                 return found
         refusal = ""
         if not _MAX_FASTEST_RATIO * given < fastest < math.inf:
             try:
-                return self._begin_now(*searched, chosen, cancellation)
+                return self._begin_now(task)
             except NotFoundError as reason:
                 if fastest == math.inf:
                     raise
@@ -549,40 +546,42 @@ class OptimalGait(GaitMethod):
 
     def _begin_now(
         self,
-        request: PlanRequest,
-        boundary: BoundaryConditions,
-        limits: MotionLimits,
-        chosen: OptimalOptions,
-        cancellation: Cancellation,
+        task: _Task,
         max_failed_starts: int = sys.maxsize,
         guess: Array | None = None,
+        motion: InitialMotion | None = None,
     ) -> _PlanResult:
-        """Return a manoeuvre that begins at once; see :meth:`.ManoeuvreSearch.search`.
+        """Return a manoeuvre that begins at once; see :class:`.SearchProblem` for the others.
 
-        The shapes (M, n) of a ``guess`` come before all other guesses.
+        Without effort limits if that keeps them, and otherwise with them. Limits that are the
+        robot's own, and that no manoeuvre is found to keep, are not kept.
         """
-        state, correction = request.state, request.correction
-        found = self._within_efforts(
-            self._kind_of(request.goal),
-            lambda searches: searches.from_rest.search(
-                boundary,
-                limits,
-                state.quaternion,
-                self._count_intervals(correction),
-                chosen,
-                cancellation,
-                guess=guess,
-                # While a gentle manoeuvre takes its time, the base of a robot that drifts turns on.
-                gentle=correction and not boundary.is_timed,
-                max_failed_starts=max_failed_starts,
-            ),
-            boundary.velocity,
+        boundary, correction = task.boundary, task.request.correction and motion is None
+        intervals = self.options.intervals
+        problem = SearchProblem(
             boundary,
+            task.limits,
+            task.request.state.quaternion,
+            min(intervals, _MAX_CORRECTION_INTERVALS) if correction else intervals,
+            task.options,
+            guess,
+            # While a gentle manoeuvre takes its time, the base of a robot that drifts turns on.
+            correction and not boundary.is_timed,
+            max_failed_starts,
+            motion,
         )
+        kind = self._kind_of(task.request.goal)
+        found = kind.without_effort_limits.search(problem, task.cancellation, task.clock)
+        if not self._is_within_efforts(task, found):
+            try:
+                found = kind.within_efforts.search(problem, task.cancellation, task.clock)
+            except NotFoundError:
+                if self._efforts_are_strict:
+                    raise
         notes: Notes = {
             "starts": float(found.starts),
             "durations": list(found.solutions),
-            "solution_time": found.solution_time,
+            "solution_time": found.solution.duration,
         }
         if found.cut_short:
             notes["cut_short"] = (
@@ -591,42 +590,29 @@ class OptimalGait(GaitMethod):
             )
         return _PlanResult(found, found.held.positions, notes)
 
-    def _begin_now_or_coast(
-        self,
-        request: PlanRequest,
-        boundary: BoundaryConditions,
-        limits: MotionLimits,
-        chosen: OptimalOptions,
-        cancellation: Cancellation,
-    ) -> _PlanResult:
+    def _begin_now_or_coast(self, task: _Task) -> _PlanResult:
         """Return a manoeuvre of a robot that drifts: joints may rest until the goal is in reach.
 
         The drift may lead away from the goal faster than the joints turn the base back; later, it
         leads past it. At first a manoeuvre is looked for that ends before the base has turned far,
         then such a one that ends when the base passes the goal, and at last any.
         """
-        state, q = request.state, request.state.q
+        state, longest = task.request.state, task.options.longest
         momenta, rest = (state.linear_momentum, state.angular_momentum), np.zeros(self.robot.n)
-        _, omega = self.robot.base_twist(state.quaternion, q, rest, *momenta)
+        _, omega = self.robot.base_twist(state.quaternion, state.q, rest, *momenta)
         rate = float(np.linalg.norm(omega))
-        brief = replace(chosen, longest=min(chosen.longest, _MAX_ANGLE_WITHOUT_COASTING / rate))
+        brief = _within_time(task, _MAX_ANGLE_WITHOUT_COASTING / rate)
         with suppress(NotFoundError):
-            return self._begin_now(
-                request, boundary, limits, brief, cancellation, _STARTS_BEFORE_COASTING
-            )
-        last = min(chosen.longest, _COASTING_TURNS * 2 * math.pi / rate)
-        coast = self._coast(request, math.ceil(last / self.control_period))
+            return self._begin_now(brief, _STARTS_BEFORE_COASTING)
+        last = min(longest, _COASTING_TURNS * 2 * math.pi / rate)
+        coast = self._coast(task.request, math.ceil(last / self.control_period))
         step = max(1, round(_COASTING_ANGLE / rate / self.control_period))
-        for end in self._goal_passing_ticks(request, boundary, coast, step):
+        for end in self._goal_passing_ticks(task, coast, step):
             try:
-                return self._plan_for_coasting_time(
-                    request, boundary, limits, chosen, cancellation, coast, end
-                )
+                return self._plan_for_coasting_time(task, coast, end)
             except (PlanningError, UnusableCandidateError):
-                cancellation.raise_if_requested()
-        return self._begin_now(
-            request, boundary, limits, replace(chosen, longest=last), cancellation
-        )
+                task.cancellation.raise_if_requested()
+        return self._begin_now(_within_time(task, last))
 
     def _coast(self, request: PlanRequest, ticks: int) -> _CoastingMotion:
         state, shapes = request.state, np.tile(request.state.q, (ticks + 1, 1))
@@ -636,47 +622,28 @@ class OptimalGait(GaitMethod):
             shapes, attitudes, self._prediction.positions(state, times, shapes, attitudes)
         )
 
-    def _later(
-        self, request: PlanRequest, boundary: BoundaryConditions, coast: _CoastingMotion, ticks: int
-    ) -> tuple[PlanRequest, BoundaryConditions]:
-        state, quaternion = request.state, coast.attitudes[ticks]
+    def _later(self, task: _Task, coast: _CoastingMotion, ticks: int) -> _Task:
+        """Return the task of a manoeuvre that begins after some ticks of coasting."""
+        state, quaternion = task.request.state, coast.attitudes[ticks]
         after = replace(state, position=coast.positions[ticks], quaternion=quaternion)
-        later = replace(request, state=after)
-        aimed = self._kind_of(request.goal).specification.boundary_conditions(
-            self.robot,
-            later,
-            self.goal_shape(request.goal),
-            self._limits,
-            self._constraints.direction_W,
-        )
+        later = replace(task.request, state=after)
+        aimed = self._boundary(later, self.goal_shape(later.goal))
         R_BW = matrix_from_quaternion(quaternion).T
-        L_B = R_BW @ matrix_from_quaternion(state.quaternion) @ boundary.angular_momentum
-        return later, replace(aimed, state=after, angular_momentum=L_B)
+        L_B = R_BW @ matrix_from_quaternion(state.quaternion) @ task.boundary.angular_momentum
+        aimed = replace(aimed, state=after, angular_momentum=L_B)
+        return replace(task, request=later, boundary=aimed)
 
-    def _goal_passing_ticks(
-        self, request: PlanRequest, boundary: BoundaryConditions, coast: _CoastingMotion, step: int
-    ) -> list[int]:
+    def _goal_passing_ticks(self, task: _Task, coast: _CoastingMotion, step: int) -> list[int]:
         """Return the ticks at which the coasting base passes the goal, the closest pass first."""
         grid = np.arange(0, len(coast.shapes), step)
-        turns = np.array(
-            [self._later(request, boundary, coast, int(k))[1].goal_rotation for k in grid]
-        )
+        turns = np.array([self._later(task, coast, int(k)).boundary.goal_rotation for k in grid])
         # The cosine of half the angle that is left.
         near = np.abs(turns[:, 3])
         passes = 1 + np.flatnonzero((near[1:-1] > near[:-2]) & (near[1:-1] >= near[2:]))
         closest = passes[np.argsort(-near[passes], kind="stable")]
         return [int(tick) for tick in grid[closest][:_MAX_COASTING_ENDS]]
 
-    def _plan_for_coasting_time(
-        self,
-        request: PlanRequest,
-        boundary: BoundaryConditions,
-        limits: MotionLimits,
-        chosen: OptimalOptions,
-        cancellation: Cancellation,
-        coast: _CoastingMotion,
-        end: int,
-    ) -> _PlanResult:
+    def _plan_for_coasting_time(self, task: _Task, coast: _CoastingMotion, end: int) -> _PlanResult:
         """Return a manoeuvre that ends about when the coasting base passes the goal, at tick
         ``end``.
 
@@ -685,17 +652,14 @@ class OptimalGait(GaitMethod):
         constraint.
         """
         h = self.control_period
-        there, aimed = self._later(request, boundary, coast, end)
-        at_rest = replace(aimed, angular_momentum=np.zeros(3))
-        few = replace(chosen, starts=min(chosen.starts, _STARTS_PER_COASTING_END))
-        free = self._begin_now(there, at_rest, limits, few, cancellation)
+        there = self._later(task, coast, end)
+        at_rest = replace(there.boundary, angular_momentum=np.zeros(3))
+        few = replace(task.options, starts=min(task.options.starts, _STARTS_PER_COASTING_END))
+        free = self._begin_now(replace(there, boundary=at_rest, options=few))
         takes = len(free.positions) - 1
         begin = max(0, end - takes)
-        later, aimed = self._later(request, boundary, coast, begin)
-        brief = replace(chosen, longest=min(chosen.longest, _MAX_DURATION_RATIO * takes * h))
-        found = self._begin_now(
-            later, aimed, limits, brief, cancellation, _STARTS_AFTER_COASTING, free.positions
-        )
+        later = _within_time(self._later(task, coast, begin), _MAX_DURATION_RATIO * takes * h)
+        found = self._begin_now(later, _STARTS_AFTER_COASTING, free.positions)
         self._constraints.check(coast.shapes[:begin], coast.attitudes[:begin], h)
         return replace(
             found,
@@ -703,23 +667,18 @@ class OptimalGait(GaitMethod):
             notes={**found.notes, "coasting_time": begin * h},
         )
 
-    def _plan_in_motion(
-        self,
-        request: PlanRequest,
-        motion: InitialMotion,
-        boundary: BoundaryConditions,
-        limits: MotionLimits,
-        cancellation: Cancellation,
-        given: float | None = None,
-    ) -> GaitSchedule:
-        """Plan from moving joints; the remaining previous motion is the first guess."""
-        too_fast = np.abs(motion.velocity) > limits.velocity * (1 + _LIMIT_ROUNDING)
+    def _plan_in_motion(self, task: _Task, motion: InitialMotion, *, given: bool) -> GaitSchedule:
+        """Plan from moving joints; the remaining previous motion is the first guess.
+
+        ``given``: the duration of the options is that of this request.
+        """
+        too_fast = np.abs(motion.velocity) > task.limits.velocity * (1 + _LIMIT_ROUNDING)
         if too_fast.any():
             names = ", ".join(np.array(self.robot.joint_names)[too_fast])
             raise PlanningError(f"Joints move faster than the velocity limits of optimal: {names}.")
-        chosen, again = self.options, request.previous is not None
-        duration = chosen.duration if given is None else given
-        if given is None and again and duration > 0:
+        again, chosen = task.request.previous is not None, self.options
+        duration = task.options.duration if given else chosen.duration
+        if again and not given and duration > 0:
             # The previous manoeuvre continues, and keeps its end time.
             duration = (len(motion.remaining) - 1) * self.control_period
         budget = replace(
@@ -728,70 +687,65 @@ class OptimalGait(GaitMethod):
             starts=1 if again else min(chosen.starts, _MAX_STARTS_IN_MOTION),
             answers=1 if again else chosen.answers,
         )
-        found = self._within_efforts(
-            self._kind_of(request.goal),
-            lambda searches: searches.in_motion.search(
-                boundary,
-                limits,
-                request.state.quaternion,
-                self._count_intervals(False),
-                budget,
-                motion,
-                cancellation,
-            ),
-            motion.velocity,
-            boundary,
-        )
-        notes: Notes = {"starts": float(found.starts), "durations": list(found.solutions)}
-        return self._build_schedule(
-            request.state,
-            request.goal,
-            found.held.positions,
-            notes,
-            motion.velocity,
-            boundary.final_velocity,
-        )
-
-    def _within_efforts(
-        self,
-        kind: _GoalKind,
-        search: Callable[[_Searches], Manoeuvre],
-        velocity: Array | float = 0.0,
-        boundary: BoundaryConditions | None = None,
-    ) -> Manoeuvre:
-        """Return the manoeuvre of a search without effort limits if it keeps them, and otherwise
-        that of a search with them; ``velocity`` (n,) is held before.
-
-        Limits that are the robot's own, and that no manoeuvre is found to keep, are not kept.
-        """
-        found = search(kind.without_effort_limits)
-        if self._is_within_efforts(found, velocity, boundary):
-            return found
         try:
-            return search(kind.within_efforts)
-        except NotFoundError:
-            if self.options.effort_limits == 0 and not self.options.max_effort:
-                return found
-            raise
+            found = self._begin_now(replace(task, options=budget), motion=motion)
+        except NotFoundError as refusal:
+            # The present manoeuvre goes on where the same goal is planned for again; a base that
+            # drifts would have to pass its goal later.
+            rests = not (task.boundary.drifts or len(self._wheels))
+            if again or duration > 0 or not rests or not motion.velocity.any():
+                raise
+            return self._plan_with_braking(task, motion, refusal)
+        return self._schedule(task, found)
 
-    def _is_within_efforts(
-        self,
-        found: Manoeuvre,
-        velocity: Array | float = 0.0,
-        boundary: BoundaryConditions | None = None,
-    ) -> bool:
+    def _plan_with_braking(
+        self, task: _Task, motion: InitialMotion, refusal: NotFoundError
+    ) -> GaitSchedule:
+        """Plan from the shape in which joints that brake as fast as they may come to rest.
+
+        Raises
+        ------
+        NotFoundError
+            None was found; the ``refusal`` where the braking itself is not possible.
+        """
+        state, limits, period = task.request.state, task.limits, self.control_period
+        ticks = math.ceil(float((np.abs(motion.velocity) / limits.acceleration).max()) / period)
+        # The last tick is one of rest, from which the next command keeps its limits.
+        shares = 1 - np.arange(1, ticks + 1) / ticks
+        travel = np.append(0.0, period * np.cumsum(shares))
+        braking = state.q + travel[:, np.newaxis] * motion.velocity
+        attitudes = self._prediction.attitudes(braking, state.quaternion, state.angular_momentum)
+        times = period * np.arange(len(braking), dtype=np.float64)
+        positions = self._prediction.positions(state, times, braking, attitudes)
+        beyond = np.any(braking < limits.lower) or np.any(braking > limits.upper)
+        if self._efforts is not None and self._efforts_are_strict:
+            beyond |= self._efforts.excess(braking, motion.velocity) > 1 + _LIMIT_ROUNDING
+        if beyond or self._too_near(braking, self._base_poses(state, braking)):
+            raise refusal
+        try:
+            self._constraints.check(braking, attitudes, period)
+        except UnusableCandidateError:
+            raise refusal from None
+        at_rest = replace(state, position=positions[-1], quaternion=attitudes[-1], q=braking[-1])
+        request = replace(task.request, state=at_rest, motion=None)
+        gait = self._plan_about_center(request, task.cancellation, task.clock)
+        notes: Notes = {**gait.notes, "braking_time": float(times[-1])}
+        shapes = np.vstack([braking[:-1], gait.positions])
+        after = task.boundary.final_velocity
+        return self._build_schedule(state, request.goal, shapes, notes, motion.velocity, after)
+
+    @property
+    def _efforts_are_strict(self) -> bool:
+        """Whether limits of efforts are asked for: others are kept where a manoeuvre is found."""
+        return self.options.effort_limits != 0 or bool(self.options.max_effort)
+
+    def _is_within_efforts(self, task: _Task, found: Manoeuvre) -> bool:
         if self._efforts is None:
             return True
-        L_B, after = None, np.zeros(self.robot.n)
-        if boundary is not None:
-            L_B = boundary.momenta_in_base(found.held.quaternions)
-            after[:] = boundary.final_velocity
-        excess = self._efforts.excess(found.held.positions, velocity, L_B, after)
+        L_B, after = task.boundary.momenta_in_base(found.held.quaternions), np.zeros(self.robot.n)
+        after[:] = task.boundary.final_velocity
+        excess = self._efforts.excess(found.held.positions, task.velocity, L_B, after)
         return excess <= 1 + _LIMIT_ROUNDING
-
-    def _count_intervals(self, correction: bool) -> int:
-        intervals = self.options.intervals
-        return min(intervals, _MAX_CORRECTION_INTERVALS) if correction else intervals
 
     def _is_reached(self, state: RobotState, goal: Goal) -> bool:
         error = PoseError.between(state.position, state.quaternion, goal, state.q, self.robot)
@@ -813,24 +767,14 @@ class OptimalGait(GaitMethod):
         attitudes = self._prediction.attitudes(positions, state.quaternion, state.angular_momentum)
         path = self._prediction.path(state, positions, attitudes)
         L_B = _momenta_in_base(state, attitudes)
-        end = path.position[-1], path.quaternion[-1]
-        left = PoseError.between(*end, goal, positions[-1], self.robot)
+        # Held commands end on the goal by the plant's integration; where it is off, so are they.
+        true_end = self._prediction.true_end(positions, attitudes, state.angular_momentum)
+        (true_position,) = self._prediction.positions(
+            state, path.time[-1:], positions[-1:], true_end[np.newaxis]
+        )
         controls = self._kind_of(goal).specification.controls
-        notes = {
-            **notes,
-            "final_shape": positions[-1].tolist(),
-            "final_position": path.position[-1].tolist(),
-        }
-        if not goal.end_effectors or "attitude" in controls:
-            notes["predicted_attitude_error"] = left.angle
-        if not goal.end_effectors or "position" in controls:
-            notes["predicted_position_error"] = left.distance
-        for each in goal.end_effectors:
-            r_WE, quaternion = end_effector_pose(self.robot, each.link, *end, positions[-1])
-            notes[f"final_pose_of_{each.link}"] = [*r_WE.tolist(), *quaternion.tolist()]
-        if goal.end_effectors:
-            notes["predicted_end_effector_position_error"] = left.largest_end_effector_distance
-            notes["predicted_end_effector_attitude_error"] = left.largest_end_effector_angle
+        at_end = self._end_notes(goal, positions[-1], true_position, true_end, controls)
+        notes = {**notes, **at_end}
         if L_B is not None:
             momenta = state.linear_momentum, state.angular_momentum
             kept = np.broadcast_to(after, self.robot.n).copy()
@@ -900,6 +844,11 @@ class OptimalGait(GaitMethod):
         if self.clearance is not None:
             numbers["clearance"] = self.clearance.facts
         return plan_key(self.robot, numbers, values_of(self.options))
+
+
+def _within_time(task: _Task, seconds: float) -> _Task:
+    """Return a task whose manoeuvre takes no longer than a time, s."""
+    return replace(task, options=replace(task.options, longest=min(task.options.longest, seconds)))
 
 
 def _asked_time(chosen: OptimalOptions) -> tuple[str, float]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -38,6 +38,8 @@ _IPOPT_OPTIONS = {
     "ipopt.print_level": 0,
     "ipopt.sb": "yes",
     "ipopt.linear_solver": "mumps",
+    # Approximate minimum degree: the matrices are banded, and the choice of MUMPS fills them in.
+    "ipopt.mumps_pivot_order": 0,
     "ipopt.mu_strategy": "monotone",
     "ipopt.constr_viol_tol": 1e-6,
     # Iterative refinement of steps is off.
@@ -90,12 +92,15 @@ class StopRule:
     deadline, last_call
         ``time.monotonic()``, s, at which it stops with a feasible iterate, and without one;
         infinite where no wall time limits the search.
+    watch
+        Called at every iterate.
     """
 
     iterations: int
     cancellation: Cancellation = NEVER
     deadline: float = math.inf
     last_call: float = math.inf
+    watch: Callable[[], None] = lambda: None
 
     def is_expired(self, *, found: bool) -> bool:
         """Whether the wall time is used up; ``found``: there is a feasible iterate."""
@@ -398,6 +403,7 @@ class _SolverMonitor(ca.Callback):
             if worst <= _FEASIBILITY_TOLERANCE:
                 self.best, self._least = x.copy(), float(f[0])
         self._iterates += 1
+        self._stop.watch()
         stops = (
             # The first iterate is the guess itself.
             self._iterates > self._stop.iterations

@@ -1,12 +1,20 @@
-"""The search for the fastest manoeuvre: guesses, solutions, held commands.
+"""The search for the fastest manoeuvre, from guesses to held commands, in the order of this file.
 
-From rest, many guesses are solved on a coarse grid, at a small part of the cost of the full one.
-The best solution, and the next if it is about as good, are guesses for the full grid.
+1. **Guesses**: the direct way with loops upon it; in motion, the rest of the motion comes first.
+2. **Coarse solutions**: guesses are solved on a coarse grid, at a small part of the cost of the
+   full one, until some solutions agree.
+3. **Full grid**: the best solution, and the next if it is about as good, are refined.
+4. **Held commands**: a solution becomes commands that end on the goal. If its duration matters (the
+   robot drifts, or joints move at an end), it can not be stretched to whole control periods: the
+   path of least effort in as many periods, or a few more, is solved for.
+5. **Clear**: if held commands bring links too near to each other or to obstacles, clear paths are
+   looked for near to them, then near to other solutions, then near to guesses, and made fast.
 
-In motion, the first held command follows the one before it, so neither the beginning nor the
-duration of a solution can be stretched to whole control periods. The fastest trajectory is found
-first; then the one of least effort in as many control periods, or a few more, is solved for from
-there, and made into held commands within the limits.
+Each step is a few methods of :class:`ManoeuvreSearch`.
+
+J. Schulman et al., "Motion planning with sequential convex optimization and convex collision
+checking", International Journal of Robotics Research 33, 2014, clear paths by steps that are
+quadratic programs; here they are the manoeuvre's own problem.
 """
 
 from __future__ import annotations
@@ -20,18 +28,19 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 
+from spacerobot_ros.collision import Approach
 from spacerobot_ros.collision.planes import PlaneDistance
 from spacerobot_ros.errors import NotFoundError, PlanningError
-from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.rotations import quaternion_multiply
 from spacerobot_ros.model.wheels import ReactionWheels
 from spacerobot_ros.planning.core.cancellation import NEVER, Cancellation
 from spacerobot_ros.planning.core.method import InitialMotion
-from spacerobot_ros.planning.core.progress import SearchProgress, log_progress
+from spacerobot_ros.planning.core.progress import SearchPhase, SearchProgress, log_progress
 from spacerobot_ros.planning.methods.optimal.held_commands import (
     CommandHolder,
     HeldCommands,
@@ -39,11 +48,7 @@ from spacerobot_ros.planning.methods.optimal.held_commands import (
 )
 from spacerobot_ros.planning.methods.optimal.initial_guesses import InitialGuesses, move_to_ends
 from spacerobot_ros.planning.methods.optimal.joint_efforts import EffortLimitedShooting
-from spacerobot_ros.planning.methods.optimal.kept_distances import (
-    KeptDistances,
-    PathClearing,
-    instants_of,
-)
+from spacerobot_ros.planning.methods.optimal.kept_distances import KeptDistances, instants_of
 from spacerobot_ros.planning.methods.optimal.multiple_shooting import (
     TOLERANCE,
     DurationBounds,
@@ -65,64 +70,58 @@ _LOG = logging.getLogger(__name__)
 _NO_PATH_FOUND = "the solver found no path within the limits"
 _NO_HELD_COMMANDS = "held commands could not be brought to the goal within the limits"
 
-_MIN_TICKS = 2
-"""Fewest ticks of a manoeuvre: one begins to move, another one stops."""
+# -- constants, each with its reason --------------------------------------------------------------
+
+_MIN_TICKS, _MIN_TICKS_IN_MOTION = 2, 4
+"""Fewest ticks of a manoeuvre: one begins to move, another one stops; in motion, one brakes."""
 
 _GENTLE_TICKS, _GENTLE_TIME = 20, 1.0
 """A gentle manoeuvre has as many ticks or takes as long, s, whichever is less: it corrects a
 small error, and haste would leave a larger one."""
 
-_BUDGET_FACTOR_WITHOUT_SOLUTION = 5.0
-
 _GENTLE_DURATION_FACTOR = 4.0
 """A gentle manoeuvre is the path of least effort in this many times the time of its guess, then as
 fast as the limits allow."""
 
-_COARSE_GRID_RATIO = 5
+_BUDGET_FACTOR_WITHOUT_SOLUTION = 5.0
+"""As ``optimal.time_budget`` is documented."""
 
-_COARSE_TOLERANCE = 1e-4
+_COARSE_GRID_RATIO, _COARSE_GRID_RATIO_IN_MOTION = 5, 4
+"""Ratio of the full grid to the coarse one: in motion, what remains may be planned on it alone."""
 
-_MIN_COARSE_INTERVALS = 8
+_MIN_COARSE_INTERVALS, _MIN_COARSE_INTERVALS_IN_MOTION = 8, 10
 """Fewest intervals of a coarse grid; with fewer there is none."""
 
-_MAX_REFINED_SOLUTIONS = 2
+_COARSE_TOLERANCE = 1e-4
+"""Tolerance on a coarse grid from rest, whose solutions differ by more from those that follow."""
+
+_MAX_REFINED_SOLUTIONS, _MAX_REFINED_SOLUTIONS_IN_MOTION = 2, 1
+"""Largest number of solutions that are refined: in motion, the robot flies on meanwhile."""
 
 _MAX_REFINED_COST_RATIO = 1.1
 """Largest ratio of the cost of a coarse solution to the best one at which it is refined, too: the
 coarse grid underestimates some costs by more than others."""
 
-_MAX_CLEARING_ITERATIONS = 80
-"""Steps of the solver between paths that planes are made for at most."""
-
-_MAX_CLEAR_STARTS, _CLEAR_ANSWERS = 16, 2
-"""Further guesses near which manoeuvres that keep clear are looked for at most, and the number of
-solutions that ends the search."""
-
-_CLEARING_TIME_FACTOR, _RESAMPLED_TIME_FACTOR = 2.0, 1.2
-"""Ratios of the time of a path that is to become clear to that of a path in collision, and to that
-of a clear path on a coarse grid: slow joints leave room to go round."""
-
 _SAME_COST_TOLERANCE = 1e-3
+"""Relative difference of costs up to which two solutions are the same one."""
 
 _AGREEING_COST_TOLERANCE = 3e-3
 """Solutions whose costs are this near, relative, agree: the coarse grid and the tolerance of the
 solver leave as much between them."""
 
 _AGREEING_SOLUTIONS_WITH_GUESS = 2
+"""Agreeing solutions that end a search whose first guess was given."""
 
 _MAX_ITERATIONS_OF_STOPS = 120
 """Steps of the solver from a guess in which wheels stop the base: most take twenty."""
 
 _MAX_FULL_GRID_STARTS = 3
-"""Number of guesses on the full grid after a coarse grid without solutions."""
-
-_HELD_REACH_SHARE = 0.3
-"""Share of the largest reach by which a clear path may change where it is solved for in whole
-ticks."""
+"""Number of guesses on the full grid after a coarse grid without solutions, and of other paths that
+are made clear on it alone: it costs the most."""
 
 _LIMIT_SHARE_IN_GIVEN_TIME = 0.99
-"""Share of velocity and acceleration limits for manoeuvres of a given duration."""
-
+"""Share of velocity and acceleration limits for manoeuvres of a given duration: held commands take
+the rest."""
 
 _ACCELERATION_SHARES_IN_MOTION = (0.98, 1.0)
 """In motion: shares of accelerations that are planned with, one after the other: changes of a path
@@ -132,35 +131,53 @@ _VELOCITY_RESERVE_IN_MOTION = 0.02
 """In motion: share of velocities that is left for the same reason, at most: a joint at full speed
 is slowed down to the rest in a quarter of a control period."""
 
-_COARSE_GRID_RATIO_IN_MOTION, _MIN_COARSE_INTERVALS_IN_MOTION = 4, 10
-"""As ``_COARSE_GRID_RATIO``, ``_MIN_COARSE_INTERVALS``, in motion."""
-
-_MAX_REFINED_SOLUTIONS_IN_MOTION = 3
-"""In motion: largest number of solutions that are made into commands, fastest first, until one
-keeps all limits."""
-
-_AGREEING_SOLUTIONS_IN_MOTION = 3
-"""In motion: solutions of the same duration that end the search."""
+_ADDITIONAL_TICKS, _ADDITIONAL_SHARES_OF_STOPS = (0, 0, 1, 3, 7), (0.03, 0.08)
+"""Control periods that are added where held commands miss the goal or a limit (the second time, the
+end is corrected), and shares of the duration where wheels stop the base: they use their torque all
+the time."""
 
 _MAX_RATE_EXCESS, _RATE_RESERVE = 1.1, 1.002
 """Largest excess of the base rate of held commands over its bound at which they are made slower, as
 the bound is imposed at the steps of a solution alone, and the factor of that excess."""
 
-_CLEARING_TIME_FACTORS_IN_MOTION = (1.4, 2.5)
-"""As ``_CLEARING_TIME_FACTOR``, in motion, one after the other: joints run on farther in long
-intervals, but slow ones need the time."""
+_HELD_REACH_SHARE = 0.3
+"""Share of the largest reach by which a clear path may change where it is solved for in whole
+ticks."""
 
-_MIN_TICKS_IN_MOTION = 4
+_CLEARING_TIME_FACTOR, _RESAMPLED_TIME_FACTOR = 2.0, 1.2
+"""Ratios of the time of a path that is to become clear to that of a path in collision, and to that
+of a clear path on a coarse grid: slow joints leave room to go round."""
 
-_ADDITIONAL_TICKS = (0, 1, 3, 7)
-"""Control periods that lengthen a manoeuvre in motion whose commands exceed a limit."""
+_MAX_CLEARING_ITERATIONS = 80
+"""Steps of the solver between paths that planes are made for at most: what takes more diverges."""
 
-_ADDITIONAL_TICKS_OF_DRIFT = (0, 0, 1, 3, 7)
-"""Additional control periods where the robot drifts; the second time, the end is corrected."""
+_MAX_CLEARING_ROUNDS, _MAX_SHORTENING_ROUNDS = 15, 10
+"""Paths on the way to a clear one, and from there to a fast one, at most: most take a few."""
 
+_MIN_LARGEST_LACK, _LACK_PER_DEPTH = 0.1, 2.0
+"""Distance by which links on the way to a clear path may be nearer than they ought to be, m: at
+least, and as a multiple of the depth of their contact."""
 
-_ADDITIONAL_SHARES_OF_STOPS = (0.03, 0.08)
-"""And shares of its duration where wheels stop the base: they use their torque all the time."""
+_NO_LACK = 1e-3
+"""Lack of distance below which all planes are kept, m."""
+
+_PROGRESS_SHARE = 0.9
+"""Largest ratio of the lack of distance to the one two paths before at which it is going on."""
+
+_MIN_GAIN = 0.01
+"""Relative gain of time below which a clear path is not made faster any more, at the full reach."""
+
+_REACH_DIVISOR, _REACH_FACTOR, _MIN_REACH_SHARE = 3.0, 2.0, 0.02
+"""Divisor of the reach where a faster path is not clear, its factor where it is, and the share of
+the largest reach at which paths are not made faster any more."""
+
+_MAX_CLEAR_STARTS, _MAX_CLEAR_STARTS_IN_MOTION, _CLEAR_ANSWERS = 16, 1, 2
+"""Guesses near which, or near whose solutions, manoeuvres that keep clear are looked for at most
+(in motion, the rest of the motion is the one: from rest, after braking, others are found sooner),
+and the number of clear paths on a coarse grid that ends the search."""
+
+_REPORT_PERIOD = 1.0
+"""Wall time after which a solver reports that it is still busy, s."""
 
 
 @dataclass(frozen=True)
@@ -190,88 +207,88 @@ class Manoeuvre:
     solutions: list[float] = field(default_factory=list)
     cut_short: bool = False
 
-    @property
-    def positions(self) -> Array:
-        """(N + 1, n) shapes at the ticks, m or rad."""
-        return self.held.positions
+
+@dataclass(frozen=True)
+class SearchClock:
+    """The wall time of a plan, of which all its searches take.
+
+    Attributes
+    ----------
+    budget
+        s; 0: no limit.
+    began
+        ``time.monotonic()``, s, at the beginning.
+    """
+
+    budget: float = 0.0
+    began: float = field(default_factory=lambda: time.monotonic())
 
     @property
-    def quaternions(self) -> Array:
-        """(N + 1, 4) turns of the base since the start there."""
-        return self.held.quaternions
+    def elapsed(self) -> float:
+        """s."""
+        return time.monotonic() - self.began
 
     @property
-    def solution_time(self) -> float:
-        """Duration before it was made into held commands, s."""
-        return self.solution.duration
+    def deadline(self) -> float:
+        """``time.monotonic()``, s, at which a plan with a manoeuvre ends; infinite: never."""
+        return self.began + self.budget if self.budget > 0 else math.inf
+
+    @property
+    def last_call(self) -> float:
+        """``time.monotonic()``, s, at which a plan without a manoeuvre ends; infinite: never."""
+        factor = _BUDGET_FACTOR_WITHOUT_SOLUTION
+        return self.began + factor * self.budget if self.budget > 0 else math.inf
+
+    def is_over(self, *, found: bool) -> bool:
+        """Whether the wall time is used up; ``found``: there is a manoeuvre."""
+        end = self.deadline if found else self.last_call
+        return end < math.inf and time.monotonic() > end
 
 
-@dataclass
-class _SearchState:
-    """One search: its problem, as of :meth:`ManoeuvreSearch.search`, and its progress.
+@dataclass(frozen=True)
+class SearchProblem:
+    """What is searched for.
 
-    ``starts`` guesses were tried, ``rejection`` is the reason against the last candidate,
-    ``shortest`` the duration of the fastest solution so far, s; without any, the search ends after
-    ``max_failed_starts``. The pairs of links ``kept`` are kept apart; None: no clearance is asked
-    for.
+    Attributes
+    ----------
+    boundary, limits
+        Both ends, and the limits of the joints.
+    quaternion
+        (4,) attitude of R_WB at the start.
+    intervals
+        Those of the full grid.
+    options
+        The options of ``optimal``.
+    guess
+        (M, n) shapes that, moved to the ends, come before all other guesses; None: none.
+    gentle
+        Whether the manoeuvre takes the path of least effort, whose turn of the base depends least
+        on errors of masses.
+    max_failed_starts
+        Guesses without any solution after which the search ends.
+    motion
+        Motion of the joints at the start, whose rest is the first guess; None: they rest.
     """
 
     boundary: BoundaryConditions
     limits: MotionLimits
     quaternion: Array
+    intervals: int
     options: OptimalOptions
-    cancellation: Cancellation
-    guess: Array | None
-    gentle: bool
+    guess: Array | None = None
+    gentle: bool = False
     max_failed_starts: int = sys.maxsize
-    starts: int = 0
-    rejection: str = ""
-    shortest: float = math.inf
-    kept: KeptDistances | None = None
-    _began: float = field(default_factory=lambda: time.monotonic())
+    motion: InitialMotion | None = None
 
-    def stop_rule(self, *, found: bool) -> StopRule:
-        deadline = last_call = math.inf
-        if self.options.time_budget > 0:
-            deadline, last_call = (
-                self._began + x * self.options.time_budget
-                for x in (1.0, _BUDGET_FACTOR_WITHOUT_SOLUTION)
-            )
-        last = deadline if found else last_call
-        return StopRule(self.options.iterations, self.cancellation, deadline, last)
+    @property
+    def is_timed(self) -> bool:
+        """Whether the motion leads elsewhere where it takes longer."""
+        return self.boundary.is_timed or self.motion is not None
 
     @property
     def hastens(self) -> bool:
+        """Whether the fastest manoeuvre is searched for."""
         return self.options.duration == 0 and not self.gentle
-
-    def clearing(self) -> _SearchState:
-        """Return the same with no pairs yet that are kept apart, and fewer steps of the solver."""
-        assert self.kept is not None
-        iterations = min(self.options.iterations, _MAX_CLEARING_ITERATIONS)
-        options = replace(self.options, iterations=iterations)
-        return replace(self, options=options, kept=self.kept.anew())
-
-    def cut_short(self, *, found: bool) -> bool:
-        """Whether the wall time is used up."""
-        return self.stop_rule(found=found).is_expired(found=found)
-
-    def report(self, step: str, result: str, iterations: int) -> None:
-        seconds = time.monotonic() - self._began
-        # Without a coarse solution, some guesses are tried on the full grid as well.
-        most = max(self.options.starts, self.starts)
-        log_progress(
-            _LOG,
-            SearchProgress(self.starts, most, self.shortest),
-            f"{step}: {result} after {seconds:.2f} s, {iterations} steps of the solver",
-        )
-
-    def solutions_agree(self, solutions: list[Trajectory]) -> bool:
-        costs = np.array([self.cost(each) for each in solutions])
-        agreeing = self.options.agreeing
-        if self.guess is not None:
-            agreeing = min(agreeing, _AGREEING_SOLUTIONS_WITH_GUESS)
-        same = int(np.sum(costs <= costs.min(initial=math.inf) * (1 + _AGREEING_COST_TOLERANCE)))
-        return 0 < agreeing <= same
 
     def cost(self, trajectory: Trajectory) -> float:
         """Return the cost: the duration, or the effort where the duration is given."""
@@ -280,6 +297,91 @@ class _SearchState:
         scale = np.where(np.isfinite(self.limits.velocity), self.limits.velocity, 1.0)
         change = np.diff(trajectory.velocities, axis=0) / trajectory.step / scale
         return float(np.mean(np.sum(change**2, axis=1)))
+
+    def solutions_agree(self, solutions: Sequence[Trajectory]) -> bool:
+        """Whether enough of the solutions are the best one."""
+        costs = np.array([self.cost(each) for each in solutions])
+        agreeing = self.options.agreeing
+        if self.guess is not None:
+            agreeing = min(agreeing, _AGREEING_SOLUTIONS_WITH_GUESS)
+        same = int(np.sum(costs <= costs.min(initial=math.inf) * (1 + _AGREEING_COST_TOLERANCE)))
+        return 0 < agreeing <= same
+
+
+class _Grid(NamedTuple):
+    """A number of intervals, and the tolerance of solutions."""
+
+    intervals: int
+    tolerance: float = TOLERANCE
+
+
+@dataclass
+class _SearchState:
+    """The progress of one search.
+
+    ``starts`` guesses were tried, ``rejection`` is the reason against the last candidate, ``best``
+    the duration of the fastest path so far, s: of the clear ones if it ``is_clearing``. ``solved``
+    are guesses on the coarse grid with their solutions.
+    """
+
+    problem: SearchProblem
+    cancellation: Cancellation
+    clock: SearchClock
+    coarse: _Grid
+    full: _Grid
+    phase: SearchPhase = SearchPhase.SEARCHING
+    starts: int = 0
+    rejection: str = ""
+    best: float = math.inf
+    is_clearing: bool = False
+    solved: list[tuple[Trajectory, Trajectory | None]] = field(default_factory=list)
+    _reported: float = 0.0
+
+    def stop_rule(self, *, found: bool = False) -> StopRule:
+        """Return when the solver stops in the present phase."""
+        iterations, end = self.problem.options.iterations, self.clock.deadline
+        last = end if found else self.clock.last_call
+        if self.phase is SearchPhase.CLEARING:
+            # A path on the way to a clear one is no manoeuvre.
+            end = last = self.clock.last_call
+        if self.phase in (SearchPhase.CLEARING, SearchPhase.SHORTENING):
+            iterations = min(iterations, _MAX_CLEARING_ITERATIONS)
+        return StopRule(iterations, self.cancellation, end, last, self._watch)
+
+    def _watch(self) -> None:
+        elapsed = self.clock.elapsed
+        if elapsed >= self._reported + _REPORT_PERIOD:
+            self.report("going on")
+
+    def report(self, result: str, duration: float = math.inf) -> None:
+        """Report a result; ``duration``, s, is that of a path which may be the best."""
+        self.best = min(self.best, duration)
+        self._reported = elapsed = self.clock.elapsed
+        # Without a coarse solution, some guesses are tried on the full grid as well.
+        most = max(self.problem.options.starts, self.starts)
+        progress = SearchProgress(self.starts, most, self.best, self.phase, elapsed)
+        log_progress(_LOG, progress, f"{self.phase.value}: {result} after {elapsed:.2f} s")
+
+    @contextmanager
+    def attempt(self) -> Iterator[None]:
+        """Note the reason why there is no manoeuvre, instead of raising an error."""
+        try:
+            yield
+        except UnusableCandidateError as reason:
+            self.rejection = str(reason)
+            self.report(self.rejection)
+        self.cancellation.raise_if_requested()
+
+
+class _Apart(NamedTuple):
+    """Pairs that are kept apart on a grid; those that come too near on the way are added.
+
+    ``hold`` makes the held commands that are to keep clear; None: the path itself is.
+    """
+
+    kept: KeptDistances
+    grid: _Grid
+    hold: Callable[[Trajectory], Manoeuvre] | None = None
 
 
 class ManoeuvreSearch:
@@ -292,34 +394,19 @@ class ManoeuvreSearch:
     """
 
     def __init__(self, model: ManoeuvreModel) -> None:
-        self._robot, self._period, self._axes = model.robot, model.control_period, model.axes
-        self._constraints, self._efforts = model.constraints, model.efforts
-        self._end_effectors = model.end_effectors
-        self._distances = model.distances
-        self._begin = model.begin
+        self._model, self._period = model, model.control_period
         self._wheels = ReactionWheels.of(model.robot.description)
         self._holder = CommandHolder(model)
         self._stages: dict[tuple[bool, bool, bool], Stages] = {}
-        self._solvers: dict[tuple[int, bool, float, tuple[int, ...], bool], MultipleShooting] = {}
+        self._solvers: dict[tuple[_Grid, bool, tuple[int, ...], bool], MultipleShooting] = {}
 
     def search(
         self,
-        boundary: BoundaryConditions,
-        limits: MotionLimits,
-        quaternion: Array,
-        intervals: int,
-        options: OptimalOptions,
+        problem: SearchProblem,
         cancellation: Cancellation = NEVER,
-        guess: Array | None = None,
-        *,
-        gentle: bool = False,
-        max_failed_starts: int = sys.maxsize,
+        clock: SearchClock | None = None,
     ) -> Manoeuvre:
-        """Return the fastest manoeuvre found from attitude ``quaternion`` (4,) of R_WB.
-
-        The shapes (M, n) of a ``guess``, moved to the ends, come before all other guesses. A
-        ``gentle`` manoeuvre takes the path of least effort, whose turn of the base depends least on
-        errors of masses. After ``max_failed_starts`` guesses without any solution the search ends.
+        """Return the fastest manoeuvre found; ``clock`` is that of the plan, None: one of its own.
 
         Raises
         ------
@@ -330,112 +417,339 @@ class ManoeuvreSearch:
         PlanningCancelled
             The search was cancelled.
         """
+        options = problem.options
         if options.longest < _MIN_TICKS * self._period:
             raise PlanningError(
                 f"Manoeuvres take at least {_MIN_TICKS} control periods of {self._period:g} s, "
                 f"more than optimal.longest = {options.longest:g} s."
             )
-        kept = self._begin(boundary)
-        progress = _SearchState(
-            boundary, limits, quaternion, options, cancellation, guess, gentle, max_failed_starts
-        )
-        found = self._search_on_grids(progress, intervals)
+        if problem.motion is not None:
+            velocity = self._initial_velocity(problem.motion, problem.limits)
+            problem = replace(problem, boundary=replace(problem.boundary, velocity=velocity))
+        kept = self._model.begin(problem.boundary)
+        clock = clock or SearchClock(options.time_budget)
+        state = _SearchState(problem, cancellation, clock, *self._grids(problem))
+        found = self._search_on_grids(state)
         if found and kept is not None:
-            progress.kept = kept
-            found = self._keep_clear(progress, found, intervals)
-        cut_short = progress.cut_short(found=bool(found))
+            found = self._keep_clear(state, kept, found)
+        cut_short = clock.is_over(found=bool(found))
         if not found:
             within = f" within optimal.time_budget {options.time_budget:g} s" if cut_short else ""
+            in_motion = "" if problem.motion is None else " that begins in motion"
             limit = "duration" if options.duration > 0 else "longest"
             longer = "A longer optimal.time_budget, more" if cut_short else "More"
             raise NotFoundError(
-                f"No manoeuvre to the goal was found from {progress.starts} start(s){within}: "
-                f"{progress.rejection}. {longer} optimal.starts, optimal.iterations or "
+                f"No manoeuvre to the goal{in_motion} was found from {state.starts} start(s)"
+                f"{within}: {state.rejection}. {longer} optimal.starts, optimal.iterations or "
                 f"optimal.intervals, a longer optimal.{limit}, or a smaller goal may help."
             )
         best = min(found, key=lambda one: one.duration)
         durations = [one.duration for one in found]
-        return replace(best, starts=progress.starts, solutions=durations, cut_short=cut_short)
+        return replace(best, starts=state.starts, solutions=durations, cut_short=cut_short)
 
-    def _search_on_grids(self, progress: _SearchState, intervals: int) -> list[Manoeuvre]:
-        """Return manoeuvres with a number of intervals, from guesses on a coarse grid first."""
-        options = progress.options
-        full = self._get_solver(progress, intervals)
-        coarser = intervals // _COARSE_GRID_RATIO
-        # A single answer costs less without a coarse grid, on which the attitude of a base that is
-        # to be stopped is too far off; guesses with wheels are near to solutions.
-        if len(self._wheels) and progress.boundary.is_timed:
-            iterations = min(options.iterations, _MAX_ITERATIONS_OF_STOPS)
-            brief = replace(options, answers=1, iterations=iterations)
-            progress.options = brief
-            return self._search_from_guesses(progress, full, full, options.starts)
-        if options.answers > 1 and coarser >= _MIN_COARSE_INTERVALS:
-            coarse = self._get_solver(progress, coarser, _COARSE_TOLERANCE)
-            found = self._search_from_guesses(progress, coarse, full, options.starts)
-            ends = progress.starts >= progress.max_failed_starts or progress.cut_short(found=False)
-            if found or ends:
-                return found
-            return self._search_from_guesses(
-                progress, full, full, min(options.starts, _MAX_FULL_GRID_STARTS)
+    # -- 1. guesses -------------------------------------------------------------------------------
+
+    def _guesses(self, state: _SearchState, grid: MultipleShooting) -> Iterator[Trajectory]:
+        """Yield guesses on a grid without end, in the same order for equal problems."""
+        problem, source = state.problem, self._guesses_on(grid, state.problem.boundary)
+        boundary, limits, motion = problem.boundary, problem.limits, problem.motion
+        likely = boundary.likely_final_shape
+        if motion is not None:
+            velocity = np.broadcast_to(boundary.velocity, boundary.start.shape)
+            if len(motion.remaining) > 1:
+                yield source.from_ticks(motion.remaining, velocity, self._period)
+            for guess in source.generate(boundary, limits, likely):
+                yield source.with_initial_velocity(guess, velocity, limits)
+        if problem.guess is not None:
+            yield source.from_shapes(move_to_ends(problem.guess, boundary, limits), limits)
+        if len(self._wheels) and len(self._model.axes):
+            robot = self._model.robot
+            yield from source.generate_with_wheels(self._wheels, boundary, limits, robot)
+        yield from source.generate(boundary, limits, likely)
+
+    def _guesses_on(self, grid: MultipleShooting, boundary: BoundaryConditions) -> InitialGuesses:
+        curvature = self._model.robot.function("curvature", compile=False)
+        L_0 = boundary.angular_momentum if boundary.drifts else None
+        return InitialGuesses(grid.turn, curvature, grid.intervals, L_0)
+
+    # -- 2. coarse solutions ----------------------------------------------------------------------
+
+    def _search_on_grids(self, state: _SearchState) -> list[Manoeuvre]:
+        """Return manoeuvres that need not keep clear, from guesses on a coarse grid first."""
+        problem, starts = state.problem, state.problem.options.starts
+        if self._wheels_stop_base(problem):
+            # Guesses with wheels are near to solutions.
+            iterations = min(problem.options.iterations, _MAX_ITERATIONS_OF_STOPS)
+            brief = replace(problem.options, answers=1, iterations=iterations)
+            state.problem = replace(problem, options=brief)
+            return self._search_from_guesses(state, state.full, starts)
+        # A single answer from rest costs less without a coarse grid.
+        if state.coarse == state.full or problem.options.answers == 1:
+            return self._search_from_guesses(state, state.full, starts)
+        found = self._search_from_guesses(state, state.coarse, starts)
+        if found or state.starts >= problem.max_failed_starts or state.clock.is_over(found=False):
+            return found
+        return self._search_from_guesses(state, state.full, min(starts, _MAX_FULL_GRID_STARTS))
+
+    def _search_from_guesses(
+        self, state: _SearchState, grid: _Grid, starts: int
+    ) -> list[Manoeuvre]:
+        """Return manoeuvres from at most ``starts`` guesses on a grid; none where none is found."""
+        problem, clock = state.problem, state.clock
+        solver = self._solver(problem, grid)
+        solutions: list[Trajectory] = []
+        enough = problem.options.answers
+        for number, guess in enumerate(itertools.islice(self._guesses(state, solver), starts), 1):
+            solution = self._solve_start(state, solver, guess, found=bool(solutions))
+            if grid == state.coarse:
+                state.solved.append((guess, solution))
+            if solution is not None:
+                solutions.append(solution)
+            # A search may also be cut short within its last start.
+            cut_short = clock.is_over(found=bool(solutions)) or not (
+                solutions or state.starts < problem.max_failed_starts
             )
-        return self._search_from_guesses(progress, full, full, options.starts)
+            going_on = len(solutions) < enough and not problem.solutions_agree(solutions)
+            if going_on and number < starts and not cut_short:
+                continue
+            found = self._refine_solutions(state, solutions, grid)
+            if found or cut_short:
+                return found
+            # These are none; the next ones count one by one.
+            solutions, enough = [], 1
+        return []
+
+    def _solve_start(
+        self, state: _SearchState, grid: MultipleShooting, guess: Trajectory, *, found: bool = False
+    ) -> Trajectory | None:
+        """Return the solution from the next guess; None: none was found."""
+        state.phase = SearchPhase.SEARCHING
+        solution = self._solve_from_guess(state, grid, guess, found=found)
+        state.starts += 1
+        if solution is None:
+            state.rejection = _NO_PATH_FOUND
+            state.report(f"start {state.starts}, {_NO_PATH_FOUND}")
+        else:
+            duration = math.inf if state.is_clearing else solution.duration
+            state.report(f"start {state.starts}, {solution.duration:.6g} s", duration)
+        return solution
+
+    def _solve_from_guess(
+        self,
+        state: _SearchState,
+        grid: MultipleShooting,
+        guess: Trajectory,
+        *,
+        found: bool = False,
+        refining: bool = False,
+    ) -> Trajectory | None:
+        """Return the solution from a guess: the fastest one, that of least effort in the time that
+        is given, or a gentle one; None: none was found."""
+        problem, boundary, limits = state.problem, state.problem.boundary, state.problem.limits
+        shortest, T = self._shortest_duration(problem), problem.options.duration
+        guess = self._model.constraints.slowed(guess)
+        if problem.hastens:
+            bounds = DurationBounds(shortest, problem.options.longest)
+        else:
+            if problem.gentle and T == 0:
+                guess = self._slow_to_effort_limits(guess, boundary)
+                T = max(_GENTLE_DURATION_FACTOR * guess.duration, shortest)
+            else:
+                T = self._given_duration(problem.options)
+            guess, bounds = guess.stretched(T / guess.duration), DurationBounds(T, T)
+            if problem.motion is not None:
+                # Only its commands are solved for.
+                return guess
+        in_given_time = problem.options.duration > 0
+        solution, stop = None, state.stop_rule(found=found)
+        for within in self._planned_limits(problem, limits, in_given_time=in_given_time):
+            solution = grid.solve(
+                boundary, within, guess, stop, bounds, refining=refining and problem.hastens
+            )
+            state.cancellation.raise_if_requested()
+            if solution is not None:
+                break
+        if solution is None or in_given_time or problem.motion is not None:
+            return solution
+        is_fastest = grid.converged or self._model.constraints.base_rate_limit > 0
+        if problem.hastens and is_fastest:
+            return solution
+        # A solution without convergence is not yet as fast as possible.
+        return self._slow_to_effort_limits(solution.at_full_speed(limits, shortest), boundary)
+
+    # -- 3. full grid -----------------------------------------------------------------------------
+
+    def _refine_solutions(
+        self, state: _SearchState, solutions: list[Trajectory], grid: _Grid
+    ) -> list[Manoeuvre]:
+        """Return manoeuvres from the best solutions on a grid, refined on the full grid.
+
+        Where the search ended because solutions agree, the next one is refined only if it promises
+        a shorter time than the refined best one.
+        """
+        problem, in_motion = state.problem, state.problem.motion is not None
+        most = _MAX_REFINED_SOLUTIONS_IN_MOTION if in_motion else _MAX_REFINED_SOLUTIONS
+        state.phase = SearchPhase.REFINING
+        found: list[Manoeuvre] = []
+        costs: list[float] = []
+        solutions_agree = problem.solutions_agree(solutions)
+        for solution in sorted(solutions, key=problem.cost):
+            cost = problem.cost(solution)
+            if found and (len(found) == most or cost > _MAX_REFINED_COST_RATIO * costs[0]):
+                break
+            least = min((one.solution.duration for one in found), default=math.inf)
+            if solutions_agree and solution.duration > (1 - _SAME_COST_TOLERANCE) * least:
+                break
+            if any(abs(cost - other) <= _SAME_COST_TOLERANCE * other for other in costs):
+                continue
+            with state.attempt():
+                refined: Trajectory | None = solution
+                if grid != state.full:
+                    full = self._solver(problem, state.full)
+                    guess = self._guesses_on(full, problem.boundary).resample(solution)
+                    refined = self._solve_from_guess(
+                        state, full, guess, found=bool(found), refining=True
+                    )
+                    if refined is None and problem.motion is not None:
+                        # The path of least effort in its time may be found all the same.
+                        refined = guess
+                if refined is None:
+                    raise UnusableCandidateError(_NO_PATH_FOUND)
+                manoeuvre = self._make_held_commands(state, refined)
+                found.append(manoeuvre)
+                costs.append(cost)
+                state.report(f"manoeuvre of {manoeuvre.duration:.6g} s")
+        return found
+
+    # -- 4. held commands -------------------------------------------------------------------------
+
+    def _make_held_commands(
+        self, state: _SearchState, trajectory: Trajectory, kept: KeptDistances | None = None
+    ) -> Manoeuvre:
+        """Return a solution as held commands, near to it if pairs are kept apart;
+        UnusableCandidateError if none reach the goal within the constraints.
+        """
+        problem, constraints = state.problem, self._model.constraints
+        fixed = problem.options.duration > 0
+        if problem.is_timed:
+            held = self._hold_in_whole_ticks(state, trajectory, kept)
+        else:
+            held = self._holder.hold(trajectory, problem.boundary, problem.limits, fixed=fixed)
+            if held is not None and not fixed:
+                excess = constraints.excess_rate(held.quaternions, self._period)
+                if 1 < excess <= _MAX_RATE_EXCESS:
+                    # At zero momentum the base turns as much slower as the joints move.
+                    slower = trajectory.stretched(excess * _RATE_RESERVE)
+                    held = self._holder.hold(slower, problem.boundary, problem.limits)
+        if held is None:
+            raise UnusableCandidateError(_NO_HELD_COMMANDS)
+        attitudes = quaternion_multiply(problem.quaternion, held.quaternions)
+        constraints.check(held.positions, attitudes, self._period)
+        duration = (len(held.positions) - 1) * self._period
+        return Manoeuvre(held, duration, trajectory)
+
+    def _hold_in_whole_ticks(
+        self, state: _SearchState, trajectory: Trajectory, kept: KeptDistances | None
+    ) -> HeldCommands | None:
+        """Return a solution whose duration matters as held commands; None where that fails.
+
+        Were it stretched to whole control periods, the base would turn on meanwhile, or the joints
+        begin at other rates. So the trajectory of least effort in as many control periods, or a few
+        more, is solved for.
+        """
+        problem, limits, near = state.problem, state.problem.limits, None
+        if kept is not None and kept.pairs:
+            limits = kept.within(limits, trajectory)
+            near = Neighbourhood.within(limits, _HELD_REACH_SHARE)
+        pairs = () if kept is None else kept.pairs
+        solver = self._solver(problem, _Grid(len(trajectory.shapes) - 1), pairs)
+        ticks = max(_MIN_TICKS, math.ceil(trajectory.duration / self._period - 1e-6))
+        before = None if problem.motion is None else problem.motion.velocity
+        guess, aim = trajectory, problem.boundary
+        additional = list(_ADDITIONAL_TICKS)
+        if len(self._wheels):
+            additional += [math.ceil(share * ticks) for share in _ADDITIONAL_SHARES_OF_STOPS]
+        planned = self._planned_limits(problem, limits, in_given_time=True)
+        # In a given time there is no other than the first.
+        most = 2 if problem.options.duration > 0 else len(additional)
+        for number, more in enumerate(additional[:most]):
+            T = (ticks + more) * self._period
+            guess = guess.stretched(T / guess.duration)
+            within, stop = planned[min(number, len(planned) - 1)], state.stop_rule()
+            solution = solver.solve(aim, within, guess, stop, DurationBounds(T, T), near)
+            state.cancellation.raise_if_requested()
+            if solution is None:
+                continue
+            held = self._holder.hold(
+                solution, problem.boundary, problem.limits, fixed=True, before=before
+            )
+            if held is not None:
+                return held
+            guess = solution
+            aim = self._holder.corrected_end(solution, problem.boundary, ticks + more)
+        return None
+
+    # -- 5. clear ---------------------------------------------------------------------------------
 
     def _keep_clear(
-        self, progress: _SearchState, found: list[Manoeuvre], intervals: int
+        self, state: _SearchState, kept: KeptDistances, found: list[Manoeuvre]
     ) -> list[Manoeuvre]:
-        """Return manoeuvres that keep clear: those that were found, if the fastest one does, or
-        others near to them, or others from new guesses; none where none is found.
+        """Return manoeuvres that keep clear: those that were found, if the fastest one does; else
+        others near to them, or near to other paths; none where none is found.
         """
-        kept = progress.kept
-        assert kept is not None
+        problem = state.problem
         in_order = sorted(found, key=lambda one: one.duration)
         if not kept.approaches(in_order[0].held.positions, in_order[0].held.quaternions):
             return found
+        state.best, state.is_clearing = math.inf, True
         freed: list[Manoeuvre] = []
         for each in in_order:
             if freed and each.duration >= min(one.duration for one in freed):
                 break
-            freed += self._make_clear(progress, each, intervals)
+            if not kept.approaches(each.held.positions, each.held.quaternions):
+                freed.append(each)
+                continue
+            with state.attempt():
+                freed.append(self._make_clear(state, kept.anew(), each.solution))
         # A robot that drifts finds others sooner after it has coasted.
-        if freed or progress.boundary.drifts:
+        if freed or (problem.boundary.drifts and problem.motion is None):
             return freed
-        known, clear = [each.solution for each in found], []
-        for path in self._other_paths(progress, intervals, known):
-            with self._attempt(progress):
-                clear.append(self._clear_coarsely(progress.clearing(), path, intervals))
+        others = self._other_paths(state, [each.solution for each in found])
+        if not self._has_coarse_paths(state):
+            for path in itertools.islice(others, _MAX_FULL_GRID_STARTS):
+                with state.attempt():
+                    return [self._clear_finely(state, kept.anew(), path)]
+            return []
+        clear: list[tuple[KeptDistances, Trajectory]] = []
+        for path in others:
+            with state.attempt():
+                clear.append(self._clear_coarsely(state, kept.anew(), path))
             if len(clear) == _CLEAR_ANSWERS:
                 break
-        for state, path in sorted(clear, key=lambda each: each[1].duration):
-            with self._attempt(progress):
-                return [self._clear_finely(state, path, intervals)]
+        for apart, path in sorted(clear, key=lambda each: each[1].duration):
+            with state.attempt():
+                return [self._clear_finely(state, apart, path)]
         return []
 
     def _other_paths(
-        self, progress: _SearchState, intervals: int, known: Sequence[Trajectory]
+        self, state: _SearchState, known: Sequence[Trajectory]
     ) -> Iterator[Trajectory]:
         """Yield other solutions that need not keep clear, from guesses on a coarse grid, then those
-        guesses that led to known solutions.
+        guesses that led to known ones.
         """
-        costs = [progress.cost(each) for each in known]
-        free = replace(progress, kept=None)
-        grid = self._get_solver(free, *self._coarse_grid(progress, intervals))
-        guesses = _build_guesses(self._robot, grid, progress.boundary)
-        boundary, limits = progress.boundary, progress.limits
-        unused: list[Trajectory] = []
-        for guess in itertools.islice(
-            guesses.generate(boundary, limits, boundary.likely_final_shape),
-            min(progress.options.starts, _MAX_CLEAR_STARTS),
-        ):
-            if progress.cut_short(found=False):
+        problem = state.problem
+        costs = [problem.cost(each) for each in known]
+        solver = self._solver(problem, state.coarse)
+        most = _MAX_CLEAR_STARTS if problem.motion is None else _MAX_CLEAR_STARTS_IN_MOTION
+        starts, unused = min(problem.options.starts, most), []
+        others = itertools.islice(self._guesses(state, solver), len(state.solved), starts)
+        solved = ((guess, self._solve_start(state, solver, guess)) for guess in others)
+        for guess, solution in itertools.chain(state.solved[:starts], solved):
+            if state.clock.is_over(found=False):
                 return
-            solution = self._solve_from_guess(free, grid, guess, progress.stop_rule(found=False))
-            progress.cancellation.raise_if_requested()
-            progress.starts += 1
-            result = _NO_PATH_FOUND if solution is None else f"{solution.duration:.6g} s"
-            progress.report(f"start {progress.starts}", result, grid.iterations)
             if solution is None:
                 continue
-            cost = progress.cost(solution)
+            cost = problem.cost(solution)
             if any(abs(cost - other) <= _SAME_COST_TOLERANCE * other for other in costs):
                 unused.append(guess)
             else:
@@ -443,253 +757,207 @@ class ManoeuvreSearch:
                 yield solution
         yield from unused
 
-    def _coarse_grid(self, progress: _SearchState, intervals: int) -> tuple[int, float]:
-        """Return the intervals of the coarse grid and the tolerance on it; of the full grid where
-        there is none.
-        """
-        coarser = intervals // _COARSE_GRID_RATIO
-        # On a coarse grid the attitude of a robot that drifts is too far off.
-        if progress.boundary.is_timed or coarser < _MIN_COARSE_INTERVALS:
-            return intervals, TOLERANCE
-        return coarser, _COARSE_TOLERANCE
+    def _has_coarse_paths(self, state: _SearchState) -> bool:
+        """Whether paths are made clear on the coarse grid first."""
+        problem = state.problem
+        # A motion that is timed is too far off on it: joints run on in long intervals.
+        return problem.hastens and state.coarse != state.full and not problem.is_timed
 
-    @contextmanager
-    def _attempt(self, progress: _SearchState) -> Iterator[None]:
-        """Note the reason why there is no manoeuvre, instead of raising an error."""
-        try:
-            yield
-        except UnusableCandidateError as reason:
-            progress.rejection = str(reason)
-        progress.cancellation.raise_if_requested()
-
-    def _make_clear(
-        self, progress: _SearchState, manoeuvre: Manoeuvre, intervals: int
-    ) -> list[Manoeuvre]:
-        """Return a manoeuvre near to one that keeps clear; that one itself, if it does; or none."""
-        kept = progress.kept
-        assert kept is not None
-        if not kept.approaches(manoeuvre.positions, manoeuvre.quaternions):
-            return [manoeuvre]
-        with self._attempt(progress):
-            state = progress.clearing()
-            coarse = self._clear_coarsely(state, manoeuvre.solution, intervals)
-            return [self._clear_finely(*coarse, intervals)]
-        return []
+    def _make_clear(self, state: _SearchState, kept: KeptDistances, path: Trajectory) -> Manoeuvre:
+        """Return a manoeuvre near to a path that keeps clear; UnusableCandidateError if none was
+        found."""
+        if self._has_coarse_paths(state):
+            kept, path = self._clear_coarsely(state, kept, path)
+        return self._clear_finely(state, kept, path)
 
     def _clear_coarsely(
-        self, progress: _SearchState, path: Trajectory, intervals: int
-    ) -> tuple[_SearchState, Trajectory]:
-        """Return a fast path near to another one that keeps clear on a coarse grid, with the search
-        whose pairs it keeps apart; the same path where it is for the full grid alone.
-        UnusableCandidateError if none was found."""
-        coarser, tolerance = self._coarse_grid(progress, intervals)
-        if not progress.hastens or coarser == intervals:
-            return progress, path
-        clearing = self._path_clearing(progress, coarser, tolerance)
-        slow, _ = clearing.clear(path, _CLEARING_TIME_FACTOR * path.duration)
-        fast, _ = clearing.shorten(slow, None)
-        progress.report("clear path", f"{fast.duration:.6g} s", 0)
-        return progress, fast.stretched(_RESAMPLED_TIME_FACTOR)
+        self, state: _SearchState, kept: KeptDistances, path: Trajectory
+    ) -> tuple[KeptDistances, Trajectory]:
+        """Return a fast path near to another one that keeps clear on the coarse grid, with the
+        pairs that it keeps apart; UnusableCandidateError if none was found.
+        """
+        apart = _Apart(kept, state.coarse)
+        slow, _ = self._clear(state, apart, path, _CLEARING_TIME_FACTOR * path.duration)
+        fast, _ = self._shorten(state, apart, slow, None)
+        return kept, fast.stretched(_RESAMPLED_TIME_FACTOR)
 
-    def _clear_finely(self, progress: _SearchState, path: Trajectory, intervals: int) -> Manoeuvre:
-        """Return a manoeuvre near to a path that keeps clear, by the full grid.
-        UnusableCandidateError if none was found."""
-        options, kept = progress.options, progress.kept
-        assert kept is not None
-        clearing = self._path_clearing(
-            progress, intervals, TOLERANCE, partial(self._make_held_commands, progress)
-        )
-        shortest = self._shortest_duration(progress)
+    def _clear_finely(
+        self, state: _SearchState, kept: KeptDistances, path: Trajectory
+    ) -> Manoeuvre:
+        """Return a manoeuvre near to a path that keeps clear, by the full grid;
+        UnusableCandidateError if none was found.
+        """
+        problem, options = state.problem, state.problem.options
+        hold = partial(self._make_held_commands, state, kept=kept)
+        apart = _Apart(kept, state.full, hold)
+        shortest = self._shortest_duration(problem)
         duration = path.duration if kept.pairs else _CLEARING_TIME_FACTOR * path.duration
         if options.duration > 0:
             duration = self._given_duration(options)
-        elif progress.gentle:
-            path = self._slow_to_effort_limits(path, progress.boundary)
+        elif problem.gentle:
+            path = self._slow_to_effort_limits(path, problem.boundary)
             duration = max(_GENTLE_DURATION_FACTOR * path.duration, shortest)
-        path, made = clearing.clear(path, duration)
-        if progress.hastens:
-            path, made = clearing.shorten(path, made)
-        elif progress.gentle:
-            fast = path.at_full_speed(progress.limits, shortest)
-            made = self._make_held_commands(
-                progress, self._slow_to_effort_limits(fast, progress.boundary)
-            )
-            if near := kept.approaches(made.positions, made.quaternions):
+        path, made = self._clear(state, apart, path, duration)
+        if problem.hastens:
+            path, made = self._shorten(state, apart, path, made)
+        elif problem.gentle:
+            fast = path.at_full_speed(problem.limits, shortest)
+            made = hold(self._slow_to_effort_limits(fast, problem.boundary))
+            if near := kept.approaches(made.held.positions, made.held.quaternions):
                 raise UnusableCandidateError(kept.message(near[0], self._period))
         assert made is not None
         if made.duration > max(options.longest, options.duration) + self._period / 2:
             raise UnusableCandidateError(_NO_PATH_FOUND)
-        progress.report("manoeuvre that keeps clear", f"{made.duration:.6g} s", 0)
+        state.report(f"manoeuvre of {made.duration:.6g} s", made.duration)
         return made
 
-    def _path_clearing(
-        self,
-        progress: _SearchState,
-        intervals: int,
-        tolerance: float,
-        hold: Callable[[Trajectory], Manoeuvre] | None = None,
-    ) -> PathClearing[Manoeuvre]:
-        """Return the clearing of paths on a grid, as held commands or as they are."""
-        kept, limits = progress.kept, progress.limits
-        assert kept is not None
-        solve = partial(self._solve_apart, progress, intervals, tolerance)
-        return PathClearing(kept, limits, solve, self._period, hold)
+    def _clear(
+        self, state: _SearchState, apart: _Apart, path: Trajectory, duration: float
+    ) -> tuple[Trajectory, Manoeuvre | None]:
+        """Return a clear path near to one, in a given duration (s), and its held commands;
+        UnusableCandidateError if none was found.
+        """
+        state.phase = SearchPhase.CLEARING
+        kept, limits, lacks = apart.kept, state.problem.limits, [math.inf, math.inf]
+        near, made = kept.approaches_of(path), None
+        for _ in range(_MAX_CLEARING_ROUNDS):
+            (kept.widen if lacks[-1] < _NO_LACK else kept.add)(near)
+            guess = path.stretched(duration / path.duration)
+            deepest = min((each.distance for each in near), default=0.0)
+            largest_lack = max(_MIN_LARGEST_LACK, -_LACK_PER_DEPTH * deepest)
+            around = Neighbourhood.within(limits, largest_lack=largest_lack)
+            path, lack = self._solve_apart(state, apart, guess, duration, around)
+            near, made = self._approaches(apart, path)
+            if not near:
+                return path, made
+            lacks.append(lack)
+            if lack >= _NO_LACK and lack > _PROGRESS_SHARE * lacks[-3]:
+                break
+        period = None if made is None else self._period
+        raise UnusableCandidateError(kept.message(near[0], period))
+
+    def _shorten(
+        self, state: _SearchState, apart: _Apart, path: Trajectory, made: Manoeuvre | None
+    ) -> tuple[Trajectory, Manoeuvre | None]:
+        """Return a faster path near to a clear one, and its held commands; else that one itself."""
+        state.phase = SearchPhase.SHORTENING
+        reach, limits = 1.0, state.problem.limits
+        for _ in range(_MAX_SHORTENING_ROUNDS):
+            state.report("clear path", path.duration)
+            if reach < _MIN_REACH_SHARE or state.clock.is_over(found=True):
+                break
+            try:
+                faster, _ = self._solve_apart(
+                    state, apart, path, None, Neighbourhood.within(limits, reach)
+                )
+                near, found = self._approaches(apart, faster)
+            except UnusableCandidateError:
+                reach /= _REACH_DIVISOR
+                continue
+            if near:
+                # A pair that is new has no planes yet.
+                if all(each.pair in apart.kept.pairs for each in near):
+                    reach /= _REACH_DIVISOR
+                apart.kept.add(near)
+                continue
+            gain = 1 - faster.duration / path.duration
+            if gain > 0:
+                path, made = faster, found
+            if gain < _MIN_GAIN * reach:
+                break
+            reach = min(_REACH_FACTOR * reach, 1.0)
+        return path, made
+
+    def _approaches(
+        self, apart: _Apart, path: Trajectory
+    ) -> tuple[list[Approach], Manoeuvre | None]:
+        """Return the pairs that come too near along a path, or else along its held commands."""
+        near = apart.kept.approaches_of(path)
+        if near or apart.hold is None:
+            return near, None
+        made = apart.hold(path)
+        return apart.kept.approaches(made.held.positions, made.held.quaternions), made
 
     def _solve_apart(
         self,
-        progress: _SearchState,
-        intervals: int,
-        tolerance: float,
+        state: _SearchState,
+        apart: _Apart,
         guess: Trajectory,
         duration: float | None,
         near: Neighbourhood,
     ) -> tuple[Trajectory, float]:
         """Return a solution near to a guess that keeps pairs of links apart, in a duration, s
-        (None: the fastest one), and by how much they are too near all the same, m.
-        UnusableCandidateError if no such solution was found."""
-        kept, boundary, limits = progress.kept, progress.boundary, progress.limits
-        assert kept is not None
-        if progress.options.duration > 0:
-            limits = _narrowed(limits)
-        solver = self._get_solver(progress, intervals, tolerance)
-        if len(guess.shapes) != intervals + 1:
-            guess = _build_guesses(self._robot, solver, boundary).resample(guess)
-        shortest = self._shortest_duration(progress)
-        bounds = DurationBounds(shortest, progress.options.longest)
+        (None: the fastest one), and by how much they are too near all the same, m;
+        UnusableCandidateError if none was found.
+        """
+        problem, boundary, kept = state.problem, state.problem.boundary, apart.kept
+        given = problem.options.duration > 0
+        limits = self._planned_limits(problem, problem.limits, in_given_time=given)[-1]
+        solver = self._solver(problem, apart.grid, kept.pairs)
+        if len(guess.shapes) != apart.grid.intervals + 1:
+            guess = self._guesses_on(solver, boundary).resample(guess)
+        shortest = self._shortest_duration(problem)
+        bounds = DurationBounds(shortest, problem.options.longest)
         if duration is not None:
             bounds = DurationBounds(duration, duration)
+        if problem.motion is not None and duration is not None:
+            # A path that takes longer begins as fast all the same.
+            source, lacking = self._guesses_on(solver, boundary), boundary.velocity
+            lacking = lacking - guess.velocities[0]
+            guess = source.with_initial_velocity(guess, lacking, problem.limits)
         within = kept.within(limits, guess, pushing=near.largest_lack > 0)
         # On the same grid, a solver continues at its own last solution.
-        stop = progress.stop_rule(found=False)
-        solution = solver.solve(boundary, within, guess, stop, bounds, near)
-        progress.cancellation.raise_if_requested()
-        result = _NO_PATH_FOUND
-        if solution is not None:
-            result = f"{solution.duration:.6g} s, {1e3 * solver.lack:.3g} mm too near"
-        progress.report(f"{len(kept.pairs)} pair(s) apart", result, solver.iterations)
+        solution = solver.solve(boundary, within, guess, state.stop_rule(found=True), bounds, near)
+        state.cancellation.raise_if_requested()
+        pairs = f"{len(kept.pairs)} pair(s) apart"
         if solution is None:
+            state.report(f"{pairs}, {_NO_PATH_FOUND}")
             raise UnusableCandidateError(_NO_PATH_FOUND)
-        if duration is None and not solver.converged and self._constraints.base_rate_limit == 0:
+        lack = f"{1e3 * solver.lack:.3g} mm too near"
+        state.report(f"{pairs}, {solution.duration:.6g} s, {lack}")
+        free_rate = self._model.constraints.base_rate_limit == 0
+        if duration is None and not solver.converged and free_rate and problem.motion is None:
             # A solution without convergence is not yet as fast as possible.
             solution = solution.at_full_speed(limits, shortest)
             solution = self._slow_to_effort_limits(solution, boundary)
         return solution, solver.lack
 
-    def _get_solver(
-        self, progress: _SearchState, intervals: int, tolerance: float = TOLERANCE
+    # -- what the steps share ---------------------------------------------------------------------
+
+    def _grids(self, problem: SearchProblem) -> tuple[_Grid, _Grid]:
+        """Return the coarse grid and the full one: the same one where there is no coarse one."""
+        full, in_motion = _Grid(problem.intervals), problem.motion is not None
+        if in_motion:
+            coarse = _Grid(full.intervals // _COARSE_GRID_RATIO_IN_MOTION)
+            fewest = _MIN_COARSE_INTERVALS_IN_MOTION
+        else:
+            coarse = _Grid(full.intervals // _COARSE_GRID_RATIO, _COARSE_TOLERANCE)
+            fewest = _MIN_COARSE_INTERVALS
+        # On a coarse grid the attitude of a base that wheels stop is too far off.
+        if coarse.intervals < fewest or self._wheels_stop_base(problem):
+            return full, full
+        # A single answer in motion is for the rest of a manoeuvre, which is short.
+        return coarse, (coarse if in_motion and problem.options.answers == 1 else full)
+
+    def _wheels_stop_base(self, problem: SearchProblem) -> bool:
+        return len(self._wheels) > 0 and problem.boundary.is_timed and problem.motion is None
+
+    def _solver(
+        self, problem: SearchProblem, grid: _Grid, pairs: tuple[int, ...] = ()
     ) -> MultipleShooting:
-        pairs = progress.kept.pairs if progress.kept is not None else ()
-        return self.solver(
-            intervals,
-            progress.boundary.center is not None,
-            tolerance,
-            pairs,
-            drifting=progress.boundary.drifts,
-        )
-
-    def _search_from_guesses(
-        self, progress: _SearchState, grid: MultipleShooting, full: MultipleShooting, starts: int
-    ) -> list[Manoeuvre]:
-        """Return manoeuvres from at most ``starts`` guesses on a grid; none where none is found."""
-        guesses = _build_guesses(self._robot, grid, progress.boundary)
-        boundary, limits = progress.boundary, progress.limits
-        of_boundary = guesses.generate(boundary, limits, boundary.likely_final_shape)
-        if len(self._wheels) and len(self._axes):
-            of_boundary = guesses.generate_with_wheels(self._wheels, boundary, limits, self._robot)
-        if progress.guess is not None:
-            moved = move_to_ends(progress.guess, boundary, limits)
-            of_boundary = itertools.chain([guesses.from_shapes(moved, limits)], of_boundary)
-        solutions: list[Trajectory] = []
-        enough = progress.options.answers
-        for number, guess in enumerate(itertools.islice(of_boundary, starts), 1):
-            stop = progress.stop_rule(found=bool(solutions))
-            solution = self._solve_from_guess(progress, grid, guess, stop)
-            progress.cancellation.raise_if_requested()
-            progress.starts += 1
-            result = _NO_PATH_FOUND if solution is None else f"{solution.duration:.6g} s"
-            if solution is not None:
-                progress.shortest = min(progress.shortest, solution.duration)
-            progress.report(f"start {progress.starts}", result, grid.iterations)
-            if solution is None:
-                progress.rejection = _NO_PATH_FOUND
-            else:
-                solutions.append(solution)
-            # A search may also be cut short within its last start.
-            cut_short = progress.cut_short(found=bool(solutions))
-            going_on = len(solutions) < enough and not progress.solutions_agree(solutions)
-            cut_short = cut_short or not (solutions or progress.starts < progress.max_failed_starts)
-            if going_on and number < starts and not cut_short:
-                continue
-            found = self._refine_solutions(progress, solutions, grid, full)
-            if found or cut_short:
-                return found
-            # These are none; the next ones count one by one.
-            solutions, enough = [], 1
-        return []
-
-    def _refine_solutions(
-        self,
-        progress: _SearchState,
-        solutions: list[Trajectory],
-        grid: MultipleShooting,
-        full: MultipleShooting,
-    ) -> list[Manoeuvre]:
-        """Return manoeuvres from the best solutions on a grid, refined on the full grid.
-
-        Where the search ended because solutions agree, the next one is refined only if it promises
-        a shorter time than the refined best one.
-        """
-        found: list[Manoeuvre] = []
-        costs: list[float] = []
-        solutions_agree = progress.solutions_agree(solutions)
-        for solution in sorted(solutions, key=progress.cost):
-            cost = progress.cost(solution)
-            if found and (
-                len(found) == _MAX_REFINED_SOLUTIONS or cost > _MAX_REFINED_COST_RATIO * costs[0]
-            ):
-                break
-            least = min((one.solution_time for one in found), default=math.inf)
-            if solutions_agree and solution.duration > (1 - _SAME_COST_TOLERANCE) * least:
-                break
-            if any(abs(cost - other) <= _SAME_COST_TOLERANCE * other for other in costs):
-                continue
-            try:
-                refined: Trajectory | None = solution
-                if grid is not full:
-                    guess = _build_guesses(self._robot, full, progress.boundary).resample(solution)
-                    stop = progress.stop_rule(found=bool(found))
-                    refined = self._solve_from_guess(progress, full, guess, stop, refining=True)
-                    progress.cancellation.raise_if_requested()
-                manoeuvre = self._make_held_commands(progress, refined)
-                found.append(manoeuvre)
-                costs.append(cost)
-                result = f"{manoeuvre.duration:.6g} s"
-            except UnusableCandidateError as reason:
-                result = progress.rejection = str(reason)
-            progress.report("manoeuvre", result, full.iterations)
-        return found
-
-    def solver(
-        self,
-        intervals: int,
-        position: bool,
-        tolerance: float = TOLERANCE,
-        pairs: tuple[int, ...] = (),
-        *,
-        drifting: bool = False,
-    ) -> MultipleShooting:
-        """Return the solver with a number of intervals, with or without a position, which keeps
-        pairs of links apart; ``drifting``, for an angular momentum that is not zero.
-        """
-        key = intervals, position, tolerance, pairs, drifting
+        """Return the solver on a grid, which keeps pairs of links apart."""
+        position, drifting = problem.boundary.center is not None, problem.boundary.drifts
+        key = grid, position, pairs, drifting
         if key not in self._solvers:
-            rows = partial(self._distances.of, pairs) if pairs and self._distances else None
-            of = partial(self._get_stages, position, rows, instants_of(intervals), drifting)
+            library = self._model.distances
+            rows = partial(library.of, pairs) if pairs and library else None
+            of = partial(self._get_stages, position, rows, instants_of(grid.intervals), drifting)
+            efforts = self._model.efforts
             self._solvers[key] = (
-                MultipleShooting(of(), intervals, tolerance)
-                if self._efforts is None
+                MultipleShooting(of(), *grid)
+                if efforts is None
                 else EffortLimitedShooting(
-                    of, intervals, self._efforts, tolerance, drifting=drifting
+                    of, grid.intervals, efforts, grid.tolerance, drifting=drifting
                 )
             )
         return self._solvers[key]
@@ -704,299 +972,38 @@ class ManoeuvreSearch:
     ) -> Stages:
         key = position, bool(inequalities), drifting
         if key not in self._stages:
+            model = self._model
             self._stages[key] = Stages.of(
-                self._robot,
-                self._axes,
+                model.robot,
+                model.axes,
                 position,
-                self._constraints,
+                model.constraints,
                 inequalities,
-                end_effectors=self._end_effectors and self._end_effectors.function,
+                end_effectors=model.end_effectors and model.end_effectors.function,
                 drifting=drifting,
             )
         if rows is None:
             return self._stages[key]
         return self._stages[key].with_distances(rows(), instants)
 
-    def _solve_from_guess(
-        self,
-        progress: _SearchState,
-        solver: MultipleShooting,
-        guess: Trajectory,
-        stop: StopRule,
-        *,
-        refining: bool = False,
-    ) -> Trajectory | None:
-        boundary, limits, options = progress.boundary, progress.limits, progress.options
-        shortest = self._shortest_duration(progress)
-        guess = self._constraints.slowed(guess)
-        if options.duration > 0:
-            limits, T = _narrowed(limits), self._given_duration(options)
-        elif progress.gentle:
-            guess = self._slow_to_effort_limits(guess, boundary)
-            T = max(_GENTLE_DURATION_FACTOR * guess.duration, shortest)
-        else:
-            duration = DurationBounds(shortest, options.longest)
-            solution = solver.solve(boundary, limits, guess, stop, duration, refining=refining)
-            if solution is None or solver.converged or self._constraints.base_rate_limit > 0:
-                return solution
-            # A solution without convergence is not yet as fast as possible.
-            return self._slow_to_effort_limits(solution.at_full_speed(limits, shortest), boundary)
-        guess = guess.stretched(T / guess.duration)
-        solution = solver.solve(boundary, limits, guess, stop, DurationBounds(T, T))
-        if solution is None or not progress.gentle:
-            return solution
-        return self._slow_to_effort_limits(solution.at_full_speed(limits, shortest), boundary)
-
-    def _shortest_duration(self, progress: _SearchState) -> float:
-        """Return the duration that a manoeuvre has at least, s."""
-        gentle = min(_GENTLE_TICKS * self._period, _GENTLE_TIME) if progress.gentle else 0.0
-        return max(_MIN_TICKS * self._period, gentle)
-
-    def _given_duration(self, options: OptimalOptions) -> float:
-        """Return the duration that is asked for in whole ticks, s."""
-        return max(round(options.duration / self._period), 1) * self._period
-
-    def _slow_to_effort_limits(
-        self, trajectory: Trajectory, boundary: BoundaryConditions
-    ) -> Trajectory:
-        return trajectory if self._efforts is None else self._efforts.slowed(trajectory, boundary)
-
-    def _make_held_commands(
-        self, progress: _SearchState, trajectory: Trajectory | None
-    ) -> Manoeuvre:
-        """Return a solution as held commands; UnusableCandidateError if there is no solution, or
-        none that commands reach within the constraints."""
-        if trajectory is None:
-            raise UnusableCandidateError(_NO_PATH_FOUND)
-        fixed = progress.options.duration > 0
-        if progress.boundary.is_timed:
-            held = self._hold_in_whole_ticks(progress, trajectory)
-        else:
-            held = self._holder.hold(trajectory, progress.boundary, progress.limits, fixed=fixed)
-            if held is not None and not fixed:
-                excess = self._constraints.excess_rate(held.quaternions, self._period)
-                if 1 < excess <= _MAX_RATE_EXCESS:
-                    # At zero momentum the base turns as much slower as the joints move.
-                    slower = trajectory.stretched(excess * _RATE_RESERVE)
-                    held = self._holder.hold(slower, progress.boundary, progress.limits)
-        if held is None:
-            raise UnusableCandidateError(_NO_HELD_COMMANDS)
-        attitudes = quaternion_multiply(progress.quaternion, held.quaternions)
-        self._constraints.check(held.positions, attitudes, self._period)
-        duration = (len(held.positions) - 1) * self._period
-        return Manoeuvre(held, duration, trajectory)
-
-    def _hold_in_whole_ticks(
-        self, progress: _SearchState, trajectory: Trajectory
-    ) -> HeldCommands | None:
-        """Return a solution whose duration matters as held commands; None where that fails.
-
-        Were it stretched to whole control periods, the base would turn on meanwhile, or the wheels
-        begin at other rates. So the trajectory of least effort in as many control periods, or a few
-        more, is solved for.
-        """
-        boundary, limits, kept = progress.boundary, progress.limits, progress.kept
-        narrowed, near = _narrowed(limits), None
-        if kept is not None and kept.pairs:
-            narrowed = kept.within(narrowed, trajectory)
-            near = Neighbourhood.within(limits, _HELD_REACH_SHARE)
-        solver = self._get_solver(progress, len(trajectory.shapes) - 1)
-        ticks = max(_MIN_TICKS, math.ceil(trajectory.duration / self._period - 1e-6))
-        guess, aim = trajectory, boundary
-        # In a given time there is no other than the first.
-        additional = list(_ADDITIONAL_TICKS_OF_DRIFT)
-        if len(self._wheels):
-            additional += [math.ceil(share * ticks) for share in _ADDITIONAL_SHARES_OF_STOPS]
-        most = 2 if progress.options.duration > 0 else len(additional)
-        for more in additional[:most]:
-            T = (ticks + more) * self._period
-            guess = guess.stretched(T / guess.duration)
-            stop = progress.stop_rule(found=False)
-            solution = solver.solve(aim, narrowed, guess, stop, DurationBounds(T, T), near)
-            progress.cancellation.raise_if_requested()
-            if solution is None:
-                continue
-            held = self._holder.hold(solution, boundary, limits, fixed=True)
-            if held is not None:
-                return held
-            guess = solution
-            aim = self._holder.corrected_end(solution, boundary, ticks + more)
-        return None
-
-
-def _narrowed(limits: MotionLimits) -> MotionLimits:
-    """Return the limits of manoeuvres of a given duration."""
-    return replace(
-        limits,
-        velocity=_LIMIT_SHARE_IN_GIVEN_TIME * limits.velocity,
-        acceleration=_LIMIT_SHARE_IN_GIVEN_TIME * limits.acceleration,
-    )
-
-
-class MotionSearch:
-    """Searches for manoeuvres of one robot that begin in motion.
-
-    Parameters
-    ----------
-    model
-        Model and constraints of the manoeuvres.
-    solver
-        Returns the solver (:meth:`ManoeuvreSearch.solver`).
-    """
-
-    def __init__(self, model: ManoeuvreModel, solver: Callable[..., MultipleShooting]) -> None:
-        self._robot, self._period = model.robot, model.control_period
-        self._constraints, self._begin = model.constraints, model.begin
-        self._holder = CommandHolder(model)
-        self._solver = solver
-
-    def search(
-        self,
-        boundary: BoundaryConditions,
-        limits: MotionLimits,
-        quaternion: Array,
-        intervals: int,
-        options: OptimalOptions,
-        motion: InitialMotion,
-        cancellation: Cancellation = NEVER,
-    ) -> Manoeuvre:
-        """Return the fastest manoeuvre found from attitude ``quaternion`` (4,) of R_WB.
-
-        The rest of the motion so far is the first guess.
-
-        Raises
-        ------
-        NotFoundError
-            None was found.
-        PlanningCancelled
-            The search was cancelled.
-        """
-        boundary = replace(boundary, velocity=self._initial_velocity(motion, limits))
-        kept = self._begin(boundary)
-        coarser = intervals
-        if intervals >= _COARSE_GRID_RATIO_IN_MOTION * _MIN_COARSE_INTERVALS_IN_MOTION:
-            coarser = intervals // _COARSE_GRID_RATIO_IN_MOTION
-        coarse = self._solver(
-            coarser, boundary.center is not None, TOLERANCE, (), drifting=boundary.drifts
-        )
-        stop = StopRule(options.iterations, cancellation)
-        # The remaining motion is short, so a coarse grid is fine enough.
-        finer = coarser if options.answers == 1 else intervals
-        candidates: list[Trajectory] = []
-        tried: list[float] = []
-        starts, rejection = 0, _NO_PATH_FOUND
-        guesses = itertools.islice(
-            self._guesses(boundary, limits, coarse, motion.remaining), options.starts
-        )
-        while True:
-            for guess in guesses:
-                starts += 1
-                if options.duration > 0:
-                    candidates.append(guess)
-                else:
-                    solution = self._find_fastest(coarse, boundary, limits, guess, stop, options)
-                    candidates += [] if solution is None else [solution]
-                cancellation.raise_if_requested()
-                if len(candidates) >= options.answers or _durations_agree(candidates) or tried:
-                    break
-            else:
-                if tried or not candidates:
-                    break
-            for candidate in _fastest_others(candidates, tried):
-                tried.append(candidate.duration)
-                try:
-                    held = self._keep_clear(
-                        finer, boundary, limits, candidate, motion, options, stop, kept
-                    )
-                    attitudes = quaternion_multiply(quaternion, held.quaternions)
-                    self._constraints.check(held.positions, attitudes, self._period)
-                except UnusableCandidateError as reason:
-                    rejection = str(reason)
-                    continue
-                finally:
-                    cancellation.raise_if_requested()
-                duration = (len(held.positions) - 1) * self._period
-                durations = [each.duration for each in candidates]
-                return Manoeuvre(held, duration, candidate, starts, durations)
-            if kept is None:
-                break
-        raise NotFoundError(
-            f"No manoeuvre to the goal that begins in motion was found from {starts} start(s): "
-            f"{rejection}."
-        )
-
-    def _keep_clear(
-        self,
-        intervals: int,
-        boundary: BoundaryConditions,
-        limits: MotionLimits,
-        candidate: Trajectory,
-        motion: InitialMotion,
-        options: OptimalOptions,
-        stop: StopRule,
-        kept: KeptDistances | None,
-    ) -> HeldCommands:
-        """Return a candidate as held commands that keep clear; UnusableCandidateError if there are
-        none that reach the goal within the limits."""
-        position, drifting = boundary.center is not None, boundary.drifts
-        free = self._solver(intervals, position, TOLERANCE, (), drifting=drifting)
-        guesses = _build_guesses(self._robot, free, boundary)
-        path, duration = guesses.resample(candidate), options.duration
-        if duration == 0:
-            path = self._find_fastest(free, boundary, limits, path, stop, options) or path
-            duration = path.duration
-        held = self._hold(free, boundary, limits, path, duration, motion, options, stop)
-        if kept is None or not kept.approaches(held.positions, held.quaternions):
-            return held
-        kept = kept.anew()
-        brief = replace(stop, iterations=min(stop.iterations, _MAX_CLEARING_ITERATIONS))
-
-        def solver() -> MultipleShooting:
-            return self._solver(intervals, position, TOLERANCE, kept.pairs, drifting=drifting)
-
-        def solve(
-            guess: Trajectory, duration: float | None, near: Neighbourhood
-        ) -> tuple[Trajectory, float]:
-            bounds = self._duration_bounds(options)
-            if duration is not None:
-                bounds = DurationBounds(duration, duration)
-            narrowed = self._narrow_limits(limits, _ACCELERATION_SHARES_IN_MOTION[-1])
-            within = kept.within(narrowed, guess, pushing=near.largest_lack > 0)
-            apart = solver()
-            solution = apart.solve(boundary, within, guess, brief, bounds, near)
-            stop.cancellation.raise_if_requested()
-            if solution is None:
-                raise UnusableCandidateError(_NO_PATH_FOUND)
-            return solution, apart.lack
-
-        def hold(path: Trajectory) -> HeldCommands:
-            apart, within = solver(), kept.within(limits, path)
-            near = Neighbourhood.within(limits, _HELD_REACH_SHARE)
-            return self._hold(
-                apart, boundary, within, path, path.duration, motion, options, brief, near
-            )
-
-        clearing = PathClearing(kept, limits, solve, self._period, hold)
-        if options.duration > 0:
-            _, clear = clearing.clear(path, duration)
-            assert clear is not None
-            return clear
-        for factor in _CLEARING_TIME_FACTORS_IN_MOTION:
-            slower = path.stretched(factor)
-            lacking = boundary.velocity - slower.velocities[0]
-            slower = guesses.with_initial_velocity(slower, lacking, limits)
-            try:
-                _, clear = clearing.shorten(*clearing.clear(slower, slower.duration))
-            except UnusableCandidateError:
-                if factor == _CLEARING_TIME_FACTORS_IN_MOTION[-1]:
-                    raise
-                continue
-            break
-        assert clear is not None
-        return clear
+    def _planned_limits(
+        self, problem: SearchProblem, limits: MotionLimits, *, in_given_time: bool
+    ) -> list[MotionLimits]:
+        """Return the limits that solutions are to keep, one after the other until one does."""
+        if problem.motion is not None:
+            velocity = self._planned_speed_limit(limits)
+            return [
+                replace(limits, velocity=velocity, acceleration=share * limits.acceleration)
+                for share in _ACCELERATION_SHARES_IN_MOTION
+            ]
+        if not in_given_time:
+            return [limits]
+        share = _LIMIT_SHARE_IN_GIVEN_TIME
+        velocity, acceleration = share * limits.velocity, share * limits.acceleration
+        return [replace(limits, velocity=velocity, acceleration=acceleration)]
 
     def _planned_speed_limit(self, limits: MotionLimits) -> Array:
-        """Return the largest planned velocities (n,)."""
+        """Return the largest velocities (n,) that are planned in motion."""
         given_up = np.minimum(
             _VELOCITY_RESERVE_IN_MOTION * limits.velocity, limits.acceleration * self._period / 4
         )
@@ -1011,112 +1018,19 @@ class MotionSearch:
         speed = self._planned_speed_limit(limits)
         return np.clip(between, -speed, speed)
 
-    def _find_fastest(
-        self,
-        solver: MultipleShooting,
-        boundary: BoundaryConditions,
-        limits: MotionLimits,
-        guess: Trajectory,
-        stop: StopRule,
-        options: OptimalOptions,
-    ) -> Trajectory | None:
-        duration = self._duration_bounds(options)
-        for room in _ACCELERATION_SHARES_IN_MOTION:
-            narrowed = self._narrow_limits(limits, room)
-            solution = solver.solve(boundary, narrowed, guess, stop, duration)
-            if solution is not None or stop.cancellation.requested:
-                return solution
-        return None
+    def _shortest_duration(self, problem: SearchProblem) -> float:
+        """Return the duration that a manoeuvre has at least, s."""
+        if problem.motion is not None:
+            return min(_MIN_TICKS_IN_MOTION * self._period, problem.options.longest)
+        gentle = min(_GENTLE_TICKS * self._period, _GENTLE_TIME) if problem.gentle else 0.0
+        return max(_MIN_TICKS * self._period, gentle)
 
-    def _duration_bounds(self, options: OptimalOptions) -> DurationBounds:
-        shortest = min(_MIN_TICKS_IN_MOTION * self._period, options.longest)
-        return DurationBounds(shortest, options.longest)
+    def _given_duration(self, options: OptimalOptions) -> float:
+        """Return the duration that is asked for in whole ticks, s."""
+        return max(round(options.duration / self._period), 1) * self._period
 
-    def _narrow_limits(self, limits: MotionLimits, room: float) -> MotionLimits:
-        velocity = self._planned_speed_limit(limits)
-        return replace(limits, velocity=velocity, acceleration=room * limits.acceleration)
-
-    def _hold(
-        self,
-        solver: MultipleShooting,
-        boundary: BoundaryConditions,
-        limits: MotionLimits,
-        path: Trajectory,
-        duration: float,
-        motion: InitialMotion,
-        options: OptimalOptions,
-        stop: StopRule,
-        near: Neighbourhood | None = None,
-    ) -> HeldCommands:
-        """Return a path as held commands, in a duration (s) or a few more control periods.
-        UnusableCandidateError if there are none that reach the goal within the limits."""
-        most = 1 if options.duration > 0 else len(_ADDITIONAL_TICKS)
-        ticks = max(1, math.ceil(duration / self._period - 1e-6))
-        aim = boundary
-        for more, room in itertools.product(
-            _ADDITIONAL_TICKS[:most], _ACCELERATION_SHARES_IN_MOTION
-        ):
-            T = (ticks + more) * self._period
-            solution = solver.solve(
-                aim,
-                self._narrow_limits(limits, room),
-                replace(path, step=T / solver.intervals),
-                stop,
-                DurationBounds(T, T),
-                near,
-            )
-            if stop.cancellation.requested:
-                break
-            held = None
-            if solution is not None:
-                held = self._holder.hold(
-                    solution, boundary, limits, fixed=True, before=motion.velocity
-                )
-            if held is not None:
-                return held
-            if solution is not None and boundary.drifts:
-                aim = self._holder.corrected_end(solution, boundary, ticks + more)
-        raise UnusableCandidateError(_NO_HELD_COMMANDS)
-
-    def _guesses(
-        self,
-        boundary: BoundaryConditions,
-        limits: MotionLimits,
-        solver: MultipleShooting,
-        remaining: Array,
-    ) -> Iterator[Trajectory]:
-        """Yield the rest of the motion so far, then guesses with loops, from its velocity."""
-        velocity = np.broadcast_to(boundary.velocity, boundary.start.shape)
-        guesses = _build_guesses(self._robot, solver, boundary)
-        if len(remaining) > 1:
-            yield guesses.from_ticks(remaining, velocity, self._period)
-        for guess in guesses.generate(boundary, limits, boundary.likely_final_shape):
-            yield guesses.with_initial_velocity(guess, velocity, limits)
-
-
-def _build_guesses(
-    robot: SpaceRobot, solver: MultipleShooting, boundary: BoundaryConditions
-) -> InitialGuesses:
-    curvature = robot.function("curvature", compile=False)
-    L_0 = boundary.angular_momentum if boundary.drifts else None
-    return InitialGuesses(solver.turn, curvature, solver.intervals, L_0)
-
-
-def _fastest_others(found: Sequence[Trajectory], tried: Sequence[float]) -> list[Trajectory]:
-    """Return the fastest trajectories, of those that are the same one, and none of ``tried``
-    durations, s.
-    """
-    chosen: list[Trajectory] = []
-    for each in sorted(found, key=lambda one: one.duration):
-        known = [*tried, *(one.duration for one in chosen)]
-        if all(abs(each.duration - other) > _SAME_COST_TOLERANCE * other for other in known):
-            chosen.append(each)
-    return chosen[:_MAX_REFINED_SOLUTIONS_IN_MOTION]
-
-
-def _durations_agree(found: list[Trajectory]) -> bool:
-    durations = np.array([each.duration for each in found])
-    return (
-        int(np.sum(durations <= durations.min(initial=math.inf) * (1 + _SAME_COST_TOLERANCE)))
-        >= _AGREEING_SOLUTIONS_IN_MOTION
-    )
+    def _slow_to_effort_limits(
+        self, trajectory: Trajectory, boundary: BoundaryConditions
+    ) -> Trajectory:
+        efforts = self._model.efforts
+        return trajectory if efforts is None else efforts.slowed(trajectory, boundary)
