@@ -202,7 +202,7 @@ def _state_streams(flight: Flight) -> Iterator[_Stream]:
         if not all(field.quantity in quantities for field in topic.state):
             continue
         names = thrusters if topic.array_entries_of == "thrusters" else flight.joint_names
-        base = config.frame_prefix + robot.base_link
+        base = config.prefix_for(robot) + robot.base_link
         target = "" if flight.target is None else flight.target.base_link
         message = state_message(topic, names, config.world_frame, base, target)
         columns = {
@@ -261,7 +261,7 @@ def _frame_streams(flight: Flight) -> Iterator[_Stream]:
     # As those that the recorder writes where no node publishes transforms.
     every = config.ticks_of(flight.scenario.config("recorder").tf_period)
     if every:
-        frames = RobotTransforms(robot, config.world_frame, config.frame_prefix, links=True)
+        frames = RobotTransforms(robot, config.world_frame, config.prefix_for(robot), links=True)
         ticks = np.arange(0, len(flight.time), every)
         lost = flight.quantities.get("pose_lost")
         if lost is not None:

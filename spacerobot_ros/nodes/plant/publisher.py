@@ -158,7 +158,7 @@ class StatePublisher:
     ) -> None:
         self._node, self._robot, self._state, self._config = node, robot, state, config
         self._world = config.world_frame
-        self._base = config.frame_prefix + robot.base_link
+        self._base = config.prefix_for(robot.description) + robot.base_link
         self._outputs: dict[str, RawOutput] = {}
         self._readers: frozenset[bytes] = frozenset()
         self._matched = 0
@@ -273,7 +273,10 @@ class TransformPublisher:
             return
         self.publishes = True
         self._frames = RobotTransforms(
-            robot.description, config.world_frame, config.frame_prefix, links=config.tf_links
+            robot.description,
+            config.world_frame,
+            config.prefix_for(robot.description),
+            links=config.tf_links,
         )
         self._stream = node.send_raw(self._kind, TRANSFORMS)
         self._static: RawOutput | None = None
