@@ -175,8 +175,12 @@ def first_shape(robot: SpaceRobot) -> Array:
     return np.asarray(np.round(np.clip(shape, lower, upper), 3))
 
 
-def first_problem(name: str, robot: SpaceRobot, file: Path) -> PlanningProblem:
+def first_problem(
+    name: str, robot: SpaceRobot, file: Path, *, clear: bool = True
+) -> PlanningProblem:
     """Return the problem of a small base rotation about an axis that the joints allow.
+
+    ``clear`` is whether links are kept clear of each other, for which their meshes are needed.
 
     Raises
     ------
@@ -197,6 +201,8 @@ def first_problem(name: str, robot: SpaceRobot, file: Path) -> PlanningProblem:
     config = PlannerConfig(robot=str(file)).for_robot(robot.description)
     tolerance = min(config.attitude_tolerance, float(f"{angle / _ROTATION_TO_TOLERANCE:.1g}"))
     config = replace(config, attitude_tolerance=tolerance)
+    if not clear:
+        config = replace(config, clearance=0.0)
     return PlanningProblem(name, robot, InitialState(joint_positions=shape), goal, config)
 
 
@@ -237,6 +243,10 @@ def scenario_text(problem: PlanningProblem, method: str, robot_path: str) -> str
     angle = math.degrees(float(np.linalg.norm(turn)))
     axis = ", ".join(f"{each:.3g}" for each in turn / np.linalg.norm(turn) + 0.0)
     name = problem.robot.description.name
+    unclear = (
+        "    clearance: 0.0   # m; contacts are not noticed: meshes of <collision> are missing\n"
+    )
+    clearance = "" if config.clearance else unclear
     start = f"    initial_joint_positions: [{shape}]   # {joints}\n" if problem.robot.n else ""
     return f"""\
 # The first flight of {name}: its joints turn its base.
@@ -260,4 +270,4 @@ scenario:
     method: {method}
     attitude_tolerance: {config.attitude_tolerance!r}   # rad
     position_tolerance: {config.position_tolerance!r}   # m
-"""
+{clearance}"""
