@@ -11,6 +11,7 @@ import click
 
 from spacerobot_ros.cli.options import (
     PATH,
+    NumberRange,
     bag_argument,
     beside,
     format_option,
@@ -149,7 +150,13 @@ def figures_command(
 )
 @click.option("--paused", is_flag=True, help="Begin paused.")
 @view_option
-@click.option("--wait", default=3.0, show_default=True, help="Longest wait for readers (s).")
+@click.option(
+    "--wait",
+    default=3.0,
+    show_default=True,
+    type=NumberRange(min=0.0),
+    help="Longest wait for readers (s).",
+)
 def replay_command(
     bag: Path, topics: tuple[str, ...], remap: tuple[str, ...], view: bool, **options: Any
 ) -> None:
@@ -228,7 +235,7 @@ def salvage_command(bag: Path, out: Path | None) -> None:
     "--tolerance",
     default=1e-9,
     show_default=True,
-    type=click.FloatRange(min=0.0),
+    type=NumberRange(min=0.0),
     help="Largest deviation that counts as equal (SI units; relative above 1).",
 )
 @click.option(

@@ -16,6 +16,7 @@ from spacerobot_ros.cli.options import (
     METHODS,
     EndEffectorOptions,
     GoalOptions,
+    NumberRange,
     RegisteredName,
     attitude_options,
     bag_option,
@@ -54,13 +55,13 @@ if TYPE_CHECKING:
     "--realtime",
     is_flag=False,
     flag_value=1.0,
-    type=click.FloatRange(min=0.0, min_open=True),
+    type=NumberRange(min=0.0, min_open=True),
     metavar="[FACTOR]",
     help="Fly by the nodes on the wall clock, FACTOR times as fast (1 without a number).",
 )
 @click.option(
     "--longest",
-    type=click.FloatRange(min=0.0, min_open=True),
+    type=NumberRange(min=0.0, min_open=True),
     default=math.inf,
     metavar="SECONDS",
     help="Simulated time after which the flight is interrupted.",
@@ -265,7 +266,7 @@ def _published_lines(scenario: Scenario, summary: dict[str, Any]) -> list[str]:
     "--rate",
     default=1.0,
     show_default=True,
-    type=click.FloatRange(min=0.0, min_open=True),
+    type=NumberRange(min=0.0, min_open=True),
     help="Simulated time per wall time.",
 )
 @click.option(
@@ -329,7 +330,10 @@ def up_command(
 @end_effector_options
 @click.option("--namespace", default="", help="Namespace of the stack.")
 @click.option(
-    "--timeout", default=0.0, help="Longest wait for the result, s of wall time; 0: no limit."
+    "--timeout",
+    default=0.0,
+    type=NumberRange(min=0.0),
+    help="Longest wait for the result, s of wall time; 0: no limit.",
 )
 def goal_command(
     pose: tuple[float, ...],

@@ -46,6 +46,17 @@ class _TextPath(click.Path):
 PATH = _TextPath(path_type=Path)
 
 
+class NumberRange(click.FloatRange):
+    """Range of numbers that refuses NaN, which compares as within every range."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """Return a number of the range."""
+        number = super().convert(value, param, ctx)
+        if math.isnan(number):
+            self.fail(f"{value} is no number.", param, ctx)
+        return number
+
+
 class DefaultGroup(click.Group):
     """Command group with a default command."""
 
