@@ -280,7 +280,8 @@ def _frame_streams(flight: Flight) -> Iterator[_Stream]:
     if every:
         ticks = np.arange(0, len(flight.time), every)
         markers = RobotMarkers(robot, flight.target, config.world_frame)
-        yield _Stream(TOPICS["markers"], ticks * period, _marker_maker(flight, markers, ticks))
+        if markers.draws_anything:
+            yield _Stream(TOPICS["markers"], ticks * period, _marker_maker(flight, markers, ticks))
 
 
 def _marker_maker(
@@ -296,7 +297,7 @@ def _marker_maker(
         R, r = (each[:, order] for each in kinematics.link_poses(flight.q[chosen]))
         # Attitudes of links stand side by side.
         R = R.transpose(0, 2, 1, 3).reshape(len(chosen), 3, -1)
-        made = (
+        return [
             markers.message(
                 tick * period,
                 flight.pose[tick],
@@ -305,8 +306,7 @@ def _marker_maker(
                 None if target is None else target[tick],
             )
             for k, tick in enumerate(chosen.tolist())
-        )
-        return [each or b"" for each in made]
+        ]
 
     return make
 

@@ -271,3 +271,30 @@ scenario:
     attitude_tolerance: {config.attitude_tolerance!r}   # rad
     position_tolerance: {config.position_tolerance!r}   # m
 {clearance}"""
+
+
+def thruster_scenario_text(robot: SpaceRobot, robot_path: str) -> str:
+    """Return a parameter file that moves and turns a robot without joints by its thrusters."""
+    name = robot.description.name
+    return f"""\
+# The first flight of {name}, which has no joints: thrusters move and turn it.
+
+scenario:
+  ros__parameters:
+    description: Thrusters move {name} by 0.2 m and turn it by 10 deg
+    goal_position: [0.2, 0.0, 0.0]   # m
+    goal_rotvec: [0.0, 0.0, {math.radians(10.0):.4g}]   # rad
+
+/**/plant:
+  ros__parameters:
+    robot: {robot_path}
+    tick_rate: 50.0
+    actuation: effort
+
+/**/coordinated_control:
+  ros__parameters:
+    robot: {robot_path}
+    tick_rate: 50.0
+    max_force: 0.0    # N, of the thrusters; 0: no limit
+    max_torque: 0.0   # N m
+"""

@@ -128,9 +128,14 @@ def test_an_impossible_inertia_becomes_the_nearest_possible_one_if_asked_for(rob
 
 
 def test_a_robot_that_cannot_turn_its_base_is_told_so(robot: Path) -> None:
-    text = robot.read_text("utf-8").replace('type="revolute"', 'type="fixed"')
-    text = text.replace('type="continuous"', 'type="fixed"')
-    robot.write_text(text, "utf-8")
+    body = '<inertial><mass value="3"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/>'
+    robot.write_text(
+        f'<robot name="piston"><link name="hull">{body}</inertial></link>'
+        f'<link name="rod">{body}</inertial></link><joint name="slide" type="prismatic">'
+        '<parent link="hull"/><child link="rod"/>'
+        '<limit lower="-1" upper="1" velocity="1" effort="1"/></joint></robot>',
+        "utf-8",
+    )
     result = CliRunner().invoke(main, ["new", str(robot)])
     assert result.exit_code == 1, result.output
     assert "turn its base not at all" in result.output

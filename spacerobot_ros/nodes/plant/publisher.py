@@ -389,8 +389,10 @@ class LinkMarkers:
 
     def publish(self, time_ns: int) -> None:
         """Publish the markers of all visuals at their present poses."""
+        if not self._markers.draws_anything:
+            return
         plant = self._plant
         target = None if plant.capturing is None else plant.capturing.target_pose
-        message = self._markers.message(time_ns, plant.pose, plant.link_R, plant.link_r, target)
-        if message is not None:
-            self._stream.take(message)
+        self._stream.take(
+            self._markers.message(time_ns, plant.pose, plant.link_R, plant.link_r, target)
+        )
