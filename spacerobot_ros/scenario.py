@@ -101,6 +101,15 @@ class Kill:
     until: float
 
 
+_ATTITUDE: frozenset[Controlled] = frozenset({"attitude"})
+
+_KEYS_OF_PARTS: Mapping[Controlled, frozenset[str]] = {
+    "position": frozenset({"goal_position"}),
+    "attitude": frozenset({"goal_orientation", "goal_rotvec"}),
+}
+"""Keys of a scenario's section that ask for a part of the pose of the base."""
+
+
 @dataclass(frozen=True)
 class Scenario:
     """The nodes of a flight with their parameters, and the goals of the flight.
@@ -121,6 +130,8 @@ class Scenario:
         Parameters by node and full name; overrides take precedence over the file.
     has_goal
         Whether a goal was given; without one ``goal`` is the start.
+    asked
+        The parts of the pose of the base that were given as numbers; others are those of the start.
     """
 
     name: str
@@ -137,6 +148,7 @@ class Scenario:
         default_factory=lambda: {"plant": {"time_mode": "lockstep"}}
     )
     has_goal: bool = True
+    asked: frozenset[Controlled] = frozenset()
     _configs: dict[str, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
     """Cached results of :meth:`config` by node."""
     _changes: dict[str, tuple[Any, dict[str, Any]]] = field(
@@ -393,7 +405,8 @@ class Scenario:
         if goal is self.goal:
             return self
         goal = replace(goal, end_effectors=(), base=POSE)
-        return replace(self, goal=goal, published=(), has_goal=True)
+        asked = POSE if pose is not None else self.asked.union(_ATTITUDE)
+        return replace(self, goal=goal, published=(), has_goal=True, asked=asked)
 
     def with_end_effectors(
         self, goals: Sequence[EndEffectorGoal], base: frozenset[Controlled] = frozenset()
@@ -535,6 +548,9 @@ def load_scenario(name: str) -> Scenario:
         published_method=str(values.get("published_method", "")),
         kills=parse_kills(values.get("kills", []), f"the file {path}"),
         in_file=in_file,
+        asked=frozenset(
+            part for part, keys in _KEYS_OF_PARTS.items() if not keys.isdisjoint(values)
+        ),
     )._with_goal_topics()
 
 
