@@ -21,25 +21,26 @@ _MAX_MEMORY = 2**30
 def package_around(name: str, folder: Path) -> Path | None:
     """Return the folder of the package that has a file in ``folder``, or of one beside it.
 
-    The name of a package is that in its ``package.xml``, and that of a folder without one. None:
-    no such package.
+    The name of a package is that in its ``package.xml``, or else that of its folder. None: no such
+    package.
     """
     folder = folder.resolve()
     for parent in (folder, *folder.parents):
-        if _package_name(parent) == name:
-            return parent
         if (parent / "package.xml").is_file():
-            beside = (each.parent for each in sorted(parent.parent.glob("*/package.xml")))
-            return next((each for each in beside if _package_name(each) == name), None)
+            packages = [each.parent for each in sorted(parent.parent.glob("*/package.xml"))]
+            found = [each for each in packages if _package_name(each) == name]
+            found += [each for each in packages if each.name == name]
+            return found[0] if found else None
+        if parent.name == name:
+            return parent
     return None
 
 
 def _package_name(folder: Path) -> str:
     try:
-        named = parse(folder / "package.xml").findtext("name")
+        return (parse(folder / "package.xml").findtext("name") or "").strip()
     except (OSError, ParseError):
-        return folder.name
-    return (named or folder.name).strip()
+        return ""
 
 
 def main(file: str, seconds: int) -> int:
