@@ -79,6 +79,9 @@ def test_a_campaign_that_is_ended_goes_on_where_it_was(tmp_path: Path) -> None:
     assert (fewer.flown, fewer.total) == (2, 2)
     results = Results.of(tmp_path / "cut")
     assert (len(results), results.planned_flights) == (6, 6)
+    read = require_module("pyarrow.parquet").read_table
+    parts = (tmp_path / "cut" / "flights").glob("*.parquet")
+    assert sum(len(read(part)) for part in parts) == 6, "none is flown twice"
 
 
 @pytest.mark.slow
