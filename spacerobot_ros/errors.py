@@ -95,6 +95,10 @@ class NotFoundError(PlanningError):
     """
 
 
+class UnreadMeshError(PlanningError):
+    """The mesh of a collision shape cannot be read, so that its link cannot be kept clear."""
+
+
 def refusal_of_all(message: str, refusals: Iterable[Exception]) -> PlanningError:
     """Return one refusal of a goal that several methods have refused.
 

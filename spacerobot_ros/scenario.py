@@ -103,6 +103,15 @@ class Kill:
     until: float
 
 
+_ATTITUDE: frozenset[Controlled] = frozenset({"attitude"})
+
+_KEYS_OF_PARTS: Mapping[Controlled, frozenset[str]] = {
+    "position": frozenset({"goal_position"}),
+    "attitude": frozenset({"goal_orientation", "goal_rotvec"}),
+}
+"""Keys of a scenario's section that ask for a part of the pose of the base."""
+
+
 @dataclass(frozen=True)
 class Scenario:
     """The nodes of a flight with their parameters, and the goals of the flight.
@@ -123,6 +132,8 @@ class Scenario:
         Parameters by node and full name; overrides take precedence over the file.
     has_goal
         Whether a goal was given; without one ``goal`` is the start.
+    asked
+        The parts of the pose of the base that were given as numbers; others are those of the start.
     """
 
     name: str
@@ -139,6 +150,7 @@ class Scenario:
         default_factory=lambda: {"plant": {"time_mode": "lockstep"}}
     )
     has_goal: bool = True
+    asked: frozenset[Controlled] = frozenset()
     _configs: dict[str, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
     """Cached results of :meth:`config` by node."""
     _changes: dict[str, tuple[Any, dict[str, Any]]] = field(
@@ -407,7 +419,13 @@ class Scenario:
             goal = replace(goal, quaternion=given.quaternion)
         if goal is self.goal:
             return self
-        return self.with_other_goal(replace(goal, end_effectors=(), base=POSE))
+        asked = self.asked
+        if pose is not None:
+            asked = asked.union(POSE if len(pose) == 7 else ["position"])
+        if rotvec is not None or rpy_deg is not None:
+            asked = asked.union(_ATTITUDE)
+        goal = replace(goal, end_effectors=(), base=POSE)
+        return replace(self.with_other_goal(goal), asked=asked)
 
     def with_other_goal(self, goal: Goal) -> Scenario:
         """Return the scenario with another goal, as the description says then.
@@ -565,6 +583,9 @@ def load_scenario(name: str) -> Scenario:
         published_method=str(values.get("published_method", "")),
         kills=parse_kills(values.get("kills", []), f"the file {path}"),
         in_file=in_file,
+        asked=frozenset(
+            part for part, keys in _KEYS_OF_PARTS.items() if not keys.isdisjoint(values)
+        ),
     )._with_goal_topics()
 
 

@@ -8,8 +8,9 @@ import json
 import os
 import platform
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -21,13 +22,13 @@ from spacerobot_ros.campaign.draws import require_module
 from spacerobot_ros.campaign.rows import Row
 from spacerobot_ros.campaign.targets import description_of
 from spacerobot_ros.errors import ParameterError, RecordingError, reason
-from spacerobot_ros.files import load_yaml
+from spacerobot_ros.files import load_yaml, warn_once
 from spacerobot_ros.measures import metric_names
 from spacerobot_ros.model.urdf import load_robot, parse_robot
 from spacerobot_ros.resources import is_path, robot_file
 from spacerobot_ros.scenario import load_scenario, scenario_text
 from spacerobot_ros.simulation.capture import load_target, target_parameters
-from spacerobot_ros.version import __version__
+from spacerobot_ros.version import __version__, source_hash
 
 DRAW_PREFIX = "draw."
 """Prefix of the columns of drawn quantities."""
@@ -38,9 +39,18 @@ _FLIGHTS_FOLDER = "flights"
 _FLUSH_PERIOD, _FLUSH_ROWS = 5.0, 2000
 """Wall time (s) and number of rows after which rows are written: a kill loses at most as much."""
 
-VERSIONS_JSON = json.dumps(
-    {"spacerobot_ros": __version__, "numpy": np.__version__, "python": platform.python_version()}
-)
+
+@lru_cache(maxsize=1)
+def versions_json() -> str:
+    """Return the versions of what flies, with the hash of this package's code."""
+    return json.dumps(
+        {
+            "spacerobot_ros": __version__,
+            "source": source_hash(),
+            "numpy": np.__version__,
+            "python": platform.python_version(),
+        }
+    )
 
 
 class Dataset:
@@ -89,6 +99,8 @@ class Dataset:
             for left in (self.folder / _FLIGHTS_FOLDER).glob(".*"):
                 left.unlink()  # An earlier process was killed while it wrote this file.
             done = self.flown_numbers()
+            if done:
+                self._name_other_software()
             self._write_description(
                 campaign, max([campaign.flights, *(number + 1 for number in done)])
             )
@@ -116,6 +128,14 @@ class Dataset:
             f"{difference}. Name another folder, or remove it."
         )
 
+    def _name_other_software(self) -> None:
+        flown_by = json.loads((self.folder / _ABOUT_FILE).read_text("utf-8")).get("versions", "")
+        if flown_by != versions_json():
+            warn_once(
+                f"The flights in {self.folder} were flown by other software ({flown_by}): those "
+                "that follow may differ."
+            )
+
     def _require_no_other_files(self) -> None:
         if not self.folder.exists():
             return
@@ -139,7 +159,7 @@ class Dataset:
         facts = {
             "name": campaign.name,
             "fingerprint": _fingerprint_of(campaign),
-            "versions": VERSIONS_JSON,
+            "versions": versions_json(),
             "scenario": campaign.scenario.name,
         }
         content = {"campaign": section}
@@ -255,19 +275,10 @@ class Dataset:
             ) from error
         self._rows.clear()
 
-    def table(self) -> Any:
-        """Return all rows as a pyarrow table, by the number of the flight.
+    def table(self, columns: Sequence[str] | None = None) -> Any:
+        """Return the rows as a pyarrow table, by the number of the flight; one row a flight.
 
-        Raises
-        ------
-        ParameterError
-            The dataset has no rows.
-        """
-        return self.table_in_written_order().sort_by("flight")
-
-    def table_in_written_order(self, columns: Sequence[str] | None = None) -> Any:
-        """Return all rows as a pyarrow table, as they were written.
-
+        If a file was copied into the folder, the first row of a flight counts, with a warning.
         Columns that are not among ``columns`` are not read; those that no file has are left out.
 
         Raises
@@ -276,17 +287,30 @@ class Dataset:
             The dataset has no rows.
         """
         arrow = require_module("pyarrow")
-        parts = [_read_row_file(part, columns) for part in self._row_files()]
+        wanted = None if columns is None else {"flight", *columns}
+        parts = [_read_row_file(part, wanted) for part in self._row_files()]
         if not parts:
             raise ParameterError(f"The folder {self.folder} has no flights yet.")
         # Files of earlier versions may lack columns.
-        return arrow.concat_tables(parts, promote_options="default")
+        table = arrow.concat_tables(parts, promote_options="default")
+        _, first = np.unique(table["flight"].to_numpy(), return_index=True)
+        if repeated := len(table) - len(first):
+            warn_once(
+                f"{repeated} of the rows in {self.folder} repeat a flight: the first row of each "
+                "flight counts. Remove files that were copied there."
+            )
+        table = table.take(first)
+        return (
+            table
+            if columns is None
+            else table.select([name for name in columns if name in table.column_names])
+        )
 
     def _row_files(self) -> Sequence[Path]:
         return sorted((self.folder / _FLIGHTS_FOLDER).glob("part-*.parquet"))
 
 
-def _read_row_file(part: Path, columns: Sequence[str] | None = None) -> Any:
+def _read_row_file(part: Path, columns: Collection[str] | None = None) -> Any:
     """Return a file of rows as a pyarrow table of ``columns`` it has; ParameterError if damaged."""
     arrow, parquet = require_module("pyarrow"), require_module("pyarrow.parquet")
     try:
@@ -332,7 +356,7 @@ def _columns_of_rows(rows: Sequence[Row], names: Sequence[str]) -> dict[str, lis
         "plan_time_s": [row.plan_time for row in rows],
         "engine": [row.engine for row in rows],
         "fallback": [row.fallback for row in rows],
-        "versions": [VERSIONS_JSON] * len(rows),
+        "versions": [versions_json()] * len(rows),
     }
     for name in names:
         if name.startswith(DRAW_PREFIX):

@@ -393,7 +393,7 @@ class _ControlledLanes:
         ):
             return "its controller has integral gains, which engine 'flights' flies"
         if law.fixed_inputs is None:
-            return f"the law '{law.name}' is no function of numbers, and engine 'flights' flies it"
+            return f"the law '{law.name}' with these options is more than one function"
         for key, goal in _goals_by_frame(scenario).items():
             if goal is not None and not getattr(law.outputs.selection, key):
                 return f"the law '{law.name}' does not control the {key.replace('_', '-')}"

@@ -104,14 +104,12 @@ class Columns(Mapping[str, Any]):
     def __init__(self, dataset: Dataset) -> None:
         self._dataset = dataset
         self._known: dict[str, Any] = {}
-        numbers = dataset.table_in_written_order(["flight"])["flight"].to_numpy()
-        self._order = np.argsort(numbers, kind="stable")
-        self._known["flight"] = numbers[self._order].astype(float)
+        self._known["flight"] = dataset.table(["flight"])["flight"].to_numpy().astype(float)
 
     def read(self, names: Iterable[str]) -> None:
         """Read columns together: each file is opened once."""
         left = [name for name in names if name not in self._known]
-        table = self._dataset.table_in_written_order(left)
+        table = self._dataset.table(left)
         text = require_module("pyarrow").string()
         for name in left:
             self._known[name] = None
@@ -124,19 +122,12 @@ class Columns(Mapping[str, Any]):
                 self._known[name] = self._texts(column.cast(text))
             else:
                 # Missing numbers become NaN; seeds beyond 2^53 are rounded.
-                numbers = column.cast("double", safe=False).to_numpy()
-                self._known[name] = numbers[self._order]
+                self._known[name] = column.cast("double", safe=False).to_numpy()
 
     def _texts(self, column: Any) -> list[str | None]:
         """Return a column of texts; equal ones are one object."""
         known: dict[str | None, str | None] = {}
-        texts = np.empty(len(column), dtype=object)
-        at = 0
-        for chunk in column.chunks:
-            texts[at : at + len(chunk)] = [known.setdefault(x, x) for x in chunk.to_pylist()]
-            at += len(chunk)
-        found: list[str | None] = texts[self._order].tolist()
-        return found
+        return [known.setdefault(x, x) for chunk in column.chunks for x in chunk.to_pylist()]
 
     def __getitem__(self, name: str) -> Any:
         if name not in self._known:

@@ -9,7 +9,7 @@ import math
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -20,8 +20,9 @@ from spacerobot_ros.campaign.config import Campaign, parse_campaign, scenario_of
 from spacerobot_ros.campaign.dataset import Dataset
 from spacerobot_ros.campaign.draws import Draws, drawn_flight
 from spacerobot_ros.campaign.engines import engine_by_name, fly_all, select_engine
-from spacerobot_ros.campaign.rows import FLIGHTS, Row
+from spacerobot_ros.campaign.rows import ERROR, FLIGHTS, Row
 from spacerobot_ros.campaign.workers import (
+    KILLED,
     THIS_PROCESS,
     Cluster,
     TaskDistributor,
@@ -49,12 +50,15 @@ class Progress:
         Flights a second of wall time, in this process.
     seconds
         Wall time so far.
+    errors
+        Flights of the dataset that could not be flown, counted at the end.
     """
 
     flown: int
     total: int
     flights_per_second: float
     seconds: float
+    errors: int = 0
 
     @property
     def seconds_left(self) -> float:
@@ -128,7 +132,8 @@ def run_campaign(
                 show(progress(flown))
         finally:
             dataset.close()
-        return progress(flown)
+        outcomes = dataset.table(["outcome"])["outcome"].to_pylist() if before + flown else []
+        return replace(progress(flown), errors=sum(each in (ERROR, KILLED) for each in outcomes))
 
 
 def _fly_rows(
@@ -252,7 +257,7 @@ def stored_flight(dataset: Dataset, number: int) -> tuple[str, str, dict[str, fl
     """Return outcome, engine and metrics of a flight in a dataset; None: it is not there."""
     if number not in dataset.flown_numbers():
         return None
-    (record,) = [row for row in dataset.table().to_pylist() if row["flight"] == number]
+    record = next(row for row in dataset.table().to_pylist() if row["flight"] == number)
     metrics = {
         name: value
         for name, value in record.items()

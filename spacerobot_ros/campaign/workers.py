@@ -34,7 +34,7 @@ from spacerobot_ros.campaign.rows import FLIGHTS, Fallback, Row
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.files import warn_once
 from spacerobot_ros.termination import end_with_parent
-from spacerobot_ros.version import __version__
+from spacerobot_ros.version import __version__, source_hash
 
 TARGET_TASK_TIME = 2.0
 """Wall time that a task should take, s: the overhead of its distribution is small beside it."""
@@ -92,15 +92,20 @@ def _deserialise_campaign(packed: bytes) -> Campaign:
     return parse_campaign(*pickle.loads(packed))
 
 
+def this_code() -> str:
+    """Return the version of the package, and the hash of its code."""
+    return f"{__version__} ({source_hash()})"
+
+
 def fly_task(
-    packed: bytes, version: str, draws: list[Draw], engine: str, include_fallbacks: bool
+    packed: bytes, code: str, draws: list[Draw], engine: str, include_fallbacks: bool
 ) -> list[Row | Fallback]:
     """Fly some draws: a task of a worker.
 
     Parameters
     ----------
-    packed, version
-        Result of :func:`serialise_campaign`, and the version of the package that made it.
+    packed, code
+        Result of :func:`serialise_campaign`, and :func:`this_code` of the process that made it.
     draws, engine
         Draws, and name of the engine.
     include_fallbacks
@@ -109,12 +114,12 @@ def fly_task(
     Raises
     ------
     SpaceRobotError
-        The worker has another version of this package.
+        The worker has other code of this package.
     """
-    if version != __version__:
+    if code != this_code():
         raise SpaceRobotError(
-            f"A worker has spacerobot_ros {__version__}, and this process {version}: "
-            "all need the same."
+            f"A worker has {_PACKAGE_NAME} {this_code()}, and this process {code}: all need the "
+            "same code."
         )
     flying, campaign = engine_by_name(engine), _deserialise_campaign(packed)
     fly = partial(fly_all, flying) if include_fallbacks else flying.fly
@@ -474,7 +479,7 @@ class TaskDistributor:
 
     def _submit_task(self, numbers: list[int], engine: str, *, alone: bool = False) -> None:
         draws = [self._draws[number] for number in numbers]
-        task = self._workers.submit(self._packed, __version__, draws, engine, alone)
+        task = self._workers.submit(self._packed, this_code(), draws, engine, alone)
         self._running[task] = _SubmittedTask(numbers, engine, alone)
 
     def _collect_rows(self, ended: Any) -> list[Row]:

@@ -96,8 +96,8 @@ def fly(
     A second file with another `method: lie_bracket` beside the scenario is the second design of
     --compare. More are in examples/campaigns.
 
-    A campaign that was interrupted is continued. Exit code 0: all flights were flown; 2: bad input;
-    130: Ctrl-C, the flights so far are kept.
+    A campaign that was interrupted is continued. Exit code 0: all flights were flown; 1: every
+    flight ended by an error; 2: bad input; 130: Ctrl-C, the flights so far are kept.
     """
     from spacerobot_ros.campaign.workers import Cluster
 
@@ -108,9 +108,10 @@ def fly(
         _compare(compare, flights, engine, cluster, out, report)
         return
     assert file is not None
-    folder = _fly_campaign(file, flights, engine, cluster, out)
+    folder, progress = _fly_campaign(file, flights, engine, cluster, out)
     _write_report(folder, report)
     exit_if_terminated()
+    _require_flights(progress)
 
 
 @campaign_command.command("report")
@@ -144,8 +145,11 @@ def rerun(folder: Path, number: int, bag: Path | None) -> None:
 
 def _fly_campaign(
     file: Path, flights: int | None, engine: str, cluster: Cluster, out: Path | None, name: str = ""
-) -> Path:
-    """Fly a campaign, print its progress, and return its folder; ``name`` replaces its name."""
+) -> tuple[Path, Progress]:
+    """Fly a campaign, print its progress, and return its folder and its end.
+
+    ``name`` replaces its name.
+    """
     from spacerobot_ros.campaign.config import load_campaign
     from spacerobot_ros.campaign.running import run_campaign
     from spacerobot_ros.termination import graceful_shutdown
@@ -162,7 +166,14 @@ def _fly_campaign(
         )
     flown = f"{progress.flown} of {progress.total} flights"
     click.echo(f"{campaign.name}: {flown}, {progress.flights_per_second:.3g} a second; {folder}")
-    return folder
+    return folder, progress
+
+
+def _require_flights(*each: Progress) -> None:
+    """Exit with 1 if no draw of a campaign could be flown."""
+    for progress in each:
+        if progress.errors and progress.errors == progress.flown:
+            fail(f"None of the {progress.flown} draws could be flown: the report has the reasons.")
 
 
 @contextmanager
@@ -210,11 +221,13 @@ def _compare(
     if names[0] == names[1]:  # The default folders of two campaigns must differ.
         names = [f"{name}_{letter}" for name, letter in zip(names, "AB", strict=True)]
     base = out or Path("out") / "_".join(names)
-    folders = []
+    flown = []
     for file, name in zip(files, names, strict=True):
-        folders.append(_fly_campaign(file, flights, engine, cluster, base / name, name))
+        flown.append(_fly_campaign(file, flights, engine, cluster, base / name, name))
         exit_if_terminated()
     path = report or base / "report.html"
-    for line in write_comparison((folders[0], folders[1]), path):
+    (first, first_end), (second, second_end) = flown
+    for line in write_comparison((first, second), path):
         click.echo(line)
     click.echo(f"report      {path}")
+    _require_flights(first_end, second_end)

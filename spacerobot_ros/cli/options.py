@@ -48,6 +48,17 @@ class _TextPath(click.Path):
 PATH = _TextPath(path_type=Path)
 
 
+class NumberRange(click.FloatRange):
+    """Range of numbers that refuses NaN, which compares as within every range."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """Return a number of the range."""
+        number = super().convert(value, param, ctx)
+        if math.isnan(number):
+            self.fail(f"{value} is no number.", param, ctx)
+        return number
+
+
 class DefaultGroup(click.Group):
     """Command group with a default command."""
 
@@ -175,17 +186,6 @@ _position_option = click.option(
     metavar="X Y Z",
     help="Goal position (m), as --goal with three numbers.",
 )
-
-
-class NumberRange(click.FloatRange):
-    """A range of numbers without NaN, which every comparison lets through."""
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """Return the number, or fail with what was given."""
-        number = super().convert(value, param, ctx)
-        if math.isnan(number):
-            self.fail(f"{value!r} is not a number.", param, ctx)
-        return number
 
 
 class GoalCommand(click.Command):

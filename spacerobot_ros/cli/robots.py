@@ -351,23 +351,45 @@ def _distance_lines(found: Analysis) -> list[str]:
 @click.command("new")
 @click.argument("robot", metavar="URDF")
 @out_option("Scenario file to write [NAME.yaml].")
-def new_command(robot: str, out: Path | None) -> None:
+@click.option(
+    "--nearest-inertia",
+    is_flag=True,
+    help="Write NAME_possible.urdf beside the scenario, in which impossible inertias are the "
+    "nearest possible ones, and go on with it.",
+)
+def new_command(robot: str, out: Path | None, nearest_inertia: bool) -> None:
     """Check a robot of your own, plan a first turn, write a scenario.
 
-    URDF is a URDF or xacro file, or the name of a robot. Exit code 0: a scenario that reaches its
-    goal is written; 1: no method reaches one; 2: the robot is refused.
+    URDF is a URDF or xacro file, or the name of a robot. A robot without joints flies by thrusters.
+    Exit code 0: a scenario that reaches its goal is written; 1: no method reaches one; 2: the robot
+    is refused.
     """
     from spacerobot_ros.bag import free_name
     from spacerobot_ros.cli.plan import comparison_lines
     from spacerobot_ros.flight.trials import compare, fastest
     from spacerobot_ros.model import SpaceRobot
+    from spacerobot_ros.model.urdf import nearest_inertias
     from spacerobot_ros.planning.analysis import analyze
     from spacerobot_ros.resources import is_path, robot_file
-    from spacerobot_ros.session.own_robot import first_problem, scenario_text, urdf_remarks
+    from spacerobot_ros.session.own_robot import (
+        first_problem,
+        scenario_text,
+        thruster_scenario_text,
+        urdf_remarks,
+    )
 
     file = robot_file(robot)
-    model = SpaceRobot.from_file(file)
     name = file.name.split(".")[0]
+    target = free_name(out or Path(f"{name}.yaml"))
+    if nearest_inertia:
+        text, changes = nearest_inertias(file)
+        for link, change in changes.items():
+            click.echo(f"{'inertia':<13}that of link '{link}' is changed by {100 * change:.2g} %")
+        if changes:
+            file = free_name(target.with_name(f"{name}_possible.urdf"))
+            write_output(file, text)
+            robot = str(file)
+    model = SpaceRobot.from_file(file)
     with display(name):
         known = analyze(model)
     for line in analysis_lines(known):
@@ -375,7 +397,16 @@ def new_command(robot: str, out: Path | None) -> None:
     for remark in urdf_remarks(model.description):
         click.echo(f"{'note':<13}{remark}")
     click.echo()
-    problem = first_problem(name, model, file)
+    # A robot file beside its scenario is found from any working folder.
+    from_there = os.path.relpath(file.resolve(), target.resolve().parent)
+    named = from_there if is_path(robot) else robot
+    if not model.n:
+        write_output(target, thruster_scenario_text(model, named))
+        click.echo(f"It has no joints and flies by thrusters. The scenario is {target}:")
+        click.echo(f"  spacerobot run {shlex.quote(str(target))}")
+        return
+    missing = [each.link for each in known.geometry.unread_meshes if each.is_collision_shape]
+    problem = first_problem(name, model, file, clear=not missing)
     with display(name):
         plans = compare(problem)
     for line in comparison_lines(plans):
@@ -383,10 +414,6 @@ def new_command(robot: str, out: Path | None) -> None:
     best = fastest(plans)
     if best is None:
         fail("No method reaches the goal of a first flight; no scenario is written.")
-    target = free_name(out or Path(f"{name}.yaml"))
-    # A robot file beside its scenario is found from any working folder.
-    from_there = os.path.relpath(file.resolve(), target.resolve().parent)
-    named = from_there if is_path(robot) else robot
     write_output(target, scenario_text(problem, best.method, named))
     click.echo(f"\n{best.method} is the fastest: {best.duration:.4g} s. The scenario is {target}:")
     click.echo(f"  spacerobot run {shlex.quote(str(target))}")

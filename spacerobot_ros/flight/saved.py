@@ -202,7 +202,7 @@ def _state_streams(flight: FlightData) -> Iterator[_Stream]:
         if not all(field.quantity in quantities for field in topic.state):
             continue
         names = thrusters if topic.array_entries_of == "thrusters" else flight.joint_names
-        base = config.frame_prefix + robot.base_link
+        base = config.prefix_for(robot) + robot.base_link
         target = "" if flight.target is None else flight.target.base_link
         message = state_message(topic, names, config.world_frame, base, target)
         columns = {
@@ -261,7 +261,7 @@ def _frame_streams(flight: FlightData) -> Iterator[_Stream]:
     # As those that the recorder writes where no node publishes transforms.
     every = config.ticks_of(flight.scenario.config("recorder").tf_period)
     if every:
-        frames = RobotTransforms(robot, config.world_frame, config.frame_prefix, links=True)
+        frames = RobotTransforms(robot, config.world_frame, config.prefix_for(robot), links=True)
         ticks = np.arange(0, len(flight.time), every)
         lost = flight.quantities.get("pose_lost")
         if lost is not None:
@@ -280,7 +280,8 @@ def _frame_streams(flight: FlightData) -> Iterator[_Stream]:
     if every:
         ticks = np.arange(0, len(flight.time), every)
         markers = RobotMarkers(robot, flight.target, config.world_frame)
-        yield _Stream(TOPICS["markers"], ticks * period, _marker_maker(flight, markers, ticks))
+        if markers.draws_anything:
+            yield _Stream(TOPICS["markers"], ticks * period, _marker_maker(flight, markers, ticks))
 
 
 def _marker_maker(
@@ -296,7 +297,7 @@ def _marker_maker(
         R, r = (each[:, order] for each in kinematics.link_poses(flight.q[chosen]))
         # Attitudes of links stand side by side.
         R = R.transpose(0, 2, 1, 3).reshape(len(chosen), 3, -1)
-        made = (
+        return [
             markers.message(
                 tick * period,
                 flight.pose[tick],
@@ -305,8 +306,7 @@ def _marker_maker(
                 None if target is None else target[tick],
             )
             for k, tick in enumerate(chosen.tolist())
-        )
-        return [each or b"" for each in made]
+        ]
 
     return make
 

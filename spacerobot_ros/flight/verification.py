@@ -209,7 +209,8 @@ class _RecordedPlant:
         series = self.recorded.get(source.topic)
         if series is None:
             return commands
-        reader = CommandReader(source, self.robot, self.config.frame_prefix)
+        prefix = self.config.prefix_for(self.robot.description)
+        reader = CommandReader(source, self.robot, prefix)
         for raw in series.data:
             try:
                 stamp_ns, command = reader.read(raw)

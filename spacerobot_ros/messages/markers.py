@@ -152,6 +152,8 @@ class RobotMarkers:
         present = {(marker["ns"], marker["id"]) for marker in markers}
         markers += [_erased(*each) for each in sorted(self._drawn - present)]
         self._drawn |= present
+        self.draws_anything = bool(markers)
+        """Whether there is a marker: robot, target and obstacles may have no shapes."""
         self._template = MessageTemplate(MARKER_ARRAY, encode(MARKER_ARRAY, {"markers": markers}))
         moved = len(poses) + len(self._of_target)
         self._places = [
@@ -161,8 +163,8 @@ class RobotMarkers:
 
     def message(
         self, time_ns: int, base: Array, link_R: Array, link_r: Array, target: Array | None
-    ) -> bytes | None:
-        """Return the markers at one time; None where nothing moves.
+    ) -> bytes:
+        """Return the markers at one time.
 
         Parameters
         ----------
@@ -173,8 +175,6 @@ class RobotMarkers:
         link_R, link_r
             Attitudes (3, 3 L) and positions (3, L) of the links in the base frame, m.
         """
-        if not self._places:
-            return None
         self._placement.update(base, link_R, link_r)
         count = len(self._placement.poses)
         for place, pose in zip(self._places[:count], self._placement.poses, strict=True):

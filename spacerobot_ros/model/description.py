@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 from enum import Enum
 from functools import cached_property
 from typing import Any
+from xml.etree.ElementTree import Element, TreeBuilder, XMLParser, fromstring
 
 import numpy as np
 
@@ -325,6 +326,17 @@ def _leading_limit(limits: JointLimits, mimic: Mimic, kind: str) -> float:
         return limits.velocity / abs(k)
     bounds = sorted(((limits.lower - mimic.offset) / k, (limits.upper - mimic.offset) / k))
     return bounds[0] if kind == "lower" else bounds[1]
+
+
+def editable_root(urdf: str) -> Element:
+    """Return the root of a URDF text with its comments, for texts that are written again.
+
+    Raises
+    ------
+    xml.etree.ElementTree.ParseError
+        The text is not XML.
+    """
+    return fromstring(urdf, XMLParser(target=TreeBuilder(insert_comments=True)))
 
 
 def weld_links(

@@ -17,17 +17,18 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
-from html import unescape
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote, unquote, urlparse
+from xml.etree.ElementTree import ParseError, tostring
 
 import numpy as np
 import numpy.typing as npt
 
 from spacerobot_ros.errors import MeshError, SpaceRobotError
-from spacerobot_ros.model.description import Array, Pose, Shape
+from spacerobot_ros.model.description import Array, Pose, Shape, editable_root
+from spacerobot_ros.model.xacro_files import package_around
 from spacerobot_ros.resources import share_directory
 
 _MAX_MESH_BYTES = 100_000_000
@@ -39,10 +40,6 @@ _STL_HEADER_BYTES = 84
 _STL_TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 
 _STL_VERTEX_PATTERN = re.compile(rb"^\s*vertex\s+(\S+)\s+(\S+)\s+(\S+)\s*$", re.MULTILINE)
-
-_MESH_FILE_PATTERN = re.compile(
-    r"""(?P<before><mesh\b[^>]*?\bfilename\s*=\s*["'])(?P<file>[^"']+)(?P<after>["'])"""
-)
 
 _TRIMESH_SUFFIXES = (".dae", ".glb", ".gltf", ".ply")
 
@@ -100,18 +97,20 @@ def with_mesh_files(text: str, find: Callable[[str], Path | None]) -> str:
     Parameters
     ----------
     text
-        URDF.
+        URDF; a text that is not XML is returned as it is.
     find
         Returns the file of a mesh by its name in the text; None: the name stays.
     """
-
-    def absolute(match: re.Match[str]) -> str:
-        found = find(unescape(match["file"]))
-        if found is None:
-            return match[0]
-        return f"{match['before']}file://{quote(str(found))}{match['after']}"
-
-    return _MESH_FILE_PATTERN.sub(absolute, text)
+    try:
+        root = editable_root(text)
+    except (ParseError, ValueError):
+        return text
+    any_found = False
+    for mesh in root.iter("mesh"):
+        if found := find(mesh.get("filename", "")):
+            mesh.set("filename", f"file://{quote(str(found))}")
+            any_found = True
+    return tostring(root, encoding="unicode") if any_found else text
 
 
 def mesh_beside(resource: str, folder: Path) -> Path | None:
@@ -124,10 +123,8 @@ def mesh_beside(resource: str, folder: Path) -> Path | None:
     if scheme != "package" or mesh_file(resource) is not None:
         return None
     package, _, inside = rest.partition("/")
-    for parent in (folder, *folder.parents):
-        if parent.name == package and (parent / inside).is_file():
-            return parent / inside
-    return None
+    around = package_around(package, folder)
+    return around / inside if around is not None and (around / inside).is_file() else None
 
 
 def mesh_file(resource: str) -> Path | None:

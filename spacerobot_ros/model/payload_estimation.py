@@ -39,6 +39,12 @@ _MIN_SIGNAL_TO_NOISE = 10.0
 _MIN_JERK_RATIO = 3.0
 """Second difference beyond which it counts as a jerk of the motion, relative to the median."""
 
+_DRIFT_SHARE = 0.2
+"""Part of the time over which a drift of the momenta is looked for."""
+
+_DRIFT_SIGNIFICANCE = 3.0
+"""Growth of differences that counts as a drift, in standard deviations of that of noise."""
+
 _MIN_UNDETERMINED_SHARE = 0.2
 """Share of undetermined directions in a parameter from which it is undetermined itself."""
 
@@ -204,12 +210,32 @@ def _fit(rows: Array) -> _Fit:
     determined = V.T[found]
     inverse = determined.T / power[found]
     x = inverse @ (determined @ signal[:10, 10])
-    left = flat[:, :10] @ x - flat[:, 10]
+    left, gains = rows[..., :10] @ x - rows[..., 10], rows[..., :10] @ inverse
     # Each row by its own error.
-    scattered = (flat[:, :10] @ inverse) * left[:, np.newaxis]
-    deviations = np.sqrt(np.sum(scattered**2, axis=0))
+    independent = np.sum((gains * left[..., np.newaxis]) ** 2, axis=(0, 1, 2))
+    drift = _drift_rates(left, usual[..., :10] @ x - usual[..., 10])
+    later = np.cumsum(gains.sum(axis=1)[::-1], axis=0)
+    drifting = np.einsum("i,tik->k", drift, later**2)
+    deviations = np.sqrt(independent + drifting)
     rounding = _ROUNDING * max(float(np.linalg.norm(x)), 1e-300)
     return _Fit(x, determined, np.maximum(deviations, rounding), V.T[~found])
+
+
+def _drift_rates(left: Array, noise: Array) -> Array:
+    """Return how fast the variance of the momenta (6,) that are left grows, per triple of states.
+
+    What the impulses of the thrust lack adds up from tick to tick: errors that are far apart in
+    time differ by more than the noise. ``left`` (T, 3, 6) are the errors, ``noise`` (N, 6) those of
+    second differences.
+    """
+    means = left.mean(axis=1)
+    lag = max(1, round(_DRIFT_SHARE * len(means)))
+    steps = means[lag:] - means[:-lag]
+    count = max(len(steps), 1)
+    grown, of_noise = np.sum(steps**2, axis=0) / count, 2.0 / 3.0 * np.mean(noise**2, axis=0)
+    # The mean of so many squares scatters by sqrt(2 / count).
+    surely = grown > (1.0 + _DRIFT_SIGNIFICANCE * np.sqrt(2.0 / count)) * of_noise
+    return np.where(surely, grown - of_noise, 0.0) / lag
 
 
 def _nearest_physical_parameters(fit: _Fit) -> tuple[Array, bool]:

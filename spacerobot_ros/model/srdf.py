@@ -7,18 +7,13 @@ other readers of URDF leave out: nodes and bags that get the text alone know the
 from __future__ import annotations
 
 import itertools
-import re
 from dataclasses import replace
-from html import escape
 from pathlib import Path
-from xml.etree.ElementTree import Element, ParseError, fromstring
+from xml.etree.ElementTree import Element, ParseError, SubElement, fromstring, tostring
 
 from spacerobot_ros.errors import RobotDescriptionError, reason
-from spacerobot_ros.model.description import RobotDescription
+from spacerobot_ros.model.description import RobotDescription, editable_root
 from spacerobot_ros.resources import suggestion
-
-_DISABLED_PAIR_ELEMENTS = re.compile(r"[ \t]*<disable_collisions\b[^<>]*/>\n?")
-_ROBOT_END_TAG = re.compile(r"</robot\s*>")
 
 
 def with_srdf(robot: RobotDescription, path: str | Path) -> RobotDescription:
@@ -79,20 +74,12 @@ def disabled_pairs(root: Element, links: list[str], source: str) -> frozenset[fr
 
 def _with_pairs(urdf: str, pairs: frozenset[frozenset[str]]) -> str:
     """Return a URDF text that carries these pairs alone."""
-    urdf = _DISABLED_PAIR_ELEMENTS.sub("", urdf)
-    ends = list(_ROBOT_END_TAG.finditer(urdf))
-    if not pairs or not ends:
-        return urdf
-    place = ends[-1].start()
-    return urdf[:place] + "".join(_pair_elements(pairs)) + urdf[place:]
-
-
-def _pair_elements(pairs: frozenset[frozenset[str]]) -> list[str]:
-    named = sorted((min(pair), max(pair)) for pair in pairs)
-    return [
-        f'  <disable_collisions link1="{escape(first)}" link2="{escape(second)}"/>\n'
-        for first, second in named
-    ]
+    root = editable_root(urdf)
+    for each in root.findall("disable_collisions"):
+        root.remove(each)
+    for first, second in sorted((min(pair), max(pair)) for pair in pairs):
+        SubElement(root, "disable_collisions", link1=first, link2=second).tail = "\n"
+    return tostring(root, encoding="unicode")
 
 
 def _read_pair(element: Element, links: list[str], source: str) -> frozenset[str]:

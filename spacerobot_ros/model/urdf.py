@@ -7,7 +7,6 @@ would be singular are refused.
 
 from __future__ import annotations
 
-import logging
 import math
 import subprocess
 import sys
@@ -22,6 +21,7 @@ from xml.etree.ElementTree import Element, ParseError, fromstring, tostring
 import numpy as np
 
 from spacerobot_ros.errors import RobotDescriptionError, reason
+from spacerobot_ros.files import warn_once
 from spacerobot_ros.model import xacro_files
 from spacerobot_ros.model.description import (
     Array,
@@ -34,9 +34,10 @@ from spacerobot_ros.model.description import (
     Pose,
     RobotDescription,
     Shape,
+    editable_root,
     weld_links,
 )
-from spacerobot_ros.model.inertial_parameters import TRIANGLE_SLACK
+from spacerobot_ros.model.inertial_parameters import INERTIA_ENTRIES, TRIANGLE_SLACK
 from spacerobot_ros.model.meshes import mesh_beside, mesh_file, with_mesh_files
 from spacerobot_ros.model.rotations import (
     matrix_from_quaternion,
@@ -46,8 +47,6 @@ from spacerobot_ros.model.rotations import (
 from spacerobot_ros.model.srdf import disabled_pairs, with_srdf
 from spacerobot_ros.model.wheels import require_reaction_wheels
 from spacerobot_ros.resources import suggestion
-
-_LOG = logging.getLogger(__name__)
 
 _MAX_NUMBER = 1e12
 """Largest number (kg, m, kg m^2): larger ones are typing errors, and their squares overflow."""
@@ -117,6 +116,18 @@ def require_found_meshes(world: RobotDescription) -> None:
 
 def _loaded(path: Path, parse: Callable[[str], RobotDescription]) -> RobotDescription:
     """Return the description of a file, whose paths of meshes become absolute."""
+    text = _read_text(path)
+    try:
+        return parse(text)
+    except RobotDescriptionError as error:
+        remedy = ""
+        if path.suffix != ".xacro" and ("<xacro:" in text or "${" in text):
+            remedy = f" To have the xacro in it expanded, name it {path.stem}.xacro."
+        raise RobotDescriptionError(f"{path}: {error}{remedy}") from error
+
+
+def _read_text(path: Path) -> str:
+    """Return the URDF text of a file, expanded and with absolute paths of meshes."""
     try:
         text = path.read_text(encoding="utf-8")
     except OSError as error:
@@ -127,18 +138,12 @@ def _loaded(path: Path, parse: Callable[[str], RobotDescription]) -> RobotDescri
         ) from error
     if path.suffix == ".xacro":
         text = _expand_xacro(path)
-    try:
-        folder = path.resolve().parent
-        return parse(with_mesh_files(text, lambda mesh: mesh_beside(mesh, folder)))
-    except RobotDescriptionError as error:
-        remedy = ""
-        if path.suffix != ".xacro" and ("<xacro:" in text or "${" in text):
-            remedy = f" To have the xacro in it expanded, name it {path.stem}.xacro."
-        raise RobotDescriptionError(f"{path}: {error}{remedy}") from error
+    folder = path.resolve().parent
+    return with_mesh_files(text, lambda mesh: mesh_beside(mesh, folder))
 
 
 def _expand_xacro(path: Path) -> str:
-    by_hand = f"`xacro {path.name} > {path.name.split('.')[0]}.urdf`"
+    by_hand = f"`xacro {path.name} [NAME:=VALUE ...] > {path.name.split('.')[0]}.urdf`"
     if find_spec("xacro") is None:
         raise RobotDescriptionError(
             f"{path} is a xacro file, and the package xacro is not installed: `pip install xacro`, "
@@ -259,12 +264,12 @@ def parse_world(text: str) -> RobotDescription:
 
 def _read_tree(text: str) -> RobotDescription:
     """Return the links and joints of a URDF text, whatever their masses."""
-    if text.count("<link") > _MAX_LINKS:
+    root = _checked_root(text)
+    if len(root.findall("link")) > _MAX_LINKS:
         raise RobotDescriptionError(
             f"The robot description has more than {_MAX_LINKS} links: its equations would take "
             "hours to derive."
         )
-    root = _checked_root(text)
     colours = {
         material.get("name", ""): _read_colour(color, f"material '{material.get('name', '')}'")
         for material in root.findall("material")
@@ -342,15 +347,7 @@ def _read_link(link: Element, colours: dict[str, tuple[float, ...]]) -> Link:
         pose = _read_pose(inertial, where)
         mass = _read_number(inertial.find("mass"), "value", where)
         moments = inertial.find("inertia")
-        about = np.array(
-            [
-                [
-                    _read_number(moments, f"i{''.join(sorted(row + column))}", where)
-                    for column in "xyz"
-                ]
-                for row in "xyz"
-            ]
-        )
+        about = _read_inertia(moments, where)
         if mass < 0:
             raise RobotDescriptionError(f"The mass of {where} is negative ({mass} kg).")
         inertia = Inertia(mass, np.zeros(3), about).moved(pose)
@@ -359,6 +356,14 @@ def _read_link(link: Element, colours: dict[str, tuple[float, ...]]) -> Link:
         for tag in ("visual", "collision")
     )
     return Link(name, inertia, shapes, collisions)
+
+
+def _read_inertia(moments: Element | None, where: str) -> Array:
+    about = np.zeros((3, 3))
+    for row, column in INERTIA_ENTRIES:
+        entry = _read_number(moments, f"i{'xyz'[row]}{'xyz'[column]}", where)
+        about[row, column] = about[column, row] = entry
+    return about
 
 
 def describe_inertia_flaw(about: Array) -> str:
@@ -378,6 +383,43 @@ def describe_inertia_flaw(about: Array) -> str:
     return ""
 
 
+def nearest_inertias(path: Path) -> tuple[str, dict[str, float]]:
+    """Return the URDF text of a file in which every link has an inertia that a body can have.
+
+    An impossible one becomes the nearest possible one by the Frobenius norm. Also returned is by
+    which part of its norm the inertia of each such link has changed.
+
+    Raises
+    ------
+    RobotDescriptionError
+        The file cannot be read, or is not URDF.
+    """
+    text = _read_text(path)
+    links = {each.name: each for each in _read_tree(text).links}
+    root, changes = editable_root(text), {}
+    for element in root.findall("link"):
+        name, inertia = element.get("name", ""), element.find("inertial/inertia")
+        if inertia is None or not describe_inertia_flaw(links[name].inertia.about_com):
+            continue
+        given = _read_inertia(inertia, f"link '{name}'")
+        found = _nearest_inertia(given)
+        for row, column in INERTIA_ENTRIES:
+            inertia.set(f"i{'xyz'[row]}{'xyz'[column]}", repr(float(found[row, column])))
+        changes[name] = float(np.linalg.norm(found - given) / np.linalg.norm(given))
+    return tostring(root, encoding="unicode"), changes
+
+
+def _nearest_inertia(about: Array) -> Array:
+    """Return the nearest moments of inertia (3, 3) that a body can have."""
+    from scipy.optimize import nnls
+
+    moments, axes = np.linalg.eigh(about)
+    scale = float(np.abs(moments).max())
+    # A principal moment is the sum of two second moments, and no second moment is negative.
+    second = scale * nnls(1.0 - np.eye(3), moments / scale)[0]
+    return np.asarray((axes * (second.sum() - second)) @ axes.T)
+
+
 def _refuse_impossible_inertia(welded: list[Link]) -> NoReturn:
     """Refuse a body of impossible inertia; the message names the worst of its welded links."""
 
@@ -387,7 +429,8 @@ def _refuse_impossible_inertia(welded: list[Link]) -> NoReturn:
 
     worst = max(welded, key=excess)
     raise RobotDescriptionError(
-        f"The inertia of link '{worst.name}' {describe_inertia_flaw(worst.inertia.about_com)}"
+        f"The inertia of link '{worst.name}' {describe_inertia_flaw(worst.inertia.about_com)} "
+        "`spacerobot new URDF --nearest-inertia` writes a URDF with the nearest possible one."
     )
 
 
@@ -659,6 +702,9 @@ _REQUIRED_ELEMENTS = {
     "joint": {"parent": '<parent link="..."/>', "child": '<child link="..."/>'},
 }
 
+_LIMITS_NOT_READ = ("acceleration", "deceleration", "jerk")
+"""Limits of URDF 1.2 that nothing here keeps."""
+
 _JOINT_TYPES = tuple(kind.value for kind in JointKind)
 
 
@@ -688,13 +734,24 @@ def _checked_root(text: str) -> Element:
             # Other programs write forms of their own, such as planes.
             form = [each.tag for each in collision.iterfind("geometry/*")][0:1]
             if form not in _ACCEPTED_GEOMETRIES:
-                _LOG.warning(
-                    "A <collision> of link '%s' is %s, which is not read: give it one of %s.",
-                    link.get("name", ""),
-                    f"a <{form[0]}>" if form else "empty",
-                    ", ".join(f"<{name}>" for name in _GEOMETRIES),
+                warn_once(
+                    f"A <collision> of link '{link.get('name', '')}' is "
+                    f"{f'a <{form[0]}>' if form else 'empty'}, which is not read: give it one of "
+                    f"{', '.join(f'<{name}>' for name in _GEOMETRIES)}."
                 )
                 link.remove(collision)
+    ignored = {
+        name
+        for limit in root.iterfind("joint/limit")
+        for name in _LIMITS_NOT_READ
+        if limit.get(name) is not None
+    }
+    if ignored:
+        warn_once(
+            f"The limits of {' and '.join(sorted(ignored))} in the URDF of "
+            f"'{root.get('name', '')}' are ignored: motions keep those of position, velocity and "
+            "effort."
+        )
     if not root.get("name"):
         raise _MalformedError("the <robot> has no name", '<robot name="...">')
     for kind in ("link", "joint"):

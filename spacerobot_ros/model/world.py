@@ -7,16 +7,12 @@ robot alone know them, too.
 
 from __future__ import annotations
 
-import re
 from dataclasses import replace
-from xml.etree.ElementTree import fromstring, tostring
+from xml.etree.ElementTree import SubElement, fromstring, tostring
 
 from spacerobot_ros.errors import RobotDescriptionError
-from spacerobot_ros.model.description import RobotDescription
+from spacerobot_ros.model.description import RobotDescription, editable_root
 from spacerobot_ros.model.urdf import parse_world, require_found_meshes
-
-_CARRIED = re.compile(r"\s*<world>.*</world>", re.DOTALL)
-_END = re.compile(r"</robot\s*>")
 
 
 def with_world(robot: RobotDescription, world: RobotDescription | None) -> RobotDescription:
@@ -24,14 +20,15 @@ def with_world(robot: RobotDescription, world: RobotDescription | None) -> Robot
 
     Without a world there are none around it.
     """
-    urdf = _CARRIED.sub("", robot.urdf)
-    if world is not None and (ends := list(_END.finditer(urdf))):
-        root = fromstring(world.urdf)
-        root.tail = None
-        place = ends[-1].start()
-        carried = f"  <world>{tostring(root, encoding='unicode')}</world>\n"
-        urdf = urdf[:place] + carried + urdf[place:]
-    return replace(robot, world=world, urdf=urdf)
+    root = editable_root(robot.urdf)
+    carried = root.findall("world")
+    if world is None and not carried:
+        return replace(robot, world=None)
+    for each in carried:
+        root.remove(each)
+    if world is not None:
+        SubElement(root, "world").append(fromstring(world.urdf))
+    return replace(robot, world=world, urdf=tostring(root, encoding="unicode"))
 
 
 def obstacles_from_topic(text: str) -> RobotDescription | None:
@@ -47,11 +44,11 @@ def obstacles_from_topic(text: str) -> RobotDescription | None:
     """
     if not text.strip():
         return None
-    if "<world" in text:
+    world = parse_world(text)
+    if world.world is not None:
         raise RobotDescriptionError(
             "Obstacles are not among others: leave the element <world> out of their URDF."
         )
-    world = parse_world(text)
     require_found_meshes(world)
     return world
 

@@ -11,23 +11,68 @@ from __future__ import annotations
 
 import resource
 import sys
+from pathlib import Path
+from xml.etree.ElementTree import ParseError, parse
 
 _MAX_MEMORY = 2**30
 """Limit of the address space, bytes."""
 
 
+def package_around(name: str, folder: Path) -> Path | None:
+    """Return the folder of the package that has a file in ``folder``, or of one beside it.
+
+    The name of a package is that in its ``package.xml``, or else that of its folder. None: no such
+    package.
+    """
+    folder = folder.resolve()
+    for parent in (folder, *folder.parents):
+        if (parent / "package.xml").is_file():
+            packages = [each.parent for each in sorted(parent.parent.glob("*/package.xml"))]
+            found = [each for each in packages if _package_name(each) == name]
+            found += [each for each in packages if each.name == name]
+            return found[0] if found else None
+        if parent.name == name:
+            return parent
+    return None
+
+
+def _package_name(folder: Path) -> str:
+    try:
+        return (parse(folder / "package.xml").findtext("name") or "").strip()
+    except (OSError, ParseError):
+        return ""
+
+
 def main(file: str, seconds: int) -> int:
     """Print the URDF text of a xacro file; return 1 with a reason on standard error if refused.
 
+    ``$(find NAME)`` finds the package around the file without a ROS environment.
     ``seconds`` is the limit of processor time.
     """
     resource.setrlimit(resource.RLIMIT_CPU, (seconds, seconds + 1))
     resource.setrlimit(resource.RLIMIT_AS, (_MAX_MEMORY, _MAX_MEMORY))
     try:
         import xacro
+        from xacro import substitution_args
 
+        installed = substitution_args._eval_find
+
+        def find(name: str) -> str:
+            around = package_around(name, Path(file).parent)
+            if around is not None:
+                return str(around)
+            try:
+                return str(installed(name))
+            except (ImportError, LookupError, OSError):
+                raise ValueError(
+                    f"the package '{name}' is neither around the file nor in a ROS environment"
+                ) from None
+
+        substitution_args._eval_find = find
         text = str(xacro.process_file(file).toxml())
     except Exception as error:  # Of xacro, its expressions, the XML parser
+        # xacro's exceptions repeat the one that they wrap.
+        error = getattr(error, "exc", None) or error
         reason = " ".join(str(error).split()) or type(error).__name__
         print(f"REASON {reason}", file=sys.stderr)
         return 1

@@ -175,8 +175,12 @@ def first_shape(robot: SpaceRobot) -> Array:
     return np.asarray(np.round(np.clip(shape, lower, upper), 3))
 
 
-def first_problem(name: str, robot: SpaceRobot, file: Path) -> PlanningProblem:
+def first_problem(
+    name: str, robot: SpaceRobot, file: Path, *, clear: bool = True
+) -> PlanningProblem:
     """Return the problem of a small base rotation about an axis that the joints allow.
+
+    ``clear`` is whether links are kept clear of each other, for which their meshes are needed.
 
     Raises
     ------
@@ -197,6 +201,8 @@ def first_problem(name: str, robot: SpaceRobot, file: Path) -> PlanningProblem:
     config = PlannerConfig(robot=str(file)).for_robot(robot.description)
     tolerance = min(config.attitude_tolerance, float(f"{angle / _ROTATION_TO_TOLERANCE:.1g}"))
     config = replace(config, attitude_tolerance=tolerance)
+    if not clear:
+        config = replace(config, clearance=0.0)
     return PlanningProblem(name, robot, InitialState(joint_positions=shape), goal, config)
 
 
@@ -237,6 +243,10 @@ def scenario_text(problem: PlanningProblem, method: str, robot_path: str) -> str
     angle = math.degrees(float(np.linalg.norm(turn)))
     axis = ", ".join(f"{each:.3g}" for each in turn / np.linalg.norm(turn) + 0.0)
     name = problem.robot.description.name
+    unclear = (
+        "    clearance: 0.0   # m; contacts are not noticed: meshes of <collision> are missing\n"
+    )
+    clearance = "" if config.clearance else unclear
     start = f"    initial_joint_positions: [{shape}]   # {joints}\n" if problem.robot.n else ""
     return f"""\
 # The first flight of {name}: its joints turn its base.
@@ -260,4 +270,31 @@ scenario:
     method: {method}
     attitude_tolerance: {config.attitude_tolerance!r}   # rad
     position_tolerance: {config.position_tolerance!r}   # m
+{clearance}"""
+
+
+def thruster_scenario_text(robot: SpaceRobot, robot_path: str) -> str:
+    """Return a parameter file that moves and turns a robot without joints by its thrusters."""
+    name = robot.description.name
+    return f"""\
+# The first flight of {name}, which has no joints: thrusters move and turn it.
+
+scenario:
+  ros__parameters:
+    description: Thrusters move {name} by 0.2 m and turn it by 10 deg
+    goal_position: [0.2, 0.0, 0.0]   # m
+    goal_rotvec: [0.0, 0.0, {math.radians(10.0):.4g}]   # rad
+
+/**/plant:
+  ros__parameters:
+    robot: {robot_path}
+    tick_rate: 50.0
+    actuation: effort
+
+/**/coordinated_control:
+  ros__parameters:
+    robot: {robot_path}
+    tick_rate: 50.0
+    max_force: 0.0    # N, of the thrusters; 0: no limit
+    max_torque: 0.0   # N m
 """

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Any
 
+from spacerobot_ros.model.description import RobotDescription
 from spacerobot_ros.model.shared_parameters import DEFAULT_TICK_RATE, RobotConfig, WatchdogConfig
 from spacerobot_ros.parameters import group, parameter
 from spacerobot_ros.times import SECOND
@@ -341,7 +342,9 @@ class PlantConfig(WatchdogConfig, RobotConfig):
         True, "whether all links are on /tf; false: the base alone, beside robot_state_publisher"
     )
     frame_prefix: str = parameter(
-        "", "before the names of the robot's frames, such as 'robot_1/'; not of world_frame"
+        "",
+        "before the names of the robot's frames, such as 'robot_1/'; not of world_frame. '': none, "
+        "or 'robot/' if a link is called world_frame",
     )
     diagnostics_period: float = parameter(
         1.0,
@@ -438,6 +441,11 @@ class PlantConfig(WatchdogConfig, RobotConfig):
             return self
         needs_efforts = bool(self.thrusters) or any(self.initial_joint_velocities)
         return replace(self, actuation=actuation or ("effort" if needs_efforts else "velocity"))
+
+    def prefix_for(self, robot: RobotDescription) -> str:
+        """Return what goes before the names of a robot's frames, none of which is the world's."""
+        taken = self.world_frame in robot.frames
+        return self.frame_prefix or ("robot/" if taken else "")
 
     @property
     def period_ns(self) -> int:

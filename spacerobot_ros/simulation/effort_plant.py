@@ -23,6 +23,8 @@ A locked joint (a brake, a jam) is brought to rest by the same kind of impulse a
 
 from __future__ import annotations
 
+import math
+
 import casadi as ca
 import numpy as np
 import numpy.typing as npt
@@ -43,6 +45,16 @@ _BISECTIONS = 40
 
 _STOP_TOLERANCE = 1e-12
 """Distance beyond a limit at which a joint counts as outside: relative, below one in m or rad."""
+
+
+_TOO_FAST = (
+    "the commands drive the robot too fast for the integration step. Reduce the commands, or "
+    "parameter 'integration_step'."
+)
+
+_MAX_ARRIVALS_PER_STEP = 2
+"""Largest number of arrivals at stops per joint and integration step, on average over a tick: the
+joints of a robot that commands drive around knock each other off their stops ever more often."""
 
 
 class JointStops:
@@ -79,9 +91,11 @@ class JointStops:
         Raises
         ------
         SpaceRobotError
-            The motion is no longer finite.
+            The motion is no longer finite, or joints arrive at their stops without end.
         """
         x, left = state.copy(), duration
+        steps = duration / self._integration_step
+        arrivals_left = _MAX_ARRIVALS_PER_STEP * self._lower.size * math.ceil(steps)
         none = np.zeros(self._lower.size, dtype=np.bool_)
         locked = none if locked is None else locked
         held, stopped = self._bring_to_rest(x, command, none, locked)
@@ -90,6 +104,9 @@ class JointStops:
             fixed = held | locked
             after = self._integrate_step(x, command, fixed, step)
             if self._is_outside_limits(after):
+                arrivals_left -= 1
+                if arrivals_left < 0:
+                    raise SpaceRobotError(f"Joints hit their stops without end: {_TOO_FAST}")
                 step = self._time_to_stop(x, command, fixed, step)
                 after = self._integrate_step(x, command, fixed, step)
                 after[self._q] = np.clip(after[self._q], self._lower, self._upper)
@@ -134,10 +151,7 @@ class JointStops:
     def _integrate_step(self, x: Array, command: Array, held: Flags, step: float) -> Array:
         after = self._step(x, command, np.where(held, 0.0, 1.0), step)[0]
         if not np.all(np.isfinite(after)):
-            raise SpaceRobotError(
-                "The motion is no longer finite: the commands drive the robot too fast for the "
-                "integration step. Reduce the commands, or parameter 'integration_step'."
-            )
+            raise SpaceRobotError(f"The motion is no longer finite: {_TOO_FAST}")
         return after
 
     def _is_outside_limits(self, x: Array) -> bool:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import casadi as ca
 import numpy as np
 import pytest
 from support.campaigns import campaign
@@ -20,6 +22,9 @@ from spacerobot_ros.campaign.lanes import LanesEngine
 from spacerobot_ros.campaign.one_by_one import FlightsEngine
 from spacerobot_ros.campaign.rows import Row
 from spacerobot_ros.campaign.running import RERUN_TOLERANCE, largest_deviation, run_campaign
+from spacerobot_ros.control.laws.registry import LAWS
+from spacerobot_ros.control.laws.transposed_jacobian import TransposedJacobianLaw
+from spacerobot_ros.control.state import Actuation, Reference
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.planning import Goal
 
@@ -229,6 +234,32 @@ def test_control_in_lanes_is_flown_in_this_process_too(tmp_path: Path) -> None:
     end = run_campaign(controlled(flights=3, longest=0.2), tmp_path)
     assert end.flown == 3
     assert Dataset(tmp_path).table()["engine"].to_pylist() == ["lanes"] * 3
+
+
+class HalfLaw(TransposedJacobianLaw):
+    """A law of one's own, whose command is more than its function."""
+
+    def actuation(self, reference: Reference) -> Actuation:
+        whole = super().actuation(reference)
+        return Actuation(0.5 * whole.wrench_B, 0.5 * whole.tau)
+
+
+class SaidHalfLaw(HalfLaw):
+    """The same law, which says so."""
+
+    def is_complete(self, results: Mapping[str, ca.SX]) -> ca.SX:
+        return ca.SX(0)
+
+
+def test_lanes_fly_the_whole_command_of_a_law_or_leave_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    made = controlled(flights=2, longest=0.2)
+    monkeypatch.setitem(LAWS, "transposed_jacobian", HalfLaw)
+    assert select_engine(made, "auto").name == "flights"
+    with pytest.raises(SpaceRobotError, match=r"'transposed_jacobian' .* more than one function"):
+        select_engine(made, "lanes")
+    monkeypatch.setitem(LAWS, "transposed_jacobian", SaidHalfLaw)
+    lanes, _ = assert_same_flights(made)
+    assert {row.engine for row in lanes.values()} == {"lanes"}
 
 
 def test_the_engine_is_chosen_and_says_why_it_cannot() -> None:

@@ -471,7 +471,9 @@ def test_the_files_of_a_dataset(tmp_path: Path) -> None:
     assert dataset.begin(replace(MADE, description="D")) == set()
     facts = json.loads((tmp_path / "about.json").read_text("utf-8"))
     assert (facts["name"], facts["scenario"]) == ("short", "stuck_slider")
-    assert sorted(json.loads(facts["versions"])) == ["numpy", "python", "spacerobot_ros"]
+    assert sorted(json.loads(facts["versions"])) == [
+        *("numpy", "python", "source", "spacerobot_ros")
+    ]
     assert len(facts["fingerprint"]) == 64
     text = (tmp_path / "campaign.yaml").read_text("utf-8")
     assert "scenario: scenario.yaml" in text

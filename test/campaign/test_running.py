@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import errno
 import os
+import shutil
+import subprocess
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -35,7 +38,7 @@ from spacerobot_ros.campaign.workers import Cluster
 from spacerobot_ros.cli.main import main
 from spacerobot_ros.errors import ParameterError, RecordingError, SpaceRobotError
 from spacerobot_ros.resources import robot_file
-from spacerobot_ros.version import __version__
+from spacerobot_ros.version import __version__, source_hash
 
 MASSES: dict[str, Any] = {
     "mass.*": {"norm": {"loc": 1.0, "scale": 0.03}},
@@ -76,6 +79,9 @@ def test_a_campaign_that_is_ended_goes_on_where_it_was(tmp_path: Path) -> None:
     assert (fewer.flown, fewer.total) == (2, 2)
     results = Results.of(tmp_path / "cut")
     assert (len(results), results.planned_flights) == (6, 6)
+    read = require_module("pyarrow.parquet").read_table
+    parts = (tmp_path / "cut" / "flights").glob("*.parquet")
+    assert sum(len(read(part)) for part in parts) == 6, "none is flown twice"
 
 
 @pytest.mark.slow
@@ -267,18 +273,64 @@ def test_a_flight_is_flown_again_as_often_as_one_likes(
 
 def test_a_worker_of_another_version_flies_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     made = small(flights=1)
-    task = workers.serialise_campaign(made), __version__, [_draw(made, 0)], "flights", False
+    code = workers.this_code()
+    task = workers.serialise_campaign(made), code, [_draw(made, 0)], "flights", False
     assert len(workers.fly_task(*task)) == 1
-    monkeypatch.setattr(workers, "__version__", "9.9")
-    with pytest.raises(SpaceRobotError, match=r"A worker has spacerobot_ros 9\.9, and this"):
+    monkeypatch.setattr(workers, "this_code", lambda: f"{__version__} (0123456789ab)")
+    with pytest.raises(SpaceRobotError, match=r"A worker has .*\(0123456789ab\), and this process"):
         workers.fly_task(*task)
+
+
+def test_code_of_one_version_that_differs_is_other_code(tmp_path: Path) -> None:
+    """A worker from another checkout, as a process of its own would import it."""
+    source = Path(workers.__file__).parents[1]
+    shutil.copytree(source, tmp_path / "spacerobot_ros", ignore=shutil.ignore_patterns("*.pyc"))
+    line = "from spacerobot_ros.campaign.workers import this_code; print(this_code())"
+
+    def told() -> str:
+        environment = {**os.environ, "PYTHONPATH": str(tmp_path)}
+        words = [sys.executable, "-c", line]
+        done = subprocess.run(words, env=environment, cwd=tmp_path, capture_output=True, check=True)
+        return done.stdout.decode().strip()
+
+    assert told() == workers.this_code()
+    with (tmp_path / "spacerobot_ros" / "batch" / "driver.hpp").open("a") as file:
+        file.write("// another\n")
+    assert told() != workers.this_code()
+    assert told().startswith(__version__)
+
+
+def test_a_flight_that_is_twice_in_a_folder_counts_once(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Someone has copied a file of rows beside it."""
+    made = small(flights=3)
+    run_campaign(made, tmp_path)
+    before = rows(tmp_path)
+    flights = tmp_path / "flights"
+    for part in sorted(flights.glob("part-0000*.parquet")):
+        shutil.copy2(part, flights / part.name.replace("part-0000", "part-0001"))
+    np.testing.assert_equal(rows(tmp_path), before)
+    assert any(line.startswith(f"3 of the rows in {tmp_path} repeat") for line in caplog.messages)
+    results = Results.of(tmp_path)
+    assert (len(results), results.incompleteness_warning) == (3, "")
+    assert rerun_flight(tmp_path, 1, tmp_path / "again.mcap").agrees
+    assert run_campaign(small(flights=4), tmp_path).flown == 4
+
+
+def test_rows_of_other_software_are_named(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    run_campaign(small(flights=1), tmp_path)
+    about = tmp_path / "about.json"
+    about.write_text(about.read_text("utf-8").replace(source_hash(), "0123456789ab"))
+    run_campaign(small(flights=2), tmp_path)
+    assert any("were flown by other software" in line for line in caplog.messages)
 
 
 def test_a_task_of_lanes_leaves_what_others_fly_unless_all_of_it_is_asked_for() -> None:
     """What is flown at once is sent back before flights that take long."""
     settings = {"planner.attitude_tolerance": 0.002, "planner.max_corrections": 3}
     made = campaign(flights=8, set=settings, disperse={"mass.*": {"norm": [1.0, 0.03]}}, seed=8)
-    task = workers.serialise_campaign(made), __version__, list(Draws(made)), "lanes"
+    task = workers.serialise_campaign(made), workers.this_code(), list(Draws(made)), "lanes"
     part, whole = workers.fly_task(*task, False), workers.fly_task(*task, True)
     assert all(isinstance(each, Row) for each in whole)
     left = {each.draw.number: each.reason for each in part if isinstance(each, Fallback)}

@@ -19,9 +19,9 @@ from spacerobot_ros.campaign.workers import (
     WorkerDeath,
     open_workers,
     serialise_campaign,
+    this_code,
 )
 from spacerobot_ros.errors import SpaceRobotError
-from spacerobot_ros.version import __version__
 
 DISPERSED = {"plant.sensors.position_noise": {"uniform": [0.0, 0.001]}}
 
@@ -43,7 +43,7 @@ class Queue:
     def submit(
         self, packed: bytes, version: str, draws: list[Draw], engine: str, alone: bool
     ) -> int:
-        assert version == __version__
+        assert version == this_code()
         self.open.append(([draw.number for draw in draws], engine, alone))
         return len(self.open) - 1
 
@@ -147,7 +147,7 @@ def test_a_process_of_this_machine_flies_a_task_and_says_what_is_wrong() -> None
                 pass
             return workers.result(task)
 
-        (row,) = answer(__version__)
+        (row,) = answer(this_code())
         assert (row.draw.number, row.outcome) == (1, "reached")
         with pytest.raises(SpaceRobotError, match="A worker has spacerobot_ros"):
             answer("0.0.0")

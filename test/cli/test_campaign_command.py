@@ -76,6 +76,19 @@ def test_without_options(campaigns: Campaigns) -> None:
     assert drawn == call["campaign"].description_lines
 
 
+def test_a_campaign_of_errors_alone_fails(tmp_path: Path) -> None:
+    for beyond, code in ((5.0, 1), (0.0, 0)):
+        values = {"plant.initial_joint_positions[0]": {"uniform": [beyond, 0.1]}}
+        file = tmp_path / f"beyond_{beyond}.yaml"
+        given = {"campaign": section(disperse=values, flights=2)}
+        file.write_text(yaml.safe_dump(given), "utf-8")
+        words = ["campaign", str(file), "--workers", "0", "--out", str(tmp_path / f"{beyond}")]
+        for _ in ("flown", "nothing left to fly"):
+            result = CliRunner().invoke(main, words)
+            assert result.exit_code == code, result.output
+            assert ("None of the 2 draws could be flown" in result.output) == bool(code)
+
+
 def test_the_range_of_what_is_drawn_is_said(tmp_path: Path) -> None:
     file = tmp_path / "c.yaml"
     disperse = {"mass.*": {"uniform": [0.95, 1.05]}, "goal.position.x": {"uniform": [-0.01, 0.02]}}

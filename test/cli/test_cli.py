@@ -256,6 +256,15 @@ def test_every_option_says_what_it_does() -> None:
     assert [name for name, option in options.items() if (option.help or "").startswith(".")] == []
 
 
+def test_no_range_of_an_option_has_nan_in_it() -> None:
+    options = [option for each in commands().values() for option in each.params]
+    ranges = [option for option in options if isinstance(option.type, click.FloatRange)]
+    assert {option.opts[0] for option in ranges} >= {"--longest", "--timeout", "--tolerance"}
+    for option in ranges:
+        with pytest.raises(click.BadParameter, match="nan is no number"):
+            option.type.convert("nan", option, None)
+
+
 @pytest.mark.parametrize("words", [[], ["campaign"]])
 def test_the_list_of_commands_has_whole_sentences(words: list[str]) -> None:
     listed = CliRunner().invoke(main, [*words, "--help"]).output.partition("Commands:\n")[2]

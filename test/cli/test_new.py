@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
+from xml.etree import ElementTree
 
+import mujoco
 import numpy as np
 import pytest
+from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 from support.command_line import CliRunner
 from support.oracles import PinocchioOracle
@@ -70,10 +74,68 @@ def test_no_scenario_is_overwritten(robot: Path) -> None:
     assert PlanningProblem.of(load_scenario("mine-1.yaml")).robot.n == 2
 
 
-def test_a_robot_that_cannot_turn_its_base_is_told_so(robot: Path) -> None:
-    text = robot.read_text("utf-8").replace('type="revolute"', 'type="fixed"')
-    text = text.replace('type="continuous"', 'type="fixed"')
+def test_a_robot_whose_collision_meshes_are_missing_flies_without_them(
+    robot: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    mesh = '<collision><geometry><mesh filename="package://gone/link.stl"/></geometry></collision>'
+    text = re.sub(r'(<link name="[^"]*"(?<!/)>)', rf"\1{mesh}", robot.read_text("utf-8"))
     robot.write_text(text, "utf-8")
+    turn = ["plan", robot.name, "--goal-rotvec", "0", "0", "0.02"]
+    for words, code in (([], 0), (["--method", "optimal"], 1)):
+        plan = CliRunner().invoke(main, [*turn, *words])
+        assert plan.exit_code == code, plan.output
+        said = plan.output + caplog.text
+        assert len(re.findall("cannot be kept clear .*'package://gone/", said)) == 1
+        caplog.clear()
+    result = CliRunner().invoke(main, ["new", robot.name])
+    assert result.exit_code == 0, result.output
+    assert "clearance: 0.0   # m; contacts are not noticed" in Path("mine.yaml").read_text("utf-8")
+    scenario = load_scenario("mine.yaml")
+    assert try_method(PlanningProblem.of(scenario), scenario.planner.method).reached
+
+
+def test_an_impossible_inertia_becomes_the_nearest_possible_one_if_asked_for(robot: Path) -> None:
+    """MuJoCo accepts no inertia beyond the triangle rule; the nearest is found by a search."""
+    given = np.array([0.5, 0.7, 1.3])
+    turned = Rotation.from_euler("xyz", [0.3, -0.8, 0.5]).as_matrix()
+    about = turned @ np.diag(given) @ turned.T
+    entries = " ".join(
+        f'i{"xyz"[i]}{"xyz"[j]}="{float(about[i, j])!r}"' for i in range(3) for j in range(i, 3)
+    )
+    text = re.sub(r"<inertia [^>]*/>", f"<inertia {entries}/>", robot.read_text("utf-8"), count=1)
+    robot.write_text(text, "utf-8")
+    refused = CliRunner().invoke(main, ["new", robot.name])
+    assert refused.exit_code == 2
+    assert "`spacerobot new URDF --nearest-inertia` writes" in refused.output
+    result = CliRunner().invoke(main, ["new", robot.name, "--nearest-inertia"])
+    assert result.exit_code == 0, result.output
+    best = minimize(
+        lambda x: float(np.sum((x - given) ** 2)),
+        [1.0, 1.0, 1.0],
+        constraints=[{"type": "ineq", "fun": lambda x, k=k: x.sum() - 2 * x[k]} for k in range(3)],
+    ).x
+    root = ElementTree.parse("mine_possible.urdf")
+    (found, *_) = root.iterfind(".//inertia")
+    entry = [[float(found.get(f"i{''.join(sorted(a + b))}", "")) for b in "xyz"] for a in "xyz"]
+    np.testing.assert_allclose(entry, turned @ np.diag(best) @ turned.T, atol=1e-6)
+    change = np.linalg.norm(best - given) / np.linalg.norm(given)
+    assert f"is changed by {100 * change:.2g} %" in result.output
+    mujoco.MjModel.from_xml_path("mine_possible.urdf")
+    assert (
+        Path(str(load_scenario("mine.yaml").parameters("plant")["robot"])).name
+        == "mine_possible.urdf"
+    )
+
+
+def test_a_robot_that_cannot_turn_its_base_is_told_so(robot: Path) -> None:
+    body = '<inertial><mass value="3"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/>'
+    robot.write_text(
+        f'<robot name="piston"><link name="hull">{body}</inertial></link>'
+        f'<link name="rod">{body}</inertial></link><joint name="slide" type="prismatic">'
+        '<parent link="hull"/><child link="rod"/>'
+        '<limit lower="-1" upper="1" velocity="1" effort="1"/></joint></robot>',
+        "utf-8",
+    )
     result = CliRunner().invoke(main, ["new", str(robot)])
     assert result.exit_code == 1, result.output
     assert "turn its base not at all" in result.output

@@ -8,7 +8,9 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pinocchio as pin
 import pytest
+from scipy.optimize import lsq_linear
 from support.urdf_text import without_collisions
 
 from spacerobot_ros.collision import CollisionGeometry, LinkPair
@@ -122,7 +124,7 @@ def test_the_urdf_text_carries_the_pairs_of_an_srdf(tmp_path: Path) -> None:
     # Those of another file take their place.
     other = with_srdf(again, srdf(tmp_path, '<disable_collisions link1="b" link2="d"/>'))
     assert parse_robot(other.urdf).disabled_collisions == {frozenset({"b", "d"})}
-    assert with_srdf(other, srdf(tmp_path)).urdf == robot.urdf
+    assert parse_robot(with_srdf(other, srdf(tmp_path)).urdf).disabled_collisions == frozenset()
     with pytest.raises(RobotDescriptionError, match="The robot description has a <disable_coll"):
         parse_robot(robot.urdf.replace("</robot>", '<disable_collisions link1="x"/></robot>'))
 
@@ -168,6 +170,30 @@ def test_a_flat_open_mesh_counts_as_its_hull(tmp_path: Path) -> None:
     assert distance == pytest.approx(0.2 - 0.25, abs=1e-5)
     distance, _ = geometry.nearest(np.array([-1.0, 1.0])) or (np.nan, 0)
     assert distance > 0.3
+
+
+def test_a_tilted_flat_mesh_lies_where_its_corners_are(tmp_path: Path) -> None:
+    """Against the distance from a ball to the parallelogram of the corners, by least squares."""
+    corners = np.array([[0, 0, 0], [2, 0, 0.8], [2, 1, 0.8], [0, 1, 0]])
+    lines = "".join(f"v {x} {y} {z}\n" for x, y, z in corners)
+    (tmp_path / "plate.obj").write_text(f"{lines}f 1 2 3 4\n")
+    plate = f'<collision><geometry><mesh filename="{tmp_path}/plate.obj"/></geometry></collision>'
+    other = '<collision><origin xyz="-1 0.5 1"/><geometry><sphere radius="0.25"/></geometry>'
+    text = chain((plate,), (), (f"{other}</collision>",))
+    robot = parse_robot(text.replace("0.1 0 0.2", "0 0 0"))
+    geometry = CollisionGeometry(robot)
+    for q in ([0.0, 0.0], [0.3, -0.4]):
+        pair, poses = 0, geometry.poses(np.array([q]))
+        frame = pin.buildModelFromXML(
+            re.sub("<collision.*?</collision>", "", text.replace("0.1 0 0.2", "0 0 0"))
+        )
+        data = frame.createData()
+        pin.framesForwardKinematics(frame, data, np.array(q))
+        center = data.oMf[frame.getFrameId("c")].act(np.array([-1.0, 0.5, 1.0]))
+        sides = (corners[[1, 3]] - corners[0]).T
+        share = lsq_linear(sides, center - corners[0], bounds=(0.0, 1.0)).x
+        expected = np.linalg.norm(sides @ share + corners[0] - center) - 0.25
+        assert geometry.distances(pair, poses)[0] == pytest.approx(expected, abs=1e-5)
 
 
 @pytest.mark.parametrize("name", ["dual_arm", "servicer"])
@@ -329,7 +355,6 @@ def test_plans_are_refused_where_the_mesh_of_a_collision_is_missing(
     pairs = [frozenset({"b", link.name}) for link in declared.links if link.name != "b"]
     disabled = replace(declared, disabled_collisions=frozenset(pairs))
     Clearance(disabled, 0.01).required(start)
-    caplog.clear()
     drawn = parse_robot(chain((BALL,), (solid("visual", mesh),), (BALL,)))
     Clearance(drawn, 0.01).required(start)
     (warning,) = caplog.messages

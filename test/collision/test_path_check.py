@@ -9,11 +9,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from spacerobot_ros.collision import CollisionGeometry, PathCheck
+from spacerobot_ros.collision import BasePoses, CollisionGeometry, PathCheck
 from spacerobot_ros.collision.rounded_box import RoundedBox, separation
 from spacerobot_ros.model import RobotDescription, load_robot, parse_robot
 from spacerobot_ros.model.description import Array, Pose, Shape
 from spacerobot_ros.model.rotations import matrix_from_rpy
+from spacerobot_ros.model.urdf import parse_world
+from spacerobot_ros.model.world import with_world
 from spacerobot_ros.resources import robot_file
 
 
@@ -84,6 +86,56 @@ def test_a_single_shape_is_a_path() -> None:
     (found,) = check.approaches(np.zeros((1, 2)), np.array([0.05]))
     assert found.distance == pytest.approx(0.03, abs=1e-6)
     assert check.approaches(np.ones((1, 2)), np.array([0.05])) == []
+
+
+def telescope() -> RobotDescription:
+    """Return a ball on a slider on a turntable, and another ball on the base, 2 m from its axis."""
+    inertial = CROSSING.split("<inertial>")[1].split("</inertial>")[0]
+    body = f"<inertial>{inertial}</inertial>"
+    ball = '<collision><origin xyz="{}"/><geometry><sphere radius="0.1"/></geometry></collision>'
+    post = ball.format(f"{2 * math.cos(0.3)} {2 * math.sin(0.3)} 0")
+    limit = '<limit lower="-3" upper="3" velocity="9" effort="1"/>'
+    return parse_robot(
+        f"""<robot name="telescope"><link name="base">{body}{post}</link>
+<link name="table">{body}</link><link name="ball">{body}{ball.format("0 0 0")}</link>
+<joint name="turn" type="revolute"><parent link="base"/><child link="table"/>
+<axis xyz="0 0 1"/>{limit}</joint>
+<joint name="slide" type="prismatic"><parent link="table"/><child link="ball"/>
+<axis xyz="1 0 0"/>{limit}</joint></robot>"""
+    )
+
+
+def test_what_a_slider_carries_out_sweeps_farther_in_a_tick() -> None:
+    """Both ends of the tick are far from the post; the ball on the extended slider passes it."""
+    geometry = CollisionGeometry(telescope())
+    (found,) = PathCheck(geometry).approaches(np.array([[0.0, 2.0], [0.6, 2.0]]), np.array([0.01]))
+    assert (found.tick, found.distance) == pytest.approx((0.5, -0.2), abs=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("place", "turn"), [((1.0, 0.0, 0.0), 0.0), ((0.0, 0.0, 0.0), 0.6)], ids=["moves", "turns"]
+)
+def test_obstacles_are_met_between_ticks_where_the_base_moves_or_turns(
+    place: tuple[float, float, float], turn: float
+) -> None:
+    """A contact 5 cm deep in the middle of a tick, at whose ends 0.2 m and more are free."""
+    path = np.array([[0.0, -2.0], [0.0, -2.0]])
+    # The middle of the way of the ball, and 0.25 m beyond it, across the way.
+    middle = np.array([-1.5, 0.25, 0.0])
+    if turn:
+        middle = -2.25 * np.array([math.cos(turn / 2), math.sin(turn / 2), 0.0])
+    world = parse_world(
+        f"""<robot name="world"><link name="rock"><collision>
+<origin xyz="{middle[0]} {middle[1]} {middle[2]}"/><geometry><sphere radius="0.2"/></geometry>
+</collision></link></robot>"""
+    )
+    geometry = CollisionGeometry(with_world(telescope(), world))
+    turned = [0.0, 0.0, math.sin(turn / 2), math.cos(turn / 2)]
+    base = BasePoses(np.array([[0.0, 0.0, 0.0], place]), np.array([[0.0, 0.0, 0.0, 1.0], turned]))
+    required = np.full(len(geometry.pairs), 0.01)
+    found = PathCheck(geometry).approaches(path, required, base)
+    assert [each.links.subject for each in found] == ["link 'ball' and obstacle 'rock'"]
+    assert (found[0].tick, found[0].distance) == pytest.approx((0.5, -0.05), abs=1e-4)
 
 
 # -- bodies of revolution that spin in place, such as reaction wheels, come no nearer to ---------

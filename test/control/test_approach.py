@@ -182,6 +182,23 @@ def test_the_distance_of_a_reach_is_that_of_two_links() -> None:
     assert "stays 0.4" in arm.shapes_along(at(np.array([0.5, 2.4, 0.0])), 0.25)[1]
 
 
+@pytest.mark.parametrize(("rate", "slow_enough"), [(0.85, True), (0.95, False)])
+def test_an_arm_follows_within_nine_tenths_of_the_rates_of_its_joints(
+    rate: float, slow_enough: bool
+) -> None:
+    """The shoulder turns by so much of its rate of 1 rad/s for 0.1 s: two links of 1 m."""
+    arm, period = reach(1.0), 0.1
+    turned = SHAPE[0] + period * rate * np.array([0.0, 1.0])
+    tips = [
+        [0.5 + math.cos(q) + math.cos(q + SHAPE[1]), math.sin(q) + math.sin(q + SHAPE[1]), 0.0]
+        for q in turned
+    ]
+    zero = np.zeros((2, 3))
+    motion = FrameMotion(np.tile(np.eye(3), (2, 1, 1)), np.array(tips), zero, zero, zero, zero)
+    _, why = arm.shapes_along(motion, period)
+    assert why == "" if slow_enough else why.startswith("joint 'shoulder' would move at 0.9")
+
+
 # -- predictions of a free target against an independent integration, and paths beside it --------
 
 

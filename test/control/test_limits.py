@@ -443,3 +443,25 @@ def test_goal_without_a_start_is_refused() -> None:
 def test_limits_of_references_that_are_refused(value: float) -> None:
     with pytest.raises(ParameterError, match="'angular_speed'"):
         replace(SIX_LIMITS, angular_speed=value)
+
+
+def test_references_accelerate_as_the_thrust_can_move_a_rigid_body() -> None:
+    """Newton and Euler of a body of 4 kg, whose centre of mass is 0.3 m from its base frame."""
+    text = """<robot name="brick"><link name="hull"><inertial><origin xyz="0 0.3 0"/>
+      <mass value="4"/><inertia ixx="3" iyy="4" izz="5" ixy="0" ixz="0" iyz="0"/></inertial></link>
+      </robot>"""
+    robot, q = SpaceRobot.from_urdf(text), np.zeros(0)
+    given = MotionLimits(speed=9.0, acceleration=90.0, angular_speed=9.0, angular_acceleration=90.0)
+
+    def lowered(force: float, torque: float) -> tuple[float, float]:
+        found = given.within_thruster_limits(ActuatorLimits(force, torque, np.zeros(0)), robot, q)
+        return found.acceleration, found.angular_acceleration
+
+    by_force, _ = lowered(2.0, 1e6)
+    share = by_force / (2.0 / 4.0)
+    assert 0.3 < share <= 1.0
+    by_torque, turning = lowered(1e6, 0.6)
+    assert turning == pytest.approx(share * 0.6 / 5.0)
+    # A force at the base turns the body, which the torque makes up for.
+    assert by_torque == pytest.approx(share * 0.6 / (4.0 * 0.3))
+    assert lowered(0.0, 0.0) == (90.0, 90.0)

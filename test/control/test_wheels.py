@@ -318,6 +318,19 @@ def test_a_wheel_that_answers_well_enough_goes_on() -> None:
     assert wheels.rank == 3
 
 
+def test_a_wheel_that_stops_answering_is_noticed_however_long_it_has_answered() -> None:
+    wheels = control()
+    observe(wheels, [0.0, 0.0, 0.0])
+    for _ in range(6):
+        fly(wheels, [-0.1, 0.05, 0.2], 1.0, 2.5)
+        fly(wheels, [0.1, -0.05, -0.2], 1.0, 2.5)
+    assert wheels.events() == []
+    fly(wheels, [-0.1, 0.05, 0.2], 0.0, 3.2)
+    assert [(each.kind, each.about) for each in wheels.events()] == [
+        (EventKind.WHEEL_FAILED, {"wheel": "spin_c"})
+    ]
+
+
 def test_the_turn_of_the_base_counts_as_an_answer() -> None:
     wheels = control(0.0)
     observe(wheels, [0.0, 0.0, 0.0])

@@ -448,6 +448,27 @@ def test_the_way_of_a_link_is_in_the_frame_of_the_base() -> None:
     assert 0.2 < max(distances) <= 0.25
 
 
+@pytest.mark.parametrize(("by_force", "dimensions"), [(False, 2), (True, 3)])
+def test_random_places_fill_the_disc_or_the_ball_in_which_the_link_goes(
+    by_force: bool, dimensions: int
+) -> None:
+    """Of places that fill it evenly, the shares (d / R)^k are even; a planar robot keeps to its
+    plane, however it is turned in the world."""
+    robot = SpaceRobot(load_robot(robot_file("planar_chain")))
+    task, given, rng = (
+        Reach(robot, "segment_2", (by_force, False)),
+        states(2),
+        np.random.default_rng(6),
+    )
+    link = task.link_positions(given)[0]
+    ways = np.array([task.random_goal(given, 0.3, rng) - link for _ in range(400)])
+    shares = (np.linalg.norm(ways, axis=1) / 0.3) ** dimensions
+    assert shares.max() <= 1.0
+    assert np.mean(shares) == pytest.approx(0.5, abs=0.06)
+    in_base = ways @ matrix_from_quaternion(given.pose[0, 3:])
+    assert bool(np.abs(in_base[:, 2]).max() < 1e-12) is (dimensions == 2)
+
+
 def test_random_attitudes_are_within_their_spread() -> None:
     robot = SpaceRobot(load_robot(robot_file("planar_chain")))
     task, given = Reorient(robot), states(2)
@@ -508,6 +529,12 @@ def test_a_force_on_the_base_is_an_action_where_there_is_one() -> None:
             "reorient", scenario="planar_chain", max_force=force, max_torque=torque
         )
         assert Episodes(config, 1, in_lanes=False).taken.tolist() == taken
+    # Without limits of its own, those of the controller of the scenario.
+    config = EpisodeConfig("reorient", scenario="wheels")
+    limits = load_scenario("wheels").controller
+    scale = Episodes(config, 1, in_lanes=False).scale
+    assert scale[-6:].tolist() == [limits.max_force] * 3 + [limits.max_torque] * 3
+    assert limits.max_force != limits.max_torque
 
 
 def test_registering_twice_changes_nothing_and_a_missing_package_is_named(

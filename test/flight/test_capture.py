@@ -422,6 +422,17 @@ def test_a_satellite_with_unequal_moments_is_estimated_from_its_flight(servicing
     assert found.payload.link == held.payload.link
 
 
+def test_an_estimate_without_noise_knows_what_the_impulses_of_ticks_lack(
+    servicing: Flight,
+) -> None:
+    (held,) = held_bodies(servicing)
+    true = payload_parameters(held.payload.inertia)
+    (found,) = payload_estimates(servicing)
+    shares = (found.parameters - true) / found.deviations
+    assert 0.3 < np.sqrt(np.mean(shares**2)) < 1.8
+    assert np.abs(shares).max() < 3.5
+
+
 def test_an_estimate_from_noisy_sensors_knows_its_errors(servicing: Flight) -> None:
     (held,) = held_bodies(servicing)
     true = payload_parameters(held.payload.inertia)

@@ -9,7 +9,7 @@ import pytest
 from diagnostic_msgs.msg import DiagnosticStatus
 from nav_msgs.msg import Path
 from std_msgs.msg import String
-from support.made_bags import made_bag, odometry, pose
+from support.made_bags import joint_states, made_bag, odometry, pose
 
 from spacerobot_ros.flight.reading import FlightBag, open_flight_bag, read_flight
 from spacerobot_ros.resources import robot_file
@@ -73,3 +73,31 @@ def test_the_last_pose_of_a_path_is_a_goal(tmp_path: File) -> None:
     assert [each.goal_id for each in sent] == ["9.000000000", "5.000000000"]
     assert [each.goal.position.tolist() for each in sent] == [[1, 2, 3], [4, 5, 6]]
     assert sent[1].goal.quaternion.tolist() == [0, 0, 0, 1]
+
+
+def test_goals_have_the_frame_of_their_pose_and_the_shape_that_was_sent_before(
+    tmp_path: File,
+) -> None:
+    names, path = ["pin_1", "pin_2"], tmp_path / "made.mcap"
+    with made_bag(path) as (_, say):
+        say("/robot_description", String(data=ROBOT), 0.25)
+        for time in (1.0, 2.0):
+            say("/odom", odometry(time, time, 2, 3, 0, 0, 0, 1, 0, 0, 0, 0, 0, 0), time)
+            say("/joint_states", joint_states(time, names, [0.0, 0.0], [0.0, 0.0]), time)
+        for x, header, frame in ((1, "map", "world"), (2, "world", "map"), (3, "world", "")):
+            last = pose(0.0, x, 0, 0, 0, 0, 0, 1)
+            last.header.frame_id = frame
+            sent = Path(poses=[pose(0.0, 7, 8, 9, 0, 0, 0, 1), last])
+            sent.header.frame_id = header
+            say("/end_effector/path", sent, 1.0 + x / 10)
+        for time, shape in ((1.15, [0.3, -0.4]), (1.35, [])):
+            given = joint_states(time, names[: len(shape)], shape, [])
+            say("/goal_joint_states", given, time)
+        for time in (1.1, 1.2, 1.3, 1.4):
+            say("/goal_pose", pose(time, 10 * time, 0, 0, 0, 0, 0, 1), time)
+    bag = open_flight_bag(path)
+    assert [each.goal.position[0] for each in bag.goals("end_effector/path")] == [1.0, 3.0]
+    shapes = [each.goal.joint_positions for each in bag.goals("goal_pose")]
+    assert [None if each is None else each.tolist() for each in shapes] == [
+        *(None, [0.3, -0.4], [0.3, -0.4], None)
+    ]

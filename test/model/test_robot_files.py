@@ -85,6 +85,34 @@ def test_a_xacro_file_takes_macros_properties_lists_and_files_of_its_package(
 
 
 @pytest.mark.parametrize(
+    ("package", "folder"), [("probe_arm", "src/checkout"), ("probe_parts", "src/probe_arm")]
+)
+def test_a_package_is_found_by_its_name_from_its_own_files_and_those_beside_it(
+    tmp_path: Path, package: str, folder: str
+) -> None:
+    """Folders of checkouts have names of their own; nothing is installed."""
+    for name, where in (("probe_arm", "src/checkout"), ("probe_parts", "src/probe_arm")):
+        (tmp_path / where / "urdf").mkdir(parents=True)
+        (tmp_path / where / "package.xml").write_text(f"<package><name>{name}</name></package>")
+    parts = f'<robot{HEADING}><xacro:property name="m" value="42"/></robot>'
+    file_with(tmp_path / folder, parts, "urdf/probe.gazebo")
+    file_with(tmp_path / folder, "solid hull", "meshes/hull.stl")
+    mesh = f'<visual><geometry><mesh filename="package://{package}/meshes/hull.stl"/></geometry>'
+    text = urdf(mass="${m}", attribute=HEADING, visual=f"{mesh}</visual>")
+    head = f'<xacro:include filename="$(find {package})/urdf/probe.gazebo"/>'
+    text = text.replace("  <link", f"{head}\n  <link", 1)
+    found = load_robot(file_with(tmp_path / "src/checkout", text, "urdf/probe.xacro"))
+    assert found.bodies[0].inertia.mass == 42.0
+    assert found.links[0].shapes[0].resource == f"file://{tmp_path / folder}/meshes/hull.stl"
+
+
+def test_a_package_that_is_nowhere_is_named(tmp_path: Path) -> None:
+    text = urdf(attribute=HEADING).replace("  <link", "<a b='$(find no_such)'/><link", 1)
+    with pytest.raises(RobotDescriptionError, match=r"expanded: the package 'no_such' is neither"):
+        load_robot(file_with(tmp_path, text, "probe.xacro"))
+
+
+@pytest.mark.parametrize(
     ("expression", "reason"),
     [
         ("${9**9**9}", "needs too much time or memory"),
@@ -379,6 +407,17 @@ def test_what_other_programs_have_written_is_passed_over(tmp_path: Path) -> None
     found = load_robot(file_with(tmp_path, text))
     assert (found.name, found.joint_names, found.total_mass) == ("probe", ("elbow",), 11.0)
     assert "plane" in found.urdf
+
+
+def test_limits_that_motions_do_not_keep_are_named_once(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    text = urdf(limit=LIMIT.replace("<limit", '<limit acceleration="1" jerk="2"'))
+    file = file_with(tmp_path, text.replace('name="probe"', 'name="jerky"'))
+    for _ in range(2):
+        load_robot(file)
+    (line,) = caplog.messages
+    assert line.startswith("The limits of acceleration and jerk in the URDF of 'jerky' are ignored")
 
 
 def test_what_a_link_is_welded_to_makes_up_for_its_inertia(tmp_path: Path) -> None:

@@ -16,6 +16,7 @@ from spacerobot_ros.errors import ParameterError, RobotDescriptionError
 from spacerobot_ros.model import SpaceRobot, load_robot, parse_robot
 from spacerobot_ros.model.description import JointKind, Shape
 from spacerobot_ros.model.shared_parameters import RobotConfig, robot_of
+from spacerobot_ros.model.srdf import with_srdf
 from spacerobot_ros.model.urdf import load_world, parse_world
 from spacerobot_ros.model.world import (
     links_with_shapes,
@@ -333,6 +334,28 @@ def test_the_text_of_a_robot_carries_its_world() -> None:
 
 
 @pytest.mark.parametrize(
+    "comment", ["<!-- end of </robot> -->", "<!-- no <world> here -->", "<!-- </world> -->"]
+)
+@pytest.mark.parametrize("after", [False, True])
+def test_obstacles_disabled_pairs_and_comments_get_along(
+    comment: str, after: bool, tmp_path: Path
+) -> None:
+    end = f"</robot>{comment}" if after else f"{comment}</robot>"
+    srdf = tmp_path / "robot.srdf"
+    first, second = (link.name for link in parse_robot(URDF).links[:2])
+    srdf.write_text(
+        f'<robot><disable_collisions link1="{first}" link2="{second}"/></robot>', "utf-8"
+    )
+    robot = parse_robot(URDF.replace("</robot>", end))
+    robot = with_srdf(with_world(robot, parse_world(WORLD)), srdf)
+    again = parse_robot(robot.urdf)
+    assert again.world is not None
+    assert links_with_shapes(again.world) == ["mast"]
+    assert again.disabled_collisions == {frozenset({first, second})}
+    assert len(pin.buildModelFromXML(robot.urdf).names) - 1 == len(again.joint_names)
+
+
+@pytest.mark.parametrize(
     ("change", "message"),
     [
         (('name="b" type="fixed"', 'name="b" type="continuous"'), "joint 'b' is continuous"),
@@ -390,7 +413,7 @@ def test_a_text_is_obstacles_and_an_empty_one_is_none() -> None:
         ('<robot name="w"><link name="w"/></robot>', "The world 'w' has no obstacle"),
         ("<robot", "is no XML"),
         (
-            BALL_AND_POST.replace("</robot>", f"<world>{BALL}</world></robot>"),
+            BALL_AND_POST.replace("</robot>", f"<world>{BALL_AND_POST}</world></robot>"),
             "^Obstacles are not among others: leave the element <world> out",
         ),
         (BALL_AND_POST.replace("0.3", "${radius}"), "radius"),

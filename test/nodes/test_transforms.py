@@ -156,6 +156,21 @@ def test_frames_have_the_prefix_that_they_are_given(harness: Harness, tmp_path: 
     assert (odom.header.frame_id, odom.child_frame_id) == ("orbit", "one/base_link")
 
 
+def test_a_link_that_is_called_like_the_world_is_another_frame(
+    harness: Harness, tmp_path: Path
+) -> None:
+    text = robot_file("planar_chain").read_text("utf-8").replace("base_link", "world")
+    file = tmp_path / "chain.urdf"
+    file.write_text(text, "utf-8")
+    bag = record_states(harness, tmp_path / "bag.mcap", str(file))
+    _, message = next(iter(bag["/tf"].messages()))
+    frames = [(each.header.frame_id, each.child_frame_id) for each in message.transforms]
+    assert frames[0] == ("world", "robot/world")
+    assert all(child.startswith("robot/") for _, child in frames)
+    _, odom = next(iter(bag["/odom"].messages()))
+    assert (odom.header.frame_id, odom.child_frame_id) == frames[0]
+
+
 @pytest.mark.slow
 def test_a_recorder_writes_frames_as_often_as_it_is_to(harness: Harness, tmp_path: Path) -> None:
     every = {"tf_period": 0.2}

@@ -7,14 +7,16 @@ import subprocess
 import sys
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support.planner_loop import HERE, NEAR, Loop, MovingStub, StubMethod
+from support.planner_loop import HERE, NEAR, TICK, Loop, MovingStub, StubMethod
 from support.planner_phases import (
     FAR,
     OTHER,
@@ -26,6 +28,9 @@ from support.planner_phases import (
 )
 
 from spacerobot_ros.errors import PlanningError
+from spacerobot_ros.planning import GaitSchedule
+from spacerobot_ros.planning.core.cancellation import NEVER, Cancellation
+from spacerobot_ros.planning.core.method import PlanRequest
 from spacerobot_ros.planning.execution.executive import (
     TRANSITIONS,
     Event,
@@ -200,6 +205,28 @@ def test_no_sequence_of_events_leads_astray(
 
 
 # -- the page in the documents ----------------------------------------------------------------
+
+
+class PieceStub(StubMethod):
+    """Plans a piece, after which others of 7.5 s are expected."""
+
+    def plan(self, request: PlanRequest, cancellation: Cancellation = NEVER) -> GaitSchedule:
+        return replace(super().plan(request, cancellation), remaining=7.5)
+
+
+def test_the_time_until_the_end_of_a_goal_is_that_of_this_piece_and_of_those_to_come() -> None:
+    loop = Loop(method=PieceStub(ticks=8))
+    goal = loop.propose_goal(NEAR)
+    assert loop.executive.progress(goal)[1] is None
+    while loop.executive.phase is not Phase.EXECUTING:
+        loop.tick()
+    _, first = loop.executive.progress(goal)
+    assert first is not None
+    assert first - 7.5 == pytest.approx(8 * TICK, abs=TICK + 1e-9)
+    for ticks in (1, 2, 3):
+        loop.tick()
+        _, left = loop.executive.progress(goal)
+        assert left == pytest.approx(first - ticks * TICK)
 
 
 def test_the_table_of_the_documentation_is_that_of_the_code() -> None:

@@ -258,6 +258,7 @@ def test_links_do_not_come_too_near() -> None:
             "The frame '' of the twist is none of 'inertial', 'base_link', 'end_eff",
         ),
         (HAND, [0.0, np.nan, 0.0], "inertial", "The twist has a number that is not finite."),
+        (HAND, [0.0, 1e155, 0.0], "inertial", "The twist has a number beyond 1e+06 m/s"),
     ],
 )
 def test_twists_that_are_none_are_refused(link: str, linear: Any, frame: str, message: str) -> None:

@@ -15,7 +15,7 @@ from support.made_bags import array, joint_states, made_bag, odometry, pose
 from spacerobot_ros.bag import BagWriter, iterate_raw
 from spacerobot_ros.control.status import CommandReport, ControllerState, ControllerStatus
 from spacerobot_ros.flight.reading import open_flight_bag, read_flight, with_propellant
-from spacerobot_ros.measures import Outcome
+from spacerobot_ros.measures import Outcome, flown_time
 from spacerobot_ros.model.thrusters import find_thrusters
 from spacerobot_ros.model.urdf import parse_robot
 from spacerobot_ros.planning import Goal
@@ -25,6 +25,7 @@ from spacerobot_ros.planning.execution.status import (
 )
 from spacerobot_ros.resources import share_directory
 from spacerobot_ros.scenario import Scenario, load_scenario
+from spacerobot_ros.session.run import run_scenario
 
 HALF = math.sin(0.05), math.cos(0.05)
 """Of a quaternion that turns by 0.1 rad."""
@@ -204,3 +205,24 @@ def test_what_the_planner_reports(tmp_path: Path) -> None:
     assert found["corrections"] == 4
     assert (found["succeeded"], found["state"]) == (False, "failed")
     assert found["message"] == "Missed."
+
+
+def test_a_schedule_that_begins_with_the_last_status_has_not_been_flown() -> None:
+    """Its status comes after the last state: none of its 4 s counts."""
+    statuses = [
+        (0.0, PlannerStatus(PlannerState.EXECUTING, ".", manoeuvre_time_s=10.0, duration_s=10.0)),
+        (12.0, PlannerStatus(PlannerState.EXECUTING, ".", manoeuvre_time_s=14.0, duration_s=4.0)),
+    ]
+    assert flown_time(statuses, 11.9) == pytest.approx(10.0)
+    assert flown_time(statuses, 13.0) == pytest.approx(11.0)
+
+
+def test_a_part_that_was_asked_for_and_is_not_controlled_is_not_reached(tmp_path: Path) -> None:
+    """As numbers, that is: an attitude alone asks for no place of the base."""
+    scenario = load_scenario("planar_chain").with_overrides("planner", {"method": "square_path"})
+    turn = scenario.with_goal(rotvec=[0.0, 0.0, 0.1])
+    assert run_scenario(turn, tmp_path / "turn.mcap").succeeded
+    place = [1.0, 0.0, 0.0, 0.0, 0.0, math.sin(0.05), math.cos(0.05)]
+    result = run_scenario(scenario.with_goal(place), tmp_path / "place.mcap")
+    assert (result.summary["state"], result.succeeded) == ("reached_partly", False)
+    assert "'square_path' does not control the position, which is 1" in result.message

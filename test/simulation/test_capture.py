@@ -641,10 +641,15 @@ def test_a_target_slides_on_a_table_with_the_robot() -> None:
     v = capturing.target.motion.v[:2]
     np.testing.assert_allclose(v, steady + ([-0.05, 0.02] - steady) * left, atol=1e-9)
     assert capturing.target.motion.omega[2] == pytest.approx(0.1 * left, abs=1e-12)
-    for flaw in ({"target.velocity": [0.0, 0.0, 0.1]}, {"target.angular_velocity": [0.1, 0, 0]}):
-        with pytest.raises(
-            ParameterError, match="the target 'block' does not stay in the x-y plane"
-        ):
+    # It would not go on turning about z: none of its principal axes is along it.
+    wobbly = {"target.robot_description": TUMBLER, "target.grapple_frame": "ring"}
+    for flaw in (
+        {"target.velocity": [0.0, 0.0, 0.1]},
+        {"target.angular_velocity": [0.1, 0, 0]},
+        wobbly,
+    ):
+        name = "tumbler" if flaw is wobbly else "block"
+        with pytest.raises(ParameterError, match=f"the target '{name}' does not stay in the x-y"):
             plant_of(PAPER_ROBOT, **{"table.tilt": 0.1, **flaw})
 
 
@@ -704,6 +709,27 @@ def test_a_plant_goes_on_from_a_state_with_its_target(
         fresh = plant_of(values)
         np.testing.assert_array_equal(resumed.pose, fresh.pose)
         np.testing.assert_array_equal(second.target_pose, capturing_of(fresh).target_pose)
+
+
+def test_a_plant_that_goes_on_beside_its_target_captures_it_when_it_comes_back() -> None:
+    """Nothing hinders a capture there, as just after a release."""
+    plant = plant_of(PAPER_ROBOT, **{"capture.mode": "automatic", "capture.distance": 0.05})
+    capturing = capturing_of(plant)
+    state = InitialState(
+        position=plant.pose[:3].copy(),
+        quaternion=plant.pose[3:].copy(),
+        joint_positions=plant.q.copy(),
+    )
+    there = BodyMotion.of(capturing.target_pose, capturing.target_twist)
+    capturing.resume(state, None, there)
+    plant.step(*commands_of(plant))
+    assert capturing.payload is None
+    away = replace(there, r_WT=there.r_WT + np.array([0.0, 0.2, 0.0]))
+    for body, held in ((away, False), (there, True)):
+        capturing.target.release(body)
+        plant.step(*commands_of(plant))
+        plant.step(*commands_of(plant))
+        assert (capturing.payload is not None) is held
 
 
 def test_a_body_that_another_link_holds_is_not_gone_on_with() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import time
 from functools import cache
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from support.oracles import Array
 from support.random_robots import random_robot_urdf
 from support.slow import some_fast
 
+from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.resources import robot_file
 from spacerobot_ros.simulation import EffortPlant, InitialState
@@ -219,6 +221,24 @@ def test_joints_that_knock_each_other_off_their_stops_come_to_rest() -> None:
         np.testing.assert_allclose(plant.momentum[:6], 0.0, atol=1e-12)
     assert plant.q[[3, 5]].tolist() == [3.0, 3.0]
     assert plant.qdot[[3, 5]].tolist() == [0.0, 0.0]
+
+
+def test_joints_that_hit_their_stops_without_end_are_refused_soon() -> None:
+    """The arm of the free-flyer is thrown about by a force of 1e6 to 1e12 N on its base."""
+    plant = EffortPlant(SpaceRobot.from_file(robot_file("free_flyer")), 0.02)
+    plant.step(np.zeros(6), [1.0, 0.0, 0.0, 0.0, 1.0, 0.0])
+    before = plant.state.copy()
+
+    def push(force: float) -> None:
+        for _ in range(10):
+            plant.step(np.zeros(6), [force, 0.0, 0.0, 0.0, force, 0.0])
+
+    began = time.process_time()
+    for force in (1e6, 1e9, 1e12):
+        with pytest.raises(SpaceRobotError, match="drive the robot too fast"):
+            push(force)
+        plant.place(before)
+    assert time.process_time() - began < 10.0
 
 
 def test_robots_on_their_stops_fly_the_same_every_time() -> None:

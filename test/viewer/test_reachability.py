@@ -19,7 +19,7 @@ from spacerobot_ros.model.description import Array
 from spacerobot_ros.parameters import values_of
 from spacerobot_ros.planning import Goal, RobotState
 from spacerobot_ros.planning.core.cancellation import Cancellation, PlanningCancelled
-from spacerobot_ros.planning.core.goal import EndEffectorGoal
+from spacerobot_ros.planning.core.goal import EndEffectorGoal, Tolerance
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus
 from spacerobot_ros.resources import robot_file
@@ -29,6 +29,7 @@ from spacerobot_ros.viewer.reachability import (
     GoalQuestion,
     Planner,
     Verdict,
+    goal_tolerance,
     make_question,
     planned_goal,
     planned_links,
@@ -368,3 +369,13 @@ def test_the_robot_of_a_planner_is_that_of_the_page() -> None:
     assert (config.robot, config.world, config.robot_description) == ("", "", "")
     assert config.tick_rate == 17.0
     assert config.averaging == type(config)().averaging
+
+
+def test_the_tolerances_of_goals_are_those_of_the_commander() -> None:
+    texts = {"position_tolerance": "0.01", "attitude_tolerance": "0.02", "joint_tolerance": "0.03"}
+    assert goal_tolerance(texts, SERVICER) == Tolerance(0.01, 0.02, 0.03)
+    automatic = goal_tolerance({**texts, "position_tolerance": "0.0"}, SERVICER)
+    assert automatic == Tolerance(
+        PlannerConfig().for_robot(SERVICER).position_tolerance, 0.02, 0.03
+    )
+    assert goal_tolerance({"position_tolerance": "0.01"}, SERVICER) is None

@@ -523,10 +523,20 @@ class ControlLaw(ABC):
     @property
     def fixed_inputs(self) -> Mapping[str, npt.ArrayLike] | None:
         """Arguments of :attr:`function` beside state, reference and gains that are the same in
-        every flight; None: some depend on the flight.
+        every flight; None: some depend on the flight, or the function is not the whole command.
+
+        It is not in a law that overrides a step of the command and not :meth:`is_complete` too.
         """
+        steps = min(map(self._owner, ("command", "actuation")))
+        if steps < self._owner("is_complete"):
+            return None
         integral = {"integral": np.zeros(self.outputs.m)}
         return {**integral, **self.inputs(), **self.robot.mass_arguments}
+
+    def _owner(self, method: str) -> int:
+        """Return the place, in the order of resolution, of the class that has a method."""
+        classes = type(self).__mro__
+        return next(place for place, each in enumerate(classes) if method in vars(each))
 
     def is_complete(self, results: Mapping[str, ca.SX]) -> ca.SX:
         """Return whether the results of :attr:`function` are the command without further steps."""

@@ -54,11 +54,6 @@ class NumpyLaw(ControlLaw):
         super().command(state, reference)
         return self.compute(state, reference)
 
-    @property
-    def fixed_inputs(self) -> None:
-        """None: the command is more than a function of numbers."""
-        return None
-
     def results(self, symbols: dict[str, ca.SX]) -> dict[str, ca.SX]:
         """Return no command: :meth:`compute` does."""
         return {"actuation": ca.SX(6 + self.robot.n, 1)}

@@ -211,7 +211,9 @@ class PlantNode(FlightNode):
         self._reported = ReportedState(plant, config)
         self._commands = CommandValidator(plant, config)
         self._readers = {
-            source.topic: CommandReader(source, plant.robot, config.frame_prefix)
+            source.topic: CommandReader(
+                source, plant.robot, config.prefix_for(plant.robot.description)
+            )
             for source in self._commands.sources
         }
         self._capturing = plant.capturing

@@ -158,7 +158,7 @@ class StatePublisher:
     ) -> None:
         self._node, self._robot, self._state, self._config = node, robot, state, config
         self._world = config.world_frame
-        self._base = config.frame_prefix + robot.base_link
+        self._base = config.prefix_for(robot.description) + robot.base_link
         self._outputs: dict[str, Publisher] = {}
         self._readers: frozenset[bytes] = frozenset()
         self._matched = 0
@@ -275,7 +275,10 @@ class TransformPublisher:
             return
         self.publishes = True
         self._frames = RobotTransforms(
-            robot.description, config.world_frame, config.frame_prefix, links=config.tf_links
+            robot.description,
+            config.world_frame,
+            config.prefix_for(robot.description),
+            links=config.tf_links,
         )
         self._stream = node.create_publisher(self._kind, TRANSFORMS, STREAM)
         self._static: Publisher | None = None
@@ -388,8 +391,10 @@ class LinkMarkers:
 
     def publish(self, time_ns: int) -> None:
         """Publish the markers of all visuals at their present poses."""
+        if not self._markers.draws_anything:
+            return
         plant = self._plant
         target = None if plant.capturing is None else plant.capturing.target_pose
-        message = self._markers.message(time_ns, plant.pose, plant.link_R, plant.link_r, target)
-        if message is not None:
-            self._stream.publish(message)
+        self._stream.publish(
+            self._markers.message(time_ns, plant.pose, plant.link_R, plant.link_r, target)
+        )

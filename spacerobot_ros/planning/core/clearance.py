@@ -22,8 +22,10 @@ from spacerobot_ros.errors import (
     PlanningError,
     Proof,
     UnreachableError,
+    UnreadMeshError,
     sentence_case,
 )
+from spacerobot_ros.files import warn_once
 from spacerobot_ros.model.description import Array, RobotDescription
 
 _LOG = logging.getLogger(__name__)
@@ -85,11 +87,8 @@ class Clearance:
 
     @cached_property
     def geometry(self) -> CollisionGeometry:
-        """The solids of the robot; meshes that cannot be read are named in the log."""
-        geometry = CollisionGeometry(self._robot)
-        for each in geometry.unread_meshes:
-            _LOG.warning("%s", each.note)
-        return geometry
+        """The solids of the robot."""
+        return CollisionGeometry(self._robot)
 
     @property
     def has_obstacles(self) -> bool:
@@ -150,7 +149,7 @@ class Clearance:
 
     def _require_declared_meshes(self) -> None:
         """Refuse a robot with a ``<collision>`` whose mesh cannot be read, unless an SRDF disables
-        all pairs of its link.
+        all pairs of its link. Other meshes that cannot be read are named in the log.
         """
         robot = self._robot
         names = {link.name for link in robot.links}
@@ -161,10 +160,11 @@ class Clearance:
                 and each.link in names
                 and not pairs <= robot.disabled_collisions
             ):
-                raise PlanningError(
+                raise UnreadMeshError(
                     f"Link '{each.link}' cannot be kept clear of others: {each.reason} Or have an "
                     "SRDF disable its pairs (planner.srdf), or set planner.clearance to 0."
                 )
+            warn_once(each.note)
 
     def _warn_of_contact(self, links: LinkPair) -> None:
         if links.subject not in self._warned:

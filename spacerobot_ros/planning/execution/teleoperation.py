@@ -48,6 +48,9 @@ _LOOK_AHEAD = 1e-3
 _TRIED_SPEED_SHARES = (1.0, 0.5, 0.25, 0.0)
 """Shares of the rates that are tried where links come too near; with the last one joints brake."""
 
+_MAX_TWIST = 1e6
+"""Largest number of a twist, m/s or rad/s: squares of much larger ones overflow."""
+
 _MIDPOINT_STEPS = 2
 _ROUNDING = 1e-12
 
@@ -105,6 +108,8 @@ class TwistCommand:
             raise PlanningError(f"The frame '{frame}' of the twist is none of '{names}'.")
         if not (np.all(np.isfinite(linear)) and np.all(np.isfinite(angular))):
             raise PlanningError("The twist has a number that is not finite.")
+        if max(np.abs(linear).max(), np.abs(angular).max()) > _MAX_TWIST:
+            raise PlanningError(f"The twist has a number beyond {_MAX_TWIST:g} m/s or rad/s.")
         return cls(link, np.asarray(linear, float), np.asarray(angular, float), found)
 
     def in_base(self, R_WB: Array, R_BE: Array) -> tuple[Array, Array]:

@@ -11,8 +11,10 @@ from spacerobot_ros.errors import (
     PlanningError,
     SpaceRobotError,
     UnreachableError,
+    UnreadMeshError,
     refusal_of_all,
 )
+from spacerobot_ros.files import warn_once
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.integration import DEFAULT_INTEGRATION_STEP
 from spacerobot_ros.planning.core.cancellation import NEVER, Cancellation, PlanningCancelled
@@ -101,6 +103,9 @@ class AutoGait(GaitMethod):
                 results[name] = _MethodResult.of(self.robot, schedule, request)
         if not results:
             raise self._refuse_goal(refusals)
+        for refusal in refusals.values():
+            if isinstance(refusal, UnreadMeshError):
+                warn_once(str(refusal))
         chosen = min(results, key=lambda name: results[name].rank(results.values()))
         because = f"{chosen} suits robot '{self.robot.description.name}' and " + (
             f"plans the shortest of {len(results)} manoeuvres to this goal."
@@ -116,9 +121,11 @@ class AutoGait(GaitMethod):
         for refusal in of_goal:
             if isinstance(refusal, UnreachableError):
                 return refusal
-        reasons = " ".join(
-            f"{name}: {refusals[name]}" for name in self._candidates if name in refusals
-        )
+        names_by_reason: dict[str, list[str]] = {}
+        for name in self._candidates:
+            if name in refusals:
+                names_by_reason.setdefault(str(refusals[name]), []).append(name)
+        reasons = " ".join(f"{', '.join(each)}: {why}" for why, each in names_by_reason.items())
         message = f"No method plans this goal of robot '{self.robot.description.name}'. {reasons}"
         return refusal_of_all(message, of_goal)
 
