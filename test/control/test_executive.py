@@ -118,6 +118,18 @@ def test_a_base_without_a_goal_of_the_hand_carries_it() -> None:
     np.testing.assert_allclose(hand.position, TIP, atol=1e-12)
 
 
+def test_a_base_that_only_turns_carries_the_hand_about_the_centre_of_mass() -> None:
+    loop = ExecutiveLoop(base_outputs="rz", end_effector_outputs="x y")
+    loop.answer()
+    turn = Rotation.from_euler("z", 0.5)
+    loop.aim(base=IdentifiedGoal(Goal(AIM, turn.as_quat()), "a"))
+    loop.answer()
+    hand = loop.executive.controller.goal.end_effector
+    assert hand is not None
+    center = planar_manipulator().center_of_mass(SHAPE)
+    np.testing.assert_allclose(hand.position, center + turn.apply(TIP - center), atol=1e-12)
+
+
 @pytest.mark.parametrize("end", ["reached", "failed", "aborted"])
 def test_goals_of_base_and_hand_end_together_and_each_once(end: str) -> None:
     loop = ExecutiveLoop(settle_time=0.02, time_limit=0.2)

@@ -103,5 +103,7 @@ def test_every_service_is_documented_with_its_type() -> None:
         source = path.read_text(encoding="utf-8")
         for kind, name in re.findall(r'create_service\((\w+), "~/(\w+)"', source):
             found |= {(f"{node}/{name}", f"std_srvs/{kind}") for node in names}
+        for name in re.findall(r'self.offer\("~/(\w+)"', source):
+            found |= {(f"{node}/{name}", "std_srvs/Trigger") for node in names}
     assert len(found) >= 9
     assert documented == found
