@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+from xml.etree.ElementTree import fromstring
 
 import numpy as np
 import pytest
@@ -293,11 +294,12 @@ def test_meshes_that_only_the_bag_has_are_files_while_it_is_replayed(
         f"<mesh scale='2 2 2' filename='{name.replace('&', '&amp;')}'/>"
         for name in (elsewhere, f"file://{here}", lost, damaged)
     ]
+    text = f"<robot name='r'>{''.join(lines)}</robot>"
     path = tmp_path / "carried.mcap"
     with BagWriter(path) as writer:
         for name in ("/robot_description", "/robot_1/robot_description", "/stream"):
             topic = writer.add_topic(name, STRING, LATCHED)
-            writer.write(topic, string("".join(lines)), BEGAN, BEGAN)
+            writer.write(topic, string(text), BEGAN, BEGAN)
         for name, data in (
             (elsewhere, stl_of(tetrahedron)),
             (f"file://{here}", stl_of(tetrahedron)),
@@ -308,13 +310,15 @@ def test_meshes_that_only_the_bag_has_are_files_while_it_is_replayed(
     probe = harness.probe(dict.fromkeys(topics, String), latched=topics)
     replay: ReplayNode = harness.make(ReplayNode, {"bag": str(path), "hold": True})
     harness.spin_until(lambda: all(map(probe.count, topics)), "all are heard")
-    assert probe.last("/stream").data == "".join(lines), "another text stays"
+    assert probe.last("/stream").data == text, "another text stays"
     texts = {probe.last(topic).data for topic in topics[:2]}
     assert len(texts) == 1
-    first, *others = texts.pop().replace("/>", "/>\n").splitlines()
-    assert others == lines[1:], "what is here, is not in the bag, or is none keeps its name"
-    assert first.startswith("<mesh scale='2 2 2' filename='file:///")
-    file = mesh_file(first.split("'")[3])
+    first, *others = (mesh.attrib for mesh in fromstring(texts.pop()))
+    kept = [{"scale": "2 2 2", "filename": name} for name in (f"file://{here}", lost, damaged)]
+    assert others == kept, "what is here, is not in the bag, or is none keeps its name"
+    assert first["scale"] == "2 2 2"
+    assert first["filename"].startswith("file:///")
+    file = mesh_file(first["filename"])
     assert file is not None
     assert file.parent.stat().st_mode & 0o077 == 0, "a folder of this user's alone"
     found = read_mesh(file)
