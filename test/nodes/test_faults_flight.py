@@ -114,12 +114,12 @@ def test_a_goal_is_aborted_while_its_end_is_averaged(harness: Harness) -> None:
     flight = sliders(harness, averaging=2000)
     flight.send(*TURNED)
     flight.ticks(2000 + 14 * 20 + 10)
-    assert flight.states == ["idle", "executing"]
+    assert flight.states[-1] == "executing"
     client = flight.probe.create_client(Trigger, "planner/abort")
     assert harness.call(client, Trigger.Request()).success
     harness.spin_until(lambda: flight.states[-1] == "aborted", "the abortion")
     flight.ticks(2010)
-    assert flight.states == ["idle", "executing", "aborted"], "nothing is judged"
+    assert flight.states[-2:] == ["executing", "aborted"], "nothing is judged"
 
 
 # -- faults that the planner flies through ----------------------------------------------------
@@ -289,8 +289,8 @@ def test_a_thruster_that_stays_on_is_too_much_and_said(harness: Harness) -> None
         coordinated_control={**CONTROL, "time_limit": 8.0},
     )
     status = flight.fly(*THERE)
-    assert values_of(status)["state"] == "failed"
-    assert_one_sentence(status.message, "not reached")
+    assert values_of(status)["state"] == "aborted"
+    assert_one_sentence(status.message, "control is lost")
 
 
 @pytest.mark.slow
