@@ -61,7 +61,7 @@ def test_the_attitude_of_a_goal_that_is_sent_is_given_in_degrees(
 
 
 @pytest.mark.parametrize("command", ["plan", "run"])
-def test_the_attitude_of_a_scenario_is_given_in_degrees(
+def test_attitude_in_degrees_and_position_of_a_goal_reach_the_scenario(
     command: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -77,6 +77,9 @@ def test_the_attitude_of_a_scenario_is_given_in_degrees(
     call(command, "arm_attitude", "--goal-rpy-deg", *RPY)
     attitude = Rotation.from_quat(PlanningProblem.of(found[0]).goal.quaternion)
     assert (attitude.inv() * attitude_of_rpy()).magnitude() < 1e-12
+    call(command, "arm_attitude", "--goal-position", 0.5, -0.25, 1.0)
+    np.testing.assert_array_equal(found[1].goal.position, [0.5, -0.25, 1.0])
+    np.testing.assert_array_equal(found[1].goal.quaternion, scenario.goal.quaternion)
 
 
 HANDS = (

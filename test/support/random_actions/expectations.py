@@ -406,7 +406,8 @@ class Goals:
             if before is not None:
                 self._report(f"goal {goal_id} was {before} and is {state}: {sentence}")
             if state != "planning":
-                if self.pursued not in ("", goal_id):
+                # A controller pursues a goal of the base and one of the hand together.
+                if self.pursued not in ("", goal_id) and not self._repeats:
                     self.decided[self.pursued] = "replaced"
                 self.pursued = goal_id
         if state == "aborted" and not goal_id:
