@@ -49,3 +49,8 @@ def _warn_of_full_shared_memory() -> None:
 
 
 _warn_of_full_shared_memory()
+
+if os.environ.get("SPACEROBOT_PLUGINS"):
+    from spacerobot_ros.registry import import_plugins
+
+    import_plugins()

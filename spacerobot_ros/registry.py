@@ -17,7 +17,7 @@ import logging
 import os
 import sys
 from collections.abc import Iterable
-from functools import cache
+from contextlib import suppress
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from types import ModuleType
@@ -88,12 +88,14 @@ class Registry(dict[str, type[T]]):
         self._load_files()
 
     def _load_files(self) -> None:
-        for file in filter(None, os.environ.get(PLUGINS_VARIABLE, "").split(os.pathsep)):
-            module = _module_of(Path(file).resolve())
-            for entry in vars(module).values():
-                own = inspect.isclass(entry) and entry.__module__ == module.__name__
-                if own and issubclass(entry, self.base) and not inspect.isabstract(entry):
-                    self.register(entry)
+        for file in _plugin_files():
+            self._add_all_of(_module_of(file))
+
+    def _add_all_of(self, module: ModuleType) -> None:
+        for entry in list(vars(module).values()):
+            own = inspect.isclass(entry) and entry.__module__ == module.__name__
+            if own and issubclass(entry, self.base) and not inspect.isabstract(entry):
+                self.register(entry)
 
     def _usable_name(self, entry: Any) -> str:
         named = f"The {self.kind} '{getattr(entry, '__name__', entry)}'"
@@ -114,6 +116,22 @@ class Registry(dict[str, type[T]]):
         return name
 
 
+def import_plugins() -> None:
+    """Import the files in ``SPACEROBOT_PLUGINS`` before anything else of this package.
+
+    They may import all of it, which is half imported when a registry is. A file that cannot be
+    imported is named by the registries.
+    """
+    for file in _plugin_files():
+        with suppress(ParameterError):
+            _module_of(file)
+
+
+def _plugin_files() -> list[Path]:
+    given = os.environ.get(PLUGINS_VARIABLE, "").split(os.pathsep)
+    return [Path(file).resolve() for file in given if file]
+
+
 _LOADED: list[Registry[Any]] = []
 """Registries of this process, to which later plugins are added."""
 
@@ -127,8 +145,9 @@ def add_plugin(file: Path) -> None:
         The file cannot be imported, or a class in it is refused. Registries that are not imported
         yet raise the error when they are.
     """
-    files = [each for each in os.environ.get(PLUGINS_VARIABLE, "").split(os.pathsep) if each]
-    os.environ[PLUGINS_VARIABLE] = os.pathsep.join(dict.fromkeys([*files, str(file.resolve())]))
+    files = dict.fromkeys([*_plugin_files(), file.resolve()])
+    os.environ[PLUGINS_VARIABLE] = os.pathsep.join(map(str, files))
+    import_plugins()
     for registry in _LOADED:
         registry._load_files()
 
@@ -144,19 +163,26 @@ def _loaded(point: EntryPoint) -> Any:
         ) from error
 
 
-@cache
 def _module_of(file: Path) -> ModuleType:
-    """Import a file, once, under a name of its own, so that its objects can be pickled."""
+    """Import a file, once, under a name of its own, so that its objects can be pickled.
+
+    A file may import what loads a registry: that one finds the file half imported, and gets its
+    classes at the end.
+    """
     name = f"spacerobot_plugin_{file.stem}_{hashlib.sha256(str(file).encode()).hexdigest()[:8]}"
+    if name in sys.modules:
+        return sys.modules[name]
     spec = importlib.util.spec_from_file_location(name, file)
     if spec is None or spec.loader is None:
         raise ParameterError(f"The plugin '{file}' is no Python file: its name must end in .py.")
     module = sys.modules[name] = importlib.util.module_from_spec(spec)
     try:
         spec.loader.exec_module(module)
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         del sys.modules[name]
         raise ParameterError(
             f"The plugin '{file}' cannot be imported: {type(error).__name__}: {error}."
         ) from error
+    for registry in _LOADED:
+        registry._add_all_of(module)
     return module

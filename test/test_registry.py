@@ -15,11 +15,14 @@ import numpy as np
 import pytest
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
+from support.sentences import assert_one_sentence
 
+from spacerobot_ros import fly
+from spacerobot_ros.control import ControlState, Reference
 from spacerobot_ros.control.laws.numpy_law import NumpyLaw
 from spacerobot_ros.control.laws.registry import LAWS
 from spacerobot_ros.control.laws.transposed_jacobian import TransposedJacobianLaw
-from spacerobot_ros.errors import ParameterError
+from spacerobot_ros.errors import ParameterError, SpaceRobotError
 from spacerobot_ros.planning.methods.registry import METHODS
 from spacerobot_ros.registry import PLUGINS_VARIABLE, add_plugin
 
@@ -102,11 +105,8 @@ def test_a_plugin_flies_by_nodes_and_in_the_workers_of_a_campaign(tmp_path: Path
     plugin = ["--plugin", str(EXAMPLES / "own_control_law.py")]
     words = ["run", "coordinated_control", "--method", "soft"]
     by_loop = _run([*plugin, *words, "--bag", "loop.mcap"], tmp_path)
-    by_nodes = _run(
-        [*words, "--bag", "nodes.mcap", "--nodes"],
-        tmp_path,
-        SPACEROBOT_PLUGINS=str(EXAMPLES / "own_control_law.py"),
-    )
+    both = os.pathsep.join(str(EXAMPLES / f"{name}.py") for name in ("lqr_law", "own_control_law"))
+    by_nodes = _run([*words, "--bag", "nodes.mcap", "--nodes"], tmp_path, SPACEROBOT_PLUGINS=both)
     assert (by_loop.returncode, by_nodes.returncode) == (0, 0), by_nodes.stderr
     assert _last_pose(tmp_path / "loop.mcap") == _last_pose(tmp_path / "nodes.mcap")
 
@@ -194,3 +194,60 @@ def test_a_plugin_adds_what_it_defines_and_not_what_it_imports(tmp_path: Path) -
         str(EXAMPLES / "lqr_law.py"),
         str(EXAMPLES / "own_gait_method.py"),
     ]
+
+
+class _Told(NumpyLaw):
+    """A law that returns what it is told to."""
+
+    name = "told"
+    answer: Any = None
+
+    def compute(self, state: ControlState, reference: Reference) -> Any:
+        return self.answer
+
+
+@pytest.mark.usefixtures("plugins")
+@pytest.mark.parametrize(
+    "answer",
+    [
+        None,
+        (np.zeros(6), np.zeros(1)),
+        (np.zeros((6, 1)), np.zeros(2)),
+        (np.full(6, np.nan), np.zeros(2)),
+        (np.zeros(6), ["a", "b"]),
+        (np.zeros(6), [0.0, np.inf]),
+    ],
+)
+def test_a_law_that_returns_no_command_is_named(
+    answer: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(_Told, "answer", answer)
+    with pytest.raises(SpaceRobotError) as refused:
+        fly("planar_manipulator", (0.1, 0.0, 0.0), law=_Told)
+    assert_one_sentence(str(refused.value), "The law 'told' returned", "with 6 and 2 finite")
+
+
+@pytest.mark.usefixtures("plugins")
+def test_a_law_that_cannot_be_built_is_named() -> None:
+    class Narrow(_Told):
+        name = "narrow"
+
+        def __init__(self, robot: Any) -> None:
+            super().__init__(robot)  # type: ignore[call-arg]
+
+    with pytest.raises(SpaceRobotError, match="The control law 'narrow' cannot be built: TypeErr"):
+        fly("planar_manipulator", (0.1, 0.0, 0.0), law=Narrow)
+
+
+def test_a_node_names_a_plugin_that_is_not_there(tmp_path: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, EXAMPLES.parent / "scripts" / "coordinated_control"],
+        cwd=tmp_path,
+        env=os.environ | {PLUGINS_VARIABLE: "nowhere.py"},
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    assert done.returncode == 2
+    assert_one_sentence(done.stderr.strip(), f"The plugin '{tmp_path}/nowhere.py' cannot be")

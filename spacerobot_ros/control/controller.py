@@ -38,7 +38,7 @@ from spacerobot_ros.control.state import (
     Reference,
 )
 from spacerobot_ros.control.wheels import WheelControl
-from spacerobot_ros.errors import ParameterError
+from spacerobot_ros.errors import ParameterError, SpaceRobotError, describe_exception
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.grasp import Payload
 from spacerobot_ros.model.rotations import compose_poses, matrix_from_quaternion, relative_pose
@@ -283,13 +283,10 @@ class CoordinatedController:
             commanded = self._braking_command(q, qdot)
         else:
             if self.profile is None:
-                self.profile = StepReference(
-                    self._present_reference(time, state),
-                    self._present_reference(time, state),
-                    self._motion,
-                    carries=True,
-                )
+                here = self._present_reference(time, state)
+                self.profile = StepReference(here, here, self._motion, carries=True)
                 self._began = time
+                self.law.start(time, here, here)
             # The law is always evaluated, for its errors and status.
             self.law.time = time
             commanded = self.law.command(state, self._reference_at(time))
@@ -502,15 +499,23 @@ def build_controller(robot: SpaceRobot, config: ControllerConfig) -> Coordinated
     outputs = controlled_outputs(robot, config, law_type)
     if not thrust:
         _require_torque(outputs, robot, wheels)
-    return CoordinatedController(
-        law_type(
+    try:
+        law = law_type(
             robot,
             outputs,
             config.gains,
             config.options[config.law],
             thrust=thrust,
             control_period=config.control_period,
-        ),
+        )
+    except SpaceRobotError:
+        raise
+    except Exception as error:
+        raise ParameterError(
+            f"The control law '{config.law}' cannot be built: {describe_exception(error)}."
+        ) from error
+    return CoordinatedController(
+        law,
         ActuatorLimits(force, torque, robot.effort_limit),
         JointRateLimits(robot, config.joint_rates * robot.velocity_limit, config.control_period),
         PROFILES[config.profile],

@@ -8,6 +8,7 @@ from __future__ import annotations
 import sys
 from importlib import import_module
 
+from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.termination import Terminated, guarded
 
 
@@ -22,6 +23,9 @@ def run_module(name: str) -> int | None:
             return code
         except Terminated:
             return 0
+        except SpaceRobotError as error:  # Of a plugin, which is imported with the module.
+            print(error, file=sys.stderr)
+            return 2
 
 
 if __name__ == "__main__":

@@ -6,9 +6,11 @@ from abc import abstractmethod
 from typing import ClassVar
 
 import casadi as ca
+import numpy as np
 
 from spacerobot_ros.control.laws.law import ACCELERATION_GAINS, ControlLaw
 from spacerobot_ros.control.state import Actuation, ControlState, Reference
+from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.model.description import Array
 
 
@@ -52,7 +54,18 @@ class NumpyLaw(ControlLaw):
     def command(self, state: ControlState, reference: Reference) -> Actuation:
         """Return :meth:`compute`, after the errors of the outputs; see :class:`ControlLaw`."""
         super().command(state, reference)
-        return self.compute(state, reference)
+        given = self.compute(state, reference)
+        try:
+            wrench, tau = (np.array(each, dtype=float) for each in given)
+        except (TypeError, ValueError):
+            wrench = tau = np.empty(0)
+        sizes = wrench.shape, tau.shape
+        if sizes != ((6,), (self.robot.n,)) or not np.isfinite(np.concatenate([wrench, tau])).all():
+            raise SpaceRobotError(
+                f"The law '{self.name}' returned {given!r} at {self.time:g} s; it must return "
+                f"Actuation(wrench_B, tau) with 6 and {self.robot.n} finite numbers."
+            )
+        return Actuation(wrench, tau)
 
     def results(self, symbols: dict[str, ca.SX]) -> dict[str, ca.SX]:
         """Return no command: :meth:`compute` does."""

@@ -33,7 +33,6 @@ METHODS: Registry[GaitMethod] = Registry(
         AutoGait,
     ),
 )
-METHODS.load()
 
 
 def build_method(
@@ -83,3 +82,7 @@ def method_options(name: str, values: Mapping[str, Any]) -> Any:
         raise ParameterError(f"There is no gait method '{name}'; there are: {', '.join(METHODS)}.")
     require_known(name, METHODS[name].Options, values)
     return configured(METHODS[name].Options, values)
+
+
+# Last: a plugin may import this module.
+METHODS.load()
