@@ -171,7 +171,6 @@ class CoordinatedController:
     def _begin_motion(
         self, time: float, state: ControlState, start: Reference, goal: Reference, *, carries: bool
     ) -> None:
-        self.law.reset_integral()
         motion = self._motion.within_thruster_limits(self._limits, self.law.robot, state.q)
         if self.wheels is not None:
             motion = self.wheels.limits_with_wheels(motion, state.q)
