@@ -324,6 +324,8 @@ def goal_options(command: Callable[..., None]) -> Callable[..., None]:
         paths: Any = (),
         **options: Any,
     ) -> None:
+        if goal is not None and position is not None:
+            raise click.UsageError("The goal is given twice, as a pose and as a position.")
         hands = EndEffectorOptions(poses, positions, links, paths)
         command(*words, goal=GoalOptions(goal or position, rotvec, rpy_deg, hands), **options)
 

@@ -303,10 +303,15 @@ def test_a_goal_of_the_command_line_is_a_position_or_a_pose(words: list[str]) ->
     kept = load_scenario("sliding_masses").goal.quaternion
     assert np.linalg.norm(kept[:3]) > 0.1
     np.testing.assert_array_equal(goal.quaternion, kept if len(words) == 3 else [0, 0, 0, 1])
-    for wrong in (words[:2], [*words, "1"]):
+    twice = [*"1230001", "--goal-position", *"456"]
+    for wrong, told in (
+        (words[:2], "A goal is X Y Z, or"),
+        ([*words, "1"], "A goal is X Y Z, or" if len(words) == 3 else "unexpected extra"),
+        (twice, "The goal is given twice"),
+    ):
         refused = CliRunner().invoke(fly, ["sliding_masses", "--goal", *wrong])
         assert refused.exit_code == 2
-        assert "X Y Z" in refused.output or "unexpected extra" in refused.output
+        assert told in refused.output
 
 
 @pytest.mark.parametrize(
