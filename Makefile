@@ -186,7 +186,7 @@ $(STAMP)/venv:
 	@mkdir -p $(STAMP)
 	@touch $@
 
-$(STAMP)/demo: EXTRAS := jazzy,viewer,collision
+$(STAMP)/demo: EXTRAS := jazzy,viewer,collision,pytest
 $(STAMP)/test: EXTRAS := jazzy,test
 $(STAMP)/bench: EXTRAS := jazzy,campaign,bench
 $(STAMP)/docs: EXTRAS := jazzy,docs

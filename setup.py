@@ -146,6 +146,8 @@ setup(
             "setuptools",
             "types-PyYAML",
         ],
+        # What `make demo` adds for tests of your own nodes.
+        "pytest": ["pytest>=8"],
         "bench": ["psutil", "pytest>=8", "pytest-benchmark>=5"],
     },
 )

@@ -190,6 +190,12 @@ def test_nodes_that_are_run_one_by_one_fly_to_a_goal(
     assert terminals.complaints == [], terminals.said
     (bag,) = terminals.folder.glob("*.mcap")
     assert len(read_bag(bag)["/odom"]) > 10
+    if page == "README.md":
+        replay = "ros2 run spacerobot_ros replay --ros-args -p bag:=flight.mcap"
+        assert f"`{replay}`" in (ROOT / page).read_text("utf-8")
+        heard = probe.count("odom")
+        terminals.do(replay)
+        terminals.wait(lambda: probe.count("odom") > heard + 10, "the bag")
 
 
 def test_the_launch_file_starts_a_scenario(terminals: Terminals, probe: Probe) -> None:
@@ -206,7 +212,7 @@ def test_the_launch_file_starts_a_scenario(terminals: Terminals, probe: Probe) -
 
 
 def test_two_launches_fly_in_namespaces(terminals: Terminals, harness: Harness) -> None:
-    lines = commands("docs/operation.md", "namespace:=robot_1", "namespace:=robot_2")
+    lines = commands("docs/reference/operation.md", "namespace:=robot_1", "namespace:=robot_2")
     topics = {f"/{name}/odom": Odometry for name in ("robot_1", "robot_2")}
     status = {"/robot_1/planner/status": DiagnosticStatus}
     both = harness.probe({**topics, **status}, latched=tuple(status), name="both")
@@ -224,7 +230,7 @@ def test_two_launches_fly_in_namespaces(terminals: Terminals, harness: Harness) 
 def test_a_stack_without_the_ros_command_flies_in_a_namespace(
     terminals: Terminals, harness: Harness
 ) -> None:
-    lines = commands("docs/operation.md", "namespace:=robot_1", "namespace:=robot_2")
+    lines = commands("docs/reference/operation.md", "namespace:=robot_1", "namespace:=robot_2")
     for line in lines:
         if line.startswith("spacerobot"):
             terminals.do(line)
@@ -240,7 +246,7 @@ def test_parameters_are_set_between_two_lives(
     assert len(probe.last("joint_states").name) == 3
     # The command looks for the node for half a second, in which a busy machine does not find it.
     terminals.do("until ros2 param dump /plant; do :; done")
-    for line in commands("docs/operation.md", "ros2 lifecycle set", "ros2 param set"):
+    for line in commands("docs/reference/operation.md", "ros2 lifecycle set", "ros2 param set"):
         terminals.do(line)
     terminals.wait(lambda: len(probe.last("joint_states").name) == 6, "states of the other robot")
     assert set(terminals.interrupt().values()) <= {0, -signal.SIGINT}, terminals.said
@@ -253,7 +259,7 @@ def test_a_planner_is_run_beside_a_trajectory_controller(
 
     topic = "/joint_trajectory_controller/joint_trajectory"
     probe.watch(topic, JointTrajectory, latched=True)
-    (line,) = commands("docs/operation.md", "-r gait_schedule:=")
+    (line,) = commands("docs/reference/operation.md", "-r gait_schedule:=")
     terminals.do("ros2 run spacerobot_ros plant --ros-args -p robot:=sliding_masses")
     terminals.do(line)
     goals = probe.create_publisher(PoseStamped, "goal_pose", 10)
