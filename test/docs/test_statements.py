@@ -53,8 +53,7 @@ HELD_BY_TESTS = [
     ),
     (
         "docs/theory/wheels.md",
-        "one wheel is announced at 4.6 s with 6 s left, and at 8.4 s all are dumped, which takes "
-        "23 s",
+        "The warning comes at 4.6 s with 6 s left; the dump starts at 8.4 s and takes 23 s.",
         "session/test_scenario_flights.py::"
         "test_the_base_is_held_while_saturation_is_announced_and_momentum_dumped",
     ),
