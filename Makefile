@@ -151,6 +151,10 @@ figures: $(STAMP)/docs ## compute the numbers of the documents again: docs/figur
 	$(BIN)/python3 -m docs_build.figures
 	$(BIN)/python3 -m docs_build.singularities
 
+.PHONY: reference
+reference: $(STAMP)/docs ## write the references of parameters, topics and commands again: reference/
+	$(BIN)/python3 -m docs_build.clone
+
 .PHONY: animation
 animation: $(STAMP)/demo ## fly the satellite of the documents' first picture and draw it again: docs/images/turning.gif
 	$(BIN)/python3 -m docs_build.animation

@@ -16,6 +16,9 @@ from docs_build.blocks import Block, replace_blocks
 _characters: set[str] = set()
 """Of all equations of the site."""
 
+_IN_CLONE = re.compile(r"^> In the clone: .*\n\n", re.MULTILINE)
+"""A link to a file outside of the site, for readers of the repository."""
+
 _PLACEHOLDER = re.compile(r"\{\{ *(?P<kind>\w+)(?: +(?P<argument>[^{}]+?))? *\}\}")
 
 
@@ -60,7 +63,8 @@ def prepared(markdown: str) -> str:
     ValueError, KeyError
         A placeholder, a key of a number, or the mark of a block is unknown.
     """
-    return _PLACEHOLDER.sub(_replacement, replace_blocks(markdown, _drawn))
+    page = _IN_CLONE.sub("", markdown)
+    return _PLACEHOLDER.sub(_replacement, replace_blocks(page, _drawn))
 
 
 @cache

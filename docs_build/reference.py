@@ -59,7 +59,7 @@ def topics() -> str:
     for topic in TOPICS.values():
         names = [node if node != "user" else "you" for node in topic.publishers]
         latched = ", latched" if topic.latched else ""
-        condition = f" Where {topic.condition}." if topic.condition else ""
+        condition = f" If {topic.condition}." if topic.condition else ""
         rows.append(
             (
                 f"`{topic.name}`",
@@ -178,7 +178,7 @@ def _command(level: str, words: str, command: click.Command, parent: click.Conte
     rows = [
         (f"`{record[0]}`", record[1])
         for parameter in command.get_params(context)
-        if (record := parameter.get_help_record(context)) is not None
+        if (record := parameter.get_help_record(context)) is not None and record[1]
     ]
     parts = [
         f"{level} {words}",

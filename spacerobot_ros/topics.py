@@ -141,7 +141,7 @@ _TOPIC_TABLE = (
         "base_pose",
         _POSE_STAMPED_TYPE,
         _PUBLISHED_BY_PLANT,
-        "pose of the base link in the world: the truth, every `base_pose_period`",
+        "true pose of the base link in the world, every `base_pose_period`",
         state=(StateField("pose", "pose", _POSE_MEMBERS),),
         every_tick=False,
     ),
@@ -149,7 +149,7 @@ _TOPIC_TABLE = (
         "end_effector_pose",
         _POSE_STAMPED_TYPE,
         _PUBLISHED_BY_PLANT,
-        "pose of the link `end_effector_frame` in the world: the truth",
+        "true pose of the link `end_effector_frame` in the world",
         condition="the robot has that link",
         state=(StateField("pose", "end_effector_pose", _POSE_MEMBERS),),
     ),
@@ -157,8 +157,8 @@ _TOPIC_TABLE = (
         "end_effector/pose",
         _POSE_STAMPED_TYPE,
         _PUBLISHED_BY_PLANT,
-        "pose of the link in the world, as measured: of the base and the joints that `odom` and "
-        "`joint_states` carry; likewise `NAME/pose` of every link in the plant's `end_effectors`",
+        "measured pose of the link in the world, from `odom` and `joint_states`; also `NAME/pose` "
+        "of every link in the plant's `end_effectors`",
         condition="the plant's `end_effectors` list the link",
         state=(StateField("pose", "pose_of_end_effector", _POSE_MEMBERS),),
     ),
@@ -176,8 +176,7 @@ _TOPIC_TABLE = (
         "momentum_expected",
         _ARRAY_TYPE,
         _PUBLISHED_BY_PLANT,
-        "expected momenta: those of the beginning plus the impulses of thrusters, disturbances "
-        "and captures",
+        "initial momenta plus the impulses of thrusters, disturbances and captures",
         condition="actuation is effort, a disturbance acts, or there is a target",
         state=(StateField("data", "expected_momenta", array_entry_names=_MOMENTUM_LABELS),),
     ),
@@ -194,24 +193,24 @@ _TOPIC_TABLE = (
         "target/odom_true",
         _ODOMETRY_TYPE,
         _PUBLISHED_BY_PLANT,
-        "the truth beside what target/odom then measures",
-        condition="`target.sensors` err",
+        "true state of the target",
+        condition="`target.sensors` have errors",
         state=_odometry("true_target"),
     ),
     Topic(
         "odom_true",
         _ODOMETRY_TYPE,
         _PUBLISHED_BY_PLANT,
-        "the truth beside what odom then measures",
-        condition="the sensors err",
+        "true state of the base",
+        condition="the sensors have errors",
         state=_odometry("true"),
     ),
     Topic(
         "joint_states_true",
         _JOINT_STATE_TYPE,
         _PUBLISHED_BY_PLANT,
-        "the truth beside what joint_states then measures",
-        condition="the sensors err",
+        "true state of the joints",
+        condition="the sensors have errors",
         state=_joint_states("true"),
         frame="base",
     ),
@@ -227,7 +226,7 @@ _TOPIC_TABLE = (
         _JOINT_STATE_TYPE,
         _PUBLISHED_BY_PLANT,
         "measured positions and velocities of the joints, and the efforts of their actuators in "
-        "the last tick: of servos, those that their motion took",
+        "the last tick",
         state=_joint_states("measured"),
         frame="base",
     ),
@@ -235,7 +234,7 @@ _TOPIC_TABLE = (
         "base_wrench_realised",
         _WRENCH_STAMPED_TYPE,
         _PUBLISHED_BY_PLANT,
-        "mean wrench of the thrusters in the last tick, in answer to base_wrench",
+        "mean wrench of the thrusters in the last tick",
         condition="`thrusters` is set",
         state=(StateField("wrench", "thruster_wrench", _WRENCH_MEMBERS),),
         frame="base",
@@ -244,8 +243,8 @@ _TOPIC_TABLE = (
         "thrusters",
         _JOINT_STATE_TYPE,
         _PUBLISHED_BY_PLANT,
-        "of each thruster by name: position, for how long it was on since the beginning (s); "
-        "velocity, for what part of the last tick; effort, its mean force in it (N)",
+        "by name of the thruster: total on-time (position, s), part of the last tick (velocity), "
+        "mean force in it (effort, N)",
         condition="`thrusters` is set",
         state=(
             StateField("position", "thruster_on_time"),
@@ -259,16 +258,16 @@ _TOPIC_TABLE = (
         "/tf",
         _TRANSFORMS_TYPE,
         _PUBLISHED_BY_PLANT,
-        "base link in the world and links in their parents, as odom and joint_states have them, "
-        "every `tf_period`",
+        "base link in the world and links in their parents, from odom and joint_states, every "
+        "`tf_period`",
         condition="tf2_msgs is installed; in bags always",
     ),
     Topic(
         "/tf_static",
         _TRANSFORMS_TYPE,
         _PUBLISHED_BY_PLANT,
-        "the links that fixed joints hold in their parents",
-        condition="likewise, and the robot has such links",
+        "links on fixed joints in their parents",
+        condition="tf2_msgs is installed and the robot has such links; in bags always",
         latched=True,
     ),
     Topic(
@@ -296,16 +295,16 @@ _TOPIC_TABLE = (
         "/diagnostics",
         "diagnostic_msgs/msg/DiagnosticArray",
         ("plant", "planner", "coordinated_control", "recorder"),
-        "refused commands, limits, momentum, faults, deadlines; ignored states; silent nodes; what "
-        "was recorded and lost",
+        "refused commands, limits, momentum, faults, deadlines; ignored states; silent nodes; "
+        "recorded and lost messages",
     ),
     Topic(
         "clearance",
         _STATUS_TYPE,
         _PUBLISHED_BY_PLANT,
         "smallest distance between two links, every `clearance_period`: `time` (s), `distance` "
-        "(m; negative: the depth of a contact), and the links `first` and `second`; `second_is` is "
-        "`obstacle` where the second is one",
+        "(m; negative: penetration depth), and the links `first` and `second`; `second_is` is "
+        "`obstacle` if the second is one",
         condition="links of the robot could touch",
     ),
     Topic(
@@ -324,55 +323,55 @@ _TOPIC_TABLE = (
         "obstacles",
         _STRING_TYPE,
         _PUBLISHED_BY_USER,
-        "URDF of the obstacles that are fixed in the world from now on, in place of those so far, "
-        "for the planner, the plant and viewers; empty: there are none",
+        "URDF of all fixed obstacles, which replaces the earlier ones, for the planner, the plant "
+        "and viewers; empty: none",
         latched=True,
     ),
     Topic(
         "joint_commands",
         _JOINT_STATE_TYPE,
         ("planner", "coordinated_control"),
-        "velocities or efforts (by `actuation`), by joint name, stamped with the state that they "
-        "answer, of all joints in any order",
+        "velocities or efforts (by `actuation`) of all joints by name, with the stamp of their "
+        "state",
     ),
     Topic(
         "base_wrench",
         _WRENCH_STAMPED_TYPE,
         ("coordinated_control",),
-        "thruster force and torque wanted at the origin of the base link, in its frame",
+        "commanded thruster force and torque at the origin of the base link, in its frame",
     ),
     Topic(
-        "goal_pose", _POSE_STAMPED_TYPE, _PUBLISHED_BY_USER, "where the base is to be, in the world"
+        "goal_pose", _POSE_STAMPED_TYPE, _PUBLISHED_BY_USER, "goal pose of the base in the world"
     ),
     Topic(
         "goal_joint_states",
         _JOINT_STATE_TYPE,
         _PUBLISHED_BY_USER,
-        "the shape that later goals are to end in; without joints: any",
+        "final joint positions of later goals; without joints: any",
     ),
     Topic(
         "end_effector/goal_pose",
         _POSE_STAMPED_TYPE,
         _PUBLISHED_BY_USER,
-        "where the end-effector is to be, in the world; likewise `NAME/goal_pose` of links in the "
-        "planner's `end_effectors`. To the planner an orientation of zeros means any "
-        "attitude, and goals with one stamp, of the base too, are one goal",
+        "goal pose of the end-effector in the world; also `NAME/goal_pose` of links in the "
+        "planner's `end_effectors`. For the planner an orientation of zeros means any attitude, "
+        "and poses with one stamp, also of the base, are one goal",
     ),
     Topic(
         "end_effector/twist",
         _TWIST_STAMPED_TYPE,
         _PUBLISHED_BY_USER,
-        "twist that the end-effector is to have, in the frame of its header: the world, the base "
-        "link or the end-effector; likewise `NAME/twist` of links in the planner's "
-        "`end_effectors`. The joints brake when none comes for `twist_timeout`",
+        "commanded twist of the end-effector in the frame of its header: the world, the base link "
+        "or the end-effector; also `NAME/twist` of links in the planner's `end_effectors`. The "
+        "joints brake if none arrives for `twist_timeout`",
     ),
     Topic(
         "end_effector/path",
         _PATH_TYPE,
         _PUBLISHED_BY_USER,
-        "path for the end-effector in the world, straight from pose to pose, with the base free: a "
-        "goal, at its last pose; likewise `NAME/path` of links in the planner's `end_effectors`. "
-        "Orientations of zeros in all poses mean any attitude",
+        "path of the end-effector in the world, straight from pose to pose, to the goal at its "
+        "last pose, with the base free; also `NAME/path` of links in the planner's "
+        "`end_effectors`. Orientations of zeros in all poses mean any attitude",
     ),
     Topic(
         "joint_reference",
@@ -398,38 +397,37 @@ _TOPIC_TABLE = (
         "planned_path",
         _PATH_TYPE,
         ("planner",),
-        "the path of the base that the schedule predicts",
+        "predicted path of the base",
         latched=True,
     ),
     Topic(
         "plant/status",
         _STATUS_TYPE,
         ("plant",),
-        "state of the plant, why, the injected faults that are active, and the `payload` that the "
-        "robot holds: at once on every change; `state` is inactive, running, resting, paused, "
-        "latched or failed",
+        "state of the plant, reason, active injected faults, and the held `payload`, on every "
+        "change; `state` is inactive, running, resting, paused, latched or failed",
         latched=True,
     ),
     Topic(
         "planner/status",
         _STATUS_TYPE,
         ("planner",),
-        "state of the planner, why, its goal and the remaining error",
+        "state of the planner, reason, goal and remaining error",
         latched=True,
     ),
     Topic(
         "controller/status",
         _STATUS_TYPE,
         ("coordinated_control",),
-        "state of the controller, why, its goal, when it is to be reached (`ends_at_s`), "
-        "errors, and what saturation cost",
+        "state of the controller, reason, goal, expected arrival (`ends_at_s`), errors, and "
+        "losses by saturation",
         latched=True,
     ),
     Topic(
         "replay/status",
         _STATUS_TYPE,
         ("replay",),
-        "where a replay is: `state` is playing, paused or ended, `position_s` and `duration_s` "
+        "position of a replay: `state` is playing, paused or ended, `position_s` and `duration_s` "
         "from its beginning, `rate`; on every change, and five times a second",
         condition="a bag is replayed",
         latched=True,
@@ -438,7 +436,7 @@ _TOPIC_TABLE = (
         "replay/seek",
         "std_msgs/msg/Float64",
         _PUBLISHED_BY_USER,
-        "where a replay is to go on, s from its beginning",
+        "time at which a replay continues, s from its beginning",
         condition="a bag is replayed",
     ),
     Topic(
@@ -452,8 +450,8 @@ _TOPIC_TABLE = (
         "heartbeat",
         _STATUS_TYPE,
         ("plant", "planner", "coordinated_control", "recorder", "replay"),
-        "five times a second of wall time from every active node: `name`, `hardware_id` (what "
-        "others depend on it for), `message` (active, busy or inactive); in bags only on request",
+        "five times a second of wall time from every active node: `name`, `hardware_id` (its "
+        "role), `message` (active, busy or inactive); in bags only on request",
     ),
 )
 

@@ -30,13 +30,12 @@ class RecorderConfig(WatchdogConfig):
     )
     tf_period: float = parameter(
         0.1,
-        "bag time between transforms of all links, which the recorder writes where no node "
-        "publishes /tf; 0: none",
+        "bag time between transforms that the recorder writes if no node publishes /tf; 0: none",
         unit="s",
         minimum=0.0,
     )
     flush_period: float = parameter(
-        0.5, "longest wall time of messages that a killed recorder loses", unit="s", minimum=0.01
+        0.5, "longest wall time of messages that a killed recorder can lose", unit="s", minimum=0.01
     )
     max_size: float = parameter(
         0.0,
@@ -68,7 +67,5 @@ class ReplayConfig:
         maximum=10000.0,
     )
     paused: bool = parameter(False, "begin paused")
-    hold: bool = parameter(
-        False, "stand still at the end, for a viewer that goes back in time, instead of ending"
-    )
+    hold: bool = parameter(False, "pause at the end instead of ending")
     wait: float = parameter(3.0, "longest wall time to wait for readers", unit="s", minimum=0.0)

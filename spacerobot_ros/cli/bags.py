@@ -153,7 +153,7 @@ def figures_command(
     default=3.0,
     show_default=True,
     type=NumberRange(min=0.0),
-    help="Longest wait for readers (s).",
+    help="Longest wait for subscribers (s).",
 )
 def replay_command(
     bag: Path, topics: tuple[str, ...], remap: tuple[str, ...], view: bool, **options: Any
@@ -239,7 +239,7 @@ def salvage_command(bag: Path, out: Path | None) -> None:
 @click.option(
     "--engine",
     type=click.Choice(["mujoco"]),
-    help="Have this engine fly the commands, too, and compare its states.",
+    help="Also replay the commands in this engine, and compare its states.",
 )
 def verify_command(bag: Path, tolerance: float, engine: str | None) -> None:
     """Re-simulate a BAG from its commands, and compare the states.

@@ -57,7 +57,7 @@ def campaign_command() -> None:
     "--scheduler",
     default="",
     metavar="tcp://HOST:PORT",
-    help="Address of a dask scheduler, whose workers fly.",
+    help="Address of a dask scheduler whose workers fly.",
 )
 @out_option("Folder of the results [out/NAME].")
 @report_option("Report to write [OUT/report.html].")
@@ -80,7 +80,7 @@ def fly(
 ) -> None:
     """Fly the campaign of FILE and write its dataset and report.
 
-    Such a FILE, of 20 flights whose masses and goals differ:
+    A FILE of 20 flights with dispersed masses and goals:
 
     \b
       campaign:

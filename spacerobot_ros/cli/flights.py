@@ -72,7 +72,7 @@ if TYPE_CHECKING:
     "--processes",
     "nodes",
     is_flag=True,
-    help="Fly by the ROS 2 nodes, each in a process of its own.",
+    help="Fly by the ROS 2 nodes, one process each.",
 )
 @view_option
 def run_command(
@@ -290,8 +290,7 @@ def _published_lines(scenario: Scenario, summary: dict[str, Any]) -> list[str]:
     default=3,
     show_default=True,
     type=click.IntRange(min=0),
-    help="How often a minute planner, controller and viewer are started again when they die; "
-    "0: never.",
+    help="Restarts per minute of planner, controller and viewer if they die; 0: never.",
 )
 @click.option(
     "--namespace", default="", help="Namespace of all nodes and topics, also of /clock and /tf."

@@ -113,7 +113,7 @@ settings_option = click.option(
     help="Set a parameter of a node. May be repeated.",
 )
 view_option = click.option(
-    "--view", is_flag=True, help="Serve a page on which the robot is watched and steered."
+    "--view", is_flag=True, help="Serve a web page for watching and steering the robot."
 )
 
 
@@ -165,7 +165,7 @@ def _attitude_options(*prefixes: str) -> Callable[..., Any]:
         nargs=3,
         type=float,
         metavar="ROLL PITCH YAW",
-        help="Attitude of the goal by turns about the fixed axes x, y, z in this order (deg).",
+        help="Attitude of the goal by rotations about the fixed axes x, y, z in this order (deg).",
     )
     return lambda command: rotvec(rpy_deg(command))
 
@@ -341,8 +341,8 @@ def end_effector_options(command: Callable[..., None]) -> Callable[..., None]:
             "links",
             multiple=True,
             metavar="NAME",
-            help="Link of a goal of an end-effector [end_effector]. May be repeated: in the order "
-            "of the poses, then of the positions, then of the paths.",
+            help="Link of a goal of an end-effector [end_effector]. May be repeated, in the order "
+            "poses, positions, paths.",
         ),
         click.option(
             "--end-effector-path",
@@ -350,8 +350,8 @@ def end_effector_options(command: Callable[..., None]) -> Callable[..., None]:
             type=PATH,
             multiple=True,
             metavar="FILE",
-            help="Path of an end-effector, which the method resolved_rate follows: a text file "
-            "with a position X Y Z (m) or a pose X Y Z QX QY QZ QW in each line. May be repeated.",
+            help="Path of an end-effector for the method resolved_rate: a text file with a "
+            "position X Y Z (m) or a pose X Y Z QX QY QZ QW in each line. May be repeated.",
         ),
         click.option(
             "--end-effector-position",
@@ -360,7 +360,7 @@ def end_effector_options(command: Callable[..., None]) -> Callable[..., None]:
             type=float,
             multiple=True,
             metavar="X Y Z",
-            help="Goal position of an end-effector (m), in any attitude. May be repeated.",
+            help="Goal position of an end-effector (m) with any attitude. May be repeated.",
         ),
         click.option(
             "--end-effector-goal",
@@ -369,8 +369,8 @@ def end_effector_options(command: Callable[..., None]) -> Callable[..., None]:
             type=float,
             multiple=True,
             metavar="X Y Z QX QY QZ QW",
-            help="Goal pose of an end-effector (m, quaternion), with the base where it ends, but "
-            "for the goal of the base that is given. May be repeated.",
+            help="Goal pose of an end-effector (m, quaternion); the base is free unless its goal "
+            "is given. May be repeated.",
         ),
     ):
         command = option(command)

@@ -49,8 +49,8 @@ _MAX_LISTED_INTERVALS = 4
     help="Link whose workspaces are computed [end_effector].",
 )
 @picture_option(
-    "Picture of the curvature (.png, .svg, .pdf) [out/ROBOT_curvature.png]. That of the "
-    "workspaces is beside it, its name ends in _workspaces."
+    "Picture of the curvature (.png, .svg, .pdf) [out/ROBOT_curvature.png]. The picture of the "
+    "workspaces has _workspaces in its name."
 )
 @json_option("Write the findings as JSON.")
 def analyze_command(
@@ -354,11 +354,11 @@ def _distance_lines(found: Analysis) -> list[str]:
 @click.option(
     "--nearest-inertia",
     is_flag=True,
-    help="Write NAME_possible.urdf beside the scenario, in which impossible inertias are the "
-    "nearest possible ones, and go on with it.",
+    help="Replace impossible inertias by the nearest possible ones in NAME_possible.urdf, and "
+    "continue with it.",
 )
 def new_command(robot: str, out: Path | None, nearest_inertia: bool) -> None:
-    """Check a robot of your own, plan a first turn, write a scenario.
+    """Check your robot, plan a first rotation, and write a scenario.
 
     URDF is a URDF or xacro file, or the name of a robot. A robot without joints flies by thrusters.
     Exit code 0: a scenario that reaches its goal is written; 1: no method reaches one; 2: the robot

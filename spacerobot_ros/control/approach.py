@@ -60,7 +60,7 @@ _ARM_RATE_SHARE = 0.9
 class ApproachOptions:
     """Where and how an end-effector approaches a target."""
 
-    grapple_frame: str = parameter("grapple", "link of the target that the end-effector is to meet")
+    grapple_frame: str = parameter("grapple", "link of the target that the end-effector meets")
     standoff: tuple[float, ...] = parameter(
         (-0.3, 0.0, 0.0),
         "position of the end-effector in the grapple frame before it closes in, along the axis of "
@@ -80,15 +80,15 @@ class ApproachOptions:
         minimum=1e-4,
     )
     horizon: float = parameter(
-        120.0, "time within which the robot has to set out", unit="s", minimum=0.0, maximum=3600.0
+        120.0, "time within which the approach must start", unit="s", minimum=0.0, maximum=3600.0
     )
     patience: float = parameter(
-        3.0, "time at contact within which the target has to be captured", unit="s", minimum=0.0
+        3.0, "time at contact within which the target must be captured", unit="s", minimum=0.0
     )
     clearance: float = parameter(
         0.02,
-        "smallest distance of base and arm from the body of the target on the way; of the "
-        "end-effector's own body up to the standoff; 0: the body is not looked at",
+        "smallest distance of base and arm from the target during the approach, and of the "
+        "end-effector's body up to the standoff; 0 disables the checks",
         unit="m",
         minimum=0.0,
         maximum=100.0,

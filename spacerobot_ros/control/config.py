@@ -24,13 +24,13 @@ class ErrorMargin:
 
     position: float = parameter(
         1.0,
-        "a goal is aborted when position errors exceed twice its distance by more; 0: never",
+        "abort a goal if a position error exceeds twice its distance by more than this; 0: never",
         unit="m",
         minimum=0.0,
     )
     attitude: float = parameter(
         1.0,
-        "a goal is aborted when attitude errors exceed twice its turn by more; 0: never",
+        "abort a goal if an attitude error exceeds twice its angle by more than this; 0: never",
         unit="rad",
         minimum=0.0,
     )
@@ -46,19 +46,19 @@ class ControllerConfig(CommanderConfig):
 
     law: str = parameter("transposed_jacobian", "control law", choices=LAWS)
     end_effector_frame: str = parameter(
-        "", "link of the end-effector; '': 'end_effector', if there is one"
+        "", "link of the end-effector; '': 'end_effector', if it exists"
     )
     base_outputs: str = parameter(
         "", "axes of the base that are outputs: x y z rx ry rz; all three '': by the robot"
     )
     end_effector_outputs: str = parameter("", "axes of the end-effector that are outputs")
     joint_outputs: str = parameter("", "joints that are outputs")
-    profile: str = parameter("quintic", "how references move to goals", choices=tuple(PROFILES))
+    profile: str = parameter("quintic", "profile of references to goals", choices=tuple(PROFILES))
     motion: MotionLimits = group(MotionLimits())
     use_thrusters: bool = parameter(
         True,
-        "whether the base has thrusters; false: reaction wheels alone turn it, and its position is "
-        "not controlled",
+        "whether the base has thrusters; false: only reaction wheels rotate it, and its position "
+        "is not controlled",
     )
     max_force: float = parameter(
         0.0, "largest force of the thrusters; 0: no limit", unit="N", minimum=0.0
@@ -68,7 +68,7 @@ class ControllerConfig(CommanderConfig):
     )
     joint_rates: float = parameter(
         1.0,
-        "share of the joint rates of the URDF that joint efforts keep joints within; 0: no limit",
+        "limit of the joint rates, as a share of the URDF's; 0: no limit",
         minimum=0.0,
         maximum=1000.0,
     )
@@ -77,8 +77,8 @@ class ControllerConfig(CommanderConfig):
     )
     reference_timeout: float = parameter(
         1.0,
-        "time for which states wait for a silent publisher of joint_reference or base_reference, "
-        "simulated, and while time stands still of the wall; 0: for ever",
+        "time that states wait for a silent publisher of joint_reference or base_reference, "
+        "simulated or, in lockstep, wall time; 0: forever",
         unit="s",
         minimum=0.0,
     )
@@ -91,8 +91,7 @@ class ControllerConfig(CommanderConfig):
     )
     time_limit: float = parameter(
         0.0,
-        "time after which a goal that is not reached has failed; 0: 300 s after the end of its "
-        "reference",
+        "time after which an unreached goal fails; 0: 300 s after the end of its reference",
         unit="s",
         minimum=0.0,
     )
@@ -103,8 +102,8 @@ class ControllerConfig(CommanderConfig):
     )
     tasks: str = parameter(
         "",
-        "what is done before a goal is pursued, in this order, separated by spaces: 'approach' of "
-        "the target until it is captured, 'detumble' the robot that holds it; '': nothing",
+        "tasks before a goal, in this order, separated by spaces: 'approach' the target until it "
+        "is captured, 'detumble' the robot that holds it; '': none",
     )
     target: ApproachOptions = group(ApproachOptions())
     detumble: DetumbleOptions = group(DetumbleOptions())

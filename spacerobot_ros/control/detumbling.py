@@ -38,7 +38,7 @@ class DetumbleOptions:
     speed: float = parameter(
         0.002, "largest speed of the centre of mass at rest", unit="m/s", minimum=1e-9
     )
-    settle_time: float = parameter(1.0, "time for which it is to be at rest", unit="s", minimum=0.0)
+    settle_time: float = parameter(1.0, "time at rest", unit="s", minimum=0.0)
 
 
 def shortest_detumbling(momentum: float, torque: float) -> float:

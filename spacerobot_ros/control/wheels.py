@@ -61,18 +61,18 @@ class WheelOptions:
 
     warning_rate: float = parameter(
         0.9,
-        "share of a wheel's largest rate at which an event announces its saturation",
+        "share of a wheel's largest rate at which an event warns of saturation",
         minimum=0.01,
         maximum=1.0,
     )
     dump_rate: float = parameter(
         0.0,
-        "share of a wheel's largest rate at which the momentum of the wheels is dumped to the "
-        "thrusters; 0: on request alone",
+        "share of a wheel's largest rate at which the momentum of the wheels is dumped; 0: on "
+        "request only",
         minimum=0.0,
         maximum=1.0,
     )
-    excluded: str = parameter("", "joints of wheels out of use, separated by spaces")
+    excluded: str = parameter("", "joints of disabled wheels, separated by spaces")
 
 
 class WheelAllocation:

@@ -46,9 +46,7 @@ class RobotConfig:
     robot: str = parameter(
         "", "URDF file, or the name of a robot of this package (sliding_masses, ...)"
     )
-    world: str = parameter(
-        "", "URDF file of obstacles that are fixed in the world; '': those that the robot carries"
-    )
+    world: str = parameter("", "URDF file of fixed obstacles; '': those in the robot's description")
 
     def described(self, robot: RobotDescription) -> RobotDescription:
         """Return the robot with the obstacles and disabled pairs of this configuration.
@@ -131,8 +129,7 @@ class WatchdogConfig:
 
     watchdog_timeout: float = parameter(
         0.8,
-        "wall time without a heartbeat after which a node that this one depends on is silent; 0: "
-        "never",
+        "wall time without a heartbeat after which a required node counts as silent; 0: never",
         unit="s",
         minimum=0.0,
     )
@@ -144,8 +141,7 @@ class CommanderConfig(WatchdogConfig, AssumedRobotConfig):
 
     tick_rate: float = parameter(
         0.0,
-        "commands per second; 0: that of the plant, from its status or from the stamps of its "
-        "states",
+        "commands per second; 0: the plant's rate",
         unit="Hz",
         minimum=0.0,
         maximum=100000.0,
@@ -153,8 +149,8 @@ class CommanderConfig(WatchdogConfig, AssumedRobotConfig):
     world_frame: str = parameter("world", "frame of goals that name no known frame")
     state_reliability: str = parameter(
         "auto",
-        "how odom and joint_states are subscribed: best_effort receives from every publisher, "
-        "reliable loses no message of a reliable publisher; auto: reliable, until one offers less",
+        "reliability of the subscriptions to odom and joint_states; auto: reliable, or best "
+        "effort if a publisher offers no more",
         choices=("auto", "reliable", "best_effort"),
     )
     diagnostics_period: float = parameter(
@@ -166,35 +162,35 @@ class CommanderConfig(WatchdogConfig, AssumedRobotConfig):
     )
     position_tolerance: float = parameter(
         0.0,
-        "largest position error at a goal that is reached; 0: a thousandth of the diameter of "
-        "gyration of the robot",
+        "largest position error of a reached goal; 0: a thousandth of the robot's diameter of "
+        "gyration",
         unit="m",
         minimum=0.0,
         read_only=False,
     )
     attitude_tolerance: float = parameter(
         0.001,
-        "largest attitude error at a goal that is reached",
+        "largest attitude error of a reached goal",
         unit="rad",
         minimum=0.0,
         read_only=False,
     )
     joint_tolerance: float = parameter(
         0.001,
-        "largest error of a joint at a goal that is reached",
+        "largest joint error of a reached goal",
         unit="m or rad",
         minimum=0.0,
         read_only=False,
     )
     resume_file: str = parameter(
-        "", "file of the present goals, from which a node that is restarted resumes; '': none"
+        "", "file of the present goals, from which a restarted node resumes; '': none"
     )
     stop_when_decided: bool = parameter(
-        False, "answer no states once a goal is decided: a lockstep plant stays at that tick"
+        False, "send no commands after a goal is decided: a lockstep plant stays at that tick"
     )
     watchdog_action: str = parameter(
         "report",
-        "reaction to a silent plant: report alone, or abort too",
+        "reaction to a silent plant: report only, or also abort",
         choices=("report", "abort"),
     )
 

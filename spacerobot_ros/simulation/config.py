@@ -95,7 +95,7 @@ class TargetSensorConfig:
         0.0, "likewise", unit="rad/s", minimum=0.0, maximum=_MAX_SENSOR_ERROR
     )
     position_bias: tuple[float, ...] = _bias_parameter(
-        (0.0, 0.0, 0.0), "of target/odom, in the frame of the root link, with which it turns", "m"
+        (0.0, 0.0, 0.0), "of target/odom, in the rotating frame of the root link", "m"
     )
     attitude_bias: tuple[float, ...] = _bias_parameter(
         (0.0, 0.0, 0.0), "likewise, a rotation vector", "rad"
@@ -123,13 +123,13 @@ class TargetSensorConfig:
 class TargetConfig:
     """A body that floats beside the robot: its URDF, its grapple frame and its initial state."""
 
-    robot: str = parameter("", "URDF file of the target, whose joints are held; '': no target")
+    robot: str = parameter("", "URDF file of the target, whose joints are locked; '': no target")
     robot_description: str = parameter(
         "", "URDF text of the target; takes precedence over 'target.robot'"
     )
     joint_positions: tuple[float, ...] = parameter(
         (),
-        "at which the joints of the target are held, by joint order of its URDF; []: zero",
+        "locked joint positions of the target, by joint order of its URDF; []: zero",
         unit="m or rad",
         minimum=-_MAX_INITIAL_VALUE,
         maximum=_MAX_INITIAL_VALUE,
@@ -137,7 +137,7 @@ class TargetConfig:
     grapple_frame: str = parameter("grapple", "link of the target at which it is captured")
     position: tuple[float, ...] = parameter(
         (0.0, 0.0, 0.0),
-        "root link of the target in the world at the beginning",
+        "initial position of the target's root link in the world",
         unit="m",
         minimum=-_MAX_INITIAL_VALUE,
         maximum=_MAX_INITIAL_VALUE,
@@ -177,8 +177,8 @@ class CaptureConfig:
 
     mode: str = parameter(
         "manual",
-        "whether the service ~/capture captures the target, or the plant by itself as soon as it "
-        "can",
+        "manual: the service ~/capture captures the target; automatic: the plant does as soon as "
+        "possible",
         choices=("manual", "automatic"),
     )
     end_effector: str = parameter(
@@ -215,7 +215,11 @@ class OrbitConfig:
         maximum=_MAX_INITIAL_VALUE,
     )
     mean_motion: float = parameter(
-        0.0, "of the orbit, instead of altitude", unit="rad/s", minimum=0.0, maximum=100.0
+        0.0,
+        "mean motion of the orbit, instead of altitude",
+        unit="rad/s",
+        minimum=0.0,
+        maximum=100.0,
     )
     orientation: tuple[float, ...] = parameter(
         (0.0, 0.0, 0.0, 1.0),
@@ -229,9 +233,7 @@ class OrbitConfig:
 class TableConfig:
     """A table with air bearings, in the x-y plane of the world, for planar robots."""
 
-    tilt: float = parameter(
-        0.0, "angle by which the table is off level", unit="rad", minimum=0.0, maximum=1.5707963
-    )
+    tilt: float = parameter(0.0, "tilt of the table", unit="rad", minimum=0.0, maximum=1.5707963)
     direction: float = parameter(
         0.0,
         "direction downhill in the x-y plane, from x",
@@ -257,16 +259,20 @@ class PlantConfig(WatchdogConfig, RobotConfig):
 
     actuation: str = parameter(
         "auto",
-        "what joint_commands carry; auto: what the first command carries that moves anything",
+        "type of joint_commands; auto: that of the first command that moves anything",
         choices=("auto", "velocity", "effort"),
     )
     engine: str = parameter(
         "exact",
-        "integrates the motion: the package's own equations, where bodies pass through each other, "
-        "or MuJoCo, where they push each other",
+        "integrator of the motion: the package's equations, without contacts, or MuJoCo, with "
+        "contacts",
         choices=("exact", "mujoco"),
     )
-    time_mode: str = parameter("realtime", "who drives time", choices=("realtime", "lockstep"))
+    time_mode: str = parameter(
+        "realtime",
+        "driver of time: the commands or the wall clock",
+        choices=("realtime", "lockstep"),
+    )
     tick_rate: float = parameter(
         DEFAULT_TICK_RATE,
         "ticks a second of simulated time",
@@ -289,7 +295,7 @@ class PlantConfig(WatchdogConfig, RobotConfig):
     )
     second_commander: str = parameter(
         "refuse",
-        "realtime: a second answer to one state while several nodes publish commands",
+        "realtime: a second command for one state while several nodes publish commands",
         choices=("refuse", "accept"),
     )
     latched_faults: str = parameter(
@@ -300,7 +306,7 @@ class PlantConfig(WatchdogConfig, RobotConfig):
     )
     watchdog_action: str = parameter(
         "report",
-        "reaction to a silent commander: report alone, or latch a fault too",
+        "reaction to a silent commander: report only, or also latch a fault",
         choices=("report", "latch"),
     )
     integration_step: float = parameter(
@@ -311,7 +317,7 @@ class PlantConfig(WatchdogConfig, RobotConfig):
         maximum=_MAX_INITIAL_VALUE,
     )
     thrusters: str = parameter("", "'urdf': those of the robot's URDF; a YAML file; '': any wrench")
-    thrusters_excluded: str = parameter("", "names of thrusters out of use, separated by spaces")
+    thrusters_excluded: str = parameter("", "names of disabled thrusters, separated by spaces")
     world_frame: str = parameter("world", "name of the inertial frame")
     end_effector_frame: str = parameter("", "link of end_effector_pose; '': 'end_effector', if any")
     end_effectors: tuple[str, ...] = parameter(
@@ -339,12 +345,13 @@ class PlantConfig(WatchdogConfig, RobotConfig):
         maximum=_MAX_INITIAL_VALUE,
     )
     tf_links: bool = parameter(
-        True, "whether all links are on /tf; false: the base alone, beside robot_state_publisher"
+        True,
+        "whether all links are on /tf; false: the base only, for use with robot_state_publisher",
     )
     frame_prefix: str = parameter(
         "",
-        "before the names of the robot's frames, such as 'robot_1/'; not of world_frame. '': none, "
-        "or 'robot/' if a link is called world_frame",
+        "prefix of the robot's frames, such as 'robot_1/', but not of world_frame. '': none, or "
+        "'robot/' if a link has the name of world_frame",
     )
     diagnostics_period: float = parameter(
         1.0,
@@ -363,7 +370,7 @@ class PlantConfig(WatchdogConfig, RobotConfig):
         maximum=_MAX_INITIAL_VALUE,
     )
     resume_bag: str = parameter(
-        "", "bag from whose last state and time to go on; '': the initial state"
+        "", "bag from whose last state and time to continue; '': the initial state"
     )
     initial_position: tuple[float, ...] = parameter(
         (0.0, 0.0, 0.0),
@@ -421,7 +428,7 @@ class PlantConfig(WatchdogConfig, RobotConfig):
     )
     disturbances: tuple[str, ...] = parameter(
         (),
-        "wrenches on links from outside, e.g. 'hand force 1 0 0 in world at 10 until 50'; see "
+        "external wrenches on links, e.g. 'hand force 1 0 0 in world at 10 until 50'; see "
         "docs/disturbances.md",
         texts=True,
     )

@@ -42,7 +42,7 @@ class ViewerConfig(WatchdogConfig):
     )
     host: str = parameter(
         "127.0.0.1",
-        "address that the page is served at; any other one lets other machines steer the robot",
+        "address of the page; any address but the default lets other machines steer the robot",
     )
     port: int = parameter(
         8080,
@@ -51,12 +51,12 @@ class ViewerConfig(WatchdogConfig):
         maximum=65535,
     )
     update_rate: float = parameter(
-        20.0, "how often the page is drawn, wall time", unit="Hz", minimum=1.0, maximum=60.0
+        20.0, "updates of the page per second of wall time", unit="Hz", minimum=1.0, maximum=60.0
     )
     dark: bool = parameter(True, "whether pages are dark when they are opened")
     world_frame: str = parameter("world", "frame of the goals that the page sends")
     check_goals: bool = parameter(
-        True, "plan for the goal that is shown, to tell whether it is reachable before it is sent"
+        True, "plan the shown goal to check whether it is reachable before it is sent"
     )
 
 

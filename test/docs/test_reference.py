@@ -7,7 +7,7 @@ import re
 import click
 import pytest
 
-from docs_build import reference
+from docs_build import clone, reference
 from docs_build.hooks import prepared
 from spacerobot_ros.cli.main import COMMANDS, main
 from spacerobot_ros.nodes import (
@@ -78,6 +78,11 @@ def test_every_command_and_option_is_documented() -> None:
         for parameter in command.params:
             for option in (*parameter.opts, *parameter.secondary_opts):
                 assert option in sections[words] or parameter.human_readable_name in sections[words]
+
+
+@pytest.mark.parametrize("name", clone.references())
+def test_the_references_in_the_clone_are_those_of_make_reference(name: str) -> None:
+    assert (clone.FOLDER / name).read_text("utf-8") == clone.references()[name]
 
 
 def test_every_topic_is_documented() -> None:

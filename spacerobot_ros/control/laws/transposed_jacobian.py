@@ -19,7 +19,7 @@ class TransposedJacobianOptions(LawOptions):
 
     joint_damping: float = parameter(
         0.0,
-        "viscous friction imitated by the joint efforts; damps motion that moves no output",
+        "viscous friction by joint efforts; damps motion that moves no output",
         unit="N m s/rad",
         minimum=0.0,
         maximum=1000000000.0,

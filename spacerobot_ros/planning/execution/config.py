@@ -29,7 +29,7 @@ class PlannerConfig(CommanderConfig):
     )
     end_effectors: tuple[str, ...] = parameter(
         (),
-        "links that take goals on NAME/goal_pose and paths on NAME/path, beside those of the link "
+        "links with goals on NAME/goal_pose and paths on NAME/path, in addition to the link "
         "end_effector",
         texts=True,
     )
@@ -45,15 +45,15 @@ class PlannerConfig(CommanderConfig):
     )
     clearance: float = parameter(
         DEFAULT_CLEARANCE,
-        "smallest distance that plans keep between links that no joint connects; 0: contacts are "
-        "not looked at",
+        "smallest distance that plans keep between links that no joint connects; 0 disables "
+        "collision checks",
         unit="m",
         minimum=0.0,
         maximum=1000.0,
     )
     srdf: str = parameter(
         "",
-        "SRDF file with pairs of links whose contact does not count; '': NAME.srdf beside the URDF",
+        "SRDF file with pairs of links that are not checked; '': NAME.srdf beside the URDF",
     )
     max_corrections: int = parameter(
         3, "new plans after the first", minimum=0, maximum=1000, read_only=False
@@ -74,16 +74,16 @@ class PlannerConfig(CommanderConfig):
     )
     takeover_time: float = parameter(
         1.0,
-        "flown on along the schedule, before a plan for another goal takes over in motion, by "
-        "methods that can; 0: the joints brake first, as for other methods",
+        "time along the present schedule before a plan for another goal takes over in motion, if "
+        "the method supports it; 0: the joints brake first",
         unit="s",
         minimum=0.0,
         maximum=1000.0,
     )
     replan_period: float = parameter(
         -1.0,
-        "time after which the remaining motion is planned again from the measured state, without "
-        "a stop, by methods that can; 0: never, -1: 2 s with plan_in_background, else never",
+        "period of planning the remaining motion again without a stop, if the method supports it; "
+        "0: never, -1: 2 s with plan_in_background, else never",
         unit="s",
         minimum=-1.0,
         maximum=1e6,
@@ -96,10 +96,17 @@ class PlannerConfig(CommanderConfig):
     )
     drift_attitude: float = parameter(0.0, "likewise", unit="rad", minimum=0.0)
     shape_gain: float = parameter(
-        2.0, "feedback on the shape while tracking", unit="1/s", minimum=0.0, maximum=1000.0
+        2.0,
+        "feedback gain on joint positions while tracking",
+        unit="1/s",
+        minimum=0.0,
+        maximum=1000.0,
     )
     shape_deadband: float = parameter(
-        0.0, "shape errors up to this are noise: no feedback", unit="m or rad", minimum=0.0
+        0.0,
+        "joint position errors up to this are not fed back, as noise",
+        unit="m or rad",
+        minimum=0.0,
     )
     averaging: int = parameter(
         1,
@@ -109,7 +116,7 @@ class PlannerConfig(CommanderConfig):
     )
     rest_tolerance: float = parameter(
         0.0,
-        "measured rates up to this are noise about rest; 0: all count",
+        "measured rates up to this count as rest; 0: none",
         unit="m/s or rad/s",
         minimum=0.0,
     )
@@ -121,8 +128,8 @@ class PlannerConfig(CommanderConfig):
     )
     plan_in_background: bool = parameter(
         True,
-        "plan in a thread while states are answered; false, and with a plant in lockstep: states "
-        "wait",
+        "plan in a thread while the robot keeps moving; false, or a lockstep plant: states wait "
+        "for the plan",
     )
     options: Mapping[str, Any] = registered(METHODS)
 

@@ -62,7 +62,7 @@ class AreaLoopOptions:
     """The options of ``area_loop``."""
 
     k: float = parameter(
-        0.15, "share of the missing turn that one cycle makes up for", minimum=1e-3, maximum=1.0
+        0.15, "share of the remaining rotation that one cycle corrects", minimum=1e-3, maximum=1.0
     )
     edge_time: float = parameter(
         4.0, "duration of an edge; slow joints take longer", unit="s", minimum=1e-3, maximum=1e9
@@ -84,9 +84,11 @@ class AreaLoopOptions:
     cycles_per_plan: int = parameter(
         1, "cycles before the attitude is measured again", minimum=1, maximum=10000
     )
-    most_cycles: int = parameter(1000, "cycles that a goal may take", minimum=1, maximum=1000000)
+    most_cycles: int = parameter(
+        1000, "largest number of cycles for a goal", minimum=1, maximum=1000000
+    )
     longest: float = parameter(
-        100000.0, "longest manoeuvre that is still planned", unit="s", minimum=1.0, maximum=1e9
+        100000.0, "longest permitted manoeuvre", unit="s", minimum=1.0, maximum=1e9
     )
 
 

@@ -82,7 +82,7 @@ class LieBracketOptions:
         1.0, "a31 over sqrt(|a31 (b21, b11)|); 1: balanced", minimum=1e-3, maximum=1e9
     )
     longest: float = parameter(
-        100000.0, "longest manoeuvre that is still planned", unit="s", minimum=1.0, maximum=1e9
+        100000.0, "longest permitted manoeuvre", unit="s", minimum=1.0, maximum=1e9
     )
 
 

@@ -98,30 +98,29 @@ class ResolvedRateOptions(MotionOptions):
 
     keep_attitude: int = parameter(
         0,
-        "1: the attitude of the base stays as it is (reaction null space), 0: the base turns as it "
-        "must",
+        "1: the base keeps its attitude (reaction null space), 0: its attitude is free",
         minimum=0,
         maximum=1,
     )
     waypoints: tuple[float, ...] = parameter(
         (),
-        "positions x, y, z in the world, one after the other, through which a smooth path leads "
-        "the end-effector to its goal; []: the straight line",
+        "positions x, y, z in the world, one after the other, of a smooth path of the "
+        "end-effector to its goal; []: a straight line",
         unit="m",
         minimum=-1e9,
         maximum=1e9,
     )
     as_far_as_possible: int = parameter(
         0,
-        "1: a line that meets a singularity, a joint limit or a contact is followed until shortly "
-        "before, 0: it is refused",
+        "if a line meets a singularity, a joint limit or a contact: 1: stop shortly before, 0: "
+        "refuse the goal",
         minimum=0,
         maximum=1,
     )
     corner_tolerance: float = parameter(
         0.005,
-        "largest distance of the end-effector from the straight lines of a given path, whose "
-        "corners are rounded, and as many rad of its attitude; 0: it stops at every corner",
+        "largest deviation at the rounded corners of a path, in m and in as many rad; 0: stop at "
+        "every corner",
         unit="m",
         minimum=0.0,
         maximum=1000.0,

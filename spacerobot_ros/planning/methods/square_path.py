@@ -81,9 +81,9 @@ class SquarePathOptions:
     t4: float = parameter(
         24.0, "end of step 4, the motion back", unit="s", minimum=1e-3, maximum=1e9
     )
-    most_loops: int = parameter(20, "loops that a turn may take", minimum=1, maximum=1000000)
+    most_loops: int = parameter(20, "largest number of loops", minimum=1, maximum=1000000)
     given_centre: int = parameter(
-        0, "1: squares round (centre_1, centre_2); 0: the best", minimum=0, maximum=1
+        0, "1: squares around (centre_1, centre_2); 0: the best centre", minimum=0, maximum=1
     )
     centre_1: float = parameter(
         0.0, "first coordinate of a given centre", unit="rad", minimum=-1000.0, maximum=1000.0
@@ -92,10 +92,10 @@ class SquarePathOptions:
         0.0, "second coordinate of a given centre", unit="rad", minimum=-1000.0, maximum=1000.0
     )
     check_position: int = parameter(
-        0, "1: refuse goals that are not where the base ends", minimum=0, maximum=1
+        0, "1: refuse goals whose position differs from the predicted one", minimum=0, maximum=1
     )
     longest: float = parameter(
-        3600.0, "longest manoeuvre that is still planned", unit="s", minimum=1.0, maximum=1e9
+        3600.0, "longest permitted manoeuvre", unit="s", minimum=1.0, maximum=1e9
     )
 
 

@@ -63,9 +63,8 @@ class OptimalOptions(MotionOptions):
     )
     effort_limits: int = parameter(
         0,
-        "efforts of the joints within their limits: 0: kept where a manoeuvre is found that keeps "
-        "them, with effort_reserve where a controller tracks it, 1: kept, with effort_reserve, "
-        "2: not",
+        "effort limits of the joints: 0: enforced if such a manoeuvre is found, with "
+        "effort_reserve if a controller tracks it, 1: enforced, with effort_reserve, 2: ignored",
         minimum=0,
         maximum=2,
     )
@@ -80,7 +79,7 @@ class OptimalOptions(MotionOptions):
     )
     effort_reserve: float = parameter(
         0.15,
-        "share of the effort limits that is left to the feedback of the controller",
+        "share of the effort limits reserved for the controller's feedback",
         minimum=0.0,
         maximum=0.95,
     )
@@ -98,23 +97,33 @@ class OptimalOptions(MotionOptions):
     )
     base_attitude: int = parameter(1, "1: reached, 0: ignored", minimum=0, maximum=1)
     final_shape: int = parameter(
-        0, "of goals without a shape: 0: any, 1: the present one", minimum=0, maximum=1
+        0,
+        "final joint positions of goals without them: 0: any, 1: the present ones",
+        minimum=0,
+        maximum=1,
     )
     max_base_rate: float = parameter(
-        0.0, "fastest turn of the base; 0: any", unit="rad/s", minimum=0.0, maximum=1e9
+        0.0, "largest rate of the base; 0: no limit", unit="rad/s", minimum=0.0, maximum=1e9
     )
     keep_axis: tuple[float, ...] = parameter(
-        (), "direction in the base, away from keep_direction; []: none", minimum=-1e9, maximum=1e9
+        (),
+        "axis of the base that stays away from keep_direction; []: none",
+        minimum=-1e9,
+        maximum=1e9,
     )
     keep_direction: tuple[float, ...] = parameter(
         (), "direction in the world that keep_axis stays away from", minimum=-1e9, maximum=1e9
     )
     keep_angle: float = parameter(
-        0.0, "angle that keep_axis stays away by", unit="rad", minimum=0.0, maximum=math.pi
+        0.0,
+        "smallest angle between keep_axis and keep_direction",
+        unit="rad",
+        minimum=0.0,
+        maximum=math.pi,
     )
     keep_out: tuple[float, ...] = parameter(
         (),
-        "boxes that the shape avoids: lower, then upper corner",
+        "boxes of joint positions to avoid: lower, then upper corner",
         unit="m or rad",
         minimum=-1e9,
         maximum=1e9,
@@ -122,35 +131,35 @@ class OptimalOptions(MotionOptions):
     intervals: int = parameter(
         80, "steps of the optimal control problem", minimum=10, maximum=10000
     )
-    starts: int = parameter(24, "guesses that are tried at most", minimum=1, maximum=10000)
+    starts: int = parameter(24, "largest number of guesses", minimum=1, maximum=10000)
     answers: int = parameter(
         16,
-        "solutions to find, unless starts agree before; several are found on a coarse grid, and "
-        "the best of them is refined",
+        "solutions to find, unless starts agree before; several are computed on a coarse grid, "
+        "and the best is refined",
         minimum=1,
         maximum=10000,
     )
     agreeing: int = parameter(
         3,
-        "solutions that are the best one and end the search; 0: only answers and starts do",
+        "starts that must find the best solution to end the search; 0: not used",
         minimum=0,
         maximum=10000,
     )
     iterations: int = parameter(
-        300, "steps of the solver from one guess at most", minimum=1, maximum=100000
+        300, "largest number of solver steps for a guess", minimum=1, maximum=100000
     )
     time_budget: float = parameter(
         0.0,
-        "wall time to search, 5 times that if nothing is found; 0: no limit. A plan that it cuts "
-        "short depends on how busy the machine is",
+        "wall time to search, 5 times that if nothing is found; 0: no limit. If it ends the "
+        "search, the plan depends on the load of the machine",
         unit="s",
         minimum=0.0,
         maximum=1e9,
     )
     longest: float = parameter(
-        3600.0, "longest manoeuvre that is still planned", unit="s", minimum=1.0, maximum=1e9
+        3600.0, "longest permitted manoeuvre", unit="s", minimum=1.0, maximum=1e9
     )
-    cache: int = parameter(1, "1: manoeuvres are kept on disk", minimum=0, maximum=1)
+    cache: int = parameter(1, "1: cache manoeuvres on disk", minimum=0, maximum=1)
 
 
 _UNLIMITED_HALF_RANGE = np.pi
