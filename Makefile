@@ -150,6 +150,7 @@ docs: $(STAMP)/docs ## build the documentation site; see out/docs/index.html
 figures: $(STAMP)/docs ## compute the numbers of the documents again: docs/figures.json
 	$(BIN)/python3 -m docs_build.figures
 	$(BIN)/python3 -m docs_build.singularities
+	$(BIN)/python3 -m docs_build.integration
 
 .PHONY: reference
 reference: $(STAMP)/docs ## write the references of parameters, topics and commands again: reference/

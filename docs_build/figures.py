@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from docs_build.integration import integration_figures
 from docs_build.singularities import singularity_figures
 from spacerobot_ros.control import ControlState, PoseReference
 from spacerobot_ros.control.controller import build_controller
@@ -39,6 +40,7 @@ def figures() -> dict[str, str]:
         **_area_loop(),
         **_coordinated_control(),
         **singularity_figures(),
+        **integration_figures(),
     }
 
 

@@ -44,6 +44,9 @@ def test_the_file_is_what_make_figures_writes() -> None:
         ("square_path.z_star", [1.130702], 1e-6),
         ("coordinated_control.transposed_jacobian.force_at_start", [5.5116, 59.3298], 1e-2),
         ("coordinated_control.model_based.force_at_start", [864.58, 642.76], 1e-2),
+        # Runge-Kutta 4.
+        ("integration.velocity_order", [4.0], 0.1),
+        ("integration.effort_order", [4.0], 0.1),
         ("singularities.start", [2.000077, -0.002373], 1e-6),
         ("singularities.det_at_start", [0.373488], 1e-6),
         ("singularities.length", [1.583415], 1e-6),
