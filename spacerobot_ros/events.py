@@ -49,7 +49,7 @@ SECONDS = number_format(".9f")
 class KeyValueField:
     """An attribute of a status or event, and its key-value pair or pairs.
 
-    An attribute is left out while it has the default of its class.
+    An attribute is omitted while it has the default of its class.
 
     Attributes
     ----------
@@ -65,7 +65,7 @@ class KeyValueField:
     always
         Whether the attribute is written with its default, too.
     present_with
-        The attribute without which this one is left out; empty: none.
+        The attribute without which this one is omitted; empty: none.
     """
 
     attribute: str
@@ -181,7 +181,7 @@ class EventKind(str, Enum):
     """A wrench from outside begins to act."""
     DISTURBANCE_ENDED = "disturbance_ended"
     CONTACT = "contact"
-    """Two links of the robot touch; the exact plant goes on through the contact."""
+    """Two links of the robot touch; the exact plant continues through the contact."""
     CONTACT_ENDED = "contact_ended"
     CAPTURED = "captured"
     """The robot has captured the target: from now on it is another robot."""
@@ -198,7 +198,7 @@ class EventKind(str, Enum):
     """A reaction wheel comes near its largest rate."""
     WHEEL_SATURATED = "wheel_saturated"
     WHEEL_FAILED = "wheel_failed"
-    """A reaction wheel does not answer its torque; control goes on without it."""
+    """A reaction wheel does not answer its torque; control continues without it."""
     DUMP_STARTED = "dump_started"
     """The momentum of reaction wheels is dumped to the thrusters."""
     DUMP_ENDED = "dump_ended"

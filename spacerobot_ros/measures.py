@@ -35,7 +35,7 @@ class Outcome(str, Enum):
 
 @dataclass(frozen=True)
 class CaptureMeasures:
-    """The measures of a flight to a target; NaN where there is none, or what did not take place.
+    """The measures of a flight to a target; NaN if there is none, or what did not take place.
 
     Attributes
     ----------
@@ -98,7 +98,7 @@ class Measures:
     propellant
         Propellant used by the thrusters, kg; NaN without thrusters.
     plan_time, wall_time
-        Wall time of planning and of the whole flight, s; NaN where it is not known.
+        Wall time of planning and of the whole flight, s; NaN if it is not known.
     clearance
         Smallest distance between two links, m, negative where they touch: the depth. Infinite of a
         robot without pairs that could touch, NaN where it was not measured.

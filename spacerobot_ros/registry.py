@@ -56,7 +56,7 @@ class Registry(dict[str, type[T]]):
         self._own = frozenset(self)
 
     def register(self, entry: type[T]) -> type[T]:
-        """Add a class, in place of an earlier one of its name; usable as a decorator.
+        """Add a class, instead of an earlier one of its name; usable as a decorator.
 
         Raises
         ------
@@ -71,7 +71,7 @@ class Registry(dict[str, type[T]]):
     def load(self) -> None:
         """Add the classes of installed packages and of the files in ``SPACEROBOT_PLUGINS``.
 
-        An entry point that is refused is left out with a warning: it must not end the flights of
+        An entry point that is refused is omitted with a warning: it must not end the flights of
         those who do not use it.
 
         Raises

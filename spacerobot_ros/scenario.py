@@ -761,7 +761,7 @@ def different_parameters(scenarios: Sequence[Scenario]) -> list[tuple[str, ...]]
     """Return each parameter that is not the same in all scenarios, with its unit, and its values.
 
     Values are texts; ``–`` where a scenario does not give the parameter, which has its default
-    then. Texts of robots are left out.
+    then. Texts of robots are omitted.
     """
     given = [{(n, p): v for n in CONFIGS for p, v in s.parameters(n).items()} for s in scenarios]
     known = {(n, each.name): each for n in CONFIGS for each in declared(CONFIGS[n])}

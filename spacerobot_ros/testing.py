@@ -41,7 +41,7 @@ class Arrival(NamedTuple):
 class Stack:
     """Nodes in one executor, in lockstep, in a ROS domain of their own; a context manager.
 
-    The plant begins with the first goal, when all nodes have met. Time goes on while nodes spin.
+    The plant starts with the first goal, when all nodes have met. Time continues while nodes spin.
 
     Parameters
     ----------
@@ -115,8 +115,8 @@ class Stack:
     ) -> Arrival:
         """Send a goal and spin until the planner, or else the controller, has decided it.
 
-        ``goal`` is any goal; None: the base at ``x``, ``y``, ``z`` (m), turned by ``rotvec`` (rad).
-        Raises :class:`.SpaceRobotError` if a node fails, or time is up.
+        ``goal`` is any goal; None: the base at ``x``, ``y``, ``z`` (m), rotated by ``rotvec``
+        (rad). Raises :class:`.SpaceRobotError` if a node fails, or time is up.
         """
         goal = Goal.from_rotvec([x, y, z], rotvec) if goal is None else goal
         controls = "coordinated_control" in self.nodes and "planner" not in self.nodes

@@ -160,7 +160,7 @@ class Playback:
     rate
         Seconds of the bag in a second of the clock.
     start
-        Where to begin, in seconds from the first message.
+        Start, in seconds from the first message.
     duration
         How much to play, in seconds of the bag; 0 for all.
     loop
@@ -264,8 +264,8 @@ class Playback:
         """Jump to ``bag_ns`` in the bag, or to its nearer end; a pause lasts.
 
         Returns the messages that a subscriber would have by then: of each topic the last one, if
-        it is latched or no older than a second. In a pause at the beginning these are the messages
-        there, as nothing is before it; that comes again when time goes on.
+        it is latched or no older than a second. In a pause at the beginning these are the first
+        messages, which are published again when time continues.
 
         Raises
         ------

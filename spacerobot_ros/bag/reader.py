@@ -163,8 +163,8 @@ class Bag(Mapping[str, TopicSeries]):
     Raises
     ------
     RecordingError
-        From the constructor, as :func:`read_bag`; from methods, where there is no such topic, the
-        bag is damaged, or pandas or xarray is not installed.
+        From the constructor, as :func:`read_bag`; from methods, if there is no such topic, the bag
+        is damaged, or pandas or xarray is not installed.
     """
 
     def __init__(self, path: Path, files: Sequence[Path] | None = None) -> None:
@@ -203,7 +203,7 @@ class Bag(Mapping[str, TopicSeries]):
         return isinstance(topic, str) and self._recorded_name(topic) in self.topics
 
     def get(self, topic: str, default: Any = None) -> Any:
-        """Return the messages of a topic, or ``default`` where there is no such topic."""
+        """Return the messages of a topic, or ``default`` if there is no such topic."""
         if topic in self:
             return self[topic]
         return default
@@ -341,9 +341,9 @@ class Bag(Mapping[str, TopicSeries]):
         """Return a topic as a table of pandas, or every topic that can be read by its name.
 
         The index is the log time in seconds, ``attrs["units"]`` has the units of the columns; see
-        :func:`~spacerobot_ros.bag.tables.table_of` for the columns. With ``euler`` the turns of
-        each attitude about the fixed axes x, y, z (rad) stand beside its quaternion, in columns
-        ``roll``, ``pitch`` and ``yaw``.
+        :func:`~spacerobot_ros.bag.tables.table_of` for the columns. With ``euler`` the columns
+        ``roll``, ``pitch`` and ``yaw`` have the rotations of each attitude about the fixed axes x,
+        y, z (rad).
         """
         if topic is not None:
             return to_pandas(self.table(topic, euler=euler))
@@ -441,7 +441,7 @@ class Bag(Mapping[str, TopicSeries]):
         return self._series_by_topic[topic]
 
     def load(self, topics: Iterable[str]) -> None:
-        """Read topics together, in one pass over the file; those that cannot be read are left out.
+        """Read topics together, in one pass over the file; those that cannot be read are omitted.
 
         Each is in memory from then on.
         """

@@ -51,9 +51,9 @@ class _EarlyMessage(NamedTuple):
 class Recording:
     """Writes messages with one time base for the whole bag; begins paused.
 
-    Messages carry the time of the clock, those before its first message that one's time. Where no
-    clock is published for ``clock_wait`` all carry the wall time of their arrival. The choice
-    stays, because a bag has one time base.
+    Messages carry the time of the clock, those before its first message that one's time. If no
+    clock is published for ``clock_wait``, all carry the wall time of their arrival. The choice is
+    final, because a bag has one time base.
 
     Parameters
     ----------

@@ -149,7 +149,7 @@ class _Copy:
         self._schemas: dict[int, tuple[int, str]] = {}
         """New number and name by the number in the old file."""
         self._channels: dict[int, tuple[int, Channel]] = {}
-        """New number and old record likewise."""
+        """New number and old record by the number in the old file."""
 
     def add_readable_records(self, old: BinaryIO) -> None:
         """Add what can be read of a file, up to the first record that is cut."""
@@ -180,7 +180,7 @@ class _Copy:
                 self._add(data[begin:end])
 
     def _add(self, record: bytes) -> None:
-        """Add a record; one that cannot be read, or is of an unknown channel, is left out."""
+        """Add a record; one that cannot be read, or is of an unknown channel, is omitted."""
         found = None
         with suppress(*DAMAGE_ERRORS):
             found = parse_record(record)

@@ -99,7 +99,7 @@ class TopicSeries:
 
     @property
     def stamp(self) -> NDArray[np.float64]:
-        """Stamps of the headers in seconds (N,), a copy; the log times where messages have none."""
+        """Stamps of the headers in seconds (N,), a copy; the log times if messages have none."""
         return np.asarray(self.stamp_ns / SECOND)
 
     @cached_property
@@ -181,7 +181,7 @@ class TopicSeries:
         return self._columns is not None and self._columns.constant("name")
 
     def of_joints(self, path: str, names: Sequence[str]) -> NDArray[np.float64]:
-        """Return an array of joint states by joints: shape (N, n); nan where a joint is missing.
+        """Return an array of joint states by joints: shape (N, n); nan if a joint is missing.
 
         ``path`` is ``position``, ``velocity`` or ``effort``, and ``names`` are those of n joints.
         """

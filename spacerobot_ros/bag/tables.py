@@ -75,7 +75,7 @@ class Field:
     values
         Numbers (N,), numbers (N, k), or texts (N,) as objects.
     units
-        One for each column; empty where it is not known or there is none.
+        One for each column; empty if it is not known or there is none.
     labels
         Names of the k entries of an array; empty for one value a message.
     column_kind
@@ -108,7 +108,7 @@ class TopicTable:
         Log times in seconds, shape (N,): simulated time in a bag of this stack.
     fields
         The columns, arrays in one piece. The first is ``time_ns``, the log time in whole
-        nanoseconds. Where the messages have a header, its time follows: ``stamp`` in seconds and
+        nanoseconds. If the messages have a header, its time follows: ``stamp`` in seconds and
         ``stamp_ns``.
     """
 
@@ -131,7 +131,7 @@ class TopicTable:
 
     @property
     def units(self) -> dict[str, str]:
-        """Unit of every column by its name; empty where it is not known or there is none."""
+        """Unit of every column by its name; empty if it is not known or there is none."""
         pairs = (zip(field.columns, field.units, strict=True) for field in self.fields)
         return {name: unit for each in pairs for name, unit in each}
 

@@ -47,14 +47,14 @@ class BagWriter(AbstractContextManager["BagWriter"]):
     overwrite
         Whether a file that is there is replaced; not one that is being written.
     next_free
-        Whether the bag takes the next name that is free where one is there: ``NAME-1.mcap``,
+        Whether the bag takes the next free name if the name exists: ``NAME-1.mcap``,
         ``NAME-2.mcap``, ...
     max_size
         How large a file grows, in bytes, before the next one is begun; 0: without bound. The files
         of a bag that may be split are ``NAME_0.mcap``, ``NAME_1.mcap``, ..., each complete, with
         all attachments and metadata.
     max_duration_ns
-        How much log time a file spans, in nanoseconds, likewise. Both are checked after every
+        How much log time a file spans, in nanoseconds; 0: any. Both are checked after every
         chunk.
 
     Raises

@@ -243,7 +243,7 @@ class ControlledGoals:
         The controller's model of the robot; None: the nominal one of the flights.
     ends_when_decided
         Whether a flight ends with the decision about its goal: a tick later, after the command for
-        that state. Otherwise it goes on, and holds the goal.
+        that state. Otherwise it continues, and holds the goal.
     """
 
     config: ControllerConfig

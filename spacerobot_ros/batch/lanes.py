@@ -312,7 +312,7 @@ class LaneBlock:
                 self._write_rows(name, other._read_rows(name))
 
     def restart(self, model: ModelFunctions, p: Array, lanes: Counts) -> Array:
-        """Begin the flights of some lanes anew, and return their reports (lanes, width).
+        """Begin the flights of some lanes again, and return their reports (lanes, width).
 
         ``p`` are their masses as arguments of the model.
         """

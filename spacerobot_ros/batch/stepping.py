@@ -145,7 +145,7 @@ class SteppedFlights:
     def reset(
         self, rows: npt.ArrayLike, starts: InitialStates, inertial: InertialParameters | None = None
     ) -> None:
-        """Begin some flights anew; the others are not changed.
+        """Begin some flights again; the others are not changed.
 
         Parameters
         ----------

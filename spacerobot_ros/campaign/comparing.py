@@ -134,8 +134,8 @@ def _notes_on_failures(first: Results, second: Results) -> list[str]:
 
 def _notes_on_control(first: Results, second: Results) -> list[str]:
     return [
-        f"{each.campaign.name} does not control the {' and '.join(parts)}: that error is where "
-        "the motion ends, and is no part of passing unless a criterion names it."
+        f"{each.campaign.name} does not control the {' and '.join(parts)}: its error does not "
+        "count unless a criterion names it."
         for each in (first, second)
         if (parts := each.not_controlled)
     ]

@@ -271,7 +271,7 @@ class Dataset:
         except OSError as error:
             raise RecordingError(
                 f"The last {len(self._rows)} flights cannot be written to {path}: {reason(error)}. "
-                "The same command goes on from those before them."
+                "The same command continues from those before them."
             ) from error
         self._rows.clear()
 
@@ -279,7 +279,7 @@ class Dataset:
         """Return the rows as a pyarrow table, by the number of the flight; one row a flight.
 
         If a file was copied into the folder, the first row of a flight counts, with a warning.
-        Columns that are not among ``columns`` are not read; those that no file has are left out.
+        Columns that are not among ``columns`` are not read; those that no file has are omitted.
 
         Raises
         ------
@@ -327,7 +327,8 @@ def _read_row_file(part: Path, columns: Collection[str] | None = None) -> Any:
 
 def _damaged_file_error(path: Path, error: Exception) -> ParameterError:
     return ParameterError(
-        f"The file {path} is damaged ({type(error).__name__}: {error}): the campaign cannot go on."
+        f"The file {path} is damaged ({type(error).__name__}: {error}): "
+        "the campaign cannot continue."
     )
 
 
@@ -389,7 +390,7 @@ def _settings_of_draws(campaign: Campaign) -> dict[str, Any]:
 
 
 def self_contained(campaign: Campaign) -> Campaign:
-    """Return the campaign with the texts of its robots in place of files, for other machines."""
+    """Return the campaign with the texts of its robots instead of files, for other machines."""
     scenario = campaign.scenario
     for node in ("plant", *scenario.commanders):
         config = scenario.config(node)

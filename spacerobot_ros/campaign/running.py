@@ -311,13 +311,13 @@ def sweep(
     what, goal, position, rotvec, method, parameters
         As for :func:`~spacerobot_ros.flight.api.fly`.
     end_effector_position, end_effector_pose, end_effector
-        Likewise.
+        The same.
     disperse
         Distributions by the name of the quantity, as in a file of a campaign.
     seed, flights
         Seed of the draws, and their number.
     folder
-        Where the dataset is kept, which a later call goes on with; None: nowhere.
+        Folder of the dataset, which a later call continues; None: none.
     section
         Other keys of a file of a campaign: ``sampler``, ``criteria``, ``engine``, ``longest``;
         ``set`` means the same as ``parameters``.

@@ -127,7 +127,7 @@ class Influence:
 def influences(causes: Mapping[str, Array], metrics: Mapping[str, Array]) -> list[Influence]:
     """Return the sensitivity of each metric (N,) to each dispersion (N,).
 
-    Flights without the metric are left out, and so are pairs of which one does not vary.
+    Flights without the metric are omitted, and so are pairs of which one does not vary.
     """
     found = []
     for metric, values in metrics.items():

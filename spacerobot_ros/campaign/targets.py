@@ -215,7 +215,8 @@ class DrawnFlight:
     def with_draws_in_scenario(self) -> DrawnFlight:
         """Return the flight with its seed in the scenario and its masses in the plant's URDF.
 
-        The commanders go on to believe in the robot as it was, unless they have one of their own.
+        The commanders continue to believe in the robot as it was, unless they have one of their
+        own.
 
         To build one takes milliseconds: engines without ROS take :attr:`inertial` as it is.
         """

@@ -344,7 +344,7 @@ class DaskWorkers:
 
 def _lost_scheduler_error() -> SpaceRobotError:
     return SpaceRobotError(
-        "The scheduler is gone. Finished flights are kept: the same command goes on from there."
+        "The scheduler is gone. Finished flights are kept; the same command continues."
     )
 
 

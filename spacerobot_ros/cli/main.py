@@ -35,7 +35,7 @@ class CommandGroup(click.Group):
         return list(COMMANDS)
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        """Return a command by its name, None where there is none."""
+        """Return a command by its name, None if there is none."""
         if cmd_name not in COMMANDS:
             return None
         module = import_module(f"spacerobot_ros.cli.{COMMANDS[cmd_name]}")

@@ -264,7 +264,7 @@ class EndEffectorOptions:
     paths: Sequence[Path] = ()
 
     def goals(self) -> list[EndEffectorGoal]:
-        """Return the goals; none where none is given.
+        """Return the goals; none if none is given.
 
         Raises
         ------
@@ -382,8 +382,8 @@ def warn_of_large_angles(rotvec: Sequence[float], option_in_degrees: str) -> Non
     angle = math.hypot(*rotvec)
     if 2 * math.pi < angle < math.inf:
         click.echo(
-            f"The goal turns by {angle:.5g} rad, which is {angle / (2 * math.pi):.3g} turns: only "
-            f"the attitude at their end counts. For degrees there is {option_in_degrees}.",
+            f"The goal turns by {angle:.5g} rad, which is {angle / (2 * math.pi):.3g} revolutions: "
+            f"only the final attitude counts. For degrees there is {option_in_degrees}.",
             err=True,
         )
 

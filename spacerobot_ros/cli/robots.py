@@ -81,7 +81,7 @@ def analyze_command(
     target = picture or Path("out") / f"{name}_curvature.png"
     drawn = draw_analysis(found, PictureFormat.of(target))
     if drawn is None:
-        click.echo(f"{'picture':<13}none: no loops of the joints turn the base")
+        click.echo(f"{'picture':<13}none: no loops of the joints rotate the base")
     else:
         write_output(target, drawn)
         click.echo(f"{'picture':<13}{target}")
@@ -305,7 +305,7 @@ def _position_text(found: Analysis) -> str:
 
     count = len(sliders_of(found.robot))
     if found.sliding.controllable:
-        return f"{count} sliders with independent slots put the base where it is to be (paper 1)"
+        return f"{count} sliders with independent slots control the position of the base (paper 1)"
     return "follows from attitude and shape: the centre of mass rests"
 
 
@@ -334,7 +334,7 @@ def _distance_lines(found: Analysis) -> list[str]:
     geometry = found.geometry
     distances = geometry.distances_of_links(found.shape)
     pairs = "1 pair" if len(distances) == 1 else f"{len(distances)} pairs"
-    lines = [f"{pairs} of links may come into contact"]
+    lines = [f"{pairs} of links may touch"]
     if distances:
         distance = "a distance" if len(distances) == 1 else "distances"
         lines[0] += f", with {distance} at this shape of"

@@ -1,9 +1,9 @@
 """Collision geometry: the solids of a robot, and the pairs of them that may come into contact.
 
-A link has the shapes of its ``<collision>`` elements, or, where it has none, those of its
+A link has the shapes of its ``<collision>`` elements, or, if it has none, those of its
 ``<visual>`` elements. A mesh counts as its convex hull, which encloses it, open or not.
 
-Pairs of one rigid body are left out, pairs of neighbouring bodies, pairs that an SRDF disables, and
+Pairs of one rigid body are omitted, pairs of neighbouring bodies, pairs that an SRDF disables, and
 pairs that are in contact at each of 1000 random shapes: their contact is a matter of how the robot
 is drawn.
 """
@@ -144,9 +144,9 @@ class CollisionGeometry:
         The robot, with its world.
     mesh_of
         Returns the triangles of a visual of the kind ``mesh`` in the frame of its link; a mesh for
-        which it raises a :class:`.MeshError` is left out.
+        which it raises a :class:`.MeshError` is omitted.
     obstacles_alone
-        Whether pairs of two links of the robot are left out.
+        Whether pairs of two links of the robot are omitted.
 
     Attributes
     ----------
@@ -160,7 +160,7 @@ class CollisionGeometry:
     notes
         Sentences on links whose shape may surprise the user.
     unread_meshes
-        Meshes that are left out.
+        Meshes that are omitted.
     """
 
     def __init__(
@@ -515,7 +515,7 @@ def collision_visuals(
     robot: RobotDescription, mesh_of: Callable[[Shape], TriangleMesh] = shape_mesh
 ) -> tuple[Visual, ...]:
     """Return the solids whose distances count; a mesh is its convex hull, and one that cannot be
-    read is left out.
+    read is omitted.
 
     ``mesh_of`` is that of :class:`~spacerobot_ros.collision.geometry.CollisionGeometry`.
     """

@@ -3,7 +3,7 @@
 Between two convex solids at given poses there is a plane that touches the first one where it is
 nearest to the second, and moves with it. The distance of the nearest point of the second one from
 that plane is that of the solids at these poses, or less the depth of their contact, and near them
-to first order. It is exact and cheap, and is made anew along every path that a solver has found.
+to first order. It is exact and cheap, and is made again along every path that a solver has found.
 
 Distances of two links depend on the shape q alone. Those of a link and an obstacle depend on the
 turn X of the base since the start, too: the centre of mass C of the system rests or drifts steadily

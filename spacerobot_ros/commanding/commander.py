@@ -138,7 +138,7 @@ class GoalExecutive(Protocol):
             The message of the plant; it becomes part of the status.
         commanded_until_ns
             For a plant that rests because commands did not come: the stamp of the last one that it
-            received. Goals that were begun later go on. None: the plant obeys nothing.
+            received. Goals that were begun later continue. None: the plant obeys nothing.
         rests_since_ns
             Stamp since which it rests then, ns.
 
@@ -152,7 +152,7 @@ class GoalExecutive(Protocol):
         """React to a plant that obeys again."""
 
     def plant_reset(self) -> None:
-        """Begin the present goal anew: the robot is in another state than before."""
+        """Begin the present goal again: the robot is in another state than before."""
 
 
 class StateDecoder(Protocol):
@@ -557,7 +557,7 @@ class Commander(ABC):
             return GoalErrors()
 
     def _base_pose(self) -> Array | None:
-        """Return the last measured pose (7,) of the base; None where it is not known."""
+        """Return the last measured pose (7,) of the base; None if it is not known."""
         odom, decoder = self.states.odom, self._decoder
         # Before the first joints, there is no shape of the robot either.
         if odom is None or decoder is None or self.states.joints is None:
@@ -671,7 +671,7 @@ class Commander(ABC):
             return  # The rest is on its way.
         self._reported_missing, self._reported_waiting = missing, goal_id
         if missing:
-            goes_on = " The goal is pursued when they come." if goal_id else ""
+            goes_on = " The goal is pursued when they arrive." if goal_id else ""
             message = f"Waiting for {missing}.{goes_on}"
             self._publish_status(self._make_status("waiting", message, goal_id))
         else:

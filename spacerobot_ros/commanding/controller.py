@@ -204,14 +204,12 @@ class ControllerCommander(Commander):
         self._silent.add(topic)
         if followed:
             self.executive.reference_ended(Reference())
-        self.host.log(
-            "warning", f"'{topic}' is silent: the controller goes on without until it comes again."
-        )
+        self.host.log("warning", f"'{topic}' is silent: the controller continues without it.")
 
     def _publish_status(self, status: Status) -> None:
         if self._silent and status.state is not ControllerState.REFUSED:
             silent = " and ".join(sorted(self._silent))
-            status = replace(status, message=f"{status.message} No reference comes on {silent}.")
+            status = replace(status, message=f"{status.message} There is no reference on {silent}.")
         super()._publish_status(status)
 
     def take_joints(self, stamp_ns: int, joints: Any) -> None:

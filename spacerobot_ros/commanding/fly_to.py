@@ -115,7 +115,7 @@ class GoalErrors:
         )
 
     def reported_by(self, status: Status) -> GoalErrors:
-        """Return the errors with those that a status reports in place of its own."""
+        """Return the errors with those that a status reports instead of its own."""
         if not isinstance(status, PlannerStatus):
             return self
         reported = {

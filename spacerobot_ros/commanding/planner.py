@@ -155,7 +155,7 @@ class PlannerCommander(Commander):
             self.executive.schedule_ended(end.message, final=end.final)
 
     def receive_obstacles(self, text: str) -> None:
-        """Plan around the obstacles of a URDF text in place of those so far; empty: around none.
+        """Plan around the obstacles of a URDF text instead of those so far; empty: around none.
 
         A text that is refused is logged, and the obstacles so far stay.
         """
@@ -170,7 +170,7 @@ class PlannerCommander(Commander):
         self._obstacles = text
         links = [] if self._world is None else links_with_shapes(self._world)
         listed = f": {', '.join(links)}" if links else ""
-        self.host.log("info", printable(f"Plans go round {len(links)} obstacle(s){listed}."))
+        self.host.log("info", printable(f"Plans avoid {len(links)} obstacle(s){listed}."))
         executive, robot = self.executive, self.robot
         if executive is not None and robot is not None:
             method = self._method if robot is self._described else None

@@ -169,7 +169,7 @@ class StampFilter:
         self._jump = self._jump_odom = _NO_MESSAGE
 
     def _ignore_jump(self) -> None:
-        """Count the set-aside messages as ignored: the present time goes on.
+        """Count the set-aside messages as ignored: the present time continues.
 
         While nodes meet, they receive one topic earlier than the other: such poses do not count.
         """
@@ -331,7 +331,7 @@ class PlantStopped:
     reason
         Message of the plant.
     commanded_until_ns
-        Where it rests because no command came: the stamp of the last one; None: it obeys nothing.
+        If it rests because no command came: the stamp of the last one; None: it obeys nothing.
     rests_since_ns
         Time since which it rests then, as far as is known.
     """

@@ -211,7 +211,7 @@ def plan_approach(
 ) -> ApproachPlan:
     """Return the approach that begins earliest.
 
-    Where the body of the target is in the way, the end-effector goes round: along a path that is
+    If the body of the target is in the way, the end-effector goes round: along a path that is
     short in W, to the standoff or to one two or three times as far away; or it sets out later.
 
     Parameters

@@ -151,7 +151,7 @@ class CoordinatedController:
         """Start towards new goals; a group without a new goal keeps its earlier goal.
 
         An end-effector without a goal since the robot was held or brought to rest has none: the
-        base carries it, so that the arm keeps its shape. The integral of the errors begins anew.
+        base carries it, so that the arm keeps its shape. The integral of the errors begins again.
         """
         if self.coming_to_rest:
             self.profile, self.coming_to_rest = None, False

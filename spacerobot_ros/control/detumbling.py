@@ -59,7 +59,7 @@ def shortest_detumbling(momentum: float, torque: float) -> float:
 def largest_feasible_share(start: Array, change: Array, limit: float) -> float:
     """Return the largest share ``s`` in [0, 1] with ``|start + s change| <= limit``.
 
-    Where there is none, the share with the least norm.
+    If there is none, the share with the least norm.
     """
     square, along = float(change @ change), float(start @ change)
     if square == 0.0:

@@ -51,7 +51,7 @@ class _Next(IntEnum):
     HOLD = 2
     """The robot holds the measured pose, without a goal."""
     ABORT = 3
-    """Likewise, and the abort is reported."""
+    """The same, and the abort is reported."""
 
 
 # Names of the module are found faster than members of an enum: they are needed for every state.
@@ -219,8 +219,8 @@ class ControlExecutive:
                 )
             if each.quaternion is None:
                 raise PlanningError(
-                    f"The goal of '{each.link}' is a position alone; the controller takes a pose: "
-                    "give it an orientation, too."
+                    f"The goal of '{each.link}' is a position only; the controller needs a pose: "
+                    "add an orientation."
                 )
             pose = Goal(each.position, each.quaternion, goal.joint_positions)
             parts[END_EFFECTOR] = replace(identified, goal=pose)
@@ -286,7 +286,7 @@ class ControlExecutive:
         """
         self._give_up(f"Aborted {why}; the robot holds.")
         self._next = _Next.ABORT
-        return "The robot holds where it is."
+        return "The robot holds its pose."
 
     def plant_stopped(
         self, why: str, commanded_until_ns: int | None = None, rests_since_ns: int = 0
@@ -308,19 +308,19 @@ class ControlExecutive:
         self._plan_next(_Next.HOLD)
 
     def reference_ended(self, remaining: Reference) -> None:
-        """Go on with the references that remain: to a goal anew, else hold the measured pose."""
+        """Go on with the references that remain: to a goal again, else hold the measured pose."""
         self.controller.follow(remaining)
         self._begin_anew_or_hold()
 
     def plant_reset(self) -> None:
-        """Begin the goal anew at the next measured state; without a goal, hold its pose."""
+        """Begin the goal again at the next measured state; without a goal, hold its pose."""
         self.servicing.end()
         if self._goal_state is ControllerState.TRACKING and self._after_tasks:
             self._pending = {**self._after_tasks, **self._pending}
         self._begin_anew_or_hold()
 
     def _begin_anew_or_hold(self) -> None:
-        """Begin the goal anew at the next measured state; without a goal, hold its pose."""
+        """Begin the goal again at the next measured state; without a goal, hold its pose."""
         tracking = self._goal_state is ControllerState.TRACKING
         self._plan_next(_Next.BEGIN_ANEW if tracking else _Next.HOLD)
 
@@ -333,7 +333,7 @@ class ControlExecutive:
     ) -> None:
         """Control by another controller of the same outputs: the robot's masses have changed.
 
-        The goal begins anew at the next measured state; without a goal the robot holds where it
+        The goal begins again at the next measured state; without a goal the robot holds where it
         held. ``payload`` is the body that the robot holds from now on.
         """
         controller.take_over_goals(self.controller)
@@ -467,7 +467,7 @@ class ControlExecutive:
             self._report_decision(kind, message, self._goal_state)
 
     def _end_goals(self, kind: EventKind, state: ControllerState, message: str) -> None:
-        """Report the end of all goals but the latest, whose status goes on."""
+        """Report the end of all goals but the latest, whose status continues."""
         for goal_id in sorted({goal.goal_id for goal in self._goals.values()} - {self._goal_id}):
             self._publish(state, message, goal_id)
             self._report_decision(kind, message, state, goal_id)

@@ -141,7 +141,7 @@ def default_selection(description: RobotDescription, end_effector_link: str) -> 
 
     * A planar robot (:func:`plane_normal`) whose plane is a coordinate plane of its base: the base
       in that plane (x, y, rz for the plane x-y), and with two joints or more the position of the
-      end-effector in it. The axes are those of W, so that the base is to fly in that plane.
+      end-effector in it. The axes are those of W, so the base must fly in that plane.
     * Any other robot: the whole pose of the base, and of the end-effector its whole pose with six
       joints or more, its position with three to five.
     * Without an end-effector, or with too few joints for one: the pose of the base and the joints.

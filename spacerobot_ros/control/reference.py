@@ -120,7 +120,7 @@ class StepReference(ReferenceProfile):
 class QuinticReference(ReferenceProfile):
     """Positions along straight lines, attitudes along geodesics (one fixed axis), in W.
 
-    An end-effector that the base carries turns about the base's origin, which is on its line.
+    An end-effector that the base carries rotates about the base's origin, which is on its line.
     All share one profile, ``s = 10 u^3 - 15 u^4 + 6 u^5`` of ``u = t / T``: rest to rest, without
     a jump in acceleration. T is the shortest time in which all are within their limits: the one
     that needs longest sets the pace, and all reach their goals together.

@@ -33,7 +33,7 @@ from spacerobot_ros.model.grasp import (
 
 _PREDICTION_TOLERANCE = 0.02
 """Distance (m) and angle (rad) of a target from its predicted motion beyond which the approach is
-planned anew."""
+planned again."""
 
 
 class Task(str, Enum):
@@ -123,7 +123,7 @@ class ApproachTask:
     Parameters
     ----------
     target
-        The target, which is measured while the approach goes on.
+        The target, which is measured while the approach continues.
     config
         Parameters of the controller.
     """
@@ -395,7 +395,7 @@ class Servicing:
         self._remaining_tasks, self._present = list(tasks), None
 
     def restart(self) -> None:
-        """Begin the present task anew."""
+        """Begin the present task again."""
         self._present = None
 
     def end(self) -> None:

@@ -23,7 +23,7 @@ _LEAST_WINDOW_PERIODS = 20
 """Shortest such time in control periods."""
 
 _SAMPLES = 32
-"""Number of states in such a time whose errors are looked at."""
+"""Number of states in such a time whose errors are checked."""
 
 _LEAST_PROGRESS = 0.02
 """Share by which errors shrink at least from one time to the next; in a time constant, linear loops
@@ -62,7 +62,7 @@ class StallMonitor:
         self.restart()
 
     def restart(self) -> None:
-        """Begin anew: at a new goal, and after a jump of time or of the robot."""
+        """Begin again: at a new goal, and after a jump of time or of the robot."""
         self.cause = ""
         self._ends = self._next_sample = -math.inf
         self._window = 0.0

@@ -155,9 +155,9 @@ class DeadReckoning:
     :attr:`elapsed`.
 
     The integrated state is that of :mod:`spacerobot_ros.model.composite_rigid_body`, with both
-    momenta and the centre of mass, which joints do not change. Joints that are measured are
-    therefore not predicted: their positions and rates replace the predicted ones, and the base
-    turns by the connection ``A``. Then only the effect of the thrusters accumulates errors.
+    momenta and the centre of mass, which joints do not change. Measured joint positions and rates
+    replace the predicted ones, and the base rotates by the connection ``A``. Only the effect of
+    the thrusters then accumulates errors.
 
     Parameters
     ----------

@@ -166,7 +166,7 @@ class WheelControl:
         if options.dump_rate and not self.has_thrusters:
             raise ParameterError(
                 f"Parameter 'wheels.dump_rate' is {options.dump_rate:g}, but 'use_thrusters' is "
-                "false: momentum is dumped to thrusters alone; set it to 0."
+                "false: only thrusters can dump momentum; set it to 0."
             )
         self.gyrostat = robot.derived(wheels.gyrostat)
         """The robot that the laws control."""

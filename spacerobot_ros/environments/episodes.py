@@ -70,7 +70,7 @@ class EpisodeConfig:
         Link that reaches; empty: that of the scenario, else the robot's end-effector.
     max_force, max_torque
         Force (N) and torque (N m) on the base of an action of one under efforts; 0: those of the
-        scenario's controller, and where it has none, actions have no wrench.
+        scenario's controller, and if it has none, actions have no wrench.
     action_scale
         Command of an action of ones; empty: limits of joints, force and torque.
     reward
@@ -161,7 +161,7 @@ class _Start:
 class EpisodeStarts:
     """Starts of episodes: of a scenario, or of the draws of a campaign.
 
-    Draws that are no robot or no start are left out, with a warning.
+    Draws that are no robot or no start are omitted, with a warning.
 
     Raises
     ------
@@ -325,8 +325,8 @@ class Episodes:
                 )
             if not scale.any():
                 raise ParameterError(
-                    "Argument 'action_scale' has zeros alone, so that no action moves the robot: "
-                    "give some larger ones."
+                    "Argument 'action_scale' is all zeros, so no action moves the robot: use "
+                    "larger values."
                 )
         else:
             scale = action_scale(self.robot, actuation, force, torque)
@@ -358,7 +358,7 @@ class Episodes:
         generators: Sequence[np.random.Generator],
         goal: Any = None,
     ) -> None:
-        """Begin the episodes of some rows anew, by the random generators of all rows.
+        """Begin the episodes of some rows again, by the random generators of all rows.
 
         ``goal``, one for all (goal_size,) or one for each row (N, goal_size), replaces the goals
         that are drawn.
@@ -420,7 +420,7 @@ class Episodes:
         return scenario.end_effector_goal.position
 
     def end(self, rows: Counts) -> None:
-        """End episodes: they are not stepped until they begin anew."""
+        """End episodes: they are not stepped until they begin again."""
         self._flights.end(rows)
 
     def step(self, actions: Any) -> None:

@@ -73,7 +73,7 @@ def _seeds_of(seed: Any, count: int) -> list[int | None]:
 class SpaceRobotEnv(gymnasium.Env, EzPickle):
     """One robot; its step is that of the plant. The arguments are those of `EpisodeConfig`.
 
-    A copy, by pickle too, has the arguments and begins anew.
+    A copy, by pickle too, has the arguments and begins again.
 
     Raises
     ------
@@ -117,14 +117,14 @@ class SpaceRobotVectorEnv(VectorEnv, EzPickle):
     """Many robots in SIMD lanes, each with the episodes of :class:`SpaceRobotEnv`.
 
     Lane i of a seed s has the episodes of one environment with the seed s + i. A copy, by pickle
-    too, has the arguments and begins anew.
+    too, has the arguments and begins again.
 
     Parameters
     ----------
     num_envs
         Number of robots.
     autoreset_mode
-        When episodes that have ended begin anew: ``NextStep``, ``SameStep`` or ``Disabled``.
+        When episodes that have ended begin again: ``NextStep``, ``SameStep`` or ``Disabled``.
     arguments
         Those of `EpisodeConfig`.
 
@@ -158,7 +158,7 @@ class SpaceRobotVectorEnv(VectorEnv, EzPickle):
         self._seeds = [seed for _, seed in seeded]
         self._begun = np.zeros(num_envs, dtype=np.bool_)
         self._ended = np.zeros(num_envs, dtype=np.bool_)
-        """Episodes that have ended and not begun anew."""
+        """Episodes that have ended and not begun again."""
 
     @property
     def np_random_seed(self) -> tuple[int, ...]:
@@ -196,7 +196,7 @@ class SpaceRobotVectorEnv(VectorEnv, EzPickle):
         return self.episodes.observations.copy(), self._info(mask)
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
-        """Step all episodes; those that have ended begin anew by the autoreset mode."""
+        """Step all episodes; those that have ended begin again by the autoreset mode."""
         episodes, mode = self.episodes, self.autoreset_mode
         if not self._begun.all():
             raise ResetNeeded(

@@ -76,7 +76,7 @@ class RewardWeights:
     reached
         Once, in the step in which the goal is reached.
     failed
-        Penalty, once, where the flight cannot go on.
+        Penalty, once, where the flight cannot continue.
     """
 
     progress: float = 10.0
@@ -190,8 +190,8 @@ class Reorient(Task):
             return axes
         if not self.by_torque:
             raise ParameterError(
-                f"The joints of robot '{self.robot.description.name}' do not turn its base to "
-                "attitudes around the start, so there are no random goals: give 'max_torque' under "
+                f"The joints of robot '{self.robot.description.name}' cannot rotate its base near "
+                "the start, so there are no random goals: give 'max_torque' under "
                 "efforts, or take the goal of a scenario (goals: scenario)."
             )
         return np.eye(3)

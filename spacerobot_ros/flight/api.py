@@ -76,8 +76,8 @@ def fly(
     method
         A gait method or a control law; None: that of the scenario.
     law, law_options
-        A class of a control law of your own, which is registered, and its options by name; the
-        scenario has a controller, whose gains it takes.
+        A class of your own control law, and its options by name. The scenario must have a
+        controller, whose gains it uses.
     seed
         Seed of the noise of sensors and actuators.
     parameters
@@ -141,7 +141,7 @@ def plan(
     """Plan a gait for a scenario or for a robot.
 
     A scenario gives the start, the limits, the tolerances, the control period, the method and,
-    where none is given, the goal: ``plan("arm_attitude")``, or for another goal
+    if none is given, the goal: ``plan("arm_attitude")``, or for another goal
     ``plan(load_scenario("sliding_masses"), rotvec=(0, 0, 0.1))``.
     For a robot these are the defaults of :func:`spacerobot_ros.planning.plan`, which takes more
     arguments: ``plan("sliding_masses", rotvec=(0.5, 0, 0), start=(0, 1, 0))``.
@@ -150,18 +150,18 @@ def plan(
     ----------
     what
         The model, a URDF file or the name of a robot; or a scenario, its file, or its name. A name
-        that is both is the scenario where no goal is given, and else the robot.
+        of both means the scenario if no goal is given, and the robot otherwise.
     goal
         Goal pose of the base; or its position (3,), m, or position and quaternion (7,).
     position, rotvec
         Position (3,), m, and attitude (3,), rad, as exponential coordinates; they replace those of
         ``goal``.
     end_effector_position, end_effector_pose, end_effector
-        Goal of an end-effector, with the base free but for what is given of its pose: its position
+        Goal of an end-effector, with the base free except for given parts of its pose: its position
         (3,), m, or position and quaternion (7,), and the name of its link; or positions or poses
         of several, by name.
     method
-        Name of a gait method; None: that of the scenario; of a robot alone ``auto``, or ``optimal``
+        Name of a gait method; None: that of the scenario, or for a robot ``auto``, or ``optimal``
         if there are options of a method.
     parameters
         Parameters of the nodes by name, as for :func:`fly`, such as

@@ -132,7 +132,7 @@ class FlightData:
     status, gait
         The last status of the commander that decides, and the planner's when its first gait began.
     plan_time, wall_time
-        Wall time of planning, and of the whole flight, s; NaN where it is not known.
+        Wall time of planning, and of the whole flight, s; NaN if it is not known.
     refusals
         Commands that were refused: time (s), topic, reason.
     measures_clearance
@@ -243,7 +243,7 @@ class FlightData:
     def capture(self) -> dict[str, Any]:
         """The first capture of the target, by the keys of ``spacerobot run --json``.
 
-        Without a capture, ``captured`` is false; empty where there is no target.
+        Without a capture, ``captured`` is false; empty if there is no target.
         """
         for event in self.events:
             if event.kind is EventKind.CAPTURED:
@@ -263,7 +263,7 @@ class FlightData:
 
     @cached_property
     def capture_measures(self) -> CaptureMeasures:
-        """The measures of the flight to the target; all are NaN where there is none."""
+        """The measures of the flight to the target; all are NaN if there is none."""
         capture, detumbling = self.capture, self.detumbling
         if not capture:
             return CaptureMeasures()
@@ -414,7 +414,7 @@ class FlightData:
     @property
     def errors(self) -> Array:
         """(N, 2) distances (m) and angles (rad) of the true poses from the goal that counts at the
-        end; without rows where there is no goal of the base.
+        end; without rows if there is no goal of the base.
         """
         if self.goal is None or not self.goal.base:
             return np.empty((0, 2))
@@ -462,7 +462,7 @@ class FlightData:
 
     @cached_property
     def clearance(self) -> FlightClearance | None:
-        """The smallest distance between links over time; None where it is not measured, without
+        """The smallest distance between links over time; None if it is not measured, without
         joint states, or of a robot without links that could touch.
         """
         if self.robot is None or not self.measures_clearance:

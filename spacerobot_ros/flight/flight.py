@@ -121,8 +121,8 @@ class Flight(FlightData):
         Columns and their units, ``attrs["units"]``, are those of the tables of bags: of ``odom``
         and ``joint_states`` as there, with the true state, of other topics with the topic before
         them, as ``momentum.data[linear_x]``; ``measured`` stands before measured states that
-        differ from the true ones. With ``euler`` the turns of each attitude about the fixed axes
-        x, y, z (rad) stand beside its quaternion, in columns ``roll``, ``pitch`` and ``yaw``.
+        differ from the true ones. With ``euler`` the columns ``roll``, ``pitch`` and ``yaw`` have
+        the rotations of each attitude about the fixed axes x, y, z (rad).
 
         Raises
         ------

@@ -12,7 +12,7 @@ loop makes the same calls in the same order:
    tick k + 1 is.
 
 Planner and controller are the same :class:`~spacerobot_ros.commanding.commander.Commander` objects
-as in the nodes, given arrays in place of messages.
+as in the nodes, given arrays instead of messages.
 """
 
 from __future__ import annotations
@@ -111,7 +111,8 @@ class Robots:
 
 
 def require_flyable(scenario: Scenario) -> None:
-    """Refuse a scenario that only nodes can fly: wall time, other processes, files to go on from.
+    """Refuse a scenario that only nodes can fly: wall time, other processes, files to continue
+    from.
 
     Raises
     ------
@@ -335,7 +336,7 @@ class LockstepFlight:
             if self._decided is _DecisionState.BEFORE_COMMAND:
                 return ""
             if not self._commands.complete and not self._reported.sensors.dropout:
-                return f"No command answers the state of {self.time:g} s."
+                return f"There is no command for the state of {self.time:g} s."
             ends = self._decided is not None
             if not self._step():
                 return ""

@@ -131,7 +131,7 @@ class FlightBag(RecordedRobot):
     @property
     def description(self) -> RobotDescription | None:
         """The first readable description of the robot, among the obstacles that came last; None
-        where there is none.
+        if there is none.
         """
         for text in self.bag.robot_descriptions(self.namespace):
             try:
@@ -145,7 +145,7 @@ class FlightBag(RecordedRobot):
     @cached_property
     def obstacles(self) -> list[tuple[int, RobotDescription | None]]:
         """The obstacles that came on the topic obstacles, with their log times, ns; None: that
-        there are none. Texts that nodes refuse are left out.
+        there are none. Texts that nodes refuse are omitted.
         """
         came = []
         for time_ns, message in self.messages("obstacles"):

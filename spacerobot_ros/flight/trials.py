@@ -217,7 +217,7 @@ def try_method(
 def compare(problem: PlanningProblem) -> dict[str, PlanEvaluation | SpaceRobotError]:
     """Return the evaluation of every method by its name, or the reason of its refusal.
 
-    Methods that plan for end-effectors alone are left out of goals of the base.
+    Methods that plan for end-effectors alone are omitted of goals of the base.
     """
     found: dict[str, PlanEvaluation | SpaceRobotError] = {}
     for name, method in METHODS.items():

@@ -289,8 +289,8 @@ def _plant_config(recorded: RecordedRobot) -> PlantConfig:
         ) from error
     if config.time_mode != "lockstep":
         raise RecordingError(
-            f"The bag {bag.path} was flown in real time, where nothing records which command the "
-            "plant held in which tick: only flights in lockstep can be verified."
+            f"The bag {bag.path} was flown in real time, and does not record which command "
+            "the plant held in which tick: only flights in lockstep can be verified."
         )
     return config
 
@@ -487,13 +487,12 @@ def _resimulate(
     commands = CommandValidator(plant, flight.config)
     if first and state.sensors.used:
         raise RecordingError(
-            f"The bag {flight.path} begins in mid-flight, where the noise of its sensors is "
-            "not known."
+            f"The bag {flight.path} begins in mid-flight, so the noise of its sensors is unknown."
         )
     if first and plant.capturing is not None:
         raise RecordingError(
-            f"The bag {flight.path} begins in mid-flight, where it is not known whether the target "
-            "is held."
+            f"The bag {flight.path} begins in mid-flight, so it is unknown whether the target is "
+            "held."
         )
     plant.tick = first
     if flight.config.actuation == "velocity":

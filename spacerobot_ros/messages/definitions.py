@@ -1,7 +1,7 @@
 """Definitions of message types: of installed packages, and of schemas in bags.
 
 ``rosbags`` writes Python code for every type that it decodes, a line for each element of an array
-of messages, and follows types that contain themselves for ever. The definitions of a bag may be
+of messages, and follows types that contain themselves forever. The definitions of a bag may be
 anybody's, so names, lengths, nesting and the number of fields are limited.
 """
 
@@ -129,7 +129,7 @@ def _with_dependencies(name: _InterfaceName, seen: set[str]) -> str:
 def type_hash(type_name: str) -> str:
     """Return the hash by which ROS 2 tells apart versions of a message type.
 
-    It is ``RIHS01_`` and 64 hexadecimal digits; empty where the package was installed without the
+    It is ``RIHS01_`` and 64 hexadecimal digits; empty if the package was installed without the
     description of its types (``share/<package>/msg/<Type>.json``). Raises as
     :func:`message_definition` does.
     """

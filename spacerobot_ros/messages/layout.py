@@ -269,7 +269,7 @@ def _encode_field(buffer: bytearray, fields: Fields, node: Any, value: Any) -> N
             dtype = DTYPES[element[1][0]]
             data = np.zeros(count, dtype) if value is None else np.asarray(value, dtype)
             if data.shape != (count,):
-                raise ValueError(f"{count} numbers are wanted, not {data.shape}")
+                raise ValueError(f"{count} numbers are required, not {data.shape}")
             _append_aligned(buffer, data.tobytes(), dtype.itemsize)
         else:
             for each in [None] * count if value is None else value:
@@ -409,7 +409,7 @@ def column_dtype(dtype: np.dtype[Any]) -> np.dtype[Any]:
 def read_columns(messages: Sequence[bytes], type_name: str, fields: Fields) -> Columns | None:
     """Return the fields that have the same place in every message of one type.
 
-    Fields in lists of messages and of texts are left out. None if the layouts differ.
+    Fields in lists of messages and of texts are omitted. None if the layouts differ.
     """
     if not messages or len(set(map(len, messages))) != 1:
         return None

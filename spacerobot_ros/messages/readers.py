@@ -225,7 +225,7 @@ class TemplateReader:
 
 
 def _as_little_endian(raw: bytes, type_name: str) -> bytes:
-    """Return a big-endian message as little-endian; IndexError where it is not of the type."""
+    """Return a big-endian message as little-endian; IndexError if it is not of the type."""
     kind = message_type(type_name, message_definition(type_name).encode())
     try:
         return kind.serialise(kind.decode(raw))

@@ -140,8 +140,8 @@ def compiled(function: ca.Function) -> ca.Function:
         return load_library(name, str(generator.dump()), lambda path: ca.external(name, path))
     except NoLibraryError as reason:
         warn_once(
-            "Functions run in CasADi's virtual machine, slower and with the same formulas "
-            f"(SPACEROBOT_COMPILE=0 asks for it): {reason}."
+            "Functions run in CasADi's virtual machine, slower, with the same formulas "
+            f"(SPACEROBOT_COMPILE=0 selects it): {reason}."
         )
         return function
 

@@ -405,7 +405,7 @@ def weld_links(
 def plane_normal(description: RobotDescription) -> Array | None:
     """Return the unit normal (3,), base components, of the plane a robot moves in; None: spatial.
 
-    A robot is planar if it has a joint that turns, the axes of all such joints are parallel, and
+    A robot is planar if it has a revolute joint, the axes of all such joints are parallel, and
     those of all prismatic joints are perpendicular to them. Its bodies then move in parallel
     planes of the base.
     """

@@ -53,7 +53,7 @@ class LoadLayout:
 
     @property
     def in_world(self) -> slice:
-        """Likewise in components of W: (6 L,)."""
+        """The same in components of W: (6 L,)."""
         return slice(6 * self.links, 12 * self.links)
 
     @property

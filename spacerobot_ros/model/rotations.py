@@ -66,7 +66,7 @@ def matrix_from_rpy(rpy: npt.ArrayLike) -> Array:
 def rpy_from_matrix(R: npt.ArrayLike) -> Array:
     """Return roll, pitch and yaw (3,), rad, of a rotation (3, 3): :func:`matrix_from_rpy` inverted.
 
-    Where the pitch is a right angle, roll and yaw are some of those that give the rotation.
+    If the pitch is a right angle, roll and yaw are some of those that give the rotation.
     """
     m = np.asarray(R, dtype=float)
     yaw = math.atan2(m[1, 0], m[0, 0])

@@ -202,7 +202,7 @@ class CommanderConfig(WatchdogConfig, AssumedRobotConfig):
             )
 
     def for_robot(self: Config, robot: RobotDescription) -> Config:
-        """Return the configuration with the tolerance of a robot in place of an automatic one."""
+        """Return the configuration with the tolerance of a robot instead of an automatic one."""
         if self.position_tolerance:
             return self
         return replaced(self, position_tolerance=automatic_tolerance(robot))

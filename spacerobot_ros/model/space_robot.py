@@ -42,7 +42,7 @@ class SpaceRobot:
     description
         The robot, as :func:`load_robot` or :func:`parse_robot` return it.
     build
-        Models of all robots that differ in mass properties alone: :meth:`buffered` and
+        Models of all robots that differ only in mass properties: :meth:`buffered` and
         :meth:`composed` functions take these as an argument and are compiled once for all of them.
         None: the mass properties are compiled in.
 
@@ -102,8 +102,8 @@ class SpaceRobot:
     def derived(self, description: RobotDescription) -> SpaceRobot:
         """Return the robot of a description that was made of this one's, such as its gyrostat.
 
-        Where this robot shares its compiled functions with robots that differ in mass properties
-        alone, so does that one.
+        If this robot shares its compiled functions with robots that differ only in mass
+        properties, so does that one.
         """
         shared = None if self._p is None else SymbolicModels.of(description)
         return SpaceRobot(description, shared)
@@ -256,7 +256,7 @@ class SpaceRobot:
         return self._call_function("connection", q)[0].reshape((6, self.n), order="F")
 
     def reaction_null_space(self, q: npt.ArrayLike) -> Array:
-        """Return an orthonormal basis (n, k) of the joint rates that do not turn the base.
+        """Return an orthonormal basis (n, k) of the joint rates that do not rotate the base.
 
         They are the null space of the coupling inertia ``D_q`` (Nenchev, Umetani and Yoshida, 1992,
         from memory): at zero angular momentum the base keeps its attitude while the joints move at
@@ -341,8 +341,8 @@ class SpaceRobot:
     def composed(self, name: str, build: Callable[[Composition], ca.Function]) -> BufferedFunction:
         """Return a function that ``build`` composes from MX functions of the model, with buffers.
 
-        It is compiled once per name for all robots that differ in mass properties alone, to be
-        evaluated in every tick.
+        It is compiled once per name for all robots that differ only in mass properties, for
+        evaluation in every tick.
         """
         model = self._model
         function = model.composed(name, lambda: build(Composition(model, ca.MX)))

@@ -17,7 +17,7 @@ from spacerobot_ros.resources import suggestion
 
 
 def with_srdf(robot: RobotDescription, path: str | Path) -> RobotDescription:
-    """Return a robot with the disabled pairs of an SRDF file in place of its own.
+    """Return a robot with the disabled pairs of an SRDF file instead of its own.
 
     Read are ``<disable_collisions link1="..." link2="..."/>``, ``<disable_default_collisions
     link="..."/>`` and ``<enable_collisions link1="..." link2="..."/>``; the last one wins.

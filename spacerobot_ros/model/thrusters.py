@@ -391,7 +391,7 @@ class ThrusterModulator:
     """Turns a wanted wrench into on-times of thrusters, one control period after the other.
 
     Sigma-delta modulation with shortest pulses. ``pending_impulse`` grows by the wanted wrench
-    times the period and shrinks by the impulses of the pulses fired. It is allocated anew in every
+    times the period and shrinks by the impulses of the pulses fired. It is allocated again in every
     period, so that opposite contributions cancel. The pending impulse is therefore at most one
     shortest pulse of each thruster: with ``t`` that time and ``h`` the period, ``allocation <= t +
     h - (remaining part of a shortest pulse)`` holds in every period if the wanted wrench is within
@@ -465,7 +465,7 @@ class ThrusterModulator:
         self._excluded.append(name)
 
     def reset(self) -> None:
-        """Close all thrusters and drop the pending impulse; the counts go on."""
+        """Close all thrusters and drop the pending impulse; the counts continue."""
         self.pending_impulse = np.zeros(6)
         """Impulse (6,) that was wanted and has not been fired yet, N s, N m s."""
         self._remaining[:] = 0.0

@@ -61,8 +61,8 @@ def load_robot(path: str | Path) -> RobotDescription:
     """Read the robot of a URDF file, or of a xacro file (by its suffix), which is expanded.
 
     Paths of meshes that are relative to the file, or in a package that is not installed and is a
-    folder around the file, become absolute in the text that the robot keeps. Where an SRDF of the
-    same name is beside it, pairs of links that it disables do not count as contacts.
+    folder around the file, become absolute in the text that the robot keeps. If an SRDF of the
+    same name is beside it, its disabled pairs of links do not count as contacts.
 
     Raises
     ------

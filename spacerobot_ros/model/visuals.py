@@ -117,7 +117,7 @@ def visuals_of(
     robot
         The robot.
     meshes
-        Triangles of meshes by their URIs, in their own frames; other meshes are left out.
+        Triangles of meshes by their URIs, in their own frames; other meshes are omitted.
     most
         Largest number of faces of a mesh; finer ones are simplified.
     """

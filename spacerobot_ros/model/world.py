@@ -16,7 +16,7 @@ from spacerobot_ros.model.urdf import parse_world, require_found_meshes
 
 
 def with_world(robot: RobotDescription, world: RobotDescription | None) -> RobotDescription:
-    """Return a robot among obstacles (:func:`.load_world`), in place of those around it so far.
+    """Return a robot among obstacles (:func:`.load_world`), instead of those around it so far.
 
     Without a world there are none around it.
     """

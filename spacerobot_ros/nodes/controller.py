@@ -45,7 +45,7 @@ class CoordinatedControlNode(CommanderNode):
     """Closes the loop over spacecraft and arm (paper 4): one command for every measured state.
 
     ``goal_pose`` is where the base is to be, ``end_effector/goal_pose`` where the end-effector is.
-    Where a planner publishes ``joint_reference`` (or ``base_reference``), those are tracked. Until
+    If a planner publishes ``joint_reference`` (or ``base_reference``), those are tracked. Until
     there is a goal, the robot holds the pose of its first state. The node converts messages; what
     becomes of goals is decided by a :class:`ControllerCommander` and its
     :class:`~spacerobot_ros.control.executive.ControlExecutive`.

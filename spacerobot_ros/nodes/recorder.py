@@ -365,7 +365,7 @@ class RecorderNode(FlightNode):
         elif recording.writer.splits != self._splits:
             self._splits = recording.writer.splits
             self._report_bag_event(
-                EventKind.FILE_SPLIT, f"Recording goes on in {recording.writer.path}."
+                EventKind.FILE_SPLIT, f"Recording continues in {recording.writer.path}."
             )
 
     def _report_bag_event(self, kind: EventKind, message: str, level: int = 0) -> None:

@@ -58,7 +58,8 @@ class ReplayNode(FlightNode):
     are written from the bag into files that are deleted at the end.
 
     Services: ``~/pause`` (SetBool), ``~/resume`` and, while paused, ``~/step`` (Trigger): the next
-    message. A time on ``replay/seek`` is where it goes on, and ``replay/status`` says where it is.
+    message. A time on ``replay/seek`` is where it continues, and ``replay/status`` says where it
+    is.
     """
 
     Config: ClassVar = ReplayConfig

@@ -70,8 +70,8 @@ def plan(
         Positions (K, 3) in m, or positions and quaternions (K, 7), which one end-effector passes
         on straight lines; the last one is its goal.
     start
-        The start: a state, or the shape (n,) alone with the base at the origin of W; None is the
-        shape zero, or as near to it as the joint limits allow.
+        The start: a state, or the shape (n,) with the base at the origin of W; None: zero, or as
+        near to zero as the joint limits allow.
     linear_momentum, angular_momentum
         (3,) each in W, kg m/s and kg m^2/s, the second about the centre of mass; None: those of the
         start. ``optimal`` plans for robots that drift.
@@ -82,8 +82,8 @@ def plan(
         Duration of a command (s), largest error at the goal, and longest step of the prediction
         (s): the plant's, for a flight that ends where the plan does.
     clearance
-        Smallest distance of links on the way, m; 0: contacts are not looked at. Among obstacles, 0
-        stands for 0.01 m.
+        Smallest distance of links during the motion, m; 0 disables collision checks. With
+        obstacles, 0 means 0.01 m.
     world
         Obstacles that are fixed in the world (:func:`.load_world`), or their URDF file; None: those
         that the robot carries.

@@ -181,7 +181,7 @@ def send_goal(
 ) -> Outcome:
     """Send one goal pose, show its statuses, and return its outcome.
 
-    ``timeout`` is wall time in s, 0: for ever. A commander is looked for no longer than that, and
+    ``timeout`` is wall time in s, 0: forever. A commander is looked for no longer than that, and
     for ten seconds at most.
 
     Raises

@@ -119,7 +119,7 @@ class MultiProcessStack:
     namespace
         Of all nodes and topics, the clock and the frames among them; empty for none.
     restarts
-        How often a minute each planner or controller that dies is started again; it then goes on
+        How often a minute each planner or controller that dies is started again; it then continues
         with its goal.
     show
         Shows a line about each restart to the user.

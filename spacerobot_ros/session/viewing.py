@@ -122,7 +122,7 @@ def viewing(
 ) -> Iterator[Viewer]:
     """Run a viewer while the block lasts; ``show`` receives the line with its address.
 
-    If the viewer ends early, the block goes on and a line at its end reports it.
+    If the viewer ends early, the block continues and a line at its end reports it.
 
     Parameters
     ----------

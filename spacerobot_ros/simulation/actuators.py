@@ -130,7 +130,7 @@ class ThrusterPlant(WrappedPlant):
         self._modulator.exclude(name)
 
     def reset(self) -> None:
-        """Return to the initial state, thrusters off; totals and counters go on."""
+        """Return to the initial state, thrusters off; totals and counters continue."""
         super().reset()
         self._modulator.reset()
         self.wrench[:] = self.duty[:] = self.thrust[:] = 0.0
@@ -464,7 +464,7 @@ def build_plant(
     config
         The parameters of the plant.
     initial
-        Initial state in place of the configuration's.
+        Initial state instead of the configuration's.
 
     Raises
     ------

@@ -1,6 +1,6 @@
 """The clearance of a plant in flight: the smallest distance of its links, and their contacts.
 
-An exact plant integrates the motion of bodies that do not push each other: it goes on through a
+An exact plant integrates the motion of bodies that do not push each other: it continues through a
 contact, and reports that it does.
 """
 
@@ -125,7 +125,7 @@ class ClearanceMonitor:
     ) -> ClearanceMonitor | None:
         """Return the monitor of a robot; None: none of its links could touch.
 
-        ``before`` is that among other obstacles, whose contacts go on or end.
+        ``before`` is that among other obstacles, whose contacts continue or end.
         It is None, too, where the package coal is not installed, which the log says.
         """
         geometry = CollisionGeometry(robot)

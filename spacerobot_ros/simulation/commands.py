@@ -479,7 +479,7 @@ def _parse_latching_reasons(words: str) -> frozenset[Reason]:
 class _JointBrakes:
     """Efforts that brake the joints of a plant: internal forces, which keep its momenta.
 
-    Reaction wheels go on spinning, because braking them would turn the base.
+    Reaction wheels continue spinning, because braking them would turn the base.
     """
 
     def __init__(self, plant: Plant, control_period: float) -> None:

@@ -439,7 +439,7 @@ class PlantConfig(WatchdogConfig, RobotConfig):
     capture: CaptureConfig = group(CaptureConfig())
 
     def decided(self, actuation: str = "") -> PlantConfig:
-        """Return the configuration with an actuation in place of ``auto``.
+        """Return the configuration with an actuation instead of ``auto``.
 
         ``actuation`` is what commands carry; empty: velocities, unless thrusters or moving joints
         need efforts.

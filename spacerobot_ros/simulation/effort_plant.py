@@ -284,7 +284,7 @@ class EffortPlant:
         return self._next_state[p_W.start : L_W.stop]
 
     def reset(self) -> None:
-        """Return to the initial state, without efforts; the limit counters go on."""
+        """Return to the initial state, without efforts; the limit counters continue."""
         start, robot = self.initial, self.robot
         self._state[:] = np.concatenate(
             [
@@ -316,7 +316,7 @@ class EffortPlant:
         self._holding = bool(joints.any())
 
     def load(self, loads: PlantLoads) -> None:
-        """Step under external loads from now on; their numbers may change before each step."""
+        """Step under external loads; their numbers may change before each step."""
         robot, substeps = self.robot, self._substeps
         loaded = robot.composed(
             f"loaded_effort_tick_{substeps}",
@@ -329,10 +329,9 @@ class EffortPlant:
         """Advance one tick under joint efforts (n,), clipped to their limits, and a base wrench.
 
         ``wrench`` (6,) is force (N) over torque (N m) at the origin of the base link, in base
-        components; it turns with the base during the tick. A joint that reaches its limit
-        stops there without rebound and is held while something pushes it outwards. Returns
-        whether any joint was limited; ``effort_limited`` and ``stroke_limited`` count the ticks by
-        joint.
+        components; it rotates with the base during the tick. A joint that reaches its limit stops
+        there without rebound and is held while something pushes it outwards. Returns whether any
+        joint was limited; ``effort_limited`` and ``stroke_limited`` count the ticks by joint.
 
         Raises
         ------

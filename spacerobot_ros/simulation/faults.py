@@ -409,7 +409,7 @@ class Timeline(Generic[Entry]):
             self.read(text.splitlines(), now)
 
     def copy_from(self, other: Timeline[Entry]) -> None:
-        """Take the entries of another timeline in place of these."""
+        """Take the entries of another timeline instead of these."""
         self.entries, self.next_change = list(other.entries), -math.inf
 
     def clear(self) -> None:

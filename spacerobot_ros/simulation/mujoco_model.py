@@ -46,7 +46,7 @@ def body_name(link: str) -> str:
 
 
 def robot_spec(mujoco: Any, description: RobotDescription) -> Any:
-    """Return MuJoCo's specification of a robot whose base is free; its shapes are left out.
+    """Return MuJoCo's specification of a robot whose base is free; its shapes are omitted.
 
     Raises
     ------

@@ -1,6 +1,6 @@
 """The plant in MuJoCo: links, obstacles and the target push each other, and a grasp is a weld.
 
-The parameter ``engine`` chooses it in place of :class:`.EffortPlant` or :class:`.VelocityPlant`;
+The parameter ``engine`` chooses it instead of :class:`.EffortPlant` or :class:`.VelocityPlant`;
 commands, states and topics are the same. MuJoCo integrates by Runge-Kutta 4; contacts, joint stops,
 locked joints and welds are its soft constraints, with a time constant of two steps. They are
 internal forces, so that total momentum changes by the error of the integration alone: with steps of
@@ -161,7 +161,7 @@ class MujocoPlant:
     # -- the plant ----------------------------------------------------------------------------
 
     def reset(self) -> None:
-        """Return to the initial state, without efforts; the limit counters go on."""
+        """Return to the initial state, without efforts; the limit counters continue."""
         start, robot, data = self.initial, self.robot, self._data
         rates = start.rates(robot)
         if self._velocity and rates.any():
@@ -210,7 +210,7 @@ class MujocoPlant:
         self._held = joints.copy()
 
     def load(self, loads: PlantLoads) -> None:
-        """Step under external loads from now on; their numbers may change before each step."""
+        """Step under external loads; their numbers may change before each step."""
         self._loads = loads
 
     def step(self, command: npt.ArrayLike, wrench: npt.ArrayLike = 0.0) -> bool:

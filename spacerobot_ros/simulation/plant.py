@@ -58,7 +58,7 @@ class Plant(Protocol):
         """Lock the marked joints (n,) at their positions, and release all other joints."""
 
     def load(self, loads: PlantLoads) -> None:
-        """Step under external loads from now on; their numbers may change before each step."""
+        """Step under external loads; their numbers may change before each step."""
 
     @property
     def step(self) -> Callable[..., bool]:
@@ -98,7 +98,7 @@ class WrappedPlant:
         self.plant.hold(joints)
 
     def load(self, loads: PlantLoads) -> None:
-        """Step under external loads from now on; their numbers may change before each step."""
+        """Step under external loads; their numbers may change before each step."""
         self.plant.load(loads)
 
     def reset(self) -> None:

@@ -28,10 +28,10 @@ _ROUNDING = 1e-9
 class VelocityPlant:
     """A free-floating robot whose servos realise held joint velocities.
 
-    After :meth:`step`, the attributes are those of :class:`Plant`, where ``qdot`` are the
-    velocities of the last tick, and ``effort`` the efforts that the servos' motion took in it: the
-    inverse dynamics of the mean of the velocities before and in the tick, and of the acceleration
-    that leads from one to the other in a tick. Limits of efforts do not hold the servos back.
+    After :meth:`step`, the attributes are those of :class:`Plant`: ``qdot`` has the velocities of
+    the last tick, and ``effort`` the efforts of the servos, from inverse dynamics with the mean of
+    the velocities before and in the tick, and their difference over a tick. Effort limits do not
+    restrict servos.
 
     Parameters
     ----------
@@ -89,7 +89,7 @@ class VelocityPlant:
         return self._momenta
 
     def reset(self) -> None:
-        """Return to the initial state, at rest; the limit counters go on."""
+        """Return to the initial state, at rest; the limit counters continue."""
         start, robot = self.initial, self.robot
         if np.any(start.rates(robot)):
             raise ParameterError(
@@ -111,7 +111,7 @@ class VelocityPlant:
         self._held = joints.copy() if joints.any() else None
 
     def load(self, loads: PlantLoads) -> None:
-        """Step under external loads from now on; their numbers may change before each step."""
+        """Step under external loads; their numbers may change before each step."""
         robot, substeps = self.robot, self._substeps
         loaded = robot.composed(
             f"loaded_velocity_tick_{substeps}",

@@ -126,8 +126,8 @@ def test_a_scheduler_that_goes_away_is_said_and_takes_no_flight_with_it(tmp_path
                 scheduler.kill()
                 assert run.process.wait(timeout=_LONGEST) == 2
                 assert run.log.read_text().endswith(
-                    "The scheduler is gone. Finished flights are kept: the same command goes on "
-                    "from there.\n"
+                    "The scheduler is gone. Finished flights are kept; the same command "
+                    "continues.\n"
                 )
     found = rows(out)
     assert {row["outcome"] for row in found} == {"reached"}

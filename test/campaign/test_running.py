@@ -241,7 +241,7 @@ def test_a_disk_that_is_full_costs_nothing_that_is_there(
     assert len(Results.of(tmp_path)) == 2
     with monkeypatch.context() as patch:
         patch.setattr(require_module("pyarrow.parquet"), "write_table", full)
-        with pytest.raises(RecordingError, match=r"The last 1 flights cannot be .*goes on from"):
+        with pytest.raises(RecordingError, match=r"The last 1 flights cannot be .*continues from"):
             run_campaign(small(flights=3), tmp_path)
     assert str(rows(tmp_path)) == str(before)
     assert run_campaign(small(flights=3), tmp_path).flown == 3

@@ -164,8 +164,8 @@ def test_coasting_wheels_have_no_torque() -> None:
          "Parameter 'wheels.excluded' names 'spin_d'; the wheels of robot 'gyro' are spin_c, "
          "spin_a, spin_b."),
         ({"dump_rate": 0.75}, 0.0,
-         "Parameter 'wheels.dump_rate' is 0.75, but 'use_thrusters' is false: momentum is dumped "
-         "to thrusters alone; set it to 0."),
+         "Parameter 'wheels.dump_rate' is 0.75, but 'use_thrusters' is false: only thrusters can "
+         "dump momentum; set it to 0."),
     ],
 )  # fmt: skip
 def test_options_that_no_wheel_fits_are_refused(

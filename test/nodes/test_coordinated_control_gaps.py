@@ -130,7 +130,7 @@ def test_a_silent_reference_is_done_without_until_it_comes_again(harness: Harnes
     loop = Referenced(harness, reference_timeout=0.3)
     # Its publisher has sent nothing yet.
     np.testing.assert_allclose(np.concatenate(loop.answer()), 0.0, atol=1e-9)
-    said = " No reference comes on base_reference."
+    said = " There is no reference on base_reference."
     harness.spin_until(lambda: loop.probe.last(STATUS).message.endswith(said), "a status")
     assert loop.status["state"] == "holding"
     loop.place = np.array([0.1, 0.0, 0.0])
@@ -169,7 +169,7 @@ def test_in_real_time_a_silent_reference_costs_no_answer_and_odom_is_not_blamed(
     assert stamps == [TICK_NS * tick for tick in range(1, 11)]
     states = [value_of(each, "state") for each in loop.probe.messages[STATUS]]
     assert set(states) == {"waiting", "holding"}
-    assert loop.probe.last(STATUS).message.endswith(" No reference comes on base_reference.")
+    assert loop.probe.last(STATUS).message.endswith(" There is no reference on base_reference.")
 
 
 def test_without_a_timeout_states_wait_for_references(harness: Harness) -> None:

@@ -256,7 +256,7 @@ def test_the_shape_of_one_joint_that_turns_its_base_decides_the_attitude() -> No
     schedule = plan(robot, goal, tolerance=Tolerance(1.0, 1e-3, 1e-3), **quick)
     np.testing.assert_allclose(schedule.positions[-1], final, atol=1e-3)
     other = replace(goal, joint_positions=-final)
-    with pytest.raises(UnreachableError, match="loops of its joints do not turn its base"):
+    with pytest.raises(UnreachableError, match="loops of its joints do not rotate its base"):
         plan(robot, other, tolerance=Tolerance(1.0, 1e-3, 1e-3), **quick)
 
 

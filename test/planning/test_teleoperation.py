@@ -136,7 +136,7 @@ def test_rates_change_within_the_limits_and_the_joints_brake_when_twists_stop() 
     assert np.all(np.diff(speeds) <= 1e-12)
     assert speeds[-1] == 0.0
     assert loop.executive.phase is Phase.IDLE
-    assert loop.statuses[-1].message == "No twists come any more: the joints rest."
+    assert loop.statuses[-1].message == "No more twists arrive: the joints rest."
     assert loop.states[-1] == "idle"
     commands = np.array(loop.commands)
     assert np.abs(np.diff(commands, axis=0) / TICK / most).max() <= 1 + 1e-9
@@ -209,7 +209,7 @@ def test_joints_stop_at_their_limits() -> None:
     shapes = np.array(loop.shapes)
     assert shapes[:, 1].max() <= 2.8 + 1e-9
     assert shapes[:, 1].max() > 2.75
-    assert any("Joint 'elbow' comes to its limit at 2." in s.message for s in loop.statuses)
+    assert any("Joint 'elbow' reaches its limit at 2." in s.message for s in loop.statuses)
     most = np.array([0.6, 0.8]) * TICK
     assert np.all(np.abs(np.diff(np.array(loop.commands), axis=0)) <= most + 1e-9)
 
@@ -300,9 +300,9 @@ def test_a_goal_comes_first_and_twists_have_to_pause_before_they_count_again() -
             break
         assert refusal(loop, **options) == pursued
     assert loop.states[-1] == "reached"
-    assert refusal(loop, **options) == "Twists are not followed until none has come for 0.4 s."
+    assert refusal(loop, **options) == "Twists are ignored until none has arrived for 0.4 s."
     loop.tick(7)
-    assert refusal(loop, **options) == "Twists are not followed until none has come for 0.4 s."
+    assert refusal(loop, **options) == "Twists are ignored until none has arrived for 0.4 s."
     loop.tick(9)
     send(loop, **options)
     assert loop.executive.phase is Phase.TELEOPERATING

@@ -173,11 +173,11 @@ class LawOptions:
 
 
 class ControlLaw(ABC):
-    """A way to turn errors of the outputs into thruster forces and joint efforts.
+    """A function from the errors of the outputs to thruster forces and joint efforts.
 
-    A law is constructed once for a robot and commands once every control period. A subclass gives
-    ``name``, ``gain_units`` and :meth:`results`, and where it has options, ``Options``: a frozen
-    dataclass derived from :class:`LawOptions`, whose fields become the parameters
+    A law is constructed once for a robot and commands once every control period. A subclass
+    defines ``name``, ``gain_units`` and :meth:`results`, and if it has options, ``Options``: a
+    frozen dataclass derived from :class:`LawOptions`, whose fields become the parameters
     ``<name>.<option>`` of the controller node. A line in
     :mod:`spacerobot_ros.control.laws.registry` makes it available.
 
@@ -373,7 +373,7 @@ class ControlLaw(ABC):
         return (kp, kd) if self.gain_units != ACCELERATION_GAINS else self._filled(kp, kd)
 
     def _filled(self, kp: Array, kd: Array) -> tuple[Array, Array]:
-        """Return gains (m,) with those of accelerations in place of zeros."""
+        """Return gains (m,) with those of accelerations instead of zeros."""
         rate = self._damping_rate
         filled_kp = np.where(kp > 0, kp, _CRITICAL_STIFFNESS * rate**2)
         return filled_kp, np.where(kd > 0, kd, rate)
@@ -381,7 +381,7 @@ class ControlLaw(ABC):
     def integrate_error(self, duration: float, *, limited: bool = False) -> None:
         """Add the error of the last command, which is held for ``duration`` (s), to the integral.
 
-        Where the command was ``limited``, an integral may only shrink (anti-windup).
+        If the command was ``limited``, an integral may only shrink (anti-windup).
         """
         if not self.integrates:
             return
@@ -392,7 +392,7 @@ class ControlLaw(ABC):
         self._in["integral"][:] = self._ki * self._integral
 
     def start(self, time: float, start: Reference, goal: Reference) -> None:
-        """Begin anew: at ``time`` (s) the reference starts towards new goals.
+        """Restart: at ``time`` (s) the reference starts towards new goals.
 
         A law that keeps a state between commands starts it here, after this base method.
         """
@@ -522,8 +522,9 @@ class ControlLaw(ABC):
 
     @property
     def fixed_inputs(self) -> Mapping[str, npt.ArrayLike] | None:
-        """Arguments of :attr:`function` beside state, reference and gains that are the same in
-        every flight; None: some depend on the flight, or the function is not the whole command.
+        """Arguments of :attr:`function` other than state, reference and gains, if they are the
+        same in every flight; None: some depend on the flight, or the function is not the whole
+        command.
 
         It is not in a law that overrides a step of the command and not :meth:`is_complete` too.
         """
@@ -544,7 +545,7 @@ class ControlLaw(ABC):
 
     @abstractmethod
     def results(self, symbols: dict[str, ca.SX]) -> dict[str, ca.SX]:
-        """Return the expressions of the law's results beside the errors and ``J_z``, by name.
+        """Return the expressions of the law's results, other than the errors and ``J_z``, by name.
 
         ``actuation`` (6 + n,) is the command: force (N) and torque (N m) at the origin of the base
         link in base components, then the joint efforts; other results are the law's own.

@@ -19,7 +19,7 @@ class NumpyLaw(ControlLaw):
 
     A subclass gives ``name`` and :meth:`compute`. Before each call the base class evaluates
     :attr:`error`, :attr:`error_rate` and :attr:`J_z` of the outputs; :attr:`gain_diagonals` are the
-    parameters ``gains``. A law with a state keeps it in its attributes, and starts it anew in
+    parameters ``gains``. A law with a state keeps it in its attributes, and starts it again in
     :meth:`start`. All engines but the lanes of campaigns fly such a law.
 
     See :class:`ControlLaw` for the parameters and errors of the constructor.

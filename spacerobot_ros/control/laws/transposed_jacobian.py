@@ -35,8 +35,8 @@ class TransposedJacobianLaw(ControlLaw):
     acceleration feedforward. Automatic gains are matrices that do follow the masses, with
     feedforward (:meth:`.ControlLaw.automatic_effort`).
 
-    With fewer outputs than degrees of freedom eq. (29) does not act on the other motion: arms go on
-    swinging. ``joint_damping`` subtracts ``joint_damping * qdot`` from the joint efforts.
+    With fewer outputs than degrees of freedom eq. (29) does not act on the other motion: arms
+    continue swinging. ``joint_damping`` subtracts ``joint_damping * qdot`` from the joint efforts.
 
     Parameters
     ----------

@@ -203,7 +203,7 @@ class CommanderNode(FlightNode):
     def waiting_states(self) -> tuple[list[Stamped], list[Stamped]]:
         """Return the messages that wait in the subscriptions of odom and joint_states.
 
-        Where no joints wait, nor are skipped, odom comes in its own order.
+        If no joints wait, nor are skipped, odom comes in its own order.
         """
         joints = [*map(self._joined, self._waiting("joint_states"))]
         odoms = self._waiting("odom") if joints else []
@@ -285,7 +285,8 @@ class CommanderNode(FlightNode):
         return answer
 
     def _subscribe_plant_status(self) -> None:
-        """Subscribe anew to plant/status, whose present publishers first send their last status."""
+        """Subscribe again to plant/status, whose present publishers first send their last
+        status."""
         if self._statuses is not None:
             self.destroy_subscription(self._statuses)
         self._doubted = False

@@ -265,8 +265,8 @@ class GoalActions:
                 self._servers.append(self._create_server(kind(found)))
         if not self._servers:
             node.get_logger().info(
-                "Goals come by topics alone: neither spacerobot_msgs nor nav2_msgs is installed, "
-                "whose actions bring them, too."
+                "Goals are accepted on topics only: actions need spacerobot_msgs or nav2_msgs, "
+                "and neither is installed."
             )
 
     def _create_server(self, action: GoalAction) -> _Server:

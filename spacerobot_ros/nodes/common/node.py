@@ -233,7 +233,7 @@ class FlightNode(LifecycleNode):
         return guarded
 
     def _fail(self, what: str, error: Exception) -> None:
-        """Stop working after an exception of a callback; the executor goes on."""
+        """Stop working after an exception of a callback; the executor continues."""
         if self._destroyed or (isinstance(error, InvalidHandle) and not self._has_entities):
             return  # The executor may still call back for a destroyed entity.
         self.get_logger().debug("".join(traceback.format_exception(error)))

@@ -83,7 +83,7 @@ class Watchdog:
     """Finds nodes whose heartbeats cease.
 
     A node is watched from its first heartbeat on until it says that it is inactive. While it is
-    busy nothing is expected of it. Where this node itself stood still, all are given their time
+    busy nothing is expected of it. If this node itself stood still, all are given their time
     again.
 
     Parameters

@@ -549,7 +549,7 @@ class PlantNode(FlightNode):
         self._publish_changed_status()
 
     def _on_obstacles(self, message: String) -> None:
-        """Measure distances to the obstacles of a text, and draw them, in place of those so far."""
+        """Measure distances to the obstacles of a text, and draw them, instead of those so far."""
         if message.data == self._obstacles:
             return
         try:
@@ -587,7 +587,7 @@ class PlantNode(FlightNode):
         self._publish_changed_status()
         if self._is_running_or_paused:
             self._publish()
-        return "The robot is back in its initial state; time goes on."
+        return "The robot is back in its initial state; time continues."
 
     def _abort(self) -> str:
         self._commands.latch("abort", "stopped on request", self.time_ns)

@@ -341,7 +341,7 @@ class ClearancePublisher:
     ) -> ClearancePublisher | None:
         """Return the publisher of a plant among obstacles; None where no links could touch.
 
-        ``before`` is the publisher among the obstacles so far, whose topic goes on;
+        ``before`` is the publisher among the obstacles so far, whose topic continues;
         ``has_contact_forces`` is that of :class:`.ClearanceMonitor`.
         """
         # Not every plant measures distances.

@@ -34,7 +34,7 @@ DEFAULT_CLEARANCE = 0.01
 """Smallest distance between two links of a plan, m; 0: contacts are not looked at."""
 
 _CLEARANCE_OF_OBSTACLES = 0.01
-"""Smallest distance among obstacles where none is asked for, m."""
+"""Smallest distance among obstacles if none is asked for, m."""
 
 _SRDF_REMEDY = ", or have an SRDF disable the pair (planner.srdf)"
 

@@ -176,7 +176,7 @@ def tilted_goal_error(robot: SpaceRobot, axis: Array, tilt: float) -> Unreachabl
     return UnreachableError(
         f"The goal attitude is {tilt:.4g} rad off any rotation about the axis "
         f"{(np.round(axis, 6) + 0.0).tolist()} of {robot.base_link}: planar robot "
-        f"'{robot.description.name}' turns about no other axis.",
+        f"'{robot.description.name}' rotates about no other axis.",
         Proof.RANK,
     )
 
@@ -207,7 +207,7 @@ def _span_of_brackets(
     rank = int(max(_numerical_rank(row) for row in values))
     where, names = f"at the best of {len(shapes)} shapes", robot.joint_names
     if len(joints) < 3:
-        message = f"Loops of two joints of robot '{name}' turn its base about one axis at a time."
+        message = f"Loops of two joints of robot '{name}' rotate its base about one axis at a time."
         chosen = tuple(names[i] for i in joints)
         return Controllability(
             min(rank, 1), 3, np.pad(values[0], (0, 2)), chosen, shapes[0], message
@@ -228,7 +228,7 @@ def _span_of_brackets(
     else:
         message = (
             f"First-order brackets of the joints of robot '{name}' span {rank} of the three axes "
-            f"of rotation {where}: small loops turn the base about no other axis."
+            f"of rotation {where}: small loops rotate the base about no other axis."
         )
     return Controllability(rank, 3, singular[best], triple, shapes[best], message)
 

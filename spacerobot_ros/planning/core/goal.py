@@ -190,8 +190,8 @@ class Goal:
     end_effectors
         Goals of links, each of another one.
     base
-        The parts of the pose of the base that are asked for. With end-effectors it may be any of
-        them or none; the base is then where the motion leaves it.
+        The requested parts of the pose of the base. With end-effectors any of them may be omitted,
+        and the base is free in them.
     """
 
     position: Array
@@ -288,7 +288,8 @@ class Goal:
         Raises
         ------
         GoalError
-            It is no goal, or the rotation vector is not three numbers of at most a million turns.
+            The goal is invalid, or the rotation vector is not three numbers of at most a million
+            revolutions.
         """
         vector = as_numbers(rotvec, "The goal rotation vector", GoalError)
         if vector.shape != (3,) or not np.all(np.abs(vector) <= _MAX_ANGLE):
@@ -344,9 +345,9 @@ class Goal:
         return replace(self, end_effectors=tuple(sorted(goals, key=lambda each: each.link)))
 
     def joined_with(self, other: Goal) -> Goal:
-        """Return the goal with the parts of another one, which count where both have a part.
+        """Return the goal with the parts of another one, which has precedence.
 
-        A goal of the base alone takes the place of another one.
+        A goal of the base only replaces another one.
         """
         if not self.end_effectors and not other.end_effectors:
             return other
@@ -357,12 +358,12 @@ class Goal:
 
     @property
     def has_path(self) -> bool:
-        """Whether an end-effector is to follow a given path to the goal."""
+        """Whether an end-effector follows a given path to the goal."""
         return bool(self.links_with_paths)
 
     @property
     def links_with_paths(self) -> frozenset[str]:
-        """Links that are to follow a given path."""
+        """Links that follow a given path."""
         return frozenset(each.link for each in self.end_effectors if each.waypoints is not None)
 
     def displaced(self, by: Array) -> Goal:
@@ -429,10 +430,10 @@ class PoseError:
     rotvec
         (3,) rotation vector from the attitude to that of the goal, in B, rad.
     shape
-        (n,) from the joint positions to those of the goal, m or rad; empty where the goal has none.
+        (n,) from the joint positions to those of the goal, m or rad; empty if the goal has none.
     end_effectors
-        Likewise of each end-effector of the goal: from its pose, in W and in its own frame; the
-        rotation is zero where the goal is a position alone.
+        The same for each end-effector of the goal: from its pose, in W and in its own frame; the
+        rotation is zero if the goal is a position only.
     """
 
     position: Array
@@ -498,12 +499,12 @@ class PoseError:
 
     @property
     def largest_end_effector_distance(self) -> float:
-        """Largest distance of an end-effector from its goal, m; zero where the goal has none."""
+        """Largest distance of an end-effector from its goal, m; zero if the goal has none."""
         return max((each.distance for each in self.end_effectors), default=0.0)
 
     @property
     def largest_end_effector_angle(self) -> float:
-        """Largest angle of an end-effector from its goal, rad; zero where the goal has none."""
+        """Largest angle of an end-effector from its goal, rad; zero if the goal has none."""
         return max((each.angle for each in self.end_effectors), default=0.0)
 
 
@@ -536,7 +537,7 @@ def uncontrolled_parts(goal: Goal, controls: frozenset[Controlled]) -> tuple[Con
 class Tolerance:
     """Largest errors of a reached goal: ``position`` m, ``attitude`` rad, joints m or rad.
 
-    Those of the pose are for the base and for end-effectors alike.
+    Those of the pose hold for the base and for end-effectors.
     """
 
     position: float
@@ -544,7 +545,7 @@ class Tolerance:
     shape: float = 1e-3
 
     def require_control(self, goal: Goal, controls: frozenset[Controlled], who: str) -> None:
-        """Refuse a goal with these tolerances, where 0 is none, if ``who`` leaves one unmet.
+        """Refuse a goal with these tolerances (0: none) if ``who`` does not control one of them.
 
         ``controls`` are the parts of the goal that ``who``, a method or a law, controls.
 

@@ -60,23 +60,22 @@ class InitialMotion:
 
 @dataclass(frozen=True)
 class PlanRequest:
-    """The arguments of a plan, beside the robot and the options of the method.
+    """The arguments of a plan, in addition to the robot and the options of the method.
 
     Attributes
     ----------
     state
         The state in which the gait begins.
     goal
-        The goal at which it is to end.
+        The goal at which it ends.
     tolerance
         Largest errors at the goal.
     correction
         Whether an earlier schedule for the same goal has just ended: the remaining error is small,
         and options that fix the size of the first manoeuvre do not apply.
     previous
-        The schedule that was executed last for the same goal, None for the first. Methods keep to
-        the choices that it made: ``auto`` stays with its method, and methods that plan piece by
-        piece go on from its ``progress``.
+        The last executed schedule for the same goal, None for the first. ``auto`` keeps its
+        method, and methods that plan piece by piece continue from its ``progress``.
     motion
         Motion of the joints at the beginning of the gait; None: they rest. Only methods that
         declare ``starts_in_motion`` are asked with it.
@@ -100,7 +99,7 @@ BEYOND_EFFORT_LIMITS = "beyond_effort_limits"
 
 
 class GaitMethod(ABC):
-    """A way to turn a goal pose into a gait.
+    """An algorithm that turns a goal pose into a gait.
 
     A method is built once for a robot and plans many times. It keeps nothing between the calls of
     :meth:`plan` but functions that it has compiled.
@@ -123,8 +122,8 @@ class GaitMethod(ABC):
     name
         Name in the registry, and of the group of parameters ``<name>.<option>``.
     controls
-        The parts of a goal that the method's schedules control; the others follow from these.
-        A method that chooses among others states them in each schedule alone.
+        The parts of a goal that the method's schedules control. A method that selects among others
+        states them in each schedule only.
     plans_for_base, plans_for_end_effectors
         Whether it plans goals of the base, and goals of end-effectors.
     follows_paths
@@ -173,7 +172,7 @@ class GaitMethod(ABC):
             self._setup_refusal = refusal
 
     def setup(self) -> None:  # noqa: B027 - methods that delegate have nothing to set up here
-        """Compute all attributes that depend on robot and options alone; called once.
+        """Compute all attributes that depend only on robot and options; called once.
 
         A `PlanningError` refuses the robot: :meth:`require_rest` raises it for every goal.
         """
@@ -400,7 +399,7 @@ class GaitMethod(ABC):
             raise PlanningError(
                 "The robot drifts: its total momentum is not zero "
                 f"({p:.3g} kg m/s, {L:.3g} kg m^2/s), and {self.name} plans for zero momentum; "
-                "shape changes cannot remove it, and optimal plans for robots that drift."
+                "joint motions cannot remove it; optimal plans for robots that drift."
             )
         wheels = ReactionWheels.of(self.robot.description)
         if state.qdot is not None and wheels.are_spinning(state.qdot):

@@ -1,7 +1,7 @@
 """Path-independent and path-dependent workspaces of an end-effector while the base floats.
 
 At zero momentum the generalised Jacobian ``J*(q)`` maps joint rates to the velocity of the
-end-effector. Where it loses rank no rates move the end-effector in some direction: a dynamic
+end-effector. If it loses rank no rates move the end-effector in some direction: a dynamic
 singularity. The shape decides whether it does. Its distance from the system's centre of mass,
 which rests, depends on the shape alone, too, and the base may have any attitude; so a distance at
 which some singular shape puts the end-effector is *path-dependent*: whether the robot is singular

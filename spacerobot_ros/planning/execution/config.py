@@ -142,7 +142,7 @@ class PlannerConfig(CommanderConfig):
     def goal_links(self) -> tuple[str, ...]:
         """Names of the links that take goals.
 
-        Where a controller moves the robot, goals of its end-effector are for the controller.
+        If a controller moves the robot, goals of its end-effector are for the controller.
         """
         default = [DEFAULT_END_EFFECTOR] if self.output != "reference" else []
         return tuple(dict.fromkeys((*default, *self.end_effectors)))

@@ -219,7 +219,7 @@ class Executive:
     With a worker that plans at once, the measured state waits for its plan, and a plan that is
     requested while the joints move begins with their braking. With one that plans in the
     background, the joints brake to rest before a plan is requested, and hold their shape until it
-    is there. Where the methods of both schedules allow it, neither happens: a plan takes over in
+    is there. If the methods of both schedules allow it, neither happens: a plan takes over in
     motion, at a tick ahead. That tick follows from parameters and from the stamp of the request,
     not from the time that planning takes.
 
@@ -340,7 +340,7 @@ class Executive:
     def abort(self, why: str = "on request") -> str | None:
         """Give up all goals and come to rest.
 
-        Returns a message about the joints; None where there is no goal.
+        Returns a message about the joints; None if there is no goal.
         """
         goal_id, message = self._latest_goal_id(), "The joints rest."
         match self.phase:
@@ -373,7 +373,7 @@ class Executive:
     ) -> bool:
         """Give up every goal at once: the plant does not obey commands any more.
 
-        Where it rests because commands did not come, a goal goes on for which nothing was commanded
+        If it rests because commands did not come, a goal continues for which nothing was commanded
         until then, and one whose plan has taken so long that no state was answered. A goal that was
         to replace it is planned for from rest.
         """
@@ -473,7 +473,7 @@ class Executive:
     def use_obstacles(self, make_worker: Callable[[], PlanningWorker]) -> None:
         """Plan around other obstacles from now on.
 
-        A plan that is being made is made again. Where the rest of the present schedule comes too
+        A plan that is being made is made again. If the rest of the present schedule comes too
         near, the joints brake, and the remaining motion is planned again.
 
         Parameters
@@ -726,7 +726,7 @@ class Executive:
         self._request_plan(job, state)
 
     def _keep_schedule_for(self, identified: IdentifiedGoal, active: ActiveGoal) -> None:
-        """Make a goal with the same pose and shape the active goal; the schedule goes on."""
+        """Make a goal with the same pose and shape the active goal; the schedule continues."""
         self._new_goal = None
         left = active.ends_at - self._stamp_ns / 1e9
         active = replace(active, identified=identified, corrections=0, manoeuvre_time=left)

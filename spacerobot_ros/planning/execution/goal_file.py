@@ -36,8 +36,8 @@ class IdentifiedGoal:
     tolerance
         Its largest errors where it is reached; None: those of the commander's parameters.
     resumes
-        Whether a restarted commander goes on with it. The client of an action is told that its
-        goal has ended when the commander stops, so nothing goes on.
+        Whether a restarted commander continues it. The client of an action is told that its
+        goal has ended when the commander stops, so nothing continues.
     required
         The tolerances that its sender has given, 0: none. A goal with a tolerance for a part that
         the method or the law does not control is refused.

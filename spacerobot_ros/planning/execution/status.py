@@ -156,7 +156,7 @@ _PARTS = TextFormat(
     " ".join,
     lambda text: tuple(part for part in ("position", "attitude", "shape") if part in text.split()),
 )
-"""The parts of a goal that a method may leave uncontrolled; unknown words are left out."""
+"""The parts of a goal that a method may leave uncontrolled; unknown words are omitted."""
 
 _FORMAT = KeyValueFormat(
     "status of a planner",

@@ -43,7 +43,7 @@ _SLOW_PROGRESS_RATE = 2 * MIN_PROGRESS_RATE
 """Progress below which the end-effector slows down before a singularity."""
 
 _LOOK_AHEAD = 1e-3
-"""Motion of the fastest joint after which the progress is looked at again, rad."""
+"""Motion of the fastest joint after which the progress is checked again, rad."""
 
 _TRIED_SPEED_SHARES = (1.0, 0.5, 0.25, 0.0)
 """Shares of the rates that are tried where links come too near; with the last one joints brake."""
@@ -157,7 +157,7 @@ class Teleoperation:
     """End-effectors that follow twists, one at a time, until none has come for ``twist_timeout``.
 
     After a refusal, and after an abort, twists are refused until none has come for that time: so
-    an operator who goes on sending moves nothing by surprise.
+    an operator who continues sending moves nothing by surprise.
 
     Parameters
     ----------
@@ -197,9 +197,7 @@ class Teleoperation:
         try:
             if refused is not None and stamp_ns - refused <= self._timeout_ns:
                 timeout = self._config.twist_timeout
-                raise PlanningError(
-                    f"Twists are not followed until none has come for {timeout:g} s."
-                )
+                raise PlanningError(f"Twists are ignored until none has arrived for {timeout:g} s.")
             if following is not None and following.follower.link != twist.link:
                 raise PlanningError(
                     f"'{following.follower.link}' follows twists: '{twist.link}' waits until they "
@@ -261,7 +259,7 @@ class Teleoperation:
         pose = np.eye(7)[6] if following.pose is None else following.pose
         rates, limited = following.follower.rates(twist, pose, q, before)
         if following.twist is None and not np.any(rates):
-            return TwistStep(rates, "No twists come any more: the joints rest.", ended=True)
+            return TwistStep(rates, "No more twists arrive: the joints rest.", ended=True)
         return TwistStep(rates, self._news(following, reason or limited, stamp))
 
     def _news(self, following: _Following, reason: str, stamp: int) -> str:
@@ -409,7 +407,7 @@ class TwistFollower:
         if by_stops[nearest] < factor:
             factor = float(by_stops[nearest])
             joint = self._robot.joint_names[nearest]
-            reason = f"Joint '{joint}' comes to its limit at {q[nearest]:.4g}."
+            reason = f"Joint '{joint}' reaches its limit at {q[nearest]:.4g}."
         return factor * rates, reason
 
     def _moves_away_from_singularity(

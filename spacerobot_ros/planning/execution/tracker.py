@@ -456,7 +456,7 @@ class StuckJointWatch:
     Since it was last seen to follow, every joint has gone over some range and was commanded to go
     over another; a joint is stuck when it was commanded to move in N ticks or more and the first
     range is a small part of the second. So joints that are not commanded to move, slow ones, and
-    ones whose measurements are noisy are not taken for stuck. Where no joint moves at all, or none
+    ones whose measurements are noisy are not taken for stuck. If no joint moves at all, or none
     has moved for half of N ticks although several were commanded to, they are watched for longer:
     a plant that is restarted takes a while to receive commands.
 

@@ -260,7 +260,7 @@ class AreaLoopGait(GaitMethod):
 
         Also returned are the paper's symbols and the expected number of cycles for the goal.
 
-        The gait begins in ``state``. Cycles go on until the attitude is off by ``enough`` (rad);
+        The gait begins in ``state``. Cycles continue until the attitude is off by ``enough`` (rad);
         ``flown`` are done.
         """
         S, share = self._initial_loop_areas(left, nominal)

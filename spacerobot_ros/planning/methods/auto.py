@@ -34,7 +34,7 @@ class CandidateMethod:
 class AutoGait(GaitMethod):
     """Plans by all methods that suit the robot, and returns the shortest manoeuvre.
 
-    Where a method that suits the robot controls the position, methods that do not are left out. A
+    If a method that suits the robot controls the position, methods that do not are omitted. A
     manoeuvre that ends off the goal, or controls less of it than another, is taken only if there
     is no better one. A goal stays with the method of the schedule that was flown for it before, as
     long as that plans. A schedule is that of the chosen method, in all but its notes.

@@ -141,7 +141,7 @@ def check_planar_chain(robot: SpaceRobot) -> Controllability:
         "(paper 3)."
     )
     if largest <= ZERO_TURN_PER_AREA:
-        message = f"Loops of the joints of robot '{robot.description.name}' do not turn its base."
+        message = f"Loops of the joints of robot '{robot.description.name}' do not rotate its base."
     values = np.array([largest, 0.0, 0.0])
     return Controllability(int(largest > ZERO_TURN_PER_AREA), 1, values, pair, shape, message)
 

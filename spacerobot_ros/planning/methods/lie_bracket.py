@@ -218,8 +218,8 @@ class LieBracketGait(GaitMethod):
         ):
             if distance > _ZERO_MOTION and 2 * distance > rate * longest:
                 raise PlanningError(
-                    f"The slide would take more than {longest:.6g} s: joint '{name}' is to "
-                    f"move {distance:.4g} m at no more than {rate:.4g} m/s."
+                    f"The slide would take more than {longest:.6g} s: joint '{name}' must move "
+                    f"{distance:.4g} m at no more than {rate:.4g} m/s."
                 )
             if distance > _ZERO_MOTION:
                 slowest = max(slowest, 2 * distance / rate)
@@ -321,7 +321,7 @@ class LieBracketGait(GaitMethod):
                 raise PlanningError(
                     f"The turn would take more than {longest:.6g} s within the strokes and "
                     f"rates of the sliders at the final shape {np.round(z_f, 4).tolist()}; "
-                    "a goal that leaves the sliders more room takes less."
+                    "a goal with more room for the sliders takes less."
                 )
             shapes = self._cycle_shapes(amplitudes, n, triple, z_f)
             swing = np.abs(shapes - z_f).max(axis=0)

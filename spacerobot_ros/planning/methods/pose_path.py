@@ -3,7 +3,7 @@
 Within a distance ``d`` of a corner both lines are blended: the place is ``c - a l_1 + b l_2``, with
 the lines ``l_1`` and ``l_2`` to and from the corner ``c``, ``a = (1 - t)^2 d / |l_1|``, and
 ``b = t^2 d / |l_2|``, for t from 0 to 1. The tangent is continuous, and the place at most ``d / 4``
-beside the lines. The attitude is blended likewise, by rotations in the place of displacements.
+beside the lines. The attitude is blended in the same way, by rotations.
 """
 
 from __future__ import annotations

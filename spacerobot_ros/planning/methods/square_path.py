@@ -366,7 +366,7 @@ class SquareSearch:
         if len(self._movable) < 2:
             return (
                 f"Fewer than two joints of robot '{self._robot.description.name}' have a velocity "
-                "limit above zero: they cannot go round a loop."
+                "limit above zero: they cannot follow a loop."
             )
         given = ""
         if self._centre is not None:

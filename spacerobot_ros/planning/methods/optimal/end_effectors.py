@@ -6,7 +6,7 @@ base since the start place every link E: seen from C, in the attitude B_0 of the
 ``r_CE = X (r_BE(q) - r_BC(q))``,  ``R = X R_BE(q)``.
 
 A goal of an end-effector is a value of the first, or of both; the position of the base is that of
-the base link, likewise. These are :class:`EndEffectorRows` of the optimal control problem, along
+the base link, too. These are :class:`EndEffectorRows` of the optimal control problem, along
 those directions alone in which the joints move the link at all. Its guesses end in shapes that
 inverse kinematics finds (:meth:`EndEffectorSpecification.boundary_conditions`), each with the turn
 of the base on the direct way there (Umetani and Yoshida's generalised Jacobian), because the solver

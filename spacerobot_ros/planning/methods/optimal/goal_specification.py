@@ -126,8 +126,8 @@ class GoalSpecification:
             raise PlanningError(f"Robot '{name}' has no joints that could move its base.")
         if self.attitude and self.base_rotations.turns_base and not len(self.base_rotations.axes):
             raise PlanningError(
-                f"The attitude of robot '{name}' is uncontrollable: whatever its joints do, its "
-                "base only turns to and fro along one curve of attitudes; with "
+                f"The attitude of robot '{name}' is uncontrollable: its joints rotate its base "
+                "along one curve of attitudes only; with "
                 "optimal.base_attitude 0 the attitude of the goal is ignored."
             )
 
@@ -222,9 +222,9 @@ class GoalSpecification:
         drifts = f"Robot '{name}' drifts, with an angular momentum of {size:.3g} kg m^2/s"
         if not self.base_rotations.loops_turn_base:
             raise PlanningError(
-                f"{drifts}, and loops of its joints do not turn its base: optimal plans for robots "
-                "that drift only where they do. With optimal.base_attitude 0 the attitude of the "
-                "goal is ignored."
+                f"{drifts}, and loops of its joints do not rotate its base: optimal plans for "
+                "drifting robots only if they do. With optimal.base_attitude 0 the attitude is "
+                "ignored."
             )
         if len(self.base_rotations.axes) == 1:
             axis = self.base_rotations.axes[0]
@@ -233,8 +233,8 @@ class GoalSpecification:
             off = max(np.linalg.norm(np.cross(axis, x)) for x in (turned, D @ axis / D.max()))
             if off > _AXIS_TOLERANCE:
                 raise PlanningError(
-                    f"{drifts}, which turns its base about another axis than the only one about "
-                    "which its joints turn it: no motion of them stops that. With "
+                    f"{drifts}, which rotates its base about another axis than its joints "
+                    "do: no motion of them stops that. With "
                     "optimal.base_attitude 0 the attitude of the goal is ignored."
                 )
 
@@ -245,8 +245,8 @@ class GoalSpecification:
         if tilt > max(tolerance, _ZERO_ROTATION_ANGLE):
             if not len(axes):
                 raise UnreachableError(
-                    f"The attitude of robot '{name}' is uncontrollable: its joints do not turn its "
-                    f"base, and the goal is turned by {tilt:.4g} rad.",
+                    f"The attitude of robot '{name}' is uncontrollable: its joints do not rotate "
+                    f"its base, and the goal is turned by {tilt:.4g} rad.",
                     Proof.RANK,
                 )
             raise tilted_goal_error(robot, axes[0], tilt)
@@ -266,7 +266,7 @@ class GoalSpecification:
         if abs(math.remainder(wanted - angle, 2 * math.pi)) > max(tolerance, _ZERO_ROTATION_ANGLE):
             raise UnreachableError(
                 f"The attitude of robot '{robot.description.name}' is uncontrollable where the "
-                "final shape is given: loops of its joints do not turn its base, and the way to "
+                "final shape is given: loops of its joints do not rotate its base, and the way to "
                 f"that shape turns it by {angle:.4g} rad.",
                 Proof.RANK,
             )
@@ -368,7 +368,7 @@ def shape_for_center(
 ) -> Array:
     """Return the shape (n,), near ``start``, whose centre of mass is at ``wanted`` (3,), m, in B.
 
-    Where there is none it may be ``enough`` (m) beside.
+    If there is none it may be ``enough`` (m) beside.
 
     Raises
     ------

@@ -9,13 +9,13 @@ the plant's own prediction ends on the goal. The first variation of the final at
 ``eta = R_f' sum_k R_k K(q_k)(dq_k, q_k' dt)``,  K the curvature of the connection,
 
 for a change ``dq`` that vanishes at both ends, and more terms where the robot drifts
-(:class:`DriftVariation`). Where that needs more speed or acceleration than
+(:class:`DriftVariation`). If that needs more speed or acceleration than
 the limits allow, the least change of the commands is sought that keeps them, by a quadratic program
 whose unknowns are the changes of all shapes at the ticks; the end is linear in them to first order,
 and a few programs one after the other reach it (sequential quadratic programming). Otherwise the
 manoeuvre takes a few ticks longer.
 
-Where that fails and the last shape is free, it is changed as well: loops of some robots do not turn
+If that fails and the last shape is free, it is changed as well: loops of some robots do not turn
 the base. A manoeuvre of a few ticks only is a polygon, whose chords are no image of the curve any
 more; one of two or three may have too few corners to end on the goal, and takes a tick more.
 """
@@ -157,7 +157,7 @@ class CommandHolder:
         """Return the commands of a trajectory that end in the shape and attitude of the goal.
 
         They take the trajectory's time, rounded up to ticks, or as much longer as it takes to keep
-        the limits (``fixed``: not longer); None where that is not found. Where the boundary
+        the limits (``fixed``: not longer); None where that is not found. If the boundary
         conditions leave the last shape free, it is the trajectory's, or one near to it. ``before``
         are the velocities (n,) that are held until then; None: those of the boundary conditions.
         """
@@ -295,7 +295,7 @@ class CommandHolder:
         """Return boundary conditions whose solution ends at the goal as commands of ``ticks``.
 
         The goal attitude is turned by the difference between the end of a trajectory and that of
-        its commands. Where the robot drifts, the solver's attitude is of order two only.
+        its commands. If the robot drifts, the solver's attitude is of order two only.
         """
         reached = self._attitudes(trajectory.at_ticks(ticks), boundary)[-1]
         error = quaternion_from_rotvec(attitude_error(reached, trajectory.quaternions[-1]))

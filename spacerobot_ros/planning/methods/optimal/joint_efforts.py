@@ -119,7 +119,7 @@ class EffortLimitedShooting(MultipleShooting):
     """Multiple shooting that also keeps joint efforts within limits.
 
     The problem is solved without them first: they cost time, and for most motions of most robots
-    do not matter. Where the solution exceeds them, the problem with them is solved from there.
+    do not matter. If the solution exceeds them, the problem with them is solved from there.
 
     Parameters
     ----------

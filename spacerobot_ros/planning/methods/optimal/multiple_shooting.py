@@ -224,7 +224,7 @@ class MultipleShooting:
         """Return the fastest trajectory near ``guess``; None if none.
 
         With distances, the solver continues at its own last solution, where that is the guess:
-        then it takes a few steps. Where that fails, it begins there as at any guess: at the same
+        then it takes a few steps. If that fails, it begins there as at any guess: at the same
         path in more time.
 
         In a fixed time it is the one of least effort: of the least mean square of the

@@ -207,7 +207,7 @@ class BoundaryConditions:
     velocity
         (n,) first velocities of the joints, m/s or rad/s; a number is that of all.
     final_velocity
-        (n,) velocities that the joints keep from the end on, likewise.
+        (n,) velocities that the joints keep from the end on, rad/s or m/s.
     end_effectors
         (7 k,) goals of k links (:meth:`.EndEffectorRows.pack`).
     possible_ends

@@ -494,7 +494,7 @@ class ManoeuvreSearch:
     def _search_from_guesses(
         self, state: _SearchState, grid: _Grid, starts: int
     ) -> list[Manoeuvre]:
-        """Return manoeuvres from at most ``starts`` guesses on a grid; none where none is found."""
+        """Return manoeuvres from at most ``starts`` guesses on a grid; none if none is found."""
         problem, clock = state.problem, state.clock
         solver = self._solver(problem, grid)
         solutions: list[Trajectory] = []
@@ -584,7 +584,7 @@ class ManoeuvreSearch:
     ) -> list[Manoeuvre]:
         """Return manoeuvres from the best solutions on a grid, refined on the full grid.
 
-        Where the search ended because solutions agree, the next one is refined only if it promises
+        If the search ended because solutions agree, the next one is refined only if it promises
         a shorter time than the refined best one.
         """
         problem, in_motion = state.problem, state.problem.motion is not None
@@ -695,7 +695,7 @@ class ManoeuvreSearch:
         self, state: _SearchState, kept: KeptDistances, found: list[Manoeuvre]
     ) -> list[Manoeuvre]:
         """Return manoeuvres that keep clear: those that were found, if the fastest one does; else
-        others near to them, or near to other paths; none where none is found.
+        others near to them, or near to other paths; none if none is found.
         """
         problem = state.problem
         in_order = sorted(found, key=lambda one: one.duration)
@@ -925,7 +925,7 @@ class ManoeuvreSearch:
     # -- what the steps share ---------------------------------------------------------------------
 
     def _grids(self, problem: SearchProblem) -> tuple[_Grid, _Grid]:
-        """Return the coarse grid and the full one: the same one where there is no coarse one."""
+        """Return the coarse grid and the full one: the same one if there is no coarse one."""
         full, in_motion = _Grid(problem.intervals), problem.motion is not None
         if in_motion:
             coarse = _Grid(full.intervals // _COARSE_GRID_RATIO_IN_MOTION)

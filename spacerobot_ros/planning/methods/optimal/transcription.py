@@ -13,7 +13,7 @@ momentum is zero: ``D(q) w + D_q(q) u = 0`` (paper 1, eq. 3). So the attitude fo
 of the shape, however fast it is travelled, and the base's position needs no state: the centre of
 mass rests, and the last shape and attitude tell where the base is.
 
-Where a robot drifts, its angular momentum L about the centre of mass is constant in the world, so
+If a robot drifts, its angular momentum L about the centre of mass is constant in the world, so
 ``D(q) w + D_q(q) u = h X' L_0``, with L_0 in the base at the start. X at a Gauss point is the
 weighted mean of the quaternions at both knots, normalised, which makes the attitude of order two.
 These functions are others than those at zero momentum, and are made where a robot drifts.
@@ -68,7 +68,7 @@ class PathInequality:
     ----------
     function
         Of SX: shape, velocities and accelerations of the joints, each (n,), to any number of rows.
-        Where the robot drifts, a fourth argument is its angular momentum (3,) about the centre of
+        If the robot drifts, a fourth argument is its angular momentum (3,) about the centre of
         mass in the base.
     instants
         Where in each interval it is imposed, 0 its beginning, 1 its end.
