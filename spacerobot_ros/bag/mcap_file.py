@@ -65,7 +65,7 @@ class QosProfile:
     deadline_ns
         Longest time between two messages, in nanoseconds.
     lifespan_ns
-        How long a message is worth delivering, in nanoseconds.
+        Lifespan of a message, in nanoseconds.
     liveliness
         ``automatic``, ``manual_by_topic``, or as above.
     liveliness_lease_duration_ns

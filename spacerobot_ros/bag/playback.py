@@ -146,7 +146,7 @@ def renamed_topics(remap: str, topics: Collection[str]) -> dict[str, str]:
 
 
 class Playback:
-    """The messages of a bag in the rhythm of their log times.
+    """The messages of a bag, due by their log times.
 
     The last messages of latched topics before the start are due at once:
     a subscriber of such a topic expects its last message whenever it subscribes.

@@ -158,7 +158,7 @@ class Bag(Mapping[str, TopicSeries]):
     """A bag as time series: ``bag["odom"].field("pose.pose.position.x")``.
 
     It is a mapping from the names of its topics, with the slash before them or without, to their
-    messages. A topic is read when it is first asked for and kept. The file is not held open.
+    messages. A topic is read on first access and kept. The file is not held open.
 
     Raises
     ------
@@ -570,7 +570,7 @@ class RecordedRobot:
     def metadata(self) -> dict[str, dict[str, str]]:
         """Metadata records of the bag by name, those of this robot's nodes as ``parameters/NODE``.
 
-        A recorder in the namespace of the robot calls them so itself.
+        A recorder in the namespace of the robot uses these names.
         """
         before = f"parameters{self.namespace}/"
         return {

@@ -51,9 +51,9 @@ class _EarlyMessage(NamedTuple):
 class Recording:
     """Writes messages with one time base for the whole bag; begins paused.
 
-    Messages carry the time of the clock, those before its first message that one's time. If no
-    clock is published for ``clock_wait``, all carry the wall time of their arrival. The choice is
-    final, because a bag has one time base.
+    Messages carry the time of the clock; those before its first message carry the time of that
+    message. If no clock is published for ``clock_wait``, all carry the wall time of their arrival.
+    The choice is final, because a bag has one time base.
 
     Parameters
     ----------
@@ -62,7 +62,7 @@ class Recording:
     clock_wait
         How long the first message waits for a clock, wall time in s.
     on_failure
-        Called once, with the reason, when the disk refuses something.
+        Called once, with the reason, if writing fails.
     wall_time
         Returns the wall time in ns.
     """
@@ -191,7 +191,7 @@ class Recording:
         Raises
         ------
         RecordingError
-            The disk refused something, and nothing had failed before.
+            Writing failed, and no earlier call has reported it.
         """
         if self.state is RecordingState.CLOSED:
             return

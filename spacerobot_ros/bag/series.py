@@ -31,7 +31,7 @@ _DECODING_ERRORS = (SerdeError, ValueError, IndexError, OverflowError, TypeError
 
 
 class TopicSeries:
-    """The messages of one topic, by log time; ``bag[topic]`` makes it.
+    """The messages of one topic in order of log time; ``bag[topic]`` makes it.
 
     Attributes
     ----------
@@ -123,7 +123,7 @@ class TopicSeries:
         Parameters
         ----------
         path
-            The way to it, such as ``pose.pose.position.x``. It may lead through a list of
+            Path of the field, such as ``pose.pose.position.x``. It may lead through a list of
             messages, as ``points.positions`` does.
 
         Returns
@@ -219,7 +219,7 @@ class TopicSeries:
 
         Returns
         -------
-        Shape (N, width). A message with another number of values in a field has nan there.
+        Shape (N, width). If a message has another number of values in a field, they are nan.
 
         Raises
         ------

@@ -32,20 +32,19 @@ class BagWriter(AbstractContextManager["BagWriter"]):
     that loses power may lose more). A bag is complete, with its summary, once it is closed; use the
     writer as a context manager. One thread at a time may use it.
 
-    When the disk refuses a chunk, that chunk is lost, the call that met it and every later one that
-    would add something raise RecordingError, and closing still completes the file where there is
-    room.
+    If writing a chunk fails, the chunk is lost, this call and every later one that would add
+    something raise RecordingError, and closing still completes the file if there is room.
 
     Parameters
     ----------
     path
-        The bag, usually ``*.mcap``; its folders are made.
+        The bag, usually ``*.mcap``; its folders are created.
     compression
         Of the chunks: ``zstd``, ``lz4`` or ``none``.
     chunk_size
         How large a chunk grows, in bytes before compression.
     overwrite
-        Whether a file that is there is replaced; not one that is being written.
+        Whether an existing file is replaced, unless it is being written.
     next_free
         Whether the bag takes the next free name if the name exists: ``NAME-1.mcap``,
         ``NAME-2.mcap``, ...
@@ -60,7 +59,7 @@ class BagWriter(AbstractContextManager["BagWriter"]):
     Raises
     ------
     RecordingError
-        The file cannot be made, or is there and is not to be replaced.
+        The file cannot be created, or exists and may not be replaced.
     """
 
     def __init__(
@@ -181,8 +180,7 @@ class BagWriter(AbstractContextManager["BagWriter"]):
         Raises
         ------
         RecordingError
-            The disk refused it, nothing more can be written, the channel is unknown, or a time is
-            negative.
+            Writing failed, now or earlier, the channel is unknown, or a time is negative.
         """
         if self._refusal is not None or channel_id not in self._channel_ids:
             raise RecordingError(
@@ -203,7 +201,7 @@ class BagWriter(AbstractContextManager["BagWriter"]):
     def add_attachment(self, name: str, data: bytes, media_type: str, log_time_ns: int) -> None:
         """Put a whole file into the bag.
 
-        ``media_type`` is such as ``application/xml``, ``log_time_ns`` when it was recorded.
+        ``media_type`` is for example ``application/xml``; ``log_time_ns`` is the time of recording.
         """
         self._add(lambda file: file.add_attachment(name, data, media_type, log_time_ns))
 
@@ -217,7 +215,7 @@ class BagWriter(AbstractContextManager["BagWriter"]):
             record(self._file)
 
     def flush(self) -> None:
-        """Hand the chunk in progress to the operating system: a kill loses nothing of it."""
+        """Write the chunk in progress to the operating system, where a kill cannot lose it."""
         with self._adding():
             if self._file.flush() and self._is_full():
                 self._begin_next_file()
@@ -228,7 +226,7 @@ class BagWriter(AbstractContextManager["BagWriter"]):
         Raises
         ------
         RecordingError
-            The disk refused something, and no earlier call has said so.
+            Writing failed, and no earlier call has reported it.
         """
         if self._closed:
             return

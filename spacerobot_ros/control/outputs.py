@@ -78,7 +78,7 @@ class OutputSelection:
         return (*found, *(("joints", (first + i,)) for i in range(len(self.joints))))
 
     def distance(self, errors: Array) -> OutputDistance:
-        """Return the distance that errors (m,) of the outputs amount to."""
+        """Return the total distance of the errors (m,) of the outputs."""
         largest = dict.fromkeys(("position", "attitude", "joints"), math.nan)
         for kind, places in self.distances:
             size = float(np.linalg.norm(errors[list(places)]))

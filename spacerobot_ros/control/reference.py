@@ -54,8 +54,8 @@ class ReferenceProfile(ABC):
     limits
         Largest speeds and accelerations.
     carries
-        Whether the end-effector has no goal of its own: the base takes it along, so that the arm
-        keeps its shape on the way.
+        Whether the end-effector has no goal: it moves with the base, so that the arm keeps its
+        shape.
 
     Raises
     ------
@@ -97,7 +97,7 @@ class ReferenceProfile(ABC):
         )
 
     def lines(self) -> tuple[_PoseInterpolation | None, _PoseInterpolation | None]:
-        """Return the ways of base and end-effector, None for a group that is not controlled."""
+        """Return the paths of base and end-effector, None for a group that is not controlled."""
         start, goal, base, hand = self.start, self.goal, None, None
         if start.base is not None and goal.base is not None:
             base = _PoseInterpolation(start.base, goal.base)
@@ -108,7 +108,7 @@ class ReferenceProfile(ABC):
 
 
 class StepReference(ReferenceProfile):
-    """The goal at once, as in paper 4, section V."""
+    """The goal as a step, as in paper 4, section V."""
 
     name: ClassVar[str] = "step"
 

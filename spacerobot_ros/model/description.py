@@ -170,7 +170,7 @@ class RobotDescription:
 
     ``bodies`` are in topological order, the base first; the movable joints are those of
     ``bodies[1:]`` that follow no other, in that order. ``frames`` maps every link to its body and
-    its pose in it. ``disabled_collisions`` are pairs of links whose contact does not count.
+    its pose in it. ``disabled_collisions`` are pairs of links that are not checked for collision.
     ``world`` are the obstacles around the robot, whose root link is the frame W; None: none.
     """
 

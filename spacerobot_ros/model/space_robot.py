@@ -176,7 +176,7 @@ class SpaceRobot:
         tau: npt.ArrayLike | None = None,
     ) -> tuple[Array, Array]:
         """Return ``A`` (12 + 2 n, 12 + 2 n) and ``B`` (12 + 2 n, 6 + n) of the equations of motion
-        about a state and an actuation; those left out are zero.
+        about a state and an actuation; omitted ones are zero.
 
         ``d/dt dx = A dx + B du`` to first order, with ``dx = [dr; dtheta; dq; dv; domega; dqdot]``:
         position (m) and rotation vector (rad) of the base from its motion in that state, joint
@@ -260,7 +260,7 @@ class SpaceRobot:
 
         They are the null space of the coupling inertia ``D_q`` (Nenchev, Umetani and Yoshida, 1992,
         from memory): at zero angular momentum the base keeps its attitude while the joints move at
-        such rates. Its projection ``N N'`` takes the nearest of them from any rates.
+        such rates. The projection ``N N'`` maps any rates to the nearest of them.
         """
         _, s, Vt = np.linalg.svd(self.connection(q)[3:])
         rank = int(np.count_nonzero(s > _MIN_RELATIVE_COUPLING * max(1.0, s.max(initial=0.0))))

@@ -122,7 +122,7 @@ class VelocityPlant:
     def step(self, command: Array) -> bool:
         """Advance one tick under the joint velocities ``command`` (n,), clipped to its limits.
 
-        A joint that would pass its limit within the tick moves at the rate that ends on it.
+        If a joint would pass its limit within the tick, its rate is reduced to end at the limit.
         Returns whether any joint was limited; ``velocity_limited`` and ``stroke_limited`` count
         the ticks by joint.
         """

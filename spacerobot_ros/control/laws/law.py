@@ -194,7 +194,7 @@ class ControlLaw(ABC):
     thrust
         Whether thrusters push the base; otherwise the law commands no force.
     control_period
-        Time for which a command is held, s: automatic gains are the lower, the longer it is.
+        Time for which a command is held, s; longer times give lower automatic gains.
 
     Raises
     ------

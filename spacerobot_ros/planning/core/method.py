@@ -138,7 +138,7 @@ class GaitMethod(ABC):
     Raises
     ------
     ParameterError
-        An option does not go with the robot or with another option.
+        An option is incompatible with the robot or with another option.
     """
 
     name: ClassVar[str]

@@ -202,7 +202,7 @@ class PlanningWorker:
     Raises
     ------
     ParameterError
-        An option does not go with the robot or with another option.
+        An option is incompatible with the robot or with another option.
     """
 
     def __init__(

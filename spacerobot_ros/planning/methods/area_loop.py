@@ -345,7 +345,7 @@ class AreaLoopGait(GaitMethod):
             if not found:
                 return share, too_near
             share, too_near = share / 2, found
-        raise PlanningError(f"In the smallest of {_MAX_SHRINKS} loops {too_near}.")
+        raise PlanningError(f"Even in the smallest of {_MAX_SHRINKS} loops {too_near}.")
 
     def _count_cycles_left(self, missing: float, share: float, enough: float) -> float:
         """Return the number of cycles left for a missing turn (rad), to first order.

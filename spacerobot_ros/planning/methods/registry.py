@@ -52,7 +52,7 @@ def build_method(
     KeyError
         There is no such method.
     ParameterError
-        An option does not go with the robot or with another option.
+        An option is incompatible with the robot or with another option.
     """
     method = METHODS[name]
     if method is not AutoGait:
