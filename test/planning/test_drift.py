@@ -166,7 +166,9 @@ def test_all_places_of_a_goal_are_displaced() -> None:
 
 def test_a_planar_robot_that_tumbles_is_refused() -> None:
     tumbling = [0.3, 0.0, 0.4]
-    with pytest.raises(PlanningError, match=r"0\.5 kg m\^2/s, which turns its base about another"):
+    with pytest.raises(
+        PlanningError, match=r"0\.5 kg m\^2/s, which rotates its base about another"
+    ):
         plan("planar_chain", rotvec=[0, 0, 0.1], angular_momentum=tumbling, **QUICK)
 
 
