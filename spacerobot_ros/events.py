@@ -285,7 +285,7 @@ class Event:
         Raises
         ------
         SpaceRobotError
-            The pairs are no event.
+            The pairs are not an event.
         """
         given = {key: value for key, value in values.items() if key != "wall_time"}
         return _EVENT_FORMAT.from_values(cls, given, message=message, level=level)

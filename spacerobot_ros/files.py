@@ -97,7 +97,7 @@ def write_output(path: Path, content: bytes | str, mode: int = 0o666) -> None:
     except OSError as error:
         reason = error.strerror
         if isinstance(error, FileExistsError | NotADirectoryError):
-            reason = f"{path.parent} is no folder"
+            reason = f"{path.parent} is not a folder"
         raise SpaceRobotError(f"The file {path} cannot be written: {reason}.") from error
 
 

@@ -46,7 +46,7 @@ def as_numbers(
     Raises
     ------
     SpaceRobotError
-        They are no real numbers; of the type ``error``, whose subject is ``name``.
+        They are not real numbers; of the type ``error``, whose subject is ``name``.
     """
     try:
         numbers = np.asarray(given)

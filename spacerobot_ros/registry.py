@@ -100,7 +100,7 @@ class Registry(dict[str, type[T]]):
     def _usable_name(self, entry: Any) -> str:
         named = f"The {self.kind} '{getattr(entry, '__name__', entry)}'"
         if not (inspect.isclass(entry) and issubclass(entry, self.base)):
-            raise ParameterError(f"{named} is no class derived from {self.base.__name__}.")
+            raise ParameterError(f"{named} is not a class derived from {self.base.__name__}.")
         name = getattr(entry, "name", None)
         if inspect.isabstract(entry):
             missing = ", ".join(sorted(vars(entry)["__abstractmethods__"]))

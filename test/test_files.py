@@ -68,7 +68,7 @@ def test_a_file_is_replaced_through_a_link_and_keeps_its_mode(tmp_path: Path) ->
 def test_what_is_no_folder_is_named(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("older")
     for below in ("file/a.html", "file/deep/a.html"):
-        with pytest.raises(SpaceRobotError, match="is no folder"):
+        with pytest.raises(SpaceRobotError, match="is not a folder"):
             write_output(tmp_path / below, "newer")
     with pytest.raises(SpaceRobotError, match="Is a directory"):
         write_output(tmp_path, "newer")

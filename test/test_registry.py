@@ -141,8 +141,8 @@ class _Clash(TransposedJacobianLaw):
         (_Plain, "The control law '_Plain' lacks compute."),
         (_Unnamed, "needs a name of letters, digits and underscores"),
         (_Clash, "has the name of the package's own 'transposed_jacobian'"),
-        (METHODS["optimal"], "'OptimalGait' is no class derived from ControlLaw."),
-        ("lqr", "'lqr' is no class derived from ControlLaw."),
+        (METHODS["optimal"], "'OptimalGait' is not a class derived from ControlLaw."),
+        ("lqr", "'lqr' is not a class derived from ControlLaw."),
     ],
 )
 def test_a_class_that_is_no_law_is_refused(entry: Any, sentence: str) -> None:

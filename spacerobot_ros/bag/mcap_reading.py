@@ -104,7 +104,7 @@ def open_file(path: Path, content: Path | None = None) -> Iterator[BinaryIO]:
     Raises
     ------
     RecordingError
-        There is no such file, it is no regular file, or it cannot be read, or a record turns out
+        There is no such file, it is not a regular file, or it cannot be read, or a record turns out
         damaged, while the context lasts.
     """
     content = content or path

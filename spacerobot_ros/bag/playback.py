@@ -66,7 +66,7 @@ class ReplayStatus:
         Raises
         ------
         SpaceRobotError
-            They are no status of a replay.
+            They are not a status of a replay.
         """
         with _STATUS_FORMAT.reading():
             state = values["state"]

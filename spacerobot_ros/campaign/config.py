@@ -287,7 +287,7 @@ def scenario_of_section(scenario: Scenario, section: Mapping[str, Any]) -> Scena
         node, _, parameter = str(key).partition(".")
         if node not in CONFIGS or not parameter:
             raise ParameterError(
-                f"'{key}' under 'set' is no parameter: it is called node.parameter with one of the "
+                f"'{key}' under 'set' is not a parameter: write NODE.PARAMETER with one of the "
                 f"nodes {', '.join(CONFIGS)}."
             )
         scenario = scenario.with_overrides(node, {parameter: value})

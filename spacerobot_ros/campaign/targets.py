@@ -291,7 +291,7 @@ def targets_of(name: str, scenario: Scenario) -> list[DispersionTarget]:
     known += [*_POSE_TARGET_NAMES, "faults[0].at", "faults[0].until"]
     kinds = "; ".join(names for names, _ in TARGET_KINDS)
     raise ParameterError(
-        f"'{name}' is nothing that can be dispersed; there are {kinds}.{suggestion(name, known)}"
+        f"'{name}' cannot be dispersed; there are {kinds}.{suggestion(name, known)}"
     )
 
 
@@ -315,7 +315,7 @@ def _parameter_target(name: str, node: str, rest: str, scenario: Scenario) -> Di
     if isinstance(value, tuple) and bare.startswith("initial_orientation"):
         raise ParameterError(f"'{name}' is a quaternion: disperse initial.rotvec.x, y and z.")
     if isinstance(value, tuple) is not bool(index):
-        how = f"say which number of the list: {name}[0]" if not index else "it is no list"
+        how = f"say which number of the list: {name}[0]" if not index else "it is not a list"
         raise ParameterError(f"'{name}': {how}.")
     if not index:
         return _scalar_target(name, node, declaration, value)

@@ -62,7 +62,7 @@ def _parse_length(context: click.Context, option: click.Parameter, text: str) ->
     """Return a length in mm."""
     match = re.fullmatch(r"([0-9]*\.?[0-9]+) *([a-z]*)", text.strip().lower())
     if match is None or match[2] not in _MILLIMETRES_BY_UNIT:
-        raise click.BadParameter(f"'{text}' is no length such as 88mm, 18cm, 3.5in or 246pt.")
+        raise click.BadParameter(f"'{text}' is not a length such as 88mm, 18cm, 3.5in or 246pt.")
     return float(match[1]) * _MILLIMETRES_BY_UNIT[match[2]]
 
 

@@ -55,7 +55,7 @@ class NumberRange(click.FloatRange):
         """Return a number of the range."""
         number = super().convert(value, param, ctx)
         if math.isnan(number):
-            self.fail(f"{value} is no number.", param, ctx)
+            self.fail(f"{value} is not a number.", param, ctx)
         return number
 
 
@@ -271,7 +271,7 @@ class EndEffectorOptions:
         click.UsageError
             There are more or fewer names than goals.
         GoalError
-            One is no position, pose or path, or a link has two.
+            One is not a position, pose or path, or a link has two.
         """
         from spacerobot_ros.planning.core.goal import EndEffectorGoal, Goal
 
@@ -291,7 +291,7 @@ def _read_path(file: Path) -> list[list[float]]:
     """Return the numbers of a text file, a position or a pose a line; else raise BadParameter."""
     try:
         if file.exists() and not file.is_file():
-            raise click.BadParameter(f"The path {file} is no regular file.")
+            raise click.BadParameter(f"The path {file} is not a regular file.")
         lines = [line.partition("#")[0] for line in file.read_text("utf-8").splitlines()]
         rows = [list(map(float, line.replace(",", " ").split())) for line in lines]
     except (OSError, ValueError) as error:

@@ -403,7 +403,7 @@ class Episodes:
         if isinstance(self.task, Reorient):
             sizes = np.linalg.norm(goals, axis=1, keepdims=True)
             if sizes.min() < 1e-3:
-                raise ParameterError("The goal is a quaternion of zeros, which is no attitude.")
+                raise ParameterError("The goal is a quaternion of zeros, which is not an attitude.")
             return np.asarray(goals / sizes)
         return goals
 
@@ -431,7 +431,7 @@ class Episodes:
         Raises
         ------
         CommandError
-            The shape is wrong, or an action is no finite number.
+            The shape is wrong, or an action is not a finite number.
         """
         count, size = len(self._flights), self.action_size
         shares = as_numbers(actions, "The array of actions", CommandError)

@@ -88,7 +88,7 @@ def fly(
     ParameterError
         There is no such scenario, robot, method or parameter, or only the nodes can fly it.
     GoalError
-        The goal is no pose.
+        The goal is not a pose.
     PlanningError
         The goal is refused, as by :func:`plan`, or by the controller.
     """
@@ -243,7 +243,7 @@ def scenario_to_fly(
     ParameterError
         There is no such scenario or robot.
     GoalError
-        A goal is no pose.
+        A goal is not a pose.
     """
     match what:
         case Scenario():

@@ -58,7 +58,7 @@ Quantity = Literal["position", "velocity", "effort"]
 
 
 class UnreadableError(CommandError):
-    """Bytes are no message of their type; the message names the type."""
+    """Bytes are not a message of their type; the message names the type."""
 
 
 def read_text(raw: bytes, type_name: str, path: str) -> str:
@@ -67,12 +67,12 @@ def read_text(raw: bytes, type_name: str, path: str) -> str:
     Raises
     ------
     UnreadableError
-        The bytes are no message of the type.
+        The bytes are not a message of the type.
     """
     try:
         leaf = Layout(raw, type_name).leaves[path]
     except IndexError as error:
-        raise UnreadableError(f"its bytes are no {type_name.rpartition('/')[2]}") from error
+        raise UnreadableError(f"its bytes are not a {type_name.rpartition('/')[2]}") from error
     return raw[leaf.offset : leaf.offset + leaf.size].decode(errors="replace")
 
 
@@ -206,7 +206,7 @@ class TemplateReader:
             layout = Layout(raw, name, self._fields, elements=True, max_elements=_MAX_LIST_TEXTS)
         except IndexError as error:
             short = name.rpartition("/")[2]
-            raise UnreadableError(f"its bytes are no {short}") from error
+            raise UnreadableError(f"its bytes are not a {short}") from error
         except TooLongError as error:
             # The stamp of the refused message stays readable, but its bytes do not count as
             # accepted.
@@ -536,7 +536,7 @@ class CommandReader:
         """Return the stamp of a message, ns, and its values, or the reason why they are malformed.
 
         The values are overwritten by the next message. Raises UnreadableError for bytes that are
-        no message of the type.
+        not a message of the type.
         """
         try:
             return self._reader.accept(raw), self._values

@@ -349,7 +349,7 @@ def weld_links(
     Raises
     ------
     RobotDescriptionError
-        The links and joints are no tree.
+        The links and joints are not a tree.
     """
     children: dict[str, list[Joint]] = {name: [] for name in links}
     parents: dict[str, str] = {}

@@ -91,7 +91,7 @@ class Payload:
         Raises
         ------
         RobotDescriptionError
-            The text is no payload.
+            The text is not a payload.
         """
         try:
             values = json.loads(text)

@@ -249,7 +249,7 @@ _PARSE_ERRORS = (ValueError, IndexError, OverflowError)
 
 def _mesh_error(name: str, error: Exception) -> MeshError:
     # The text of a parse error would quote the file.
-    why = error if isinstance(error, _DamagedError) else "a coordinate or index is no number"
+    why = error if isinstance(error, _DamagedError) else "a coordinate or index is not a number"
     return MeshError(f"The mesh {name} cannot be read: {why}.")
 
 
@@ -284,7 +284,7 @@ def _read_stl(data: bytes) -> TriangleMesh:
             triangles = np.frombuffer(data, _STL_TRIANGLE, count, _STL_HEADER_BYTES)
             return mesh_from_corners(triangles["corners"].reshape(-1, 3))
     if not data.lstrip().startswith(b"solid"):
-        raise _DamagedError("it is no STL, or the file is cut")
+        raise _DamagedError("it is not an STL file, or it is cut")
     if b"endsolid" not in data:
         raise _DamagedError("its end is missing: the file is cut")
     corners = np.array(_STL_VERTEX_PATTERN.findall(data), dtype=bytes).astype(float)

@@ -25,18 +25,17 @@ def with_srdf(robot: RobotDescription, path: str | Path) -> RobotDescription:
     Raises
     ------
     RobotDescriptionError
-        The file cannot be read, is no SRDF, or names a link that the robot does not have.
+        The file cannot be read, is not an SRDF, or names a link that the robot does not have.
     """
     try:
         root = fromstring(Path(path).read_bytes())
     except OSError as error:
         raise RobotDescriptionError(f"The SRDF {path} cannot be read: {reason(error)}.") from error
     except (ParseError, ValueError) as error:
-        raise RobotDescriptionError(f"The SRDF {path} is no XML ({error}).") from error
+        raise RobotDescriptionError(f"The SRDF {path} is not XML ({error}).") from error
     if root.tag != "robot":
         raise RobotDescriptionError(
-            f"The file {path} is no SRDF: its root element is <{root.tag}>, and that of an SRDF "
-            "is <robot>."
+            f"The file {path} is not an SRDF: its root element is <{root.tag}> instead of <robot>."
         )
     disabled = disabled_pairs(root, [link.name for link in robot.links], f"The SRDF {path}")
     text = _with_pairs(robot.urdf, disabled)

@@ -134,7 +134,7 @@ def _read_text(path: Path) -> str:
         raise RobotDescriptionError(f"The URDF {path} cannot be read: {reason(error)}.") from error
     except UnicodeDecodeError as error:
         raise RobotDescriptionError(
-            f"The URDF {path} cannot be read: it is no text in UTF-8 ({error}). Save it as UTF-8."
+            f"The URDF {path} cannot be read: it is not UTF-8 text ({error}). Save it as UTF-8."
         ) from error
     if path.suffix == ".xacro":
         text = _expand_xacro(path)
@@ -718,7 +718,7 @@ def _checked_root(text: str) -> Element:
         root = fromstring(text)
     except (ParseError, ValueError) as error:
         raise RobotDescriptionError(
-            f"The robot description is not valid URDF: it is no XML ({error})."
+            f"The robot description is not valid URDF: it is not XML ({error})."
         ) from error
     if root.tag != "robot":
         raise RobotDescriptionError(
@@ -847,7 +847,9 @@ def _require_attribute(element: Element, attribute: _Attribute, where: str) -> N
     words = given.split()
     wrong = next((word for word in words if not _is_number(word)), None)
     if wrong is not None:
-        raise _MalformedError(f"'{attribute.name}' of {owner} has '{wrong}', no number", remedy)
+        raise _MalformedError(
+            f"'{attribute.name}' of {owner} has '{wrong}', which is not a number", remedy
+        )
     if len(words) != count:
         flaw = f"'{attribute.name}' of {owner} has {len(words)} numbers instead of {count}"
         raise _MalformedError(flaw, remedy)

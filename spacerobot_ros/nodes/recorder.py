@@ -613,7 +613,7 @@ def _read_descriptions(path: str) -> list[tuple[str, dict[str, str]]]:
         return [(n, {k: str(v) for k, v in values.items()}) for n, values in records.items()]
     except (OSError, ValueError, AttributeError) as error:
         raise ParameterError(
-            f"Parameter 'describe' is '{path}', which is no JSON file of named objects: {error}."
+            f"Parameter 'describe' is '{path}', which is not a JSON file of named objects: {error}."
         ) from error
 
 

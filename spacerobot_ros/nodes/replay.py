@@ -173,7 +173,7 @@ class ReplayNode(FlightNode):
                 )
             except InvalidTopicNameException:
                 raise ParameterError(
-                    f"Topic '{topic.name}' cannot be replayed as '{name}': that is no topic name."
+                    f"Topic '{topic.name}' cannot be replayed as '{name}': it is not a topic name."
                 ) from None
             except SpaceRobotError as error:
                 message = f"Topic '{topic.name}' is not replayed: {error}"

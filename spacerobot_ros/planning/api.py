@@ -164,7 +164,7 @@ def end_effector_goals(
     Raises
     ------
     GoalError
-        One is no position or no pose, or a link has two goals, or one is named twice.
+        One is not a position or a pose, or a link has two goals, or one is named twice.
     """
     goals = []
     for values, count in ((position, 3), (pose, 7), (path, None)):

@@ -330,7 +330,7 @@ def parse_times(
     Raises
     ------
     ParameterError
-        The words are no times, or they end before they begin.
+        The words are not times, or they end before they begin.
     """
     times = {"at": now, "until": math.inf}
     if words[0::2] not in ([], ["at"], ["until"], ["at", "until"]) or len(words) % 2:

@@ -49,8 +49,8 @@ class Surroundings:
         Raises
         ------
         ParameterError
-            The orbit is given twice, or its orientation is no quaternion, or there is a table in an
-            orbit.
+            The orbit is given twice, or its orientation is not a quaternion, or there is a table
+            in an orbit.
         """
         if orbit.altitude and orbit.mean_motion:
             raise ParameterError(

@@ -261,7 +261,7 @@ def test_no_range_of_an_option_has_nan_in_it() -> None:
     ranges = [option for option in options if isinstance(option.type, click.FloatRange)]
     assert {option.opts[0] for option in ranges} >= {"--longest", "--timeout", "--tolerance"}
     for option in ranges:
-        with pytest.raises(click.BadParameter, match="nan is no number"):
+        with pytest.raises(click.BadParameter, match="nan is not a number"):
             option.type.convert("nan", option, None)
 
 
@@ -534,7 +534,7 @@ def test_a_path_that_never_ends_is_no_path() -> None:
     words = ["plan", "three_joint_arm", "--end-effector-path", "/dev/zero"]
     result = CliRunner().invoke(main, words)
     assert result.exit_code == 2
-    assert "The path /dev/zero is no regular file." in result.output
+    assert "The path /dev/zero is not a regular file." in result.output
 
 
 def test_replay_has_the_options_of_its_node() -> None:

@@ -326,7 +326,7 @@ def test_a_goal_of_the_command_line_is_a_position_or_a_pose(words: list[str]) ->
 def test_a_duration_is_a_number(words: list[str]) -> None:
     result = CliRunner().invoke(main, [*words, "nan"])
     assert result.exit_code == 2
-    assert "nan is no number" in result.output
+    assert "nan is not a number" in result.output
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a device that is always full")

@@ -56,7 +56,7 @@ def test_widths_of_figures_are_taken_in_any_unit(
     done = call("figures", "a.mcap", "--width", text)
     if width is None:
         assert done.exit_code == 2
-        assert f"'{text}' is no length such as 88mm, 18cm, 3.5in or 246pt." in done.stderr
+        assert f"'{text}' is not a length such as 88mm, 18cm, 3.5in or 246pt." in done.stderr
         return
     assert done.exit_code == 0
     assert done.stdout == "pose        pose.pdf\n"

@@ -132,7 +132,7 @@ def test_the_urdf_text_carries_the_pairs_of_an_srdf(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("<robot", "is no XML"),
+        ("<robot", "is not XML"),
         ("<sdf/>", "its root element is <sdf>"),
         (
             '<robot><disable_collisions link1="a" link2="bb"/></robot>',

@@ -76,7 +76,7 @@ class OneRobotDecoder(ArrayDecoder):
 
     def decode_base(self, odom: StateArrays) -> tuple[Any, Any]:
         if odom.pose is None:
-            raise CommandError("its bytes are no Odometry")
+            raise CommandError("its bytes are not a Odometry")
         return super().decode_base(odom)
 
 

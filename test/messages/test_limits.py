@@ -160,16 +160,16 @@ def test_messages_of_big_endian_machines_are_read() -> None:
         reader = JointReader(["a"], ["position"])
         assert reader.accept(raw) == 3 * S + 4
         assert reader.values["position"].tolist() == [0.5]
-    with pytest.raises(UnreadableError, match="its bytes are no JointState"):
+    with pytest.raises(UnreadableError, match="its bytes are not a JointState"):
         JointReader(["a"], ["position"]).accept(b"\0\2" + little[2:])
-    with pytest.raises(UnreadableError, match="its bytes are no JointState"):
+    with pytest.raises(UnreadableError, match="its bytes are not a JointState"):
         JointReader(["a"], ["position"]).accept(big[:-9])
 
 
 def test_single_texts_are_read_and_broken_ones_refused() -> None:
     raw = serialize_message(String(data="a robot ü"))
     assert read_text(raw, "std_msgs/msg/String", "data") == "a robot ü"
-    with pytest.raises(UnreadableError, match=r"^its bytes are no String$"):
+    with pytest.raises(UnreadableError, match=r"^its bytes are not a String$"):
         read_text(raw[:-4], "std_msgs/msg/String", "data")
 
 

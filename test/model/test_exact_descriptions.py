@@ -86,7 +86,7 @@ def test_attributes_have_their_count_of_numbers(
             text = refusal(f'{name}="{" ".join(words)}"')
             assert f"has {len(words)} numbers instead of {count}" in text
             assert text.endswith(remedy)
-        assert "has 'one', no number; write" in refusal(f'{name}="{"one " * count}"')
+        assert "has 'one', which is not a number; write" in refusal(f'{name}="{"one " * count}"')
 
 
 # -- masses -------------------------------------------------------------------------------------

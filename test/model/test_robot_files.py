@@ -162,9 +162,9 @@ def changed(before: str, after: str, count: int = -1) -> str:
 
 BROKEN = {
     # No URDF.
-    "a password file": ("name:password:0:0\n", r"not valid URDF: it is no XML"),
-    "nothing": ("", r"it is no XML \(no element found"),
-    "half a file": (urdf()[:300], r"it is no XML \("),
+    "a password file": ("name:password:0:0\n", r"not valid URDF: it is not XML"),
+    "nothing": ("", r"it is not XML \(no element found"),
+    "half a file": (urdf()[:300], r"it is not XML \("),
     "SDF": ("<sdf version='1.9'><model name='a'/></sdf>", r"but an SDF model: .* <sdf>.* convert"),
     "MuJoCo": ("<mujoco><worldbody/></mujoco>", r"but a MuJoCo model: .* <mujoco>.* convert"),
     "a web page": ("<html><body/></html>", r"but something else: .* <html>"),
@@ -230,7 +230,7 @@ BROKEN = {
     ),
     "a comma": (
         urdf(mass="9,5"),
-        r"<mass> of link 'hull' has '9,5', no number; write <mass value=",
+        r"<mass> of link 'hull' has '9,5', which is not a number; write <mass value=",
     ),
     # Joints.
     "no limits": (
@@ -279,7 +279,7 @@ BROKEN = {
     ),
     "commas in an origin": (
         changed("<axis", '<origin xyz="1, 2, 3"/><axis'),
-        r"<origin> of joint 'elbow' has '1,', no number; write <origin xyz=.*: 3 numbers with",
+        r"<origin> of joint 'elbow' has '1,', which is not a number; write <origin xyz=",
     ),
     "no type": (
         changed(' type="revolute"', ""),
@@ -393,7 +393,7 @@ def test_a_file_that_is_no_robot_says_what_to_mend(
 def test_other_encodings_are_asked_for_as_utf_8(tmp_path: Path) -> None:
     path = tmp_path / "probe.urdf"
     path.write_bytes(urdf().replace("probe", "Süd").encode("latin-1"))
-    with pytest.raises(RobotDescriptionError, match=r"no text in UTF-8 .*\. Save it as UTF-8"):
+    with pytest.raises(RobotDescriptionError, match=r"not UTF-8 text .*\. Save it as UTF-8"):
         load_robot(path)
     path.write_bytes(b"\xef\xbb\xbf" + urdf().replace("probe", "Süd").encode())
     assert load_robot(path).name == "Süd"

@@ -360,7 +360,7 @@ def test_obstacles_disabled_pairs_and_comments_get_along(
     [
         (('name="b" type="fixed"', 'name="b" type="continuous"'), "joint 'b' is continuous"),
         ((BALL, ""), "The world 'station' has no obstacle"),
-        (("</robot>", ""), "is no XML"),
+        (("</robot>", ""), "is not XML"),
     ],
 )
 def test_a_world_that_is_none_is_refused(change: tuple[str, str], message: str) -> None:
@@ -411,7 +411,7 @@ def test_a_text_is_obstacles_and_an_empty_one_is_none() -> None:
             "joint 'a' is (floating|continuous): give it",
         ),
         ('<robot name="w"><link name="w"/></robot>', "The world 'w' has no obstacle"),
-        ("<robot", "is no XML"),
+        ("<robot", "is not XML"),
         (
             BALL_AND_POST.replace("</robot>", f"<world>{BALL_AND_POST}</world></robot>"),
             "^Obstacles are not among others: leave the element <world> out",

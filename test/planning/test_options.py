@@ -274,7 +274,7 @@ def test_an_unknown_joint_is_refused(name: str) -> None:
             "planned",
         )
     assert str(refusal.value) == (
-        f"planned.{name} names '{FIRST}x', which is no joint of robot 'three_joint_arm'; its "
+        f"planned.{name} names '{FIRST}x', which is not a joint of robot 'three_joint_arm'; its "
         f"joints are {FIRST}, {SECOND}, {THIRD}. Did you mean '{FIRST}'?"
     )
 

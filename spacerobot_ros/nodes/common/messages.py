@@ -148,7 +148,7 @@ def end_effector_goal(
     Raises
     ------
     PlanningError
-        It is no pose, or in a frame that is not known; ``what`` names it.
+        It is not a pose, or in a frame that is not known; ``what`` names it.
     """
     from spacerobot_ros.planning.core.goal import EndEffectorGoal
 

@@ -306,7 +306,7 @@ class Goal:
         Raises
         ------
         GoalError
-            It is no goal, or the angles are not three finite numbers.
+            It is not a goal, or the angles are not three finite numbers.
         """
         angles = as_numbers(rpy_deg, "The goal roll, pitch and yaw", GoalError)
         if angles.shape != (3,) or not np.all(np.abs(angles) <= np.degrees(_MAX_ANGLE)):

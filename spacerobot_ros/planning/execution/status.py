@@ -129,7 +129,7 @@ class PlannerStatus:
         Raises
         ------
         SpaceRobotError
-            They are no status of a planner.
+            They are not a status of a planner.
         """
         return _FORMAT.from_values(cls, values, message=message)
 

@@ -591,7 +591,7 @@ def per_joint(
         for name, _, number in (str(each).rpartition(":") for each in values):
             if name not in names:
                 raise ParameterError(
-                    f"{method}.{option} names '{name}', which is no joint of robot "
+                    f"{method}.{option} names '{name}', which is not a joint of robot "
                     f"'{robot.description.name}'; its joints are {', '.join(names)}."
                     f"{suggestion(name, names)}"
                 )
