@@ -281,7 +281,7 @@ def records_in_chunk(data: bytes, place: int) -> Iterator[tuple[int, int]]:
             raise ValueError(f"a record reaches out of the chunk at byte {place}")
         if not opcode:
             # Otherwise a chunk of zeros would count as millions of records.
-            raise ValueError(f"the chunk at byte {place} has records of no kind")
+            raise ValueError(f"the chunk at byte {place} has records of unknown kinds")
         yield position, end
         position = end
 

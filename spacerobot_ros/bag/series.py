@@ -215,7 +215,7 @@ class TopicSeries:
         fields
             Paths as for :meth:`field`, all of one number, or all of one array.
         width
-            Columns of the table, the same number for every field; by default one a field.
+            Columns of the table, the same number for every field; by default one for each field.
 
         Returns
         -------
@@ -262,7 +262,7 @@ class TopicSeries:
         if size > self._max_decoded_bytes:
             raise RecordingError(
                 f"The messages on {self.topic} have {size} bytes, and "
-                f"{self._max_decoded_bytes:.0f} can be decoded of a bag of this size."
+                f"{self._max_decoded_bytes:.0f} bytes is the limit for a bag of this size."
             )
 
     def _decode_message(self, data: bytes) -> Any:

@@ -97,7 +97,9 @@ def _parse_shape(text: str) -> list[float]:
     try:
         return [float(word) for word in text.replace(",", " ").split()]
     except ValueError:
-        raise ParameterError(f"--shape is '{text}'; it must be numbers, one a joint.") from None
+        raise ParameterError(
+            f"--shape is '{text}'; it must be one number for each joint."
+        ) from None
 
 
 def analysis_lines(found: Analysis) -> list[str]:

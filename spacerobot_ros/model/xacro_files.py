@@ -65,7 +65,7 @@ def main(file: str, seconds: int) -> int:
                 return str(installed(name))
             except (ImportError, LookupError, OSError):
                 raise ValueError(
-                    f"the package '{name}' is neither around the file nor in a ROS environment"
+                    f"the package '{name}' was found neither near the file nor in a ROS environment"
                 ) from None
 
         substitution_args._eval_find = find

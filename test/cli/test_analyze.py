@@ -210,7 +210,7 @@ def test_a_robot_whose_loops_turn_nothing_has_no_picture(tmp_path: Path) -> None
         (["nobody.urdf"], "no such URDF file"),
         (["three_joint_arm", "--shape", "0 1"], "The shape has 2 number(s)"),
         (["three_joint_arm", "--shape", "0 1 nan"], "The shape has 3 number(s)"),
-        (["three_joint_arm", "--shape", "0 1 two"], "it must be numbers"),
+        (["three_joint_arm", "--shape", "0 1 two"], "it must be one number for each joint"),
         (["planar_chain", "--end-effector", "hand"], "has no link 'hand' besides its base; its "),
         (["planar_chain", "--end-effector", "base_link"], "has no link 'base_link' besides"),
     ],

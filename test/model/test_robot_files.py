@@ -108,7 +108,9 @@ def test_a_package_is_found_by_its_name_from_its_own_files_and_those_beside_it(
 
 def test_a_package_that_is_nowhere_is_named(tmp_path: Path) -> None:
     text = urdf(attribute=HEADING).replace("  <link", "<a b='$(find no_such)'/><link", 1)
-    with pytest.raises(RobotDescriptionError, match=r"expanded: the package 'no_such' is neither"):
+    with pytest.raises(
+        RobotDescriptionError, match=r"expanded: the package 'no_such' was found neither"
+    ):
         load_robot(file_with(tmp_path, text, "probe.xacro"))
 
 
