@@ -76,13 +76,15 @@ def test_without_options(campaigns: Campaigns) -> None:
     assert drawn == call["campaign"].description_lines
 
 
-def test_a_campaign_of_errors_alone_fails(tmp_path: Path) -> None:
-    for beyond, code in ((5.0, 1), (0.0, 0)):
-        values = {"plant.initial_joint_positions[0]": {"uniform": [beyond, 0.1]}}
-        file = tmp_path / f"beyond_{beyond}.yaml"
+def test_a_campaign_of_errors_or_refused_goals_alone_fails(tmp_path: Path) -> None:
+    """As the flight of one draw by `run` does: here starts and goals beyond the strokes."""
+    start, goal = "plant.initial_joint_positions[0]", "goal.position.x"
+    for name, beyond, code in ((start, 5.0, 1), (start, 0.0, 0), (goal, 9.0, 1)):
+        values = {name: {"uniform": [beyond, 0.1]}}
+        file = tmp_path / f"{name}_{beyond}.yaml"
         given = {"campaign": section(disperse=values, flights=2)}
         file.write_text(yaml.safe_dump(given), "utf-8")
-        words = ["campaign", str(file), "--workers", "0", "--out", str(tmp_path / f"{beyond}")]
+        words = ["campaign", str(file), "--workers", "0", "--out", str(tmp_path / file.stem)]
         for _ in ("flown", "nothing left to fly"):
             result = CliRunner().invoke(main, words)
             assert result.exit_code == code, result.output
