@@ -114,7 +114,7 @@ def test_a_plugin_flies_by_nodes_and_in_the_workers_of_a_campaign(tmp_path: Path
     campaign.write_text(
         "campaign:\n  scenario: coordinated_control\n  flights: 3\n  engine: flights\n"
         "  method: soft\n  disperse:\n"
-        "    coordinated_control.soft.reach: {uniform: [0.1, 0.2]}\n"
+        "    coordinated_control.soft.reach: {uniform: [0.1, 0.3]}\n"
     )
     flown = _run([*plugin, "campaign", "fly", str(campaign), "--workers", "2"], tmp_path)
     assert flown.returncode == 0, flown.stderr

@@ -355,7 +355,7 @@ _SCIPY_NAMES = {"normal": "norm", "gauss": "norm", "gaussian": "norm", "exponent
 
 _ARGUMENT_HELP = {
     "norm": "loc is its mean and scale its standard deviation",
-    "uniform": "loc is its least value and scale its width",
+    "uniform": "loc is its least value and scale its width; [a, b] is from a to b",
 }
 
 
@@ -376,6 +376,11 @@ def _read_distribution(target: DispersionTarget, given: Any) -> Distribution:
     shapes = (distribution.shapes or "").replace(" ", "").split(",")
     words = [*filter(None, shapes), "loc", *(["scale"] if hasattr(distribution, "pdf") else [])]
     if isinstance(arguments, list):
+        if kind == "uniform":
+            if len(arguments) != 2:
+                raise ParameterError(f"'{name}': uniform takes [least, largest], two numbers.")
+            least, most = (_read_real_number(f"{name}: uniform", each) for each in arguments)
+            arguments = [least, most - least]
         if len(arguments) > len(words):
             raise ParameterError(
                 f"'{name}': {kind} takes {', '.join(words)}, not {len(arguments)} numbers."

@@ -89,7 +89,7 @@ def fly(
         seed: 1
         disperse:
           mass.*: {norm: {loc: 1.0, scale: 0.05}}
-          goal.position.x: {uniform: {loc: -0.01, scale: 0.02}}
+          goal.position.x: {uniform: [-0.01, 0.01]}
         criteria:
           position_error_m: {max: 0.02}
 

@@ -402,7 +402,7 @@ SERVICER: dict[str, Any] = {
     "initial.joints.elbow_pitch": {"norm": {"scale": 0.01}},
     "plant.sensors.position_noise": {"uniform": [0.0, 0.00005]},
     "plant.sensors.joint_rate_noise": {"uniform": [0.0, 0.0001]},
-    "coordinated_control.gains.base_attitude.kd": {"uniform": [390.0, 20.0]},
+    "coordinated_control.gains.base_attitude.kd": {"uniform": [390.0, 410.0]},
 }
 NEARLY: dict[str, Any] = {
     "coordinated_control.time_limit": 31.5,
