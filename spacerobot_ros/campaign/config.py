@@ -348,7 +348,7 @@ def _read_dispersions(section: Mapping[str, Any], scenario: Scenario) -> tuple[D
                         f"'{other.name}' and '{target.name}' set the same numbers: leave one out."
                     )
             found[target.name] = Dispersion(target, distribution)
-    return tuple(found.values())
+    return tuple(sorted(found.values(), key=lambda each: each.target.order))
 
 
 _SCIPY_NAMES = {"normal": "norm", "gauss": "norm", "gaussian": "norm", "exponential": "expon"}

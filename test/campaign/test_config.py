@@ -91,7 +91,22 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     ({"disperse": {"goal.position.u": NORM}}, "none of goal.position.x"),
     ({"disperse": {"end_effector_goal.position.x": NORM}}, "no goal for the end-effector"),
     ({"disperse": {"faults[0].at": NORM}}, r"plant.faults has 0 fault\(s\)"),
+    (
+        {
+            "disperse": {"faults[0].target": {"choice": ["slider_1", "slider_9"]}},
+            "set": {"plant.faults": ["joint_stuck slider_1"]},
+        },
+        "'joint_stuck slider_9' is refused: the target of joint_stuck is one of slider_1",
+    ),
+    (
+        {
+            "disperse": {"faults[0].kind": {"choice": ["joint_slow"]}},
+            "set": {"plant.faults": ["joint_stuck slider_1"]},
+        },
+        "joint_slow needs a value: factor on the command",
+    ),
     ({"disperse": {"planner.method": NORM}}, "is a text: it must have a 'choice' of texts"),
+    ({"disperse": {"faults[0].present": NORM}}, r"plant.faults has 0 fault\(s\)"),
     ({"disperse": {"mass": {"choice": ["a"]}}}, "'mass: choice' is 'a'"),
     ({"criteria": {"position_eror_m": {"max": 1}}}, "no metric.*Did you mean 'position_error_m'"),
     ({"criteria": {"peak_rate.slider_9": {"max": 1}}}, "Did you mean 'peak_rate.slider_[123]'"),
@@ -478,6 +493,26 @@ KINDS: list[Any] = [
 ]  # fmt: skip
 
 FAULT_SLOWLY = pytest.param(*KINDS[-1].values, id="fault", marks=pytest.mark.slow)
+
+
+def test_faults_take_place_on_what_was_drawn() -> None:
+    """A joint stands still from the time of its fault on; all move in a flight without one."""
+    drawn = {
+        "faults[0].present": {"bernoulli": {"p": 0.5}},
+        "faults[1].present": {"bernoulli": {"p": 0.5}},
+        "faults[1].target": {"choice": ["slider_1", "slider_2"]},
+    }
+    faults = {**FAULT, "plant.faults": ["joint_stuck slider_3 at 1", "joint_stuck slider_1 at 1"]}
+    made = campaign(disperse=drawn, set=faults, flights=4, seed=13)
+    seen = set()
+    for number in range(4):
+        flight, values = flown(made, number)
+        still = {f"slider_{i + 1}" for i in range(3) if not flight.qdot[flight.time > 1.2, i].any()}
+        targets = ("slider_3", values["faults[1].target"])
+        present = [bool(values[f"faults[{i}].present"]) for i in range(2)]
+        assert still == {targets[i] for i in range(2) if present[i]}
+        seen.add(frozenset(still))
+    assert len(seen) == 4
 
 
 @pytest.mark.parametrize(("disperse", "settings", "check"), [*KINDS[:-1], FAULT_SLOWLY])
