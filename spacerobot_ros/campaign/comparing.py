@@ -41,10 +41,11 @@ def require_same_draws(first: Campaign, second: Campaign) -> None:
     # The order counts, because numbers are assigned to dispersions in order.
     for ours_is, theirs_is in zip_longest(first.dispersions, second.dispersions):
         a, b = (
-            "nothing" if each is None else f"{each.name}: {each.distribution}"
-            for each in (ours_is, theirs_is)
+            "nothing" if each is None else f"{each.name}: {each}" for each in (ours_is, theirs_is)
         )
-        same = a == b and ours_is.distribution == theirs_is.distribution
+        same = a == b and all(
+            getattr(ours_is, key) == getattr(theirs_is, key) for key in ("distribution", "weights")
+        )
         if not same:
             raise ParameterError(f"{sentence}under 'disperse' is {a}, and {b}, in the same place.")
 

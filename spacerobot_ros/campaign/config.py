@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import csv
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -32,31 +33,40 @@ FIXED_SIZE_SAMPLERS = ("latin_hypercube", "saltelli")
 """Samplers whose draws depend on the number of flights."""
 
 _CAMPAIGN_KEYS = (
-    *("scenario", "flights", "seed", "sampler", "method", "set", "longest", "disperse"),
+    *("scenario", "flights", "seed", "sampler", "method", "set", "longest", "disperse", "table"),
     *("criteria", "engine", "description"),
 )
 _MAX_FLIGHTS = 10_000_000
 ENGINES = ("auto", "lanes", "flights")
 """Names of the engines that may fly a campaign."""
 
+_TABLE, _CORRELATED = "table", "multivariate_normal"
+
 
 @dataclass(frozen=True)
 class Distribution:
-    """Probability distribution of a value: one of scipy.stats, or a choice.
+    """Probability distribution of a value: one of scipy.stats, a choice, or the rows of a table.
 
     Attributes
     ----------
     name
-        Name in ``scipy.stats``, or ``choice``.
+        Name in ``scipy.stats``, ``choice``, or ``table``.
     arguments
         Arguments by name, as ``scipy.stats`` takes them.
     choices
-        Equally likely values of a ``choice``.
+        Equally likely values of a ``choice``, or the values of a ``table`` flight by flight.
     """
 
     name: str
     arguments: Mapping[str, float] = field(default_factory=dict)
     choices: tuple[Any, ...] = ()
+
+    def values(self, flights: Sequence[int], shares: Array) -> list[Any]:
+        """Return the values (N,) of flights by their numbers and cumulative probabilities (N,)."""
+        if self.name == _TABLE:
+            # Draws are made in blocks, whose last one reaches beyond the table.
+            return [self.choices[flight % len(self.choices)] for flight in flights]
+        return self.quantiles(shares)
 
     def quantiles(self, shares: Array) -> list[Any]:
         """Return the quantiles (N,) of cumulative probabilities (N,), 0 to 1."""
@@ -71,6 +81,8 @@ class Distribution:
         return list(found.tolist())
 
     def __str__(self) -> str:
+        if self.name == _TABLE:
+            return f"{len(self.choices)} rows of the table"
         if self.choices:
             return f"one of {', '.join(map(str, self.choices))}"
         given = ", ".join(f"{name} {value:g}" for name, value in self.arguments.items())
@@ -79,15 +91,24 @@ class Distribution:
 
 @dataclass(frozen=True)
 class Dispersion:
-    """A quantity that varies from flight to flight, and its distribution."""
+    """A quantity that varies from flight to flight, and its distribution.
+
+    ``weights`` are those of the independent standard normals, by the name of their dispersion,
+    whose sum is the standard normal of a correlated quantity; empty: it is independent.
+    """
 
     target: DispersionTarget
     distribution: Distribution
+    weights: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def name(self) -> str:
         """Name of the quantity."""
         return self.target.name
+
+    def __str__(self) -> str:
+        others = ", ".join(name for name in self.weights if name != self.name)
+        return f"{self.distribution}{f', correlated with {others}' if others else ''}"
 
 
 @dataclass(frozen=True)
@@ -147,6 +168,14 @@ class Campaign:
     def names(self) -> tuple[str, ...]:
         """Names of the drawn quantities, in the order of the columns."""
         return tuple(dispersion.name for dispersion in self.dispersions)
+
+    @property
+    def correlation_factor(self) -> Array | None:
+        """(D, D) factor by which independent standard normals become correlated; None: none are."""
+        if not any(each.weights for each in self.dispersions):
+            return None
+        rows = (each.weights or {each.name: 1.0} for each in self.dispersions)
+        return np.array([[row.get(name, 0.0) for name in self.names] for row in rows])
 
     @property
     def description_lines(self) -> list[str]:
@@ -234,14 +263,29 @@ def parse_campaign(
     for key in section:
         _require_known("key", key, _CAMPAIGN_KEYS)
     scenario = scenario or _read_scenario(section, folder)
-    flights = _read_whole_number(section, "flights", 100, 1, _MAX_FLIGHTS)
+    drawn = [*_read_distributions(_read_mapping(section, "disperse"), scenario)]
+    rows = None
+    if section.get("table") is not None:
+        section = {**section, "table": _table_text(section["table"], folder)}
+        columns = _read_table(section["table"], scenario)
+        rows, drawn = len(columns[0].distribution.choices), [*columns, *drawn]
+    flights = _read_whole_number(section, "flights", rows or 100, 1, _MAX_FLIGHTS)
+    if rows is not None and flights > rows:
+        raise ParameterError(f"'flights' is {flights}, but the table has {rows}, one a row.")
     sampler = str(section.get("sampler", "random"))
     engine = str(section.get("engine", "auto"))
     _require_known("sampler", sampler, SAMPLERS)
     _require_known("engine", engine, ENGINES)
-    dispersions = _read_dispersions(_read_mapping(section, "disperse"), scenario)
+    dispersions = _checked_dispersions(drawn)
     if sampler == "saltelli" and not dispersions:
         raise ParameterError("the sampler 'saltelli' needs at least one dispersion.")
+    if sampler == "saltelli" and any(
+        each.weights or each.distribution.name == _TABLE for each in dispersions
+    ):
+        raise ParameterError(
+            "the sampler 'saltelli' is for independent values: take another one with a table or "
+            f"{_CORRELATED}."
+        )
     return Campaign(
         name=name,
         scenario=scenario,
@@ -333,21 +377,102 @@ def _read_real_number(key: str, value: Any, least: float = -math.inf) -> float:
 # -- dispersions ------------------------------------------------------------------------------
 
 
-def _read_dispersions(section: Mapping[str, Any], scenario: Scenario) -> tuple[Dispersion, ...]:
-    found: dict[str, Dispersion] = {}
-    for name, given in section.items():
-        for target in targets_of(str(name), scenario):
+def _read_distributions(section: Mapping[str, Any], scenario: Scenario) -> Iterator[Dispersion]:
+    for names, given in section.items():
+        targets = [
+            target
+            for name in str(names).split(",")
+            for target in targets_of(name.strip(), scenario)
+        ]
+        if isinstance(given, dict) and set(given) == {_CORRELATED}:
+            yield from _read_correlated(str(names), targets, given[_CORRELATED])
+            continue
+        for target in targets:
             distribution = _read_distribution(target, given)
             for choice in distribution.choices:
                 _require_node_accepts(target, choice, scenario)
-            if target.name in found:
-                raise ParameterError(f"'{target.name}' is dispersed twice.")
-            for other in found.values():
-                if other.target.assigned_parameters & target.assigned_parameters:
-                    raise ParameterError(
-                        f"'{other.name}' and '{target.name}' set the same numbers: leave one out."
-                    )
-            found[target.name] = Dispersion(target, distribution)
+            yield Dispersion(target, distribution)
+
+
+def _read_correlated(
+    names: str, targets: Sequence[DispersionTarget], given: Any
+) -> Iterator[Dispersion]:
+    """Yield normal dispersions, whose standard normals are sums of independent ones."""
+    from scipy.stats import multivariate_normal
+
+    if not isinstance(given, dict) or set(given) - {"mean", "cov"} or "cov" not in given:
+        raise ParameterError(f"'{names}': {_CORRELATED} must have 'cov' and may have 'mean'.")
+    if any(target.is_text for target in targets):
+        raise ParameterError(f"'{names}' has a text: {_CORRELATED} is of numbers.")
+    count = len(targets)
+    try:
+        mean = np.array(given.get("mean", np.zeros(count)), dtype=float)
+        covariance = np.array(given["cov"], dtype=float)
+        if mean.shape != (count,) or covariance.shape != (count, count):
+            raise ValueError(f"mean must have {count} numbers, cov {count} x {count}")
+        multivariate_normal(mean, covariance, allow_singular=True)
+        spread = np.sqrt(np.diag(covariance))
+        if not (np.isfinite(mean).all() and spread.all()):
+            raise ValueError("means must be finite and variances positive")
+        if not np.allclose(covariance, covariance.T, atol=0.0):
+            raise ValueError("cov must be symmetric")
+    except (TypeError, ValueError) as error:
+        raise ParameterError(
+            f"'{names}': {_CORRELATED} of {count} values is refused: {str(error).rstrip('.')}."
+        ) from error
+    values, vectors = np.linalg.eigh(covariance / np.outer(spread, spread))
+    factor = vectors * np.sqrt(np.clip(values, 0.0, None))
+    for target, middle, scale, row in zip(targets, mean, spread, factor, strict=True):
+        normal = Distribution("norm", {"loc": float(middle), "scale": float(scale)})
+        weights = zip((each.name for each in targets), row.tolist(), strict=True)
+        yield Dispersion(target, normal, dict(weights))
+
+
+def _table_text(given: Any, folder: Path) -> str:
+    """Return the CSV text of a table: of a file, or as it is in the campaign's file."""
+    if not isinstance(given, str):
+        raise ParameterError("'table' must be the name of a CSV file, or its lines.")
+    if "\n" in given:
+        return given
+    try:
+        return (folder / given).read_text(encoding="utf-8-sig")
+    except (OSError, ValueError) as error:
+        raise ParameterError(f"the table '{given}' cannot be read: {reason(error)}.") from error
+
+
+def _read_table(text: str, scenario: Scenario) -> list[Dispersion]:
+    names, *rows = [row for row in csv.reader(text.splitlines(), skipinitialspace=True) if row]
+    if not rows:
+        raise ParameterError("the table needs a line of names, and a line for each flight.")
+    for number, row in enumerate(rows, 1):
+        if len(row) != len(names):
+            raise ParameterError(
+                f"row {number} of the table has {len(row)} values for {len(names)} names."
+            )
+    found = []
+    for name, column in zip(names, zip(*rows, strict=True), strict=True):
+        targets = targets_of(name.strip(), scenario)
+        if len(targets) > 1:
+            raise ParameterError(f"'{name}' in the table is of {len(targets)} values: name one.")
+        values = tuple(_read_choice(targets[0], each.strip(), _TABLE) for each in column)
+        for text in set(values) if targets[0].is_text else ():
+            _require_node_accepts(targets[0], text, scenario)
+        found.append(Dispersion(targets[0], Distribution(_TABLE, {}, values)))
+    return found
+
+
+def _checked_dispersions(drawn: Sequence[Dispersion]) -> tuple[Dispersion, ...]:
+    """Return dispersions in the order in which they are applied; no two set the same number."""
+    found: dict[str, Dispersion] = {}
+    for each in drawn:
+        if each.name in found:
+            raise ParameterError(f"'{each.name}' is dispersed twice.")
+        for other in found.values():
+            if other.target.assigned_parameters & each.target.assigned_parameters:
+                raise ParameterError(
+                    f"'{other.name}' and '{each.name}' set the same numbers: leave one out."
+                )
+        found[each.name] = each
     return tuple(sorted(found.values(), key=lambda each: each.target.order))
 
 
@@ -411,13 +536,13 @@ def _read_distribution(target: DispersionTarget, given: Any) -> Distribution:
     return Distribution(str(kind), values)
 
 
-def _read_choice(target: DispersionTarget, value: Any) -> Any:
+def _read_choice(target: DispersionTarget, value: Any, where: str = "choice") -> Any:
     if target.is_text:
         if not isinstance(value, str):
-            raise ParameterError(f"'{target.name}' is a text; the choice has {value!r}.")
+            raise ParameterError(f"'{target.name}' is a text; the {where} has {value!r}.")
         return value
     return _read_real_number(
-        f"{target.name}: choice", number_in(value) if isinstance(value, str) else value
+        f"{target.name}: {where}", number_in(value) if isinstance(value, str) else value
     )
 
 

@@ -653,7 +653,7 @@ def _dispersions_section(campaign: Campaign) -> str:
             numbers = [
                 f"{value:.4g}" for value in each.distribution.quantiles(np.array(_QUANTILES_SHOWN))
             ]
-        rows.append([each.name, str(each.distribution), each.target.unit or "", *numbers])
+        rows.append([each.name, str(each), each.target.unit or "", *numbers])
     if not rows:
         return '<p class="missing">No dispersions: flights differ in their noise only.</p>'
     head = [

@@ -26,6 +26,11 @@ from spacerobot_ros.scenario import load_scenario
 
 NORM = {"norm": {"loc": 1.0, "scale": 0.05}}
 
+
+def joint(names: str = "goal.position.x, goal.position.y", **given: Any) -> dict[str, Any]:
+    return {"disperse": {names: {"multivariate_normal": given}}}
+
+
 REFUSED: list[tuple[dict[str, Any], str]] = [
     ({"flight": 3}, "there is no key 'flight'.*Did you mean 'flights'"),
     ({"flights": 0}, "'flights' is 0; it must be a whole number from 1"),
@@ -56,6 +61,22 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     ({"disperse": {"mass": {"gaussian": {}}}}, "Did you mean 'norm'"),
     ({"disperse": {"mass": {"norm": {"mean": 1}}}}, "loc is its mean and scale its standard"),
     ({"disperse": {"mass": {"uniform": {"max": 1}}}}, "loc is its least value and scale its width"),
+    ({"table": "none.csv"}, "the table 'none.csv' cannot be read: No such file"),
+    ({"table": 3}, "'table' must be the name of a CSV file, or its lines"),
+    ({"table": "mass\n"}, "needs a line of names, and a line for each flight"),
+    ({"table": "mass\n1,2\n"}, "row 1 of the table has 2 values for 1 names"),
+    ({"table": "mass.*\n1\n"}, r"'mass.\*' in the table is of 4 values: name one"),
+    ({"table": "mass\nx\n"}, "'mass: table' is 'x'; it must be a finite number"),
+    ({"table": "mass\n1\n", "disperse": {"mass.mass_1": NORM}}, "set the same numbers"),
+    ({"table": "planner.method\noptima\n"}, "must be one of lie_bracket"),
+    ({"table": "mass\n1\n", "sampler": "saltelli"}, "'saltelli' is for independent values"),
+    (joint(cov=[[1, 2], [2.5, 8]]), "cov must be symmetric"),
+    (joint(cov=[[1, 2], [2, 1]]), "positive semidefinite"),
+    (joint(cov=[1, 2]), "mean must have 2 numbers, cov 2 x 2"),
+    (joint(mean=[1], cov=[[1, 0], [0, 1]]), "mean must have 2 numbers, cov 2 x 2"),
+    (joint(cov=[[1, 0], [0, 0]]), "means must be finite and variances positive"),
+    (joint(mean=[1, 2]), "multivariate_normal must have 'cov' and may have 'mean'"),
+    (joint("mass, planner.method", cov=[[1, 0], [0, 1]]), "has a text"),
     ({"disperse": {"mass": {"norm": {"loc": 1, "scale": 0}}}}, "norm takes no such arguments"),
     ({"disperse": {"mass": {"choice": [1, None]}}}, "'mass: choice' is None"),
     ({"disperse": {"mass": {"choice": [True, 1]}}}, "'mass: choice' is True"),
@@ -250,6 +271,61 @@ def test_a_latin_hypercube_has_one_draw_in_each_slice() -> None:
     made = campaign(disperse={"mass": {"uniform": [0, 1]}}, sampler="latin_hypercube", flights=20)
     slices = sorted(int(20 * draw.values["mass"]) for draw in Draws(made))
     assert slices == list(range(20))
+
+
+NAMES = ("goal.position.x", "goal.position.y", "initial.rotvec.z")
+MEAN = np.array([0.001, -0.002, 0.01])
+COVARIANCE = np.array([[4.0, -3.0, 1.0], [-3.0, 9.0, 2.0], [1.0, 2.0, 25.0]]) * 1e-6
+
+
+@pytest.mark.parametrize("sampler", ["random", "latin_hypercube", "sobol", "halton"])
+def test_correlated_values_are_those_of_scipys_distribution(sampler: str) -> None:
+    """By the cumulative distribution, and by distances, whose squares are those of chi squared."""
+    normal = {"multivariate_normal": {"mean": MEAN.tolist(), "cov": COVARIANCE.tolist()}}
+    disperse = {"mass": NORM, ", ".join(NAMES): normal}
+    made = campaign(disperse=disperse, sampler=sampler, flights=512, seed=3)
+    assert made.names == ("mass", *NAMES)
+    drawn = np.array([[draw.values[name] for name in made.names] for draw in Draws(made)])
+    expected, values = stats.multivariate_normal(MEAN, COVARIANCE), drawn[:, 1:]
+    squared = np.einsum("ni,ij,nj->n", values - MEAN, np.linalg.inv(COVARIANCE), values - MEAN)
+    assert stats.kstest(squared, stats.chi2(3).cdf).pvalue > 0.01
+    for corner in ([0.0, 0.0, 0.01], [0.001, -0.004, 0.02], [0.003, 0.001, 0.008]):
+        share = np.mean(np.all(values <= corner, axis=1))
+        assert share == pytest.approx(expected.cdf(corner), abs=0.06)
+    np.testing.assert_allclose(np.cov(values.T), COVARIANCE, atol=4e-6)
+    assert np.abs(np.corrcoef(drawn.T)[0, 1:]).max() < 0.15
+    assert stats.kstest(drawn[:, 0], stats.norm(1.0, 0.05).cdf).pvalue > 0.01
+
+
+def test_a_covariance_may_be_singular() -> None:
+    normal = {"multivariate_normal": {"cov": [[4e-6, -6e-6], [-6e-6, 9e-6]]}}
+    made = campaign(disperse={"goal.position.x, goal.position.y": normal}, flights=5)
+    x, y = np.array([[*draw.values.values()] for draw in Draws(made)]).T
+    np.testing.assert_allclose(y, -1.5 * x, rtol=1e-9)
+
+
+def test_the_rows_of_a_table_are_its_flights(tmp_path: Path) -> None:
+    """Beside values that are drawn; the campaign has the table, wherever its file was."""
+    (tmp_path / "draws.csv").write_text(
+        "mass.mass_1, planner.method, goal.position.x\n1.25, optimal, 1e-3\n0.75, auto, -2e-3\n"
+    )
+    file = tmp_path / "many.yaml"
+    content = section(table="draws.csv", disperse={"mass.mass_2": NORM})
+    del content["set"]
+    file.write_text(yaml.safe_dump({"campaign": content}))
+    made = load_campaign(file)
+    assert (made.flights, load_campaign(file, 1).flights) == (2, 1)
+    again = campaign(**made.section)
+    assert again.dispersions[0].distribution == made.dispersions[0].distribution
+    draws = [dict(draw.values) for draw in Draws(made)]
+    second = [draw.pop("mass.mass_2") for draw in draws]
+    assert draws == [
+        {"mass.mass_1": 1.25, "planner.method": "optimal", "goal.position.x": 0.001},
+        {"mass.mass_1": 0.75, "planner.method": "auto", "goal.position.x": -0.002},
+    ]
+    assert second[0] != second[1]
+    with pytest.raises(ParameterError, match="'flights' is 3, but the table has 2, one a row"):
+        load_campaign(file, 3)
 
 
 def test_saltelli_draws_are_whole_blocks() -> None:

@@ -20,7 +20,7 @@ from scipy import stats
 from support.campaigns import campaign
 from support.chromium import browser, chromium
 
-from spacerobot_ros.campaign.comparing import write_comparison
+from spacerobot_ros.campaign.comparing import require_same_draws, write_comparison
 from spacerobot_ros.campaign.config import Campaign, passes_criteria
 from spacerobot_ros.campaign.dataset import Dataset
 from spacerobot_ros.campaign.draws import Draw, Draws
@@ -268,6 +268,18 @@ def test_two_designs_are_compared_draw_by_draw(tmp_path: Path) -> None:
     four = filled(tmp_path / "four", other, bowl)
     with pytest.raises(ParameterError, match="do not have the same draws: 'seed' is 8 and 9"):
         write_comparison((one, four), tmp_path / "no.html")
+
+
+def test_designs_of_another_covariance_or_table_have_other_draws() -> None:
+    def of(covariance: float, mass: float) -> Campaign:
+        normal = {"multivariate_normal": {"cov": [[1e-4, covariance], [covariance, 1e-4]]}}
+        disperse = {"goal.position.x, goal.position.y": normal}
+        return campaign(disperse=disperse, table=f"mass\n1.0\n{mass}\n")
+
+    require_same_draws(of(5e-5, 1.1), of(5e-5, 1.1))
+    for other in (of(6e-5, 1.1), of(5e-5, 1.2)):
+        with pytest.raises(ParameterError, match="do not have the same draws"):
+            require_same_draws(of(5e-5, 1.1), other)
 
 
 def test_messages_are_counted_by_outcome_without_their_numbers(tmp_path: Path) -> None:
