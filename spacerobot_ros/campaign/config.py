@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import yaml
 
+from spacerobot_ros.campaign.metrics import OWN_METRICS, metric_of
 from spacerobot_ros.campaign.targets import (
     DispersionTarget,
     DrawnFlight,
@@ -34,7 +35,7 @@ FIXED_SIZE_SAMPLERS = ("latin_hypercube", "saltelli")
 
 _CAMPAIGN_KEYS = (
     *("scenario", "flights", "seed", "sampler", "method", "set", "longest", "disperse", "table"),
-    *("criteria", "engine", "description"),
+    *("criteria", "metrics", "engine", "description"),
 )
 _MAX_FLIGHTS = 10_000_000
 ENGINES = ("auto", "lanes", "flights")
@@ -120,7 +121,7 @@ class Criterion:
     maximum: float = math.inf
 
     def __str__(self) -> str:
-        unit = METRICS[self.metric.partition(".")[0]].unit
+        unit = metric_of(self.metric).unit
         parts = [f"at least {self.minimum:g}"] if math.isfinite(self.minimum) else []
         parts += [f"at most {self.maximum:g}"] if math.isfinite(self.maximum) else []
         return f"{self.metric} {' and '.join(parts)} {unit}".rstrip()
@@ -144,6 +145,8 @@ class Campaign:
         Quantities that vary.
     criteria
         Requirements on metrics, beside a goal that is reached.
+    metrics
+        Names of metrics that are measured and reported, beside those of the criteria.
     engine
         Name of the engine: ``auto``, ``lanes`` or ``flights``.
     description
@@ -160,6 +163,7 @@ class Campaign:
     max_flight_time: float
     dispersions: tuple[Dispersion, ...]
     criteria: tuple[Criterion, ...]
+    metrics: tuple[str, ...] = ()
     engine: str = "auto"
     description: str = ""
     section: Mapping[str, Any] = field(default_factory=dict)
@@ -193,9 +197,19 @@ class Campaign:
         ]
 
     @property
+    def named_metrics(self) -> list[str]:
+        """Metrics that a criterion or ``metrics`` names."""
+        return list(dict.fromkeys([*(each.metric for each in self.criteria), *self.metrics]))
+
+    @property
+    def own_metrics(self) -> list[str]:
+        """Those of the named metrics that are of users."""
+        return [name for name in self.named_metrics if name in OWN_METRICS]
+
+    @property
     def measures_clearance(self) -> bool:
-        """Whether a criterion names the smallest distance between links."""
-        return any(criterion.metric == CLEARANCE for criterion in self.criteria)
+        """Whether the smallest distance between links is measured."""
+        return CLEARANCE in self.named_metrics
 
 
 class _UniqueKeyLoader(yaml.SafeLoader):
@@ -295,6 +309,7 @@ def parse_campaign(
         max_flight_time=_read_real_number("longest", section.get("longest", 100_000.0), 0.0),
         dispersions=dispersions,
         criteria=_read_criteria(_read_mapping(section, "criteria"), scenario),
+        metrics=_read_metrics(section.get("metrics"), scenario),
         engine=engine,
         description=printable(str(section.get("description", ""))),
         section=dict(section),
@@ -574,13 +589,9 @@ def _load_scipy_distribution(name: str) -> Any:
 
 
 def _read_criteria(section: Mapping[str, Any], scenario: Scenario) -> tuple[Criterion, ...]:
-    found, known = [], metric_names(description_of(scenario).joint_names)
+    found = []
     for name, given in section.items():
-        if str(name) not in known:
-            raise ParameterError(
-                f"there is no metric '{name}'; there are {', '.join(METRICS)}, those of joints "
-                f"also for one.{suggestion(str(name), known)}"
-            )
+        _require_metric(str(name), scenario)
         if not isinstance(given, dict) or not given or set(given) - {"min", "max"}:
             raise ParameterError(f"the criterion of '{name}' must have 'min' or 'max', or both.")
         least = _read_real_number(f"{name}: min", given["min"]) if "min" in given else -math.inf
@@ -589,6 +600,24 @@ def _read_criteria(section: Mapping[str, Any], scenario: Scenario) -> tuple[Crit
             raise ParameterError(f"the criterion of '{name}' has min {least} above max {most}.")
         found.append(Criterion(str(name), least, most))
     return tuple(found)
+
+
+def _read_metrics(given: Any, scenario: Scenario) -> tuple[str, ...]:
+    if not isinstance(given, list | None):
+        raise ParameterError("'metrics' must be a list of names.")
+    names = tuple(map(str, given or ()))
+    for name in names:
+        _require_metric(name, scenario)
+    return names
+
+
+def _require_metric(name: str, scenario: Scenario) -> None:
+    known = [*metric_names(description_of(scenario).joint_names), *OWN_METRICS]
+    if name not in known:
+        raise ParameterError(
+            f"there is no metric '{name}'; there are {', '.join([*METRICS, *OWN_METRICS])}, those "
+            f"of joints also for one, and yours by --plugin.{suggestion(name, known)}"
+        )
 
 
 def passes_criteria(

@@ -338,7 +338,8 @@ def _row_schema(campaign: Campaign) -> Any:
     fields += [("outcome", text), ("reason", text)]
     for each in campaign.dispersions:
         fields.append((f"{DRAW_PREFIX}{each.name}", text if each.target.is_text else real))
-    fields += [(name, real) for name in metric_names(description_of(campaign.scenario).joint_names)]
+    metrics = [*metric_names(description_of(campaign.scenario).joint_names), *campaign.own_metrics]
+    fields += [(name, real) for name in metrics]
     fields += [("wall_time_s", real), ("plan_time_s", real), ("engine", text)]
     fields += [("fallback", text), ("versions", text)]
     return arrow.schema(fields)

@@ -22,6 +22,7 @@ from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 from spacerobot_ros.campaign.config import Campaign, Criterion, meets_criterion
 from spacerobot_ros.campaign.dataset import DRAW_PREFIX, Dataset
 from spacerobot_ros.campaign.draws import Draws, require_module
+from spacerobot_ros.campaign.metrics import metric_of
 from spacerobot_ros.campaign.rows import ERROR
 from spacerobot_ros.campaign.statistics import (
     PERCENTILES,
@@ -34,7 +35,7 @@ from spacerobot_ros.campaign.statistics import (
     sobol_indices,
 )
 from spacerobot_ros.files import write_output
-from spacerobot_ros.measures import METRICS, Metric, Outcome
+from spacerobot_ros.measures import METRICS, Outcome
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.report.figures import (
     LINE_COLOUR,
@@ -181,7 +182,7 @@ class Results:
         dataset = Dataset(folder)
         campaign = dataset.campaign()
         columns = Columns(dataset)
-        shown = {*_MAIN_METRICS, *(each.metric for each in campaign.criteria)}
+        shown = {*_MAIN_METRICS, *campaign.named_metrics}
         shown |= {name for name, metric in METRICS.items() if metric.yes_or_no}
         drawn = [f"{DRAW_PREFIX}{name}" for name in campaign.names]
         columns.read(["passed", "wall_time_s", *drawn, *sorted(shown)])
@@ -223,8 +224,8 @@ class Results:
 
     @property
     def shown_metrics(self) -> list[str]:
-        """Metrics of the report: those with a criterion, and the main ones that have values."""
-        names = [criterion.metric for criterion in self.campaign.criteria]
+        """Metrics of the report that have values: those that are named, and the main ones."""
+        names = self.campaign.named_metrics
         names += [name for name in _MAIN_METRICS if name not in names]
         return [name for name in names if np.isfinite(self.columns.get(name, np.nan)).any()]
 
@@ -259,7 +260,7 @@ class Results:
     @property
     def distributed_metrics(self) -> list[str]:
         """Metrics of the report that are not just yes or no."""
-        return [name for name in self.shown_metrics if not _metric(name).yes_or_no]
+        return [name for name in self.shown_metrics if not metric_of(name).yes_or_no]
 
     @property
     def sampler_shares(self) -> dict[str, Share]:
@@ -393,15 +394,11 @@ def figure_with_axes(count: int, across: int, height: float = 2.2) -> tuple[Figu
     return figure, axes[:count]
 
 
-def _metric(name: str) -> Metric:
-    return METRICS[name.partition(".")[0]]
-
-
 def metric_label(metric: str, not_controlled: Sequence[str] = ()) -> str:
     """Return the name of a metric with its unit, unless the name has it, and whether it is the
     error of a part of the goal that is not controlled.
     """
-    unit = _metric(metric).unit
+    unit = metric_of(metric).unit
     named = metric.endswith(("_m", "_rad", "_s", "_kg", "_N", "_Nm", "_Ns", "_Nms"))
     label = f"{metric}, {unit}" if unit and not named else metric
     free = _PART_OF_METRIC.get(metric) in not_controlled

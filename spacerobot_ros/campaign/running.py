@@ -240,8 +240,7 @@ def rerun_flight(folder: Path, number: int, bag: Path) -> Rerun:
     scenario = flight.with_draws_in_scenario().scenario
     flown = fly_scenario(scenario, longest=campaign.max_flight_time)
     flown.save(bag)
-    measures = flown.measured(clearance=campaign.measures_clearance)
-    row = Row.of(campaign, draw, measures, FLIGHTS)
+    row = Row.of(campaign, draw, flown, FLIGHTS)
     known = stored_flight(dataset, number)
     if known is None:
         return Rerun(row, None, "", "", bag)
