@@ -26,6 +26,7 @@ from spacerobot_ros.campaign.metrics import metric_of
 from spacerobot_ros.campaign.rows import ERROR
 from spacerobot_ros.campaign.statistics import (
     PERCENTILES,
+    Bin,
     Influence,
     Share,
     corrected_for_multiple_tests,
@@ -33,6 +34,7 @@ from spacerobot_ros.campaign.statistics import (
     percentiles,
     share,
     sobol_indices,
+    success_by_bins,
 )
 from spacerobot_ros.files import write_output
 from spacerobot_ros.measures import METRICS, Outcome
@@ -299,6 +301,15 @@ class Results:
                     found[place] = replace(each, first_order_index=first, total_order_index=total)
         return sorted(found, key=lambda each: -each.strength)
 
+    def drawn_by_influence(self, found: Sequence[Influence]) -> list[str]:
+        """Return the names of what was drawn: texts, then numbers by their influence on passing."""
+        causes = [each.cause for each in found if each.metric == PASSED_COLOUR]
+        return [*(name for name in self.campaign.names if name not in self.drawn_numbers), *causes]
+
+    def success_by_bins(self, name: str) -> list[Bin]:
+        """Return the shares of flights that passed over the drawn values of a name."""
+        return success_by_bins(np.asarray(self.columns[f"{DRAW_PREFIX}{name}"]), self.passed)
+
     def worst_rows(self) -> list[int]:
         """Return the rows of the worst flights: first those that failed, then those that missed.
 
@@ -427,6 +438,7 @@ def _page_body(results: Results) -> list[str]:
             "<h2>Drivers of the result</h2>",
             _sensitivity_section(found),
             _scatter_section(results, found),
+            _success_by_bins_section(results, found),
             "<h2>The worst flights</h2>",
             _worst_flights_section(results),
             *_convergence_section(results),
@@ -591,6 +603,31 @@ def _scatter_section(results: Results, found: Sequence[Influence]) -> str:
         panel.locator_params(axis="x", nbins=5)
     caption = "The strongest correlations; orange: flights that did not pass."
     return picture_part(figure, "scatter", caption)
+
+
+def _success_by_bins_section(results: Results, found: Sequence[Influence]) -> str:
+    drawn = results.drawn_by_influence(found)[:_MAX_SCATTER_PLOTS]
+    if not drawn or results.passed.all() or not results.passed.any():
+        return ""
+    figure, axes = figure_with_axes(len(drawn), 3, 2.4)
+    for panel, name in zip(axes, drawn, strict=True):
+        bins = results.success_by_bins(name)
+        shares = np.array([each.passed.value for each in bins])
+        low = np.array([each.passed.interval_low for each in bins])
+        high = np.array([each.passed.interval_high for each in bins])
+        at: Sequence[Any] = [each.low for each in bins]
+        half = None
+        if not isinstance(at[0], str):
+            half = np.array([(each.high - each.low) / 2.0 for each in bins])
+            at = np.array(at, dtype=float) + half
+        panel.errorbar(at, shares, [shares - low, high - shares], half, ".", color=PALETTE[0])
+        panel.set_ylim(-0.03, 1.03)
+        panel.margins(x=0.08)
+        panel.set_xlabel(name)
+        panel.set_ylabel("success")
+        panel.tick_params(axis="x", labelsize=7)
+    caption = "Success over what was drawn, in bins of about equally many flights; 95 % intervals."
+    return picture_part(figure, "success", caption)
 
 
 def _worst_flights_section(results: Results) -> str:

@@ -15,7 +15,7 @@ from support.campaigns import campaign, flown, section
 
 from spacerobot_ros.campaign import running as module
 from spacerobot_ros.campaign.config import load_campaign
-from spacerobot_ros.campaign.draws import Draws
+from spacerobot_ros.campaign.draws import Draws, drawn_flight
 from spacerobot_ros.campaign.running import sweep
 from spacerobot_ros.campaign.targets import description_of
 from spacerobot_ros.errors import ParameterError
@@ -24,6 +24,7 @@ from spacerobot_ros.flight.flight import Flight
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.scenario import load_scenario
 
+EXAMPLES = Path(__file__).resolve().parents[2] / "examples" / "campaigns"
 NORM = {"norm": {"loc": 1.0, "scale": 0.05}}
 
 
@@ -326,6 +327,13 @@ def test_the_rows_of_a_table_are_its_flights(tmp_path: Path) -> None:
     assert second[0] != second[1]
     with pytest.raises(ParameterError, match="'flights' is 3, but the table has 2, one a row"):
         load_campaign(file, 3)
+
+
+@pytest.mark.parametrize("file", sorted(EXAMPLES.glob("*.yaml")), ids=lambda file: file.stem)
+def test_examples_are_read_and_drawn(file: Path) -> None:
+    made = load_campaign(file, 8)
+    first, second = (drawn_flight(made, Draws(made)[number]) for number in (0, 1))
+    assert first.mass.tolist() != second.mass.tolist() or first.scenario != second.scenario
 
 
 def test_saltelli_draws_are_whole_blocks() -> None:

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pyarrow as arrow
 import pyarrow.parquet as parquet
 import pytest
@@ -188,6 +189,40 @@ def test_what_grows_to_both_sides_is_found(tmp_path: Path) -> None:
     worst = results.worst_rows()
     errors = results.columns["position_error_m"]
     assert [errors[row] for row in worst] == sorted(errors, reverse=True)[:10]
+
+
+def test_success_is_counted_over_bins_of_what_was_drawn(tmp_path: Path) -> None:
+    """As pandas bins and counts, with the interval by Wilson's formula."""
+    disperse = {**MASSES, "planner.method": {"choice": ["optimal", "auto"]}}
+    made = campaign(disperse=disperse, flights=97, seed=8, criteria=CRITERIA)
+
+    def error(draw: Draw) -> float:
+        return bowl(draw) * (0.5 if draw.values["planner.method"] == "auto" else 1.0)
+
+    results = Results.of(filled(tmp_path, made, error))
+    rows = pd.DataFrame(
+        {"passed": results.passed, **{name: results.columns[f"draw.{name}"] for name in made.names}}
+    )
+    by_mass = rows.groupby(pd.qcut(rows["mass.mass_1"], 8), observed=True)
+    by_method = rows.groupby("planner.method")
+    for name, groups in (("mass.mass_1", by_mass), ("planner.method", by_method)):
+        bins = results.success_by_bins(name)
+        assert len(bins) == len(groups)
+        for found, (_, group) in zip(bins, groups, strict=True):
+            count, total = int(group["passed"].sum()), len(group)
+            assert (found.passed.count, found.passed.total) == (count, total)
+            assert (found.low, found.high) == (group[name].min(), group[name].max())
+            share, z = count / total, stats.norm.ppf(0.975)
+            middle = (share + z**2 / (2 * total)) / (1 + z**2 / total)
+            half = np.sqrt(share * (1 - share) / total + (z / (2 * total)) ** 2) * z
+            half /= 1 + z**2 / total
+            interval = found.passed.interval_low, found.passed.interval_high
+            assert interval == pytest.approx((middle - half, middle + half))
+    # The text first, then the mass that drives the result.
+    assert results.drawn_by_influence(results.influences())[:2] == ["planner.method", "mass.mass_1"]
+    page = tmp_path / "page.html"
+    write_campaign_report(tmp_path, page)
+    assert "Success over what was drawn" in page.read_text("utf-8")
 
 
 def test_the_worst_flights_that_pass_are_those_next_to_their_bounds(tmp_path: Path) -> None:
