@@ -13,6 +13,7 @@ from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
+from xml.etree.ElementTree import canonicalize
 
 import numpy as np
 import yaml
@@ -390,7 +391,11 @@ def _settings_of_draws(campaign: Campaign) -> dict[str, Any]:
 
 
 def self_contained(campaign: Campaign) -> Campaign:
-    """Return the campaign with the texts of its robots in place of files, for other machines."""
+    """Return the campaign with the texts of its robots in place of files, for other machines.
+
+    Texts are canonical XML: files that differ in layout, comments or order of attributes are one
+    robot.
+    """
     scenario = campaign.scenario
     for node in ("plant", *scenario.commanders):
         config = scenario.config(node)
@@ -401,12 +406,14 @@ def self_contained(campaign: Campaign) -> Campaign:
                 robot = parse_robot(config.robot_description)
             elif config.robot:
                 robot = load_robot(robot_file(config.robot))
-            text = {"robot_description": config.described(robot).urdf, "robot": "", "world": ""}
+            urdf = canonicalize(config.described(robot).urdf, strip_text=True)
+            text = {"robot_description": urdf, "robot": "", "world": ""}
             scenario = scenario.with_overrides(node, text)
     floating = scenario.plant.target
     if is_path(floating.robot) and not floating.robot_description:
         target = load_target(floating)
         assert target is not None
-        text = {**target_parameters(target.urdf), "target.robot": ""}
+        urdf = canonicalize(target.urdf, strip_text=True)
+        text = {**target_parameters(urdf), "target.robot": ""}
         scenario = scenario.with_overrides("plant", text)
     return replace(campaign, scenario=scenario)
