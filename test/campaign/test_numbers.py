@@ -16,8 +16,9 @@ from support.campaigns import campaign
 
 from spacerobot_ros.campaign import draws as sampling
 from spacerobot_ros.campaign import running as reruns
-from spacerobot_ros.campaign.config import Criterion, Distribution, load_campaign, meets_criterion
+from spacerobot_ros.campaign.config import Criterion, load_campaign, meets_criterion
 from spacerobot_ros.campaign.dataset import Dataset, self_contained
+from spacerobot_ros.campaign.distributions import Distribution
 from spacerobot_ros.campaign.draws import Draw, Draws, drawn_flight, drawn_flights, sobol_problem
 from spacerobot_ros.campaign.rows import Row
 from spacerobot_ros.campaign.running import Progress, Rerun, largest_deviation
