@@ -11,12 +11,11 @@ import numpy as np
 from spacerobot_ros.campaign.config import Campaign
 from spacerobot_ros.campaign.report import (
     FOOTER_TEXT,
-    Results,
     figure_with_axes,
-    messages_of,
     metric_label,
     picture_part,
 )
+from spacerobot_ros.campaign.results import Results, messages_of
 from spacerobot_ros.campaign.statistics import PairedDifference, paired_difference, paired_success
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.files import write_output

@@ -25,7 +25,8 @@ from spacerobot_ros.campaign.comparing import require_same_draws, write_comparis
 from spacerobot_ros.campaign.config import Campaign, passes_criteria
 from spacerobot_ros.campaign.dataset import Dataset
 from spacerobot_ros.campaign.draws import Draw, Draws
-from spacerobot_ros.campaign.report import PASSED_COLOUR, Columns, Results, write_campaign_report
+from spacerobot_ros.campaign.report import write_campaign_report
+from spacerobot_ros.campaign.results import PASSING, Columns, Results
 from spacerobot_ros.campaign.rows import Row
 from spacerobot_ros.campaign.running import run_campaign
 from spacerobot_ros.errors import ParameterError
@@ -139,7 +140,7 @@ def test_shares_of_captures_have_their_intervals(tmp_path: Path) -> None:
 def test_sobol_indices_are_those_of_a_function_that_is_known(tmp_path: Path) -> None:
     made = campaign(disperse=TURNS, sampler="saltelli", flights=512 * 5, seed=3)
     results = Results.of(filled(tmp_path, made, ishigami))
-    drivers = [each for each in results.influences() if each.metric != PASSED_COLOUR]
+    drivers = [each for each in results.influences() if each.metric != PASSING]
     found = {each.cause: each for each in drivers}
     first, total = (0.3139, 0.4424, 0.0), (0.5576, 0.4424, 0.2437)
     for name, one, all_together in zip(NAMES, first, total, strict=True):
@@ -175,7 +176,7 @@ def test_what_grows_to_both_sides_is_found(tmp_path: Path) -> None:
     (passing,) = (
         each
         for each in results.influences()
-        if (each.metric, each.cause) == (PASSED_COLOUR, "mass.mass_1")
+        if (each.metric, each.cause) == (PASSING, "mass.mass_1")
     )
     # The farther the mass is off, the fewer pass.
     assert passing.distance_correlation < -0.6

@@ -25,7 +25,7 @@ from spacerobot_ros.campaign.draws import Draw, Draws, require_module
 from spacerobot_ros.campaign.engines import fly_all
 from spacerobot_ros.campaign.lanes import LanesEngine
 from spacerobot_ros.campaign.one_by_one import FlightsEngine
-from spacerobot_ros.campaign.report import Results
+from spacerobot_ros.campaign.results import Results
 from spacerobot_ros.campaign.rows import ERROR, Fallback, Row
 from spacerobot_ros.campaign.running import (
     RERUN_TOLERANCE,
