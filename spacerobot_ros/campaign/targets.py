@@ -23,7 +23,13 @@ from spacerobot_ros.planning import Goal
 from spacerobot_ros.resources import robot_file, suggestion
 from spacerobot_ros.scenario import CONFIGS, Scenario
 from spacerobot_ros.simulation.capture import load_target, target_parameters
-from spacerobot_ros.simulation.faults import FAULT_KINDS, Fault, FaultTargets, parse_fault
+from spacerobot_ros.simulation.faults import (
+    FAULT_KINDS,
+    Fault,
+    FaultTargets,
+    edited_fault,
+    parse_fault,
+)
 
 AXES = ("x", "y", "z")
 
@@ -556,7 +562,7 @@ def _fault_target(name: str, index: int, part: str, scenario: Scenario) -> Dispe
             lines[index : index + 1] = lines[index : index + 1] if drawn else []
         else:
             text = drawn if is_text else repr(float(drawn))
-            lines[index] = _edit_fault_line(lines[index].split(), part, text)
+            lines[index] = edited_fault(lines[index], part, text)
         if is_text:
             _require_fault(lines[index], flight.scenario)
         return flight.with_overrides("plant", {"faults": lines})
@@ -571,27 +577,6 @@ def _require_fault(line: str, scenario: Scenario) -> Fault:
     """Return the fault of a line; its plant alone knows whether it has a nozzle or a wrench."""
     joints = description_of(scenario).joint_names
     return parse_fault(line, FaultTargets(joints, wrench=True, nozzles=line.split()[1:2]))
-
-
-def _has_value(kind: str) -> bool:
-    return kind in FAULT_KINDS and bool(FAULT_KINDS[kind].value)
-
-
-def _edit_fault_line(words: Sequence[str], part: str, text: str) -> str:
-    """Return a fault's line with another part; a kind without a value drops that of the line."""
-    kind, target, *times = words
-    value = [times.pop(0)] if _has_value(kind) else []
-    if part == "kind":
-        kind, value = text, value if _has_value(text) else []
-    elif part == "target":
-        target = text
-    elif part == "value":
-        value = [text] if value else []
-    elif part in times:
-        times[times.index(part) + 1] = text
-    else:
-        times = [part, text, *times] if part == "at" else [*times, part, text]
-    return " ".join([kind, target, *value, *times])
 
 
 # -- the URDF of a robot with other masses ----------------------------------------------------
