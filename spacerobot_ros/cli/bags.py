@@ -99,10 +99,10 @@ def _parse_length(context: click.Context, option: click.Parameter, text: str) ->
 def figures_command(
     bags: tuple[Path, ...], only: str, format_name: str, out: Path | None, **options: Any
 ) -> None:
-    """Draw figures of a BAG for a paper, one file each; of several, in the same panels.
+    """Draw figures of a BAG for a paper, one file each.
 
-    Files of the same names are replaced. Exit code 1: the bag lacks the data of a figure that
-    --only names, or of all figures.
+    Several bags are drawn into the same panels. Files of the same names are replaced. Exit code 1:
+    the bags lack the data of a figure that --only names, or of all figures.
     """
     from spacerobot_ros.report import write_figures
     from spacerobot_ros.report.figures import PictureFormat
