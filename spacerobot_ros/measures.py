@@ -271,7 +271,7 @@ _OF_JOINTS = ("peak_rate", "peak_effort", "lowest", "highest")
 """Fields of :class:`Measures` that have a number for each joint."""
 
 CLEARANCE = "clearance_m"
-"""Name of the metric that campaigns measure only where a criterion names it."""
+"""Name of the metric that campaigns measure only if they name it."""
 
 METRICS: dict[str, Metric] = {
     "position_error_m": _error_metric(
@@ -322,7 +322,7 @@ METRICS: dict[str, Metric] = {
     ),
     CLEARANCE: Metric(
         "m",
-        "smallest distance between two links, measured where a criterion names it; negative: the "
+        "smallest distance between two links, measured if the campaign names it; negative: the "
         "depth of a contact",
         lambda m, _: m.clearance,
         smallest_is_worst=True,

@@ -1,4 +1,4 @@
-"""Registries of control laws and gait methods: the package's own, and those of users.
+"""Registries of control laws, gait methods and metrics: the package's own, and those of users.
 
 A class of a user comes into a registry in one of three ways:
 
@@ -45,15 +45,24 @@ class Registry(dict[str, type[T]]):
         Class that all of them are derived from.
     own
         The classes of this package, which no other class replaces.
+    reserved
+        Other names that no class may have.
     """
 
-    def __init__(self, kind: str, group: str, base: Any, own: Iterable[type[T]]) -> None:
+    def __init__(
+        self,
+        kind: str,
+        group: str,
+        base: Any,
+        own: Iterable[type[T]],
+        reserved: Iterable[str] = (),
+    ) -> None:
         super().__init__()
         self.kind, self.group, self.base = kind, group, base
         self._own: frozenset[str] = frozenset()
         for entry in own:
             self.register(entry)
-        self._own = frozenset(self)
+        self._own = frozenset([*self, *reserved])
 
     def register(self, entry: type[T]) -> type[T]:
         """Add a class, instead of an earlier one of its name; usable as a decorator.
@@ -109,7 +118,7 @@ class Registry(dict[str, type[T]]):
             raise ParameterError(
                 f"{named} needs a name of letters, digits and underscores: name = 'my_name'."
             )
-        if name in self._own and self[name] is not entry:
+        if name in self._own and self.get(name) is not entry:
             raise ParameterError(
                 f"{named} has the name of the package's own '{name}': give it another one."
             )

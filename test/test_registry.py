@@ -1,4 +1,4 @@
-"""Control laws and gait methods of users: by installed packages, files, and in scripts."""
+"""Control laws, gait methods and metrics of users: by installed packages, files, and in scripts."""
 
 from __future__ import annotations
 
@@ -15,9 +15,14 @@ import numpy as np
 import pytest
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
+from support.campaigns import campaign
 from support.sentences import assert_one_sentence
 
 from spacerobot_ros import fly
+from spacerobot_ros.campaign.dataset import Dataset
+from spacerobot_ros.campaign.metrics import OWN_METRICS
+from spacerobot_ros.campaign.report import write_campaign_report
+from spacerobot_ros.campaign.running import rerun_flight, run_campaign
 from spacerobot_ros.control import ControlState, Reference
 from spacerobot_ros.control.laws.numpy_law import NumpyLaw
 from spacerobot_ros.control.laws.registry import LAWS
@@ -51,13 +56,19 @@ def _run(words: list[str], folder: Path, **environment: str) -> subprocess.Compl
     )
 
 
-def _last_pose(bag: Path) -> tuple[list[float], list[float]]:
+def _poses(bag: Path) -> list[tuple[list[float], list[float]]]:
+    found = []
     with AnyReader([bag], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as reader:
         connections = [c for c in reader.connections if c.topic == "/base_pose"]
-        *_, (connection, _, data) = reader.messages(connections)
-        message: Any = reader.deserialize(data, connection.msgtype)
-    p, o = message.pose.position, message.pose.orientation
-    return [p.x, p.y, p.z], [o.x, o.y, o.z, o.w]
+        for connection, _, data in reader.messages(connections):
+            message: Any = reader.deserialize(data, connection.msgtype)
+            p, o = message.pose.position, message.pose.orientation
+            found.append(([p.x, p.y, p.z], [o.x, o.y, o.z, o.w]))
+    return found
+
+
+def _last_pose(bag: Path) -> tuple[list[float], list[float]]:
+    return _poses(bag)[-1]
 
 
 @pytest.fixture
@@ -114,7 +125,7 @@ def test_a_plugin_flies_by_nodes_and_in_the_workers_of_a_campaign(tmp_path: Path
     campaign.write_text(
         "campaign:\n  scenario: coordinated_control\n  flights: 3\n  engine: flights\n"
         "  method: soft\n  disperse:\n"
-        "    coordinated_control.soft.reach: {uniform: [0.1, 0.2]}\n"
+        "    coordinated_control.soft.reach: {uniform: [0.1, 0.3]}\n"
     )
     flown = _run([*plugin, "campaign", "fly", str(campaign), "--workers", "2"], tmp_path)
     assert flown.returncode == 0, flown.stderr
@@ -156,7 +167,7 @@ def test_a_class_that_is_no_law_is_refused(entry: Any, sentence: str) -> None:
 def plugins(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """Leave the registries and the environment as they were."""
     monkeypatch.setenv(PLUGINS_VARIABLE, "")
-    registries: tuple[dict[str, Any], ...] = LAWS, METHODS
+    registries: tuple[dict[str, Any], ...] = LAWS, METHODS, OWN_METRICS
     before = [dict(each) for each in registries]
     yield
     for each, entries in zip(registries, before, strict=True):
@@ -194,6 +205,69 @@ def test_a_plugin_adds_what_it_defines_and_not_what_it_imports(tmp_path: Path) -
         str(EXAMPLES / "lqr_law.py"),
         str(EXAMPLES / "own_gait_method.py"),
     ]
+
+
+_METRIC = """
+import numpy as np
+
+from spacerobot_ros.campaign.metrics import FlightMetric
+
+
+class Farthest(FlightMetric):
+    name = "farthest_m"
+    unit = "m"
+
+    def evaluate(self, flight):
+        return np.linalg.norm(flight.pose[:, :3] - flight.pose[0, :3], axis=1).max()
+"""
+
+
+@pytest.mark.usefixtures("plugins")
+def test_a_metric_of_a_plugin_is_measured_and_required(tmp_path: Path) -> None:
+    """The number is that of the flight's bag as another library reads it."""
+    with pytest.raises(ParameterError, match=r"no metric 'farthest_m'.*and yours by --plugin"):
+        campaign(metrics=["farthest_m"])
+    (tmp_path / "farthest.py").write_text(_METRIC)
+    add_plugin(tmp_path / "farthest.py")
+    drawn = {"goal.position.x": {"choice": [0.0, 0.02]}}
+    given = {"flights": 2, "disperse": drawn, "sampler": "latin_hypercube"}
+    run_campaign(campaign(**given, metrics=["farthest_m"]), tmp_path / "made")
+    found = Dataset(tmp_path / "made").table().to_pylist()
+    assert [(row["passed"], row["engine"]) for row in found] == [(True, "flights")] * 2
+    for row in found:
+        bag = tmp_path / f"{row['flight']}.mcap"
+        assert rerun_flight(tmp_path / "made", row["flight"], bag).agrees
+        positions = np.array([position for position, _ in _poses(bag)])
+        farthest = max(np.linalg.norm(positions - positions[0], axis=1))
+        assert row["farthest_m"] == pytest.approx(farthest, rel=1e-12)
+    low, high = sorted(row["farthest_m"] for row in found)
+    write_campaign_report(tmp_path / "made", tmp_path / "page.html")
+    mean = f"farthest_m</th><td>{low:.4g}</td>"
+    assert mean in (tmp_path / "page.html").read_text("utf-8")
+    assert high > 1.1 * low
+    bounds = {"farthest_m": {"max": 0.5 * (low + high)}}
+    run_campaign(campaign(**given, criteria=bounds), tmp_path / "bounded")
+    table = Dataset(tmp_path / "bounded").table(["passed", "farthest_m"]).to_pylist()
+    assert sorted((row["farthest_m"], row["passed"]) for row in table) == [
+        (low, True),
+        (high, False),
+    ]
+    with pytest.raises(SpaceRobotError, match="no whole flights, of which 'farthest_m' is"):
+        run_campaign(campaign(**given, criteria=bounds), tmp_path / "lanes", engine="lanes")
+
+
+@pytest.mark.usefixtures("plugins")
+def test_a_metric_that_fails_is_named_and_takes_no_name_of_the_package(tmp_path: Path) -> None:
+    (tmp_path / "bad.py").write_text(_METRIC.replace("flight.pose[:, :3]", "flight.nowhere"))
+    add_plugin(tmp_path / "bad.py")
+    run_campaign(campaign(flights=1, metrics=["farthest_m"]), tmp_path / "made")
+    (row,) = Dataset(tmp_path / "made").table().to_pylist()
+    sentence = "The metric 'farthest_m' cannot be computed: AttributeError: 'Flight'"
+    assert row["outcome"] == "error"
+    assert row["reason"].startswith(sentence)
+    (tmp_path / "clash.py").write_text(_METRIC.replace("farthest_m", "duration_s"))
+    with pytest.raises(ParameterError, match="has the name of the package's own 'duration_s'"):
+        add_plugin(tmp_path / "clash.py")
 
 
 class _Told(NumpyLaw):

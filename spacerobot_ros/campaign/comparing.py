@@ -11,12 +11,11 @@ import numpy as np
 from spacerobot_ros.campaign.config import Campaign
 from spacerobot_ros.campaign.report import (
     FOOTER_TEXT,
-    Results,
     figure_with_axes,
-    messages_of,
     metric_label,
     picture_part,
 )
+from spacerobot_ros.campaign.results import Results, messages_of
 from spacerobot_ros.campaign.statistics import PairedDifference, paired_difference, paired_success
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.files import write_output
@@ -41,10 +40,11 @@ def require_same_draws(first: Campaign, second: Campaign) -> None:
     # The order counts, because numbers are assigned to dispersions in order.
     for ours_is, theirs_is in zip_longest(first.dispersions, second.dispersions):
         a, b = (
-            "nothing" if each is None else f"{each.name}: {each.distribution}"
-            for each in (ours_is, theirs_is)
+            "nothing" if each is None else f"{each.name}: {each}" for each in (ours_is, theirs_is)
         )
-        same = a == b and ours_is.distribution == theirs_is.distribution
+        same = a == b and all(
+            getattr(ours_is, key) == getattr(theirs_is, key) for key in ("distribution", "weights")
+        )
         if not same:
             raise ParameterError(f"{sentence}under 'disperse' is {a}, and {b}, in the same place.")
 

@@ -12,18 +12,22 @@ from typing import Any
 import numpy as np
 import yaml
 
-from spacerobot_ros.campaign.targets import (
-    DispersionTarget,
-    DrawnFlight,
-    description_of,
-    targets_of,
+from spacerobot_ros.campaign.distributions import (
+    Dispersion,
+    checked_dispersions,
+    read_distributions,
+    read_real_number,
+    read_table,
+    read_table_text,
 )
+from spacerobot_ros.campaign.metrics import OWN_METRICS, metric_of
+from spacerobot_ros.campaign.targets import description_of
 from spacerobot_ros.errors import ParameterError, printable, reason
 from spacerobot_ros.files import load_yaml
 from spacerobot_ros.measures import CLEARANCE, METRICS, metric_names
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.resources import suggestion
-from spacerobot_ros.scenario import CONFIGS, Scenario, number_in, scenario_or_robot
+from spacerobot_ros.scenario import CONFIGS, Scenario, scenario_or_robot
 
 SAMPLERS = ("random", "latin_hypercube", "sobol", "halton", "saltelli")
 """Names of samplers; saltelli, for sensitivity indices, is from SALib, the others from scipy."""
@@ -32,62 +36,12 @@ FIXED_SIZE_SAMPLERS = ("latin_hypercube", "saltelli")
 """Samplers whose draws depend on the number of flights."""
 
 _CAMPAIGN_KEYS = (
-    *("scenario", "flights", "seed", "sampler", "method", "set", "longest", "disperse"),
-    *("criteria", "engine", "description"),
+    *("scenario", "flights", "seed", "sampler", "method", "set", "longest", "disperse", "table"),
+    *("criteria", "metrics", "engine", "description"),
 )
 _MAX_FLIGHTS = 10_000_000
 ENGINES = ("auto", "lanes", "flights")
 """Names of the engines that may fly a campaign."""
-
-
-@dataclass(frozen=True)
-class Distribution:
-    """Probability distribution of a value: one of scipy.stats, or a choice.
-
-    Attributes
-    ----------
-    name
-        Name in ``scipy.stats``, or ``choice``.
-    arguments
-        Arguments by name, as ``scipy.stats`` takes them.
-    choices
-        Equally likely values of a ``choice``.
-    """
-
-    name: str
-    arguments: Mapping[str, float] = field(default_factory=dict)
-    choices: tuple[Any, ...] = ()
-
-    def quantiles(self, shares: Array) -> list[Any]:
-        """Return the quantiles (N,) of cumulative probabilities (N,), 0 to 1."""
-        if self.choices:
-            last = len(self.choices) - 1
-            return [self.choices[min(int(u * (last + 1)), last)] for u in shares.tolist()]
-        # Values that are not finite are refused when a flight draws them.
-        with np.errstate(all="ignore"):
-            found = np.asarray(
-                _load_scipy_distribution(self.name).ppf(shares, **self.arguments), dtype=float
-            )
-        return list(found.tolist())
-
-    def __str__(self) -> str:
-        if self.choices:
-            return f"one of {', '.join(map(str, self.choices))}"
-        given = ", ".join(f"{name} {value:g}" for name, value in self.arguments.items())
-        return f"{self.name} ({given})"
-
-
-@dataclass(frozen=True)
-class Dispersion:
-    """A quantity that varies from flight to flight, and its distribution."""
-
-    target: DispersionTarget
-    distribution: Distribution
-
-    @property
-    def name(self) -> str:
-        """Name of the quantity."""
-        return self.target.name
 
 
 @dataclass(frozen=True)
@@ -99,7 +53,7 @@ class Criterion:
     maximum: float = math.inf
 
     def __str__(self) -> str:
-        unit = METRICS[self.metric.partition(".")[0]].unit
+        unit = metric_of(self.metric).unit
         parts = [f"at least {self.minimum:g}"] if math.isfinite(self.minimum) else []
         parts += [f"at most {self.maximum:g}"] if math.isfinite(self.maximum) else []
         return f"{self.metric} {' and '.join(parts)} {unit}".rstrip()
@@ -123,6 +77,8 @@ class Campaign:
         Quantities that vary.
     criteria
         Requirements on metrics, beside a goal that is reached.
+    metrics
+        Names of metrics that are measured and reported, beside those of the criteria.
     engine
         Name of the engine: ``auto``, ``lanes`` or ``flights``.
     description
@@ -139,6 +95,7 @@ class Campaign:
     max_flight_time: float
     dispersions: tuple[Dispersion, ...]
     criteria: tuple[Criterion, ...]
+    metrics: tuple[str, ...] = ()
     engine: str = "auto"
     description: str = ""
     section: Mapping[str, Any] = field(default_factory=dict)
@@ -147,6 +104,14 @@ class Campaign:
     def names(self) -> tuple[str, ...]:
         """Names of the drawn quantities, in the order of the columns."""
         return tuple(dispersion.name for dispersion in self.dispersions)
+
+    @property
+    def correlation_factor(self) -> Array | None:
+        """(D, D) factor by which independent standard normals become correlated; None: none are."""
+        if not any(each.weights for each in self.dispersions):
+            return None
+        rows = (each.weights or {each.name: 1.0} for each in self.dispersions)
+        return np.array([[row.get(name, 0.0) for name in self.names] for row in rows])
 
     @property
     def description_lines(self) -> list[str]:
@@ -164,9 +129,19 @@ class Campaign:
         ]
 
     @property
+    def named_metrics(self) -> list[str]:
+        """Metrics that a criterion or ``metrics`` names."""
+        return list(dict.fromkeys([*(each.metric for each in self.criteria), *self.metrics]))
+
+    @property
+    def own_metrics(self) -> list[str]:
+        """Those of the named metrics that are of users."""
+        return [name for name in self.named_metrics if name in OWN_METRICS]
+
+    @property
     def measures_clearance(self) -> bool:
-        """Whether a criterion names the smallest distance between links."""
-        return any(criterion.metric == CLEARANCE for criterion in self.criteria)
+        """Whether the smallest distance between links is measured."""
+        return CLEARANCE in self.named_metrics
 
 
 class _UniqueKeyLoader(yaml.SafeLoader):
@@ -234,23 +209,37 @@ def parse_campaign(
     for key in section:
         _require_known("key", key, _CAMPAIGN_KEYS)
     scenario = scenario or _read_scenario(section, folder)
-    flights = _read_whole_number(section, "flights", 100, 1, _MAX_FLIGHTS)
+    drawn = [*read_distributions(_read_mapping(section, "disperse"), scenario)]
+    rows = None
+    if section.get("table") is not None:
+        section = {**section, "table": read_table_text(section["table"], folder)}
+        columns = read_table(section["table"], scenario)
+        rows, drawn = len(columns[0].distribution.choices), [*columns, *drawn]
+    flights = _read_whole_number(section, "flights", rows or 100, 1, _MAX_FLIGHTS)
+    if rows is not None and flights > rows:
+        raise ParameterError(f"'flights' is {flights}, but the table has {rows}, one a row.")
     sampler = str(section.get("sampler", "random"))
     engine = str(section.get("engine", "auto"))
     _require_known("sampler", sampler, SAMPLERS)
     _require_known("engine", engine, ENGINES)
-    dispersions = _read_dispersions(_read_mapping(section, "disperse"), scenario)
+    dispersions = checked_dispersions(drawn)
     if sampler == "saltelli" and not dispersions:
         raise ParameterError("the sampler 'saltelli' needs at least one dispersion.")
+    if sampler == "saltelli" and not all(each.is_independent for each in dispersions):
+        raise ParameterError(
+            "the sampler 'saltelli' is for independent values: take another one with a table or "
+            "multivariate_normal."
+        )
     return Campaign(
         name=name,
         scenario=scenario,
         flights=flights,
         seed=_read_whole_number(section, "seed", 0, 0, 2**63 - 1),
         sampler=sampler,
-        max_flight_time=_read_real_number("longest", section.get("longest", 100_000.0), 0.0),
+        max_flight_time=read_real_number("longest", section.get("longest", 100_000.0), 0.0),
         dispersions=dispersions,
         criteria=_read_criteria(_read_mapping(section, "criteria"), scenario),
+        metrics=_read_metrics(section.get("metrics"), scenario),
         engine=engine,
         description=printable(str(section.get("description", ""))),
         section=dict(section),
@@ -319,146 +308,39 @@ def _read_whole_number(
     return value
 
 
-def _read_real_number(key: str, value: Any, least: float = -math.inf) -> float:
-    try:
-        number = math.nan if isinstance(value, bool) else float(value)
-    except (TypeError, ValueError):
-        number = math.nan
-    if not (math.isfinite(number) and number >= least):
-        bound = f" of at least {least:g}" if math.isfinite(least) else ""
-        raise ParameterError(f"'{key}' is {value!r}; it must be a finite number{bound}.")
-    return number
-
-
-# -- dispersions ------------------------------------------------------------------------------
-
-
-def _read_dispersions(section: Mapping[str, Any], scenario: Scenario) -> tuple[Dispersion, ...]:
-    found: dict[str, Dispersion] = {}
-    for name, given in section.items():
-        for target in targets_of(str(name), scenario):
-            distribution = _read_distribution(target, given)
-            for choice in distribution.choices:
-                _require_node_accepts(target, choice, scenario)
-            if target.name in found:
-                raise ParameterError(f"'{target.name}' is dispersed twice.")
-            for other in found.values():
-                if other.target.assigned_parameters & target.assigned_parameters:
-                    raise ParameterError(
-                        f"'{other.name}' and '{target.name}' set the same numbers: leave one out."
-                    )
-            found[target.name] = Dispersion(target, distribution)
-    return tuple(found.values())
-
-
-_SCIPY_NAMES = {"normal": "norm", "gauss": "norm", "gaussian": "norm", "exponential": "expon"}
-
-_ARGUMENT_HELP = {
-    "norm": "loc is its mean and scale its standard deviation",
-    "uniform": "loc is its least value and scale its width",
-}
-
-
-def _read_distribution(target: DispersionTarget, given: Any) -> Distribution:
-    name = target.name
-    if not isinstance(given, dict) or len(given) != 1:
-        raise ParameterError(
-            f"'{name}' must have one distribution, such as 'norm: {{loc: 1, scale: 0.05}}'."
-        )
-    ((kind, arguments),) = given.items()
-    if kind == "choice":
-        if not isinstance(arguments, list) or not arguments:
-            raise ParameterError(f"'{name}' must have a list of values to choose from.")
-        return Distribution("choice", {}, tuple(_read_choice(target, each) for each in arguments))
-    if target.is_text:
-        raise ParameterError(f"'{name}' is a text: it must have a 'choice' of texts.")
-    distribution = _load_scipy_distribution(str(kind))
-    shapes = (distribution.shapes or "").replace(" ", "").split(",")
-    words = [*filter(None, shapes), "loc", *(["scale"] if hasattr(distribution, "pdf") else [])]
-    if isinstance(arguments, list):
-        if len(arguments) > len(words):
-            raise ParameterError(
-                f"'{name}': {kind} takes {', '.join(words)}, not {len(arguments)} numbers."
-            )
-        arguments = dict(zip(words, arguments, strict=False))
-    if not isinstance(arguments, dict):
-        raise ParameterError(f"'{name}': {kind} must have its arguments: {', '.join(words)}.")
-    for word in arguments:
-        if word not in words:
-            raise ParameterError(
-                f"'{name}': {kind} has no argument '{word}'; it takes {', '.join(words)}"
-                f"{': ' + _ARGUMENT_HELP[kind] if kind in _ARGUMENT_HELP else ''}."
-                f"{suggestion(str(word), words)}"
-            )
-    missing = [word for word in filter(None, shapes) if word not in arguments]
-    if missing:
-        raise ParameterError(f"'{name}': {kind} needs its argument '{missing[0]}'.")
-    values = {
-        word: _read_real_number(f"{name}: {word}", value) for word, value in arguments.items()
-    }
-    with np.errstate(all="ignore"):
-        middle = float(distribution.ppf(0.5, **values))
-    if not math.isfinite(middle):
-        raise ParameterError(
-            f"'{name}': {kind} takes no such arguments: "
-            f"{', '.join(f'{word} {value:g}' for word, value in values.items())}."
-        )
-    return Distribution(str(kind), values)
-
-
-def _read_choice(target: DispersionTarget, value: Any) -> Any:
-    if target.is_text:
-        if not isinstance(value, str):
-            raise ParameterError(f"'{target.name}' is a text; the choice has {value!r}.")
-        return value
-    return _read_real_number(
-        f"{target.name}: choice", number_in(value) if isinstance(value, str) else value
-    )
-
-
-def _require_node_accepts(target: DispersionTarget, value: Any, scenario: Scenario) -> None:
-    flight = target.apply(DrawnFlight.of(scenario), value)
-    for node in ("plant", *scenario.commanders):
-        flight.scenario.config(node)
-
-
-def _load_scipy_distribution(name: str) -> Any:
-    """Return a distribution of scipy.stats, which takes a second to load."""
-    from scipy import stats
-
-    found = getattr(stats, name, None)
-    if not isinstance(found, (stats.rv_continuous, stats.rv_discrete)):
-        known = [
-            each
-            for each, value in vars(stats).items()
-            if isinstance(value, (stats.rv_continuous, stats.rv_discrete))
-        ]
-        raise ParameterError(
-            f"scipy.stats has no distribution '{name}'."
-            f"{suggestion(_SCIPY_NAMES.get(name.lower(), name), [*known, 'choice'])}"
-        )
-    return found
-
-
 # -- criteria ---------------------------------------------------------------------------------
 
 
 def _read_criteria(section: Mapping[str, Any], scenario: Scenario) -> tuple[Criterion, ...]:
-    found, known = [], metric_names(description_of(scenario).joint_names)
+    found = []
     for name, given in section.items():
-        if str(name) not in known:
-            raise ParameterError(
-                f"there is no metric '{name}'; there are {', '.join(METRICS)}, those of joints "
-                f"also for one.{suggestion(str(name), known)}"
-            )
+        _require_metric(str(name), scenario)
         if not isinstance(given, dict) or not given or set(given) - {"min", "max"}:
             raise ParameterError(f"the criterion of '{name}' must have 'min' or 'max', or both.")
-        least = _read_real_number(f"{name}: min", given["min"]) if "min" in given else -math.inf
-        most = _read_real_number(f"{name}: max", given["max"]) if "max" in given else math.inf
+        least = read_real_number(f"{name}: min", given["min"]) if "min" in given else -math.inf
+        most = read_real_number(f"{name}: max", given["max"]) if "max" in given else math.inf
         if least > most:
             raise ParameterError(f"the criterion of '{name}' has min {least} above max {most}.")
         found.append(Criterion(str(name), least, most))
     return tuple(found)
+
+
+def _read_metrics(given: Any, scenario: Scenario) -> tuple[str, ...]:
+    if not isinstance(given, list | None):
+        raise ParameterError("'metrics' must be a list of names.")
+    names = tuple(map(str, given or ()))
+    for name in names:
+        _require_metric(name, scenario)
+    return names
+
+
+def _require_metric(name: str, scenario: Scenario) -> None:
+    known = [*metric_names(description_of(scenario).joint_names), *OWN_METRICS]
+    if name not in known:
+        raise ParameterError(
+            f"there is no metric '{name}'; there are {', '.join([*METRICS, *OWN_METRICS])}, those "
+            f"of joints also for one, and yours by --plugin.{suggestion(name, known)}"
+        )
 
 
 def passes_criteria(

@@ -13,6 +13,7 @@ from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
+from xml.etree.ElementTree import canonicalize
 
 import numpy as np
 import yaml
@@ -339,7 +340,8 @@ def _row_schema(campaign: Campaign) -> Any:
     fields += [("outcome", text), ("reason", text)]
     for each in campaign.dispersions:
         fields.append((f"{DRAW_PREFIX}{each.name}", text if each.target.is_text else real))
-    fields += [(name, real) for name in metric_names(description_of(campaign.scenario).joint_names)]
+    metrics = [*metric_names(description_of(campaign.scenario).joint_names), *campaign.own_metrics]
+    fields += [(name, real) for name in metrics]
     fields += [("wall_time_s", real), ("plan_time_s", real), ("engine", text)]
     fields += [("fallback", text), ("versions", text)]
     return arrow.schema(fields)
@@ -390,7 +392,11 @@ def _settings_of_draws(campaign: Campaign) -> dict[str, Any]:
 
 
 def self_contained(campaign: Campaign) -> Campaign:
-    """Return the campaign with the texts of its robots instead of files, for other machines."""
+    """Return the campaign with the texts of its robots instead of files, for other machines.
+
+    Texts are canonical XML: files that differ in layout, comments or order of attributes are one
+    robot.
+    """
     scenario = campaign.scenario
     for node in ("plant", *scenario.commanders):
         config = scenario.config(node)
@@ -401,12 +407,14 @@ def self_contained(campaign: Campaign) -> Campaign:
                 robot = parse_robot(config.robot_description)
             elif config.robot:
                 robot = load_robot(robot_file(config.robot))
-            text = {"robot_description": config.described(robot).urdf, "robot": "", "world": ""}
+            urdf = canonicalize(config.described(robot).urdf, strip_text=True)
+            text = {"robot_description": urdf, "robot": "", "world": ""}
             scenario = scenario.with_overrides(node, text)
     floating = scenario.plant.target
     if is_path(floating.robot) and not floating.robot_description:
         target = load_target(floating)
         assert target is not None
-        text = {**target_parameters(target.urdf), "target.robot": ""}
+        urdf = canonicalize(target.urdf, strip_text=True)
+        text = {**target_parameters(urdf), "target.robot": ""}
         scenario = scenario.with_overrides("plant", text)
     return replace(campaign, scenario=scenario)

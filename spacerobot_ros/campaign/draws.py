@@ -97,8 +97,13 @@ class Draws:
             given = self.shares[first : first + _BLOCK_SIZE]
             shares[: len(given)] = given
         shares = np.clip(shares, _MIN_PROBABILITY, 1.0 - _MIN_PROBABILITY)
+        if campaign.correlation_factor is not None:
+            from scipy.special import ndtr, ndtri
+
+            shares = ndtr(ndtri(shares) @ campaign.correlation_factor.T)
+            shares = np.clip(shares, _MIN_PROBABILITY, 1.0 - _MIN_PROBABILITY)
         columns = [
-            each.distribution.quantiles(u)
+            each.distribution.values(numbers, u)
             for each, u in zip(campaign.dispersions, shares.T, strict=True)
         ]
         made = []

@@ -153,7 +153,9 @@ class LanesEngine:
         if dispersed or loads != ((), OrbitConfig(), TableConfig()):
             return "it has disturbances, an orbit or a table, which engine 'flights' flies"
         if campaign.measures_clearance:
-            return "a criterion names clearance_m, and lanes measure no distances between links"
+            return "it names the metric clearance_m, and lanes measure no distances between links"
+        if campaign.own_metrics:
+            return f"lanes keep no whole flights, of which '{campaign.own_metrics[0]}' is computed"
         match scenario.commanders, plant.actuation:
             case ("planner",), "velocity":
                 return self._scheduled.refusal(campaign)

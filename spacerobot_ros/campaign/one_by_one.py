@@ -49,8 +49,7 @@ class FlightsEngine:
                 flown = self.fly_draw(campaign, drawn_flight(campaign, draw, common), stopped)
                 if stopped() and flown.outcome is Outcome.INTERRUPTED:
                     return
-                measures = flown.measured(clearance=campaign.measures_clearance)
-                yield Row.of(campaign, draw, measures, self.name)
+                yield Row.of(campaign, draw, flown, self.name)
             except Exception as error:  # The error becomes a row with its message as the reason.
                 yield Row.of_error(draw, error, self.name)
 

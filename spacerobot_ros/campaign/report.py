@@ -2,40 +2,31 @@
 
 from __future__ import annotations
 
-import re
 import shlex
-import sys
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
+from collections.abc import Sequence
 from html import escape
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
-from spacerobot_ros.campaign.config import Campaign, Criterion, meets_criterion
-from spacerobot_ros.campaign.dataset import DRAW_PREFIX, Dataset
-from spacerobot_ros.campaign.draws import Draws, require_module
+from spacerobot_ros.campaign.config import Campaign
+from spacerobot_ros.campaign.metrics import metric_of
+from spacerobot_ros.campaign.results import PASSING, Results, messages_of
 from spacerobot_ros.campaign.rows import ERROR
 from spacerobot_ros.campaign.statistics import (
     PERCENTILES,
     Influence,
     Share,
-    corrected_for_multiple_tests,
-    influences,
     percentiles,
     share,
-    sobol_indices,
 )
 from spacerobot_ros.files import write_output
-from spacerobot_ros.measures import METRICS, Metric, Outcome
-from spacerobot_ros.model.description import Array
+from spacerobot_ros.measures import Outcome
 from spacerobot_ros.report.figures import (
     LINE_COLOUR,
     PALETTE,
@@ -50,279 +41,15 @@ from spacerobot_ros.version import __version__
 FOOTER_TEXT = f"Made by spacerobot_ros {__version__}."
 """Footer of the pages of campaigns."""
 
-PASSED_COLOUR = "passing"
-"""Name, among the metrics, of whether a flight passed."""
-
-_WORST_FLIGHTS_SHOWN = 10
-_MESSAGES_SHOWN = 4
-_MAX_BOUND_DISTANCE = 100.0
-"""Distance from a bound at which the order of the worst flights saturates, standard deviations."""
-
 _MAX_HISTOGRAMS, _MAX_SCATTER_PLOTS = 9, 6
 """Largest numbers of metrics with a histogram and of drivers with a plot."""
 
 NO_INFLUENCES_TEXT = "no correlation is beyond chance (p < 0.05, corrected for all of them)."
 
-Flags = npt.NDArray[np.bool_]
-
 _QUANTILES_SHOWN = (0.01, 0.5, 0.99)
 _MAX_CURVE_STEPS = 2000
-_REASON = "reason"
-_TEXT_COLUMNS = ("outcome", _REASON, "engine", "fallback")
-
-_MAIN_METRICS = (
-    *("position_error_m", "attitude_error_rad", "manoeuvre_time_s", "propellant_kg"),
-    *("capture_time_s", "capture_distance_m", "capture_impulse_Ns"),
-    *("detumbling_time_s", "detumbling_bound_s"),
-)
-
-
 _PART_OF_METRIC = {"position_error_m": "position", "attitude_error_rad": "attitude"}
 """Part of the goal of the base whose error a metric is."""
-
-_NOT_CONTROLLED = re.compile(r"[(; ]([a-z]+(?: and [a-z]+)*) not controlled\)")
-"""The parts of the goal in the message of a flight that does not control them."""
-
-
-class Columns(Mapping[str, Any]):
-    """The columns of a dataset by name, in the order of the flights, read where they are needed.
-
-    Numbers are arrays (N,), in which missing ones are NaN; texts are lists, in which missing ones
-    are None.
-
-    Parameters
-    ----------
-    dataset
-        The dataset.
-
-    Raises
-    ------
-    ParameterError
-        It has no rows.
-    """
-
-    def __init__(self, dataset: Dataset) -> None:
-        self._dataset = dataset
-        self._known: dict[str, Any] = {}
-        self._known["flight"] = dataset.table(["flight"])["flight"].to_numpy().astype(float)
-
-    def read(self, names: Iterable[str]) -> None:
-        """Read columns together: each file is opened once."""
-        left = [name for name in names if name not in self._known]
-        table = self._dataset.table(left)
-        text = require_module("pyarrow").string()
-        for name in left:
-            self._known[name] = None
-            if name not in table.column_names:
-                continue
-            column = table[name]
-            # Converted data is freed at once: a million rows of a column are eight megabytes.
-            table = table.drop_columns([name])
-            if name in _TEXT_COLUMNS or column.type == text:
-                self._known[name] = self._texts(column.cast(text))
-            else:
-                # Missing numbers become NaN; seeds beyond 2^53 are rounded.
-                self._known[name] = column.cast("double", safe=False).to_numpy()
-
-    def _texts(self, column: Any) -> list[str | None]:
-        """Return a column of texts; equal ones are one object."""
-        known: dict[str | None, str | None] = {}
-        return [known.setdefault(x, x) for chunk in column.chunks for x in chunk.to_pylist()]
-
-    def __getitem__(self, name: str) -> Any:
-        if name not in self._known:
-            self.read([name])
-        # Reasons of a million flights are 300 megabytes, which are not kept.
-        values = self._known.pop(name) if name == _REASON else self._known[name]
-        if values is None:
-            raise KeyError(name)
-        return values
-
-    def __iter__(self) -> Iterator[str]:
-        return (name for name, values in self._known.items() if values is not None)
-
-    def __len__(self) -> int:
-        return sum(1 for _ in self)
-
-
-@dataclass(frozen=True)
-class Results:
-    """The rows of a campaign as columns.
-
-    Attributes
-    ----------
-    campaign
-        The campaign.
-    folder
-        Folder of the dataset.
-    flight_numbers
-        (N,) numbers of the flights.
-    columns
-        Columns by name: arrays of numbers, lists of texts.
-    planned_flights
-        Number of flights of the whole campaign.
-    """
-
-    campaign: Campaign
-    folder: Path
-    flight_numbers: Array
-    columns: Mapping[str, Any]
-    planned_flights: int
-
-    @classmethod
-    def of(cls, folder: Path) -> Results:
-        """Read a dataset.
-
-        Raises
-        ------
-        ParameterError
-            The folder holds no campaign, or no flights yet.
-        """
-        dataset = Dataset(folder)
-        campaign = dataset.campaign()
-        columns = Columns(dataset)
-        shown = {*_MAIN_METRICS, *(each.metric for each in campaign.criteria)}
-        shown |= {name for name, metric in METRICS.items() if metric.yes_or_no}
-        drawn = [f"{DRAW_PREFIX}{name}" for name in campaign.names]
-        columns.read(["passed", "wall_time_s", *drawn, *sorted(shown)])
-        return cls(campaign, folder, columns["flight"], columns, len(Draws(campaign)))
-
-    def __len__(self) -> int:
-        return len(self.flight_numbers)
-
-    @property
-    def incompleteness_warning(self) -> str:
-        """Warning that missing flights bias the numbers; empty if none are missing.
-
-        Flights that take long finish late and are underrepresented in an incomplete campaign.
-        """
-        missing = int(self.flight_numbers.max()) + 1 - len(self) if len(self) else 0
-        if not missing:
-            return ""
-        draws = "1 draw is" if missing == 1 else f"{missing} draws are"
-        return (
-            f"{draws} not flown yet although later ones are, mostly because they take longer: "
-            "the shares and distributions may change."
-        )
-
-    @property
-    def passed(self) -> Flags:
-        """(N,) whether each flight reached its goal and met every criterion."""
-        return np.asarray(self.columns["passed"] > 0)
-
-    @property
-    def success_share(self) -> Share:
-        """Share of flights that passed."""
-        return share(int(self.passed.sum()), len(self))
-
-    @property
-    def drawn_numbers(self) -> dict[str, Array]:
-        """(N,) drawn values, by name of the dispersion; numbers only."""
-        columns = {name: self.columns[f"{DRAW_PREFIX}{name}"] for name in self.campaign.names}
-        return {name: x for name, x in columns.items() if isinstance(x, np.ndarray)}
-
-    @property
-    def shown_metrics(self) -> list[str]:
-        """Metrics of the report: those with a criterion, and the main ones that have values."""
-        names = [criterion.metric for criterion in self.campaign.criteria]
-        names += [name for name in _MAIN_METRICS if name not in names]
-        return [name for name in names if np.isfinite(self.columns.get(name, np.nan)).any()]
-
-    @property
-    def refused(self) -> Flags:
-        """(N,) whether the goal of each flight was refused."""
-        return np.array([outcome == "refused" for outcome in self.columns["outcome"]], dtype=bool)
-
-    @cached_property
-    def messages(self) -> tuple[list[str], dict[str, str]]:
-        """The message of each flight without its numbers, and for each of these messages the form
-        with numbers, if all flights have the same.
-        """
-        found: list[str] = []
-        forms: dict[str, str] = {}
-        for reason in self.columns[_REASON]:
-            text = reason or ""
-            # Equal messages are one object.
-            message = sys.intern(re.sub(r"-?\d[\d.e+-]*", "…", text))
-            found.append(message)
-            if forms.setdefault(message, text) != text:
-                forms[message] = message
-        return found, forms
-
-    @property
-    def not_controlled(self) -> list[str]:
-        """Parts of the goal that a successful flight did not control, by its message."""
-        notes = [_NOT_CONTROLLED.search(text) for text in self.messages[1]]
-        named = {part for note in notes if note for part in note[1].split(" and ")}
-        return sorted(named)
-
-    @property
-    def distributed_metrics(self) -> list[str]:
-        """Metrics of the report that are not just yes or no."""
-        return [name for name in self.shown_metrics if not _metric(name).yes_or_no]
-
-    @property
-    def sampler_shares(self) -> dict[str, Share]:
-        """Shares of the flights with a yes, by name of the metric."""
-        found = {}
-        for name, metric in METRICS.items():
-            values = self.columns.get(name)
-            if metric.yes_or_no and values is not None and np.isfinite(values).any():
-                found[name] = share(int((values == 1.0).sum()), len(self))
-        return found
-
-    def metrics(self) -> dict[str, Array]:
-        """Return the columns of the metrics of the report."""
-        return {name: self.columns[name] for name in self.shown_metrics}
-
-    def share_meeting(self, criterion: Criterion) -> Share:
-        """Return the share of flights that meet a criterion."""
-        values = self.columns[criterion.metric].tolist()
-        met = sum(meets_criterion(criterion, {criterion.metric: value}) for value in values)
-        return share(met, len(self))
-
-    def influences(self) -> list[Influence]:
-        """Return the sensitivities, the strongest first, with Sobol indices if available."""
-        passing = {PASSED_COLOUR: self.passed.astype(float)}
-        found = corrected_for_multiple_tests(
-            influences(self.drawn_numbers, passing | self.metrics())
-        )
-        whole = self.campaign.sampler == "saltelli" and len(self) == self.planned_flights
-        if whole and len(self.drawn_numbers) == len(self.campaign.dispersions):
-            names = list(self.drawn_numbers)
-            indices = {PASSED_COLOUR: sobol_indices(names, self.passed.astype(float))}
-            indices |= {name: sobol_indices(names, x) for name, x in self.metrics().items()}
-            for place, each in enumerate(found):
-                if known := indices[each.metric].get(each.cause):
-                    first, total = known[:2], known[2:]
-                    found[place] = replace(each, first_order_index=first, total_order_index=total)
-        return sorted(found, key=lambda each: -each.strength)
-
-    def worst_rows(self) -> list[int]:
-        """Return the rows of the worst flights: first those that failed, then those that missed.
-
-        Flights that passed are ordered by their distance from a bound, in standard deviations.
-        """
-        badness = np.full(len(self), -_MAX_BOUND_DISTANCE)
-        for criterion in self.campaign.criteria:
-            x = self.columns[criterion.metric]
-            spread = x[np.isfinite(x)].std() if np.isfinite(x).any() else 1.0
-            over = np.maximum(x - criterion.maximum, criterion.minimum - x) / (spread or 1.0)
-            # A missing metric counts as beyond its bounds.
-            badness = np.maximum(
-                badness,
-                np.clip(
-                    np.nan_to_num(over, nan=_MAX_BOUND_DISTANCE),
-                    -_MAX_BOUND_DISTANCE,
-                    _MAX_BOUND_DISTANCE,
-                ),
-            )
-        if not self.campaign.criteria:
-            badness = np.nan_to_num(self.columns["position_error_m"])
-        badness += 1e6 * (np.array(self.columns["outcome"]) != "reached")
-        badness += 1e3 * ~self.passed
-        order = np.lexsort((self.flight_numbers, -badness))
-        return [int(row) for row in order[:_WORST_FLIGHTS_SHOWN]]
 
 
 def write_campaign_report(folder: Path, path: Path) -> list[str]:
@@ -358,23 +85,7 @@ def write_campaign_report(folder: Path, path: Path) -> list[str]:
 
 
 def _sort_passing_first(found: Sequence[Influence]) -> list[Influence]:
-    return sorted(found, key=lambda each: each.metric != PASSED_COLOUR)
-
-
-def messages_of(results: Results) -> list[tuple[str, int, str]]:
-    """Return outcomes with the numbers of flights and their most frequent messages.
-
-    Messages that differ in their numbers only are one, without the numbers.
-    """
-    messages, forms = results.messages
-    kinds: dict[str, Counter[str]] = {}
-    for outcome, message in zip(results.columns["outcome"], messages, strict=True):
-        kinds.setdefault(outcome, Counter())[message] += 1
-    return [
-        (outcome, count, forms[message])
-        for outcome, counts in sorted(kinds.items(), key=lambda kind: -kind[1].total())
-        for message, count in counts.most_common(_MESSAGES_SHOWN)
-    ]
+    return sorted(found, key=lambda each: each.metric != PASSING)
 
 
 def picture_part(drawn: Figure, name: str, caption: str) -> str:
@@ -393,15 +104,11 @@ def figure_with_axes(count: int, across: int, height: float = 2.2) -> tuple[Figu
     return figure, axes[:count]
 
 
-def _metric(name: str) -> Metric:
-    return METRICS[name.partition(".")[0]]
-
-
 def metric_label(metric: str, not_controlled: Sequence[str] = ()) -> str:
     """Return the name of a metric with its unit, unless the name has it, and whether it is the
     error of a part of the goal that is not controlled.
     """
-    unit = _metric(metric).unit
+    unit = metric_of(metric).unit
     named = metric.endswith(("_m", "_rad", "_s", "_kg", "_N", "_Nm", "_Ns", "_Nms"))
     label = f"{metric}, {unit}" if unit and not named else metric
     free = _PART_OF_METRIC.get(metric) in not_controlled
@@ -430,6 +137,7 @@ def _page_body(results: Results) -> list[str]:
             "<h2>Drivers of the result</h2>",
             _sensitivity_section(found),
             _scatter_section(results, found),
+            _success_by_bins_section(results, found),
             "<h2>The worst flights</h2>",
             _worst_flights_section(results),
             *_convergence_section(results),
@@ -577,7 +285,7 @@ def _sensitivity_section(found: Sequence[Influence]) -> str:
 
 
 def _scatter_section(results: Results, found: Sequence[Influence]) -> str:
-    chosen = [each for each in found if each.metric != PASSED_COLOUR][:_MAX_SCATTER_PLOTS]
+    chosen = [each for each in found if each.metric != PASSING][:_MAX_SCATTER_PLOTS]
     if not chosen:
         return ""
     figure, axes = figure_with_axes(len(chosen), 3, 2.4)
@@ -594,6 +302,31 @@ def _scatter_section(results: Results, found: Sequence[Influence]) -> str:
         panel.locator_params(axis="x", nbins=5)
     caption = "The strongest correlations; orange: flights that did not pass."
     return picture_part(figure, "scatter", caption)
+
+
+def _success_by_bins_section(results: Results, found: Sequence[Influence]) -> str:
+    drawn = results.drawn_by_influence(found)[:_MAX_SCATTER_PLOTS]
+    if not drawn or results.passed.all() or not results.passed.any():
+        return ""
+    figure, axes = figure_with_axes(len(drawn), 3, 2.4)
+    for panel, name in zip(axes, drawn, strict=True):
+        bins = results.success_by_bins(name)
+        shares = np.array([each.passed.value for each in bins])
+        low = np.array([each.passed.interval_low for each in bins])
+        high = np.array([each.passed.interval_high for each in bins])
+        at: Sequence[Any] = [each.low for each in bins]
+        half = None
+        if not isinstance(at[0], str):
+            half = np.array([(each.high - each.low) / 2.0 for each in bins])
+            at = np.array(at, dtype=float) + half
+        panel.errorbar(at, shares, [shares - low, high - shares], half, ".", color=PALETTE[0])
+        panel.set_ylim(-0.03, 1.03)
+        panel.margins(x=0.08)
+        panel.set_xlabel(name)
+        panel.set_ylabel("success")
+        panel.tick_params(axis="x", labelsize=7)
+    caption = "Success over what was drawn, in bins of about equally many flights; 95 % intervals."
+    return picture_part(figure, "success", caption)
 
 
 def _worst_flights_section(results: Results) -> str:
@@ -653,7 +386,7 @@ def _dispersions_section(campaign: Campaign) -> str:
             numbers = [
                 f"{value:.4g}" for value in each.distribution.quantiles(np.array(_QUANTILES_SHOWN))
             ]
-        rows.append([each.name, str(each.distribution), each.target.unit or "", *numbers])
+        rows.append([each.name, str(each), each.target.unit or "", *numbers])
     if not rows:
         return '<p class="missing">No dispersions: flights differ in their noise only.</p>'
     head = [

@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Protocol
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Protocol
 
 from spacerobot_ros.campaign.config import Campaign, passes_criteria
 from spacerobot_ros.campaign.draws import Draw
+from spacerobot_ros.campaign.metrics import own_metrics_of
 from spacerobot_ros.campaign.targets import description_of
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.measures import Measures, metrics_of_each
+
+if TYPE_CHECKING:
+    from spacerobot_ros.flight.flight import Flight
 
 LANES = "lanes"
 """Name of the engine that flies many draws at once in SIMD lanes."""
@@ -56,10 +60,15 @@ class Row:
     plan_time: float = math.nan
 
     @classmethod
-    def of(cls, campaign: Campaign, draw: Draw, measures: Measures, engine: str) -> Row:
-        """Return the row of a flight."""
+    def of(cls, campaign: Campaign, draw: Draw, flight: Flight, engine: str) -> Row:
+        """Return the row of a flight, with the metrics of users that the campaign names."""
+        measures = flight.measured(clearance=campaign.measures_clearance)
         (row,) = cls.of_each(campaign, [(draw, measures)], engine)
-        return row
+        if not campaign.own_metrics:
+            return row
+        metrics = {**row.metrics, **own_metrics_of(flight, campaign.own_metrics)}
+        passed = passes_criteria(campaign.criteria, row.outcome, metrics)
+        return replace(row, metrics=metrics, passed=passed)
 
     @classmethod
     def of_each(

@@ -32,6 +32,7 @@ from spacerobot_ros.campaign.workers import (
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.flight.api import scenario_to_fly
 from spacerobot_ros.flight.lockstep import fly_scenario
+from spacerobot_ros.measures import Outcome
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.api import EndEffectorValues, end_effector_goals
@@ -50,15 +51,16 @@ class Progress:
         Flights a second of wall time, in this process.
     seconds
         Wall time so far.
-    errors
-        Flights of the dataset that could not be flown, counted at the end.
+    unflown
+        Flights of the dataset whose draw or goal was refused or that ended by an error, counted at
+        the end.
     """
 
     flown: int
     total: int
     flights_per_second: float
     seconds: float
-    errors: int = 0
+    unflown: int = 0
 
     @property
     def seconds_left(self) -> float:
@@ -133,7 +135,8 @@ def run_campaign(
         finally:
             dataset.close()
         outcomes = dataset.table(["outcome"])["outcome"].to_pylist() if before + flown else []
-        return replace(progress(flown), errors=sum(each in (ERROR, KILLED) for each in outcomes))
+        unflown = (ERROR, KILLED, Outcome.REFUSED)
+        return replace(progress(flown), unflown=sum(each in unflown for each in outcomes))
 
 
 def _fly_rows(
@@ -237,8 +240,7 @@ def rerun_flight(folder: Path, number: int, bag: Path) -> Rerun:
     scenario = flight.with_draws_in_scenario().scenario
     flown = fly_scenario(scenario, longest=campaign.max_flight_time)
     flown.save(bag)
-    measures = flown.measured(clearance=campaign.measures_clearance)
-    row = Row.of(campaign, draw, measures, FLIGHTS)
+    row = Row.of(campaign, draw, flown, FLIGHTS)
     known = stored_flight(dataset, number)
     if known is None:
         return Rerun(row, None, "", "", bag)

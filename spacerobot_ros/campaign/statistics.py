@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import permutations
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -62,6 +63,43 @@ def share(count: int, total: int) -> Share:
     return Share(
         count, total, float(wilson.low), float(wilson.high), (float(exact.low), float(exact.high))
     )
+
+
+_MAX_BINS, _FLIGHTS_OF_BIN = 8, 10
+"""Largest number of bins, and the flights that a bin should have."""
+
+
+@dataclass(frozen=True)
+class Bin:
+    """The flights whose drawn value is from ``low`` to ``high``, and the share that passed."""
+
+    low: Any
+    high: Any
+    passed: Share
+
+
+def success_by_bins(drawn: npt.NDArray[Any], passed: Flags) -> list[Bin]:
+    """Return the shares of flights that passed, (N,), in bins of what was drawn, (N,).
+
+    A text, or one of few numbers, has a bin of its own; many numbers are in bins of about equally
+    many flights.
+    """
+    if drawn.dtype.kind == "f":
+        finite = np.isfinite(drawn)
+        drawn, passed = drawn[finite], passed[finite]
+    values = np.unique(drawn)
+    if len(values) <= _MAX_BINS or drawn.dtype.kind != "f":
+        bins = [drawn == value for value in values]
+    else:
+        count = min(_MAX_BINS, max(2, len(drawn) // _FLIGHTS_OF_BIN))
+        edges = np.quantile(drawn, np.linspace(0.0, 1.0, count + 1)[1:-1])
+        bins = [np.searchsorted(edges, drawn) == place for place in range(count)]
+    found = []
+    for of in bins:
+        if of.any():
+            inside = np.unique(drawn[of])
+            found.append(Bin(inside[0], inside[-1], share(int(passed[of].sum()), int(of.sum()))))
+    return found
 
 
 _SIGNIFICANCE = 0.05

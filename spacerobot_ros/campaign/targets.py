@@ -23,12 +23,18 @@ from spacerobot_ros.planning import Goal
 from spacerobot_ros.resources import robot_file, suggestion
 from spacerobot_ros.scenario import CONFIGS, Scenario
 from spacerobot_ros.simulation.capture import load_target, target_parameters
-from spacerobot_ros.simulation.faults import FAULT_KINDS
+from spacerobot_ros.simulation.faults import (
+    FAULT_KINDS,
+    Fault,
+    FaultTargets,
+    edited_fault,
+    parse_fault,
+)
 
 AXES = ("x", "y", "z")
 
 _INDEXED_NAME_PATTERN = re.compile(r"(.+)\[([^\]]+)\]")
-_FAULT_NAME_PATTERN = re.compile(r"faults\[(\d+)\]\.(at|until|value)")
+_FAULT_NAME_PATTERN = re.compile(r"faults\[(\d+)\]\.(at|until|value|kind|target|present)")
 _PARAMETERS_EQUAL_IN_ALL_FLIGHTS = (
     *("plant.robot", "plant.robot_description", "plant.time_mode", "plant.resume_bag"),
     *("planner.resume_file", "coordinated_control.resume_file"),
@@ -52,7 +58,8 @@ TARGET_KINDS = (
     ("end_effector_goal. ...", "likewise, of the end-effector"),
     ("initial.position.AXIS, initial.rotvec.AXIS", "likewise, of the base at the start"),
     ("initial.joints.JOINT", "offset of a joint at the start, m or rad"),
-    ("faults[i].at, .until, .value", "of the i-th fault of plant.faults"),
+    ("faults[i].at, .until, .value, .kind, .target", "of the i-th fault of plant.faults"),
+    ("faults[i].present", "1 or 0: whether that fault takes place"),
 )  # fmt: skip
 """The kinds of names, with their meanings for people."""
 
@@ -76,6 +83,8 @@ class DispersionTarget:
     changes_masses_only
         Whether it changes mass properties of the robot and leaves the scenario: ``apply`` then
         takes N flights with drawn values (N,), too.
+    order
+        Targets of a larger order are applied after those of a smaller one.
     """
 
     name: str
@@ -84,6 +93,7 @@ class DispersionTarget:
     is_text: bool
     assigned_parameters: frozenset[str]
     changes_masses_only: bool = False
+    order: int = 0
 
 
 @dataclass(frozen=True)
@@ -542,27 +552,32 @@ def _fault_target(name: str, index: int, part: str, scenario: Scenario) -> Dispe
         raise ParameterError(
             f"'{name}': plant.faults has {len(faults)} fault(s); the first is faults[0]."
         )
-    kind = faults[index].split()[0]
-    if part == "value" and not (kind in FAULT_KINDS and FAULT_KINDS[kind].value):
+    kind = _require_fault(faults[index], scenario).kind
+    if part == "value" and not FAULT_KINDS[kind].value:
         raise ParameterError(f"'{name}': a fault of the kind {kind} has no value.")
+    is_text = part in ("kind", "target")
 
     def apply(flight: DrawnFlight, drawn: Any) -> DrawnFlight:
         lines = list(flight.scenario.plant.faults)
-        lines[index] = _edit_fault_line(lines[index].split(), part, repr(float(drawn)))
+        if part == "present":
+            lines[index : index + 1] = lines[index : index + 1] if drawn else []
+        else:
+            text = drawn if is_text else repr(float(drawn))
+            lines[index] = edited_fault(lines[index], part, text)
+        if is_text:
+            _require_fault(lines[index], flight.scenario)
         return flight.with_overrides("plant", {"faults": lines})
 
-    return DispersionTarget(name, apply, "" if part == "value" else "s", False, frozenset({name}))
+    unit = "s" if part in ("at", "until") else ""
+    # Absent faults are removed last, from the end of the list on, so that places stay.
+    order = len(faults) - index if part == "present" else 0
+    return DispersionTarget(name, apply, unit, is_text, frozenset({name}), order=order)
 
 
-def _edit_fault_line(words: list[str], part: str, text: str) -> str:
-    if part == "value":
-        return " ".join([*words[:2], text, *words[3:]])
-    if part in words:
-        words[words.index(part) + 1] = text
-    else:
-        place = words.index("until") if part == "at" and "until" in words else len(words)
-        words[place:place] = [part, text]
-    return " ".join(words)
+def _require_fault(line: str, scenario: Scenario) -> Fault:
+    """Return the fault of a line; its plant alone knows whether it has a nozzle or a wrench."""
+    joints = description_of(scenario).joint_names
+    return parse_fault(line, FaultTargets(joints, wrench=True, nozzles=line.split()[1:2]))
 
 
 # -- the URDF of a robot with other masses ----------------------------------------------------

@@ -67,7 +67,7 @@ def _parse_length(context: click.Context, option: click.Parameter, text: str) ->
 
 
 @click.command("figures")
-@bag_argument
+@click.argument("bags", metavar="BAG...", type=PATH, nargs=-1, required=True)
 @click.option(
     "--only",
     metavar="NAME,NAME",
@@ -97,19 +97,20 @@ def _parse_length(context: click.Context, option: click.Parameter, text: str) ->
 @out_option("Folder of the figures [BAG_figures].")
 @namespace_option
 def figures_command(
-    bag: Path, only: str, format_name: str, out: Path | None, **options: Any
+    bags: tuple[Path, ...], only: str, format_name: str, out: Path | None, **options: Any
 ) -> None:
     """Draw figures of a BAG for a paper, one file each.
 
-    Files of the same names are replaced. Exit code 1: the bag lacks the data of a figure that
-    --only names, or of all figures.
+    Several bags are drawn into the same panels. Files of the same names are replaced. Exit code 1:
+    the bags lack the data of a figure that --only names, or of all figures.
     """
     from spacerobot_ros.report import write_figures
     from spacerobot_ros.report.figures import PictureFormat
 
     names = [name.strip().lower() for name in only.split(",") if name.strip()]
-    folder = out or beside(bag, "_figures")
-    results = write_figures(bag, folder, names, format=PictureFormat(format_name), **options)
+    folder = out or beside(bags[0], "_figures")
+    format = PictureFormat(format_name)
+    results = write_figures(bags[0], folder, names, beside=bags[1:], format=format, **options)
     drawn = {name: result for name, result in results.items() if isinstance(result, Path)}
     for name, path in drawn.items():
         click.echo(f"{name:<11} {path}")

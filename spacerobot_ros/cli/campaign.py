@@ -89,7 +89,7 @@ def fly(
         seed: 1
         disperse:
           mass.*: {norm: {loc: 1.0, scale: 0.05}}
-          goal.position.x: {uniform: {loc: -0.01, scale: 0.02}}
+          goal.position.x: {uniform: [-0.01, 0.01]}
         criteria:
           position_error_m: {max: 0.02}
 
@@ -97,7 +97,7 @@ def fly(
     --compare. More are in examples/campaigns.
 
     A campaign that was interrupted is continued. Exit code 0: all flights were flown; 1: every
-    flight ended by an error; 2: bad input; 130: Ctrl-C, the flights so far are kept.
+    flight was refused or ended by an error; 2: bad input; 130: Ctrl-C, the flights so far are kept.
     """
     from spacerobot_ros.campaign.workers import Cluster
 
@@ -172,7 +172,7 @@ def _fly_campaign(
 def _require_flights(*each: Progress) -> None:
     """Exit with 1 if no draw of a campaign could be flown."""
     for progress in each:
-        if progress.errors and progress.errors == progress.flown:
+        if progress.unflown and progress.unflown == progress.flown:
             fail(f"None of the {progress.flown} draws could be flown: the report has the reasons.")
 
 

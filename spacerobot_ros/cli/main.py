@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import shlex
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -62,8 +64,20 @@ class CommandGroup(click.Group):
     help="Python file with control laws or gait methods of your own, for all commands; nodes take "
     "such files from SPACEROBOT_PLUGINS. May be repeated.",
 )
-def main(plugins: tuple[Path, ...]) -> None:
+@click.option(
+    "--xacro-arg",
+    "xacro_arguments",
+    multiple=True,
+    metavar="NAME:=VALUE",
+    help="Argument of xacro files, for all commands; nodes take them from SPACEROBOT_XACRO_ARGS. "
+    "May be repeated.",
+)
+def main(plugins: tuple[Path, ...], xacro_arguments: tuple[str, ...]) -> None:
     """Plan, fly, record and report the motion of free-floating space robots with ROS 2."""
+    if xacro_arguments:
+        from spacerobot_ros.model.urdf import XACRO_ARGUMENTS_VARIABLE
+
+        os.environ[XACRO_ARGUMENTS_VARIABLE] = shlex.join(xacro_arguments)
     if plugins:
         from spacerobot_ros.registry import add_plugin
 

@@ -244,9 +244,9 @@ def _payload_estimate(
 ) -> PayloadEstimate:
     about = states.pose[:, :3].mean(axis=0)
     impulses = _impulses(flight, states, about)
-    middle = 1 + np.unique(
-        np.linspace(0, len(states) - 3, max(most // 3, 1)).round().astype(np.int64)
-    )
+    # No state is in two triples.
+    triples = max(min(most, len(states)) // 3, 1)
+    middle = 1 + np.linspace(0, len(states) - 3, triples).round().astype(np.int64)
     rows = (middle[:, np.newaxis] + np.arange(-1, 2)).reshape(-1)
     regressors, known = np.empty((len(rows), 6, 10)), np.empty((len(rows), 6))
     for at, row in enumerate(rows.tolist()):
@@ -278,8 +278,10 @@ def _impulses(flight: Flight, states: States, about: Array) -> Array:
     r, q = states.pose[:, :3], states.pose[:, 3:]
     R = matrices_from_quaternions(q)
     turn = rotvecs_from_quaternions(quaternion_multiply(quaternion_inverse(q[:-1]), q[1:]))
+    omega = states.twist[:, 3:]
+    turn_to_middle = turn / 2 + step * (omega[:-1] - omega[1:]) / 8
     middle = matrices_from_quaternions(
-        quaternion_multiply(q[:-1], quaternions_from_rotvecs(turn / 2))
+        quaternion_multiply(q[:-1], quaternions_from_rotvecs(turn_to_middle))
     )
     v = np.einsum("nij,nj->ni", R, states.twist[:, :3])
     r_middle = (r[:-1] + r[1:]) / 2 + step * (v[:-1] - v[1:]) / 8

@@ -20,7 +20,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import least_squares
+from scipy.fft import dct
+from scipy.optimize import least_squares, minimize
 
 from spacerobot_ros.model.description import Array, Inertia
 from spacerobot_ros.model.grasp import BodyMotion, Payload
@@ -39,17 +40,17 @@ _MIN_SIGNAL_TO_NOISE = 10.0
 _MIN_JERK_RATIO = 3.0
 """Second difference beyond which it counts as a jerk of the motion, relative to the median."""
 
-_DRIFT_SHARE = 0.2
-"""Part of the time over which a drift of the momenta is looked for."""
+_WALK_SHARES = np.append(0.0, np.geomspace(1e-6, 1e6, 73))
+"""Ratios of the power of a random walk to that of white noise that are tried."""
 
-_DRIFT_SIGNIFICANCE = 3.0
-"""Growth of differences that counts as a drift, in standard deviations of that of noise."""
+_ROUNDS = 4
+"""Fits in which the parameters and the scatter of the momenta are found in turns."""
 
 _MIN_UNDETERMINED_SHARE = 0.2
 """Share of undetermined directions in a parameter from which it is undetermined itself."""
 
-_ROUNDING = 1e-13
-"""Least relative error of momenta."""
+_ROUNDING = 1e-11
+"""Least relative error of momenta, whose impulses are sums over ticks."""
 
 _PRIOR_WEIGHT = 1e-6
 """Weight of the prior of undetermined directions, relative to the largest singular value."""
@@ -140,13 +141,17 @@ def estimate_payload(
     taken from second differences, and subtracted from the normal equations. A motion without errors
     fulfils the equation in its differences, too, so that nothing is lost then.
 
+    Errors of successive states are not independent: what the impulse lacks adds up. In the modes of
+    a cosine transform over time white noise and a random walk are; each mode is weighted by its own
+    variance, and the one of the mean, which has the unknown P_0, is left out.
+
     Parameters
     ----------
     link
         Link that holds it.
     regressors
         (T, 3, 6, 10) of :func:`momentum_regressor` at T times three successive states, equally far
-        apart in time.
+        apart in time; no state is in two of them.
     known
         (T, 3, 6) momenta of the robot without the body, less the impulse since the first state.
     mass, radius
@@ -154,6 +159,8 @@ def estimate_payload(
     """
     unit = mass * np.array([1.0, *[radius] * 3, *[radius**2] * 6])
     rows = np.concatenate([regressors * unit, -known[..., np.newaxis]], axis=-1)
+    modes = dct(rows.mean(axis=1), axis=0, norm="ortho")[1:]
+    errors = _errors_of_means(rows)
     rows = rows - rows.mean(axis=(0, 1))
     least = _ROUNDING * max(np.abs(known).max(initial=0.0), float(np.finfo(float).tiny))
     weights = np.array([1.0] * 3 + [1.0 / radius] * 3)
@@ -164,6 +171,8 @@ def estimate_payload(
         scatter = [np.sqrt(np.mean(left[..., part] ** 2)) for part in (slice(3), slice(3, 6))]
         weights = 1.0 / np.maximum(np.repeat(scatter, 3), least)
     fit = _fit(rows * weights[:, np.newaxis])
+    if len(fit.determined) and len(modes) > len(fit.determined):
+        fit = _weighted_by_modes(fit, modes, errors, least)
     x, corrected = _nearest_physical_parameters(fit)
     shares = np.sqrt(np.sum(fit.undetermined**2, axis=0))
     spread = np.sqrt(
@@ -195,11 +204,7 @@ class _Fit:
 
 def _fit(rows: Array) -> _Fit:
     """Return the fit of rows (T, 3, 6, 11) of triples of states: the last column by the others."""
-    differences = (rows[:, 0] - 2.0 * rows[:, 1] + rows[:, 2]) / np.sqrt(6.0)
-    size = np.linalg.norm(differences, axis=(1, 2))
-    # Errors are in all states; a jerk of the motion itself is in few.
-    usual = differences[size <= _MIN_JERK_RATIO * np.median(size)]
-    flat, between = rows.reshape(-1, 11), usual.reshape(-1, 11)
+    flat, between = rows.reshape(-1, 11), _usual_differences(rows).reshape(-1, 11)
     errors = len(flat) / len(between) * between.T @ between
     signal = flat.T @ flat - errors
     power, V = np.linalg.eigh(signal[:10, :10])
@@ -210,32 +215,74 @@ def _fit(rows: Array) -> _Fit:
     determined = V.T[found]
     inverse = determined.T / power[found]
     x = inverse @ (determined @ signal[:10, 10])
-    left, gains = rows[..., :10] @ x - rows[..., 10], rows[..., :10] @ inverse
+    left = rows[..., :10] @ x - rows[..., 10]
     # Each row by its own error.
-    independent = np.sum((gains * left[..., np.newaxis]) ** 2, axis=(0, 1, 2))
-    drift = _drift_rates(left, usual[..., :10] @ x - usual[..., 10])
-    later = np.cumsum(gains.sum(axis=1)[::-1], axis=0)
-    drifting = np.einsum("i,tik->k", drift, later**2)
-    deviations = np.sqrt(independent + drifting)
+    gains = (rows[..., :10] @ inverse) * left[..., np.newaxis]
+    deviations = np.sqrt(np.sum(gains**2, axis=(0, 1, 2)))
     rounding = _ROUNDING * max(float(np.linalg.norm(x)), 1e-300)
     return _Fit(x, determined, np.maximum(deviations, rounding), V.T[~found])
 
 
-def _drift_rates(left: Array, noise: Array) -> Array:
-    """Return how fast the variance of the momenta (6,) that are left grows, per triple of states.
+def _usual_differences(rows: Array) -> Array:
+    """Return the second differences (N, 6, 11) of triples of rows, with the variance of a row.
 
-    What the impulses of the thrust lack adds up from tick to tick: errors that are far apart in
-    time differ by more than the noise. ``left`` (T, 3, 6) are the errors, ``noise`` (N, 6) those of
-    second differences.
+    Errors are in all states; a jerk of the motion itself is in few, which are left out.
     """
-    means = left.mean(axis=1)
-    lag = max(1, round(_DRIFT_SHARE * len(means)))
-    steps = means[lag:] - means[:-lag]
-    count = max(len(steps), 1)
-    grown, of_noise = np.sum(steps**2, axis=0) / count, 2.0 / 3.0 * np.mean(noise**2, axis=0)
-    # The mean of so many squares scatters by sqrt(2 / count).
-    surely = grown > (1.0 + _DRIFT_SIGNIFICANCE * np.sqrt(2.0 / count)) * of_noise
-    return np.where(surely, grown - of_noise, 0.0) / lag
+    differences = (rows[:, 0] - 2.0 * rows[:, 1] + rows[:, 2]) / np.sqrt(6.0)
+    size = np.linalg.norm(differences, axis=(1, 2))
+    return np.asarray(differences[size <= _MIN_JERK_RATIO * np.median(size)])
+
+
+def _errors_of_means(rows: Array) -> Array:
+    """Return the covariances (6, 11, 11) of the errors in means of triples, by component."""
+    usual = _usual_differences(rows)
+    return np.einsum("tci,tcj->cij", usual, usual) / (3 * len(usual))
+
+
+def _weighted_by_modes(fit: _Fit, modes: Array, errors: Array, least: float) -> _Fit:
+    """Return the fit of modes (K, 6, 11) in the directions that another fit has determined.
+
+    What is not determined is about as large as the rest, and has no errors to be subtracted.
+    ``errors`` (6, 11, 11) are covariances of errors of the modes, ``least`` is the least standard
+    deviation of a momentum.
+    """
+    known, size = len(fit.determined), float(np.linalg.norm(fit.x))
+    basis = np.eye(11)
+    basis[:10, :10] = np.vstack([fit.determined, fit.undetermined])
+    modes, errors = modes @ basis.T, basis @ errors @ basis.T
+    errors[:, known:10] = errors[:, :, known:10] = 0.0
+    prior = np.diag(np.r_[np.zeros(known), np.full(10 - known, size**-2.0)])
+    combined = basis @ np.append(fit.x, -1.0)
+    for _ in range(_ROUNDS):
+        variances = _mode_variances(modes @ combined, least)
+        # Second differences have jerks of the motion beside the noise, which is in all modes.
+        noise = variances[-1] / (np.einsum("cij,i,j->c", errors, combined, combined) + least**2)
+        of_errors = np.einsum("kc,cij->ij", np.minimum(noise, 1.0) / variances, errors)
+        power = np.einsum("kci,kc,kcj->ij", modes, 1.0 / variances, modes)
+        signal = (power - of_errors)[:10]
+        signal[:, :10] += prior
+        coupling = signal[:known, known:10] @ np.linalg.inv(signal[known:, known:10])
+        free = np.hstack([np.eye(known), -coupling])
+        inverse = np.linalg.solve(free @ signal[:, :known], free)
+        combined[:known] = inverse @ signal[:, 10]
+    spread, directions = np.linalg.eigh(inverse @ (power[:10, :10] + prior) @ inverse.T)
+    deviations = np.maximum(np.sqrt(np.maximum(spread, 0.0)), _ROUNDING * size)
+    determined = directions.T @ fit.determined
+    return _Fit(combined[:known] @ fit.determined, determined, deviations, fit.undetermined)
+
+
+def _mode_variances(left: Array, least: float) -> Array:
+    """Return the variances (K, 6) of the momenta in K modes, of which ``left`` (K, 6) are samples.
+
+    They are the likeliest ones of white noise, which is equal in all modes, and a random walk,
+    which falls with the square of the frequency.
+    """
+    frequency = 2.0 * np.sin(0.5 * np.pi * np.arange(1, len(left) + 1) / (len(left) + 1))
+    shapes = 1.0 + _WALK_SHARES[:, np.newaxis] * frequency**-2
+    scales = (1.0 / shapes) @ (left**2 + least**2) / len(left)
+    costs = len(left) * np.log(scales) + np.log(shapes).sum(axis=1)[:, np.newaxis]
+    best = costs.argmin(axis=0)
+    return np.asarray((scales[best, range(6)][:, np.newaxis] * shapes[best]).T)
 
 
 def _nearest_physical_parameters(fit: _Fit) -> tuple[Array, bool]:
@@ -245,7 +292,7 @@ def _nearest_physical_parameters(fit: _Fit) -> tuple[Array, bool]:
     if not len(fit.deviations):
         return fit.x, False
     aim, weights = fit.determined @ fit.x, fit.deviations.min() / fit.deviations
-    start = _initial_log_cholesky(fit.x)
+    start = _initial_log_cholesky(_most_physical_parameters(fit))
 
     def left(theta: Array) -> Array:
         of_data = weights * (fit.determined @ _from_log_cholesky(theta) - aim)
@@ -263,6 +310,21 @@ def _nearest_physical_parameters(fit: _Fit) -> tuple[Array, bool]:
     near = np.linalg.norm(fit.determined @ found - aim) <= 1e-6 * np.linalg.norm(aim)
     corrected = not (near or distance <= _MAX_NOISE_DISTANCE)
     return (found, True) if corrected else (fit.x, False)
+
+
+def _most_physical_parameters(fit: _Fit) -> Array:
+    """Return the fit with an undetermined part that makes it a body, or nearly one."""
+    count, size = len(fit.undetermined), float(np.linalg.norm(fit.x))
+    if not count:
+        return fit.x
+
+    def lack(part: Array) -> float:
+        least = np.linalg.eigvalsh(_pseudo_inertia(fit.x + part @ fit.undetermined)).min()
+        return -min(float(least), 1e-3 * size)
+
+    simplex = np.vstack([np.zeros(count), size * np.eye(count)])
+    found = minimize(lack, simplex[0], method="Nelder-Mead", options={"initial_simplex": simplex})
+    return np.asarray(fit.x + found.x @ fit.undetermined)
 
 
 def _mass_moment_inertia(x: Array) -> tuple[float, Array, Array]:

@@ -8,6 +8,8 @@ would be singular are refused.
 from __future__ import annotations
 
 import math
+import os
+import shlex
 import subprocess
 import sys
 from collections import Counter
@@ -55,6 +57,9 @@ _MAX_LINKS = 200
 
 _XACRO_CPU_TIME = 10
 """Limit of processor time for the expansion of a xacro file, s; six times as much wall time."""
+
+XACRO_ARGUMENTS_VARIABLE = "SPACEROBOT_XACRO_ARGS"
+"""Environment variable with arguments of xacro files, ``NAME:=VALUE``, separated as in a shell."""
 
 
 def load_robot(path: str | Path) -> RobotDescription:
@@ -149,7 +154,11 @@ def _expand_xacro(path: Path) -> str:
             f"{path} is a xacro file, and the package xacro is not installed: `pip install xacro`, "
             f"or expand it where it is: {by_hand}."
         )
-    words = [xacro_files.__file__, str(path), f"{_XACRO_CPU_TIME}"]
+    arguments = shlex.split(os.environ.get(XACRO_ARGUMENTS_VARIABLE, ""))
+    for each in arguments:
+        if not each.partition(":=")[1]:
+            raise RobotDescriptionError(f"The xacro argument '{each}' is not NAME:=VALUE.")
+    words = [xacro_files.__file__, str(path), f"{_XACRO_CPU_TIME}", *arguments]
     try:
         done = subprocess.run(
             [sys.executable, "-X", "utf8", *words],

@@ -1,4 +1,4 @@
-"""Expands one xacro file, as a program of its own: ``python xacro_files.py FILE SECONDS``.
+"""Expands one xacro file, as a program: ``python xacro_files.py FILE SECONDS [NAME:=VALUE ...]``.
 
 The limits of time and memory stand against mistakes, such as a macro that calls itself. They do not
 confine the file: expressions of xacro are Python, so only files that the user names ``.xacro`` are
@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import resource
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from xml.etree.ElementTree import ParseError, parse
 
@@ -43,11 +44,11 @@ def _package_name(folder: Path) -> str:
         return ""
 
 
-def main(file: str, seconds: int) -> int:
+def main(file: str, seconds: int, arguments: Sequence[str]) -> int:
     """Print the URDF text of a xacro file; return 1 with a reason on standard error if refused.
 
     ``$(find NAME)`` finds the package around the file without a ROS environment.
-    ``seconds`` is the limit of processor time.
+    ``seconds`` is the limit of processor time, ``arguments`` are those of the file, NAME:=VALUE.
     """
     resource.setrlimit(resource.RLIMIT_CPU, (seconds, seconds + 1))
     resource.setrlimit(resource.RLIMIT_AS, (_MAX_MEMORY, _MAX_MEMORY))
@@ -69,7 +70,8 @@ def main(file: str, seconds: int) -> int:
                 ) from None
 
         substitution_args._eval_find = find
-        text = str(xacro.process_file(file).toxml())
+        given = dict(each.split(":=", 1) for each in arguments)
+        text = str(xacro.process_file(file, mappings=given).toxml())
     except Exception as error:  # Of xacro, its expressions, the XML parser
         # xacro's exceptions repeat the one that they wrap.
         error = getattr(error, "exc", None) or error
@@ -82,4 +84,4 @@ def main(file: str, seconds: int) -> int:
 
 if __name__ == "__main__":
     sys.path.pop(0)  # Modules beside this file must not shadow xacro's modules.
-    sys.exit(main(sys.argv[1], int(sys.argv[2])))
+    sys.exit(main(sys.argv[1], int(sys.argv[2]), sys.argv[3:]))

@@ -247,12 +247,13 @@ def sheet(
     bottom: float = 0.5,
     gap: float = 0.62,
     lane: float = 0.0,
+    top: float = 0.3,
 ) -> tuple[Figure, list[list[Axes]]]:
     """Return a figure of panels, row by row.
 
     Each row gives the relative widths of its panels, ``heights`` those of the rows in inches;
     there is room for labels ``left`` and ``right`` of the panels, at the ``bottom``, and for titles
-    in the ``gap`` between the rows, and for a ``lane`` below every row.
+    at the ``top``, in the ``gap`` between the rows, and for a ``lane`` below every row.
     """
     scale = _font_scale.get()
     if narrow() and left > 0.5:
@@ -260,9 +261,10 @@ def sheet(
         left = max(left, 0.95)
     if _lettered.get():
         left = max(left, _LETTER_WIDTH)
-    left, right, bottom, gap = (scale * x for x in (left, right, bottom + lane, gap + lane))
+    left, right, top = (scale * x for x in (left, right, top))
+    bottom, gap = scale * (bottom + lane), scale * (gap + lane)
     heights = [scale * each for each in heights]
-    top, between = 0.3 * scale, right + left - 0.1 * scale
+    between = right + left - 0.1 * scale
     height = top + sum(heights) + gap * (len(heights) - 1) + bottom
     figure = new_figure(height)
     panels = []
@@ -405,8 +407,21 @@ def colour(index: int) -> str:
     return PALETTE[index % len(PALETTE)]
 
 
+_FLIGHT_DASHES = ((), (4.5, 1.2, 1.2, 1.2), (2.0, 1.0), (6.0, 1.2, 1.2, 1.2, 1.2, 1.2))
+
+
+def flight_dashes(number: int) -> tuple[float, ...]:
+    """Return the dashes of one of several flights in a panel; of the first, a solid line."""
+    return _FLIGHT_DASHES[number % len(_FLIGHT_DASHES)]
+
+
 def draw_traces(
-    axes: Axes, signal: Signal, colours: Sequence[str], share: float = 1.0, factor: float = 1.0
+    axes: Axes,
+    signal: Signal,
+    colours: Sequence[str],
+    share: float = 1.0,
+    factor: float = 1.0,
+    dashes: tuple[float, ...] = (),
 ) -> bool:
     """Draw every column of a signal; return whether any is drawn as a band.
 
@@ -417,6 +432,7 @@ def draw_traces(
     if not len(signal):
         # A close-up without samples.
         return False
+    style: Any = (0, dashes) if dashes else "-"
     columns = max(int(TRACE_TIME_SLICES * share), 20)
     low, high = axes.get_ylim()
     dense = False
@@ -438,13 +454,14 @@ def draw_traces(
                 facecolor=(*mpl.colors.to_rgb(tint), 0.3),
                 edgecolor=tint,
                 linewidth=0.9,
+                linestyle=style,
                 zorder=2.5,
             )
             continue
         if off > 1.0:
             kept = np.arange(len(signal))
         marker = "o" if len(signal) < 3 else ""
-        axes.plot(signal.time[kept], values[kept], color=tint, marker=marker, ms=4)
+        axes.plot(signal.time[kept], values[kept], color=tint, ls=style, marker=marker, ms=4)
     return dense
 
 
@@ -593,6 +610,8 @@ class TraceGroup:
         Powers of ten shown below the largest value, on a logarithmic axis; 0: a linear axis.
     rows
         Whether each trace has a row of its own of height one, for duty cycles from 0 to 1.
+    beside
+        The same traces of other flights; empty signals of those that lack them.
     """
 
     signal: Signal
@@ -606,6 +625,17 @@ class TraceGroup:
     window: tuple[float, float] | None = None
     decades: int = 0
     rows: bool = False
+    beside: Sequence[Signal] = ()
+
+    @property
+    def signals(self) -> list[Signal]:
+        """The traces of all flights that have them."""
+        return [each for each in (self.signal, *self.beside) if len(each)]
+
+    @property
+    def values(self) -> Array:
+        """All values of all flights."""
+        return np.concatenate([np.empty(0), *(each.values.ravel() for each in self.signals)])
 
     def in_unit_of_angles(self) -> TraceGroup:
         """Return the traces in the unit of angles that is drawn: in degrees instead of rad, if

@@ -36,6 +36,7 @@ from spacerobot_ros.report.figures import (
     colour,
     draw_traces,
     end_labels,
+    flight_dashes,
     largest_over_time,
     legend_above,
     legend_entry,
@@ -58,6 +59,9 @@ DASHES, DOTS = (5.0, 2.5), (1.0, 1.5)
 
 _MAX_MARKED_SCHEDULES = 10
 """Schedules that are marked by lines; more of them would be a hatching."""
+
+_LABEL_HEIGHT = 0.17
+"""Height of the label of one of several flights, inches."""
 
 _DUTY_ROW_HEIGHT = 0.8
 """Height of a duty cycle of one, in its row."""
@@ -82,7 +86,7 @@ def draw_whole_flight(
         _draw_decades(axes, flight, group)
         return False
     colours = group.colours
-    values = np.concatenate([group.signal.values.ravel(), [g[3] for g in group.goals]])
+    values = np.concatenate([group.values, [g[3] for g in group.goals]])
     if group.window is not None:
         text = f"peaks of {np.abs(values).max():.3g} {group.unit} are beyond the axis"
         axes.set_title(text, loc="right" if group.limits else "left", color=SECONDARY_COLOUR)
@@ -98,42 +102,49 @@ def draw_whole_flight(
     if shown:
         keys.append(legend_entry(SECONDARY_COLOUR, group.limit_name, DOTS))
     dense = draw_traces(axes, group.signal, colours, share)
+    for number, other in enumerate(group.beside, 1):
+        dense |= draw_traces(axes, other, colours, share, dashes=flight_dashes(number))
     for start, end, index, value in group.goals:
         axes.hlines(value, start, end, color=colours[index], ls=(0, DASHES), lw=1.2, zorder=3)
     if group.goals:
         keys.append(legend_entry(SECONDARY_COLOUR, "goal", DASHES))
     later = [time for time, _ in flight.executing[1:]]
-    if len(later) > _MAX_MARKED_SCHEDULES:
+    if len(later) > _MAX_MARKED_SCHEDULES or group.beside:
         later = []
     for time in later:
         axes.axvline(time, color=LINE_COLOUR, lw=1.0, zorder=1.5)
     if later:
         keys.append(legend_entry(LINE_COLOUR, "new schedule"))
     legend_above(axes, keys)
-    set_time(axes, 0.0, flight.end)
+    set_time(axes, 0.0, _end(flight, group))
     axes.set_ylabel(f"{group.label} ({group.unit})")
     _label_trace_ends(axes, group.signal, group)
     return dense
 
 
+def _end(flight: FlightReport, group: TraceGroup) -> float:
+    return max([flight.end, *(float(each.time[-1]) for each in group.signals)])
+
+
 def _draw_decades(axes: Axes, flight: FlightReport, group: TraceGroup) -> None:
     """Draw positive traces on a logarithmic axis; smaller values lie on its lower edge."""
-    signal = group.signal
-    floor, top = log_range(signal.values, group.decades)
+    floor, top = log_range(group.values, group.decades)
     axes.set_yscale("log")
     axes.set_ylim(floor, top)
-    shown = Signal(signal.time, np.maximum(signal.values, floor))
     several = len(group.names) > 1
-    for index, tint in enumerate(group.colours):
-        axes.plot(
-            *largest_over_time(shown, index),
-            color=tint,
-            # Traces that lie on each other are both seen.
-            lw=2.6 - 1.3 * index if several else None,
-            marker="o" if len(signal) < 3 else "",
-            ms=4,
-            clip_on=False,
-        )
+    for number, signal in enumerate((group.signal, *group.beside)):
+        shown = Signal(signal.time, np.maximum(signal.values, floor))
+        for index, tint in enumerate(group.colours if len(signal) else ()):
+            axes.plot(
+                *largest_over_time(shown, index),
+                color=tint,
+                ls=(0, flight_dashes(number)) if number else "-",
+                # Traces that lie on each other are both seen.
+                lw=2.6 - 1.3 * index if several else None,
+                marker="o" if len(signal) < 3 else "",
+                ms=4,
+                clip_on=False,
+            )
     for index, bound in group.limits:
         if floor < bound < top:
             axes.axhline(bound, color=group.colours[index], lw=1.0, ls=(0, DOTS), zorder=1.8)
@@ -143,7 +154,7 @@ def _draw_decades(axes: Axes, flight: FlightReport, group: TraceGroup) -> None:
     legend_above(axes, keys)
     axes.minorticks_off()
     axes.yaxis.set_major_formatter(lambda value, _: power_of_ten(value))
-    set_time(axes, 0.0, flight.end)
+    set_time(axes, 0.0, _end(flight, group))
     if several:
         axes.set_title("" if narrow() else group.label)
     axes.set_ylabel(group.unit if several else f"{group.label} ({group.unit})")
@@ -160,28 +171,36 @@ def time_figure(
     groups: list[TraceGroup],
     *,
     small: bool = False,
+    flights: Sequence[str] = (),
 ) -> ReportFigure | str:
     """Return a figure with a panel for each group, and close-ups of a gait of equal cycles; a
     sentence where nothing was recorded over time.
 
     ``caption`` is its beginning. ``small``: panels are low and share a time axis; beside them are
-    the last cycles.
+    the last cycles. ``flights``: labels of several flights whose traces the groups have.
     """
-    if all(len(group.signal) < 2 for group in groups):
+    if all(len(signal) < 2 for group in groups for signal in group.signals):
         return ONE_STATE_TEXT
     groups = [group.in_unit_of_angles() for group in groups]
-    cycles = None if any(group.decades or group.rows for group in groups) else flight.cycles
+    whole_only = flights or any(group.decades or group.rows for group in groups)
+    cycles = None if whole_only else flight.cycles
     lane = EVENT_STRIP_HEIGHT if flight.timed_events else 0.0
+    top = 0.3 + _LABEL_HEIGHT * len(flights)
     right = room_for([name for group in groups for name in group.names])
     left = max([0.72, *(room_for(group.names) + 0.1 for group in groups if group.rows)])
     if small:
         rows = [[1.0] if cycles is None else [2.2, 1.0]] * len(groups)
         low, below = 1.0 if len(groups) <= 4 else 0.75, 0.5 + lane
-        sizes = {"left": 0.85, "right": right, "gap": 0.36, "bottom": below}
+        sizes = {"left": 0.85, "right": right, "gap": 0.36, "bottom": below, "top": top}
         figure, panels = sheet(rows, [low] * len(groups), **sizes)
     else:
         rows, heights = _layout(groups, with_cycles=cycles is not None)
-        figure, panels = sheet(rows * len(groups), heights, left=left, right=right, lane=lane)
+        sizes = {"left": left, "right": right, "lane": lane, "top": top}
+        figure, panels = sheet(rows * len(groups), heights, **sizes)
+    if flights:
+        named = enumerate(flights)
+        keys = [legend_entry(SECONDARY_COLOUR, text, flight_dashes(k)) for k, text in named]
+        figure.legend(handles=keys, loc="upper center", borderaxespad=0.1, handlelength=3.0)
     share = min(1.0, 4 / len(groups))
     dense = []
     for number, group in enumerate(groups):
@@ -219,6 +238,54 @@ def time_figure(
     aside += f" {EVENTS_CAPTION}" if flight.timed_events else ""
     caption += aside
     return ReportFigure(name, heading, caption, figure, groups, aside)
+
+
+def figure_of_flights(
+    flights: Sequence[FlightReport], draw: Callable[[FlightReport], ReportFigure | str | None]
+) -> ReportFigure | str | None:
+    """Return a figure over time with the traces of several flights; a sentence where no flight has
+    one, or it is not over time.
+
+    Traces of one label, unit and name share a panel. Events, cycles and duty cycles are of single
+    flights, and left out.
+    """
+    drawn = [draw(each) for each in flights]
+    figures = [each for each in drawn if isinstance(each, ReportFigure)]
+    if not figures:
+        return drawn[0]
+    groups = [
+        {
+            (group.label, group.unit, *group.names): group
+            for group in (each.groups if isinstance(each, ReportFigure) else ())
+            if not group.rows
+        }
+        for each in drawn
+    ]
+    merged = []
+    for key in dict.fromkeys(key for each in groups for key in each):
+        same = [each[key] for each in groups if key in each]
+        empty = replace(same[0], signal=Signal.empty(same[0].signal.width))
+        signals = [each.get(key, empty).signal for each in groups]
+        windows = [each.window for each in same if each.window is not None]
+        low, high = (np.array(windows).reshape(-1, 2)).T
+        merged.append(
+            replace(
+                same[0],
+                signal=signals[0],
+                beside=signals[1:],
+                goals=[goal for each in same for goal in each.goals],
+                window=(low.min(), high.max()) if len(windows) == len(same) else None,
+                decades=max(each.decades for each in same),
+            )
+        )
+    if not merged:
+        return "It is of one flight: name one bag."
+    first, labels = figures[0], [each.label for each in flights]
+    small = len(merged) > 1 and len({group.label for group in merged}) == 1
+    only = replace(flights[0], timed_events=[])
+    return time_figure(
+        only, first.name, first.heading, first.heading, merged, small=small, flights=labels
+    )
 
 
 def _layout(

@@ -30,6 +30,7 @@ from spacerobot_ros.report.figures_over_time import (
     draw_whole_flight,
     efforts_figure,
     errors_figure,
+    figure_of_flights,
     link_errors_figure,
     momentum_budget_figure,
     momentum_figure,
@@ -120,6 +121,7 @@ def write_figures(
     folder: Path,
     only: Sequence[str] = (),
     *,
+    beside: Sequence[Path] = (),
     format: PictureFormat = PictureFormat.PDF,
     width: float = 88.0,
     style: Path | None = None,
@@ -138,6 +140,9 @@ def write_figures(
     only
         Names of :data:`FIGURES`; none for all that the bag has something for, position and
         attitude together.
+    beside
+        Other flights, whose traces are drawn into the same panels, and their paths into that of
+        paths; figures that are of one flight are left out.
     format
         Of the files. Text in PDF and SVG stays text.
     width
@@ -172,14 +177,19 @@ def write_figures(
         raise SpaceRobotError(
             f"Figures are a folder with a file for each, which is not called '{folder.name}'."
         )
-    flight = read_report(bag, namespace)
+    flight, *others = (read_report(each, namespace) for each in (bag, *beside))
     if not events:
         flight = replace(flight, timed_events=[])
     made: dict[str, Path | str] = {}
     with drawing(width / 25.4, "paper", style, degrees=degrees, lettered=True):
         for name in only or [name for name in FIGURES if name not in ("position", "attitude")]:
             try:
-                figure = FIGURES[name](flight)
+                if others and name == "path":
+                    figure: ReportFigure | str | None = path_figure(flight, others)
+                elif others:
+                    figure = figure_of_flights([flight, *others], FIGURES[name])
+                else:
+                    figure = FIGURES[name](flight)
                 if isinstance(figure, ReportFigure):
                     widen_panels(figure.figure)
                 picture = (

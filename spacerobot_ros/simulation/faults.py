@@ -165,6 +165,28 @@ def parse_fault(line: str, targets: FaultTargets, now: float = 0.0) -> Fault:
     return Fault(name, target, value, start, end)
 
 
+def edited_fault(line: str, part: str, text: str) -> str:
+    """Return the line of a fault with another part: ``kind``, ``target``, ``value``, ``at``, or
+    ``until``.
+
+    A kind without a value drops that of the line, and takes none.
+    """
+    kind, target, *times = line.split()
+    value = [times.pop(0)] if FAULT_KINDS[kind].value else []
+    if part == "kind":
+        has_none = text in FAULT_KINDS and not FAULT_KINDS[text].value
+        kind, value = text, [] if has_none else value
+    elif part == "target":
+        target = text
+    elif part == "value":
+        value = [text] if value else []
+    elif part in times:
+        times[times.index(part) + 1] = text
+    else:
+        times = [part, text, *times] if part == "at" else [*times, part, text]
+    return " ".join([kind, target, *value, *times])
+
+
 def fault_timeline(lines: Iterable[str], targets: FaultTargets) -> Timeline[Fault]:
     """Return the faults of one plant by time.
 

@@ -144,7 +144,7 @@ def record(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     draw = Draws(made)[3]
     dataset = Dataset(folder)
     dataset.begin(made)
-    dataset.add([Row.of(made, draw, FLOWN, "lanes")])
+    dataset.add(Row.of_each(made, [(draw, FLOWN)], "lanes"))
     dataset.close()
     import pyarrow.parquet
 

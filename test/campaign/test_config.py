@@ -15,7 +15,7 @@ from support.campaigns import campaign, flown, section
 
 from spacerobot_ros.campaign import running as module
 from spacerobot_ros.campaign.config import load_campaign
-from spacerobot_ros.campaign.draws import Draws
+from spacerobot_ros.campaign.draws import Draws, drawn_flight
 from spacerobot_ros.campaign.running import sweep
 from spacerobot_ros.campaign.targets import description_of
 from spacerobot_ros.errors import ParameterError
@@ -24,7 +24,13 @@ from spacerobot_ros.flight.flight import Flight
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.scenario import load_scenario
 
+EXAMPLES = Path(__file__).resolve().parents[2] / "examples" / "campaigns"
 NORM = {"norm": {"loc": 1.0, "scale": 0.05}}
+
+
+def joint(names: str = "goal.position.x, goal.position.y", **given: Any) -> dict[str, Any]:
+    return {"disperse": {names: {"multivariate_normal": given}}}
+
 
 REFUSED: list[tuple[dict[str, Any], str]] = [
     ({"flight": 3}, "there is no key 'flight'.*Did you mean 'flights'"),
@@ -45,6 +51,8 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     ({"disperse": {"mass": {"norm": {"loc": "one"}}}}, "'mass: loc' is 'one'"),
     ({"disperse": {"mass": {"beta": {"a": 1}}}}, "beta needs its argument 'b'"),
     ({"disperse": {"mass": {"norm": [1, 2, 3]}}}, "norm takes loc, scale, not 3 numbers"),
+    ({"disperse": {"mass": {"uniform": [1]}}}, r"uniform takes \[least, largest\], two numbers"),
+    ({"disperse": {"mass": {"uniform": [2, 1]}}}, "uniform takes no such arguments"),
     ({"disperse": {"mass": 1.0}}, "must have one distribution"),
     ({"disperse": {"mass": NORM, "mass.mass_1": NORM}}, "set the same numbers"),
     ({"disperse": {"mass.mass_1": NORM, "mass": NORM}}, "'mass.mass_1' and 'mass' set the same"),
@@ -54,6 +62,22 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     ({"disperse": {"mass": {"gaussian": {}}}}, "Did you mean 'norm'"),
     ({"disperse": {"mass": {"norm": {"mean": 1}}}}, "loc is its mean and scale its standard"),
     ({"disperse": {"mass": {"uniform": {"max": 1}}}}, "loc is its least value and scale its width"),
+    ({"table": "none.csv"}, "the table 'none.csv' cannot be read: No such file"),
+    ({"table": 3}, "'table' must be the name of a CSV file, or its lines"),
+    ({"table": "mass\n"}, "needs a line of names, and a line for each flight"),
+    ({"table": "mass\n1,2\n"}, "row 1 of the table has 2 values for 1 names"),
+    ({"table": "mass.*\n1\n"}, r"'mass.\*' in the table is of 4 values: name one"),
+    ({"table": "mass\nx\n"}, "'mass: table' is 'x'; it must be a finite number"),
+    ({"table": "mass\n1\n", "disperse": {"mass.mass_1": NORM}}, "set the same numbers"),
+    ({"table": "planner.method\noptima\n"}, "must be one of lie_bracket"),
+    ({"table": "mass\n1\n", "sampler": "saltelli"}, "'saltelli' is for independent values"),
+    (joint(cov=[[1, 2], [2.5, 8]]), "cov must be symmetric"),
+    (joint(cov=[[1, 2], [2, 1]]), "positive semidefinite"),
+    (joint(cov=[1, 2]), "mean must have 2 numbers, cov 2 x 2"),
+    (joint(mean=[1], cov=[[1, 0], [0, 1]]), "mean must have 2 numbers, cov 2 x 2"),
+    (joint(cov=[[1, 0], [0, 0]]), "means must be finite and variances positive"),
+    (joint(mean=[1, 2]), "multivariate_normal must have 'cov' and may have 'mean'"),
+    (joint("mass, planner.method", cov=[[1, 0], [0, 1]]), "has a text"),
     ({"disperse": {"mass": {"norm": {"loc": 1, "scale": 0}}}}, "norm takes no such arguments"),
     ({"disperse": {"mass": {"choice": [1, None]}}}, "'mass: choice' is None"),
     ({"disperse": {"mass": {"choice": [True, 1]}}}, "'mass: choice' is True"),
@@ -89,7 +113,22 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     ({"disperse": {"goal.position.u": NORM}}, "none of goal.position.x"),
     ({"disperse": {"end_effector_goal.position.x": NORM}}, "no goal for the end-effector"),
     ({"disperse": {"faults[0].at": NORM}}, r"plant.faults has 0 fault\(s\)"),
+    (
+        {
+            "disperse": {"faults[0].target": {"choice": ["slider_1", "slider_9"]}},
+            "set": {"plant.faults": ["joint_stuck slider_1"]},
+        },
+        "'joint_stuck slider_9' is refused: the target of joint_stuck is one of slider_1",
+    ),
+    (
+        {
+            "disperse": {"faults[0].kind": {"choice": ["joint_slow"]}},
+            "set": {"plant.faults": ["joint_stuck slider_1"]},
+        },
+        "joint_slow needs a value: factor on the command",
+    ),
     ({"disperse": {"planner.method": NORM}}, "is a text: it must have a 'choice' of texts"),
+    ({"disperse": {"faults[0].present": NORM}}, r"plant.faults has 0 fault\(s\)"),
     ({"disperse": {"mass": {"choice": ["a"]}}}, "'mass: choice' is 'a'"),
     ({"criteria": {"position_eror_m": {"max": 1}}}, "no metric.*Did you mean 'position_error_m'"),
     ({"criteria": {"peak_rate.slider_9": {"max": 1}}}, "Did you mean 'peak_rate.slider_[123]'"),
@@ -219,10 +258,82 @@ def test_draws_that_are_made_together_are_those_that_are_made_alone() -> None:
         Draws(made)[300]
 
 
+def test_a_list_of_uniform_is_from_its_least_to_its_largest_value() -> None:
+    """The mapping is that of scipy; both are equal here, and slices of a tenth have one draw."""
+    given = {"mass": {"uniform": [1.1, 3.6]}, "inertia": {"uniform": {"loc": 1.1, "scale": 2.5}}}
+    for name in given:
+        made = campaign(disperse=given, sampler="latin_hypercube", flights=10)
+        drawn = sorted(draw.values[name] for draw in Draws(made))
+        edges = np.linspace(1.1, 3.6, 11)
+        assert np.all((edges[:-1] < drawn) & (drawn < edges[1:]))
+
+
 def test_a_latin_hypercube_has_one_draw_in_each_slice() -> None:
     made = campaign(disperse={"mass": {"uniform": [0, 1]}}, sampler="latin_hypercube", flights=20)
     slices = sorted(int(20 * draw.values["mass"]) for draw in Draws(made))
     assert slices == list(range(20))
+
+
+NAMES = ("goal.position.x", "goal.position.y", "initial.rotvec.z")
+MEAN = np.array([0.001, -0.002, 0.01])
+COVARIANCE = np.array([[4.0, -3.0, 1.0], [-3.0, 9.0, 2.0], [1.0, 2.0, 25.0]]) * 1e-6
+
+
+@pytest.mark.parametrize("sampler", ["random", "latin_hypercube", "sobol", "halton"])
+def test_correlated_values_are_those_of_scipys_distribution(sampler: str) -> None:
+    """By the cumulative distribution, and by distances, whose squares are those of chi squared."""
+    normal = {"multivariate_normal": {"mean": MEAN.tolist(), "cov": COVARIANCE.tolist()}}
+    disperse = {"mass": NORM, ", ".join(NAMES): normal}
+    made = campaign(disperse=disperse, sampler=sampler, flights=512, seed=3)
+    assert made.names == ("mass", *NAMES)
+    drawn = np.array([[draw.values[name] for name in made.names] for draw in Draws(made)])
+    expected, values = stats.multivariate_normal(MEAN, COVARIANCE), drawn[:, 1:]
+    squared = np.einsum("ni,ij,nj->n", values - MEAN, np.linalg.inv(COVARIANCE), values - MEAN)
+    assert stats.kstest(squared, stats.chi2(3).cdf).pvalue > 0.01
+    for corner in ([0.0, 0.0, 0.01], [0.001, -0.004, 0.02], [0.003, 0.001, 0.008]):
+        share = np.mean(np.all(values <= corner, axis=1))
+        assert share == pytest.approx(expected.cdf(corner), abs=0.06)
+    np.testing.assert_allclose(np.cov(values.T), COVARIANCE, atol=4e-6)
+    assert np.abs(np.corrcoef(drawn.T)[0, 1:]).max() < 0.15
+    assert stats.kstest(drawn[:, 0], stats.norm(1.0, 0.05).cdf).pvalue > 0.01
+
+
+def test_a_covariance_may_be_singular() -> None:
+    normal = {"multivariate_normal": {"cov": [[4e-6, -6e-6], [-6e-6, 9e-6]]}}
+    made = campaign(disperse={"goal.position.x, goal.position.y": normal}, flights=5)
+    x, y = np.array([[*draw.values.values()] for draw in Draws(made)]).T
+    np.testing.assert_allclose(y, -1.5 * x, rtol=1e-9)
+
+
+def test_the_rows_of_a_table_are_its_flights(tmp_path: Path) -> None:
+    """Beside values that are drawn; the campaign has the table, wherever its file was."""
+    (tmp_path / "draws.csv").write_text(
+        "mass.mass_1, planner.method, goal.position.x\n1.25, optimal, 1e-3\n0.75, auto, -2e-3\n"
+    )
+    file = tmp_path / "many.yaml"
+    content = section(table="draws.csv", disperse={"mass.mass_2": NORM})
+    del content["set"]
+    file.write_text(yaml.safe_dump({"campaign": content}))
+    made = load_campaign(file)
+    assert (made.flights, load_campaign(file, 1).flights) == (2, 1)
+    again = campaign(**made.section)
+    assert again.dispersions[0].distribution == made.dispersions[0].distribution
+    draws = [dict(draw.values) for draw in Draws(made)]
+    second = [draw.pop("mass.mass_2") for draw in draws]
+    assert draws == [
+        {"mass.mass_1": 1.25, "planner.method": "optimal", "goal.position.x": 0.001},
+        {"mass.mass_1": 0.75, "planner.method": "auto", "goal.position.x": -0.002},
+    ]
+    assert second[0] != second[1]
+    with pytest.raises(ParameterError, match="'flights' is 3, but the table has 2, one a row"):
+        load_campaign(file, 3)
+
+
+@pytest.mark.parametrize("file", sorted(EXAMPLES.glob("*.yaml")), ids=lambda file: file.stem)
+def test_examples_are_read_and_drawn(file: Path) -> None:
+    made = load_campaign(file, 8)
+    first, second = (drawn_flight(made, Draws(made)[number]) for number in (0, 1))
+    assert first.mass.tolist() != second.mass.tolist() or first.scenario != second.scenario
 
 
 def test_saltelli_draws_are_whole_blocks() -> None:
@@ -235,7 +346,7 @@ def test_saltelli_draws_are_whole_blocks() -> None:
 # -- A small campaign from Python, in the words of a flight --------------------------------------
 
 
-NOISE = {"plant.sensors.position_noise": {"uniform": [0.001, 0.003]}}
+NOISE = {"plant.sensors.position_noise": {"uniform": [0.001, 0.004]}}
 
 
 @pytest.fixture
@@ -466,6 +577,26 @@ KINDS: list[Any] = [
 ]  # fmt: skip
 
 FAULT_SLOWLY = pytest.param(*KINDS[-1].values, id="fault", marks=pytest.mark.slow)
+
+
+def test_faults_take_place_on_what_was_drawn() -> None:
+    """A joint stands still from the time of its fault on; all move in a flight without one."""
+    drawn = {
+        "faults[0].present": {"bernoulli": {"p": 0.5}},
+        "faults[1].present": {"bernoulli": {"p": 0.5}},
+        "faults[1].target": {"choice": ["slider_1", "slider_2"]},
+    }
+    faults = {**FAULT, "plant.faults": ["joint_stuck slider_3 at 1", "joint_stuck slider_1 at 1"]}
+    made = campaign(disperse=drawn, set=faults, flights=4, seed=13)
+    seen = set()
+    for number in range(4):
+        flight, values = flown(made, number)
+        still = {f"slider_{i + 1}" for i in range(3) if not flight.qdot[flight.time > 1.2, i].any()}
+        targets = ("slider_3", values["faults[1].target"])
+        present = [bool(values[f"faults[{i}].present"]) for i in range(2)]
+        assert still == {targets[i] for i in range(2) if present[i]}
+        seen.add(frozenset(still))
+    assert len(seen) == 4
 
 
 @pytest.mark.parametrize(("disperse", "settings", "check"), [*KINDS[:-1], FAULT_SLOWLY])

@@ -16,8 +16,9 @@ from support.campaigns import campaign
 
 from spacerobot_ros.campaign import draws as sampling
 from spacerobot_ros.campaign import running as reruns
-from spacerobot_ros.campaign.config import Criterion, Distribution, load_campaign, meets_criterion
+from spacerobot_ros.campaign.config import Criterion, load_campaign, meets_criterion
 from spacerobot_ros.campaign.dataset import Dataset, self_contained
+from spacerobot_ros.campaign.distributions import Distribution
 from spacerobot_ros.campaign.draws import Draw, Draws, drawn_flight, drawn_flights, sobol_problem
 from spacerobot_ros.campaign.rows import Row
 from spacerobot_ros.campaign.running import Progress, Rerun, largest_deviation
@@ -36,7 +37,7 @@ from spacerobot_ros.campaign.targets import DrawnFlight
 from spacerobot_ros.errors import ParameterError, SpaceRobotError
 
 running: Any = reruns
-MADE = campaign(flights=6, disperse={"mass.mass_1": {"uniform": [0.5, 1.0]}})
+MADE = campaign(flights=6, disperse={"mass.mass_1": {"uniform": [0.5, 1.5]}})
 
 # -- statistics -----------------------------------------------------------------------------------
 
@@ -285,7 +286,7 @@ def test_a_file_that_is_refused_is_named(tmp_path: Path) -> None:
 
 def test_seeds_and_values_of_draws() -> None:
     """Of the campaign's seed and the number of the draw, as numpy makes them."""
-    made = campaign(flights=3, seed=7, disperse={"mass": {"uniform": [1.0, 2.0]}})
+    made = campaign(flights=3, seed=7, disperse={"mass": {"uniform": [1.0, 3.0]}})
     draws = Draws(made)
     assert len(draws) == 3
     for number, draw in enumerate(draws):
@@ -301,7 +302,7 @@ def test_seeds_and_values_of_draws() -> None:
 
 @pytest.mark.parametrize("sampler", ["sobol", "halton", "latin_hypercube"])
 def test_samplers_are_those_of_scipy(sampler: str) -> None:
-    values = {"mass.mass_1": {"uniform": [1.0, 2.0]}, "mass.mass_2": {"uniform": [0.0, 1.0]}}
+    values = {"mass.mass_1": {"uniform": [1.0, 3.0]}, "mass.mass_2": {"uniform": [0.0, 1.0]}}
     made = campaign(flights=6, seed=7, sampler=sampler, disperse=values)
     kind = {"sobol": "Sobol", "halton": "Halton", "latin_hypercube": "LatinHypercube"}[sampler]
     rng = np.random.default_rng(np.random.SeedSequence(7))
@@ -326,7 +327,7 @@ def test_a_draw_changes_its_flight() -> None:
 def test_draws_that_are_made_together_are_those_made_alone() -> None:
     """Each is the robot times its own factors, and errors are those of their draws alone."""
     names = ("mass.mass_1", "inertia", "com.mass_2.y", "planner.position_tolerance")
-    even = {"uniform": [0.5, 1.0]}
+    even = {"uniform": [0.5, 1.5]}
     made = campaign(disperse=dict.fromkeys(names, even))
     values = [
         (1.25, 2.0, 0.5, 0.01),

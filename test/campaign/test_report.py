@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pyarrow as arrow
 import pyarrow.parquet as parquet
 import pytest
@@ -20,11 +21,12 @@ from scipy import stats
 from support.campaigns import campaign
 from support.chromium import browser, chromium
 
-from spacerobot_ros.campaign.comparing import write_comparison
+from spacerobot_ros.campaign.comparing import require_same_draws, write_comparison
 from spacerobot_ros.campaign.config import Campaign, passes_criteria
 from spacerobot_ros.campaign.dataset import Dataset
 from spacerobot_ros.campaign.draws import Draw, Draws
-from spacerobot_ros.campaign.report import PASSED_COLOUR, Columns, Results, write_campaign_report
+from spacerobot_ros.campaign.report import write_campaign_report
+from spacerobot_ros.campaign.results import PASSING, Columns, Results
 from spacerobot_ros.campaign.rows import Row
 from spacerobot_ros.campaign.running import run_campaign
 from spacerobot_ros.errors import ParameterError
@@ -138,7 +140,7 @@ def test_shares_of_captures_have_their_intervals(tmp_path: Path) -> None:
 def test_sobol_indices_are_those_of_a_function_that_is_known(tmp_path: Path) -> None:
     made = campaign(disperse=TURNS, sampler="saltelli", flights=512 * 5, seed=3)
     results = Results.of(filled(tmp_path, made, ishigami))
-    drivers = [each for each in results.influences() if each.metric != PASSED_COLOUR]
+    drivers = [each for each in results.influences() if each.metric != PASSING]
     found = {each.cause: each for each in drivers}
     first, total = (0.3139, 0.4424, 0.0), (0.5576, 0.4424, 0.2437)
     for name, one, all_together in zip(NAMES, first, total, strict=True):
@@ -174,7 +176,7 @@ def test_what_grows_to_both_sides_is_found(tmp_path: Path) -> None:
     (passing,) = (
         each
         for each in results.influences()
-        if (each.metric, each.cause) == (PASSED_COLOUR, "mass.mass_1")
+        if (each.metric, each.cause) == (PASSING, "mass.mass_1")
     )
     # The farther the mass is off, the fewer pass.
     assert passing.distance_correlation < -0.6
@@ -188,6 +190,40 @@ def test_what_grows_to_both_sides_is_found(tmp_path: Path) -> None:
     worst = results.worst_rows()
     errors = results.columns["position_error_m"]
     assert [errors[row] for row in worst] == sorted(errors, reverse=True)[:10]
+
+
+def test_success_is_counted_over_bins_of_what_was_drawn(tmp_path: Path) -> None:
+    """As pandas bins and counts, with the interval by Wilson's formula."""
+    disperse = {**MASSES, "planner.method": {"choice": ["optimal", "auto"]}}
+    made = campaign(disperse=disperse, flights=97, seed=8, criteria=CRITERIA)
+
+    def error(draw: Draw) -> float:
+        return bowl(draw) * (0.5 if draw.values["planner.method"] == "auto" else 1.0)
+
+    results = Results.of(filled(tmp_path, made, error))
+    rows = pd.DataFrame(
+        {"passed": results.passed, **{name: results.columns[f"draw.{name}"] for name in made.names}}
+    )
+    by_mass = rows.groupby(pd.qcut(rows["mass.mass_1"], 8), observed=True)
+    by_method = rows.groupby("planner.method")
+    for name, groups in (("mass.mass_1", by_mass), ("planner.method", by_method)):
+        bins = results.success_by_bins(name)
+        assert len(bins) == len(groups)
+        for found, (_, group) in zip(bins, groups, strict=True):
+            count, total = int(group["passed"].sum()), len(group)
+            assert (found.passed.count, found.passed.total) == (count, total)
+            assert (found.low, found.high) == (group[name].min(), group[name].max())
+            share, z = count / total, stats.norm.ppf(0.975)
+            middle = (share + z**2 / (2 * total)) / (1 + z**2 / total)
+            half = np.sqrt(share * (1 - share) / total + (z / (2 * total)) ** 2) * z
+            half /= 1 + z**2 / total
+            interval = found.passed.interval_low, found.passed.interval_high
+            assert interval == pytest.approx((middle - half, middle + half))
+    # The text first, then the mass that drives the result.
+    assert results.drawn_by_influence(results.influences())[:2] == ["planner.method", "mass.mass_1"]
+    page = tmp_path / "page.html"
+    write_campaign_report(tmp_path, page)
+    assert "Success over what was drawn" in page.read_text("utf-8")
 
 
 def test_the_worst_flights_that_pass_are_those_next_to_their_bounds(tmp_path: Path) -> None:
@@ -268,6 +304,18 @@ def test_two_designs_are_compared_draw_by_draw(tmp_path: Path) -> None:
     four = filled(tmp_path / "four", other, bowl)
     with pytest.raises(ParameterError, match="do not have the same draws: 'seed' is 8 and 9"):
         write_comparison((one, four), tmp_path / "no.html")
+
+
+def test_designs_of_another_covariance_or_table_have_other_draws() -> None:
+    def of(covariance: float, mass: float) -> Campaign:
+        normal = {"multivariate_normal": {"cov": [[1e-4, covariance], [covariance, 1e-4]]}}
+        disperse = {"goal.position.x, goal.position.y": normal}
+        return campaign(disperse=disperse, table=f"mass\n1.0\n{mass}\n")
+
+    require_same_draws(of(5e-5, 1.1), of(5e-5, 1.1))
+    for other in (of(6e-5, 1.1), of(5e-5, 1.2)):
+        with pytest.raises(ParameterError, match="do not have the same draws"):
+            require_same_draws(of(5e-5, 1.1), other)
 
 
 def test_messages_are_counted_by_outcome_without_their_numbers(tmp_path: Path) -> None:

@@ -61,7 +61,7 @@ def applied(name: str, scenario: Scenario, value: Any) -> tuple[list[Any], dict[
     return targets, changes(scenario, flight)
 
 
-CASES: dict[str, tuple[float, str, dict[str, Any]]] = {
+CASES: dict[str, tuple[float | str, str, dict[str, Any]]] = {
     "plant.tick_rate": (12.5, "Hz", {"plant.tick_rate": 12.5, "planner.tick_rate": 12.5}),
     "planner.position_tolerance": (0.07, "m", {"planner.position_tolerance": 0.07}),
     "plant.initial_joint_positions[1]": (
@@ -106,6 +106,22 @@ CASES: dict[str, tuple[float, str, dict[str, Any]]] = {
         "",
         {"plant.faults": (FAULTS[0], "joint_slow slider_1 0.75 until 7", FAULTS[2])},
     ),
+    "faults[1].target": (
+        "slider_3",
+        "",
+        {"plant.faults": (FAULTS[0], "joint_slow slider_3 0.5 until 7", FAULTS[2])},
+    ),
+    "faults[1].kind": (
+        "joint_stuck",
+        "",
+        {"plant.faults": (FAULTS[0], "joint_stuck slider_1 until 7", FAULTS[2])},
+    ),
+    "faults[2].kind": (
+        "actuator_noise",
+        "",
+        {"plant.faults": (*FAULTS[:2], "actuator_noise slider_3 0.125")},
+    ),
+    "faults[1].present": (0.0, "", {"plant.faults": (FAULTS[0], FAULTS[2])}),
     "faults[2].until": (
         4.5,
         "s",
@@ -130,7 +146,7 @@ def test_a_name_changes_what_it_says_and_nothing_else(name: str, scenario: Scena
     targets, found = applied(name, scenario, value)
     assert found == expected
     assert {target.unit for target in targets} == {unit}
-    assert not any(target.is_text for target in targets)
+    assert {target.is_text for target in targets} == {isinstance(value, str)}
 
 
 def test_several_bodies_have_a_target_each_or_one_together(scenario: Scenario) -> None:
@@ -232,6 +248,21 @@ def test_joints_start_as_near_to_zero_as_their_limits_allow() -> None:
     assert _start_positions(plain) == [0.0, 0.0, 0.0]
     given = plain.with_overrides("plant", {"initial_joint_positions": [0.1, 0.2, -0.3]})
     assert _start_positions(given) == [0.1, 0.2, -0.3]
+
+
+def test_the_parts_of_a_fault_are_drawn_in_any_order(scenario: Scenario) -> None:
+    def line(**parts: Any) -> str:
+        flight = DrawnFlight.of(scenario)
+        for part, value in parts.items():
+            flight = targets_of(f"faults[1].{part}", scenario)[0].apply(flight, value)
+        return flight.scenario.plant.faults[1]
+
+    given = {"kind": "actuator_bias", "target": "slider_3", "value": 0.25, "at": 1.5}
+    for names in (list(given), list(reversed(given))):
+        drawn = {name: given[name] for name in names}
+        assert line(**drawn) == "actuator_bias slider_3 0.25 at 1.5 until 7"
+        # A kind without a value takes none.
+        assert line(**drawn | {"kind": "joint_stuck"}) == "joint_stuck slider_3 at 1.5 until 7"
 
 
 def test_masses_go_into_the_description_of_the_plant_alone(scenario: Scenario) -> None:

@@ -53,7 +53,7 @@ def test_widths_of_figures_are_taken_in_any_unit(
         return {"pose": Path("pose.pdf"), "joints": "The bag has none."}
 
     monkeypatch.setattr(spacerobot_ros.report, "write_figures", draw)
-    done = call("figures", "a.mcap", "--width", text)
+    done = call("figures", "a.mcap", "b.mcap", "c.mcap", "--width", text)
     if width is None:
         assert done.exit_code == 2
         assert f"'{text}' is not a length such as 88mm, 18cm, 3.5in or 246pt." in done.stderr
@@ -65,7 +65,7 @@ def test_widths_of_figures_are_taken_in_any_unit(
     assert options.pop("width") == pytest.approx(width)
     assert options == {
         **{"format": PictureFormat.PDF, "style": None, "events": False, "namespace": None},
-        "degrees": False,
+        **{"degrees": False, "beside": (Path("b.mcap"), Path("c.mcap"))},
     }
 
 

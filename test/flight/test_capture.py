@@ -396,9 +396,9 @@ def servicing() -> Flight:
     return read_run(BAGS / "servicing.mcap")
 
 
-def noisy(flight: Flight, size: float) -> Flight:
+def noisy(flight: Flight, size: float, seed: int = 4) -> Flight:
     """The flight with white noise of measured velocities, and a hundredth of it of positions."""
-    rng = np.random.default_rng(4)
+    rng = np.random.default_rng(seed)
     noise = {"pose": size / 100, "twist": size, "q": size / 100, "qdot": size}
     measured = {
         f"measured_{name}": Signal(
@@ -422,15 +422,24 @@ def test_a_satellite_with_unequal_moments_is_estimated_from_its_flight(servicing
     assert found.payload.link == held.payload.link
 
 
-def test_an_estimate_without_noise_knows_what_the_impulses_of_ticks_lack(
-    servicing: Flight,
-) -> None:
+def test_the_mass_follows_from_a_flight_without_noise(servicing: Flight) -> None:
+    """Impulses of the thrust are known to what turns and accelerations in a tick do to them."""
+    (found,) = payload_estimates(servicing)
+    assert found.parameters[0] == pytest.approx(200.0, abs=1e-6)
+
+
+@pytest.mark.parametrize("seeds", [8, pytest.param(200, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("size", [0.0, 1e-11, 1e-8, 1e-6])
+def test_deviations_are_those_of_the_errors(servicing: Flight, size: float, seeds: int) -> None:
+    """Without noise, where it is like the error of the impulses, and where it is larger."""
     (held,) = held_bodies(servicing)
     true = payload_parameters(held.payload.inertia)
-    (found,) = payload_estimates(servicing)
-    shares = (found.parameters - true) / found.deviations
-    assert 0.3 < np.sqrt(np.mean(shares**2)) < 1.8
-    assert np.abs(shares).max() < 3.5
+    errors = []
+    for seed in range(seeds if size else 1):
+        (found,) = payload_estimates(noisy(servicing, size, seed) if size else servicing)
+        assert not found.corrected
+        errors.append((found.parameters - true) / found.deviations)
+    assert 0.7 < np.sqrt(np.mean(np.square(errors))) < 1.5
 
 
 def test_an_estimate_from_noisy_sensors_knows_its_errors(servicing: Flight) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import sys
 from dataclasses import replace
 
 import casadi as ca
@@ -358,6 +359,23 @@ def test_noise_is_averaged_and_the_deviations_say_how_well() -> None:
     np.testing.assert_allclose(found.deviations, np.sqrt(np.diag(covariance)), rtol=0.1)
 
 
+@pytest.mark.parametrize("seeds", [20, pytest.param(200, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("noise", [0.0, 0.001, 0.01, 0.1])
+def test_deviations_are_those_of_the_errors_where_momenta_drift(noise: float, seeds: int) -> None:
+    """A random walk that ends at 0.01, beside white noise: none, less, as much, and more."""
+    moving, error = motions(130), []
+    regressors = np.array([momentum_regressor(motion, ABOUT) for motion in moving])
+    exact = np.array([TOTAL - momentum(motion) for motion in moving])
+    for seed in range(seeds):
+        rng = np.random.default_rng(seed)
+        walk = np.cumsum(rng.normal(size=(130, 6)), axis=0) * 0.01 / np.sqrt(130)
+        off = noise * rng.normal(size=exact.shape) + np.repeat(walk, 3, axis=0)
+        found = fitted(regressors, exact + off * [1, 1, 1, 0.5, 0.5, 0.5])
+        error.append((found.parameters - true_parameters()) / found.deviations)
+    assert 0.7 < np.sqrt(np.mean(np.square(error))) < 1.5
+    assert np.sqrt(np.mean(np.square(error), axis=0)).max() < 2.0
+
+
 def test_parameters_that_a_planar_motion_does_not_show_are_named() -> None:
     found = estimate(motions(planar=True))
     assert found.undetermined == ("Ixx", "Iyy", "Ixy")
@@ -370,6 +388,24 @@ def test_parameters_that_a_planar_motion_does_not_show_are_named() -> None:
     np.testing.assert_allclose(found.parameters[shown], true_parameters()[shown], atol=1e-10)
     off = [PAYLOAD_PARAMETERS.index(name) for name in found.undetermined]
     np.testing.assert_allclose(np.delete(found.directions, off, axis=1), 0.0, atol=1e-9)
+
+
+def test_bodies_that_a_planar_motion_shows_in_part_are_not_corrected(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The moments that it does not show can be those of a body, whatever the others are."""
+    moving, shown = motions(60, planar=True), [0, 1, 2, 3, 6]
+    regressors = np.array([momentum_regressor(motion, ABOUT) for motion in moving])
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        monkeypatch.setattr(sys.modules[__name__], "MASSES", rng.uniform(1.0, 9.0, 4))
+        points = rng.normal(size=(4, 3)) * 0.3 + rng.normal(size=3) * 0.8
+        monkeypatch.setattr(sys.modules[__name__], "POINTS", points)
+        known = np.array([TOTAL - momentum(motion) for motion in moving])
+        found = fitted(regressors, known + 1e-5 * rng.normal(size=known.shape))
+        error = (found.parameters - true_parameters())[shown] / found.deviations[shown]
+        assert not found.corrected
+        assert np.abs(error).max() < 4.0
 
 
 def test_a_body_at_rest_shows_nothing() -> None:

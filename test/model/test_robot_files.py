@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
+from support.command_line import CliRunner
 
+from spacerobot_ros.cli.main import main
 from spacerobot_ros.errors import ParameterError, RobotDescriptionError
 from spacerobot_ros.model import SpaceRobot, load_robot, parse_robot
 from spacerobot_ros.model.meshes import mesh_file
@@ -45,6 +48,24 @@ def test_a_xacro_file_is_expanded(tmp_path: Path, name: str) -> None:
     found = load_robot(file_with(tmp_path, text, name))
     assert found.bodies[0].inertia.mass == 42.0
     assert "xacro:property" not in found.urdf
+
+
+def test_a_xacro_file_takes_its_arguments(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By the command, and from the environment, where nodes and workers find them."""
+    heading = ' xmlns:xacro="http://www.ros.org/wiki/xacro"'
+    text = urdf(mass="$(arg mass)", attribute=heading)
+    argument = '  <xacro:arg name="mass" default="7"/>\n  <link'
+    path = file_with(tmp_path, text.replace("  <link", argument, 1), "probe.xacro")
+    assert load_robot(path).bodies[0].inertia.mass == 7.0
+    monkeypatch.setenv("SPACEROBOT_XACRO_ARGS", "mass:=9")
+    assert load_robot(path).bodies[0].inertia.mass == 9.0
+    words = ["--xacro-arg", "mass:=42", "--xacro-arg", "title:=two words", "analyze", str(path)]
+    told = CliRunner().invoke(main, words)
+    assert told.exit_code == 0, told.output
+    assert re.search(r"44 kg", told.stdout)
+    refused = CliRunner().invoke(main, ["--xacro-arg", "mass=42", "analyze", str(path)])
+    assert refused.exit_code == 2
+    assert refused.stderr == "The xacro argument 'mass=42' is not NAME:=VALUE.\n"
 
 
 def test_a_xacro_file_that_cannot_be_expanded_is_refused(tmp_path: Path) -> None:

@@ -333,10 +333,10 @@ TOO_WEAK = (
 @pytest.mark.parametrize(
     ("name", "disperse", "engine"),
     [
-        ("servicer_thrusters", "{goal.position.x: {uniform: [-0.01, 0.02]}}", "flights"),
+        ("servicer_thrusters", "{goal.position.x: {uniform: [-0.01, 0.01]}}", "flights"),
         ("servicer", "{mass.*: {norm: {loc: 1.0, scale: 0.02}}}", "lanes"),
         ("planar_chain", "{mass.*: {norm: {loc: 1.0, scale: 0.02}}}", "flights"),
-        ("faults/wrong_masses", "{goal.position.x: {uniform: [-0.01, 0.02]}}", "flights"),
+        ("faults/wrong_masses", "{goal.position.x: {uniform: [-0.01, 0.01]}}", "flights"),
         ("aborted", "{mass.*: {norm: {loc: 1.0, scale: 0.02}}}", "flights"),
     ],
 )

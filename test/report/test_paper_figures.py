@@ -19,8 +19,16 @@ from spacerobot_ros.cli.main import main
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.flight.series import Signal
 from spacerobot_ros.report import write_figures, write_picture
-from spacerobot_ros.report.figures import PictureFormat, TraceGroup, angle_unit, drawing, sheet
-from spacerobot_ros.report.figures_over_time import range_without_peaks
+from spacerobot_ros.report.figures import (
+    PictureFormat,
+    ReportFigure,
+    TraceGroup,
+    angle_unit,
+    drawing,
+    sheet,
+)
+from spacerobot_ros.report.figures_over_time import figure_of_flights, range_without_peaks
+from spacerobot_ros.report.flight import read_report
 from spacerobot_ros.report.writing import FIGURES
 
 MAGIC = {"png": b"\x89PNG", "pdf": b"%PDF-", "svg": b"<?xml"}
@@ -78,6 +86,45 @@ def test_all_figures_of_a_bag_by_the_command(bag: Path, tmp_path: Path) -> None:
     asked = CliRunner().invoke(main, words)
     assert asked.exit_code == 1
     assert_one_sentence(asked.stderr, "efforts", "none")
+
+
+def test_two_flights_are_drawn_into_the_same_panels(tmp_path: Path) -> None:
+    """Each line is one of the motions that the bags tell, the shorter one over its own time."""
+    t = np.linspace(0.0, 3.0, 60)
+    motions = [
+        0.4 * np.sin(np.outer(t, [1.0, 2.0, 3.0])),
+        0.3 * np.cos(np.outer(t[:40], [3.0, 1.0, 2.0])),
+    ]
+    bags = [tell(tmp_path / f"{n}.mcap", Story(x)) for n, x in zip("ab", motions, strict=True)]
+    with drawing():
+        figure = figure_of_flights([read_report(bag) for bag in bags], FIGURES["joints"])
+    assert isinstance(figure, ReportFigure)
+    sliders, hinges = figure.figure.axes
+    for axes, joints in ((sliders, [0]), (hinges, [1, 2])):
+        lines = [line for line in axes.get_lines() if len(line.get_path()) > 2]
+        expected = [(motion[:, i], k) for k, motion in enumerate(motions) for i in joints]
+        for line, (values, number) in zip(lines, expected, strict=True):
+            time = 0.05 * np.arange(len(values))
+            x, y = (np.asarray(each, float) for each in line.get_data())
+            assert (x[0], x[-1]) == pytest.approx((0.0, time[-1]))
+            np.testing.assert_allclose(np.interp(time, x, y), values, atol=2e-3)
+            assert (line.get_linestyle() == "-") == (number == 0)
+        assert axes.get_xlim() == pytest.approx((0.0, 0.05 * 59))
+    (legend,) = figure.figure.legends
+    assert [text.get_text() for text in legend.get_texts()] == ["a.mcap", "b.mcap"]
+
+
+def test_figures_of_several_bags_by_the_command(bag: Path, tmp_path: Path) -> None:
+    other = tell(tmp_path / "other.mcap", Story(np.zeros((30, 3))))
+    names = "pose,path,robot,momentum"
+    words = ["figures", str(bag), str(other), "--format", "svg", "--only", names]
+    result = CliRunner().invoke(main, [*words, "--out", str(tmp_path / "out")])
+    assert result.exit_code == 1
+    assert_one_sentence(result.stderr, "robot", "none: It is of one flight: name one bag")
+    for name in ("pose", "path", "momentum"):
+        text = (tmp_path / "out" / f"{name}.svg").read_text("utf-8")
+        for label in ("flight.mcap", "other.mcap"):
+            assert f">{label}</text>" in text
 
 
 def test_the_help_names_every_figure() -> None:

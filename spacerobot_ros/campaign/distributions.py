@@ -1,0 +1,322 @@
+"""Distributions of what a campaign draws: of scipy, choices, covariances, and rows of a table."""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from spacerobot_ros.campaign.targets import DispersionTarget, DrawnFlight, targets_of
+from spacerobot_ros.errors import ParameterError, reason
+from spacerobot_ros.model.description import Array
+from spacerobot_ros.resources import suggestion
+from spacerobot_ros.scenario import Scenario, number_in
+
+_TABLE, _CORRELATED = "table", "multivariate_normal"
+
+
+@dataclass(frozen=True)
+class Distribution:
+    """Probability distribution of a value: one of scipy.stats, a choice, or the rows of a table.
+
+    Attributes
+    ----------
+    name
+        Name in ``scipy.stats``, ``choice``, or ``table``.
+    arguments
+        Arguments by name, as ``scipy.stats`` takes them.
+    choices
+        Equally likely values of a ``choice``, or the values of a ``table`` flight by flight.
+    """
+
+    name: str
+    arguments: Mapping[str, float] = field(default_factory=dict)
+    choices: tuple[Any, ...] = ()
+
+    def values(self, flights: Sequence[int], shares: Array) -> list[Any]:
+        """Return the values (N,) of flights by their numbers and cumulative probabilities (N,)."""
+        if self.name == _TABLE:
+            # Draws are made in blocks, whose last one reaches beyond the table.
+            return [self.choices[flight % len(self.choices)] for flight in flights]
+        return self.quantiles(shares)
+
+    def quantiles(self, shares: Array) -> list[Any]:
+        """Return the quantiles (N,) of cumulative probabilities (N,), 0 to 1."""
+        if self.choices:
+            last = len(self.choices) - 1
+            return [self.choices[min(int(u * (last + 1)), last)] for u in shares.tolist()]
+        # Values that are not finite are refused when a flight draws them.
+        with np.errstate(all="ignore"):
+            found = np.asarray(
+                _load_scipy_distribution(self.name).ppf(shares, **self.arguments), dtype=float
+            )
+        return list(found.tolist())
+
+    def __str__(self) -> str:
+        if self.name == _TABLE:
+            return f"{len(self.choices)} rows of the table"
+        if self.choices:
+            return f"one of {', '.join(map(str, self.choices))}"
+        given = ", ".join(f"{name} {value:g}" for name, value in self.arguments.items())
+        return f"{self.name} ({given})"
+
+
+@dataclass(frozen=True)
+class Dispersion:
+    """A quantity that varies from flight to flight, and its distribution.
+
+    ``weights`` are those of the independent standard normals, by the name of their dispersion,
+    whose sum is the standard normal of a correlated quantity; empty: it is independent.
+    """
+
+    target: DispersionTarget
+    distribution: Distribution
+    weights: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def name(self) -> str:
+        """Name of the quantity."""
+        return self.target.name
+
+    @property
+    def is_independent(self) -> bool:
+        """Whether it is drawn by itself."""
+        return not self.weights and self.distribution.name != _TABLE
+
+    def __str__(self) -> str:
+        others = ", ".join(name for name in self.weights if name != self.name)
+        return f"{self.distribution}{f', correlated with {others}' if others else ''}"
+
+
+def read_real_number(key: str, value: Any, least: float = -math.inf) -> float:
+    """Return a finite number of at least ``least``; ParameterError if it is none."""
+    try:
+        number = math.nan if isinstance(value, bool) else float(value)
+    except (TypeError, ValueError):
+        number = math.nan
+    if not (math.isfinite(number) and number >= least):
+        bound = f" of at least {least:g}" if math.isfinite(least) else ""
+        raise ParameterError(f"'{key}' is {value!r}; it must be a finite number{bound}.")
+    return number
+
+
+def read_distributions(section: Mapping[str, Any], scenario: Scenario) -> Iterator[Dispersion]:
+    """Yield what is under ``disperse``.
+
+    Raises
+    ------
+    ParameterError
+        A name, a distribution, or an argument of one is refused.
+    """
+    for names, given in section.items():
+        targets = [
+            target
+            for name in str(names).split(",")
+            for target in targets_of(name.strip(), scenario)
+        ]
+        if isinstance(given, dict) and set(given) == {_CORRELATED}:
+            yield from _read_correlated(str(names), targets, given[_CORRELATED])
+            continue
+        for target in targets:
+            distribution = _read_distribution(target, given)
+            for choice in distribution.choices:
+                _require_node_accepts(target, choice, scenario)
+            yield Dispersion(target, distribution)
+
+
+def _read_correlated(
+    names: str, targets: Sequence[DispersionTarget], given: Any
+) -> Iterator[Dispersion]:
+    """Yield normal dispersions, whose standard normals are sums of independent ones."""
+    from scipy.stats import multivariate_normal
+
+    if not isinstance(given, dict) or set(given) - {"mean", "cov"} or "cov" not in given:
+        raise ParameterError(f"'{names}': {_CORRELATED} must have 'cov' and may have 'mean'.")
+    if any(target.is_text for target in targets):
+        raise ParameterError(f"'{names}' has a text: {_CORRELATED} is of numbers.")
+    count = len(targets)
+    try:
+        mean = np.array(given.get("mean", np.zeros(count)), dtype=float)
+        covariance = np.array(given["cov"], dtype=float)
+        if mean.shape != (count,) or covariance.shape != (count, count):
+            raise ValueError(f"mean must have {count} numbers, cov {count} x {count}")
+        multivariate_normal(mean, covariance, allow_singular=True)
+        spread = np.sqrt(np.diag(covariance))
+        if not (np.isfinite(mean).all() and spread.all()):
+            raise ValueError("means must be finite and variances positive")
+        if not np.allclose(covariance, covariance.T, atol=0.0):
+            raise ValueError("cov must be symmetric")
+    except (TypeError, ValueError) as error:
+        raise ParameterError(
+            f"'{names}': {_CORRELATED} of {count} values is refused: {str(error).rstrip('.')}."
+        ) from error
+    values, vectors = np.linalg.eigh(covariance / np.outer(spread, spread))
+    factor = vectors * np.sqrt(np.clip(values, 0.0, None))
+    for target, middle, scale, row in zip(targets, mean, spread, factor, strict=True):
+        normal = Distribution("norm", {"loc": float(middle), "scale": float(scale)})
+        weights = zip((each.name for each in targets), row.tolist(), strict=True)
+        yield Dispersion(target, normal, dict(weights))
+
+
+def read_table_text(given: Any, folder: Path) -> str:
+    """Return the CSV text of a table: of a file, or as it is in the campaign's file.
+
+    Raises
+    ------
+    ParameterError
+        The file cannot be read.
+    """
+    if not isinstance(given, str):
+        raise ParameterError("'table' must be the name of a CSV file, or its lines.")
+    if "\n" in given:
+        return given
+    try:
+        return (folder / given).read_text(encoding="utf-8-sig")
+    except (OSError, ValueError) as error:
+        raise ParameterError(f"the table '{given}' cannot be read: {reason(error)}.") from error
+
+
+def read_table(text: str, scenario: Scenario) -> list[Dispersion]:
+    """Return the columns of a table, a row a flight.
+
+    Raises
+    ------
+    ParameterError
+        A name or a value is refused.
+    """
+    names, *rows = [row for row in csv.reader(text.splitlines(), skipinitialspace=True) if row]
+    if not rows:
+        raise ParameterError("the table needs a line of names, and a line for each flight.")
+    for number, row in enumerate(rows, 1):
+        if len(row) != len(names):
+            raise ParameterError(
+                f"row {number} of the table has {len(row)} values for {len(names)} names."
+            )
+    found = []
+    for name, column in zip(names, zip(*rows, strict=True), strict=True):
+        targets = targets_of(name.strip(), scenario)
+        if len(targets) > 1:
+            raise ParameterError(f"'{name}' in the table is of {len(targets)} values: name one.")
+        values = tuple(_read_choice(targets[0], each.strip(), _TABLE) for each in column)
+        for text in set(values) if targets[0].is_text else ():
+            _require_node_accepts(targets[0], text, scenario)
+        found.append(Dispersion(targets[0], Distribution(_TABLE, {}, values)))
+    return found
+
+
+def checked_dispersions(drawn: Sequence[Dispersion]) -> tuple[Dispersion, ...]:
+    """Return dispersions in the order in which they are applied.
+
+    Raises
+    ------
+    ParameterError
+        Two of them set the same number.
+    """
+    found: dict[str, Dispersion] = {}
+    for each in drawn:
+        if each.name in found:
+            raise ParameterError(f"'{each.name}' is dispersed twice.")
+        for other in found.values():
+            if other.target.assigned_parameters & each.target.assigned_parameters:
+                raise ParameterError(
+                    f"'{other.name}' and '{each.name}' set the same numbers: leave one out."
+                )
+        found[each.name] = each
+    return tuple(sorted(found.values(), key=lambda each: each.target.order))
+
+
+_SCIPY_NAMES = {"normal": "norm", "gauss": "norm", "gaussian": "norm", "exponential": "expon"}
+
+_ARGUMENT_HELP = {
+    "norm": "loc is its mean and scale its standard deviation",
+    "uniform": "loc is its least value and scale its width; [a, b] is from a to b",
+}
+
+
+def _read_distribution(target: DispersionTarget, given: Any) -> Distribution:
+    name = target.name
+    if not isinstance(given, dict) or len(given) != 1:
+        raise ParameterError(
+            f"'{name}' must have one distribution, such as 'norm: {{loc: 1, scale: 0.05}}'."
+        )
+    ((kind, arguments),) = given.items()
+    if kind == "choice":
+        if not isinstance(arguments, list) or not arguments:
+            raise ParameterError(f"'{name}' must have a list of values to choose from.")
+        return Distribution("choice", {}, tuple(_read_choice(target, each) for each in arguments))
+    if target.is_text:
+        raise ParameterError(f"'{name}' is a text: it must have a 'choice' of texts.")
+    distribution = _load_scipy_distribution(str(kind))
+    shapes = (distribution.shapes or "").replace(" ", "").split(",")
+    words = [*filter(None, shapes), "loc", *(["scale"] if hasattr(distribution, "pdf") else [])]
+    if isinstance(arguments, list):
+        if kind == "uniform":
+            if len(arguments) != 2:
+                raise ParameterError(f"'{name}': uniform takes [least, largest], two numbers.")
+            least, most = (read_real_number(f"{name}: uniform", each) for each in arguments)
+            arguments = [least, most - least]
+        if len(arguments) > len(words):
+            raise ParameterError(
+                f"'{name}': {kind} takes {', '.join(words)}, not {len(arguments)} numbers."
+            )
+        arguments = dict(zip(words, arguments, strict=False))
+    if not isinstance(arguments, dict):
+        raise ParameterError(f"'{name}': {kind} must have its arguments: {', '.join(words)}.")
+    for word in arguments:
+        if word not in words:
+            raise ParameterError(
+                f"'{name}': {kind} has no argument '{word}'; it takes {', '.join(words)}"
+                f"{': ' + _ARGUMENT_HELP[kind] if kind in _ARGUMENT_HELP else ''}."
+                f"{suggestion(str(word), words)}"
+            )
+    missing = [word for word in filter(None, shapes) if word not in arguments]
+    if missing:
+        raise ParameterError(f"'{name}': {kind} needs its argument '{missing[0]}'.")
+    values = {word: read_real_number(f"{name}: {word}", value) for word, value in arguments.items()}
+    with np.errstate(all="ignore"):
+        middle = float(distribution.ppf(0.5, **values))
+    if not math.isfinite(middle):
+        raise ParameterError(
+            f"'{name}': {kind} takes no such arguments: "
+            f"{', '.join(f'{word} {value:g}' for word, value in values.items())}."
+        )
+    return Distribution(str(kind), values)
+
+
+def _read_choice(target: DispersionTarget, value: Any, where: str = "choice") -> Any:
+    if target.is_text:
+        if not isinstance(value, str):
+            raise ParameterError(f"'{target.name}' is a text; the {where} has {value!r}.")
+        return value
+    return read_real_number(
+        f"{target.name}: {where}", number_in(value) if isinstance(value, str) else value
+    )
+
+
+def _require_node_accepts(target: DispersionTarget, value: Any, scenario: Scenario) -> None:
+    flight = target.apply(DrawnFlight.of(scenario), value)
+    for node in ("plant", *scenario.commanders):
+        flight.scenario.config(node)
+
+
+def _load_scipy_distribution(name: str) -> Any:
+    """Return a distribution of scipy.stats, which takes a second to load."""
+    from scipy import stats
+
+    found = getattr(stats, name, None)
+    if not isinstance(found, (stats.rv_continuous, stats.rv_discrete)):
+        known = [
+            each
+            for each, value in vars(stats).items()
+            if isinstance(value, (stats.rv_continuous, stats.rv_discrete))
+        ]
+        raise ParameterError(
+            f"scipy.stats has no distribution '{name}'."
+            f"{suggestion(_SCIPY_NAMES.get(name.lower(), name), [*known, 'choice'])}"
+        )
+    return found
