@@ -30,6 +30,18 @@ def sentence_case(text: str) -> str:
     return text[:1].upper() + text[1:]
 
 
+def quantity(value: float, unit: str) -> str:
+    """Return a number for people: three digits, in thousandths below 0.1, ``< 1 µm`` for rounding.
+
+    ``unit`` is m, rad or one that begins with these, such as m/s.
+    """
+    size = abs(value)
+    if size < 1e-6:
+        return f"< 1 µ{unit}" if size else f"0 {unit}"
+    factor, prefix = (1.0, "") if size >= 0.1 else (1e3, "m") if size >= 1e-4 else (1e6, "µ")
+    return f"{factor * value:.3g} {prefix}{unit}"
+
+
 class SpaceRobotError(Exception):
     """Base of all errors of this package; the message is one sentence for the user.
 

@@ -24,6 +24,11 @@ from spacerobot_ros.simulation.config import PlantConfig
 from spacerobot_ros.times import SECOND
 
 
+def latched_text(fault: str) -> str:
+    """Return what a latched fault means, without a full stop."""
+    return f"The joints brake and the thrusters are off until the plant is rearmed: {fault}"
+
+
 class PlantState(str, Enum):
     """State of a plant with regard to time and commands; the value of ``state`` in plant/status."""
 
@@ -239,7 +244,7 @@ class PlantMonitor:
                     message += f", and a fault is latched: {fault}"
             case _ if fault:
                 activity = PlantState.LATCHED
-                message = f"Nothing moves until '~/rearm' is called: {fault}"
+                message = latched_text(fault)
             case _ if self._config.time_mode == "lockstep":
                 message = "Every tick takes the command that answers its state"
             case _ if commands.in_force:

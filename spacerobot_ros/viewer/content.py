@@ -11,7 +11,7 @@ from typing import Generic, TypeVar
 
 import numpy as np
 
-from spacerobot_ros.errors import ParameterError
+from spacerobot_ros.errors import ParameterError, quantity
 from spacerobot_ros.measures import momentum_change
 from spacerobot_ros.model.description import DEFAULT_END_EFFECTOR, Array, RobotDescription
 from spacerobot_ros.model.kinematics import ForwardKinematics
@@ -152,6 +152,11 @@ def status_html(
     if state.plant is not None:
         plant = state.plant
         lines.append(_node_html(state, "plant", plant.state.value, plant.message, plant.level))
+        if plant.latched_fault and state.measured is not None:
+            twist, rearm = state.measured.twist, " Press Rearm." * (state.replay is None)
+            speed = quantity(math.hypot(*twist[:3]), "m/s")
+            rate = quantity(math.hypot(*twist[3:]), "rad/s")
+            lines.append(_line_html(f"The base drifts at {speed} and {rate}.{rearm}", 2))
         lines.extend(_line_html(f"Fault: {each}", 1) for each in state.plant.faults)
         lines.extend(_line_html(f"Disturbance: {each}", 1) for each in state.plant.disturbances)
     if state.clearance is not None:

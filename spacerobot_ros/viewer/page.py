@@ -81,7 +81,7 @@ class ButtonPanel:
         self._plant = gui.add_button_group(
             "Plant",
             ("Stop all", "Rearm", "Reset"),
-            hint="Stop all: all comes to rest until Rearm. Reset: back to the initial state.",
+            hint="Stop all: joints brake, thrusters are off until Rearm. Reset: back to the start.",
         )
         self._time = gui.add_button_group("Time", ("Pause", "Resume"))
 
@@ -459,7 +459,8 @@ _OBSTACLES_PATH, _TARGET_PATH = "/obstacles", "/target"
 _TEXTS_S, _TABLES_S, _PLOTS_S, _PATHS_S = 0.2, 0.25, 0.5, 0.5
 """Period of drawing of the slower parts, wall s."""
 
-_ANNOUNCEMENT_TIME_S = 60.0  # wall s
+_ANSWER_TIME_S = 10.0
+"""Wall time for which the head shows the answer to what a user has done, s."""
 
 CAMERA = np.array([1.1, 1.4, 0.8])
 """Initial position of the camera relative to the robot, in robot lengths.
@@ -704,9 +705,10 @@ class Page:
         """Add a line to the log."""
         self._log.add(notice)
 
-    def announce(self, notice: Notice) -> None:
-        """Show a line in the head for a minute."""
-        self._announced = (notice, self._now + _ANNOUNCEMENT_TIME_S)
+    def announce(self, notice: Notice, seconds: float = _ANSWER_TIME_S) -> None:
+        """Add a line to the log, and show it in the head for a wall time, s."""
+        self.note(notice)
+        self._announced = (notice, self._now + seconds)
 
     # -- drawing --------------------------------------------------------------------------------
 
@@ -883,8 +885,8 @@ class Page:
     def _request(self, action: Action) -> None:
         self._actions.append(action)
         if isinstance(action, Request):
-            self.note(Notice(f"{action.value.capitalize()} requested.", source="page",
-                             time_s=self._time_s))  # fmt: skip
+            self.announce(Notice(f"{action.value.capitalize()} requested.", source="page",
+                                 time_s=self._time_s))  # fmt: skip
 
     def _fly(self) -> None:
         try:
@@ -904,7 +906,7 @@ class Page:
             self.editor.place(measured.pose, tool, measured.q, self._now)
 
     def _refuse(self, message: str) -> None:
-        self.note(Notice(message, 2, self._time_s, "page"))
+        self.announce(Notice(message, 2, self._time_s, "page"))
 
     @property
     def _time_s(self) -> float | None:

@@ -6,6 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import Enum
 
+import numpy as np
+
 from spacerobot_ros.bag.playback import ReplayStatus
 from spacerobot_ros.control.status import ControllerStatus
 from spacerobot_ros.model.description import Array
@@ -27,6 +29,8 @@ class Measured:
         (7,) of the base link in the world: m, quaternion (x, y, z, w).
     q, qdot, effort
         (n,) of the joints in the order of the description, m or rad, /s, N or N m.
+    twist
+        (6,) velocity of the base link and its rate, in its own axes, m/s and rad/s.
     """
 
     time_s: float
@@ -34,6 +38,7 @@ class Measured:
     q: Array
     qdot: Array
     effort: Array
+    twist: Array = field(default_factory=lambda: np.zeros(6))
 
 
 @dataclass(frozen=True)

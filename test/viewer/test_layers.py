@@ -352,18 +352,21 @@ def test_nodes_that_have_ended_are_never_green(
     assert ("offline, last executing:" in head) is ("planner" in absent)
 
 
-def test_a_node_that_was_started_again_is_no_news_once_the_stack_has_ended(
-    server: Server, page: Page
-) -> None:
+def test_news_stay_ten_seconds_or_until_the_stack_has_ended(server: Server, page: Page) -> None:
     again = Notice("Node 'planner' was ended by SIGKILL. It is started again.", 1)
     page.update(FLYING, 1.0)
     page.announce(again)
-    page.update(FLYING, 2.0)
+    page.update(FLYING, 9.0)
+    assert "It is started again." in page._status.content
+    page.update(FLYING, 11.5)
+    assert "It is started again." not in page._status.content
+    page.announce(again)
+    page.update(FLYING, 12.0)
     assert "It is started again." in page._status.content
     ended = replace(
         FLYING, absent=frozenset({"plant", "planner"}), silent={"/plant": 3.0, "/planner": 3.0}
     )
-    page.update(ended, 3.0)
+    page.update(ended, 13.0)
     assert ENDED in page._status.content
     assert "It is started again." not in page._status.content
 

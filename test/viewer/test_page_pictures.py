@@ -210,8 +210,16 @@ def test_a_controlled_flight_that_is_looked_back_at_aborted_and_stopped(
         page.wait_for_text("Aborted on request; the robot holds.", "Plant running")
         looked.keep("aborted")
         page.press("Stop all")
-        page.wait_for_text("Plant latched", "stopped on request")
+        page.wait_for_text(
+            "Plant latched", "stopped on request", "The base drifts at", "Press Rearm."
+        )
         looked.keep("stopped")
+        page.press("Fly")
+        page.wait_for_text("'/plant' is latched: stopped on request; rearm it first.")
+        page.press("Rearm")
+        page.wait_for_text(
+            "Commands pass again", "Plant running", without="until the plant is rearmed"
+        )
 
 
 def test_goals_in_flight_that_are_refused_dragged_or_seen_by_a_page_that_is_loaded_again(

@@ -97,6 +97,18 @@ def test_silence_is_said() -> None:
     assert "no valid robot_description" in content.status_html(STATE, described=False)
 
 
+def test_a_latched_robot_is_said_to_drift() -> None:
+    latched = PlantStatus(PlantState.LATCHED, "Off: a fuse.", "abort", "a fuse")
+    assert STATE.measured is not None
+    drifts = replace(STATE.measured, twist=np.array([3e-3, 0.0, -4e-3, 0.0, 0.12, 0.05]))
+    for measured, speeds in (
+        (STATE.measured, "0 m/s and 0 rad/s"),
+        (drifts, "5 mm/s and 0.13 rad/s"),
+    ):
+        head = content.status_html(replace(STATE, measured=measured, plant=latched))
+        assert f"The base drifts at {speeds}. Press Rearm." in head
+
+
 def test_time_to_go_is_of_the_schedule_that_is_flown() -> None:
     executing = PlannerStatus(PlannerState.EXECUTING, manoeuvre_time_s=8.0, ends_at_s=10.0)
     flying = replace(STATE, planner=executing)

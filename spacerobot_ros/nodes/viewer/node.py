@@ -101,6 +101,7 @@ _NODES_WITH_PARAMETERS = ("plant", "planner", "controller")
 
 _LONGEST_MATCHING_WAIT = 4.0  # wall s
 _LONGEST_GOAL_ANSWER_WAIT = 5.0  # wall s
+_RESTART_NOTICE_TIME = 60.0  # wall s
 _MICROSECOND_NS = 1000
 _MILLISECOND_NS = 1_000_000
 
@@ -314,9 +315,13 @@ class ViewerNode(FlightNode):
         except SpaceRobotError:
             return
         notice = Notice(event.message, event.level, event.time_s, message.name)
-        self._page.note(notice)
         if event.kind is EventKind.NODE_RESTARTED:
+            self._page.announce(notice, _RESTART_NOTICE_TIME)
+        elif event.kind in (EventKind.GOAL_ACCEPTED, EventKind.GOAL_REFUSED):
             self._page.announce(notice)
+            self._unanswered_goal = None
+        else:
+            self._page.note(notice)
         if event.kind in (EventKind.ACTIVATED, EventKind.NODE_BACK):
             for key, name in self._full_names.items():
                 if name == message.name and key in _NODES_WITH_PARAMETERS:
@@ -401,6 +406,9 @@ class ViewerNode(FlightNode):
     def _note(self, message: str, level: int = 0, source: str = "") -> None:
         self._page.note(Notice(message, level, None, source))
 
+    def _answer(self, message: str, level: int = 0, source: str = "page") -> None:
+        self._page.announce(Notice(message, level, None, source))
+
     # -- actions of users -----------------------------------------------------------------------
 
     def _carry_out(self, action: Action) -> None:
@@ -409,7 +417,7 @@ class ViewerNode(FlightNode):
                 self._goals_to_send = goals, time.monotonic() + _LONGEST_MATCHING_WAIT
             case InjectAction(text):
                 self._fault_topic.publish(String(data=text))
-                self._note(f"Sent to the plant: {text}", source="page")
+                self._answer(f"Sent to the plant: {text}")
             case SeekAction(seconds):
                 self._seek_topic.publish(Float64(data=float(seconds)))
             case Request():
@@ -440,9 +448,7 @@ class ViewerNode(FlightNode):
                 self._unanswered_goal = goal_id, now + _LONGEST_GOAL_ANSWER_WAIT
             elif now >= until:
                 self._unanswered_goal = None
-                self._note(
-                    "No planner or controller has answered the goal: send it again.", 2, "page"
-                )
+                self._answer("No planner or controller has answered the goal: send it again.", 2)
 
     def _send(self, goals: Mapping[Part, Goal]) -> None:
         # Statuses name a goal by its stamp, which is therefore unique among all viewers.
@@ -460,9 +466,9 @@ class ViewerNode(FlightNode):
             own = 1 if part in _PARTS_WITH_RECEIVED_GOALS else 0
             readers = max(readers, self._goal_topics[part].get_subscription_count() - own)
         if not readers:
-            self._note("No planner or controller takes the goal: none is running.", 2, "page")
+            self._answer("No planner or controller takes the goal: none is running.", 2)
         else:
-            self._note("Goal sent.", source="page")
+            self._answer("Goal sent.")
             goal_id = GoalIds().of(*divmod(min(time_ns, LATEST_NS), SECOND))
             self._unanswered_goal = goal_id, time.monotonic() + _LONGEST_GOAL_ANSWER_WAIT
         editor = self._page.editor
@@ -488,7 +494,7 @@ class ViewerNode(FlightNode):
             )
         if not called:
             whose = " or ".join(keys)
-            self._note(f"No {whose} offers the service '{service}' now.", 2, "page")
+            self._answer(f"No {whose} offers the service '{service}' now.", 2)
 
     def _client(self, kind: type[Any], name: str) -> Client:
         key = (name, kind)
@@ -499,7 +505,7 @@ class ViewerNode(FlightNode):
     def _on_answer(self, name: str, future: Any) -> None:
         with suppress(Exception):  # The service no longer exists.
             answer = future.result()
-            self._note(answer.message, 0 if answer.success else 2, name)
+            self._answer(answer.message, 0 if answer.success else 2, name)
 
 
 def main() -> None:
