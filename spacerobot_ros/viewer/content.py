@@ -174,6 +174,8 @@ def status_html(
         control = state.controller
         word, level = control.state.value, control.state.level
         lines.append(_node_html(state, "controller", word, control.message, level))
+    if task := _task_before_goals(state):
+        lines.append(_line_html(f"The goal is pursued after the task '{task}'.", None))
     lines.extend(_distance_lines(state, errors or {}, tolerance))
     return padded("".join(lines))
 
@@ -389,9 +391,20 @@ class GoalDistance:
         return (self.distance,) if self.angle is None else (self.distance, self.angle)
 
 
+def _task_before_goals(state: StackState) -> str:
+    """Return the task after which a controller pursues its goals; empty: there is none."""
+    task = "" if state.controller is None else state.controller.task
+    return task if state.goals and "controller" not in state.absent else ""
+
+
 def goal_errors(state: StackState, kinematics: ForwardKinematics) -> dict[Part, GoalDistance]:
-    """Return how far each part with a goal is from it, as far as poses are known."""
+    """Return how far each part with a goal is from it, as far as poses are known.
+
+    Goals that a controller pursues after a task, such as an approach, are left out.
+    """
     measured, errors = state.measured, {}
+    if _task_before_goals(state):
+        return {}
     for part, goal in state.goals.items():
         aim: Goal | EndEffectorGoal = goal
         pose: Array | None

@@ -398,6 +398,12 @@ def test_a_controller_has_the_distances_of_base_and_end_effector() -> None:
     assert content.time_to_go(due) == 3.25
     head = content.status_html(due, errors)
     assert "base is 5 m and 0 rad from its goal, 3.2 s to go." in head
+    # An approach comes before the goal, from which the robot may then move away.
+    approach = replace(due, controller=ControllerStatus(ControllerState.TRACKING, task="approach"))
+    kinematics = ForwardKinematics(ROBOT)
+    assert set(content.goal_errors(due, kinematics)) == {"base"}
+    assert content.goal_errors(approach, kinematics) == {}
+    assert "pursued after the task &#x27;approach&#x27;." in content.status_html(approach)
     gone = replace(due, absent=frozenset({"controller"}))
     assert "to go" not in content.status_html(gone, errors)
     assert content.progress(due) is None
