@@ -380,8 +380,8 @@ class GoalDistance:
             if value is None:
                 continue
             free = part in left_out
-            numbers.append(f"{value:.3g} {unit}" + (" (not controlled)" if free else ""))
-            tolerances += [] if free or tolerance is None else [f"{limit:.3g} {unit}"]
+            numbers.append(quantity(value, unit) + (" (not controlled)" if free else ""))
+            tolerances += [] if free or tolerance is None else [quantity(limit, unit)]
         within = f" (tolerance {', '.join(tolerances)})" if tolerances else ""
         return f"{' and '.join(numbers)} from its goal{within}"
 

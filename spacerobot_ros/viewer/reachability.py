@@ -28,7 +28,7 @@ from typing import IO
 import numpy as np
 
 from spacerobot_ros.control.inverse_kinematics import FixedBaseArm, is_reached
-from spacerobot_ros.errors import GoalError, SpaceRobotError
+from spacerobot_ros.errors import GoalError, SpaceRobotError, quantity
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import DEFAULT_END_EFFECTOR, Array, Pose, RobotDescription
 from spacerobot_ros.model.rotations import matrix_from_quaternion
@@ -409,7 +409,7 @@ def _uncontrolled_text(
     parts = []
     uncontrolled = goal.base - controls
     if "position" in uncontrolled and error.distance > tolerance.position:
-        parts.append(("position", f"{error.distance:.3g} m"))
+        parts.append(("position", quantity(error.distance, "m")))
     if "attitude" in uncontrolled and error.angle > tolerance.attitude:
         parts.append(("attitude", f"{math.degrees(error.angle):.3g} deg"))
     if "shape" not in controls and goal.joint_positions is not None:
@@ -432,7 +432,7 @@ def _check_arm(question: GoalQuestion, tool: Goal) -> GoalCheck:
         return GoalCheck(Verdict.REACHABLE, message, shape=shape)
     message = (
         f"The end-effector cannot reach its goal: the nearest joint positions found leave "
-        f"{distance:.3g} m and {angle:.3g} rad."
+        f"{quantity(distance, 'm')} and {quantity(angle, 'rad')}."
     )
     return GoalCheck(Verdict.REFUSED, message, shape=shape)
 

@@ -200,7 +200,7 @@ def test_a_controlled_flight_that_is_looked_back_at_aborted_and_stopped(
         page.type("Goal (m)", [0.8, 0.4, 0.2])
         page.wait_for_text("Goal reachable", without="being moved")
         page.press("Fly")
-        page.wait_for_text("s to go.", "from the reference", "(tolerance 0.0005 m, 0.001 rad)")
+        page.wait_for_text("s to go.", "from the reference", "(tolerance 0.5 mm, 1 mrad)")
         looked.keep("controlled")
         page.slide(0.3)
         page.wait_for_text("Looking back")
@@ -231,7 +231,7 @@ def test_goals_in_flight_that_are_refused_dragged_or_seen_by_a_page_that_is_load
         page.type("Goal (m)", [0.3, -0.25, 0.1])
         page.wait_for_text("Goal reachable", without="being moved")
         page.press("Fly")
-        page.wait_for_text("executing", "s to go", "(tolerance 0.02 m, 0.06 rad)")
+        page.wait_for_text("executing", "s to go", "(tolerance 20 mm, 60 mrad)")
         # A goal that is refused leaves the first one as it is.
         up.goal("9", "0", "0", "0", "0", "0", "1")
         page.wait_for_text("A later goal is refused: The goal position", "executing", "s to go")
@@ -253,7 +253,7 @@ def test_goals_in_flight_that_are_refused_dragged_or_seen_by_a_page_that_is_load
         page.wait_for_text("executing", "s to go")
         # A page that is loaded again, or by somebody else, shows the flight as it is.
         again = Looked(looked.window, up.url)
-        again.page.wait_for_text("executing", "s to go", "base is ", "(tolerance 0.02 m, 0.06 rad)")
+        again.page.wait_for_text("executing", "s to go", "base is ", "(tolerance 20 mm, 60 mrad)")
         assert again.page.numbers("Goal (m)") == [0.1, 0.0, 0.05]
         assert np.linalg.norm(again.at("/goal/ghost") - again.at("/goal")) < 0.02
         again.keep("loaded-again")
@@ -283,7 +283,7 @@ def test_a_planar_robot(scenario: str, tmp_path: Path, ros_domain: int) -> None:
         if scenario == "planar_chain":
             page.wait_for_text("executing", "Not controlled: position.", "s to go")
         else:
-            page.wait_for_text("s to go.", "from the reference", "(tolerance 0.001 m, 0.001 rad)")
+            page.wait_for_text("s to go.", "from the reference", "(tolerance 1 mm, 1 mrad)")
         assert "refused" not in page.text()
         looked.keep(f"planar-{scenario}")
 

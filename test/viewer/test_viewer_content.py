@@ -231,10 +231,10 @@ def test_errors_of_links_are_those_of_their_measured_poses() -> None:
     base = replace(state, goals={"base": Goal(HERE[:3], HERE[3:])})
     errors, limits = content.goal_errors(base, kinematics), Tolerance(0.001, 0.002)
     head = content.status_html(base, errors, limits)
-    assert "base is 0 m and 0 rad from its goal (tolerance 0.001 m, 0.002 rad)." in head
+    assert "base is 0 m and 0 rad from its goal (tolerance 1 mm, 2 mrad)." in head
     flown = PlannerStatus(PlannerState.EXECUTING, not_controlled=("position",))
     head = content.status_html(replace(base, planner=flown), errors, limits)
-    free = "base is 0 m (not controlled) and 0 rad from its goal (tolerance 0.002 rad)."
+    free = "base is 0 m (not controlled) and 0 rad from its goal (tolerance 2 mrad)."
     assert free in head
     # Its message has the numbers once the planner has decided.
     done = replace(base, planner=PlannerStatus(PlannerState.REACHED, "It is there."))
@@ -295,13 +295,13 @@ def test_what_a_controller_does_not_control_is_said_beside_its_number() -> None:
         state = replace(STATE, controller=control, goals=goals)
         return content.status_html(state, distances, Tolerance(0.01, 0.02))
 
-    turned = "0.25 m (not controlled) and 0.5 rad from its goal (tolerance 0.02 rad)"
-    both = "0.25 m and 0.5 rad from its goal (tolerance 0.01 m, 0.02 rad)"
+    turned = "0.25 m (not controlled) and 0.5 rad from its goal (tolerance 20 mrad)"
+    both = "0.25 m and 0.5 rad from its goal (tolerance 10 mm, 20 mrad)"
     neither = "0.25 m (not controlled) and 0.5 rad (not controlled) from its goal."
     assert f"base is {turned}." in head("base.rz", "joint.elbow")
     assert f"end_effector is {neither}" in head("base.rz", "joint.elbow")
     assert f"base is {both}." in head("base.y", "base.rx", "end_effector.x")
-    placed = "0.25 m and 0.5 rad (not controlled) from its goal (tolerance 0.01 m)"
+    placed = "0.25 m and 0.5 rad (not controlled) from its goal (tolerance 10 mm)"
     assert f"end_effector is {placed}." in head("base.y", "base.rx", "end_effector.x")
 
 
@@ -441,7 +441,7 @@ def test_long_names_of_joints_have_room() -> None:
 def test_the_clearance_and_its_links_are_shown() -> None:
     links = LinkPair("left <arm>", "right")
     apart = content.status_html(replace(STATE, clearance=ClearanceStatus(0.0123, links, 4.0)))
-    assert escape("Links 'left <arm>' and 'right' are 0.0123 m apart.") in apart
+    assert escape("Links 'left <arm>' and 'right' are 12.3 mm apart.") in apart
     assert "#d23c3c" not in apart
     deep = content.status_html(replace(STATE, clearance=ClearanceStatus(-0.2, links, 4.0)))
     assert f'#d23c3c);font-weight:600;margin:2px 0">{escape("Links")}' in deep
