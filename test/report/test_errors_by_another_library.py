@@ -183,8 +183,8 @@ def assert_all_say(bag: Path, flight: Flight, *, position_counts: bool) -> None:
     assert lines[0].endswith(verdict)
     if flight.outcome is not Outcome.ABORTED:
         assert bool(re.search(r"[mµ]?m and [^,]* [mµ]?rad from", verdict)) is position_counts
-        near = shown(verdict, "(?:: |is )# m") if position_counts else truth.distance
-        same(near, shown(verdict, "# rad"), 3)
+        off = shown(verdict, "(?:: |is )# m") if position_counts else truth.distance
+        same(off, shown(verdict, "# rad"), 3)
 
     live = goal_errors(state_of(flight), ForwardKinematics(flight.robot))["base"]
     assert live.angle is not None
