@@ -44,7 +44,7 @@ from spacerobot_ros.planning.core.cancellation import Cancellation, PlanningCanc
 from spacerobot_ros.planning.core.goal import RobotState, Tolerance
 from spacerobot_ros.planning.core.method import PlanRequest
 from spacerobot_ros.planning.core.prediction import coasting_positions
-from spacerobot_ros.planning.core.progress import report_progress
+from spacerobot_ros.planning.core.progress import SearchProgress, report_progress
 from spacerobot_ros.planning.core.schedule import GaitSchedule
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.execution.goal_file import BASE_GOAL_KEY
@@ -482,7 +482,11 @@ def main() -> None:
 
         threading.Thread(target=receive_questions, daemon=True).start()
         planner, number = Planner(), 0
-        with report_progress(lambda progress: send_answer(number, progress.message)):
+
+        def send_progress(progress: SearchProgress) -> None:
+            send_answer(number, f"{progress.message}, {progress.elapsed_s:.0f} s")
+
+        with report_progress(send_progress):
             while True:
                 (number, question), cancellation = last.take()
                 send_answer(number, None)
