@@ -21,6 +21,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.font_manager import FontProperties, findfont
+from matplotlib.legend import Legend
 from matplotlib.lines import Line2D
 from matplotlib.text import Annotation
 from matplotlib.ticker import MaxNLocator
@@ -544,7 +545,7 @@ def legend_entry(tint: str, label: str, dashes: tuple[float, ...] = ()) -> Line2
 def legend_above(axes: Axes, keys: Sequence[Line2D]) -> None:
     """Add a legend above the axes, at the right."""
     if keys:
-        axes.legend(
+        legend = axes.legend(
             handles=keys,
             loc="lower right",
             bbox_to_anchor=(1.0, 0.99),
@@ -553,6 +554,17 @@ def legend_above(axes: Axes, keys: Sequence[Line2D]) -> None:
             handlelength=1.6,
             columnspacing=1.2,
         )
+        figure = axes.figure
+        assert isinstance(figure, Figure)
+        left = _LETTER_WIDTH * figure.dpi if _lettered.get() else 0.0
+        fit_legend(legend, axes.bbox.x1 - left)
+
+
+def fit_legend(legend: Legend, room: float) -> None:
+    """Make the letters of a legend smaller if it is wider than ``room``, pixels."""
+    share = room / legend.get_window_extent().width
+    for text in legend.get_texts() if share < 1.0 else ():
+        text.set_fontsize(share * float(text.get_fontsize()))
 
 
 def short(name: str) -> str:

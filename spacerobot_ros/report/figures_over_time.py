@@ -85,7 +85,10 @@ def draw_whole_flight(
     values = np.concatenate([group.signal.values.ravel(), [g[3] for g in group.goals]])
     if group.window is not None:
         text = f"peaks of {np.abs(values).max():.3g} {group.unit} are beyond the axis"
-        axes.set_title(text, loc="right" if group.limits else "left", color=SECONDARY_COLOUR)
+        axes.text(
+            0.02, 0.97, text, transform=axes.transAxes, va="top", color=SECONDARY_COLOUR,
+            bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 1.0}, zorder=4,
+        )  # fmt: skip
         values = np.array(group.window)
     set_range(axes, values, [bound for _, bound in group.limits])
     low, high = axes.get_ylim()
@@ -436,16 +439,19 @@ def _why_no_joints(flight: FlightReport) -> str:
     return "The robot has no joints." if jointless else NO_JOINTS_TEXT
 
 
-def rates_figure(flight: FlightReport) -> ReportFigure | str:
-    """Joint velocities, one panel a joint."""
+def rates_figure(flight: FlightReport) -> ReportFigure | str | None:
+    """Joint velocities; None if all joints are wheels, whose rates are in the shape's figure."""
     if not flight.joint_names:
         return _why_no_joints(flight)
     if not len(flight.rates):
         return "The bag holds no joint velocities."
-    units = {"m": "m/s", "rad": "rad/s"}
-    groups = joint_groups(flight, flight.rates, "velocity", units, _rate_bounds, most=1)
-    caption = "Velocity of each joint"
-    return time_figure(flight, "velocities", "Joint velocities", caption, groups, small=True)
+    units, columns = {"m": "m/s", "rad": "rad/s"}, flight.shape_columns
+    groups = joint_groups(
+        flight, flight.rates, "velocity", units, _rate_bounds, JOINTS_PER_PANEL, columns
+    )
+    if not groups:
+        return None
+    return time_figure(flight, "velocities", "Joint velocities", "Velocity of each joint", groups)
 
 
 def _rate_bounds(joint: Joint) -> list[float]:

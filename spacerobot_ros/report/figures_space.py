@@ -54,6 +54,11 @@ from spacerobot_ros.report.solids import (
 PIXELS = 420
 """Width of the picture of a robot, pixels."""
 _MAX_SHOWN_POSES = 6
+_FOOT_SHARE = 0.1
+"""Share of the height of a picture of a robot that is left for the scale bar."""
+
+_NEAR_GOAL = 2.0
+"""Largest extent of the robot and its goal for which the whole goal is shown, in robot extents."""
 
 
 def configurations_figure(flight: FlightReport) -> ReportFigure | str:
@@ -71,6 +76,10 @@ def configurations_figure(flight: FlightReport) -> ReportFigure | str:
     figure, panels = sheet(rows, [height] * len(rows), **sizes)
     points = np.concatenate([corner_points(scene) for scene in scenes])
     view = view_of(flight)
+    if (goal := goal_of_base(flight, MAX_MESH_FACES)) is not None:
+        both = np.concatenate([points, *outlines(goal)])
+        if np.ptp(view(both), axis=0).max() < _NEAR_GOAL * np.ptp(view(points), axis=0).max():
+            points = both
     places = [axes for row in panels for axes in row]
     for axes in places[len(indices) :]:
         axes.set_visible(False)
@@ -131,7 +140,9 @@ def draw_robot(axes: Axes, solids: Sequence[PlacedSolid], points: Array, view: V
     size = np.array([box.width, box.height])
     flat = view(points)
     middle = (flat.max(axis=0) + flat.min(axis=0)) / 2
-    span = 1.06 * max(float((np.ptp(flat, axis=0) / size).max()), 1e-6) * size
+    drawn = size * (1.0, 1.0 - _FOOT_SHARE)
+    span = 1.06 * max(float((np.ptp(flat, axis=0) / drawn).max()), 1e-6) * size
+    middle[1] -= _FOOT_SHARE / 2 * span[1]
     low, high = middle - span / 2, middle + span / 2
     canvas = Canvas(view, low, high, PIXELS)
     canvas.draw(solids)

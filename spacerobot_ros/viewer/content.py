@@ -24,7 +24,7 @@ from spacerobot_ros.planning.core.goal import (
 )
 from spacerobot_ros.planning.execution.goal_file import BASE_GOAL_KEY
 from spacerobot_ros.planning.execution.status import PlannerState
-from spacerobot_ros.simulation.faults import FAULT_KINDS, FaultTargets, parse_fault
+from spacerobot_ros.simulation.faults import FAULT_KINDS, FaultTargets, parse_fault, with_seconds
 from spacerobot_ros.simulation.status import PlantState
 from spacerobot_ros.viewer.reachability import GoalCheck, Verdict
 from spacerobot_ros.viewer.state import Measured, Momenta, Notice, Part, StackState
@@ -157,8 +157,8 @@ def status_html(
             speed = quantity(math.hypot(*twist[:3]), "m/s")
             rate = quantity(math.hypot(*twist[3:]), "rad/s")
             lines.append(_line_html(f"The base drifts at {speed} and {rate}.{rearm}", 2))
-        lines.extend(_line_html(f"Fault: {each}", 1) for each in state.plant.faults)
-        lines.extend(_line_html(f"Disturbance: {each}", 1) for each in state.plant.disturbances)
+        for kind, found in (("Fault", plant.faults), ("Disturbance", plant.disturbances)):
+            lines.extend(_line_html(f"{kind}: {with_seconds(each)}", 1) for each in found)
     if state.clearance is not None:
         level = state.clearance.level or None
         lines.append(
@@ -579,7 +579,7 @@ def faults_html(lines: Sequence[str]) -> str:
     """Return the active faults."""
     if not lines:
         return hint_html("No fault is active.")
-    return padded("".join(_line_html(line, 1) for line in lines))
+    return padded("".join(_line_html(with_seconds(line), 1) for line in lines))
 
 
 def hint_html(text: str) -> str:
