@@ -161,14 +161,11 @@ def time_figure(
     heading: str,
     caption: str,
     groups: list[TraceGroup],
-    *,
-    small: bool = False,
 ) -> ReportFigure | str:
     """Return a figure with a panel for each group, and close-ups of a gait of equal cycles; a
     sentence where nothing was recorded over time.
 
-    ``caption`` is its beginning. ``small``: panels are low and share a time axis; beside them are
-    the last cycles.
+    ``caption`` is its beginning.
     """
     if all(len(group.signal) < 2 for group in groups):
         return ONE_STATE_TEXT
@@ -177,34 +174,20 @@ def time_figure(
     lane = EVENT_STRIP_HEIGHT if flight.timed_events else 0.0
     right = room_for([name for group in groups for name in group.names])
     left = max([0.72, *(room_for(group.names) + 0.1 for group in groups if group.rows)])
-    if small:
-        rows = [[1.0] if cycles is None else [2.2, 1.0]] * len(groups)
-        low, below = 1.0 if len(groups) <= 4 else 0.75, 0.5 + lane
-        sizes = {"left": 0.85, "right": right, "gap": 0.36, "bottom": below}
-        figure, panels = sheet(rows, [low] * len(groups), **sizes)
-    else:
-        rows, heights = _layout(groups, with_cycles=cycles is not None)
-        figure, panels = sheet(rows * len(groups), heights, left=left, right=right, lane=lane)
+    rows, heights = _layout(groups, with_cycles=cycles is not None)
+    figure, panels = sheet(rows * len(groups), heights, left=left, right=right, lane=lane)
     share = min(1.0, 4 / len(groups))
     dense = []
     for number, group in enumerate(groups):
-        count = 1 if small else len(rows)
-        whole, *below_it = panels[number * count : (number + 1) * count]
+        whole, *below_it = panels[number * len(rows) : (number + 1) * len(rows)]
         dense.append(draw_whole_flight(whole[0], flight, group, share))
-        if small:
-            whole[0].set_title("" if number else group.label)
-            whole[0].set_ylabel(group.unit)
-        elif cycles is not None:
+        if cycles is not None:
             whole[0].set_title("whole flight")
             first, last = (axes for row in below_it for axes in row)
             dense.append(_draw_before_cycles(first, group, cycles))
-        if cycles is not None:
-            _draw_last_cycles(whole[1] if small else last, group, cycles)
-        for axes in whole if small and number < len(groups) - 1 else ():
-            axes.set_xlabel("")
-            axes.tick_params(labelbottom=False)
+            _draw_last_cycles(last, group, cycles)
     if flight.timed_events:
-        for axes in (each for row in (panels[-1:] if small else panels) for each in row):
+        for axes in (each for row in panels for each in row):
             draw_events(axes, flight.timed_events)
     if any(group.goals for group in groups):
         caption += "; dashed, the goal"
@@ -213,10 +196,10 @@ def time_figure(
     caption += "."
     aside = ""
     if cycles is not None:
-        where = "beside it," if small else "below, the part before them, and"
         aside += (
-            f" The flight ends with {cycles.count} equal cycles of {cycles.period:.4g} s; {where} "
-            f"the last {SHOWN_CYCLES} of them, as change since the first instant shown."
+            f" The flight ends with {cycles.count} equal cycles of {cycles.period:.4g} s; below, "
+            f"the part before them, and the last {SHOWN_CYCLES} of them, as change since the first "
+            "instant shown."
         )
     aside += f" {BAND_CAPTION}" if any(dense) else ""
     aside += f" {EVENTS_CAPTION}" if flight.timed_events else ""

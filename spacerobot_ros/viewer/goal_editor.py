@@ -47,6 +47,9 @@ _HIDDEN_GHOST_DISTANCE = 0.01
 
 _BASE_GIZMO, _TOOL_GIZMO = "/goal", "/end_effector_goal"
 
+_DECIMALS = 4, 2
+"""Decimals of the position (m) and of the angles (deg) of a goal that a user moves, and sees."""
+
 _MARK_SIZE = 0.12
 """Radius of the mark at the goal of an end-effector, as a share of the size of its gizmo."""
 
@@ -107,6 +110,7 @@ class GoalEditor:
         # Any: for mypy viser's values are read-only.
         self._position: Any = gui.add_vector3("Goal (m)", (0.0, 0.0, 0.0), step=0.01)
         self._angles: Any = gui.add_vector3("Roll, pitch, yaw (deg)", (0.0, 0.0, 0.0), step=1.0)
+        self._position.precision, self._angles.precision = _DECIMALS
         self._tool_too = gui.add_checkbox(
             "Goal for the end-effector",
             initial_value=True,
@@ -413,7 +417,9 @@ class GoalEditor:
     def _on_gizmo_moved(self, name: str, pose: Array) -> None:
         if name not in self._gizmos or not np.all(np.isfinite(pose)):
             return  # The gizmo of an earlier robot, or a pose that is not finite.
-        self._set_goal(name, pose)
+        # What the fields show is what is sent.
+        goal = Goal.from_rpy(*_fields_of(pose))
+        self._set_goal(name, np.concatenate([goal.position, goal.quaternion]))
         self._show_fields()
 
     def _on_fields_typed(self, position: tuple[float, ...], angles: tuple[float, ...]) -> None:
@@ -485,11 +491,7 @@ class GoalEditor:
     def _show_fields(self) -> None:
         pose = self._poses.get(_gizmo_of(self._parts.shown))
         if pose is not None:
-            x, y, z = (round(float(each), 4) for each in pose[:3])
-            self._position.value = (x, y, z)
-            turns = np.degrees(rpy_from_quaternion(pose[3:]))
-            roll, pitch, yaw = (round(float(each), 2) for each in turns)
-            self._angles.value = (roll, pitch, yaw)
+            self._position.value, self._angles.value = _fields_of(pose)
 
 
 class _PartMenu:
@@ -686,6 +688,16 @@ class _FinalShape:
     async def _on_field(self, event: Any) -> None:
         if event.client is not None:  # Else the page itself wrote the value.
             self._edit(self._on_change)
+
+
+def _fields_of(pose: Array) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """Return the position, m, and roll, pitch and yaw, deg, of a pose (7,), as they are shown."""
+    numbers = (pose[:3], np.degrees(rpy_from_quaternion(pose[3:])))
+    position, angles = (
+        tuple(np.round(part, digits).tolist())
+        for part, digits in zip(numbers, _DECIMALS, strict=True)
+    )
+    return position, angles
 
 
 def _links_of(goals: Mapping[Part, Goal]) -> dict[str, EndEffectorGoal]:

@@ -163,7 +163,7 @@ def farthest_flown(server: Server) -> float:
 
 def test_a_user_looks_back_at_the_last_five_minutes(server: Server, page: Page) -> None:
     last = flight(page, np.arange(0.0, 400.0, 0.5))
-    slider, back = server.gui.named("Look back (s)"), server.gui.named("Back to the present")
+    slider, back = server.gui.named("Look back to (s)"), server.gui.named("Back to the present")
     assert slider.visible
     assert not back.visible
     # The texts are drawn five times a second of wall time: a state before may be shown.
@@ -191,7 +191,7 @@ def test_a_user_looks_back_at_the_last_five_minutes(server: Server, page: Page) 
 
 def test_the_end_of_the_past_is_the_present(server: Server, page: Page) -> None:
     last = flight(page, np.arange(0.0, 10.0, 0.25))
-    slider = server.gui.named("Look back (s)")
+    slider = server.gui.named("Look back to (s)")
     slider.use(server, slider.max)
     page.update(replace(last, measured=measured(11.0, 11.0, 0.0, 0.0)), 11.0)
     assert server.scene.named("/robot").position[0] == 11.0

@@ -344,7 +344,7 @@ class Listener:
             self._statuses[key] = status
             self._reporters[key] = message.name
             self._hidden.pop(message.name, None)
-            if isinstance(status, PlannerStatus):
+            if isinstance(status, PlannerStatus) and status.state is not PlannerState.REFUSED:
                 with suppress(SpaceRobotError):  # An unreadable goal, of another package.
                     self._take_planned_goal(status)
             self._on_status(key, message.name)
@@ -367,7 +367,10 @@ class Listener:
             case (
                 PlannerStatus(state=PlannerState.REFUSED)
                 | ControllerStatus(state=ControllerState.REFUSED)
-            ) if pursued is not None and pursued.goal_id != status.goal_id:
+            ) if pursued is None or pursued.goal_id != status.goal_id:
+                if pursued is None:
+                    self._goals = {}
+                    return status
                 self._goals = dict(self._pursued_goals)
                 return replace(pursued, message=f"{pursued.message}{_REFUSED}{status.message}")
             case PlannerStatus(state=PlannerState.PLANNING):
