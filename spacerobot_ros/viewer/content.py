@@ -300,12 +300,14 @@ def joints_html(robot: RobotDescription, q: Array, qdot: Array, effort: Array) -
         effort_unit = "N" if joint.unit == "m" else "N m"
         cells.append(_value_and_limit(qdot[i], fastest[i], f"{joint.unit}/s"))
         cells.append(_value_and_limit(effort[i], strongest[i], effort_unit))
+        # Long names take several lines.
+        cells[0] = f'<div style="white-space:normal;overflow-wrap:anywhere">{name}</div>'
         rows.append("<tr>" + "".join(f"<td>{cell}</td>" for cell in cells) + "</tr>")
     titles = ("joint", "at", "in range", "rate", "effort")
     heads = "".join(f"<th>{title}</th>" for title in titles)
     if not rows:
         return padded("The robot has no joints.")
-    style = "border-spacing:4px 2px;text-align:left;white-space:nowrap;font-size:.9em"
+    style = "border-spacing:3px 2px;text-align:left;white-space:nowrap;font-size:.85em"
     table = f'<table style="{style}"><tr>{heads}</tr>{"".join(rows)}</table>'
     return padded(f'<div tabindex="0" style="overflow-x:auto">{table}</div>')
 
@@ -327,7 +329,7 @@ def _bar_html(share: float, level: int) -> str:
     place = 100 * min(1.0, max(0.0, share))
     color = _LEVEL_COLORS[level]
     return (
-        f'<div style="width:44px;height:8px;background:{_BAR_COLOR};border-radius:4px;'
+        f'<div style="width:32px;height:8px;background:{_BAR_COLOR};border-radius:4px;'
         f'position:relative"><div style="position:absolute;left:{place:.0f}%;top:-2px;width:4px;'
         f'height:12px;margin-left:-2px;background:{color};border-radius:2px"></div></div>'
     )
@@ -335,7 +337,7 @@ def _bar_html(share: float, level: int) -> str:
 
 def _value_and_limit(value: float, limit: float, unit: str) -> str:
     number = _format_decimals(value, 2)
-    return f"{number} of {limit:.3g} {unit}" if math.isfinite(limit) else f"{number} {unit}"
+    return f"{number}/{limit:.3g} {unit}" if math.isfinite(limit) else f"{number} {unit}"
 
 
 def _format_decimals(value: float, digits: int) -> str:

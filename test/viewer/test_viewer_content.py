@@ -187,8 +187,8 @@ def test_rates_and_efforts_stand_beside_their_own_limits() -> None:
     titles = re.findall("<th>(.*?)</th>", rows[1])
     for k, row in enumerate(rows[2:]):
         cells = dict(zip(titles, re.findall("<td>(.*?)</td>", row), strict=True))
-        assert cells["rate"] == f"{qdot[k]:.2f} of {rates[k]:g} rad/s"
-        assert cells["effort"] == f"{effort[k]:.2f} of {efforts[k]:g} N m"
+        assert cells["rate"] == f"{qdot[k]:.2f}/{rates[k]:g} rad/s"
+        assert cells["effort"] == f"{effort[k]:.2f}/{efforts[k]:g} N m"
 
 
 def test_errors_are_to_the_goal() -> None:
