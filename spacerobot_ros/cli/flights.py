@@ -319,7 +319,14 @@ def up_command(
     chosen = scenario_or_robot(scenario).in_real_time(rate).with_settings(settings)
     from spacerobot_ros.session.live import run_until_stopped
 
-    with viewer_if_requested(view, chosen.parameters("viewer"), namespace) as viewer:
+    mode = "real time" if rate == 1.0 else f"{rate:g} times real time"
+    shown: dict[str, Any] = {"title": f"{chosen.name}, {mode}"}
+    if view and chosen.has_goal and not chosen.goal.has_path:
+        from spacerobot_ros.viewer.state import goals_to_text
+
+        shown["scenario_goals"] = goals_to_text(chosen.goal, chosen.end_effector_goal)
+    parameters = {**shown, **chosen.parameters("viewer")}
+    with viewer_if_requested(view, parameters, namespace) as viewer:
         if viewer is not None:
             viewer.restart_within(restarts)
         recorded = run_until_stopped(

@@ -40,6 +40,9 @@ _NEAR_LIMIT_SHARE = 0.05
 _WARNING_WHEEL_SHARE, _SATURATED_WHEEL_SHARE = 0.8, 0.98
 """Shares of the largest rate of a wheel from which it is marked amber, and red."""
 
+_NEAR_CONTACT = 0.02
+"""Distance between links below which the head of the page shows it, m."""
+
 _MAX_NAME_LENGTH = 21
 
 COLORS: Mapping[Verdict, Color] = {
@@ -159,7 +162,7 @@ def status_html(
             lines.append(_line_html(f"The base drifts at {speed} and {rate}.{rearm}", 2))
         for kind, found in (("Fault", plant.faults), ("Disturbance", plant.disturbances)):
             lines.extend(_line_html(f"{kind}: {with_seconds(each)}", 1) for each in found)
-    if state.clearance is not None:
+    if state.clearance is not None and state.clearance.distance < _NEAR_CONTACT:
         level = state.clearance.level or None
         lines.append(
             _grey_out(_line_html(state.clearance.message, level), offline="plant" in state.absent)

@@ -99,11 +99,14 @@ class GoalEditor:
         self._present: tuple[Array, Array] | None = None
         self._changed_at: float | None = None
         self._origin = Origin.ROBOT
+        self._in_flight = False
+        """Whether the robot flies to the goal that is shown, whose gizmos are hidden then."""
         self._followed: object = None
         """Numbers of the goals that were last followed."""
         self._check = GoalCheck(Verdict.UNCHECKED)
         gui = server.gui
         self._none_taken = gui.add_html(hint_html("A recording takes no goals."), visible=False)
+        self._hint = gui.add_html(hint_html("Drag the arrows, or type numbers; then press Fly."))
         self._verdict = gui.add_html(check_html(self._check))
         edit = self._defer_edit
         self._parts = _PartMenu(gui, defer, edit, on_note, self._on_parts_chosen)
@@ -140,7 +143,7 @@ class GoalEditor:
     def add_tool(self, pose: Array | None) -> None:
         """Add a goal of the end-effector at a pose (7,)."""
         if pose is not None and self.placed:
-            self._add_gizmo(_TOOL_GIZMO, 0.2 * self._reach)
+            self._add_gizmo(_TOOL_GIZMO, 0.15 * self._reach)
             self._move_gizmo(_TOOL_GIZMO, pose)
             self.touch(time.monotonic())
 
@@ -169,7 +172,7 @@ class GoalEditor:
         """Set the goal to poses (7,) and the ghost to joint positions (n,)."""
         assert self._robot is not None
         if _BASE_GIZMO not in self._gizmos:
-            self._add_gizmo(_BASE_GIZMO, 0.45 * self._reach)
+            self._add_gizmo(_BASE_GIZMO, 0.3 * self._reach)
             self._ghost = RobotDrawing(
                 self._server.scene,
                 f"{_BASE_GIZMO}/ghost",
@@ -224,13 +227,13 @@ class GoalEditor:
         self._show_parts()
         self._show_fields()
         self._changed_at = now
-        self._origin = Origin.SENT
+        self.note_sent()
         if self._check.verdict is not Verdict.UNCHECKED:
             self.show_check(GoalCheck(Verdict.PLANNING, "Another goal has been sent."))
 
     def note_sent(self) -> None:
         """Note that the goal shown has been sent."""
-        self._origin = Origin.SENT
+        self._origin, self._hint.visible = Origin.SENT, False
 
     @property
     def shows_sent_goal(self) -> bool:
@@ -245,6 +248,7 @@ class GoalEditor:
     def _defer_edit(self, act: Callable[[], None]) -> None:
         def edit() -> None:
             self._origin = Origin.USER
+            self._hint.visible = False
             act()
 
         self._defer(edit)
@@ -293,11 +297,19 @@ class GoalEditor:
             and max(turned, bent) < _HIDDEN_GHOST_DISTANCE
         )
 
+    def show_flight(self, *, flies: bool) -> None:
+        """Hide the gizmos while the robot flies to the goal that is shown."""
+        in_flight = flies and self.shows_sent_goal
+        if in_flight != self._in_flight:
+            self._in_flight = in_flight
+            self._show_parts()
+
     def show_tool(self, *, there: bool) -> None:
         """Show or hide the controls of the end-effector."""
         self._tool_too.visible = there
         if _TOOL_GIZMO in self._gizmos:
-            self._gizmos[_TOOL_GIZMO].visible = there and self._tool_too.value
+            shown = there and self._tool_too.value and not self._in_flight
+            self._gizmos[_TOOL_GIZMO].visible = shown
 
     def offer_end_effectors(self, links: Iterable[str]) -> None:
         """Offer goals of the links for which the planner takes some."""
@@ -320,6 +332,7 @@ class GoalEditor:
 
     def show(self, *, visible: bool) -> None:
         """Show or hide all controls: a replay takes no goals."""
+        self._hint.visible = visible and self._origin is Origin.ROBOT
         fields = (self._verdict, self._position, self._angles, self._to_robot)
         for handle in (*fields, *self._gizmos.values()):
             handle.visible = visible
@@ -469,7 +482,7 @@ class GoalEditor:
             return
         name = _link_gizmo(link)
         if name not in self._gizmos:
-            self._add_gizmo(name, 0.25 * self._reach)
+            self._add_gizmo(name, 0.18 * self._reach)
             self._gizmos[name].visible = False
         self._move_gizmo(name, self._kinematics.link_in_world(link, *self._present))
 
@@ -479,13 +492,14 @@ class GoalEditor:
             gizmo = self._gizmos.get(_link_gizmo(link))
             if gizmo is not None:
                 asked = self._parts.asked(link)
-                gizmo.visible = asked is not RequestedPart.NOTHING
+                gizmo.visible = asked is not RequestedPart.NOTHING and not self._in_flight
                 gizmo.disable_rotations = asked is RequestedPart.POSITION
         base = self._gizmos.get(_BASE_GIZMO)
         if base is not None:
             # Its node stays visible, because the ghost hangs on it.
             free = self._parts.asked(BASE_GOAL_KEY) is RequestedPart.NOTHING
-            base.disable_axes = base.disable_sliders = base.disable_rotations = free
+            hidden = free or self._in_flight
+            base.disable_axes = base.disable_sliders = base.disable_rotations = hidden
         self._angles.visible = self._parts.asked(self._parts.shown) is not RequestedPart.POSITION
 
     def _show_fields(self) -> None:

@@ -19,6 +19,7 @@ from spacerobot_ros.errors import GoalError, ParameterError
 from spacerobot_ros.model.description import Array, RobotDescription
 from spacerobot_ros.model.kinematics import ForwardKinematics
 from spacerobot_ros.model.thrusters import ThrusterTable
+from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.core.goal import Tolerance
 from spacerobot_ros.simulation.faults import FAULT_KINDS, FaultTargets
 from spacerobot_ros.viewer import content, scene
@@ -35,6 +36,7 @@ from spacerobot_ros.viewer.state import (
     Request,
     SeekAction,
     StackState,
+    goals_from_text,
 )
 
 if TYPE_CHECKING:
@@ -71,9 +73,18 @@ class ButtonPanel:
     """Buttons whose requests the stack carries out at once."""
 
     def __init__(
-        self, gui: viser.GuiApi, defer: Defer, act: RequestAction, fly: Callable[[], None]
+        self,
+        gui: viser.GuiApi,
+        defer: Defer,
+        act: RequestAction,
+        fly: Callable[[], None],
+        scenario_goals: Mapping[Part, Goal],
     ) -> None:
         self._fly = gui.add_button("Fly", color="green", hint="Send the goal that is shown.")
+        self._has_scenario_goals = bool(scenario_goals)
+        self._fly_scenario = gui.add_button(
+            "Fly the scenario's goal", color="teal", visible=self._has_scenario_goals
+        )
         self._goal = gui.add_button_group(
             "Goal", ("Abort goal",), hint="Give the goal up; the joints brake, the stack goes on."
         )
@@ -88,6 +99,10 @@ class ButtonPanel:
         async def _(event: Any) -> None:
             defer(fly)
 
+        @self._fly_scenario.on_click
+        async def _(event: Any) -> None:
+            defer(lambda: act(FlyAction(scenario_goals)))
+
         for group in (self._goal, self._plant, self._time):
 
             @group.on_click
@@ -99,6 +114,7 @@ class ButtonPanel:
         """Show or hide the buttons."""
         for handle in (self._fly, self._goal, self._plant, self._time):
             handle.visible = visible
+        self._fly_scenario.visible = visible and self._has_scenario_goals
 
 
 class TimeLine:
@@ -596,7 +612,8 @@ class Page:
         gui.configure_theme(**self._theme_options(dark=self._config.dark))
         # Buttons come first, so that a growing status text does not move them under the mouse.
         self._time_line = TimeLine(gui, defer, self._request)
-        self._buttons = ButtonPanel(gui, defer, self._request, self._fly)
+        goals = goals_from_text(self._config.scenario_goals)
+        self._buttons = ButtonPanel(gui, defer, self._request, self._fly, goals)
         self._look_back = LookBack(gui, defer)
         self._status = gui.add_html(content.status_html(StackState()))
         self._bar: Any = gui.add_progress_bar(0.0, visible=False)
@@ -876,6 +893,7 @@ class Page:
         self.faults.show(state)
         self._plots.show_budget(shown)
         self._log.draw()
+        self.editor.show_flight(flies=content.time_to_go(state) is not None)
         has_tool = content.has_tool(state)
         if has_tool and state.measured is not None and not self.editor.has_tool:
             self.editor.add_tool(state.tool)

@@ -438,7 +438,7 @@ def test_long_names_of_joints_have_room() -> None:
     assert f'title="{long[0]}">{short[0]}<' in table
 
 
-def test_the_clearance_and_its_links_are_shown() -> None:
+def test_a_small_clearance_and_its_links_are_shown() -> None:
     links = LinkPair("left <arm>", "right")
     apart = content.status_html(replace(STATE, clearance=ClearanceStatus(0.0123, links, 4.0)))
     assert escape("Links 'left <arm>' and 'right' are 12.3 mm apart.") in apart
@@ -446,7 +446,9 @@ def test_the_clearance_and_its_links_are_shown() -> None:
     deep = content.status_html(replace(STATE, clearance=ClearanceStatus(-0.2, links, 4.0)))
     assert f'#d23c3c);font-weight:600;margin:2px 0">{escape("Links")}' in deep
     assert escape("and 'right' touch, 0.2 m deep.") in deep
-    gone = replace(STATE, clearance=ClearanceStatus(0.1, links, 4.0), absent=frozenset({"plant"}))
+    far = content.status_html(replace(STATE, clearance=ClearanceStatus(0.06, links, 4.0)))
+    assert "apart" not in far, "it is no news"
+    gone = replace(STATE, clearance=ClearanceStatus(0.01, links, 4.0), absent=frozenset({"plant"}))
     assert 'opacity:.75"><div style="margin:2px 0">Links' in content.status_html(gone)
 
 

@@ -128,7 +128,7 @@ class ViewerNode(FlightNode):
         """Start the page and subscribe."""
         config = self.config
         require_viser()
-        self._server = start_server(config.host, config.port)
+        self._server = start_server(config.host, config.port, config.title)
         self.url = url_of(self._server)
         if not is_loopback(config.host):
             self.get_logger().warning(
@@ -429,7 +429,7 @@ class ViewerNode(FlightNode):
             goals, until = self._goals_to_send
             topics = [self._shape_topic, *(self._goal_topics[part] for part in goals)]
             # A node that has just started is discovered before its subscriptions are matched.
-            met = all(
+            met = self._count_readers(goals) > 0 and all(
                 topic.get_subscription_count() >= self.count_subscribers(topic.topic_name)
                 for topic in topics
             )
@@ -450,6 +450,14 @@ class ViewerNode(FlightNode):
                 self._unanswered_goal = None
                 self._answer("No planner or controller has answered the goal: send it again.", 2)
 
+    def _count_readers(self, goals: Mapping[Part, Goal]) -> int:
+        """Return how many planners and controllers hear a goal, at most."""
+        # Where this node hears the goal too, one of the readers is its own.
+        return max(
+            self._goal_topics[part].get_subscription_count() - (part in _PARTS_WITH_RECEIVED_GOALS)
+            for part in goals
+        )
+
     def _send(self, goals: Mapping[Part, Goal]) -> None:
         # Statuses name a goal by its stamp, which is therefore unique among all viewers.
         self._sent += 1
@@ -458,14 +466,10 @@ class ViewerNode(FlightNode):
         # An empty message resets the joint positions that another goal may have required.
         names = () if self._robot is None else self._robot.joint_names
         self._shape_topic.publish(shape_message(next(iter(goals.values())), names))
-        readers = 0
         for part, goal in goals.items():
             aim = goal.end_effectors[0].as_goal() if goal.end_effectors else goal
             self._goal_topics[part].publish(goal_message(aim, self.config.world_frame, time_ns))
-            # Where this node hears the goal too, one of the readers is its own.
-            own = 1 if part in _PARTS_WITH_RECEIVED_GOALS else 0
-            readers = max(readers, self._goal_topics[part].get_subscription_count() - own)
-        if not readers:
+        if not self._count_readers(goals):
             self._answer("No planner or controller takes the goal: none is running.", 2)
         else:
             self._answer("Goal sent.")
