@@ -484,11 +484,12 @@ class _Plot:
         """Return times, curves, their limits, and an upright line at a time, s."""
         rows = np.stack(self.history.arrays(), axis=1)
         rows[:, 1:] = np.maximum(rows[:, 1:], self._least)
-        line = np.full(len(rows), np.nan)
+        line = np.full(len(rows), -1.0)  # Below the axis.
         if time_s is not None:
             at = int(np.searchsorted(rows[:, 0], time_s, "right"))
             row = np.append(time_s, rows[max(at - 1, 0), 1:])
-            rows, line = np.insert(rows, [at, at], row, axis=0), np.insert(line, [at, at], (0, 1))
+            rows = np.insert(rows, [at] * 3, row, axis=0)
+            line = np.insert(line, [at] * 3, (-1.0, 1.0, -1.0))
         curves = np.ascontiguousarray(rows.T)
         lines = [np.full(len(rows), limit) for limit in limits[: len(self.names)]]
         # A limit that is not known is hidden behind its curve.

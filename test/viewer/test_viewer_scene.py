@@ -241,8 +241,8 @@ def test_each_link_with_a_goal_has_a_plot_of_its_own(server: Any) -> None:
     # Tolerances, and an upright line at the time that is looked back to.
     plots.draw(Tolerance(0.02, 0.005), 2.5)
     times, _, _, near, turned, line = numbers("base")
-    assert (times, near, turned) == ([2.5, 2.5, 3.0], [20.0] * 3, [5.0] * 3)
-    assert line[:2] == [0.0, 1.0]
+    assert (times, near, turned) == ([2.5, 2.5, 2.5, 3.0], [20.0] * 4, [5.0] * 4)
+    assert line == [-1.0, 1.0, -1.0, -1.0]
     handle = plots._errors["base"].handle
     assert [axis["scale"] for axis in handle.axes[1:]] == ["mm", "mrad"]
     # A logarithmic axis begins at a micrometre.
