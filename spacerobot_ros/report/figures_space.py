@@ -14,8 +14,11 @@ from spacerobot_ros.flight.series import Signal
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.planning import PoseError
 from spacerobot_ros.report.figures import (
+    BASE_COLOUR,
     GHOST_COLOUR,
+    HAND_COLOUR,
     PALETTE,
+    PLANNED_COLOUR,
     SECONDARY_COLOUR,
     TEXT_COLOUR,
     TRACE_TIME_SLICES,
@@ -197,10 +200,9 @@ def _round_length(longest: float) -> float:
     return max(step * power for step in (1, 2, 5) if step * power <= longest * (1 + 1e-9))
 
 
-_PLANNED_COLOUR, _TOOL_COLOUR = PALETTE[1], PALETTE[4]
-_LINK_COLOURS = (_TOOL_COLOUR, *PALETTE[2:4], *PALETTE[5:])
+_LINK_COLOURS = (HAND_COLOUR, PALETTE[1], *PALETTE[5:])
 
-_FLIGHT_COLOURS = (PALETTE[0], PALETTE[2], PALETTE[5], *PALETTE[6:])
+_FLIGHT_COLOURS = (BASE_COLOUR, PALETTE[1], *PALETTE[5:])
 """Colours of compared flights; the first colour is for the flight of the report."""
 
 
@@ -223,14 +225,14 @@ def path_figure(flight: FlightReport, beside: Sequence[FlightReport] = ()) -> Re
     names = [each.label for each in flown] if beside else ["base"]
     keys = [legend_entry(tint, name) for tint, name in zip(tints, names, strict=True)]
     if shows_tool:
-        paths.append((flight.tool.values[:, :3], _TOOL_COLOUR))
-        keys.append(legend_entry(_TOOL_COLOUR, "end-effector"))
+        paths.append((flight.tool.values[:, :3], HAND_COLOUR))
+        keys.append(legend_entry(HAND_COLOUR, "end-effector"))
     for number, (link, poses) in enumerate(flight.link_poses.items()):
         tint = _LINK_COLOURS[number % len(_LINK_COLOURS)]
         paths.append((poses.values[:, :3], tint))
         keys.append(legend_entry(tint, short(link)))
     if flight.planned:
-        keys.append(legend_entry(_PLANNED_COLOUR, "planned", DASHES))
+        keys.append(legend_entry(PLANNED_COLOUR, "planned", DASHES))
     everything = np.concatenate(
         [path for path, _ in paths] + flight.planned + [goal[np.newaxis] for goal in goals]
     )
@@ -254,7 +256,7 @@ def path_figure(flight: FlightReport, beside: Sequence[FlightReport] = ()) -> Re
             axes.plot(
                 planned[:, i],
                 planned[:, j],
-                color=_PLANNED_COLOUR,
+                color=PLANNED_COLOUR,
                 lw=1.3,
                 ls=(0, DASHES),
                 zorder=3,
