@@ -243,8 +243,7 @@ def test_goals_in_flight_that_are_refused_typed_or_seen_by_a_page_that_is_loaded
         page.type("Goal (m)", [0.1, 0.0, 0.05])
         page.wait_for_text("Goal reachable", without="being moved")
         page.press("Fly")
-        looked.window.wait_for("document.body.innerText.includes('executing')")
-        page.wait_for_text("executing", "s to go")
+        page.wait_for_text("The goal is accepted.", "executing", "s to go")
         # A page that is loaded again, or by somebody else, shows the flight as it is.
         again = Looked(looked.window, up.url)
         again.page.wait_for_text("executing", "s to go", "base is ", "(tolerance 20 mm, 60 mrad)")
