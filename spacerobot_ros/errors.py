@@ -30,6 +30,21 @@ def sentence_case(text: str) -> str:
     return text[:1].upper() + text[1:]
 
 
+def quantity(value: float, unit: str) -> str:
+    """Return a number for people: three digits, and of a rounding error that it is one.
+
+    m and rad, also in m/s and rad/s, have prefixes: ``1.38 mm``, ``< 1 µrad``.
+    """
+    size = abs(value)
+    if not unit.startswith(("m", "rad")):
+        return f"{value:.3g} {unit}" if size >= 1e-9 or not size else f"< 1e-9 {unit}"
+    if 0 < size < 1e-6:
+        return f"< 1 µ{unit}"
+    milli, micro = size < 0.1, size < 1e-4
+    factor, prefix = (1e6, "µ") if micro else (1e3, "m") if milli else (1.0, "")
+    return f"{factor * value:.3g} {prefix if size else ''}{unit}"
+
+
 class SpaceRobotError(Exception):
     """Base of all errors of this package; the message is one sentence for the user.
 

@@ -78,7 +78,7 @@ _SCENARIO_KEYS = (
 
 _LONGEST_TF_PERIOD = 0.1  # wall s
 
-_OTHER_GOAL = " (flown to another goal)"
+_OTHER_GOAL = "Flown to another goal than the scenario's"
 
 
 @dataclass(frozen=True)
@@ -436,9 +436,8 @@ class Scenario:
         return made.described_for_other_goal() if self.has_goal else made
 
     def described_for_other_goal(self) -> Scenario:
-        """Return the scenario, its description with the remark that another goal was flown to."""
-        text = self.description.removesuffix(_OTHER_GOAL)
-        return replace(self, description=text and text + _OTHER_GOAL)
+        """Return the scenario with the description that another goal was flown to."""
+        return replace(self, description=self.description and _OTHER_GOAL)
 
     def with_end_effectors(
         self, goals: Sequence[EndEffectorGoal], base: frozenset[Controlled] = frozenset()

@@ -33,6 +33,7 @@ from spacerobot_ros.cli.options import (
     write_json,
 )
 from spacerobot_ros.cli.terminal import display, exit_if_terminated, fail
+from spacerobot_ros.errors import quantity
 from spacerobot_ros.termination import termination
 
 if TYPE_CHECKING:
@@ -136,7 +137,7 @@ def run_command(
     if report is not None:
         _write_report(path, report)
     if not result.succeeded:
-        fail(result.summary["verdict"])
+        fail()
 
 
 def _write_report(bag: Path, html: Path) -> None:
@@ -168,12 +169,12 @@ def _summary_lines(summary: dict[str, Any]) -> list[str]:
     position, attitude = summary["position_error_m"], summary["attitude_error_rad"]
     beside = turned = ""
     if position is not None and attitude is not None:
-        beside = f", {position:.3g} m from the goal{_judged(summary, 'position', 'm')}"
+        beside = f", {quantity(position, 'm')} from the goal{_judged(summary, 'position', 'm')}"
         turned = (
-            f", {attitude:.3g} rad = {math.degrees(attitude):.3g} deg from the goal"
+            f", {quantity(attitude, 'rad')} = {math.degrees(attitude):.3f} deg from the goal"
             f"{_judged(summary, 'attitude', 'rad')}"
         )
-    drift = "not explained by thrusters: at most" if summary["has_thrust"] else "changed by at most"
+    drift = "not explained by thrusters:" if summary["has_thrust"] else "changed by"
     return [
         f"{summary['scenario']}, {summary['method']}: {summary['verdict']}",
         f"position    ({numbers(summary['final_position_m'])}) m{beside}",
@@ -184,8 +185,8 @@ def _summary_lines(summary: dict[str, Any]) -> list[str]:
         f"{summary['corrections']} correction(s), planned in {summary['plan_time_s']:.3f} s",
         f"flight      {summary['ticks']} ticks in {summary['wall_time_s']:.2f} s: "
         f"{summary['ticks_per_s']:.0f} ticks/s, {summary['real_time_factor']:.0f} times real time",
-        f"momentum    {drift} {summary['linear_momentum_drift']:.1e} kg m/s and "
-        f"{summary['angular_momentum_drift']:.1e} kg m^2/s",
+        f"momentum    {drift} {quantity(summary['linear_momentum_drift'], 'kg m/s')} and "
+        f"{quantity(summary['angular_momentum_drift'], 'kg m^2/s')}",
         *_propellant_line(summary),
         *_capture_line(summary),
         *_clearance_line(summary),
@@ -204,7 +205,7 @@ def _judged(summary: dict[str, Any], part: str, unit: str) -> str:
     if part in summary["not_controlled"]:
         return " (not controlled)"
     tolerance = summary[f"{part}_tolerance_{unit}"]
-    return "" if tolerance is None else f" (tolerance {tolerance:.3g} {unit})"
+    return "" if tolerance is None else f" (tolerance {quantity(tolerance, unit)})"
 
 
 def _end_effector_line(summary: dict[str, Any]) -> list[str]:
@@ -224,11 +225,11 @@ def _end_effector_line(summary: dict[str, Any]) -> list[str]:
 
 def _end_effector_errors(summary: dict[str, Any], distance: float, angle: float | None) -> str:
     """Return the errors of an end-effector with their tolerances; None: its attitude is free."""
-    error, limit = f"{distance:.3g} m", summary["position_tolerance_m"]
-    limits = "" if limit is None else f"{limit:.3g} m"
+    error, limit = quantity(distance, "m"), summary["position_tolerance_m"]
+    limits = "" if limit is None else quantity(limit, "m")
     if angle is not None:
-        error += f" and {angle:.3g} rad"
-        limits += f", {summary['attitude_tolerance_rad']:.3g} rad" if limits else ""
+        error += f" and {quantity(angle, 'rad')}"
+        limits += f", {quantity(summary['attitude_tolerance_rad'], 'rad')}" if limits else ""
     return f"{error} from its goal" + (limits and f" (tolerance {limits})")
 
 
@@ -250,7 +251,8 @@ def _clearance_line(summary: dict[str, Any]) -> list[str]:
         return []
     first, second = summary["clearance_links"]
     distance, time = summary["clearance_m"], summary["clearance_time_s"]
-    fact = f"come within {distance:.3g} m" if distance > 0 else f"touch, {-distance:.3g} m deep,"
+    apart = quantity(abs(distance), "m")
+    fact = f"come within {apart}" if distance > 0 else f"touch, {apart} deep,"
     return [f"clearance   '{first}' and '{second}' {fact} at {time:.6g} s"]
 
 
@@ -316,7 +318,14 @@ def up_command(
     chosen = scenario_or_robot(scenario).in_real_time(rate).with_settings(settings)
     from spacerobot_ros.session.live import run_until_stopped
 
-    with viewer_if_requested(view, chosen.parameters("viewer"), namespace) as viewer:
+    mode = "real time" if rate == 1.0 else f"{rate:g} times real time"
+    shown: dict[str, Any] = {"title": f"{chosen.name}, {mode}"}
+    if view and chosen.has_goal and not chosen.goal.has_path:
+        from spacerobot_ros.viewer.state import goals_to_text
+
+        shown["scenario_goals"] = goals_to_text(chosen.goal, chosen.end_effector_goal)
+    parameters = {**shown, **chosen.parameters("viewer")}
+    with viewer_if_requested(view, parameters, namespace) as viewer:
         if viewer is not None:
             viewer.restart_within(restarts)
         recorded = run_until_stopped(

@@ -478,5 +478,5 @@ def write_json(path: Path, content: Any, indent: int | None = 2) -> None:
 
 
 def numbers(values: Iterable[float], digits: int = 5) -> str:
-    """Return numbers as text, with ``digits`` decimals."""
-    return ", ".join(f"{x:.{digits}f}" for x in values)
+    """Return numbers as text, with ``digits`` decimals; a rounded zero has no sign."""
+    return ", ".join(f"{round(x, digits) + 0.0:.{digits}f}" for x in values)

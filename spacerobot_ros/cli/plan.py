@@ -26,7 +26,7 @@ from spacerobot_ros.cli.options import (
     write_json,
 )
 from spacerobot_ros.cli.terminal import display, fail
-from spacerobot_ros.errors import ParameterError, SpaceRobotError
+from spacerobot_ros.errors import ParameterError, SpaceRobotError, quantity
 from spacerobot_ros.files import write_output
 
 if TYPE_CHECKING:
@@ -124,7 +124,8 @@ def plan_command(
 
 def _distance_from(goal: Goal, trial: PlanEvaluation) -> str:
     if not goal.end_effectors:
-        return f"{trial.error.angle:.3g} rad and {trial.error.distance:.3g} m from the goal"
+        angle, distance = quantity(trial.error.angle, "rad"), quantity(trial.error.distance, "m")
+        return f"{angle} and {distance} from the goal"
     from spacerobot_ros.planning.execution.status import describe_remaining_error
 
     return describe_remaining_error(trial.error, trial.controls - {"shape"})

@@ -1,14 +1,16 @@
-"""The terminal of a command: exit codes, one-sentence messages of failures, and progress bars."""
+"""The terminal of a command: exit codes, one-sentence messages of failures, and progress."""
 
 from __future__ import annotations
 
 import errno
+import shutil
 import sys
 import threading
+import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from enum import IntEnum
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING, NoReturn
 
 import click
 
@@ -96,92 +98,82 @@ def sentences() -> Iterator[None]:
         sys.exit(ExitCode.BAD_INPUT)
 
 
-_BAR_STEPS = 1000
+_PERIOD, _PERIOD_WITHOUT_TERMINAL = 1.0, 10.0
+"""Wall time between two lines on long work, s."""
 
 
 class Display:
-    """Progress bars: one for the search, with the best result so far, then one for the flight.
+    """A line on long work: what is done, for how long, and the best result so far.
 
-    Searches report in threads of their own.
+    On a terminal each line replaces the one before. Searches report in threads of their own, and
+    may be silent for long: the line is written by a thread.
 
     Parameters
     ----------
     label
         Name of the scenario or robot.
-    visible
-        Whether anything is shown.
+    period
+        Wall time between two lines, and before the first, s; None: one second, and ten if standard
+        error is no terminal.
     """
 
-    def __init__(self, label: str, *, visible: bool) -> None:
-        self._label, self._visible = label, visible
-        self._bar: Any = None
-        self._flies = False
+    def __init__(self, label: str, period: float | None = None) -> None:
+        self._label, self._terminal = label, sys.stderr.isatty()
+        usual = _PERIOD if self._terminal else _PERIOD_WITHOUT_TERMINAL
+        self._period = usual if period is None else period
+        self._work, self._course = "preparing", ""
+        self._began, self._ended = time.monotonic(), threading.Event()
         self._lock = threading.Lock()
+        self._thread = threading.Thread(target=self._write_lines, daemon=True)
+        self._thread.start()
 
     def search(self, progress: SearchProgress) -> None:
         """Show the progress of a search before the flight."""
-        with self._lock:
-            if self._flies or not self._visible:
-                return
-            if self._bar is None or progress.starts < self._bar.pos:
-                self._begin_bar(f"planning {self._label}", progress.max_starts)
-            self._bar.length = progress.max_starts
-            self._bar.update(progress.starts - self._bar.pos, progress.message)
-            self._bar.render_progress()
+        if self._work != "flying":
+            self._work, self._course = "planning", f": {progress.message}"
 
     def fly(self, now: float, end: float) -> None:
         """Show simulated time against the end of the schedule, s; 0: there is none yet."""
-        with self._lock:
-            if not self._visible or end <= 0.0:
-                return
-            if not self._flies:
-                self._flies = True
-                self._begin_bar(f"flying {self._label}", _BAR_STEPS)
-            steps = max(0, round(_BAR_STEPS * min(now / end, 1.0)) - self._bar.pos)
-            self._bar.update(steps, f"{now:.1f} of {end:.1f} s")
+        if end > 0.0:
+            self._work, self._course = "flying", f": {now:.1f} of {end:.1f} s"
 
     def show_line(self, message: str) -> None:
-        """Print a line above the progress bar."""
+        """Print a line that stays, if standard error is a terminal."""
         with self._lock:
-            if self._visible:
-                self._finish_bar()
-                click.echo(message, err=True)
+            if self._terminal:
+                click.echo(f"{_CLEAR}{message}", err=True)
 
     def close(self) -> None:
-        """Finish the progress bar."""
-        with self._lock:
-            self._finish_bar()
+        """End the lines; the last one on a terminal is cleared."""
+        self._ended.set()
+        self._thread.join()
 
-    def _begin_bar(self, label: str, length: int) -> None:
-        self._finish_bar()
-        self._bar = click.progressbar(
-            length=length,
-            label=label,
-            file=sys.stderr,
-            show_eta=False,
-            show_percent=False,
-            item_show_func=lambda item: item or "",
-            bar_template="%(label)s  [%(bar)s]  %(info)s",
-            width=24,
-        )
-        self._bar.__enter__()
+    def _write_lines(self) -> None:
+        written = False
+        while not self._ended.wait(self._period):
+            elapsed = time.monotonic() - self._began
+            line = f"{self._work} {self._label} for {elapsed:.0f} s{self._course}"
+            with self._lock, suppress(OSError):  # The terminal may be closed.
+                if self._terminal:
+                    width = shutil.get_terminal_size().columns - 1
+                    line = f"{_CLEAR}{line[:width]}"
+                click.echo(line, err=True, nl=not self._terminal)
+                written = True
+        if written and self._terminal:
+            click.echo(_CLEAR, err=True, nl=False)
 
-    def _finish_bar(self) -> None:
-        bar, self._bar = self._bar, None
-        if bar is not None:
-            bar.__exit__(None, None, None)
+
+_CLEAR = "\r\x1b[K"
+"""Clears the line of a terminal that was written last."""
 
 
 @contextmanager
 def display(label: str) -> Iterator[Display]:
-    """Show progress bars during a block; without a terminal they are not imported."""
-    shown = Display(label, visible=sys.stderr.isatty())
-    try:
-        if not sys.stderr.isatty():
-            yield shown
-            return
-        from spacerobot_ros.planning.core.progress import report_progress
+    """Show the progress of long work during a block."""
+    from spacerobot_ros.planning.core.progress import report_progress
 
+    shown = Display(label)
+    try:
         with report_progress(shown.search, shown.show_line):
             yield shown
     finally:

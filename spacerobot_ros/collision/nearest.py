@@ -15,6 +15,7 @@ import numpy as np
 
 from spacerobot_ros.collision.distances import ExactDistances
 from spacerobot_ros.collision.geometry import BasePoses, CollisionGeometry, LinkPair
+from spacerobot_ros.errors import quantity
 from spacerobot_ros.model.description import Array
 
 _DISTANCE_MARGIN = 1e-9
@@ -131,8 +132,8 @@ class Approach:
             else f" near {np.round(self.place_on_obstacle, 3).tolist()} m"
         )
         if self.distance <= 0:
-            return f"{self.links.subject} touch, {-self.distance:.3g} m deep{where}"
-        return f"{self.links.subject} come within {self.distance:.3g} m{where}"
+            return f"{self.links.subject} touch, {quantity(-self.distance, 'm')} deep{where}"
+        return f"{self.links.subject} come within {quantity(self.distance, 'm')}{where}"
 
 
 @dataclass(frozen=True)

@@ -363,7 +363,7 @@ class PlantListener:
         """Message on why goals are refused at present; empty: goals are accepted."""
         status = self.status
         if status.latched_fault:
-            return f"The plant is latched: {status.latched_fault}; call '{self._name}/rearm' first."
+            return f"'{self._name}' is latched: {status.latched_fault}; rearm it first."
         if status.state is PlantState.FAILED:
             return f"The plant has failed: {status.message}"
         return ""
@@ -393,7 +393,8 @@ class PlantListener:
         changes: list[PlantStopped | PlantChange] = []
         if self.refusal_of_goals:
             if not was_blocked or status.latched_fault != before.latched_fault:
-                changes.append(PlantStopped(status.message))
+                fault = status.latched_fault
+                changes.append(PlantStopped(f"{fault}." if fault else status.message))
             return changes
         if not heard:
             return changes

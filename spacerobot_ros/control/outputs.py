@@ -27,7 +27,7 @@ from spacerobot_ros.control.state import (
     Reference,
     TargetNotSetError,
 )
-from spacerobot_ros.errors import ParameterError
+from spacerobot_ros.errors import ParameterError, quantity
 from spacerobot_ros.model.description import Array, RobotDescription, plane_normal
 from spacerobot_ros.model.kinematics import link_quaternion
 from spacerobot_ros.model.space_robot import SpaceRobot
@@ -132,8 +132,8 @@ class OutputDistance:
     joints: float
 
     def __str__(self) -> str:
-        parts = ((self.position, " m"), (self.attitude, " rad"), (self.joints, " at the joints"))
-        return ", ".join(f"{value:.3g}{unit}" for value, unit in parts if not math.isnan(value))
+        parts = ((self.position, "m"), (self.attitude, "rad"), (self.joints, "at the joints"))
+        return ", ".join(quantity(*part) for part in parts if not math.isnan(part[0]))
 
 
 def default_selection(description: RobotDescription, end_effector_link: str) -> OutputSelection:

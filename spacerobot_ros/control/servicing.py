@@ -19,7 +19,7 @@ from spacerobot_ros.control.controller import CoordinatedController
 from spacerobot_ros.control.detumbling import Detumbling, shortest_detumbling
 from spacerobot_ros.control.state import ControlState, Reference
 from spacerobot_ros.control.target_motion import TorqueFreeMotion
-from spacerobot_ros.errors import ParameterError, PlanningError, RobotDescriptionError
+from spacerobot_ros.errors import ParameterError, PlanningError, RobotDescriptionError, quantity
 from spacerobot_ros.events import Event, EventKind
 from spacerobot_ros.model.description import Array, RobotDescription
 from spacerobot_ros.model.grasp import (
@@ -202,8 +202,8 @@ class ApproachTask:
         far = self._out_of_reach
         assert far is not None
         return (
-            f"{far.distance:.3g} m, {far.angle:.3g} rad, {far.speed:.3g} m/s and {far.rate:.3g} "
-            "rad/s from the grapple frame"
+            f"{quantity(far.distance, 'm')}, {quantity(far.angle, 'rad')}, "
+            f"{quantity(far.speed, 'm/s')} and {quantity(far.rate, 'rad/s')} from the grapple frame"
         )
 
     def _ended(self, why: str) -> TaskProgress:
@@ -311,14 +311,15 @@ class DetumblingTask:
             return TaskProgress(
                 TaskState.FAILED,
                 f"The robot is not at rest after {limit:g} s: it still turns at "
-                f"{self._fastest:.3g} rad/s, its centre of mass moves at {speed:.3g} m/s.",
+                f"{quantity(self._fastest, 'rad/s')}, its centre of mass moves at "
+                f"{quantity(speed, 'm/s')}.",
             )
         return _ACTIVE
 
     @property
     def message(self) -> str:
         """Sentence on the motion that is left."""
-        return f"Detumbling: base and joints turn at {self._fastest:.3g} rad/s."
+        return f"Detumbling: base and joints turn at {quantity(self._fastest, 'rad/s')}."
 
     def _begin(self, time: float, state: ControlState, controller: CoordinatedController) -> None:
         limit = self.config.detumble.grapple_torque_limit

@@ -11,6 +11,7 @@ import os
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+from spacerobot_ros.errors import quantity
 from spacerobot_ros.flight.data import FlightData
 from spacerobot_ros.model.rotations import rotvec_from_quaternion
 
@@ -27,7 +28,7 @@ class Flight(FlightData):
         error, left = self.error, ""
         if error is not None:
             distance, angle = (
-                f"{value:.3g} {unit}" + " (not controlled)" * (part in self.not_controlled)
+                quantity(value, unit) + " (not controlled)" * (part in self.not_controlled)
                 for part, value, unit in (
                     ("position", error.distance, "m"),
                     ("attitude", error.angle, "rad"),

@@ -10,6 +10,7 @@ from spacerobot_ros.messages.layout import encode
 from spacerobot_ros.messages.statuses import StatusRecord
 from spacerobot_ros.simulation.actuators import PlantWithFaults, ThrusterPlant, thrusters_in
 from spacerobot_ros.simulation.commands import CommandSource, CommandValidator, Refusal
+from spacerobot_ros.simulation.status import latched_text
 from spacerobot_ros.simulation.time_modes import RealTime
 from spacerobot_ros.times import LATEST_NS
 
@@ -164,7 +165,7 @@ class PlantDiagnostics:
             message = "no command is in force"
         if commands.fault:
             level = _ERROR
-            message = f"Nothing moves until '~/rearm' is called: {commands.fault}."
+            message = f"{latched_text(commands.fault)}."
         elif refused and self._last_refusal:
             message = self._last_refusal
         return self._record(

@@ -72,14 +72,20 @@
       if (mark.hidden) continue;
       mark.style.left = `${x}px`;
       const wide = 6.2 * event.text.length;
+      const least = Math.min(wide, 56);
       let room = limit[event.row] - x - 14;
-      // At the right end the words stand before their mark.
-      const before = room < wide && limit[event.row] === width;
-      if (before) room = x - 14 - Math.max(earlier[k], 0);
-      mark.classList.toggle("before", before);
-      words.style.display = room < Math.min(wide, 56) ? "none" : "";
+      const roomBefore = x - 14 - Math.max(earlier[k], 0);
+      // At the right end, and where the next mark is near, the words stand before their mark.
+      const before = room < (limit[event.row] === width ? wide : least) && roomBefore > room;
+      if (before) room = roomBefore;
+      // Of marks at one place a strong one has the words, or else the last.
+      const outdone = marks.some((each, j) => j !== k && each.event.row === event.row &&
+        Math.abs(at(each.event.time) - x) < 10 &&
+        (each.event.strong === event.strong ? j > k : each.event.strong));
+      mark.classList.toggle("before", before && !outdone);
+      words.style.display = outdone || room < least ? "none" : "";
       words.style.maxWidth = `${Math.max(room, 0)}px`;
-      limit[event.row] = before ? x - 14 - Math.min(wide, room) : x - 6;
+      limit[event.row] = before && !outdone ? x - 14 - Math.min(wide, room) : x - 6;
     }
   }
 

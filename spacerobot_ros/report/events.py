@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -12,7 +11,15 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from spacerobot_ros.events import Event, EventKind
-from spacerobot_ros.report.figures import PALETTE, SECONDARY_COLOUR, TEXT_COLOUR, inches, panel
+from spacerobot_ros.report.figures import (
+    PALETTE,
+    SECONDARY_COLOUR,
+    TEXT_COLOUR,
+    fit_legend,
+    inches,
+    panel,
+)
+from spacerobot_ros.simulation.faults import with_seconds
 from spacerobot_ros.times import SECOND
 
 EVENT_STRIP_HEIGHT = 0.62
@@ -40,12 +47,9 @@ class FlightEvent:
     def text(self) -> str:
         """The event in a few words, such as ``fault on: joint_stuck elbow at 5 s``."""
         label, about = _MARKS[self.event.kind].label, self.event.about
-        details = [_TIME.sub(r"\g<0> s", about[key]) for key in _DETAIL_KEYS if about.get(key)]
+        details = [with_seconds(about[key]) for key in _DETAIL_KEYS if about.get(key)]
         return f"{label}: {', '.join(details)}" if details else label
 
-
-_TIME = re.compile(r"\b(at|until) [\d.e+-]+")
-"""A time in the line of a fault or of a disturbance, s."""
 
 _DETAIL_KEYS = (
     "fault",
@@ -97,7 +101,7 @@ _MARKS = {
     EventKind.CONTACT_ENDED: _Mark("contact over", "P", _BAD, 1, hollow=True),
     EventKind.APPROACH_STARTED: _Mark("approach", ">", _PLAIN, 1, hollow=True),
     EventKind.DETUMBLE_STARTED: _Mark("detumbling", "v", _PLAIN, 1, hollow=True),
-    EventKind.DETUMBLED: _Mark("at rest with the target", "v", _GOOD, 1),
+    EventKind.DETUMBLED: _Mark("detumbled", "v", _GOOD, 1),
     EventKind.CAPTURED: _Mark("captured", "D", _GOOD, 1),
     EventKind.RELEASED: _Mark("released", "D", _GOOD, 1, hollow=True),
     EventKind.LATCHED: _Mark("latched", "s", _BAD, 1),
@@ -150,6 +154,7 @@ _PROMINENT_KINDS = _FAULT_KINDS | {
     EventKind.GOAL_ABORTED,
     EventKind.CONTACT,
     EventKind.WHEEL_FAILED,
+    EventKind.CAPTURED,
 }
 """Kinds that are marked over the whole height of a chart."""
 
@@ -219,7 +224,7 @@ def draw_events(axes: Axes, events: Sequence[FlightEvent]) -> None:
         if kind in kinds
     ]
     if keys:
-        lane.legend(
+        legend = lane.legend(
             handles=keys,
             loc="upper left",
             bbox_to_anchor=(0.0, 0.02),
@@ -229,6 +234,7 @@ def draw_events(axes: Axes, events: Sequence[FlightEvent]) -> None:
             columnspacing=0.9,
             fontsize=7.0 if len(keys) <= 8 else 5.5,
         )
+        fit_legend(legend, figure.bbox.width - lane.bbox.x0)
 
 
 def _marker_style(mark: _Mark) -> dict[str, Any]:

@@ -21,6 +21,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.font_manager import FontProperties, findfont
+from matplotlib.legend import Legend
 from matplotlib.lines import Line2D
 from matplotlib.text import Annotation
 from matplotlib.ticker import MaxNLocator
@@ -36,8 +37,9 @@ _TOL = ("#332288", "#882255", "#999933", "#44AA99")
 PALETTE = (*_OKABE_ITO, *_TOL)
 """Colours that people with any colour vision tell apart."""
 
-GHOST_COLOUR = PALETTE[3]
-"""Colour of goals in space."""
+BASE_COLOUR, HAND_COLOUR, PLANNED_COLOUR, GHOST_COLOUR = (PALETTE[i] for i in (0, 2, 4, 3))
+"""Colours of the paths of base and end-effector, of plans, and of goals in space: blue, green,
+orange, as on the live page, and pink."""
 
 WIDTH = 9.6
 """Width of a figure of a page, inches."""
@@ -561,7 +563,7 @@ def legend_entry(tint: str, label: str, dashes: tuple[float, ...] = ()) -> Line2
 def legend_above(axes: Axes, keys: Sequence[Line2D]) -> None:
     """Add a legend above the axes, at the right."""
     if keys:
-        axes.legend(
+        legend = axes.legend(
             handles=keys,
             loc="lower right",
             bbox_to_anchor=(1.0, 0.99),
@@ -570,6 +572,17 @@ def legend_above(axes: Axes, keys: Sequence[Line2D]) -> None:
             handlelength=1.6,
             columnspacing=1.2,
         )
+        figure = axes.figure
+        assert isinstance(figure, Figure)
+        left = _LETTER_WIDTH * figure.dpi if _lettered.get() else 0.0
+        fit_legend(legend, axes.bbox.x1 - left)
+
+
+def fit_legend(legend: Legend, room: float) -> None:
+    """Make the letters of a legend smaller if it is wider than ``room``, pixels."""
+    share = room / legend.get_window_extent().width
+    for text in legend.get_texts() if share < 1.0 else ():
+        text.set_fontsize(share * float(text.get_fontsize()))
 
 
 def short(name: str) -> str:

@@ -89,7 +89,10 @@ def draw_whole_flight(
     values = np.concatenate([group.values, [g[3] for g in group.goals]])
     if group.window is not None:
         text = f"peaks of {np.abs(values).max():.3g} {group.unit} are beyond the axis"
-        axes.set_title(text, loc="right" if group.limits else "left", color=SECONDARY_COLOUR)
+        axes.text(
+            0.02, 0.97, text, transform=axes.transAxes, va="top", color=SECONDARY_COLOUR,
+            bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 1.0}, zorder=4,
+        )  # fmt: skip
         values = np.array(group.window)
     set_range(axes, values, [bound for _, bound in group.limits])
     low, high = axes.get_ylim()
@@ -170,14 +173,12 @@ def time_figure(
     caption: str,
     groups: list[TraceGroup],
     *,
-    small: bool = False,
     flights: Sequence[str] = (),
 ) -> ReportFigure | str:
     """Return a figure with a panel for each group, and close-ups of a gait of equal cycles; a
     sentence where nothing was recorded over time.
 
-    ``caption`` is its beginning. ``small``: panels are low and share a time axis; beside them are
-    the last cycles. ``flights``: labels of several flights whose traces the groups have.
+    ``caption`` is its beginning. ``flights``: labels of several flights whose traces the groups have.
     """
     if all(len(signal) < 2 for group in groups for signal in group.signals):
         return ONE_STATE_TEXT
@@ -188,15 +189,9 @@ def time_figure(
     top = 0.3 + _LABEL_HEIGHT * len(flights)
     right = room_for([name for group in groups for name in group.names])
     left = max([0.72, *(room_for(group.names) + 0.1 for group in groups if group.rows)])
-    if small:
-        rows = [[1.0] if cycles is None else [2.2, 1.0]] * len(groups)
-        low, below = 1.0 if len(groups) <= 4 else 0.75, 0.5 + lane
-        sizes = {"left": 0.85, "right": right, "gap": 0.36, "bottom": below, "top": top}
-        figure, panels = sheet(rows, [low] * len(groups), **sizes)
-    else:
-        rows, heights = _layout(groups, with_cycles=cycles is not None)
-        sizes = {"left": left, "right": right, "lane": lane, "top": top}
-        figure, panels = sheet(rows * len(groups), heights, **sizes)
+    rows, heights = _layout(groups, with_cycles=cycles is not None)
+    sizes = {"left": left, "right": right, "lane": lane, "top": top}
+    figure, panels = sheet(rows * len(groups), heights, **sizes)
     if flights:
         named = enumerate(flights)
         keys = [legend_entry(SECONDARY_COLOUR, text, flight_dashes(k)) for k, text in named]
@@ -204,23 +199,15 @@ def time_figure(
     share = min(1.0, 4 / len(groups))
     dense = []
     for number, group in enumerate(groups):
-        count = 1 if small else len(rows)
-        whole, *below_it = panels[number * count : (number + 1) * count]
+        whole, *below_it = panels[number * len(rows) : (number + 1) * len(rows)]
         dense.append(draw_whole_flight(whole[0], flight, group, share))
-        if small:
-            whole[0].set_title("" if number else group.label)
-            whole[0].set_ylabel(group.unit)
-        elif cycles is not None:
+        if cycles is not None:
             whole[0].set_title("whole flight")
             first, last = (axes for row in below_it for axes in row)
             dense.append(_draw_before_cycles(first, group, cycles))
-        if cycles is not None:
-            _draw_last_cycles(whole[1] if small else last, group, cycles)
-        for axes in whole if small and number < len(groups) - 1 else ():
-            axes.set_xlabel("")
-            axes.tick_params(labelbottom=False)
+            _draw_last_cycles(last, group, cycles)
     if flight.timed_events:
-        for axes in (each for row in (panels[-1:] if small else panels) for each in row):
+        for axes in (each for row in panels for each in row):
             draw_events(axes, flight.timed_events)
     if any(group.goals for group in groups):
         caption += "; dashed, the goal"
@@ -229,10 +216,10 @@ def time_figure(
     caption += "."
     aside = ""
     if cycles is not None:
-        where = "beside it," if small else "below, the part before them, and"
         aside += (
-            f" The flight ends with {cycles.count} equal cycles of {cycles.period:.4g} s; {where} "
-            f"the last {SHOWN_CYCLES} of them, as change since the first instant shown."
+            f" The flight ends with {cycles.count} equal cycles of {cycles.period:.4g} s; below, "
+            f"the part before them, and the last {SHOWN_CYCLES} of them, as change since the first "
+            "instant shown."
         )
     aside += f" {BAND_CAPTION}" if any(dense) else ""
     aside += f" {EVENTS_CAPTION}" if flight.timed_events else ""
@@ -503,16 +490,19 @@ def _why_no_joints(flight: FlightReport) -> str:
     return "The robot has no joints." if jointless else NO_JOINTS_TEXT
 
 
-def rates_figure(flight: FlightReport) -> ReportFigure | str:
-    """Joint velocities, one panel a joint."""
+def rates_figure(flight: FlightReport) -> ReportFigure | str | None:
+    """Joint velocities; None if all joints are wheels, whose rates are in the shape's figure."""
     if not flight.joint_names:
         return _why_no_joints(flight)
     if not len(flight.rates):
         return "The bag holds no joint velocities."
-    units = {"m": "m/s", "rad": "rad/s"}
-    groups = joint_groups(flight, flight.rates, "velocity", units, _rate_bounds, most=1)
-    caption = "Velocity of each joint"
-    return time_figure(flight, "velocities", "Joint velocities", caption, groups, small=True)
+    units, columns = {"m": "m/s", "rad": "rad/s"}, flight.shape_columns
+    groups = joint_groups(
+        flight, flight.rates, "velocity", units, _rate_bounds, JOINTS_PER_PANEL, columns
+    )
+    if not groups:
+        return None
+    return time_figure(flight, "velocities", "Joint velocities", "Velocity of each joint", groups)
 
 
 def _rate_bounds(joint: Joint) -> list[float]:

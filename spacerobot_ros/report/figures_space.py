@@ -14,8 +14,11 @@ from spacerobot_ros.flight.series import Signal
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.planning import PoseError
 from spacerobot_ros.report.figures import (
+    BASE_COLOUR,
     GHOST_COLOUR,
+    HAND_COLOUR,
     PALETTE,
+    PLANNED_COLOUR,
     SECONDARY_COLOUR,
     TEXT_COLOUR,
     TRACE_TIME_SLICES,
@@ -54,6 +57,11 @@ from spacerobot_ros.report.solids import (
 PIXELS = 420
 """Width of the picture of a robot, pixels."""
 _MAX_SHOWN_POSES = 6
+_FOOT_SHARE = 0.1
+"""Share of the height of a picture of a robot that is left for the scale bar."""
+
+_NEAR_GOAL = 2.0
+"""Largest extent of the robot and its goal for which the whole goal is shown, in robot extents."""
 
 
 def configurations_figure(flight: FlightReport) -> ReportFigure | str:
@@ -71,6 +79,10 @@ def configurations_figure(flight: FlightReport) -> ReportFigure | str:
     figure, panels = sheet(rows, [height] * len(rows), **sizes)
     points = np.concatenate([corner_points(scene) for scene in scenes])
     view = view_of(flight)
+    if (goal := goal_of_base(flight, MAX_MESH_FACES)) is not None:
+        both = np.concatenate([points, *outlines(goal)])
+        if np.ptp(view(both), axis=0).max() < _NEAR_GOAL * np.ptp(view(points), axis=0).max():
+            points = both
     places = [axes for row in panels for axes in row]
     for axes in places[len(indices) :]:
         axes.set_visible(False)
@@ -131,7 +143,9 @@ def draw_robot(axes: Axes, solids: Sequence[PlacedSolid], points: Array, view: V
     size = np.array([box.width, box.height])
     flat = view(points)
     middle = (flat.max(axis=0) + flat.min(axis=0)) / 2
-    span = 1.06 * max(float((np.ptp(flat, axis=0) / size).max()), 1e-6) * size
+    drawn = size * (1.0, 1.0 - _FOOT_SHARE)
+    span = 1.06 * max(float((np.ptp(flat, axis=0) / drawn).max()), 1e-6) * size
+    middle[1] -= _FOOT_SHARE / 2 * span[1]
     low, high = middle - span / 2, middle + span / 2
     canvas = Canvas(view, low, high, PIXELS)
     canvas.draw(solids)
@@ -186,10 +200,9 @@ def _round_length(longest: float) -> float:
     return max(step * power for step in (1, 2, 5) if step * power <= longest * (1 + 1e-9))
 
 
-_PLANNED_COLOUR, _TOOL_COLOUR = PALETTE[1], PALETTE[4]
-_LINK_COLOURS = (_TOOL_COLOUR, *PALETTE[2:4], *PALETTE[5:])
+_LINK_COLOURS = (HAND_COLOUR, PALETTE[1], *PALETTE[5:])
 
-_FLIGHT_COLOURS = (PALETTE[0], PALETTE[2], PALETTE[5], *PALETTE[6:])
+_FLIGHT_COLOURS = (BASE_COLOUR, PALETTE[1], *PALETTE[5:])
 """Colours of compared flights; the first colour is for the flight of the report."""
 
 
@@ -212,14 +225,14 @@ def path_figure(flight: FlightReport, beside: Sequence[FlightReport] = ()) -> Re
     names = [each.label for each in flown] if beside else ["base"]
     keys = [legend_entry(tint, name) for tint, name in zip(tints, names, strict=True)]
     if shows_tool:
-        paths.append((flight.tool.values[:, :3], _TOOL_COLOUR))
-        keys.append(legend_entry(_TOOL_COLOUR, "end-effector"))
+        paths.append((flight.tool.values[:, :3], HAND_COLOUR))
+        keys.append(legend_entry(HAND_COLOUR, "end-effector"))
     for number, (link, poses) in enumerate(flight.link_poses.items()):
         tint = _LINK_COLOURS[number % len(_LINK_COLOURS)]
         paths.append((poses.values[:, :3], tint))
         keys.append(legend_entry(tint, short(link)))
     if flight.planned:
-        keys.append(legend_entry(_PLANNED_COLOUR, "planned", DASHES))
+        keys.append(legend_entry(PLANNED_COLOUR, "planned", DASHES))
     everything = np.concatenate(
         [path for path, _ in paths] + flight.planned + [goal[np.newaxis] for goal in goals]
     )
@@ -243,7 +256,7 @@ def path_figure(flight: FlightReport, beside: Sequence[FlightReport] = ()) -> Re
             axes.plot(
                 planned[:, i],
                 planned[:, j],
-                color=_PLANNED_COLOUR,
+                color=PLANNED_COLOUR,
                 lw=1.3,
                 ls=(0, DASHES),
                 zorder=3,

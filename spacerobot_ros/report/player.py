@@ -18,7 +18,7 @@ from spacerobot_ros.flight.series import Signal
 from spacerobot_ros.model.description import Array, Pose, Shape
 from spacerobot_ros.model.rotations import matrix_from_quaternion
 from spacerobot_ros.model.visuals import Visual, solid_mesh
-from spacerobot_ros.report.figures import GHOST_COLOUR, LINE_COLOUR, PALETTE
+from spacerobot_ros.report.figures import BASE_COLOUR, GHOST_COLOUR, HAND_COLOUR, LINE_COLOUR
 from spacerobot_ros.report.flight import FlightReport
 from spacerobot_ros.report.page_parts import PagePart, package_file
 from spacerobot_ros.report.scene import Body, bodies_of, goal_of_base, is_flat, obstacles_of
@@ -405,14 +405,14 @@ def _grid_lines(center: Array, radius: float, spacing: float, flat: bool) -> Arr
 
 
 def _path_commands(flight: FlightReport) -> list[Command]:
-    lines = [("path of the base", flight.position.values, PALETTE[0])]
+    lines = [("path of the base", flight.position.values, BASE_COLOUR)]
     if len(flight.tool):
-        lines.append(("path of the end-effector", flight.tool.values[:, :3], PALETTE[4]))
+        lines.append(("path of the end-effector", flight.tool.values[:, :3], HAND_COLOUR))
     assert flight.robot is not None
     tool = flight.robot.end_effector(flight.parameter("plant", "end_effector_frame") or "")
     for link, poses in flight.link_poses.items():
         if link != tool or not len(flight.tool):
-            lines.append((f"path of {link}", poses.values[:, :3], PALETTE[4]))
+            lines.append((f"path of {link}", poses.values[:, :3], HAND_COLOUR))
     commands = []
     for name, points, tint in lines:
         step = max(1, len(points) // _MAX_LINE_POINTS)
@@ -463,9 +463,9 @@ def _caption_text(flight: FlightReport, frames: KeyFrames, radius: float, ghosts
     )
     several = len(flight.link_poses) > 1
     if several:
-        text += " and of the end-effectors (orange)"
+        text += " and of the end-effectors (green)"
     elif len(flight.tool) or flight.link_poses:
-        text += " and of the end-effector (orange)"
+        text += " and of the end-effector (green)"
     text += "; the ghost is the goal" if ghosts else ""
     text += "; obstacles have the shapes by which distances are measured" * bool(flight.obstacles)
     text += "; the target moves as target/odom says" * (flight.target is not None)

@@ -9,7 +9,7 @@ from typing import Literal
 
 import numpy as np
 
-from spacerobot_ros.errors import SpaceRobotError
+from spacerobot_ros.errors import SpaceRobotError, quantity
 from spacerobot_ros.flight.captures import payload_estimates
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.inertial_parameters import INERTIA_ENTRIES
@@ -21,6 +21,7 @@ from spacerobot_ros.report.flight import FlightReport, joint_unit
 from spacerobot_ros.scenario import Published
 
 _NO_VALUE = "–"
+_LEAST_ANGLE_IN_DEGREES = 1e-4  # rad
 _EQUAL_TIME_TICKS = 1.5
 """Largest difference of times that count as equal, control periods."""
 
@@ -39,12 +40,13 @@ def headline(flight: FlightReport) -> list[tuple[str, str, str]]:
     rows: list[tuple[str, str, str]] = []
     error, tool, sensed = flight.error, flight.tool_error, flight.measured_error
     if error is not None:
-        measured = "" if sensed is None else f"measured: {sensed.distance:.3g} m"
-        near = f"{error.distance:.3g} m", measured
+        measured = "" if sensed is None else f"measured: {quantity(sensed.distance, 'm')}"
+        near = quantity(error.distance, "m"), measured
         rows.append(("Position error", *_error_with_tolerance(flight, "position", *near)))
-        measured = f"{math.degrees(error.angle):.3g}°"
-        measured += "" if sensed is None else f"; measured: {sensed.angle:.3g} rad"
-        turned = f"{error.angle:.3g} rad", measured
+        measured = "" if sensed is None else f"measured: {quantity(sensed.angle, 'rad')}"
+        if error.angle >= _LEAST_ANGLE_IN_DEGREES:
+            measured = "; ".join(filter(None, (f"{math.degrees(error.angle):.3g}°", measured)))
+        turned = quantity(error.angle, "rad"), measured
         rows.append(("Attitude error", *_error_with_tolerance(flight, "attitude", *turned)))
     if tool is not None:
         turns = bool(set(flight.controls("end_effector")) & {3, 4, 5})
@@ -67,13 +69,14 @@ def headline(flight: FlightReport) -> list[tuple[str, str, str]]:
     if len(flight.unexplained_momentum) > 1:
         linear, angular = flight.momentum_drift.tolist()
         label = "Momentum not explained by thrusters" if flight.has_thrust else "Momentum drift"
-        rows.append((label, f"{linear:.1e} kg m/s", f"angular {angular:.1e} kg m²/s"))
+        rows.append((label, quantity(linear, "kg m/s"), f"angular {quantity(angular, 'kg m²/s')}"))
     if (propellant := flight.propellant) is not None:
         rows.append(("Propellant", f"{1e3 * propellant:.3g} g", ""))
     if capture := flight.capture:
         about = flight.capture_measures
         done = f"at {about.time:.4g} s" if capture["captured"] else "no"
-        nearest = "" if math.isnan(about.distance) else f"{about.distance:.3g} m from the grapple"
+        off = f"{quantity(about.distance, 'm')} from the grapple"
+        nearest = "" if math.isnan(about.distance) else off
         rows.append(("Target captured", done, nearest))
     if len(time := flight.position.time) > 1:
         ticks = f"{time[-1] - time[0]:.6g} s, ticks of {flight.tick:.4g} s"
@@ -88,9 +91,9 @@ def _end_effector_row(
     limits = _tolerance_text(flight, "position")
     if limits and turns:
         limits += f", {_tolerance_text(flight, 'attitude')}"
-    notes = [f"{error.angle:.3g} rad"] if turns else []
+    notes = [quantity(error.angle, "rad")] if turns else []
     notes += [f"tolerance {limits}"] if limits else []
-    return label, f"{error.distance:.3g} m", "; ".join(notes)
+    return label, quantity(error.distance, "m"), "; ".join(notes)
 
 
 def _error_with_tolerance(
@@ -140,7 +143,7 @@ def result_table(flight: FlightReport) -> Table:
     if (clearance := flight.clearance) is not None:
         nearest = clearance.nearest
         at_links = f"links {nearest.links} at {clearance.nearest_time:.6g} s"
-        rows.append(("Clearance", f"{nearest.distance:.4g} m, {at_links}"))
+        rows.append(("Clearance", f"{quantity(nearest.distance, 'm')}, {at_links}"))
     return Table(("Quantity", "Value"), rows)
 
 
@@ -308,7 +311,7 @@ def _format_attitude(rotvec: Iterable[float]) -> str:
 
 def _tolerance_text(flight: FlightReport, part: Literal["position", "attitude"]) -> str:
     value, unit = flight.tolerance(part), "m" if part == "position" else "rad"
-    return "" if value is None else f"{value:.3g} {unit}"
+    return "" if value is None else quantity(value, unit)
 
 
 def _time_to_end_texts(flight: FlightReport) -> list[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -122,15 +123,22 @@ _LONGEST_STATUS_WAIT = 1.0
 _CHECK_PERIOD = 0.1
 
 
+_NUMBER = re.compile(r"(< )?\d[\d.]* [mµ]?(m|rad)\b")
+"""A quantity in the message of a status, which changes all the time."""
+
+
 class _StatusPrinter:
+    """Prints the message of a status if it differs from the one before by more than quantities."""
+
     def __init__(self, client: MissionClient, show: Callable[[str], None]) -> None:
         self._client, self._show, self._shown = client, show, ""
 
     def show(self) -> None:
-        if self._client.message != self._shown:
-            self._shown = self._client.message
+        told = _NUMBER.sub("", self._client.message)
+        if told != self._shown:
+            self._shown = told
             with suppress(OSError):  # A closed terminal must not stop the robot.
-                self._show(self._shown)
+                self._show(self._client.message)
 
 
 def run_until_stopped(

@@ -486,11 +486,13 @@ _LOG_PREFIX = re.compile(r"^\[(DEBUG|INFO|WARN|ERROR|FATAL)\] \[[\d.]+\] \[[^\]]
 """Level, time and name before a message in the log of a node."""
 
 
+_CRASH = "Fatal Python error: "
+
+
 def last_error(log: str) -> str:
     """Return the last error in the log of a node; empty if there is none.
 
-    It is an error that the node logged, the last line of a traceback, or the first one of Python's
-    report of a crash.
+    It is an error that the node logged, or the last line of a traceback.
     """
     found = ""
     for line in log.splitlines():
@@ -498,19 +500,18 @@ def last_error(log: str) -> str:
         if prefix is not None:
             if prefix[1] in ("ERROR", "FATAL"):
                 found = line[prefix.end() :]
-        elif line.startswith("Fatal Python error: "):
-            return f"{line}."
         elif line.strip() and not line[0].isspace() and not line.startswith("Extension mod"):
             found = line.strip()
     return found
 
 
 def end_message(name: str, code: int, log: str) -> str:
-    """Return a sentence about the end of a node: the signal or exit code, and its last error."""
+    """Return a sentence about the end of a node: a signal and its crash, or exit code and error."""
     if code < 0:
-        error = last_error(log)
+        # Of a signal Python logs a crash alone: other errors in the log are not its cause.
+        crash = next((line for line in log.splitlines() if line.startswith(_CRASH)), "")
         how = f"Node '{name}' was ended by {signal.Signals(-code).name}"
-        return f"{how}: {error}" if error else f"{how}."
+        return f"{how}: {crash}." if crash else f"{how}."
     return f"Node '{name}' has ended with exit code {code}: {last_error(log) or _NO_ERROR_TEXT}"
 
 

@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from spacerobot_ros.collision import CollisionGeometry, LinkPair, NearestPair, ObstaclePair
+from spacerobot_ros.errors import quantity
 from spacerobot_ros.events import (
     SECONDS,
     Event,
@@ -58,8 +59,8 @@ class ClearanceStatus:
     def message(self) -> str:
         """The status as a sentence."""
         if self.distance > 0:
-            return f"{_subject(self.links)} are {self.distance:.3g} m apart."
-        return f"{_subject(self.links)} touch, {-self.distance:.3g} m deep."
+            return f"{_subject(self.links)} are {quantity(self.distance, 'm')} apart."
+        return f"{_subject(self.links)} touch, {quantity(-self.distance, 'm')} deep."
 
     def to_values(self) -> dict[str, str]:
         """Return the status as key-value pairs of a DiagnosticStatus."""

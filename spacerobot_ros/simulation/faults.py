@@ -12,6 +12,7 @@ Without ``at`` either begins at once, without ``until`` it never ends.
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Generic, Protocol, TypeVar
@@ -364,6 +365,14 @@ def parse_times(
     if not times["until"] > times["at"]:
         raise refusal(f"it ends at {times['until']:g} s and begins at {times['at']:g} s")
     return times["at"], times["until"]
+
+
+_TIME = re.compile(r"\b(at|until) [\d.e+-]+")
+
+
+def with_seconds(line: str) -> str:
+    """Return the line of a fault or of a disturbance with the unit of its times, for people."""
+    return _TIME.sub(r"\g<0> s", line)
 
 
 def format_times(start: float, end: float) -> str:

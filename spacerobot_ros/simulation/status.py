@@ -21,7 +21,13 @@ from spacerobot_ros.simulation.actuators import PlantWithFaults
 from spacerobot_ros.simulation.capture import CaptureReport, ReleaseReport
 from spacerobot_ros.simulation.commands import CommandValidator
 from spacerobot_ros.simulation.config import PlantConfig
+from spacerobot_ros.simulation.faults import with_seconds
 from spacerobot_ros.times import SECOND
+
+
+def latched_text(fault: str) -> str:
+    """Return what a latched fault means, without a full stop."""
+    return f"The joints brake and the thrusters are off until the plant is rearmed: {fault}"
 
 
 class PlantState(str, Enum):
@@ -239,7 +245,7 @@ class PlantMonitor:
                     message += f", and a fault is latched: {fault}"
             case _ if fault:
                 activity = PlantState.LATCHED
-                message = f"Nothing moves until '~/rearm' is called: {fault}"
+                message = latched_text(fault)
             case _ if self._config.time_mode == "lockstep":
                 message = "Every tick takes the command that answers its state"
             case _ if commands.in_force:
@@ -271,19 +277,19 @@ def _events_between(before: PlantStatus, now: PlantStatus) -> list[Event]:
         add(EventKind.LATCHED, message, 2, reason=now.reason)
     for fault in now.faults:
         if fault not in before.faults:
-            add(EventKind.FAULT_INJECTED, f"A fault begins: {fault}.", 1, fault=fault)
+            add(EventKind.FAULT_INJECTED, f"A fault begins: {with_seconds(fault)}.", 1, fault=fault)
     ended = [fault for fault in before.faults if fault not in now.faults]
     for fault in ended:
-        add(EventKind.FAULT_ENDED, f"A fault has ended: {fault}.", fault=fault)
+        add(EventKind.FAULT_ENDED, f"A fault has ended: {with_seconds(fault)}.", fault=fault)
     if ended and not now.faults:
         add(EventKind.FAULTS_CLEARED, "No fault is active any more.")
     for each in now.disturbances:
         if each not in before.disturbances:
-            message = f"A disturbance begins: {each}."
+            message = f"A disturbance begins: {with_seconds(each)}."
             add(EventKind.DISTURBANCE, message, 1, disturbance=each)
     for each in before.disturbances:
         if each not in now.disturbances:
-            message = f"A disturbance has ended: {each}."
+            message = f"A disturbance has ended: {with_seconds(each)}."
             add(EventKind.DISTURBANCE_ENDED, message, disturbance=each)
     if now.state is not before.state:
         if before.state is PlantState.PAUSED and now.state is not PlantState.INACTIVE:

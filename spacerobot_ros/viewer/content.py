@@ -11,7 +11,7 @@ from typing import Generic, TypeVar
 
 import numpy as np
 
-from spacerobot_ros.errors import ParameterError
+from spacerobot_ros.errors import ParameterError, quantity
 from spacerobot_ros.measures import momentum_change
 from spacerobot_ros.model.description import DEFAULT_END_EFFECTOR, Array, RobotDescription
 from spacerobot_ros.model.kinematics import ForwardKinematics
@@ -24,7 +24,7 @@ from spacerobot_ros.planning.core.goal import (
 )
 from spacerobot_ros.planning.execution.goal_file import BASE_GOAL_KEY
 from spacerobot_ros.planning.execution.status import PlannerState
-from spacerobot_ros.simulation.faults import FAULT_KINDS, FaultTargets, parse_fault
+from spacerobot_ros.simulation.faults import FAULT_KINDS, FaultTargets, parse_fault, with_seconds
 from spacerobot_ros.simulation.status import PlantState
 from spacerobot_ros.viewer.reachability import GoalCheck, Verdict
 from spacerobot_ros.viewer.state import Measured, Momenta, Notice, Part, StackState
@@ -39,6 +39,9 @@ _NEAR_LIMIT_SHARE = 0.05
 
 _WARNING_WHEEL_SHARE, _SATURATED_WHEEL_SHARE = 0.8, 0.98
 """Shares of the largest rate of a wheel from which it is marked amber, and red."""
+
+_NEAR_CONTACT = 0.02
+"""Distance between links below which the head of the page shows it, m."""
 
 _MAX_NAME_LENGTH = 21
 
@@ -152,9 +155,14 @@ def status_html(
     if state.plant is not None:
         plant = state.plant
         lines.append(_node_html(state, "plant", plant.state.value, plant.message, plant.level))
-        lines.extend(_line_html(f"Fault: {each}", 1) for each in state.plant.faults)
-        lines.extend(_line_html(f"Disturbance: {each}", 1) for each in state.plant.disturbances)
-    if state.clearance is not None:
+        if plant.latched_fault and state.measured is not None:
+            twist, rearm = state.measured.twist, " Press Rearm." * (state.replay is None)
+            speed = quantity(math.hypot(*twist[:3]), "m/s")
+            rate = quantity(math.hypot(*twist[3:]), "rad/s")
+            lines.append(_line_html(f"The base drifts at {speed} and {rate}.{rearm}", 2))
+        for kind, found in (("Fault", plant.faults), ("Disturbance", plant.disturbances)):
+            lines.extend(_line_html(f"{kind}: {with_seconds(each)}", 1) for each in found)
+    if state.clearance is not None and state.clearance.distance < _NEAR_CONTACT:
         level = state.clearance.level or None
         lines.append(
             _grey_out(_line_html(state.clearance.message, level), offline="plant" in state.absent)
@@ -169,6 +177,8 @@ def status_html(
         control = state.controller
         word, level = control.state.value, control.state.level
         lines.append(_node_html(state, "controller", word, control.message, level))
+    if task := _task_before_goals(state):
+        lines.append(_line_html(f"The goal is pursued after the task '{task}'.", None))
     lines.extend(_distance_lines(state, errors or {}, tolerance))
     return padded("".join(lines))
 
@@ -293,12 +303,14 @@ def joints_html(robot: RobotDescription, q: Array, qdot: Array, effort: Array) -
         effort_unit = "N" if joint.unit == "m" else "N m"
         cells.append(_value_and_limit(qdot[i], fastest[i], f"{joint.unit}/s"))
         cells.append(_value_and_limit(effort[i], strongest[i], effort_unit))
+        # Long names take several lines.
+        cells[0] = f'<div style="white-space:normal;overflow-wrap:anywhere">{name}</div>'
         rows.append("<tr>" + "".join(f"<td>{cell}</td>" for cell in cells) + "</tr>")
     titles = ("joint", "at", "in range", "rate", "effort")
     heads = "".join(f"<th>{title}</th>" for title in titles)
     if not rows:
         return padded("The robot has no joints.")
-    style = "border-spacing:4px 2px;text-align:left;white-space:nowrap;font-size:.9em"
+    style = "border-spacing:3px 2px;text-align:left;white-space:nowrap;font-size:.85em"
     table = f'<table style="{style}"><tr>{heads}</tr>{"".join(rows)}</table>'
     return padded(f'<div tabindex="0" style="overflow-x:auto">{table}</div>')
 
@@ -320,7 +332,7 @@ def _bar_html(share: float, level: int) -> str:
     place = 100 * min(1.0, max(0.0, share))
     color = _LEVEL_COLORS[level]
     return (
-        f'<div style="width:44px;height:8px;background:{_BAR_COLOR};border-radius:4px;'
+        f'<div style="width:32px;height:8px;background:{_BAR_COLOR};border-radius:4px;'
         f'position:relative"><div style="position:absolute;left:{place:.0f}%;top:-2px;width:4px;'
         f'height:12px;margin-left:-2px;background:{color};border-radius:2px"></div></div>'
     )
@@ -328,7 +340,7 @@ def _bar_html(share: float, level: int) -> str:
 
 def _value_and_limit(value: float, limit: float, unit: str) -> str:
     number = _format_decimals(value, 2)
-    return f"{number} of {limit:.3g} {unit}" if math.isfinite(limit) else f"{number} {unit}"
+    return f"{number}/{limit:.3g} {unit}" if math.isfinite(limit) else f"{number} {unit}"
 
 
 def _format_decimals(value: float, digits: int) -> str:
@@ -373,8 +385,8 @@ class GoalDistance:
             if value is None:
                 continue
             free = part in left_out
-            numbers.append(f"{value:.3g} {unit}" + (" (not controlled)" if free else ""))
-            tolerances += [] if free or tolerance is None else [f"{limit:.3g} {unit}"]
+            numbers.append(quantity(value, unit) + (" (not controlled)" if free else ""))
+            tolerances += [] if free or tolerance is None else [quantity(limit, unit)]
         within = f" (tolerance {', '.join(tolerances)})" if tolerances else ""
         return f"{' and '.join(numbers)} from its goal{within}"
 
@@ -384,9 +396,20 @@ class GoalDistance:
         return (self.distance,) if self.angle is None else (self.distance, self.angle)
 
 
+def _task_before_goals(state: StackState) -> str:
+    """Return the task after which a controller pursues its goals; empty: there is none."""
+    task = "" if state.controller is None else state.controller.task
+    return task if state.goals and "controller" not in state.absent else ""
+
+
 def goal_errors(state: StackState, kinematics: ForwardKinematics) -> dict[Part, GoalDistance]:
-    """Return how far each part with a goal is from it, as far as poses are known."""
+    """Return how far each part with a goal is from it, as far as poses are known.
+
+    Goals that a controller pursues after a task, such as an approach, are left out.
+    """
     measured, errors = state.measured, {}
+    if _task_before_goals(state):
+        return {}
     for part, goal in state.goals.items():
         aim: Goal | EndEffectorGoal = goal
         pose: Array | None
@@ -561,7 +584,7 @@ def faults_html(lines: Sequence[str]) -> str:
     """Return the active faults."""
     if not lines:
         return hint_html("No fault is active.")
-    return padded("".join(_line_html(line, 1) for line in lines))
+    return padded("".join(_line_html(with_seconds(line), 1) for line in lines))
 
 
 def hint_html(text: str) -> str:

@@ -47,6 +47,9 @@ _HIDDEN_GHOST_DISTANCE = 0.01
 
 _BASE_GIZMO, _TOOL_GIZMO = "/goal", "/end_effector_goal"
 
+_DECIMALS = 4, 2
+"""Decimals of the position (m) and of the angles (deg) of a goal that a user moves, and sees."""
+
 _MARK_SIZE = 0.12
 """Radius of the mark at the goal of an end-effector, as a share of the size of its gizmo."""
 
@@ -96,17 +99,21 @@ class GoalEditor:
         self._present: tuple[Array, Array] | None = None
         self._changed_at: float | None = None
         self._origin = Origin.ROBOT
+        self._in_flight = False
+        """Whether the robot flies to the goal that is shown, whose gizmos are hidden then."""
         self._followed: object = None
         """Numbers of the goals that were last followed."""
         self._check = GoalCheck(Verdict.UNCHECKED)
         gui = server.gui
         self._none_taken = gui.add_html(hint_html("A recording takes no goals."), visible=False)
+        self._hint = gui.add_html(hint_html("Drag the arrows, or type numbers; then press Fly."))
         self._verdict = gui.add_html(check_html(self._check))
         edit = self._defer_edit
         self._parts = _PartMenu(gui, defer, edit, on_note, self._on_parts_chosen)
         # Any: for mypy viser's values are read-only.
         self._position: Any = gui.add_vector3("Goal (m)", (0.0, 0.0, 0.0), step=0.01)
         self._angles: Any = gui.add_vector3("Roll, pitch, yaw (deg)", (0.0, 0.0, 0.0), step=1.0)
+        self._position.precision, self._angles.precision = _DECIMALS
         self._tool_too = gui.add_checkbox(
             "Goal for the end-effector",
             initial_value=True,
@@ -136,7 +143,7 @@ class GoalEditor:
     def add_tool(self, pose: Array | None) -> None:
         """Add a goal of the end-effector at a pose (7,)."""
         if pose is not None and self.placed:
-            self._add_gizmo(_TOOL_GIZMO, 0.2 * self._reach)
+            self._add_gizmo(_TOOL_GIZMO, 0.15 * self._reach)
             self._move_gizmo(_TOOL_GIZMO, pose)
             self.touch(time.monotonic())
 
@@ -165,7 +172,7 @@ class GoalEditor:
         """Set the goal to poses (7,) and the ghost to joint positions (n,)."""
         assert self._robot is not None
         if _BASE_GIZMO not in self._gizmos:
-            self._add_gizmo(_BASE_GIZMO, 0.45 * self._reach)
+            self._add_gizmo(_BASE_GIZMO, 0.3 * self._reach)
             self._ghost = RobotDrawing(
                 self._server.scene,
                 f"{_BASE_GIZMO}/ghost",
@@ -220,13 +227,13 @@ class GoalEditor:
         self._show_parts()
         self._show_fields()
         self._changed_at = now
-        self._origin = Origin.SENT
+        self.note_sent()
         if self._check.verdict is not Verdict.UNCHECKED:
             self.show_check(GoalCheck(Verdict.PLANNING, "Another goal has been sent."))
 
     def note_sent(self) -> None:
         """Note that the goal shown has been sent."""
-        self._origin = Origin.SENT
+        self._origin, self._hint.visible = Origin.SENT, False
 
     @property
     def shows_sent_goal(self) -> bool:
@@ -241,6 +248,7 @@ class GoalEditor:
     def _defer_edit(self, act: Callable[[], None]) -> None:
         def edit() -> None:
             self._origin = Origin.USER
+            self._hint.visible = False
             act()
 
         self._defer(edit)
@@ -289,11 +297,19 @@ class GoalEditor:
             and max(turned, bent) < _HIDDEN_GHOST_DISTANCE
         )
 
+    def show_flight(self, *, flies: bool) -> None:
+        """Hide the gizmos while the robot flies to the goal that is shown."""
+        in_flight = flies and self.shows_sent_goal
+        if in_flight != self._in_flight:
+            self._in_flight = in_flight
+            self._show_parts()
+
     def show_tool(self, *, there: bool) -> None:
         """Show or hide the controls of the end-effector."""
         self._tool_too.visible = there
         if _TOOL_GIZMO in self._gizmos:
-            self._gizmos[_TOOL_GIZMO].visible = there and self._tool_too.value
+            shown = there and self._tool_too.value and not self._in_flight
+            self._gizmos[_TOOL_GIZMO].visible = shown
 
     def offer_end_effectors(self, links: Iterable[str]) -> None:
         """Offer goals of the links for which the planner takes some."""
@@ -316,6 +332,7 @@ class GoalEditor:
 
     def show(self, *, visible: bool) -> None:
         """Show or hide all controls: a replay takes no goals."""
+        self._hint.visible = visible and self._origin is Origin.ROBOT
         fields = (self._verdict, self._position, self._angles, self._to_robot)
         for handle in (*fields, *self._gizmos.values()):
             handle.visible = visible
@@ -413,7 +430,9 @@ class GoalEditor:
     def _on_gizmo_moved(self, name: str, pose: Array) -> None:
         if name not in self._gizmos or not np.all(np.isfinite(pose)):
             return  # The gizmo of an earlier robot, or a pose that is not finite.
-        self._set_goal(name, pose)
+        # What the fields show is what is sent.
+        goal = Goal.from_rpy(*_fields_of(pose))
+        self._set_goal(name, np.concatenate([goal.position, goal.quaternion]))
         self._show_fields()
 
     def _on_fields_typed(self, position: tuple[float, ...], angles: tuple[float, ...]) -> None:
@@ -463,7 +482,7 @@ class GoalEditor:
             return
         name = _link_gizmo(link)
         if name not in self._gizmos:
-            self._add_gizmo(name, 0.25 * self._reach)
+            self._add_gizmo(name, 0.18 * self._reach)
             self._gizmos[name].visible = False
         self._move_gizmo(name, self._kinematics.link_in_world(link, *self._present))
 
@@ -473,23 +492,20 @@ class GoalEditor:
             gizmo = self._gizmos.get(_link_gizmo(link))
             if gizmo is not None:
                 asked = self._parts.asked(link)
-                gizmo.visible = asked is not RequestedPart.NOTHING
+                gizmo.visible = asked is not RequestedPart.NOTHING and not self._in_flight
                 gizmo.disable_rotations = asked is RequestedPart.POSITION
         base = self._gizmos.get(_BASE_GIZMO)
         if base is not None:
             # Its node stays visible, because the ghost hangs on it.
             free = self._parts.asked(BASE_GOAL_KEY) is RequestedPart.NOTHING
-            base.disable_axes = base.disable_sliders = base.disable_rotations = free
+            hidden = free or self._in_flight
+            base.disable_axes = base.disable_sliders = base.disable_rotations = hidden
         self._angles.visible = self._parts.asked(self._parts.shown) is not RequestedPart.POSITION
 
     def _show_fields(self) -> None:
         pose = self._poses.get(_gizmo_of(self._parts.shown))
         if pose is not None:
-            x, y, z = (round(float(each), 4) for each in pose[:3])
-            self._position.value = (x, y, z)
-            turns = np.degrees(rpy_from_quaternion(pose[3:]))
-            roll, pitch, yaw = (round(float(each), 2) for each in turns)
-            self._angles.value = (roll, pitch, yaw)
+            self._position.value, self._angles.value = _fields_of(pose)
 
 
 class _PartMenu:
@@ -686,6 +702,16 @@ class _FinalShape:
     async def _on_field(self, event: Any) -> None:
         if event.client is not None:  # Else the page itself wrote the value.
             self._edit(self._on_change)
+
+
+def _fields_of(pose: Array) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """Return the position, m, and roll, pitch and yaw, deg, of a pose (7,), as they are shown."""
+    numbers = (pose[:3], np.degrees(rpy_from_quaternion(pose[3:])))
+    position, angles = (
+        tuple(np.round(part, digits).tolist())
+        for part, digits in zip(numbers, _DECIMALS, strict=True)
+    )
+    return position, angles
 
 
 def _links_of(goals: Mapping[Part, Goal]) -> dict[str, EndEffectorGoal]:

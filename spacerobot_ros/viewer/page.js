@@ -30,6 +30,8 @@
     [style*="position: fixed"][style*="max-height: 60%"] [style*="width: 20em"] {
       width: 100% !important;
     }
+    /* The number beside a slider has room for six digits. */
+    .mantine-NumberInput-root[style*="width: 3rem"] { width: 4.2rem !important; }
     :focus-visible { outline: 2px solid #4dabf7; outline-offset: 1px; }
   `;
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import time
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from queue import Empty, SimpleQueue
 from typing import TYPE_CHECKING, Any
 
@@ -19,8 +19,8 @@ from spacerobot_ros.errors import GoalError, ParameterError
 from spacerobot_ros.model.description import Array, RobotDescription
 from spacerobot_ros.model.kinematics import ForwardKinematics
 from spacerobot_ros.model.thrusters import ThrusterTable
+from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.core.goal import Tolerance
-from spacerobot_ros.planning.execution.goal_file import BASE_GOAL_KEY
 from spacerobot_ros.simulation.faults import FAULT_KINDS, FaultTargets
 from spacerobot_ros.viewer import content, scene
 from spacerobot_ros.viewer.content import History, RecentItems, Trail
@@ -36,6 +36,7 @@ from spacerobot_ros.viewer.state import (
     Request,
     SeekAction,
     StackState,
+    goals_from_text,
 )
 
 if TYPE_CHECKING:
@@ -72,22 +73,35 @@ class ButtonPanel:
     """Buttons whose requests the stack carries out at once."""
 
     def __init__(
-        self, gui: viser.GuiApi, defer: Defer, act: RequestAction, fly: Callable[[], None]
+        self,
+        gui: viser.GuiApi,
+        defer: Defer,
+        act: RequestAction,
+        fly: Callable[[], None],
+        scenario_goals: Mapping[Part, Goal],
     ) -> None:
         self._fly = gui.add_button("Fly", color="green", hint="Send the goal that is shown.")
+        self._has_scenario_goals = bool(scenario_goals)
+        self._fly_scenario = gui.add_button(
+            "Fly the scenario's goal", color="teal", visible=self._has_scenario_goals
+        )
         self._goal = gui.add_button_group(
             "Goal", ("Abort goal",), hint="Give the goal up; the joints brake, the stack goes on."
         )
         self._plant = gui.add_button_group(
             "Plant",
             ("Stop all", "Rearm", "Reset"),
-            hint="Stop all: all comes to rest until Rearm. Reset: back to the initial state.",
+            hint="Stop all: joints brake, thrusters are off until Rearm. Reset: back to the start.",
         )
         self._time = gui.add_button_group("Time", ("Pause", "Resume"))
 
         @self._fly.on_click
         async def _(event: Any) -> None:
             defer(fly)
+
+        @self._fly_scenario.on_click
+        async def _(event: Any) -> None:
+            defer(lambda: act(FlyAction(scenario_goals)))
 
         for group in (self._goal, self._plant, self._time):
 
@@ -100,6 +114,7 @@ class ButtonPanel:
         """Show or hide the buttons."""
         for handle in (self._fly, self._goal, self._plant, self._time):
             handle.visible = visible
+        self._fly_scenario.visible = visible and self._has_scenario_goals
 
 
 class TimeLine:
@@ -162,14 +177,15 @@ class LookBack:
 
     def __init__(self, gui: viser.GuiApi, defer: Defer) -> None:
         self.time_s: float | None = None
+        self._left_alone_until: float | None = None
         self._slider: Any = gui.add_slider(
-            "Look back (s)",
+            "Look back to (s)",
             0.0,
             _LOOK_BACK_STEP_S,
             _LOOK_BACK_STEP_S,
             0.0,
             visible=False,
-            hint="Show an earlier state, of the last five minutes; the robot goes on.",
+            hint="Show the state at an earlier time, of the last five minutes; the robot goes on.",
         )
         self._live = gui.add_button("Back to the present", color="orange", visible=False)
 
@@ -177,10 +193,12 @@ class LookBack:
         async def _(event: Any) -> None:
             if event.client is not None:
                 at, end = float(event.target.value), float(event.target.max)
+                self._left_alone_until = time.monotonic() + _SLIDER_HOLD_S
                 defer(lambda: self._look(None if at >= end else at))
 
         @self._live.on_click
         async def _(event: Any) -> None:
+            self._left_alone_until = 0.0
             defer(lambda: self._look(None))
 
     def _look(self, time_s: float | None) -> None:
@@ -200,9 +218,17 @@ class LookBack:
         if self.time_s is not None:
             self.time_s = min(max(self.time_s, low), high)
         at = high if self.time_s is None else self.time_s
-        for name, value in (("max", high), ("min", low), ("value", at)):
+        for name, value in (("max", high), ("min", low)):
             if getattr(self._slider, name) != value:
                 setattr(self._slider, name, value)
+        if self._left_alone_until is None:
+            self._slider.value = at
+        elif time.monotonic() >= self._left_alone_until:
+            # The browser may have received an older value after the one that it has sent, and viser
+            # sends none that it has already.
+            self._left_alone_until = None
+            self._slider.value = low if at == high else high
+            self._slider.value = at
         self._slider.visible, self._live.visible = True, self.time_s is not None
 
 
@@ -304,14 +330,13 @@ class Plots:
         self._tab_group = gui.add_tab_group()
         self._error_tab = self._tab_group.add_tab("Errors")
         with self._error_tab:
-            self._error = _Plot(gui, "Base error", ("m", "rad"), 0.01)
-            self._tool = _Plot(gui, "End-effector error", ("m", "rad"), 0.01)
-            self._tool.handle.visible = False
-        self._links: dict[Part, _Plot] = {}
+            self._logarithmic: Any = gui.add_checkbox("Logarithmic", initial_value=False)
+            self._no_errors: Any = gui.add_html(content.hint_html("No goal is pursued."))
+        self._errors: dict[Part, _Plot] = {}
         with self._tab_group.add_tab("Momentum"):
             # In millionths, because axis labels have three decimals.
             units = ("1e-6 kg m/s", "1e-6 kg m²/s")
-            self._momentum = _Plot(gui, "Momentum drift", units, 1.0)
+            self._momentum = _Plot(gui, "Momentum drift", units, 1.0, units)
             self._budget_text = gui.add_html("")
             self._budget = _Plot(gui, "Momentum budget (N m s)", content.MOMENTUM_PARTS, 0.01)
             self._budget.handle.visible = False
@@ -322,18 +347,17 @@ class Plots:
     def show_robot(self, robot: RobotDescription | None) -> None:
         """Start over with another robot."""
         self._first = None
-        for plot in (self._error, self._tool, self._momentum, self._budget):
-            plot.clear()
+        for plot in (self._momentum, self._budget):
+            plot.history = History(len(plot.names))
         self._budget.handle.visible = False
-        self._show_links({})
+        self._show_parts({})
         if self._shape is not None:
             self._shape.handle.remove()
             self._shape = None
         if robot is not None and robot.joint_names:
+            names, units = robot.joint_names, tuple(each.unit for each in robot.movable_joints)
             with self._joint_tab:
-                self._shape = _Plot(
-                    self._gui, "Joints (m, rad)", robot.joint_names, 0.01, signed=True
-                )
+                self._shape = _Plot(self._gui, "Joints", names, 0.01, units, signed=True)
 
     def add(self, state: StackState, errors: Mapping[Part, content.GoalDistance]) -> None:
         """Append the last state, and its distances from goals, to the curves."""
@@ -341,13 +365,9 @@ class Plots:
         if measured is None:
             return
         time_s = measured.time_s
-        of_links = {part: e for part, e in errors.items() if state.goals[part].end_effectors}
-        self._show_links(of_links)
-        self._error.handle.visible = BASE_GOAL_KEY in errors or not of_links
+        self._show_parts(errors)
         for part, error in errors.items():
-            plot = self._links.get(part, self._error if part == BASE_GOAL_KEY else self._tool)
-            plot.handle.visible = True
-            plot.history.add(time_s, error.numbers)
+            self._errors[part].history.add(time_s, 1e3 * np.array(error.numbers))
         if state.momenta is not None:
             if self._first is None:
                 self._first = state.momenta.actual
@@ -366,31 +386,41 @@ class Plots:
         if text != self._budget_text.content:
             self._budget_text.content = text
 
-    def _show_links(self, errors: Mapping[Part, content.GoalDistance]) -> None:
-        """Have one plot for each link with an error, and none for others."""
-        for part, plot in tuple(self._links.items()):
-            if part not in errors or plot.width != len(errors[part].numbers):
+    def _show_parts(self, errors: Mapping[Part, content.GoalDistance]) -> None:
+        """Have one plot for each part with an error, and none for others."""
+        for part, plot in tuple(self._errors.items()):
+            if part not in errors or len(plot.names) != len(errors[part].numbers):
                 plot.handle.remove()
-                del self._links[part]
+                del self._errors[part]
         for part, error in errors.items():
-            if part not in self._links:
-                title, names = f"Error of {content.shortened(part)}", ("m", "rad")
+            if part not in self._errors:
+                title, units = content.shortened(part), ("mm", "mrad")[: len(error.numbers)]
                 with self._error_tab:
-                    self._links[part] = _Plot(self._gui, title, names[: len(error.numbers)], 0.01)
+                    self._errors[part] = _Plot(
+                        self._gui, f"Error of {title}", units, 10.0, units, limited=True
+                    )
+        self._no_errors.visible = not errors
 
-    def draw(self) -> None:
-        """Redraw the curves."""
-        always = (self._error, self._tool, self._momentum, self._budget)
-        for plot in (*always, *self._links.values(), self._shape):
-            if plot is not None:
-                plot.draw()
+    def draw(self, tolerance: Tolerance | None = None, time_s: float | None = None) -> None:
+        """Redraw the curves, with tolerances of errors, and a line at a time that is shown, s."""
+        limits = () if tolerance is None else (tolerance.position, tolerance.attitude)
+        for plot in self._errors.values():
+            plot.set_logarithmic(enabled=bool(self._logarithmic.value))
+            plot.draw(time_s, [1e3 * limit for limit in limits])
+        for each in (self._momentum, self._budget, self._shape):
+            if each is not None:
+                each.draw(time_s)
+
+
+_LEAST_ON_LOGARITHMIC_AXIS = 1e-3
 
 
 class _Plot:
     """A plot and its history; its colours can be seen on white and on black.
 
-    ``least`` is the least upper end of the axis, so that rounding errors do not look like peaks;
-    ``signed``: the numbers may be negative.
+    There is an axis for each of at most two ``units``, those of ``names``. ``least`` is the least
+    upper end of the axes, so that rounding errors do not look like peaks; ``signed``: the numbers
+    may be negative; ``limited``: each has a limit.
     """
 
     def __init__(
@@ -399,36 +429,72 @@ class _Plot:
         title: str,
         names: tuple[str, ...],
         least: float,
+        units: tuple[str, ...] = (),
         *,
         signed: bool = False,
+        limited: bool = False,
     ) -> None:
-        self.history = History(len(names))
+        self._limited = limited
+        self.names, self.history = names, History(len(names))
+        scales = units or ("y",) * len(names)
         series: list[Any] = [{"label": "t (s)"}]
         for i, name in enumerate(names):
             turn, color = divmod(i, len(_CURVE_COLORS))
             look = {"label": content.shortened(name), "stroke": _CURVE_COLORS[color], "width": 1.5}
             # Colours repeat with dashes, shorter each time.
-            series.append(look | ({"dash": (max(12 // turn, 2), 4)} if turn else {}))
+            dashes = {"dash": (max(12 // turn, 2), 4)} if turn else {}
+            series.append(look | dashes | {"scale": scales[i]})
+        limit = {"label": "tolerance", "dash": (2, 4), "width": 1}
+        series += [each | limit for each in series[1:] if limited]
+        line: Any = {"label": "shown", "stroke": _AXIS_COLOR, "width": 2, "scale": "line"}
         faint = {"stroke": f"{_AXIS_COLOR}33"}
         axis: dict[str, Any] = {"stroke": _AXIS_COLOR, "grid": faint, "ticks": faint}
+        axes = [
+            axis | {"scale": scale, "size": 50, "side": side, "label": scale * bool(units)}
+            | {"labelSize": 16 * bool(units)}
+            for scale, side in zip(dict.fromkeys(scales), (3, 1), strict=False)  # Left, right.
+        ]  # fmt: skip
         # Mode 1 of uPlot's "soft limits": the axis ends there unless numbers go beyond.
         end = {"pad": 0.1, "mode": 1}
         ends = {"min": end | {"soft": -least if signed else 0.0}, "max": end | {"soft": least}}
+        time: dict[str, Any] = {"x": {"time": False}, "line": {"auto": False, "range": (0, 1)}}
+        self._linear = time | {scale: {"range": ends} for scale in scales}
+        self._logarithmic = time | {scale: {"distr": 3} for scale in scales}
+        self._least = -np.inf
         self.handle: Any = gui.add_uplot(
-            self.history.arrays(),
-            tuple(series),
+            self._data(None, ()),
+            (*series, line),
             title=title,
-            scales={"x": {"time": False}, "y": {"range": ends}},
-            axes=(axis | {"size": 34}, axis | {"size": 66}),  # type: ignore[arg-type]
+            scales=self._linear,
+            axes=(axis | {"size": 34}, *axes),  # type: ignore[arg-type]
             height=_PLOT_PIXELS,
+            padding=(14, 0, 0, 0),
         )
-        self.width = len(names)
 
-    def clear(self) -> None:
-        self.history = History(self.width)
+    def set_logarithmic(self, *, enabled: bool) -> None:
+        """Have logarithmic axes, or linear ones."""
+        self._least = _LEAST_ON_LOGARITHMIC_AXIS if enabled else -np.inf
+        if (scales := self._logarithmic if enabled else self._linear) != self.handle.scales:
+            self.handle.scales = scales
 
-    def draw(self) -> None:
-        self.handle.data = self.history.arrays()
+    def draw(self, time_s: float | None, limits: Sequence[float] = ()) -> None:
+        self.handle.data = self._data(time_s, limits)
+
+    def _data(self, time_s: float | None, limits: Sequence[float]) -> tuple[Array, ...]:
+        """Return times, curves, their limits, and an upright line at a time, s."""
+        rows = np.stack(self.history.arrays(), axis=1)
+        rows[:, 1:] = np.maximum(rows[:, 1:], self._least)
+        line = np.full(len(rows), -1.0)  # Below the axis.
+        if time_s is not None:
+            at = int(np.searchsorted(rows[:, 0], time_s, "right"))
+            row = np.append(time_s, rows[max(at - 1, 0), 1:])
+            rows = np.insert(rows, [at] * 3, row, axis=0)
+            line = np.insert(line, [at] * 3, (-1.0, 1.0, -1.0))
+        curves = np.ascontiguousarray(rows.T)
+        lines = [np.full(len(rows), limit) for limit in limits[: len(self.names)]]
+        # A limit that is not known is hidden behind its curve.
+        known = (lines or [*curves[1:]]) if self._limited else []
+        return *curves, *known, line
 
 
 class LogPanel:
@@ -459,7 +525,8 @@ _OBSTACLES_PATH, _TARGET_PATH = "/obstacles", "/target"
 _TEXTS_S, _TABLES_S, _PLOTS_S, _PATHS_S = 0.2, 0.25, 0.5, 0.5
 """Period of drawing of the slower parts, wall s."""
 
-_ANNOUNCEMENT_TIME_S = 60.0  # wall s
+_ANSWER_TIME_S = 10.0
+"""Wall time for which the head shows the answer to what a user has done, s."""
 
 CAMERA = np.array([1.1, 1.4, 0.8])
 """Initial position of the camera relative to the robot, in robot lengths.
@@ -546,7 +613,8 @@ class Page:
         gui.configure_theme(**self._theme_options(dark=self._config.dark))
         # Buttons come first, so that a growing status text does not move them under the mouse.
         self._time_line = TimeLine(gui, defer, self._request)
-        self._buttons = ButtonPanel(gui, defer, self._request, self._fly)
+        goals = goals_from_text(self._config.scenario_goals)
+        self._buttons = ButtonPanel(gui, defer, self._request, self._fly, goals)
         self._look_back = LookBack(gui, defer)
         self._status = gui.add_html(content.status_html(StackState()))
         self._bar: Any = gui.add_progress_bar(0.0, visible=False)
@@ -704,9 +772,10 @@ class Page:
         """Add a line to the log."""
         self._log.add(notice)
 
-    def announce(self, notice: Notice) -> None:
-        """Show a line in the head for a minute."""
-        self._announced = (notice, self._now + _ANNOUNCEMENT_TIME_S)
+    def announce(self, notice: Notice, seconds: float = _ANSWER_TIME_S) -> None:
+        """Add a line to the log, and show it in the head for a wall time, s."""
+        self.note(notice)
+        self._announced = (notice, self._now + seconds)
 
     # -- drawing --------------------------------------------------------------------------------
 
@@ -735,7 +804,7 @@ class Page:
             if self._robot is not None and self._is_due("tables", _TABLES_S):
                 self._draw_joints(self._robot, shown)
             if self._is_due("plots", _PLOTS_S):
-                self._plots.draw()
+                self._plots.draw(self._tolerance, self._look_back.time_s)
         actions, self._actions = self._actions, []
         return actions
 
@@ -825,6 +894,7 @@ class Page:
         self.faults.show(state)
         self._plots.show_budget(shown)
         self._log.draw()
+        self.editor.show_flight(flies=content.time_to_go(state) is not None)
         has_tool = content.has_tool(state)
         if has_tool and state.measured is not None and not self.editor.has_tool:
             self.editor.add_tool(state.tool)
@@ -883,8 +953,8 @@ class Page:
     def _request(self, action: Action) -> None:
         self._actions.append(action)
         if isinstance(action, Request):
-            self.note(Notice(f"{action.value.capitalize()} requested.", source="page",
-                             time_s=self._time_s))  # fmt: skip
+            self.announce(Notice(f"{action.value.capitalize()} requested.", source="page",
+                                 time_s=self._time_s))  # fmt: skip
 
     def _fly(self) -> None:
         try:
@@ -904,7 +974,7 @@ class Page:
             self.editor.place(measured.pose, tool, measured.q, self._now)
 
     def _refuse(self, message: str) -> None:
-        self.note(Notice(message, 2, self._time_s, "page"))
+        self.announce(Notice(message, 2, self._time_s, "page"))
 
     @property
     def _time_s(self) -> float | None:

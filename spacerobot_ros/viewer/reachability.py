@@ -28,7 +28,7 @@ from typing import IO
 import numpy as np
 
 from spacerobot_ros.control.inverse_kinematics import FixedBaseArm, is_reached
-from spacerobot_ros.errors import GoalError, SpaceRobotError
+from spacerobot_ros.errors import GoalError, SpaceRobotError, quantity
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import DEFAULT_END_EFFECTOR, Array, Pose, RobotDescription
 from spacerobot_ros.model.rotations import matrix_from_quaternion
@@ -44,7 +44,7 @@ from spacerobot_ros.planning.core.cancellation import Cancellation, PlanningCanc
 from spacerobot_ros.planning.core.goal import RobotState, Tolerance
 from spacerobot_ros.planning.core.method import PlanRequest
 from spacerobot_ros.planning.core.prediction import coasting_positions
-from spacerobot_ros.planning.core.progress import report_progress
+from spacerobot_ros.planning.core.progress import SearchProgress, report_progress
 from spacerobot_ros.planning.core.schedule import GaitSchedule
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.execution.goal_file import BASE_GOAL_KEY
@@ -409,7 +409,7 @@ def _uncontrolled_text(
     parts = []
     uncontrolled = goal.base - controls
     if "position" in uncontrolled and error.distance > tolerance.position:
-        parts.append(("position", f"{error.distance:.3g} m"))
+        parts.append(("position", quantity(error.distance, "m")))
     if "attitude" in uncontrolled and error.angle > tolerance.attitude:
         parts.append(("attitude", f"{math.degrees(error.angle):.3g} deg"))
     if "shape" not in controls and goal.joint_positions is not None:
@@ -432,7 +432,7 @@ def _check_arm(question: GoalQuestion, tool: Goal) -> GoalCheck:
         return GoalCheck(Verdict.REACHABLE, message, shape=shape)
     message = (
         f"The end-effector cannot reach its goal: the nearest joint positions found leave "
-        f"{distance:.3g} m and {angle:.3g} rad."
+        f"{quantity(distance, 'm')} and {quantity(angle, 'rad')}."
     )
     return GoalCheck(Verdict.REFUSED, message, shape=shape)
 
@@ -482,7 +482,11 @@ def main() -> None:
 
         threading.Thread(target=receive_questions, daemon=True).start()
         planner, number = Planner(), 0
-        with report_progress(lambda progress: send_answer(number, progress.message)):
+
+        def send_progress(progress: SearchProgress) -> None:
+            send_answer(number, f"{progress.message}, {progress.elapsed_s:.0f} s")
+
+        with report_progress(send_progress):
             while True:
                 (number, question), cancellation = last.take()
                 send_answer(number, None)

@@ -55,6 +55,10 @@ class ViewerConfig(WatchdogConfig):
     )
     dark: bool = parameter(True, "whether pages are dark when they are opened")
     world_frame: str = parameter("world", "frame of the goals that the page sends")
+    title: str = parameter("spacerobot", "title of the page")
+    scenario_goals: str = parameter(
+        "", "goals of a scenario by parts, as JSON, which a button of the page sends; empty: none"
+    )
     check_goals: bool = parameter(
         True, "plan the shown goal to check whether it is reachable before it is sent"
     )
@@ -66,8 +70,6 @@ _NO_FRAMING_HEADERS = {
     "Content-Security-Policy": "frame-ancestors 'none'",
     "X-Frame-Options": "DENY",
 }
-
-_PAGE_TITLE = "spacerobot"
 
 _ALIVE_PATH, _SERVER_ID = "/alive", secrets.token_hex(8)
 """Path that open pages ask for, to learn whether the viewer still runs, and the answer: another one
@@ -201,7 +203,7 @@ def _guarded_websockets(served: str) -> Iterator[None]:
         module.serve = serve  # type: ignore[misc]
 
 
-def start_server(host: str, port: int) -> viser.ViserServer:
+def start_server(host: str, port: int, title: str = "") -> viser.ViserServer:
     """Return a server that serves its page at ``http://host:port``, or at the next free port.
 
     Raises
@@ -223,7 +225,7 @@ def start_server(host: str, port: int) -> viser.ViserServer:
     port = free_port(host, port)
     # It prints its address; so does the node, in the format of the other commands.
     with _server_start_lock, _guarded_websockets(host), redirect_stdout(io.StringIO()):
-        server = LocalServer(host=host, port=port, label=_PAGE_TITLE, verbose=False)
+        server = LocalServer(host=host, port=port, label=title, verbose=False)
     return server
 
 

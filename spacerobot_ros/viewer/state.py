@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import Enum
 
+import numpy as np
+
 from spacerobot_ros.bag.playback import ReplayStatus
 from spacerobot_ros.control.status import ControllerStatus
-from spacerobot_ros.model.description import Array
+from spacerobot_ros.model.description import DEFAULT_END_EFFECTOR, Array
 from spacerobot_ros.planning import Goal
+from spacerobot_ros.planning.core.goal import EndEffectorGoal
+from spacerobot_ros.planning.execution.goal_file import BASE_GOAL_KEY
 from spacerobot_ros.planning.execution.status import PlannerStatus
 from spacerobot_ros.simulation.clearance import ClearanceStatus
 from spacerobot_ros.simulation.status import PlantStatus
@@ -27,6 +32,8 @@ class Measured:
         (7,) of the base link in the world: m, quaternion (x, y, z, w).
     q, qdot, effort
         (n,) of the joints in the order of the description, m or rad, /s, N or N m.
+    twist
+        (6,) velocity of the base link and its rate, in its own axes, m/s and rad/s.
     """
 
     time_s: float
@@ -34,6 +41,7 @@ class Measured:
     q: Array
     qdot: Array
     effort: Array
+    twist: Array = field(default_factory=lambda: np.zeros(6))
 
 
 @dataclass(frozen=True)
@@ -68,6 +76,33 @@ Part = str
 """The part of the robot that a goal is for: ``base``, the name of a link, or ``end_effector``, also
 for the end-effector of a controller.
 """
+
+
+def goals_to_text(goal: Goal, of_controller: Goal | None = None) -> str:
+    """Return goals as JSON; ``of_controller`` is the goal of a controller's end-effector."""
+    goals: dict[str, object] = {
+        "base": [*goal.position, *goal.quaternion] if goal.base else None,
+        "end_effectors": {each.link: each.numbers for each in goal.end_effectors},
+        "joints": None if goal.joint_positions is None else goal.joint_positions.tolist(),
+    }
+    if of_controller is not None:
+        goals["end_effector"] = [*of_controller.position, *of_controller.quaternion]
+    return json.dumps(goals)
+
+
+def goals_from_text(text: str) -> dict[Part, Goal]:
+    """Return the goals by part of a text of :func:`goals_to_text`; none of an empty text."""
+    given = json.loads(text or "{}")
+    joints = given.get("joints")
+    goals = {
+        part: Goal.checked(given[part][:3], given[part][3:], joints)
+        for part in (BASE_GOAL_KEY, DEFAULT_END_EFFECTOR)
+        if given.get(part)
+    }
+    for link, numbers in given.get("end_effectors", {}).items():
+        aim = EndEffectorGoal.of_numbers(link, numbers)
+        goals[link] = Goal.of_end_effectors([aim], joint_positions=joints)
+    return goals
 
 
 @dataclass(frozen=True)

@@ -75,7 +75,7 @@ def test_a_contact_between_two_ticks_is_found() -> None:
     # Both balls pass the middle at 1.4 ticks, 0.15 m apart, and are far away at every tick.
     positions = np.array([[-1.4, -0.7], [-0.4, -0.2], [0.6, 0.3], [0.7, 0.3]])
     found = PathCheck(geometry).approaches(positions, np.array([0.05]))
-    assert [str(each) for each in found] == ["links 'left' and 'right' come within 0.03 m"]
+    assert [str(each) for each in found] == ["links 'left' and 'right' come within 30 mm"]
     assert found[0].distance == pytest.approx(0.15 - 0.12, abs=1e-5)
     assert found[0].tick == pytest.approx(1.4, abs=0.01)
     assert PathCheck(geometry).approaches(positions, np.array([0.029])) == []

@@ -237,7 +237,7 @@ def test_a_goal_is_never_lost_without_a_word(planner: Rig, controller: Rig) -> N
         rig.goal(sec=3)
         refused = [status for status in host.statuses if status.state.value == "refused"]
         assert [each.goal_id for each in refused] == [f"{n}.000000000" for n in (1, 2, 3)]
-        for status, word in zip(refused, ("frame", "inactive", "/a/plant/rearm"), strict=True):
+        for status, word in zip(refused, ("frame", "inactive", "'/a/plant'"), strict=True):
             assert_one_sentence(status.message, word)
         told = [event.goal_id for event in host.events if event.kind is EventKind.GOAL_REFUSED]
         assert told == [status.goal_id for status in refused]

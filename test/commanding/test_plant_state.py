@@ -424,9 +424,9 @@ def listener(*statuses: PlantStatus) -> PlantListener:
 def test_a_latched_plant_stops_commanders_once_and_goals_are_refused() -> None:
     one = listener(RUNNING)
     assert (one.refusal_of_goals, one.has_no_command) == ("", False)
-    assert one.update(LATCHED, "/robot/plant") == [PlantStopped("Nothing moves: a fuse.")]
+    assert one.update(LATCHED, "/robot/plant") == [PlantStopped("a fuse is blown.")]
     assert one.update(replace(LATCHED, faults=("joint_stuck a",)), "/robot/plant") == []
-    assert_one_sentence(one.refusal_of_goals, "a fuse is blown", "/robot/plant/rearm")
+    assert_one_sentence(one.refusal_of_goals, "a fuse is blown", "'/robot/plant'", "rearm it")
     # Paused or inactive it is latched as well.
     for state in (PlantState.PAUSED, PlantState.INACTIVE):
         assert one.update(replace(LATCHED, state=state), "/robot/plant") == []
@@ -437,7 +437,7 @@ def test_a_latched_plant_stops_commanders_once_and_goals_are_refused() -> None:
 
 
 def test_a_commander_that_comes_later_learns_that_the_plant_is_latched() -> None:
-    assert listener().update(LATCHED) == [PlantStopped("Nothing moves: a fuse.")]
+    assert listener().update(LATCHED) == [PlantStopped("a fuse is blown.")]
     assert listener().update(RUNNING) == []
     assert listener().update(RESTING) == []
 

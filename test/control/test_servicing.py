@@ -126,7 +126,7 @@ def test_a_target_is_approached_captured_brought_to_rest_and_carried() -> None:
     loop.rates = np.array([0.03, -0.05])
     loop.answer()
     assert (loop.state, loop.status.task) == ("tracking", "detumble")
-    assert_one_sentence(loop.status.message, "Detumbling", "0.05 rad/s")
+    assert_one_sentence(loop.status.message, "Detumbling", "50 mrad/s")
     assert loop.kinds()[2:] == ["detumble_started"]
     assert_one_sentence(loop.events[-1].message, "N m s take", "s at least")
     assert loop.executive.controller.coming_to_rest
@@ -185,7 +185,7 @@ def test_the_reference_meets_the_grapple_frame_with_its_velocity_and_a_miss_has_
     assert_one_sentence(
         loop.status.message,
         "The approach is given up: the target is missed",
-        "0.0224 m/s",
+        "22.4 mm/s",
         "within 0.2 s",
     )
     (told,) = re.findall(r"is ([\d.]+) m, 0 rad", loop.status.message)

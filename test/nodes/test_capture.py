@@ -175,7 +175,7 @@ def test_a_latched_paused_or_stopped_plant_captures_nothing_but_a_paused_one(
     latched = rig.trigger("plant/capture")
     assert (latched.success, latched.message) == (
         False,
-        "A fault is latched: stopped on request; call '~/rearm' first.",
+        "A fault is latched: stopped on request; rearm the plant first.",
     )
     rig.trigger("plant/rearm")
     rig.pause(True)

@@ -252,6 +252,7 @@ def test_a_goal_that_is_refused_in_flight_leaves_the_one_that_is_pursued(
     send(7.0, "4.0", states.REFUSED, "Too far.")
     shown = getattr(viewed.look(), who)
     assert (shown.state, shown.message) == (states.REFUSED, "Too far.")
+    assert viewed.look().goals == {}, "nothing flies to it: it is no error"
 
 
 def test_goals_of_links_are_those_of_the_planner(viewed: Viewed) -> None:

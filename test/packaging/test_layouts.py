@@ -259,7 +259,8 @@ def test_foxglove_draws_a_line_for_each_joint_of_every_robot(foxglove: dict[str,
 def test_foxglove_commands_what_the_nodes_offer(foxglove: dict[str, Any]) -> None:
     panels = foxglove["configById"]
     services = {p["serviceName"] for n, p in panels.items() if n.startswith("CallService!")}
-    assert services == {"/plant/abort", "/plant/rearm", "/plant/pause", "/planner/abort"}
+    of_plant = {f"/plant/{service}" for service in ("abort", "rearm", "pause")}
+    assert services == of_plant | {"/planner/abort", "/coordinated_control/abort"}
     for name, panel in panels.items():
         if name.startswith("CallService!"):
             json.loads(panel["requestPayload"])

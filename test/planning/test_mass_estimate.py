@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import logging
+import time
 
 import numpy as np
 import numpy.typing as npt
@@ -297,41 +298,51 @@ def test_listening_changes_nothing_for_others() -> None:
     assert (package.level, package.handlers) == (before, handlers)
 
 
-def test_what_is_shown_of_a_search_and_of_a_flight(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_long_search_and_flight_are_shown_by_a_line_that_stays_true(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     terminal = Terminal()
     monkeypatch.setattr("sys.stderr", terminal)
-    shown = Display("arm", visible=True)
+    monkeypatch.setenv("COLUMNS", "60")
+    shown = Display("arm", period=0.01)
+
+    def await_line(words: str) -> None:
+        end = time.monotonic() + 20.0
+        while words not in terminal.getvalue():
+            assert time.monotonic() < end, (words, terminal.getvalue())
+            time.sleep(0.01)
+
+    await_line("preparing arm for 0 s")
     shown.show_line("Compiling.")
     shown.search(SearchProgress(1, 8))
-    shown.search(SearchProgress(8, 8, 12.34567))
+    await_line("planning arm for 0 s: searching, start 1 of at most 8, none\r")
     shown.search(SearchProgress(8, 8, 12.1, SearchPhase.SHORTENING, 3.2))
+    await_line("planning arm for 0 s: shortening, best 12.1 s\r")
+    await_line("planning arm for 1 s: shortening, best 12.1 s\r")  # Without another report.
     shown.fly(0.0, 0.0)
     shown.fly(5.0, 20.0)
     shown.search(SearchProgress(1, 8))
-    shown.fly(20.0, 20.0)
+    await_line("flying arm for 1 s: 5.0 of 20.0 s\r")
     shown.close()
     text = terminal.getvalue()
-    assert text.startswith("Compiling.\n")
-    assert "start 1 of at most 8, none found yet" in text
-    assert "start 8 of at most 8, best 12.35 s" in text
-    assert "shortening, start 8 of at most 8, best 12.1 s, 3 s" in text
-    assert "5.0 of 20.0 s" in text
-    assert text.index("planning arm") < text.index("flying arm")
+    assert text.endswith("\r\x1b[K"), "nothing of it stays"
+    assert text.count("\n") == 1, "but for the line that is to stay"
     assert "planning" not in text[text.index("flying arm") :], "corrections disturb no flight"
-    assert "20.0 of 20.0 s" in text
 
 
-def test_nobody_is_shown_anything_where_nobody_looks(
+def test_short_work_is_not_shown_and_without_a_terminal_there_are_lines(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with display("arm") as shown:
         log_progress(_LOG, SearchProgress(1, 2), "start 1")
         shown.show_line("Compiling.")
-        shown.search(SearchProgress(1, 2))
         shown.fly(1.0, 2.0)
     assert capsys.readouterr() == ("", "")
-    terminal = Terminal()
-    monkeypatch.setattr("sys.stderr", terminal)
-    with display("arm"):
-        log_progress(_LOG, SearchProgress(1, 2), "start 1")
-    assert "start 1 of at most 2" in terminal.getvalue()
+    lines = io.StringIO()
+    monkeypatch.setattr("sys.stderr", lines)
+    shown = Display("arm", period=0.01)
+    shown.fly(1.0, 2.0)
+    while lines.getvalue().count("flying arm for 0 s: 1.0 of 2.0 s\n") < 2:
+        time.sleep(0.01)
+    shown.close()
+    assert "\r" not in lines.getvalue()

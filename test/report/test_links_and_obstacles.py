@@ -140,9 +140,9 @@ def test_the_tables_have_goal_and_errors_of_each_link(hands: FlightReport) -> No
     assert rows[f"Goal of {LEFT}"] == f"(1.00000, 0.90000, 0.40000) m, {attitude}"
     assert rows[f"Final position of {LEFT}"] == "(1.00000, 0.90000, 0.40000) m"
     tiles = {label: (value, note) for label, value, note in headline(hands)}
-    assert tiles[f"Error of {LEFT}"][0].endswith(" m")
-    assert tiles[f"Error of {LEFT}"][1].endswith(" rad; tolerance 0.001 m, 0.001 rad")
-    assert tiles[f"Error of {RIGHT}"][1] == "tolerance 0.001 m"
+    assert tiles[f"Error of {LEFT}"][0] == "< 1 µm"
+    assert tiles[f"Error of {LEFT}"][1].endswith(" µrad; tolerance 1 mm, 1 mrad")
+    assert tiles[f"Error of {RIGHT}"][1] == "tolerance 1 mm"
     assert "no goal pose" not in page(hands, PagePart(), [])
     # A base with a goal beside those of links has rows as ever.
     rows = rows_of(replace(hands, goal=replace(hands.goal, base=POSE)))  # type: ignore[type-var]
@@ -272,7 +272,7 @@ def test_a_flight_without_obstacles_says_nothing_of_them(hands: FlightReport) ->
     assert f"{WORLD}/path of the end-effector" in drawn
     assert f"{WORLD}/path of {RIGHT}" in drawn
     assert f"{WORLD}/path of {LEFT}" not in drawn
-    assert "of the end-effectors (orange)" in scene.caption
+    assert "of the end-effectors (green)" in scene.caption
 
 
 def test_pictures_of_configurations_have_the_obstacles(strut: FlightReport) -> None:

@@ -384,6 +384,18 @@ def test_panels_of_a_column_reach_its_left_edge(tmp_path: Path) -> None:
             assert 0.0005 < first < 0.04, (path.name, first)
 
 
+@pytest.mark.slow
+def test_keys_of_events_and_traces_end_before_the_right_edge(tmp_path: Path) -> None:
+    source = str(Path(__file__).parents[2] / "bags" / "servicing.mcap")
+    words = ("--events", "--format", "png", "--only", "joints,momentum,robot", "-o", str(tmp_path))
+    result = CliRunner().invoke(main, ["figures", source, *words])
+    assert result.exit_code == 0, result.output
+    for path in tmp_path.glob("*.png"):
+        with Image.open(path) as picture:
+            ink = np.asarray(picture.convert("L")) < 200
+        assert not ink[:, -3:].any(), path.name
+
+
 def test_the_documents_list_every_figure() -> None:
     page = (Path(__file__).parents[2] / "docs" / "report.md").read_text("utf-8")
     (row,) = (line for line in page.splitlines() if line.startswith("| `--only` |"))

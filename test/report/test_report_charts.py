@@ -74,6 +74,22 @@ def window(bag: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Brow
         assert outside == [html.as_uri()]
 
 
+@pytest.mark.slow
+@with_browser
+def test_the_capture_has_a_label_and_its_message_fits_a_phone(tmp_path: Path) -> None:
+    html = tmp_path / "servicing.html"
+    write_report(Path(__file__).parents[2] / "bags" / "servicing.mcap", html)
+    with browser(tmp_path / "profile") as opened:
+        opened.open(html, 1440, 900)
+        opened.wait_for("document.getElementById('animation').className === 'ready'")
+        seen = opened.evaluate("document.querySelector('.lane').innerText.split('\\n')")
+        assert {"approach", "captured", "detumbled", "goal reached"} <= set(seen)
+        opened.open(html, 390, 844)
+        box = "document.getElementById('events').closest('.scroll')"
+        assert opened.evaluate(f"{box}.scrollWidth - {box}.clientWidth") <= 0
+        assert opened.complaints == []
+
+
 def chart(window: Browser, number: int, expression: str) -> Any:
     return window.evaluate(f"(chart => {expression})(flightCharts.charts[{number}])")
 
@@ -81,7 +97,7 @@ def chart(window: Browser, number: int, expression: str) -> Any:
 @pytest.mark.slow
 @with_browser
 def test_charts_have_the_numbers_of_the_bag(window: Browser, flight: FlightReport) -> None:
-    assert window.evaluate("flightCharts.charts.length") == 11
+    assert window.evaluate("flightCharts.charts.length") == 10
     assert window.evaluate("document.querySelectorAll('figure.live').length") == 6
     assert window.evaluate("getComputedStyle(document.querySelector('.live .scroll')).display") == (
         "none"

@@ -134,7 +134,7 @@ def test_the_numbers_on_top(tmp_path: Path) -> None:
         ("Attitude error", "0.3 rad", "17.2°"),
         ("Manoeuvre", "1.5 s", "2 schedules in the whole flight"),
         ("Method", "lie_bracket", ""),
-        ("Momentum drift", "2.0e-08 kg m/s", "angular 2.4e-08 kg m²/s"),
+        ("Momentum drift", "2e-08 kg m/s", "angular 2.4e-08 kg m²/s"),
         ("Recorded", "3 ticks", "1.5 s, ticks of 0.5 s"),
     ]
 
@@ -148,9 +148,9 @@ def test_cards_of_tolerances_thrusters_and_propellant(tmp_path: Path) -> None:
         found, commands={"base_wrench": wrench}, series={**found.series, "propellant": used}
     )
     cards = {label: (value, note) for label, value, note in headline(thrusting)}
-    assert cards["Position error"] == ("0.5 m", "tolerance 0.02 m")
-    assert cards["Attitude error"] == ("0.3 rad", "17.2°; tolerance 0.06 rad")
-    drift = "2.0e-08 kg m/s", "angular 2.4e-08 kg m²/s"
+    assert cards["Position error"] == ("0.5 m", "tolerance 20 mm")
+    assert cards["Attitude error"] == ("0.3 rad", "17.2°; tolerance 60 mrad")
+    drift = "2e-08 kg m/s", "angular 2.4e-08 kg m²/s"
     assert cards["Momentum not explained by thrusters"] == drift
     assert "Momentum drift" not in cards
     assert cards["Propellant"] == ("12.3 g", "")
@@ -262,7 +262,7 @@ def test_flights_side_by_side(tmp_path: Path) -> None:
         *("Bag", "Outcome", "Position error", "Attitude error", "Manoeuvre"),
         *("Method", "Momentum drift", "Recorded"),
     )
-    drift = "2.0e-08 kg m/s"
+    drift = "2e-08 kg m/s"
     assert table.rows == [
         ("flight.mcap", "Reached", "0.5 m", "0.3 rad", "1.5 s", "lie_bracket", drift, "3 ticks"),
         ("bare.mcap", "Interrupted", "–", "–", "–", "–", drift, "3 ticks"),

@@ -15,7 +15,7 @@ from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.flight.verification import verify_bag
 from spacerobot_ros.resources import share_directory
 from spacerobot_ros.scenario import load_scenario, parse_kills
-from spacerobot_ros.session.processes import KillTimeline
+from spacerobot_ros.session.processes import KillTimeline, end_message
 from spacerobot_ros.session.run import run_scenario
 
 pytestmark = pytest.mark.usefixtures("own_domain")
@@ -134,3 +134,13 @@ def test_kills_come_in_their_order() -> None:
     assert timeline.due(100.0) == (["planner"], ["plant"])
     assert timeline.due(200.0) == ([], [])
     assert timeline.away == {"planner"}
+
+
+def test_a_node_that_is_killed_has_no_cause_in_its_log_but_one_that_crashes_has() -> None:
+    log = "[ERROR] [1.5] [plant]: Node '/coordinated_control' is silent\n"
+    assert end_message("plant", -9, log) == "Node 'plant' was ended by SIGKILL."
+    crash = f"{log}Fatal Python error: Segmentation fault\n"
+    assert end_message("plant", -11, crash) == (
+        "Node 'plant' was ended by SIGSEGV: Fatal Python error: Segmentation fault."
+    )
+    assert end_message("plant", 1, log).endswith("code 1: Node '/coordinated_control' is silent")

@@ -124,6 +124,19 @@ def test_a_planner_that_dies_is_started_again_within_the_limit(
         assert robot.wait(PATIENCE) == 2
 
 
+def test_a_robot_that_is_up_reports_changes_and_not_each_number(spacerobot: Command) -> None:
+    settings = ("--rate", "5", "--set", "coordinated_control.time_limit=8")
+    with spacerobot.start("up", "coordinated_control", *settings) as robot:
+        assert robot.stdout is not None
+        lines = iter(robot.stdout.readline, "")
+        next(line for line in lines if "Waiting for a goal; holding" in line)
+        missed = spacerobot("goal", "0.5", "0.3", "0")
+        assert missed.returncode == 1, missed.stdout + missed.stderr
+        robot.send_signal(signal.SIGINT)
+        later = [line.split(";")[0].split(":")[0].strip() for line in lines]
+    assert later == ["Flying to the goal", "The goal is not reached in time"]
+
+
 @pytest.mark.slow
 @pytest.mark.usefixtures("own_domain")
 def test_a_flight_by_nodes_that_is_interrupted_says_so(tmp_path: Path) -> None:

@@ -51,7 +51,7 @@ def test_a_plant_goes_on_through_a_contact_and_says_so() -> None:
     assert [each.level for each in found] == [2 if d <= 0 else 0 for d in truth]
     assert found[0].message == f"Links 'left' and 'right' are {truth[0]:.3g} m apart."
     deepest = found[int(truth.argmin())]
-    assert deepest.message == f"Links 'left' and 'right' touch, {-truth.min():.3g} m deep."
+    assert deepest.message == f"Links 'left' and 'right' touch, {-1e3 * truth.min():.3g} mm deep."
 
 
 def test_a_plant_whose_bodies_push_each_other_says_so() -> None:

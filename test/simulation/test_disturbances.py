@@ -210,7 +210,8 @@ def test_status_and_events_name_disturbances() -> None:
     line = f"{LINK} torque 0 0 0.5 in world at 0 until 0.1"
     event, running = monitor.update(PlantState.RUNNING, 0.0)
     assert (event.kind, event.level) == (EventKind.DISTURBANCE, 1)
-    assert event.message == f"A disturbance begins: {line}."
+    told = f"{LINK} torque 0 0 0.5 in world at 0 s until 0.1 s"
+    assert event.message == f"A disturbance begins: {told}."
     assert event.about == {"disturbance": line}
     assert running.kind is EventKind.RUNNING
     status = monitor.status
@@ -220,7 +221,7 @@ def test_status_and_events_name_disturbances() -> None:
     plant.step(np.zeros(3))
     (ended,) = monitor.update(PlantState.RUNNING, 0.1)
     assert (ended.kind, ended.level) == (EventKind.DISTURBANCE_ENDED, 0)
-    assert ended.message == f"A disturbance has ended: {line}."
+    assert ended.message == f"A disturbance has ended: {told}."
     assert monitor.status.level == 0
     assert "disturbances" not in monitor.status.to_values()
 

@@ -23,7 +23,7 @@ pytestmark = [
 
 SERVICER = ("--params-file", str(ROOT / "config" / "servicer.yaml"))
 SIZES = {"desktop": (1280, 900), "phone": (390, 780)}
-LOOK_BACK = '[role=slider][aria-label="Look back (s)"]'
+LOOK_BACK = '[role=slider][aria-label="Look back to (s)"]'
 
 
 @pytest.fixture
@@ -40,7 +40,7 @@ def test_the_live_page(dark: bool, nodes: Processes, tmp_path: Path) -> None:
     for size, (width, height) in SIZES.items():
         with browser(tmp_path / size) as window:
             page = Page(window, url, width, height)
-            page.wait_for_text("Goal reachable", "Look back (s)")
+            page.wait_for_text("Goal reachable", "Look back to (s)")
             for tab in ("Plots", "Joints", "Faults", "Log", "Goal"):
                 page.press(tab)
                 page.draw()
@@ -63,7 +63,7 @@ def test_every_control_of_the_live_page_has_the_focus_in_turn_and_works_by_key(
         order = focus_order(window, 50)
         wanted = (
             *("Fly", "Abort goal", "Stop all", "Rearm", "Reset", "Pause", "Resume"),
-            *("Look back (s)", "Look back (s), as a number"),
+            *("Look back to (s)", "Look back to (s), as a number"),
             *("Goal", "Plots", "Joints", "Faults", "Log"),
             *("Goal (m) x", "Goal (m) y", "Goal (m) z", "Roll, pitch, yaw (deg) z"),
             *("Goal for the end-effector", "Goal to the robot", "Look at the robot"),
@@ -84,7 +84,7 @@ def test_every_control_of_the_live_page_has_the_focus_in_turn_and_works_by_key(
         focus("Pause")
         press(window, "Enter")
         page.wait_for_text("paused")
-        focus("Look back (s)")
+        focus("Look back to (s)")
         press(window, "Home")
         page.wait_for_text("Looking back")
         focus("Back to the present")

@@ -111,6 +111,19 @@ def test_a_goal_ends_in_the_joint_positions_that_are_asked_for(server: Any) -> N
     assert page.editor.goals()["base"].joint_positions is None
 
 
+def test_a_goal_that_is_moved_is_sent_as_it_is_shown(server: Any) -> None:
+    page = Editor(server, "sliding_masses")
+    page.editor.place(POSE, None, np.zeros(3), 0.0)
+    turn = Rotation.from_euler("xyz", [12.3456, -7.891, 33.3333], degrees=True)
+    page.editor._on_gizmo_moved("/goal", np.array([0.818265, -1.23456, 0.1, *turn.as_quat()]))
+    goal, fields = page.editor.goals()["base"], (page.editor._position, page.editor._angles)
+    assert [each.precision for each in fields] == [4, 2], "so many decimals are seen"
+    assert tuple(goal.position) == fields[0].value == (0.8183, -1.2346, 0.1)
+    assert fields[1].value == (12.35, -7.89, 33.33)
+    angles = Rotation.from_quat(goal.quaternion).as_euler("xyz", degrees=True)
+    np.testing.assert_allclose(angles, fields[1].value, atol=1e-9)
+
+
 def test_the_ghost_is_not_drawn_where_the_robot_is(server: Any) -> None:
     page = Editor(server, "sliding_masses")
     q = np.zeros(3)

@@ -163,7 +163,7 @@ def farthest_flown(server: Server) -> float:
 
 def test_a_user_looks_back_at_the_last_five_minutes(server: Server, page: Page) -> None:
     last = flight(page, np.arange(0.0, 400.0, 0.5))
-    slider, back = server.gui.named("Look back (s)"), server.gui.named("Back to the present")
+    slider, back = server.gui.named("Look back to (s)"), server.gui.named("Back to the present")
     assert slider.visible
     assert not back.visible
     # The texts are drawn five times a second of wall time: a state before may be shown.
@@ -191,7 +191,7 @@ def test_a_user_looks_back_at_the_last_five_minutes(server: Server, page: Page) 
 
 def test_the_end_of_the_past_is_the_present(server: Server, page: Page) -> None:
     last = flight(page, np.arange(0.0, 10.0, 0.25))
-    slider = server.gui.named("Look back (s)")
+    slider = server.gui.named("Look back to (s)")
     slider.use(server, slider.max)
     page.update(replace(last, measured=measured(11.0, 11.0, 0.0, 0.0)), 11.0)
     assert server.scene.named("/robot").position[0] == 11.0
@@ -352,18 +352,21 @@ def test_nodes_that_have_ended_are_never_green(
     assert ("offline, last executing:" in head) is ("planner" in absent)
 
 
-def test_a_node_that_was_started_again_is_no_news_once_the_stack_has_ended(
-    server: Server, page: Page
-) -> None:
+def test_news_stay_ten_seconds_or_until_the_stack_has_ended(server: Server, page: Page) -> None:
     again = Notice("Node 'planner' was ended by SIGKILL. It is started again.", 1)
     page.update(FLYING, 1.0)
     page.announce(again)
-    page.update(FLYING, 2.0)
+    page.update(FLYING, 9.0)
+    assert "It is started again." in page._status.content
+    page.update(FLYING, 11.5)
+    assert "It is started again." not in page._status.content
+    page.announce(again)
+    page.update(FLYING, 12.0)
     assert "It is started again." in page._status.content
     ended = replace(
         FLYING, absent=frozenset({"plant", "planner"}), silent={"/plant": 3.0, "/planner": 3.0}
     )
-    page.update(ended, 3.0)
+    page.update(ended, 13.0)
     assert ENDED in page._status.content
     assert "It is started again." not in page._status.content
 
@@ -395,6 +398,12 @@ def test_a_controller_has_the_distances_of_base_and_end_effector() -> None:
     assert content.time_to_go(due) == 3.25
     head = content.status_html(due, errors)
     assert "base is 5 m and 0 rad from its goal, 3.2 s to go." in head
+    # An approach comes before the goal, from which the robot may then move away.
+    approach = replace(due, controller=ControllerStatus(ControllerState.TRACKING, task="approach"))
+    kinematics = ForwardKinematics(ROBOT)
+    assert set(content.goal_errors(due, kinematics)) == {"base"}
+    assert content.goal_errors(approach, kinematics) == {}
+    assert "pursued after the task &#x27;approach&#x27;." in content.status_html(approach)
     gone = replace(due, absent=frozenset({"controller"}))
     assert "to go" not in content.status_html(gone, errors)
     assert content.progress(due) is None

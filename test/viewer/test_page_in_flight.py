@@ -22,6 +22,7 @@ from support.viewer_page import ROOT, Page, Processes, processes
 
 from spacerobot_ros.model import load_robot
 from spacerobot_ros.model.description import Array
+from spacerobot_ros.scenario import load_scenario
 from spacerobot_ros.viewer.page import CAMERA
 from spacerobot_ros.viewer.scene import reach_of
 
@@ -85,6 +86,25 @@ def test_paths_are_in_front_and_the_sun_casts_shadows(up: Up, tmp_path: Path) ->
         page.press("Back to the present")
         page.wait_for_text("reached", without="Looking back")
         assert window.complaints == []
+
+
+def test_the_goal_of_the_scenario_is_flown_by_a_press(ros_domain: int, tmp_path: Path) -> None:
+    up = Up(tmp_path, ros_domain, "coordinated_control", "--rate", "4")
+    try:
+        with browser(tmp_path / "profile") as window:
+            page = Page(window, up.url)
+            page.wait_for_text("coordinated_control, 4 times real time", "Drag", "holding")
+            page.press("Fly the scenario's goal")
+            page.wait_for_text("The goal is accepted.", "tracking")
+            arrow = "!!window.__viserMutable.nodeRefFromName['/end_effector_goal']?.visible"
+            window.wait_for(f"!{arrow}")  # The arrows of the goal that is flown to.
+            page.wait_for_text("The goal is reached", without="Drag the arrows")
+            scenario = load_scenario("coordinated_control")
+            np.testing.assert_allclose(page.numbers(POSITION), scenario.goal.position, atol=1e-4)
+            window.wait_for(arrow)
+            assert window.complaints == []
+    finally:
+        up.close()
 
 
 def test_nodes_that_die_are_started_again_and_the_page_says_so(up: Up, tmp_path: Path) -> None:
@@ -221,7 +241,7 @@ def test_a_mission_is_flown_from_the_page(
         # The gizmo is dragged along the vertical axis, and the goal is checked anew.
         robot = load_robot(ROOT / "urdf" / "sliding_masses.urdf")
         reach = reach_of(robot)
-        tip, to = (np.array([0.0, 0.0, z * reach]) for z in (0.40, 0.46))
+        tip, to = (np.array([0.0, 0.0, z * reach]) for z in (0.267, 0.327))
         camera = reach * CAMERA
         page.drag(page.pixel(tip, camera), page.pixel(to, camera))
         x, y, z = page.numbers(POSITION)
@@ -311,7 +331,7 @@ def test_a_page_that_is_closed_in_the_middle_of_a_drag_leaves_a_goal_and_no_harm
     with browser(tmp_path / "first") as window:
         page = Page(window, url)
         page.wait_for_text("Goal reachable")
-        tip, to = (np.array([0.0, 0.0, z * reach]) for z in (0.40, 0.46))
+        tip, to = (np.array([0.0, 0.0, z * reach]) for z in (0.267, 0.327))
         page.drag(page.pixel(tip, camera), page.pixel(to, camera), release=False)
         moved = page.numbers(POSITION)
         assert moved[2] > 0.0

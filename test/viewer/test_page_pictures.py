@@ -200,7 +200,7 @@ def test_a_controlled_flight_that_is_looked_back_at_aborted_and_stopped(
         page.type("Goal (m)", [0.8, 0.4, 0.2])
         page.wait_for_text("Goal reachable", without="being moved")
         page.press("Fly")
-        page.wait_for_text("s to go.", "from the reference", "(tolerance 0.0005 m, 0.001 rad)")
+        page.wait_for_text("s to go.", "from the reference", "(tolerance 0.5 mm, 1 mrad)")
         looked.keep("controlled")
         page.slide(0.3)
         page.wait_for_text("Looking back")
@@ -210,58 +210,46 @@ def test_a_controlled_flight_that_is_looked_back_at_aborted_and_stopped(
         page.wait_for_text("Aborted on request; the robot holds.", "Plant running")
         looked.keep("aborted")
         page.press("Stop all")
-        page.wait_for_text("Plant latched", "stopped on request")
+        page.wait_for_text(
+            "Plant latched", "stopped on request", "The base drifts at", "Press Rearm."
+        )
         looked.keep("stopped")
+        page.press("Fly")
+        page.wait_for_text("'/plant' is latched: stopped on request; rearm it first.")
+        page.press("Rearm")
+        page.wait_for_text(
+            "Commands pass again", "Plant running", without="until the plant is rearmed"
+        )
 
 
-def test_goals_in_flight_that_are_refused_dragged_or_seen_by_a_page_that_is_loaded_again(
+def test_goals_in_flight_that_are_refused_typed_or_seen_by_a_page_that_is_loaded_again(
     tmp_path: Path, ros_domain: int
 ) -> None:
     with flying(tmp_path, ros_domain, "sliding_masses", "--rate", "0.1") as (up, looked):
         page = looked.page
-        page.wait_for_text("Goal reachable")
+        page.wait_for_text(
+            "Goal reachable", "sliding_masses, 0.1 times real time", "Drag the arrows"
+        )
         page.type("Goal (m)", [0.3, -0.25, 0.1])
-        page.wait_for_text("Goal reachable", without="being moved")
+        page.wait_for_text("Goal reachable", without="Drag the arrows")
         page.press("Fly")
-        page.wait_for_text("executing", "s to go", "(tolerance 0.02 m, 0.06 rad)")
+        page.wait_for_text("executing", "s to go", "(tolerance 20 mm, 60 mrad)")
         # A goal that is refused leaves the first one as it is.
         up.goal("9", "0", "0", "0", "0", "0", "1")
         page.wait_for_text("A later goal is refused: The goal position", "executing", "s to go")
         assert page.numbers("Goal (m)") == [0.3, -0.25, 0.1]
         looked.keep("refused-in-flight")
-        # The goal is dragged by one of its arrows while the robot flies to the last one.
-        before = page.numbers("Goal (m)")
-        for shift in _drags(looked):
-            page.drag(*shift)
-            if page.numbers("Goal (m)") != before:
-                break
-        assert page.numbers("Goal (m)") != before
-        page.wait_for_text("executing")
-        keep_picture(looked.window, "dragged-in-flight-light-desktop")
+        # Another goal is typed while the robot flies to the last one.
         page.type("Goal (m)", [0.1, 0.0, 0.05])
         page.wait_for_text("Goal reachable", without="being moved")
         page.press("Fly")
-        looked.window.wait_for("document.body.innerText.includes('executing')")
-        page.wait_for_text("executing", "s to go")
+        page.wait_for_text("The goal is accepted.", "executing", "s to go")
         # A page that is loaded again, or by somebody else, shows the flight as it is.
         again = Looked(looked.window, up.url)
-        again.page.wait_for_text("executing", "s to go", "base is ", "(tolerance 0.02 m, 0.06 rad)")
+        again.page.wait_for_text("executing", "s to go", "base is ", "(tolerance 20 mm, 60 mrad)")
         assert again.page.numbers("Goal (m)") == [0.1, 0.0, 0.05]
         assert np.linalg.norm(again.at("/goal/ghost") - again.at("/goal")) < 0.02
         again.keep("loaded-again")
-
-
-def _drags(looked: Looked) -> list[tuple[tuple[float, float], tuple[float, float]]]:
-    """Return drags of the mouse from where the arrows of a goal may be seen, outwards."""
-    x, y, _ = looked.window.evaluate(f"{_UNDER}({looked.at('/goal').tolist()})")
-    turns = np.linspace(0.0, 2.0 * np.pi, 24, endpoint=False)
-    ways = [np.array([np.cos(turn), np.sin(turn)]) for turn in turns]
-    centre = np.array([x, y])
-    return [
-        (tuple((centre + r * way).tolist()), tuple((centre + (r + 60.0) * way).tolist()))
-        for r in (60.0, 90.0, 40.0, 120.0)
-        for way in ways
-    ]
 
 
 @pytest.mark.parametrize("scenario", ["planar_chain", "coordinated_control"])
@@ -275,7 +263,7 @@ def test_a_planar_robot(scenario: str, tmp_path: Path, ros_domain: int) -> None:
         if scenario == "planar_chain":
             page.wait_for_text("executing", "Not controlled: position.", "s to go")
         else:
-            page.wait_for_text("s to go.", "from the reference", "(tolerance 0.001 m, 0.001 rad)")
+            page.wait_for_text("s to go.", "from the reference", "(tolerance 1 mm, 1 mrad)")
         assert "refused" not in page.text()
         looked.keep(f"planar-{scenario}")
 

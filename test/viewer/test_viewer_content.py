@@ -97,6 +97,18 @@ def test_silence_is_said() -> None:
     assert "no valid robot_description" in content.status_html(STATE, described=False)
 
 
+def test_a_latched_robot_is_said_to_drift() -> None:
+    latched = PlantStatus(PlantState.LATCHED, "Off: a fuse.", "abort", "a fuse")
+    assert STATE.measured is not None
+    drifts = replace(STATE.measured, twist=np.array([3e-3, 0.0, -4e-3, 0.0, 0.12, 0.05]))
+    for measured, speeds in (
+        (STATE.measured, "0 m/s and 0 rad/s"),
+        (drifts, "5 mm/s and 0.13 rad/s"),
+    ):
+        head = content.status_html(replace(STATE, measured=measured, plant=latched))
+        assert f"The base drifts at {speeds}. Press Rearm." in head
+
+
 def test_time_to_go_is_of_the_schedule_that_is_flown() -> None:
     executing = PlannerStatus(PlannerState.EXECUTING, manoeuvre_time_s=8.0, ends_at_s=10.0)
     flying = replace(STATE, planner=executing)
@@ -175,8 +187,8 @@ def test_rates_and_efforts_stand_beside_their_own_limits() -> None:
     titles = re.findall("<th>(.*?)</th>", rows[1])
     for k, row in enumerate(rows[2:]):
         cells = dict(zip(titles, re.findall("<td>(.*?)</td>", row), strict=True))
-        assert cells["rate"] == f"{qdot[k]:.2f} of {rates[k]:g} rad/s"
-        assert cells["effort"] == f"{effort[k]:.2f} of {efforts[k]:g} N m"
+        assert cells["rate"] == f"{qdot[k]:.2f}/{rates[k]:g} rad/s"
+        assert cells["effort"] == f"{effort[k]:.2f}/{efforts[k]:g} N m"
 
 
 def test_errors_are_to_the_goal() -> None:
@@ -219,10 +231,10 @@ def test_errors_of_links_are_those_of_their_measured_poses() -> None:
     base = replace(state, goals={"base": Goal(HERE[:3], HERE[3:])})
     errors, limits = content.goal_errors(base, kinematics), Tolerance(0.001, 0.002)
     head = content.status_html(base, errors, limits)
-    assert "base is 0 m and 0 rad from its goal (tolerance 0.001 m, 0.002 rad)." in head
+    assert "base is 0 m and 0 rad from its goal (tolerance 1 mm, 2 mrad)." in head
     flown = PlannerStatus(PlannerState.EXECUTING, not_controlled=("position",))
     head = content.status_html(replace(base, planner=flown), errors, limits)
-    free = "base is 0 m (not controlled) and 0 rad from its goal (tolerance 0.002 rad)."
+    free = "base is 0 m (not controlled) and 0 rad from its goal (tolerance 2 mrad)."
     assert free in head
     # Its message has the numbers once the planner has decided.
     done = replace(base, planner=PlannerStatus(PlannerState.REACHED, "It is there."))
@@ -283,13 +295,13 @@ def test_what_a_controller_does_not_control_is_said_beside_its_number() -> None:
         state = replace(STATE, controller=control, goals=goals)
         return content.status_html(state, distances, Tolerance(0.01, 0.02))
 
-    turned = "0.25 m (not controlled) and 0.5 rad from its goal (tolerance 0.02 rad)"
-    both = "0.25 m and 0.5 rad from its goal (tolerance 0.01 m, 0.02 rad)"
+    turned = "0.25 m (not controlled) and 0.5 rad from its goal (tolerance 20 mrad)"
+    both = "0.25 m and 0.5 rad from its goal (tolerance 10 mm, 20 mrad)"
     neither = "0.25 m (not controlled) and 0.5 rad (not controlled) from its goal."
     assert f"base is {turned}." in head("base.rz", "joint.elbow")
     assert f"end_effector is {neither}" in head("base.rz", "joint.elbow")
     assert f"base is {both}." in head("base.y", "base.rx", "end_effector.x")
-    placed = "0.25 m and 0.5 rad (not controlled) from its goal (tolerance 0.01 m)"
+    placed = "0.25 m and 0.5 rad (not controlled) from its goal (tolerance 10 mm)"
     assert f"end_effector is {placed}." in head("base.y", "base.rx", "end_effector.x")
 
 
@@ -426,15 +438,17 @@ def test_long_names_of_joints_have_room() -> None:
     assert f'title="{long[0]}">{short[0]}<' in table
 
 
-def test_the_clearance_and_its_links_are_shown() -> None:
+def test_a_small_clearance_and_its_links_are_shown() -> None:
     links = LinkPair("left <arm>", "right")
     apart = content.status_html(replace(STATE, clearance=ClearanceStatus(0.0123, links, 4.0)))
-    assert escape("Links 'left <arm>' and 'right' are 0.0123 m apart.") in apart
+    assert escape("Links 'left <arm>' and 'right' are 12.3 mm apart.") in apart
     assert "#d23c3c" not in apart
     deep = content.status_html(replace(STATE, clearance=ClearanceStatus(-0.2, links, 4.0)))
     assert f'#d23c3c);font-weight:600;margin:2px 0">{escape("Links")}' in deep
     assert escape("and 'right' touch, 0.2 m deep.") in deep
-    gone = replace(STATE, clearance=ClearanceStatus(0.1, links, 4.0), absent=frozenset({"plant"}))
+    far = content.status_html(replace(STATE, clearance=ClearanceStatus(0.06, links, 4.0)))
+    assert "apart" not in far, "it is no news"
+    gone = replace(STATE, clearance=ClearanceStatus(0.01, links, 4.0), absent=frozenset({"plant"}))
     assert 'opacity:.75"><div style="margin:2px 0">Links' in content.status_html(gone)
 
 

@@ -23,7 +23,7 @@ from spacerobot_ros.model.thrusters import find_thrusters
 from spacerobot_ros.model.urdf import parse_robot, parse_world
 from spacerobot_ros.model.world import with_world
 from spacerobot_ros.planning import Goal
-from spacerobot_ros.planning.core.goal import EndEffectorGoal
+from spacerobot_ros.planning.core.goal import EndEffectorGoal, Tolerance
 from spacerobot_ros.resources import robot_file, share_directory
 from spacerobot_ros.viewer import scene
 from spacerobot_ros.viewer.content import GoalDistance
@@ -156,7 +156,7 @@ def test_curves_of_many_joints_differ(server: Any) -> None:
     names = tuple(f"joint_{number}" for number in range(30))
     server.gui.reset()
     plot = _Plot(server.gui, "Joints", names, 1e-3, signed=True)
-    looks = {(each["stroke"], each.get("dash")) for each in plot.handle.series[1:]}
+    looks = {(each["stroke"], each.get("dash")) for each in plot.handle.series[1:-1]}
     assert len(looks) == 30
 
 
@@ -171,14 +171,18 @@ def test_rounding_is_no_peak_and_numbers_of_a_flight_are_seen(server: Any) -> No
         plots.add(StackState(measured, momenta=Momenta(actual + size * off, actual, 0.0)), {})
     plots.draw()
     handle = plots._momentum.handle
-    assert [series["label"] for series in handle.series[1:]] == ["1e-6 kg m/s", "1e-6 kg m²/s"]
+    assert [series["label"] for series in handle.series[1:]] == [
+        "1e-6 kg m/s",
+        "1e-6 kg m²/s",
+        "shown",
+    ]
     np.testing.assert_allclose(handle.data[1], [0.0, 0.0, 3.0], atol=1e-8)
     np.testing.assert_allclose(handle.data[2], [0.0, 0.0, 6.0], atol=1e-8)
     # The axis goes to 1 where everything is less, and from below zero where numbers have signs.
-    ends = handle.scales["y"]["range"]
+    ends = handle.scales["1e-6 kg m/s"]["range"]
     assert (ends["min"]["soft"], ends["max"]["soft"]) == (0.0, 1.0)
     assert plots._shape is not None
-    ends = plots._shape.handle.scales["y"]["range"]
+    ends = plots._shape.handle.scales["m"]["range"]
     assert (ends["min"]["soft"], ends["max"]["soft"]) == (-0.01, 0.01)
 
 
@@ -200,8 +204,8 @@ def test_the_momentum_budget_is_plotted_while_a_controller_reports_it(server: An
         assert handle.visible is (controller is not None)
         assert ("2.000 N m s" in plots._budget_text.content) is (controller is not None)
     plots.draw()
-    assert [series["label"] for series in handle.series[1:]] == list(parts)
-    assert [column.tolist() for column in handle.data] == [[2.0], [0.5], [0.25], [2.0], [1.75]]
+    assert [series["label"] for series in handle.series[1:]] == [*parts, "shown"]
+    assert [column.tolist() for column in handle.data[:-1]] == [[2.0], [0.5], [0.25], [2.0], [1.75]]
     plots.show_robot(robot)
     assert not handle.visible
 
@@ -219,26 +223,37 @@ def test_each_link_with_a_goal_has_a_plot_of_its_own(server: Any) -> None:
         plots.draw()
 
     def shown() -> list[str]:
-        plain = (plots._error, plots._tool)
-        every = (*plain, *plots._links.values())
-        return [plot.handle.title for plot in every if plot.handle.visible]
+        return [plot.handle.title for plot in plots._errors.values() if plot.handle.visible]
+
+    def numbers(part: str) -> list[list[float]]:
+        return [column.tolist() for column in plots._errors[part].handle.data]
 
     add(0.0, {})
-    assert shown() == ["Base error"]
+    assert shown() == []
+    assert plots._no_errors.visible
     add(1.0, {"hand": hand}, hand=GoalDistance(0.5, None))
     assert shown() == ["Error of hand"], "the base is free"
     add(2.0, {"hand": hand}, hand=GoalDistance(0.25, None))
-    time, distance = plots._links["hand"].handle.data
-    assert (time.tolist(), distance.tolist()) == ([1.0, 2.0], [0.5, 0.25])
+    assert numbers("hand")[:2] == [[1.0, 2.0], [500.0, 250.0]], "in mm"
     add(3.0, {"hand": hand, "base": base}, hand=GoalDistance(0.2, 0.7), base=GoalDistance(3.0, 2.0))
-    assert shown() == ["Base error", "Error of hand"]
-    assert [column.tolist() for column in plots._links["hand"].handle.data] == [[3.0], [0.2], [0.7]]
-    assert [column.tolist() for column in plots._error.handle.data] == [[3.0], [3.0], [2.0]]
-    add(4.0, {"end_effector": base}, end_effector=GoalDistance(0.75, 0.5))
-    assert shown() == ["Base error", "End-effector error"], "that of a controller"
-    assert plots._tool.handle.data[1].tolist() == [0.75]
+    assert shown() == ["Error of hand", "Error of base"]
+    assert numbers("hand")[:3] == [[3.0], [200.0], [700.0]]
+    # Tolerances, and an upright line at the time that is looked back to.
+    plots.draw(Tolerance(0.02, 0.005), 2.5)
+    times, _, _, near, turned, line = numbers("base")
+    assert (times, near, turned) == ([2.5, 2.5, 2.5, 3.0], [20.0] * 4, [5.0] * 4)
+    assert line == [-1.0, 1.0, -1.0, -1.0]
+    handle = plots._errors["base"].handle
+    assert [axis["scale"] for axis in handle.axes[1:]] == ["mm", "mrad"]
+    # A logarithmic axis begins at a micrometre.
+    plots._logarithmic.value = True
+    add(4.0, {"base": base}, base=GoalDistance(0.0, 2.0))
+    assert handle.scales["mm"] == {"distr": 3}
+    assert numbers("base")[1] == [3000.0, 1e-3]
+    add(5.0, {"end_effector": base}, end_effector=GoalDistance(0.75, 0.5))
+    assert shown() == ["Error of end_effector"], "that of a controller"
     plots.show_robot(None)
-    assert plots._links == {}
+    assert plots._errors == {}
 
 
 def test_a_link_is_where_its_joints_have_it() -> None:

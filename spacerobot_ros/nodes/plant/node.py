@@ -48,7 +48,7 @@ from spacerobot_ros.simulation.capture import CapturePlant, CaptureReport, Relea
 from spacerobot_ros.simulation.commands import CommandValidator
 from spacerobot_ros.simulation.config import PlantConfig
 from spacerobot_ros.simulation.sensors import ReportedState
-from spacerobot_ros.simulation.status import PlantMonitor, PlantState, PlantStatus
+from spacerobot_ros.simulation.status import PlantMonitor, PlantState, PlantStatus, latched_text
 from spacerobot_ros.simulation.time_modes import Lockstep, RealTime
 from spacerobot_ros.times import SECOND
 from spacerobot_ros.topics import TOPICS
@@ -593,7 +593,7 @@ class PlantNode(FlightNode):
         self._commands.latch("abort", "stopped on request", self.time_ns)
         self._report.latched()
         self._publish_changed_status()
-        return "The joints come to rest; nothing moves until '~/rearm' is called."
+        return f"{latched_text('stopped on request')}."
 
     def _rearm(self) -> str:
         fault = self._commands.rearm()
@@ -611,7 +611,9 @@ class PlantNode(FlightNode):
         if not self._is_running_or_paused:
             raise CommandError(f"The plant is {self._active.value}: nothing moves.")
         if self._commands.fault:
-            raise CommandError(f"A fault is latched: {self._commands.fault}; call '~/rearm' first.")
+            raise CommandError(
+                f"A fault is latched: {self._commands.fault}; rearm the plant first."
+            )
         report = act(self._capturing)
         self._publish_changed_status()
         return report.event(self.time_ns / SECOND).message

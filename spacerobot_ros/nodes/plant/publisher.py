@@ -37,6 +37,7 @@ from spacerobot_ros.simulation.commands import (
 from spacerobot_ros.simulation.config import PlantConfig
 from spacerobot_ros.simulation.plant import Plant
 from spacerobot_ros.simulation.sensors import ReportedState
+from spacerobot_ros.simulation.status import latched_text
 from spacerobot_ros.simulation.time_modes import RealTime
 from spacerobot_ros.times import SECOND, stamp_bytes
 from spacerobot_ros.topics import TOPICS, Topic, pose_topic
@@ -96,9 +97,7 @@ class PlantReport:
 
     def latched(self) -> None:
         """Log that a fault is latched."""
-        self._node.get_logger().error(
-            f"A fault is latched: {self._commands.fault}. Nothing moves until '~/rearm' is called."
-        )
+        self._node.get_logger().error(f"{latched_text(self._commands.fault)}.")
 
     def timed_out(self, source: CommandSource, timeout: float) -> None:
         """Log that a commander's commands have ceased."""

@@ -180,6 +180,7 @@ class Listener:
     def forget_state(self) -> None:
         """Drop the received state when the robot changes."""
         self._pose: Array | None = None
+        self._twist = np.zeros(6)
         self._stamp_s, self._came_at = 0.0, -math.inf
         self._q: tuple[Array, Array, Array] | None = None
         self._measured: Measured | None = None
@@ -258,11 +259,13 @@ class Listener:
             pose = pose_array(odom.pose.pose.position, odom.pose.pose.orientation)
             if pose is not None:
                 self._pose = pose
+                moves, turns = odom.twist.twist.linear, odom.twist.twist.angular
+                self._twist = np.nan_to_num([getattr(v, x) for v in (moves, turns) for x in "xyz"])
         if joints is not None:
             self._take_joints(joints)
         if (odom is not None or joints is not None) and self._pose is not None and self._q:
             self._came_at = now
-            self._measured = Measured(self._stamp_s, self._pose, *self._q)
+            self._measured = Measured(self._stamp_s, self._pose, *self._q, self._twist)
         tool = self._end_effector.take()
         if tool is not None:
             self._tool_pose = pose_array(tool.pose.position, tool.pose.orientation)
@@ -341,7 +344,7 @@ class Listener:
             self._statuses[key] = status
             self._reporters[key] = message.name
             self._hidden.pop(message.name, None)
-            if isinstance(status, PlannerStatus):
+            if isinstance(status, PlannerStatus) and status.state is not PlannerState.REFUSED:
                 with suppress(SpaceRobotError):  # An unreadable goal, of another package.
                     self._take_planned_goal(status)
             self._on_status(key, message.name)
@@ -364,7 +367,10 @@ class Listener:
             case (
                 PlannerStatus(state=PlannerState.REFUSED)
                 | ControllerStatus(state=ControllerState.REFUSED)
-            ) if pursued is not None and pursued.goal_id != status.goal_id:
+            ) if pursued is None or pursued.goal_id != status.goal_id:
+                if pursued is None:
+                    self._goals = {}
+                    return status
                 self._goals = dict(self._pursued_goals)
                 return replace(pursued, message=f"{pursued.message}{_REFUSED}{status.message}")
             case PlannerStatus(state=PlannerState.PLANNING):

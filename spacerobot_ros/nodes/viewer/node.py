@@ -101,6 +101,7 @@ _NODES_WITH_PARAMETERS = ("plant", "planner", "controller")
 
 _LONGEST_MATCHING_WAIT = 4.0  # wall s
 _LONGEST_GOAL_ANSWER_WAIT = 5.0  # wall s
+_RESTART_NOTICE_TIME = 60.0  # wall s
 _MICROSECOND_NS = 1000
 _MILLISECOND_NS = 1_000_000
 
@@ -127,7 +128,7 @@ class ViewerNode(FlightNode):
         """Start the page and subscribe."""
         config = self.config
         require_viser()
-        self._server = start_server(config.host, config.port)
+        self._server = start_server(config.host, config.port, config.title)
         self.url = url_of(self._server)
         if not is_loopback(config.host):
             self.get_logger().warning(
@@ -314,9 +315,13 @@ class ViewerNode(FlightNode):
         except SpaceRobotError:
             return
         notice = Notice(event.message, event.level, event.time_s, message.name)
-        self._page.note(notice)
         if event.kind is EventKind.NODE_RESTARTED:
+            self._page.announce(notice, _RESTART_NOTICE_TIME)
+        elif event.kind in (EventKind.GOAL_ACCEPTED, EventKind.GOAL_REFUSED):
             self._page.announce(notice)
+            self._unanswered_goal = None
+        else:
+            self._page.note(notice)
         if event.kind in (EventKind.ACTIVATED, EventKind.NODE_BACK):
             for key, name in self._full_names.items():
                 if name == message.name and key in _NODES_WITH_PARAMETERS:
@@ -401,6 +406,9 @@ class ViewerNode(FlightNode):
     def _note(self, message: str, level: int = 0, source: str = "") -> None:
         self._page.note(Notice(message, level, None, source))
 
+    def _answer(self, message: str, level: int = 0, source: str = "page") -> None:
+        self._page.announce(Notice(message, level, None, source))
+
     # -- actions of users -----------------------------------------------------------------------
 
     def _carry_out(self, action: Action) -> None:
@@ -409,7 +417,7 @@ class ViewerNode(FlightNode):
                 self._goals_to_send = goals, time.monotonic() + _LONGEST_MATCHING_WAIT
             case InjectAction(text):
                 self._fault_topic.publish(String(data=text))
-                self._note(f"Sent to the plant: {text}", source="page")
+                self._answer(f"Sent to the plant: {text}")
             case SeekAction(seconds):
                 self._seek_topic.publish(Float64(data=float(seconds)))
             case Request():
@@ -421,7 +429,7 @@ class ViewerNode(FlightNode):
             goals, until = self._goals_to_send
             topics = [self._shape_topic, *(self._goal_topics[part] for part in goals)]
             # A node that has just started is discovered before its subscriptions are matched.
-            met = all(
+            met = self._count_readers(goals) > 0 and all(
                 topic.get_subscription_count() >= self.count_subscribers(topic.topic_name)
                 for topic in topics
             )
@@ -440,9 +448,15 @@ class ViewerNode(FlightNode):
                 self._unanswered_goal = goal_id, now + _LONGEST_GOAL_ANSWER_WAIT
             elif now >= until:
                 self._unanswered_goal = None
-                self._note(
-                    "No planner or controller has answered the goal: send it again.", 2, "page"
-                )
+                self._answer("No planner or controller has answered the goal: send it again.", 2)
+
+    def _count_readers(self, goals: Mapping[Part, Goal]) -> int:
+        """Return how many planners and controllers hear a goal, at most."""
+        # Where this node hears the goal too, one of the readers is its own.
+        return max(
+            self._goal_topics[part].get_subscription_count() - (part in _PARTS_WITH_RECEIVED_GOALS)
+            for part in goals
+        )
 
     def _send(self, goals: Mapping[Part, Goal]) -> None:
         # Statuses name a goal by its stamp, which is therefore unique among all viewers.
@@ -452,17 +466,13 @@ class ViewerNode(FlightNode):
         # An empty message resets the joint positions that another goal may have required.
         names = () if self._robot is None else self._robot.joint_names
         self._shape_topic.publish(shape_message(next(iter(goals.values())), names))
-        readers = 0
         for part, goal in goals.items():
             aim = goal.end_effectors[0].as_goal() if goal.end_effectors else goal
             self._goal_topics[part].publish(goal_message(aim, self.config.world_frame, time_ns))
-            # Where this node hears the goal too, one of the readers is its own.
-            own = 1 if part in _PARTS_WITH_RECEIVED_GOALS else 0
-            readers = max(readers, self._goal_topics[part].get_subscription_count() - own)
-        if not readers:
-            self._note("No planner or controller takes the goal: none is running.", 2, "page")
+        if not self._count_readers(goals):
+            self._answer("No planner or controller takes the goal: none is running.", 2)
         else:
-            self._note("Goal sent.", source="page")
+            self._answer("Goal sent.")
             goal_id = GoalIds().of(*divmod(min(time_ns, LATEST_NS), SECOND))
             self._unanswered_goal = goal_id, time.monotonic() + _LONGEST_GOAL_ANSWER_WAIT
         editor = self._page.editor
@@ -488,7 +498,7 @@ class ViewerNode(FlightNode):
             )
         if not called:
             whose = " or ".join(keys)
-            self._note(f"No {whose} offers the service '{service}' now.", 2, "page")
+            self._answer(f"No {whose} offers the service '{service}' now.", 2)
 
     def _client(self, kind: type[Any], name: str) -> Client:
         key = (name, kind)
@@ -499,7 +509,7 @@ class ViewerNode(FlightNode):
     def _on_answer(self, name: str, future: Any) -> None:
         with suppress(Exception):  # The service no longer exists.
             answer = future.result()
-            self._note(answer.message, 0 if answer.success else 2, name)
+            self._answer(answer.message, 0 if answer.success else 2, name)
 
 
 def main() -> None:

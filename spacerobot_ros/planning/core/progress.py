@@ -18,8 +18,6 @@ from spacerobot_ros.model.compilation import ANNOUNCEMENT_ATTRIBUTE
 _RECORD_ATTRIBUTE = "search_progress"
 _PACKAGE = "spacerobot_ros"
 
-_TIMED_FROM = 1.0  # s
-
 
 class SearchPhase(Enum):
     """What a search does: it searches for solutions, refines them, and makes them clear, and clear
@@ -59,10 +57,8 @@ class SearchProgress:
     def message(self) -> str:
         """The progress as a message, without a full stop."""
         best = f"best {self.best_s:.4g} s" if math.isfinite(self.best_s) else "none found yet"
-        elapsed = f", {self.elapsed_s:.0f} s" if self.elapsed_s >= _TIMED_FROM else ""
-        return (
-            f"{self.phase.value}, start {self.starts} of at most {self.max_starts}, {best}{elapsed}"
-        )
+        starts = f"start {self.starts} of at most {self.max_starts}, "
+        return f"{self.phase.value}, {starts * (self.phase is SearchPhase.SEARCHING)}{best}"
 
 
 def log_progress(logger: logging.Logger, progress: SearchProgress, line: str) -> None:

@@ -16,6 +16,7 @@ from functools import cached_property
 import casadi as ca
 import numpy as np
 
+from spacerobot_ros.errors import quantity
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.rotations import (
@@ -64,7 +65,7 @@ class TrackingError:
     angle: float
 
     def __str__(self) -> str:
-        return f"Off the path by {self.distance:.3g} m and {self.angle:.3g} rad"
+        return f"Off the path by {quantity(self.distance, 'm')} and {quantity(self.angle, 'rad')}"
 
 
 class PathCheck:

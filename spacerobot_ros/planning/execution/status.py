@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass, field
 from enum import Enum
 from functools import lru_cache
 
+from spacerobot_ros.errors import quantity
 from spacerobot_ros.events import (
     INTEGER,
     KeyValueField,
@@ -260,16 +261,16 @@ def describe_remaining_error(
     With a tolerance it names that of each part, with a goal also the parts that are not controlled.
     """
     parts: dict[Controlled, str] = {
-        "position": f"{error.distance:.3g} m",
-        "attitude": f"{error.angle:.3g} rad",
+        "position": quantity(error.distance, "m"),
+        "attitude": quantity(error.angle, "rad"),
     }
     if len(error.shape):
-        parts["shape"] = f"{error.max_joint_error:.3g} at the joints"
+        parts["shape"] = quantity(error.max_joint_error, "at the joints")
     if error.end_effectors:
         distance, angle = error.largest_end_effector_distance, error.largest_end_effector_angle
         # Goals of positions alone leave no angle.
-        turn = f" and {angle:.3g} rad" if angle > 0 else ""
-        parts["end_effectors"] = f"{distance:.3g} m{turn}"
+        turn = f" and {quantity(angle, 'rad')}" if angle > 0 else ""
+        parts["end_effectors"] = quantity(distance, "m") + turn
     several = len(error.end_effectors) > 1
     hand = parts.pop("end_effectors", "") if "end_effectors" in controls else ""
     if hand:
@@ -294,9 +295,9 @@ def _describe_tolerance(
     if tolerance is not None:
         hands = "end_effectors" in controls
         limits = (
-            (f"{tolerance.position:.3g} m", hands or "position" in controls),
-            (f"{tolerance.attitude:.3g} rad", hands or "attitude" in controls),
-            (f"{tolerance.shape:.3g} at the joints", "shape" in controls and has_shape),
+            (quantity(tolerance.position, "m"), hands or "position" in controls),
+            (quantity(tolerance.attitude, "rad"), hands or "attitude" in controls),
+            (quantity(tolerance.shape, "at the joints"), "shape" in controls and has_shape),
         )
         notes.append("tolerance " + ", ".join(text for text, counts in limits if counts))
     if parts_left:
