@@ -443,7 +443,8 @@ class Scenario:
     def with_end_effectors(
         self, goals: Sequence[EndEffectorGoal], base: frozenset[Controlled] = frozenset()
     ) -> Scenario:
-        """Return the scenario with goals of end-effectors, and its goal in parts of the base alone.
+        """Return the scenario with goals of end-effectors in place of its own, and its goal in
+        parts of the base alone.
 
         Raises
         ------
@@ -453,7 +454,7 @@ class Scenario:
         made = Goal.of_end_effectors(goals)
         goal = replace(self.goal, joint_positions=None, base=base)
         aimed = replace(goal, end_effectors=made.end_effectors)
-        return self.with_other_goal(aimed)._with_goal_topics()
+        return replace(self.with_other_goal(aimed), end_effector_goal=None)._with_goal_topics()
 
     def _with_goal_topics(self) -> Scenario:
         """Return the scenario with a planner that takes goals of all its end-effectors, whose poses

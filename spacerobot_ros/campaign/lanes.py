@@ -370,6 +370,8 @@ class _ControlledLanes:
         """Return the reason why lanes cannot fly a campaign, as a clause; empty if they can."""
         scenario = campaign.scenario
         plant = scenario.plant
+        if scenario.goal.end_effectors:
+            return "the goal is for end-effectors"
         if plant.thrusters:
             return "its thrusters are on or off, which engine 'flights' flies"
         if plant.beyond_limits != "clip":

@@ -22,7 +22,7 @@ from spacerobot_ros.control.limits import (
     MotionLimits,
     Saturated,
 )
-from spacerobot_ros.control.outputs import OutputDistance, OutputSelection
+from spacerobot_ros.control.outputs import AXES, OutputDistance, OutputSelection
 from spacerobot_ros.control.reference import (
     PROFILES,
     OutputErrors,
@@ -38,10 +38,20 @@ from spacerobot_ros.control.state import (
     Reference,
 )
 from spacerobot_ros.control.wheels import WheelControl
-from spacerobot_ros.errors import ParameterError, SpaceRobotError, describe_exception
+from spacerobot_ros.errors import (
+    ParameterError,
+    PlanningError,
+    SpaceRobotError,
+    describe_exception,
+)
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.grasp import Payload
-from spacerobot_ros.model.rotations import compose_poses, matrix_from_quaternion, relative_pose
+from spacerobot_ros.model.rotations import (
+    attitude_error,
+    compose_poses,
+    matrix_from_quaternion,
+    relative_pose,
+)
 from spacerobot_ros.model.space_robot import SpaceRobot
 
 _BRAKE_RATE = 2.0
@@ -167,6 +177,48 @@ class CoordinatedController:
         if joints is not None:
             goal = replace(goal, joints=JointReference.at_rest(joints))
         self._begin_motion(time, state, start, goal, carries=carries)
+
+    def require_controlled_axes(
+        self,
+        state: ControlState,
+        config: ControllerConfig,
+        *,
+        base: PoseReference | None = None,
+        end_effector: PoseReference | None = None,
+    ) -> None:
+        """Refuse goals that differ from the present pose in an axis that the law leaves as it is.
+
+        The law of a planar robot controls the axes of its plane alone. A position or an attitude
+        without any controlled axis is no matter of an axis: such a part is not controlled at all.
+
+        Raises
+        ------
+        PlanningError
+            A goal is farther from the pose than the tolerance of the configuration; the message
+            names the axes.
+        """
+        selection, labels = self.law.outputs.selection, ", ".join(self.law.outputs.labels)
+        here = Reference.present(self.law.robot, state, selection.end_effector_link)
+        for name, goal in (("base", base), ("end_effector", end_effector)):
+            start, controlled = getattr(here, name), getattr(selection, name)
+            if goal is None or start is None:
+                continue
+            way = goal.position - start.position
+            turn_B = attitude_error(start.quaternion, goal.quaternion)
+            turn = matrix_from_quaternion(start.quaternion) @ turn_B
+            for part, unit, axes, error, tolerance in (
+                ("position", "m", AXES[:3], way, config.position_tolerance),
+                ("attitude", "rad", AXES[3:], turn, config.attitude_tolerance),
+            ):
+                left = [i for i in range(3) if axes[i] not in controlled]
+                off = float(np.linalg.norm(error[left]))
+                if 0 < len(left) < 3 and off > tolerance:
+                    raise PlanningError(
+                        f"The goal {part} of the {name.replace('_', '-')} is {off:.4g} {unit} from "
+                        f"the present one in {' and '.join(axes[i] for i in left)} of the world, "
+                        f"which the law '{self.law.name}' does not control; its outputs are "
+                        f"{labels}."
+                    )
 
     def _begin_motion(
         self, time: float, state: ControlState, start: Reference, goal: Reference, *, carries: bool

@@ -194,6 +194,8 @@ class ControlExecutive:
         PlanningError
             The law does not control it, or the goal's shape has another number of joints.
         """
+        if key == END_EFFECTOR:
+            self._require_output(key)
         parts = self._parts_of(goal) if goal.goal.end_effectors else {key: goal}
         for part, each in parts.items():
             self._require_controlled(part, each)
@@ -202,11 +204,11 @@ class ControlExecutive:
             self._pending[part] = each
 
     def _parts_of(self, identified: IdentifiedGoal) -> dict[str, IdentifiedGoal]:
-        law, goal = (
-            self.controller.law,
-            identified.goal.for_robot(self.controller.law.robot.description),
-        )
-        link = law.outputs.selection.end_effector_link
+        law, goal = self.controller.law, identified.goal
+        link, axes = law.outputs.selection.end_effector_link, law.outputs.selection.end_effector
+        # The law's end-effector is the default one here, whatever its name.
+        hands = tuple(replace(each, link=each.link or link) for each in goal.end_effectors)
+        goal = replace(goal, end_effectors=hands).for_robot(law.robot.description)
         parts = {}
         if goal.base:
             pose = Goal(goal.position, goal.quaternion, goal.joint_positions)
@@ -217,23 +219,34 @@ class ControlExecutive:
                     f"The goal is for '{each.link}', which the law '{law.name}' does not control"
                     f"{f'; it controls {link!r}' if link else ''}."
                 )
-            if each.quaternion is None:
+            if each.waypoints is not None:
                 raise PlanningError(
-                    f"The goal of '{each.link}' is a position alone; the controller takes a pose: "
-                    "give it an orientation, too."
+                    f"The goal of '{each.link}' is a path, which a controller does not follow: "
+                    "plan it by the method 'resolved_rate'."
                 )
-            pose = Goal(each.position, each.quaternion, goal.joint_positions)
+            turned = any(axis.startswith("r") for axis in axes)
+            if each.quaternion is None and turned:
+                raise PlanningError(
+                    f"The goal of '{each.link}' is a position alone, and the law '{law.name}' "
+                    "controls its attitude: give it an orientation, too."
+                )
+            quaternion = _NO_ROTATION if each.quaternion is None else each.quaternion
+            pose = Goal(each.position, quaternion, goal.joint_positions)
             parts[END_EFFECTOR] = replace(identified, goal=pose)
         return parts
 
-    def _require_controlled(self, key: str, goal: IdentifiedGoal) -> None:
+    def _require_output(self, key: str) -> None:
         law = self.controller.law
         if not getattr(law.outputs.selection, key):
             raise PlanningError(
                 f"The law '{law.name}' does not control the {key.replace('_', '-')} of this robot; "
                 f"its outputs are {', '.join(law.outputs.labels)}."
             )
+
+    def _require_controlled(self, key: str, goal: IdentifiedGoal) -> None:
+        self._require_output(key)
         self._require_tolerances_met(key, goal)
+        law = self.controller.law
         shape, wheels = goal.goal.joint_positions, self.controller.wheels
         n = law.robot.n if wheels is None else law.robot.n + len(wheels.wheels)
         if shape is not None and len(shape) != n:
@@ -523,6 +536,8 @@ class ControlExecutive:
     def _follow_goals(self, time: float, state: ControlState) -> None:
         """Go on with the tasks before the pending goals, and start towards the goals after them."""
         servicing = self.servicing
+        if self._pending:
+            self._refuse_uncontrolled(state)
         if self._requested is not None:
             self._begin_tasks(time, self._requested)
             self._requested = None
@@ -549,6 +564,22 @@ class ControlExecutive:
                 )
             case TaskState.REFUSED | TaskState.FAILED:
                 self._end_tasks(time, state, progress)
+
+    def _refuse_uncontrolled(self, state: ControlState) -> None:
+        """Refuse pending goals that the law leaves unmet in a single axis, by a measured state."""
+        for key, pending in list(self._pending.items()):
+            pose = PoseReference(pending.goal.position, pending.goal.quaternion)
+            config = self._config_with(pending.tolerance)
+            try:
+                self.controller.require_controlled_axes(state, config, **{key: pose})
+            except PlanningError as error:
+                self._pending = {
+                    part: each
+                    for part, each in self._pending.items()
+                    if each.goal_id != pending.goal_id
+                }
+                self.refuse(str(error), pending.goal_id)
+                break
 
     def _begin_tasks(self, time: float, tasks: tuple[Task, ...]) -> None:
         self.servicing.begin(tasks)
@@ -607,14 +638,17 @@ class ControlExecutive:
         self.outputs.append(PursuedGoals(self._goals_to_save()))
 
     def _take_tolerance(self, tolerance: Tolerance | None) -> None:
-        self._goal_tolerance, self._goal_config = tolerance, self._config
-        if tolerance is not None:
-            self._goal_config = replace(
-                self._config,
-                position_tolerance=tolerance.position,
-                attitude_tolerance=tolerance.attitude,
-                joint_tolerance=tolerance.shape,
-            )
+        self._goal_tolerance, self._goal_config = tolerance, self._config_with(tolerance)
+
+    def _config_with(self, tolerance: Tolerance | None) -> ControllerConfig:
+        if tolerance is None:
+            return self._config
+        return replace(
+            self._config,
+            position_tolerance=tolerance.position,
+            attitude_tolerance=tolerance.attitude,
+            joint_tolerance=tolerance.shape,
+        )
 
     def _report_acceptance(self) -> None:
         message, goal_id = "The goal is accepted.", self._goal_id
@@ -712,6 +746,8 @@ def decided_message(
         message += f", within tolerance for less than the settling time of {config.settle_time:g} s"
     return f"{message}."
 
+
+_NO_ROTATION = np.array([0.0, 0.0, 0.0, 1.0])
 
 _MAX_STATE_GAP, _MAX_STATE_GAP_PERIODS = 1.0, 10
 """Longest gap between two states, s, and in control periods; longer gaps are jumps of time."""

@@ -42,7 +42,7 @@ from spacerobot_ros.measures import Outcome
 from spacerobot_ros.messages.diagnostics import PlantDiagnostics, state_diagnostics
 from spacerobot_ros.messages.statuses import StatusRecord
 from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.model.description import Array, RobotDescription
+from spacerobot_ros.model.description import DEFAULT_END_EFFECTOR, Array, RobotDescription
 from spacerobot_ros.model.shared_parameters import RobotConfig, robot_from_text, robot_of
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.core.goal import POSE
@@ -501,7 +501,16 @@ class LockstepFlight:
             self._planner.receive_goal(BASE_GOAL_KEY, *_FIRST_GOAL_STAMP, lambda: given)
         if self._controller is not None:
             unshaped = replace(given, joint_positions=None, end_effectors=(), base=POSE)
-            self._controller.receive_goal(BASE_GOAL_KEY, *_FIRST_GOAL_STAMP, lambda: unshaped)
+            if given.base:
+                self._controller.receive_goal(BASE_GOAL_KEY, *_FIRST_GOAL_STAMP, lambda: unshaped)
+            hands = [
+                each
+                for each in given.end_effectors
+                if self._planner is None or each.link in ("", DEFAULT_END_EFFECTOR)
+            ]
+            if hands:
+                aimed = Goal.of_end_effectors(hands)
+                self._controller.receive_goal(END_EFFECTOR, *_FIRST_GOAL_STAMP, lambda: aimed)
             tool = scenario.end_effector_goal
             if tool is not None:
                 self._controller.receive_goal(

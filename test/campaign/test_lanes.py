@@ -178,6 +178,16 @@ def test_flights_in_lanes_are_interrupted_or_left_to_the_controller() -> None:
     assert {lanes[number].fallback for number in lost} == {"lost control"}
 
 
+def test_a_goal_out_of_the_plane_is_refused_in_lanes_as_elsewhere() -> None:
+    disperse = {"goal.position.z": {"choice": [0.0, 0.4]}}
+    lanes, _ = assert_same_flights(controlled(flights=6, disperse=disperse, longest=0.2))
+    assert {row.outcome for row in lanes.values()} == {"interrupted", "refused"}
+    for row in lanes.values():
+        refused = row.outcome == "refused"
+        assert row.engine == ("flights" if refused else "lanes")
+        assert ("in z of the world" in row.reason) is refused
+
+
 @pytest.mark.slow
 def test_a_draw_that_is_refused_leaves_the_others_of_its_batch_in_lanes() -> None:
     """Each has its own reason: a start beyond the joint limits, noise below zero."""
