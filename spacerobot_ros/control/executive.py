@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from enum import IntEnum
+from types import MappingProxyType
 
 import numpy as np
 
@@ -23,7 +24,15 @@ from spacerobot_ros.errors import CommandError, ParameterError, PlanningError
 from spacerobot_ros.events import Event, EventKind
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.grasp import Payload
-from spacerobot_ros.planning.core.goal import Controlled, Goal, Tolerance
+from spacerobot_ros.planning.core.goal import (
+    POSE,
+    Controlled,
+    Goal,
+    PoseError,
+    Tolerance,
+    missed_parts,
+    reached_message,
+)
 from spacerobot_ros.planning.execution.goal_file import (
     BASE_GOAL_KEY,
     IdentifiedGoal,
@@ -119,6 +128,8 @@ class ControlExecutive:
         """Goals that are pursued together, by part of the robot."""
         self._goal_id = ""
         """Id of the latest of them, which statuses have."""
+        self._asked: frozenset[Controlled] = frozenset()
+        """Parts of the pose of the base that the present goals ask for."""
         self._monitor, self._stall = GoalMonitor(), StallMonitor()
         self._was_measured = False
         self.servicing.end()
@@ -211,7 +222,7 @@ class ControlExecutive:
         goal = replace(goal, end_effectors=hands).for_robot(law.robot.description)
         parts = {}
         if goal.base:
-            pose = Goal(goal.position, goal.quaternion, goal.joint_positions)
+            pose = replace(goal, end_effectors=(), base=POSE, asked=goal.asked & goal.base)
             parts[BASE_GOAL_KEY] = replace(identified, goal=pose)
         for each in goal.end_effectors:
             if each.link != link:
@@ -258,13 +269,9 @@ class ControlExecutive:
     def _require_tolerances_met(self, key: str, identified: IdentifiedGoal) -> None:
         selection, goal = self.controller.law.outputs.selection, identified.goal
         axes = selection.base if key == BASE_GOAL_KEY else selection.end_effector
-        controls: set[Controlled] = {
-            "attitude" if axis.startswith("r") else "position" for axis in axes
-        }
-        if selection.joints:
-            controls.add("shape")
+        controls = controlled_parts(axes, selection.joints)
         who = f"the law '{self.controller.law.name}'"
-        identified.required.require_control(goal, frozenset(controls), who)
+        identified.required.require_control(goal, controls, who)
 
     def request(self, task: Task) -> None:
         """Do a task from the next measured state on, without a goal after it."""
@@ -475,9 +482,22 @@ class ControlExecutive:
         decision = monitor.decide_by_errors(time, at_rest, ends, controller.errors(), config)
         if decision != _NO_DECISION:
             self._goal_state, kind = _STATE_AND_EVENT_OF_DECISION[Decision(int(decision))]
+            if decision == Decision.REACHED and self._missed_parts():
+                self._goal_state = ControllerState.REACHED_PARTLY
+                kind = EventKind.GOAL_REACHED_PARTLY
             message = self._message(self._goal_state)
             self._end_goals(kind, self._goal_state, message)
             self._report_decision(kind, message, self._goal_state)
+
+    def _missed_parts(self) -> dict[Controlled, str]:
+        """Return the :func:`missed_parts` of the base in the state of the last command."""
+        law, goal, config = self.controller.law, self.controller.goal.base, self._goal_config
+        if goal is None or not self._asked:
+            return {}
+        state, aimed = law.state, Goal(goal.position, goal.quaternion, asked=self._asked)
+        error = PoseError.between(state.r_WB, state.quaternion_WB, aimed)
+        tolerance = Tolerance(config.position_tolerance, config.attitude_tolerance)
+        return missed_parts(aimed, error, controlled_parts(law.outputs.selection.base), tolerance)
 
     def _end_goals(self, kind: EventKind, state: ControllerState, message: str) -> None:
         """Report the end of all goals but the latest, whose status goes on."""
@@ -568,7 +588,8 @@ class ControlExecutive:
     def _refuse_uncontrolled(self, state: ControlState) -> None:
         """Refuse pending goals that the law leaves unmet in a single axis, by a measured state."""
         for key, pending in list(self._pending.items()):
-            pose = PoseReference(pending.goal.position, pending.goal.quaternion)
+            goal = pending.goal.kept_at(state.r_WB, state.quaternion_WB)
+            pose = PoseReference(goal.position, goal.quaternion)
             config = self._config_with(pending.tolerance)
             try:
                 self.controller.require_controlled_axes(state, config, **{key: pose})
@@ -615,6 +636,11 @@ class ControlExecutive:
         self._resumes = all(pending.resumes for pending in self._pending.values())
         self._take_tolerance(next(reversed(self._pending.values())).tolerance)
         self._pending.clear()
+        if BASE_GOAL_KEY in goals:
+            goal = goals[BASE_GOAL_KEY].kept_at(state.r_WB, state.quaternion_WB)
+            goals[BASE_GOAL_KEY], self._asked = goal, goal.asked
+        elif BASE_GOAL_KEY not in pursued:
+            self._asked = frozenset()
         poses = {key: PoseReference(goal.position, goal.quaternion) for key, goal in goals.items()}
         shapes = [g.joint_positions for g in goals.values() if g.joint_positions is not None]
         if self.controller.wheels is not None:
@@ -665,7 +691,14 @@ class ControlExecutive:
             poses[END_EFFECTOR] = goal.end_effector
         return {
             key: IdentifiedGoal(
-                Goal(pose.position, pose.quaternion, shape), self._goal_id, resumes=self._resumes
+                Goal(
+                    pose.position,
+                    pose.quaternion,
+                    shape,
+                    asked=self._asked if key == BASE_GOAL_KEY else POSE,
+                ),
+                self._goal_id,
+                resumes=self._resumes,
             )
             for key, pose in poses.items()
             if pose is not None and getattr(selection, key)
@@ -711,9 +744,10 @@ class ControlExecutive:
             case ControllerState.STALLED:
                 away = self.controller.distance_from_reference()
                 return f"Stalled {away} from the reference: {self._stall.cause}."
-            case ControllerState.REACHED | ControllerState.FAILED:
+            case ControllerState.REACHED | ControllerState.REACHED_PARTLY | ControllerState.FAILED:
                 away, config = self.controller.distance_to_goal(), self._goal_config
-                return decided_message(state, away, config, self._stall.cause)
+                missed = self._missed_parts() if state is ControllerState.REACHED_PARTLY else {}
+                return decided_message(state, away, config, self._stall.cause, missed)
             case ControllerState.ABORTED:
                 return self._abort_message
             case ControllerState.ESTIMATING:
@@ -725,26 +759,34 @@ class ControlExecutive:
                 raise ValueError("a refusal has a message of its own")
 
 
+_NOTHING_MISSED: Mapping[Controlled, str] = MappingProxyType({})
+
+
 def decided_message(
-    state: ControllerState, distance: OutputDistance, config: ControllerConfig, cause: str = ""
+    state: ControllerState,
+    distance: OutputDistance,
+    config: ControllerConfig,
+    cause: str = "",
+    missed: Mapping[Controlled, str] = _NOTHING_MISSED,
 ) -> str:
     """Return the message about a goal that is reached or failed, at a distance from the goal.
 
-    ``cause`` is why the robot came no nearer, as far as is known.
+    ``cause`` is why the robot came no nearer, as far as is known; ``missed`` are the parts of a
+    goal that is reached partly.
     """
-    reached = "reached"
-    if state is not ControllerState.REACHED:
-        reached = f"not reached in time, as {cause}" if cause else "not reached in time"
     limits = (
         (distance.position, config.position_tolerance),
         (distance.attitude, config.attitude_tolerance),
         (distance.joints, config.joint_tolerance),
     )
     tolerance = OutputDistance(*(math.nan if math.isnan(off) else most for off, most in limits))
-    message = f"The goal is {reached}: {distance} from it (tolerance {tolerance})"
-    if state is ControllerState.FAILED and not any(off > most for off, most in limits):
-        message += f", within tolerance for less than the settling time of {config.settle_time:g} s"
-    return f"{message}."
+    away = f"{distance} from it (tolerance {tolerance})"
+    if state is not ControllerState.FAILED:
+        return reached_message(away, missed)
+    late = f"not reached in time, as {cause}" if cause else "not reached in time"
+    if not any(off > most for off, most in limits):
+        away += f", within tolerance for less than the settling time of {config.settle_time:g} s"
+    return f"The goal is {late}: {away}."
 
 
 _NO_ROTATION = np.array([0.0, 0.0, 0.0, 1.0])
@@ -754,6 +796,13 @@ _MAX_STATE_GAP, _MAX_STATE_GAP_PERIODS = 1.0, 10
 
 _LATE_POSE_PERIODS = 1.5
 """Longest time without a measured base that is not reported, in control periods."""
+
+
+def controlled_parts(axes: Sequence[str], joints: Sequence[str] = ()) -> frozenset[Controlled]:
+    """Return the parts of a goal that outputs control: axes of a pose, and joints."""
+    parts: set[Controlled] = {"attitude" if axis.startswith("r") else "position" for axis in axes}
+    return frozenset(parts | {"shape"} if joints else parts)
+
 
 _STATE_AND_EVENT_OF_DECISION = {
     Decision.REACHED: (ControllerState.REACHED, EventKind.GOAL_REACHED),

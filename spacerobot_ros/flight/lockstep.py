@@ -496,20 +496,22 @@ class LockstepFlight:
         scenario, goal = self._scenario, self._scenario.goal
         # A pose is checked, and its quaternion scaled, where it is received.
         given = Goal.checked(goal.position, goal.quaternion, goal.joint_positions)
-        given = replace(given, end_effectors=goal.end_effectors, base=goal.base)
+        hands, asked = goal.end_effectors, goal.asked
+        given = replace(given, end_effectors=hands, base=goal.base, asked=asked)
         if self._planner is not None:
             self._planner.receive_goal(BASE_GOAL_KEY, *_FIRST_GOAL_STAMP, lambda: given)
         if self._controller is not None:
             unshaped = replace(given, joint_positions=None, end_effectors=(), base=POSE)
+            unshaped = replace(unshaped, asked=asked & goal.base)
             if given.base:
                 self._controller.receive_goal(BASE_GOAL_KEY, *_FIRST_GOAL_STAMP, lambda: unshaped)
-            hands = [
+            heard = [
                 each
-                for each in given.end_effectors
+                for each in hands
                 if self._planner is None or each.link in ("", DEFAULT_END_EFFECTOR)
             ]
-            if hands:
-                aimed = Goal.of_end_effectors(hands)
+            if heard:
+                aimed = Goal.of_end_effectors(heard)
                 self._controller.receive_goal(END_EFFECTOR, *_FIRST_GOAL_STAMP, lambda: aimed)
             tool = scenario.end_effector_goal
             if tool is not None:

@@ -509,6 +509,9 @@ def test_a_status_is_reported_on_changes_and_every_period() -> None:
     assert len(loop.statuses) == count + 1
 
 
+_DECIDED = ("reached", "reached_partly", "failed", "refused", "aborted")
+
+
 @given(
     state=st.sampled_from(ControllerState),
     goal_id=st.sampled_from(["", "12.000000345", "unstamped-2"]),
@@ -528,7 +531,7 @@ def test_a_status_survives_its_values(
     assert again.to_values() == values
     assert (again.state, again.goal_id, again.message) == (state, goal_id, "A sentence.")
     assert again.ends_at_s == ends_at
-    assert state.decided == (state.value in ("reached", "failed", "refused", "aborted"))
+    assert state.decided == (state.value in _DECIDED)
 
 
 @pytest.mark.parametrize("values", [{}, {"state": "flying"}, {"state": "holding", "law": "a"}])

@@ -103,6 +103,22 @@ def test_an_end_effector_is_brought_to_the_goal_of_the_caller_by_a_law() -> None
             fly(scenario, **given)
 
 
+def test_a_part_that_is_not_asked_for_is_kept() -> None:
+    """Where the base is at the start, by a law and by a gait method."""
+    attitude = [0.0, 0.6, 0.0, 0.8]
+    start = {"plant.initial_position": [0.4, -0.2, 0.1], "plant.initial_orientation": attitude}
+    turned = fly("free_flyer", rotvec=[0, 0, 0.3], method="model_based", parameters=start)
+    assert turned.succeeded
+    np.testing.assert_allclose(turned.pose[-1, :3], [0.4, -0.2, 0.1], atol=2e-3)
+    sliders = SpaceRobot.from_file(robot_file("sliding_masses"))
+    moved = fly(sliders, position=[0.42, -0.2, 0.1], method="lie_bracket", parameters=start)
+    assert moved.succeeded
+    turn = Rotation.from_quat(attitude).inv() * Rotation.from_quat(moved.pose[-1, 3:])
+    assert turn.magnitude() < 2e-3
+    assert moved.goal is not None
+    np.testing.assert_allclose(moved.goal.quaternion, attitude, atol=1e-12)
+
+
 def statuses(flight: Flight) -> list[tuple[float, ControllerStatus]]:
     return [(t / 1e9, each) for t, each in flight.statuses if isinstance(each, ControllerStatus)]
 
