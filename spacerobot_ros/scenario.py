@@ -39,6 +39,7 @@ from spacerobot_ros.parameters import (
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.core.goal import POSE, Controlled, EndEffectorGoal
 from spacerobot_ros.planning.execution.config import PlannerConfig
+from spacerobot_ros.planning.methods.registry import METHODS
 from spacerobot_ros.resources import (
     is_path,
     resource_names,
@@ -353,6 +354,12 @@ class Scenario:
         ParameterError
             It has no planner or no controller that could use it.
         """
+        if method not in (*LAWS, *METHODS):
+            known = [*METHODS, *LAWS]
+            raise ParameterError(
+                f"There is no gait method or control law '{method}'; there are: "
+                f"{', '.join(known)}.{suggestion(method, known)}"
+            )
         kind, node, parameter = "gait method", "planner", "method"
         if method in LAWS:
             kind, node, parameter = "control law", "coordinated_control", "law"

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import replace
 from enum import Enum
 
@@ -228,7 +229,20 @@ class CoordinatedController:
             motion = self.wheels.limits_with_wheels(motion, state.q)
         self.profile = self._profile_type(start, goal, motion, carries=carries)
         self._began = time
-        self.law.start(time, start, goal)
+        with self._failures_of_law(time):
+            self.law.start(time, start, goal)
+
+    @contextmanager
+    def _failures_of_law(self, time: float) -> Iterator[None]:
+        """Name the law in errors of its code, which may be a user's and may even end Python."""
+        try:
+            yield
+        except SpaceRobotError:
+            raise
+        except (Exception, SystemExit) as error:
+            raise SpaceRobotError(
+                f"The law '{self.law.name}' has failed at {time:g} s: {describe_exception(error)}."
+            ) from error
 
     def _carried_end_effector(
         self, before: Reference, base: PoseReference, state: ControlState
@@ -337,10 +351,12 @@ class CoordinatedController:
                 here = self._present_reference(time, state)
                 self.profile = StepReference(here, here, self._motion, carries=True)
                 self._began = time
-                self.law.start(time, here, here)
+                with self._failures_of_law(time):
+                    self.law.start(time, here, here)
             # The law is always evaluated, for its errors and status.
             self.law.time = time
-            commanded = self.law.command(state, self._reference_at(time))
+            with self._failures_of_law(time):
+                commanded = self.law.command(state, self._reference_at(time))
             if self.coming_to_rest:
                 commanded = self._to_rest(state)
         if state is not None:
@@ -561,7 +577,7 @@ def build_controller(robot: SpaceRobot, config: ControllerConfig) -> Coordinated
         )
     except SpaceRobotError:
         raise
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         raise ParameterError(
             f"The control law '{config.law}' cannot be built: {describe_exception(error)}."
         ) from error
