@@ -262,8 +262,7 @@ class Scenario:
         """
         scenario = {"name": self.name, "description": self.description}
         scenario |= {key: " ".join(map(repr, pose)) for key, pose in self._goal_poses().items()}
-        if self.goal.asked != POSE:
-            scenario["goal_asked"] = " ".join(sorted(self.goal.asked))
+        scenario["goal_asked"] = " ".join(sorted(self.goal.asked))
         if self.goal.end_effectors:
             scenario["end_effector_goals"] = json.dumps(_end_effector_values(self.goal))
         scenario["published"] = json.dumps([asdict(row) for row in self.comparable])

@@ -640,9 +640,11 @@ def _sent_goal(about: Mapping[str, str], name: str) -> Goal | None:
         for part in ("position", "orientation")
     )
     goal = Goal(position, quaternion)
-    if f"{name}_asked" not in about:
+    if name != "goal":
         return goal
-    parts = about[f"{name}_asked"].split()
+    # Bags of earlier versions do not tell what was asked for: numbers of the origin were not.
+    given = {"position": position.any(), "attitude": quaternion[:3].any()}
+    parts = about.get("goal_asked", " ".join(part for part in given if given[part])).split()
     return replace(goal, asked=frozenset(part for part in POSE if part in parts))
 
 
