@@ -129,6 +129,8 @@ bags: $(STAMP)/demo ## fly the reference bags in bags/ again, where a changed be
 	    --set coordinated_control.attitude_tolerance=0.02
 	$(FLY) servicer --set coordinated_control.time_limit=8
 	$(FLY) servicer_thrusters --set coordinated_control.time_limit=5
+	$(FLY) free_flyer --set plant.world=config/worlds/panel.urdf --set plant.tick_rate=20 \
+	    --set coordinated_control.tick_rate=20 --set coordinated_control.time_limit=14
 	$(FLY) wheels --set plant.tick_rate=25 --set coordinated_control.tick_rate=25 \
 	    --set coordinated_control.time_limit=13
 	$(FLY) gravity_gradient --set plant.tick_rate=20 --set coordinated_control.tick_rate=20 \

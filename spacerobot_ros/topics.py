@@ -341,7 +341,10 @@ _TOPIC_TABLE = (
         "commanded thruster force and torque at the origin of the base link, in its frame",
     ),
     Topic(
-        "goal_pose", _POSE_STAMPED_TYPE, _PUBLISHED_BY_USER, "goal pose of the base in the world"
+        "goal_pose",
+        _POSE_STAMPED_TYPE,
+        _PUBLISHED_BY_USER,
+        "goal pose of the base in the world; NaN: any position, or any attitude",
     ),
     Topic(
         "goal_joint_states",

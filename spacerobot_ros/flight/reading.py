@@ -294,7 +294,11 @@ class FlightBag(RecordedRobot):
                 # Zeros ask for the position of an end-effector alone.
                 attitude = _NO_GOAL.quaternion.tolist()
             try:
-                goal = Goal.checked([p.x, p.y, p.z], attitude, shape)
+                goal = Goal.received([p.x, p.y, p.z], attitude, shape)
+                if odom is not None:
+                    at = odom[1].pose.pose
+                    r, o = at.position, at.orientation
+                    goal = goal.kept_at(np.array([r.x, r.y, r.z]), np.array([o.x, o.y, o.z, o.w]))
             except PlanningError:
                 continue
             if not world or frame in ("", world):
@@ -635,7 +639,13 @@ def _sent_goal(about: Mapping[str, str], name: str) -> Goal | None:
         np.array([float(word) for word in about[f"{name}_{part}"].split()])
         for part in ("position", "orientation")
     )
-    return Goal(position, quaternion)
+    goal = Goal(position, quaternion)
+    if name != "goal":
+        return goal
+    # Bags of earlier versions do not tell what was asked for: numbers of the origin were not.
+    given = {"position": position.any(), "attitude": quaternion[:3].any()}
+    parts = about.get("goal_asked", " ".join(part for part in given if given[part])).split()
+    return replace(goal, asked=frozenset(part for part in POSE if part in parts))
 
 
 def read_run(path: str | os.PathLike[str]) -> Flight:
@@ -658,10 +668,10 @@ def read_run(path: str | os.PathLike[str]) -> Flight:
         read_flight(bag),
         scenario=scenario,
         robot=robot,
-        goal=scenario.goal,
         end_effector_goal=scenario.end_effector_goal,
     )
     require_states(bag, flight)
+    flight = replace(flight, goal=scenario.goal.kept_at(*np.split(flight.pose[0], [3])))
     if len(flight.pose) != len(flight.q):
         raise RecordingError(
             f"The bag {bag.path} has {len(flight.pose)} poses of the base and {len(flight.q)} "

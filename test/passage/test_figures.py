@@ -88,11 +88,11 @@ def thruster_numbers(group: TraceGroup, messages: Messages) -> Array:
         share = np.array([m.velocity for m in states])
         assert share[:, share.any(axis=0)].max() <= 1.0
         return share[:, share.any(axis=0)]
-    thrust = 10.0  # Of each thruster of the servicer, N.
+    # Of each thruster of the servicer, and of the free-flyer, which has no joint: N, s.
+    thrust, specific = (10.0, 290.0) if messages["/joint_states"][0].name else (0.2, 60.0)
     on = np.array([m.position for m in states])
     impulse = thrust * (on - on[0]).sum(axis=1, keepdims=True)
-    specific = 290.0 * 9.80665  # Specific impulse of its thrusters, N s/kg.
-    return {"N s": impulse, "g": 1000.0 * impulse / specific}[group.unit]
+    return {"N s": impulse, "g": 1000.0 * impulse / (specific * 9.80665)}[group.unit]
 
 
 def expected(figure: str, group: TraceGroup, messages: Messages) -> Array:
