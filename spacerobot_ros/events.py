@@ -206,6 +206,7 @@ class EventKind(str, Enum):
     GOAL_ACCEPTED = "goal_accepted"
     GOAL_REFUSED = "goal_refused"
     GOAL_REACHED = "goal_reached"
+    GOAL_REACHED_PARTLY = "goal_reached_partly"
     GOAL_FAILED = "goal_failed"
     GOAL_ABORTED = "goal_aborted"
     PLAN_STARTED = "plan_started"

@@ -26,6 +26,8 @@ class Outcome(str, Enum):
     """Outcome of a goal; all values but the last also occur as ``state`` in a status message."""
 
     REACHED = "reached"
+    REACHED_PARTLY = "reached_partly"
+    """But for a part of the base that was asked for, and is not controlled."""
     FAILED = "failed"
     REFUSED = "refused"
     ABORTED = "aborted"

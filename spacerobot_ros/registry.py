@@ -56,13 +56,13 @@ class Registry(dict[str, type[T]]):
         self._own = frozenset(self)
 
     def register(self, entry: type[T]) -> type[T]:
-        """Add a class, in place of an earlier one of its name; usable as a decorator.
+        """Add a class, in place of an earlier one of its name and file; usable as a decorator.
 
         Raises
         ------
         ParameterError
             It is not derived from the base class or leaves out something abstract, it has no name,
-            or the name is one of the package's own.
+            or the name is one of the package's own, or one of another file.
         """
         name = self._usable_name(entry)
         self[name] = entry
@@ -93,8 +93,14 @@ class Registry(dict[str, type[T]]):
 
     def _add_all_of(self, module: ModuleType) -> None:
         for entry in list(vars(module).values()):
+            _require_base(entry, module)
             own = inspect.isclass(entry) and entry.__module__ == module.__name__
-            if own and issubclass(entry, self.base) and not inspect.isabstract(entry):
+            # A class without a name of its own is a base of others.
+            if (
+                own
+                and issubclass(entry, self.base)
+                and ("name" in vars(entry) or not inspect.isabstract(entry))
+            ):
                 self.register(entry)
 
     def _usable_name(self, entry: Any) -> str:
@@ -102,9 +108,13 @@ class Registry(dict[str, type[T]]):
         if not (inspect.isclass(entry) and issubclass(entry, self.base)):
             raise ParameterError(f"{named} is no class derived from {self.base.__name__}.")
         name = getattr(entry, "name", None)
-        if inspect.isabstract(entry):
-            missing = ", ".join(sorted(vars(entry)["__abstractmethods__"]))
-            raise ParameterError(f"{named} lacks {missing}.")
+        missing: set[str] = set(getattr(entry, "__abstractmethods__", ()))
+        for each in entry.__mro__:
+            wanted: Iterable[str] = getattr(each, "__abstractmethods__", ())
+            functions = (of for of in wanted if inspect.isfunction(vars(each).get(of)))
+            missing |= {of for of in functions if not callable(getattr(entry, of))}
+        if missing:
+            raise ParameterError(f"{named} lacks {', '.join(sorted(missing))}.")
         if not isinstance(name, str) or not name.isidentifier():
             raise ParameterError(
                 f"{named} needs a name of letters, digits and underscores: name = 'my_name'."
@@ -113,7 +123,19 @@ class Registry(dict[str, type[T]]):
             raise ParameterError(
                 f"{named} has the name of the package's own '{name}': give it another one."
             )
+        if name in self and _origin(self[name]) != _origin(entry):
+            raise ParameterError(
+                f"Two classes are the {self.kind} '{name}': '{self[name].__name__}' of "
+                f"{_origin(self[name])} and '{entry.__name__}' of {_origin(entry)}. Give one of "
+                "them another name, or leave its file out."
+            )
         return name
+
+
+def _origin(entry: type[Any]) -> str:
+    """Return the file of the module that defines a class; the module's name without one."""
+    file = getattr(sys.modules.get(entry.__module__), "__file__", None)
+    return f"'{file or entry.__module__}'"
 
 
 def import_plugins() -> None:
@@ -186,3 +208,17 @@ def _module_of(file: Path) -> ModuleType:
     for registry in _LOADED:
         registry._add_all_of(module)
     return module
+
+
+def _require_base(entry: Any, module: ModuleType) -> None:
+    """Refuse a class with a name and a work that is no law and no method, which nothing uses."""
+    if not (inspect.isclass(entry) and entry.__module__ == module.__name__):
+        return
+    works = any(callable(getattr(entry, each, None)) for each in ("compute", "results", "plan"))
+    package = __name__.partition(".")[0]
+    derived = any(each.__module__.partition(".")[0] == package for each in entry.__mro__)
+    if isinstance(getattr(entry, "name", None), str) and works and not derived:
+        raise ParameterError(
+            f"The class '{entry.__name__}' of the plugin '{module.__file__}' is no control law and "
+            "no gait method: derive it from NumpyLaw, ControlLaw or GaitMethod."
+        )

@@ -39,6 +39,7 @@ from spacerobot_ros.parameters import (
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.core.goal import POSE, Controlled, EndEffectorGoal
 from spacerobot_ros.planning.execution.config import PlannerConfig
+from spacerobot_ros.planning.methods.registry import METHODS
 from spacerobot_ros.resources import (
     is_path,
     resource_names,
@@ -132,8 +133,6 @@ class Scenario:
         Parameters by node and full name; overrides take precedence over the file.
     has_goal
         Whether a goal was given; without one ``goal`` is the start.
-    asked
-        The parts of the pose of the base that were given as numbers; others are those of the start.
     """
 
     name: str
@@ -150,7 +149,6 @@ class Scenario:
         default_factory=lambda: {"plant": {"time_mode": "lockstep"}}
     )
     has_goal: bool = True
-    asked: frozenset[Controlled] = frozenset()
     _configs: dict[str, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
     """Cached results of :meth:`config` by node."""
     _changes: dict[str, tuple[Any, dict[str, Any]]] = field(
@@ -264,6 +262,8 @@ class Scenario:
         """
         scenario = {"name": self.name, "description": self.description}
         scenario |= {key: " ".join(map(repr, pose)) for key, pose in self._goal_poses().items()}
+        if self.goal.asked != POSE:
+            scenario["goal_asked"] = " ".join(sorted(self.goal.asked))
         if self.goal.end_effectors:
             scenario["end_effector_goals"] = json.dumps(_end_effector_values(self.goal))
         scenario["published"] = json.dumps([asdict(row) for row in self.comparable])
@@ -354,6 +354,12 @@ class Scenario:
         ParameterError
             It has no planner or no controller that could use it.
         """
+        if method not in (*LAWS, *METHODS):
+            known = [*METHODS, *LAWS]
+            raise ParameterError(
+                f"There is no gait method or control law '{method}'; there are: "
+                f"{', '.join(known)}.{suggestion(method, known)}"
+            )
         kind, node, parameter = "gait method", "planner", "method"
         if method in LAWS:
             kind, node, parameter = "control law", "coordinated_control", "law"
@@ -419,13 +425,12 @@ class Scenario:
             goal = replace(goal, quaternion=given.quaternion)
         if goal is self.goal:
             return self
-        asked = self.asked
+        asked = self.goal.asked
         if pose is not None:
             asked = asked.union(POSE if len(pose) == 7 else ["position"])
         if rotvec is not None or rpy_deg is not None:
             asked = asked.union(_ATTITUDE)
-        goal = replace(goal, end_effectors=(), base=POSE)
-        return replace(self.with_other_goal(goal), asked=asked)
+        return self.with_other_goal(replace(goal, end_effectors=(), base=POSE, asked=asked))
 
     def with_other_goal(self, goal: Goal) -> Scenario:
         """Return the scenario with another goal, as the description says then.
@@ -443,7 +448,8 @@ class Scenario:
     def with_end_effectors(
         self, goals: Sequence[EndEffectorGoal], base: frozenset[Controlled] = frozenset()
     ) -> Scenario:
-        """Return the scenario with goals of end-effectors, and its goal in parts of the base alone.
+        """Return the scenario with goals of end-effectors in place of its own, and its goal in
+        parts of the base alone.
 
         Raises
         ------
@@ -453,7 +459,7 @@ class Scenario:
         made = Goal.of_end_effectors(goals)
         goal = replace(self.goal, joint_positions=None, base=base)
         aimed = replace(goal, end_effectors=made.end_effectors)
-        return self.with_other_goal(aimed)._with_goal_topics()
+        return replace(self.with_other_goal(aimed), end_effector_goal=None)._with_goal_topics()
 
     def _with_goal_topics(self) -> Scenario:
         """Return the scenario with a planner that takes goals of all its end-effectors, whose poses
@@ -506,6 +512,9 @@ def scenario_text(scenario: Scenario) -> str:
     Published figures and kills of nodes are not in it.
     """
     about: dict[str, Any] = {"description": scenario.description, **scenario._goal_poses()}
+    for part, keys in _KEYS_OF_PARTS.items():
+        if part not in scenario.goal.asked:
+            about = {key: value for key, value in about.items() if key not in keys}
     if scenario.goal.end_effectors:
         about["end_effector_goals"] = _end_effector_values(scenario.goal)
     if scenario.goal.joint_positions is not None:
@@ -583,9 +592,6 @@ def load_scenario(name: str) -> Scenario:
         published_method=str(values.get("published_method", "")),
         kills=parse_kills(values.get("kills", []), f"the file {path}"),
         in_file=in_file,
-        asked=frozenset(
-            part for part, keys in _KEYS_OF_PARTS.items() if not keys.isdisjoint(values)
-        ),
     )._with_goal_topics()
 
 
@@ -665,7 +671,7 @@ def _scenario_without_goal(
         name=name,
         path=path,
         description="",
-        goal=Goal.checked([0, 0, 0], [0, 0, 0, 1]),
+        goal=replace(Goal.checked([0, 0, 0], [0, 0, 0, 1]), asked=frozenset()),
         in_file=in_file,
         has_goal=False,
     )
@@ -726,6 +732,9 @@ def _parse_goal(name: str, values: Mapping[str, Any], path: Path) -> Goal:
             orientation = Goal.from_rotvec(position, values[f"{name}_rotvec"]).quaternion
         shape = values.get(f"{name}_joint_positions")
         goal = Goal.checked(position, orientation, shape)
+        if name == "goal":
+            parts = (part for part, keys in _KEYS_OF_PARTS.items() if not keys.isdisjoint(values))
+            goal = replace(goal, asked=frozenset(parts))
         links = values.get("end_effector_goals", {}) if name == "goal" else {}
         if not links:
             return goal

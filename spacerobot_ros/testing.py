@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy.typing as npt
@@ -108,17 +109,24 @@ class Stack:
         self,
         goal: Goal | None = None,
         *,
-        x: float = 0.0,
-        y: float = 0.0,
-        z: float = 0.0,
-        rotvec: npt.ArrayLike = (0.0, 0.0, 0.0),
+        x: float | None = None,
+        y: float | None = None,
+        z: float | None = None,
+        rotvec: npt.ArrayLike | None = None,
     ) -> Arrival:
         """Send a goal and spin until the planner, or else the controller, has decided it.
 
-        ``goal`` is any goal; None: the base at ``x``, ``y``, ``z`` (m), turned by ``rotvec`` (rad).
+        ``goal`` is any goal; None: the base at ``x``, ``y``, ``z`` (m), turned by ``rotvec`` (rad),
+        0 unless given; without a coordinate any position will do, without ``rotvec`` any attitude.
         Raises :class:`.SpaceRobotError` if a node fails, or time is up.
         """
-        goal = Goal.from_rotvec([x, y, z], rotvec) if goal is None else goal
+        if goal is None:
+            place = [x or 0.0, y or 0.0, z or 0.0]
+            goal = Goal.from_rotvec(place, [0.0, 0.0, 0.0] if rotvec is None else rotvec)
+            if rotvec is not None and x is y is z is None:
+                goal = replace(goal, asked=goal.asked - {"position"})
+            elif rotvec is None:
+                goal = replace(goal, asked=goal.asked - {"attitude"})
         controls = "coordinated_control" in self.nodes and "planner" not in self.nodes
         self._sent += 1
         client = MissionClient(

@@ -342,7 +342,10 @@ _TOPIC_TABLE = (
         "thruster force and torque wanted at the origin of the base link, in its frame",
     ),
     Topic(
-        "goal_pose", _POSE_STAMPED_TYPE, _PUBLISHED_BY_USER, "where the base is to be, in the world"
+        "goal_pose",
+        _POSE_STAMPED_TYPE,
+        _PUBLISHED_BY_USER,
+        "where the base is to be, in the world; NaN: any position, or any attitude",
     ),
     Topic(
         "goal_joint_states",

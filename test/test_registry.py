@@ -184,6 +184,68 @@ def test_a_plugin_that_is_none_is_refused(
         add_plugin(file)
 
 
+_LAW = """
+from spacerobot_ros.control.laws.numpy_law import NumpyLaw
+class {}({}):
+    name = "pd"
+"""
+_COMPUTE = "    def compute(self, state, reference):\n        {}\n"
+
+
+@pytest.mark.usefixtures("plugins")
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        (_LAW.format("Pd", "NumpyLaw"), "The control law 'Pd' lacks compute."),
+        (
+            _LAW.format("Pd", "NumpyLaw") + "    compute = 5\n",
+            "The control law 'Pd' lacks compute.",
+        ),
+        (
+            _LAW.format("Pd", "object") + _COMPUTE.format("return 1"),
+            "The class 'Pd' of the plugin .* is no control law and no gait method: derive it from",
+        ),
+    ],
+)
+def test_a_plugin_whose_law_cannot_work_is_refused(
+    tmp_path: Path, text: str, sentence: str
+) -> None:
+    (tmp_path / "mine.py").write_text(text)
+    for _ in range(2):  # Also once it is imported.
+        with pytest.raises(ParameterError, match=sentence) as refused:
+            add_plugin(tmp_path / "mine.py")
+        assert_one_sentence(str(refused.value))
+
+
+@pytest.mark.usefixtures("plugins")
+def test_two_plugins_of_one_name_are_refused_with_their_files(tmp_path: Path) -> None:
+    text = _LAW.format("Pd", "NumpyLaw") + _COMPUTE.format("return None")
+    for name in ("one.py", "other.py"):
+        (tmp_path / name).write_text(text)
+    add_plugin(tmp_path / "one.py")
+    add_plugin(tmp_path / "one.py")
+    with pytest.raises(ParameterError, match="Two classes are the control law 'pd'") as refused:
+        add_plugin(tmp_path / "other.py")
+    for name in ("one.py", "other.py"):
+        assert f"'{tmp_path / name}'" in str(refused.value)
+
+
+@pytest.mark.usefixtures("plugins")
+def test_a_name_that_is_none_is_answered_with_those_there_are() -> None:
+    with pytest.raises(ParameterError, match=r"no gait method or control law 'pd'; .*computed_tor"):
+        fly("coordinated_control", method="pd")
+
+
+@pytest.mark.usefixtures("plugins")
+@pytest.mark.parametrize("ends", ["raise OSError('no model')", "sys.exit(3)"])
+def test_a_law_that_fails_or_ends_python_is_named(tmp_path: Path, ends: str) -> None:
+    body = f"import sys; {ends}"
+    (tmp_path / "mine.py").write_text(_LAW.format("Pd", "NumpyLaw") + _COMPUTE.format(body))
+    add_plugin(tmp_path / "mine.py")
+    with pytest.raises(SpaceRobotError, match=r"^The law 'pd' has failed at 0 s: .*mine\.py, line"):
+        fly("planar_manipulator", (0.1, 0.0, 0.0), method="pd")
+
+
 @pytest.mark.usefixtures("plugins")
 def test_a_plugin_adds_what_it_defines_and_not_what_it_imports(tmp_path: Path) -> None:
     for name in ("lqr_law.py", "own_gait_method.py"):

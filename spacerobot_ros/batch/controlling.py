@@ -60,7 +60,8 @@ class BatchController:
 
     def __init__(self, program: ControlledGoals, controller: CoordinatedController) -> None:
         self.program, self.controller, self.law = program, controller, controller.law
-        self._config, self._n = program.config, controller.law.robot.n
+        self._config = program.config.for_robot(controller.law.robot.description)
+        self._n = controller.law.robot.n
         self._period_ns = round(program.config.control_period * SECOND)
         for gains in program.gains:
             if self.law.has_automatic_gains(gains):
@@ -98,18 +99,19 @@ class BatchController:
             The path of its references.
         bounds
             (m,) errors of the outputs beyond which control is lost.
+
+        Raises
+        ------
+        PlanningError
+            A goal is refused.
         """
         program, controller = self.program, self.controller
         controller.reset()
         controller.set_gains(self._gains(row))
         joints = None if program.joints is None else _select_row(program.joints, row)
-        controller.set_goals(
-            0.0,
-            state,
-            base=_pose_goal(program.base, row),
-            end_effector=_pose_goal(program.end_effector, row),
-            joints=joints,
-        )
+        base, hand = _pose_goal(program.base, row), _pose_goal(program.end_effector, row)
+        controller.require_controlled_axes(state, self._config, base=base, end_effector=hand)
+        controller.set_goals(0.0, state, base=base, end_effector=hand, joints=joints)
         profile = controller.profile
         assert profile is not None
         controller.law.command(state, profile.at(0.0))

@@ -32,7 +32,7 @@ from spacerobot_ros.campaign.one_by_one import FlightsEngine, nominal_robots, pl
 from spacerobot_ros.campaign.rows import LANES, Fallback, Row
 from spacerobot_ros.campaign.targets import DrawnFlight
 from spacerobot_ros.control.controller import build_controller, controlled_outputs
-from spacerobot_ros.control.executive import decided_message
+from spacerobot_ros.control.executive import controlled_parts, decided_message
 from spacerobot_ros.control.laws.registry import LAWS
 from spacerobot_ros.control.outputs import OutputDistance
 from spacerobot_ros.control.status import ControllerState
@@ -44,6 +44,7 @@ from spacerobot_ros.model.inertial_parameters import InertialParameters
 from spacerobot_ros.model.rotations import matrix_from_quaternion, quaternion_from_matrix
 from spacerobot_ros.model.space_robot import SpaceRobot
 from spacerobot_ros.planning import GaitSchedule, Goal, PoseError
+from spacerobot_ros.planning.core.goal import POSE, missed_parts, reached_message
 from spacerobot_ros.planning.execution.status import PlannerStatus, describe_remaining_error
 from spacerobot_ros.scenario import Scenario
 from spacerobot_ros.simulation.config import OrbitConfig, TableConfig
@@ -253,9 +254,11 @@ class _ScheduledLanes:
         self, campaign: Campaign, draw: Draw, flight: DrawnFlight
     ) -> _PreparedDraw | Fallback:
         began = time.perf_counter()
-        plan = self._plan_first_state(flight)
+        plan, goal = self._plan_first_state(flight), flight.scenario.goal
         if plan is None:
             return Fallback(draw, "had no schedule at the first state")
+        if plan.schedule.controls & (POSE - goal.asked):
+            return Fallback(draw, "keeps a part of the pose that its goal does not ask for")
         return _PreparedDraw(draw, flight, plan, time.perf_counter() - began)
 
     def _plan_first_state(self, flight: DrawnFlight) -> _Plan | None:
@@ -370,6 +373,10 @@ class _ControlledLanes:
         """Return the reason why lanes cannot fly a campaign, as a clause; empty if they can."""
         scenario = campaign.scenario
         plant = scenario.plant
+        if scenario.goal.end_effectors:
+            return "the goal is for end-effectors"
+        if scenario.goal.asked != POSE:
+            return "the goal asks for a part of the pose of the base alone"
         if plant.thrusters:
             return "its thrusters are on or off, which engine 'flights' flies"
         if plant.beyond_limits != "clip":
@@ -397,6 +404,8 @@ class _ControlledLanes:
         for key, goal in _goals_by_frame(scenario).items():
             if goal is not None and not getattr(law.outputs.selection, key):
                 return f"the law '{law.name}' does not control the {key.replace('_', '-')}"
+        if controlled_parts(law.outputs.selection.base) != POSE:
+            return f"the law '{law.name}' controls a part of the pose of the base alone"
         return ""
 
     def prepare_draw(
@@ -558,9 +567,11 @@ def _decide_goal(
     """
     error = PoseError.between(pose[:3], pose[3:], scenario.goal, q)
     tolerance = scenario.planner.tolerance
+    missed = missed_parts(scenario.goal, error, schedule.controls, tolerance)
     remaining = describe_remaining_error(error, schedule.controls, tolerance, scenario.goal)
     if tolerance.admits(error, schedule.controls):
-        return Outcome.REACHED, f"The goal is reached: {remaining}."
+        outcome = Outcome.REACHED_PARTLY if missed else Outcome.REACHED
+        return outcome, reached_message(remaining, missed)
     if scenario.planner.max_corrections:
         return "needed corrections"
     return Outcome.FAILED, f"The goal is not reached: {remaining} after 0 correction(s)."

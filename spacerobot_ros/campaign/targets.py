@@ -20,6 +20,7 @@ from spacerobot_ros.model.shared_parameters import RobotConfig
 from spacerobot_ros.model.urdf import load_robot, parse_robot
 from spacerobot_ros.parameters import Parameter, declared, replaced, values_of
 from spacerobot_ros.planning import Goal
+from spacerobot_ros.planning.core.goal import Controlled
 from spacerobot_ros.resources import robot_file, suggestion
 from spacerobot_ros.scenario import CONFIGS, Scenario
 from spacerobot_ros.simulation.capture import load_target, target_parameters
@@ -494,6 +495,8 @@ def _pose_target(name: str, kind: str, rest: str, scenario: Scenario) -> Dispers
         else:
             turned = quaternion_multiply(goal.quaternion, quaternion_from_rotvec(offset))
             goal = replace(goal, quaternion=turned)
+        asked: set[Controlled] = {"position" if part == "position" else "attitude"}
+        goal = replace(goal, asked=goal.asked | asked)
         goals = {key: getattr(flight.scenario, key) for key in ("goal", "end_effector_goal")}
         moved = flight.scenario.with_poses(*(goals | {kind: goal}).values())
         return replace(flight, scenario=moved)

@@ -255,8 +255,8 @@ def _clearance_line(summary: dict[str, Any]) -> list[str]:
 
 
 def _published_lines(scenario: Scenario, summary: dict[str, Any]) -> list[str]:
-    lines = []
-    for row in scenario.comparable if summary["state"] in ("reached", "failed") else ():
+    lines, flown = [], summary["state"] in ("reached", "reached_partly", "failed")
+    for row in scenario.comparable if flown else ():
         measured = summary.get(row.quantity, summary["gait"].get(row.quantity))
         if isinstance(measured, list):
             printed, here = (f"({numbers(values, 4)})" for values in (row.printed, measured))
@@ -356,28 +356,34 @@ def goal_command(
 ) -> None:
     """Send a goal pose to a running stack, and wait for the result.
 
+    Without X Y Z the base keeps its position, without an attitude its attitude.
     With a goal of an end-effector the base is free, unless its pose is given too. Exit code 0: the
     goal was reached; 1: it was not; 2: bad input; 130: Ctrl-C has ended the command, and the stack
     still pursues the goal.
     """
     hands = EndEffectorOptions(poses, positions, links, paths).goals()
-    if len(pose) not in ((0, 3, 7) if hands else (3, 7)):
+    turned = rotvec is not None or rpy_deg is not None
+    if len(pose) not in ((0, 3, 7) if hands or turned else (3, 7)):
         raise click.UsageError("A goal is X Y Z, or X Y Z QX QY QZ QW.")
     if rotvec and rpy_deg:
         raise click.UsageError("The attitude is given twice, in radians and in degrees.")
-    if (rotvec or rpy_deg) and not pose:
-        raise click.UsageError("An attitude of the base is sent with its position X Y Z.")
+    if hands and turned and not pose:
+        raise click.UsageError(
+            "Beside end-effectors an attitude of the base is sent with its position X Y Z."
+        )
     from spacerobot_ros.planning import Goal
 
-    if not pose:
+    if not (pose or turned):
         goal = Goal.of_end_effectors(hands)
     else:
-        goal = Goal.checked(pose[:3], pose[3:] or (0.0, 0.0, 0.0, 1.0))
+        # NaN: the base keeps its position or attitude.
+        position, quaternion = pose[:3] or [math.nan] * 3, pose[3:] or [math.nan] * 4
         if rotvec:
             warn_of_large_angles(rotvec, "--goal-rpy-deg")
-            goal = Goal.from_rotvec(pose[:3], rotvec)
+            quaternion = Goal.from_rotvec([0, 0, 0], rotvec).quaternion.tolist()
         if rpy_deg:
-            goal = Goal.from_rpy(pose[:3], rpy_deg)
+            quaternion = Goal.from_rpy([0, 0, 0], rpy_deg).quaternion.tolist()
+        goal = Goal.received(position, quaternion)
         goal = replace(goal, end_effectors=tuple(hands))
     from spacerobot_ros.measures import Outcome
     from spacerobot_ros.session.live import send_goal

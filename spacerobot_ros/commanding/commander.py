@@ -363,9 +363,9 @@ class Commander(ABC):
         # A lockstep plant may already wait for an answer.
         self.answer()
 
-    def deactivate(self) -> None:
-        """Give up the goals and stop commanding; the file of goals stays."""
-        why = "Aborted: this node was deactivated."
+    def deactivate(self, failure: str = "") -> None:
+        """Give up the goals and stop commanding, by a failure or not; the file of goals stays."""
+        why = f"Aborted: {failure or 'this node was deactivated.'}"
         if self.config.resume_file:
             why += " A goal that came by topic is resumed when it is activated again."
         if self.activity is not CommanderActivity.INACTIVE and self.executive is not None:

@@ -107,8 +107,8 @@ class GoalErrors:
         error = PoseError.between(pose[:3], pose[3:], goal, q, robot)
         turned = any(each.quaternion is not None for each in goal.end_effectors)
         return cls(
-            error.distance if "position" in goal.base else math.nan,
-            error.angle if "attitude" in goal.base else math.nan,
+            error.distance if "position" in goal.base & goal.asked else math.nan,
+            error.angle if "attitude" in goal.base & goal.asked else math.nan,
             error.largest_end_effector_distance if goal.end_effectors else math.nan,
             error.largest_end_effector_angle if turned else math.nan,
             error.max_joint_error if goal.joint_positions is not None else math.nan,

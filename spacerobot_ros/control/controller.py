@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import replace
 from enum import Enum
 
@@ -22,7 +23,7 @@ from spacerobot_ros.control.limits import (
     MotionLimits,
     Saturated,
 )
-from spacerobot_ros.control.outputs import OutputDistance, OutputSelection
+from spacerobot_ros.control.outputs import AXES, OutputDistance, OutputSelection
 from spacerobot_ros.control.reference import (
     PROFILES,
     OutputErrors,
@@ -38,10 +39,20 @@ from spacerobot_ros.control.state import (
     Reference,
 )
 from spacerobot_ros.control.wheels import WheelControl
-from spacerobot_ros.errors import ParameterError, SpaceRobotError, describe_exception
+from spacerobot_ros.errors import (
+    ParameterError,
+    PlanningError,
+    SpaceRobotError,
+    describe_exception,
+)
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.grasp import Payload
-from spacerobot_ros.model.rotations import compose_poses, matrix_from_quaternion, relative_pose
+from spacerobot_ros.model.rotations import (
+    attitude_error,
+    compose_poses,
+    matrix_from_quaternion,
+    relative_pose,
+)
 from spacerobot_ros.model.space_robot import SpaceRobot
 
 _BRAKE_RATE = 2.0
@@ -168,6 +179,48 @@ class CoordinatedController:
             goal = replace(goal, joints=JointReference.at_rest(joints))
         self._begin_motion(time, state, start, goal, carries=carries)
 
+    def require_controlled_axes(
+        self,
+        state: ControlState,
+        config: ControllerConfig,
+        *,
+        base: PoseReference | None = None,
+        end_effector: PoseReference | None = None,
+    ) -> None:
+        """Refuse goals that differ from the present pose in an axis that the law leaves as it is.
+
+        The law of a planar robot controls the axes of its plane alone. A position or an attitude
+        without any controlled axis is no matter of an axis: such a part is not controlled at all.
+
+        Raises
+        ------
+        PlanningError
+            A goal is farther from the pose than the tolerance of the configuration; the message
+            names the axes.
+        """
+        selection, labels = self.law.outputs.selection, ", ".join(self.law.outputs.labels)
+        here = Reference.present(self.law.robot, state, selection.end_effector_link)
+        for name, goal in (("base", base), ("end_effector", end_effector)):
+            start, controlled = getattr(here, name), getattr(selection, name)
+            if goal is None or start is None:
+                continue
+            way = goal.position - start.position
+            turn_B = attitude_error(start.quaternion, goal.quaternion)
+            turn = matrix_from_quaternion(start.quaternion) @ turn_B
+            for part, unit, axes, error, tolerance in (
+                ("position", "m", AXES[:3], way, config.position_tolerance),
+                ("attitude", "rad", AXES[3:], turn, config.attitude_tolerance),
+            ):
+                left = [i for i in range(3) if axes[i] not in controlled]
+                off = float(np.linalg.norm(error[left]))
+                if 0 < len(left) < 3 and off > tolerance:
+                    raise PlanningError(
+                        f"The goal {part} of the {name.replace('_', '-')} is {off:.4g} {unit} from "
+                        f"the present one in {' and '.join(axes[i] for i in left)} of the world, "
+                        f"which the law '{self.law.name}' does not control; its outputs are "
+                        f"{labels}."
+                    )
+
     def _begin_motion(
         self, time: float, state: ControlState, start: Reference, goal: Reference, *, carries: bool
     ) -> None:
@@ -176,7 +229,20 @@ class CoordinatedController:
             motion = self.wheels.limits_with_wheels(motion, state.q)
         self.profile = self._profile_type(start, goal, motion, carries=carries)
         self._began = time
-        self.law.start(time, start, goal)
+        with self._failures_of_law(time):
+            self.law.start(time, start, goal)
+
+    @contextmanager
+    def _failures_of_law(self, time: float) -> Iterator[None]:
+        """Name the law in errors of its code, which may be a user's and may even end Python."""
+        try:
+            yield
+        except SpaceRobotError:
+            raise
+        except (Exception, SystemExit) as error:
+            raise SpaceRobotError(
+                f"The law '{self.law.name}' has failed at {time:g} s: {describe_exception(error)}."
+            ) from error
 
     def _carried_end_effector(
         self, before: Reference, base: PoseReference, state: ControlState
@@ -285,10 +351,12 @@ class CoordinatedController:
                 here = self._present_reference(time, state)
                 self.profile = StepReference(here, here, self._motion, carries=True)
                 self._began = time
-                self.law.start(time, here, here)
+                with self._failures_of_law(time):
+                    self.law.start(time, here, here)
             # The law is always evaluated, for its errors and status.
             self.law.time = time
-            commanded = self.law.command(state, self._reference_at(time))
+            with self._failures_of_law(time):
+                commanded = self.law.command(state, self._reference_at(time))
             if self.coming_to_rest:
                 commanded = self._to_rest(state)
         if state is not None:
@@ -509,7 +577,7 @@ def build_controller(robot: SpaceRobot, config: ControllerConfig) -> Coordinated
         )
     except SpaceRobotError:
         raise
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         raise ParameterError(
             f"The control law '{config.law}' cannot be built: {describe_exception(error)}."
         ) from error

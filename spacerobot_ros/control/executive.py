@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from enum import IntEnum
+from types import MappingProxyType
 
 import numpy as np
 
@@ -23,7 +24,15 @@ from spacerobot_ros.errors import CommandError, ParameterError, PlanningError
 from spacerobot_ros.events import Event, EventKind
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.grasp import Payload
-from spacerobot_ros.planning.core.goal import Controlled, Goal, Tolerance
+from spacerobot_ros.planning.core.goal import (
+    POSE,
+    Controlled,
+    Goal,
+    PoseError,
+    Tolerance,
+    missed_parts,
+    reached_message,
+)
 from spacerobot_ros.planning.execution.goal_file import (
     BASE_GOAL_KEY,
     IdentifiedGoal,
@@ -119,6 +128,8 @@ class ControlExecutive:
         """Goals that are pursued together, by part of the robot."""
         self._goal_id = ""
         """Id of the latest of them, which statuses have."""
+        self._asked: frozenset[Controlled] = frozenset()
+        """Parts of the pose of the base that the present goals ask for."""
         self._monitor, self._stall = GoalMonitor(), StallMonitor()
         self._was_measured = False
         self.servicing.end()
@@ -194,6 +205,8 @@ class ControlExecutive:
         PlanningError
             The law does not control it, or the goal's shape has another number of joints.
         """
+        if key == END_EFFECTOR:
+            self._require_output(key)
         parts = self._parts_of(goal) if goal.goal.end_effectors else {key: goal}
         for part, each in parts.items():
             self._require_controlled(part, each)
@@ -202,14 +215,14 @@ class ControlExecutive:
             self._pending[part] = each
 
     def _parts_of(self, identified: IdentifiedGoal) -> dict[str, IdentifiedGoal]:
-        law, goal = (
-            self.controller.law,
-            identified.goal.for_robot(self.controller.law.robot.description),
-        )
-        link = law.outputs.selection.end_effector_link
+        law, goal = self.controller.law, identified.goal
+        link, axes = law.outputs.selection.end_effector_link, law.outputs.selection.end_effector
+        # The law's end-effector is the default one here, whatever its name.
+        hands = tuple(replace(each, link=each.link or link) for each in goal.end_effectors)
+        goal = replace(goal, end_effectors=hands).for_robot(law.robot.description)
         parts = {}
         if goal.base:
-            pose = Goal(goal.position, goal.quaternion, goal.joint_positions)
+            pose = replace(goal, end_effectors=(), base=POSE, asked=goal.asked & goal.base)
             parts[BASE_GOAL_KEY] = replace(identified, goal=pose)
         for each in goal.end_effectors:
             if each.link != link:
@@ -217,23 +230,34 @@ class ControlExecutive:
                     f"The goal is for '{each.link}', which the law '{law.name}' does not control"
                     f"{f'; it controls {link!r}' if link else ''}."
                 )
-            if each.quaternion is None:
+            if each.waypoints is not None:
                 raise PlanningError(
-                    f"The goal of '{each.link}' is a position alone; the controller takes a pose: "
-                    "give it an orientation, too."
+                    f"The goal of '{each.link}' is a path, which a controller does not follow: "
+                    "plan it by the method 'resolved_rate'."
                 )
-            pose = Goal(each.position, each.quaternion, goal.joint_positions)
+            turned = any(axis.startswith("r") for axis in axes)
+            if each.quaternion is None and turned:
+                raise PlanningError(
+                    f"The goal of '{each.link}' is a position alone, and the law '{law.name}' "
+                    "controls its attitude: give it an orientation, too."
+                )
+            quaternion = _NO_ROTATION if each.quaternion is None else each.quaternion
+            pose = Goal(each.position, quaternion, goal.joint_positions)
             parts[END_EFFECTOR] = replace(identified, goal=pose)
         return parts
 
-    def _require_controlled(self, key: str, goal: IdentifiedGoal) -> None:
+    def _require_output(self, key: str) -> None:
         law = self.controller.law
         if not getattr(law.outputs.selection, key):
             raise PlanningError(
                 f"The law '{law.name}' does not control the {key.replace('_', '-')} of this robot; "
                 f"its outputs are {', '.join(law.outputs.labels)}."
             )
+
+    def _require_controlled(self, key: str, goal: IdentifiedGoal) -> None:
+        self._require_output(key)
         self._require_tolerances_met(key, goal)
+        law = self.controller.law
         shape, wheels = goal.goal.joint_positions, self.controller.wheels
         n = law.robot.n if wheels is None else law.robot.n + len(wheels.wheels)
         if shape is not None and len(shape) != n:
@@ -245,13 +269,9 @@ class ControlExecutive:
     def _require_tolerances_met(self, key: str, identified: IdentifiedGoal) -> None:
         selection, goal = self.controller.law.outputs.selection, identified.goal
         axes = selection.base if key == BASE_GOAL_KEY else selection.end_effector
-        controls: set[Controlled] = {
-            "attitude" if axis.startswith("r") else "position" for axis in axes
-        }
-        if selection.joints:
-            controls.add("shape")
+        controls = controlled_parts(axes, selection.joints)
         who = f"the law '{self.controller.law.name}'"
-        identified.required.require_control(goal, frozenset(controls), who)
+        identified.required.require_control(goal, controls, who)
 
     def request(self, task: Task) -> None:
         """Do a task from the next measured state on, without a goal after it."""
@@ -462,9 +482,22 @@ class ControlExecutive:
         decision = monitor.decide_by_errors(time, at_rest, ends, controller.errors(), config)
         if decision != _NO_DECISION:
             self._goal_state, kind = _STATE_AND_EVENT_OF_DECISION[Decision(int(decision))]
+            if decision == Decision.REACHED and self._missed_parts():
+                self._goal_state = ControllerState.REACHED_PARTLY
+                kind = EventKind.GOAL_REACHED_PARTLY
             message = self._message(self._goal_state)
             self._end_goals(kind, self._goal_state, message)
             self._report_decision(kind, message, self._goal_state)
+
+    def _missed_parts(self) -> dict[Controlled, str]:
+        """Return the :func:`missed_parts` of the base in the state of the last command."""
+        law, goal, config = self.controller.law, self.controller.goal.base, self._goal_config
+        if goal is None or not self._asked:
+            return {}
+        state, aimed = law.state, Goal(goal.position, goal.quaternion, asked=self._asked)
+        error = PoseError.between(state.r_WB, state.quaternion_WB, aimed)
+        tolerance = Tolerance(config.position_tolerance, config.attitude_tolerance)
+        return missed_parts(aimed, error, controlled_parts(law.outputs.selection.base), tolerance)
 
     def _end_goals(self, kind: EventKind, state: ControllerState, message: str) -> None:
         """Report the end of all goals but the latest, whose status goes on."""
@@ -523,6 +556,8 @@ class ControlExecutive:
     def _follow_goals(self, time: float, state: ControlState) -> None:
         """Go on with the tasks before the pending goals, and start towards the goals after them."""
         servicing = self.servicing
+        if self._pending:
+            self._refuse_uncontrolled(state)
         if self._requested is not None:
             self._begin_tasks(time, self._requested)
             self._requested = None
@@ -549,6 +584,23 @@ class ControlExecutive:
                 )
             case TaskState.REFUSED | TaskState.FAILED:
                 self._end_tasks(time, state, progress)
+
+    def _refuse_uncontrolled(self, state: ControlState) -> None:
+        """Refuse pending goals that the law leaves unmet in a single axis, by a measured state."""
+        for key, pending in list(self._pending.items()):
+            goal = pending.goal.kept_at(state.r_WB, state.quaternion_WB)
+            pose = PoseReference(goal.position, goal.quaternion)
+            config = self._config_with(pending.tolerance)
+            try:
+                self.controller.require_controlled_axes(state, config, **{key: pose})
+            except PlanningError as error:
+                self._pending = {
+                    part: each
+                    for part, each in self._pending.items()
+                    if each.goal_id != pending.goal_id
+                }
+                self.refuse(str(error), pending.goal_id)
+                break
 
     def _begin_tasks(self, time: float, tasks: tuple[Task, ...]) -> None:
         self.servicing.begin(tasks)
@@ -584,6 +636,11 @@ class ControlExecutive:
         self._resumes = all(pending.resumes for pending in self._pending.values())
         self._take_tolerance(next(reversed(self._pending.values())).tolerance)
         self._pending.clear()
+        if BASE_GOAL_KEY in goals:
+            goal = goals[BASE_GOAL_KEY].kept_at(state.r_WB, state.quaternion_WB)
+            goals[BASE_GOAL_KEY], self._asked = goal, goal.asked
+        elif BASE_GOAL_KEY not in pursued:
+            self._asked = frozenset()
         poses = {key: PoseReference(goal.position, goal.quaternion) for key, goal in goals.items()}
         shapes = [g.joint_positions for g in goals.values() if g.joint_positions is not None]
         if self.controller.wheels is not None:
@@ -607,14 +664,17 @@ class ControlExecutive:
         self.outputs.append(PursuedGoals(self._goals_to_save()))
 
     def _take_tolerance(self, tolerance: Tolerance | None) -> None:
-        self._goal_tolerance, self._goal_config = tolerance, self._config
-        if tolerance is not None:
-            self._goal_config = replace(
-                self._config,
-                position_tolerance=tolerance.position,
-                attitude_tolerance=tolerance.attitude,
-                joint_tolerance=tolerance.shape,
-            )
+        self._goal_tolerance, self._goal_config = tolerance, self._config_with(tolerance)
+
+    def _config_with(self, tolerance: Tolerance | None) -> ControllerConfig:
+        if tolerance is None:
+            return self._config
+        return replace(
+            self._config,
+            position_tolerance=tolerance.position,
+            attitude_tolerance=tolerance.attitude,
+            joint_tolerance=tolerance.shape,
+        )
 
     def _report_acceptance(self) -> None:
         message, goal_id = "The goal is accepted.", self._goal_id
@@ -631,7 +691,14 @@ class ControlExecutive:
             poses[END_EFFECTOR] = goal.end_effector
         return {
             key: IdentifiedGoal(
-                Goal(pose.position, pose.quaternion, shape), self._goal_id, resumes=self._resumes
+                Goal(
+                    pose.position,
+                    pose.quaternion,
+                    shape,
+                    asked=self._asked if key == BASE_GOAL_KEY else POSE,
+                ),
+                self._goal_id,
+                resumes=self._resumes,
             )
             for key, pose in poses.items()
             if pose is not None and getattr(selection, key)
@@ -677,9 +744,10 @@ class ControlExecutive:
             case ControllerState.STALLED:
                 away = self.controller.distance_from_reference()
                 return f"Stalled {away} from the reference: {self._stall.cause}."
-            case ControllerState.REACHED | ControllerState.FAILED:
+            case ControllerState.REACHED | ControllerState.REACHED_PARTLY | ControllerState.FAILED:
                 away, config = self.controller.distance_to_goal(), self._goal_config
-                return decided_message(state, away, config, self._stall.cause)
+                missed = self._missed_parts() if state is ControllerState.REACHED_PARTLY else {}
+                return decided_message(state, away, config, self._stall.cause, missed)
             case ControllerState.ABORTED:
                 return self._abort_message
             case ControllerState.ESTIMATING:
@@ -691,33 +759,50 @@ class ControlExecutive:
                 raise ValueError("a refusal has a message of its own")
 
 
+_NOTHING_MISSED: Mapping[Controlled, str] = MappingProxyType({})
+
+
 def decided_message(
-    state: ControllerState, distance: OutputDistance, config: ControllerConfig, cause: str = ""
+    state: ControllerState,
+    distance: OutputDistance,
+    config: ControllerConfig,
+    cause: str = "",
+    missed: Mapping[Controlled, str] = _NOTHING_MISSED,
 ) -> str:
     """Return the message about a goal that is reached or failed, at a distance from the goal.
 
-    ``cause`` is why the robot came no nearer, as far as is known.
+    ``cause`` is why the robot came no nearer, as far as is known; ``missed`` are the parts of a
+    goal that is reached partly.
     """
-    reached = "reached"
-    if state is not ControllerState.REACHED:
-        reached = f"not reached in time, as {cause}" if cause else "not reached in time"
     limits = (
         (distance.position, config.position_tolerance),
         (distance.attitude, config.attitude_tolerance),
         (distance.joints, config.joint_tolerance),
     )
     tolerance = OutputDistance(*(math.nan if math.isnan(off) else most for off, most in limits))
-    message = f"The goal is {reached}: {distance} from it (tolerance {tolerance})"
-    if state is ControllerState.FAILED and not any(off > most for off, most in limits):
-        message += f", within tolerance for less than the settling time of {config.settle_time:g} s"
-    return f"{message}."
+    away = f"{distance} from it (tolerance {tolerance})"
+    if state is not ControllerState.FAILED:
+        return reached_message(away, missed)
+    late = f"not reached in time, as {cause}" if cause else "not reached in time"
+    if not any(off > most for off, most in limits):
+        away += f", within tolerance for less than the settling time of {config.settle_time:g} s"
+    return f"The goal is {late}: {away}."
 
+
+_NO_ROTATION = np.array([0.0, 0.0, 0.0, 1.0])
 
 _MAX_STATE_GAP, _MAX_STATE_GAP_PERIODS = 1.0, 10
 """Longest gap between two states, s, and in control periods; longer gaps are jumps of time."""
 
 _LATE_POSE_PERIODS = 1.5
 """Longest time without a measured base that is not reported, in control periods."""
+
+
+def controlled_parts(axes: Sequence[str], joints: Sequence[str] = ()) -> frozenset[Controlled]:
+    """Return the parts of a goal that outputs control: axes of a pose, and joints."""
+    parts: set[Controlled] = {"attitude" if axis.startswith("r") else "position" for axis in axes}
+    return frozenset(parts | {"shape"} if joints else parts)
+
 
 _STATE_AND_EVENT_OF_DECISION = {
     Decision.REACHED: (ControllerState.REACHED, EventKind.GOAL_REACHED),

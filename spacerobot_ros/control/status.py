@@ -26,6 +26,8 @@ class ControllerState(str, Enum):
     STALLED = "stalled"
     """A goal is tracked, and the robot comes no nearer."""
     REACHED = "reached"
+    REACHED_PARTLY = "reached_partly"
+    """A part of the base that was asked for is out of tolerance, and not controlled."""
     FAILED = "failed"
     REFUSED = "refused"
     ABORTED = "aborted"
@@ -37,6 +39,7 @@ class ControllerState(str, Enum):
         """Whether the state of the goal is final."""
         return self in (
             ControllerState.REACHED,
+            ControllerState.REACHED_PARTLY,
             ControllerState.FAILED,
             ControllerState.REFUSED,
             ControllerState.ABORTED,
@@ -48,7 +51,12 @@ class ControllerState(str, Enum):
         match self:
             case ControllerState.FAILED | ControllerState.REFUSED | ControllerState.STOPPED:
                 return 2
-            case ControllerState.ABORTED | ControllerState.ESTIMATING | ControllerState.STALLED:
+            case (
+                ControllerState.REACHED_PARTLY
+                | ControllerState.ABORTED
+                | ControllerState.ESTIMATING
+                | ControllerState.STALLED
+            ):
                 return 1
             case _:
                 return 0

@@ -292,12 +292,13 @@ def _changed_goal(
             raise GoalError(f"A goal is 3 or 7 numbers, not {len(pose)}: position, quaternion.")
         given = Goal.checked(pose[:3], pose[3:] or before.quaternion)
         made = replace(before, position=given.position, quaternion=given.quaternion)
+        made = replace(made, asked=POSE if pose[3:] else before.asked | {"position"})
     if position is not None:
         given = Goal.checked(_float_list(position, "position"), made.quaternion)
-        made = replace(made, position=given.position)
+        made = replace(made, position=given.position, asked=made.asked | {"position"})
     if rotvec is not None:
         given = Goal.from_rotvec(made.position.tolist(), _float_list(rotvec, "rotvec"))
-        made = replace(made, quaternion=given.quaternion)
+        made = replace(made, quaternion=given.quaternion, asked=made.asked | {"attitude"})
     return made
 
 

@@ -41,7 +41,13 @@ from spacerobot_ros.model.rotations import (
     rotvecs_from_quaternions,
 )
 from spacerobot_ros.planning import METHODS, GaitSchedule, Goal, PoseError
-from spacerobot_ros.planning.core.goal import Controlled, Tolerance, uncontrolled_parts
+from spacerobot_ros.planning.core.goal import (
+    Controlled,
+    Tolerance,
+    missed_parts,
+    reached_message,
+    uncontrolled_parts,
+)
 from spacerobot_ros.planning.execution.status import (
     PlannerState,
     PlannerStatus,
@@ -550,7 +556,7 @@ class FlightData:
     def verdict(self) -> Verdict:
         """The end of the flight in a word and a sentence, by its last true state."""
         late = self.outcome is Outcome.FAILED and isinstance(self.status, ControllerStatus)
-        reached = self.outcome is Outcome.REACHED
+        reached = self.outcome in (Outcome.REACHED, Outcome.REACHED_PARTLY)
         if not (reached or late):
             return Verdict(self.outcome.value.capitalize(), self.message)
         left_out, missed = self.not_controlled, reached and self._automatic_capture_is_missing
@@ -559,7 +565,7 @@ class FlightData:
             word += f", but for the {' and '.join(left_out)}"
         if missed:
             word += ", but the target is not captured"
-        succeeded = reached and not missed
+        succeeded = self.outcome is Outcome.REACHED and not missed
         error, tolerance = self._last_error, self._tolerances
         if error is None or tolerance is None or self.goal is None:
             sentence = self.message
@@ -583,6 +589,9 @@ class FlightData:
                 f"The measured pose is within tolerance of the goal; the true one is {errors}."
             )
             return Verdict("Reached by the measured pose", sentence)
+        parts = missed_parts(self.goal, error, frozenset(controls), tolerance)
+        if self.outcome is Outcome.REACHED_PARTLY and parts and not missed:
+            return Verdict(word, reached_message(errors, parts))
         fact = "The goal is reached" if reached else "The goal is not reached in time"
         if late and self.message.startswith(fact):
             # The message of a controller names what kept it from the goal, if that is known.

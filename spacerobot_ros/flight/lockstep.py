@@ -42,7 +42,7 @@ from spacerobot_ros.measures import Outcome
 from spacerobot_ros.messages.diagnostics import PlantDiagnostics, state_diagnostics
 from spacerobot_ros.messages.statuses import StatusRecord
 from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.model.description import Array, RobotDescription
+from spacerobot_ros.model.description import DEFAULT_END_EFFECTOR, Array, RobotDescription
 from spacerobot_ros.model.shared_parameters import RobotConfig, robot_from_text, robot_of
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.core.goal import POSE
@@ -496,12 +496,23 @@ class LockstepFlight:
         scenario, goal = self._scenario, self._scenario.goal
         # A pose is checked, and its quaternion scaled, where it is received.
         given = Goal.checked(goal.position, goal.quaternion, goal.joint_positions)
-        given = replace(given, end_effectors=goal.end_effectors, base=goal.base)
+        hands, asked = goal.end_effectors, goal.asked
+        given = replace(given, end_effectors=hands, base=goal.base, asked=asked)
         if self._planner is not None:
             self._planner.receive_goal(BASE_GOAL_KEY, *_FIRST_GOAL_STAMP, lambda: given)
         if self._controller is not None:
             unshaped = replace(given, joint_positions=None, end_effectors=(), base=POSE)
-            self._controller.receive_goal(BASE_GOAL_KEY, *_FIRST_GOAL_STAMP, lambda: unshaped)
+            unshaped = replace(unshaped, asked=asked & goal.base)
+            if given.base:
+                self._controller.receive_goal(BASE_GOAL_KEY, *_FIRST_GOAL_STAMP, lambda: unshaped)
+            heard = [
+                each
+                for each in hands
+                if self._planner is None or each.link in ("", DEFAULT_END_EFFECTOR)
+            ]
+            if heard:
+                aimed = Goal.of_end_effectors(heard)
+                self._controller.receive_goal(END_EFFECTOR, *_FIRST_GOAL_STAMP, lambda: aimed)
             tool = scenario.end_effector_goal
             if tool is not None:
                 self._controller.receive_goal(

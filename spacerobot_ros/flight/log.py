@@ -147,7 +147,7 @@ class FlightLog:
             events=tuple(self.events),
             outcome=outcome,
             message=message,
-            goal=scenario.goal,
+            goal=scenario.goal.kept_at(*np.split(states["pose"][0], [3])),
             end_effector_goal=scenario.end_effector_goal,
             schedules=tuple(self.schedules),
             plant_statuses=tuple(self.plant_statuses),

@@ -294,7 +294,11 @@ class FlightBag(RecordedRobot):
                 # Zeros ask for the position of an end-effector alone.
                 attitude = _NO_GOAL.quaternion.tolist()
             try:
-                goal = Goal.checked([p.x, p.y, p.z], attitude, shape)
+                goal = Goal.received([p.x, p.y, p.z], attitude, shape)
+                if odom is not None:
+                    at = odom[1].pose.pose
+                    r, o = at.position, at.orientation
+                    goal = goal.kept_at(np.array([r.x, r.y, r.z]), np.array([o.x, o.y, o.z, o.w]))
             except PlanningError:
                 continue
             if not world or frame in ("", world):
@@ -635,7 +639,11 @@ def _sent_goal(about: Mapping[str, str], name: str) -> Goal | None:
         np.array([float(word) for word in about[f"{name}_{part}"].split()])
         for part in ("position", "orientation")
     )
-    return Goal(position, quaternion)
+    goal = Goal(position, quaternion)
+    if f"{name}_asked" not in about:
+        return goal
+    parts = about[f"{name}_asked"].split()
+    return replace(goal, asked=frozenset(part for part in POSE if part in parts))
 
 
 def read_run(path: str | os.PathLike[str]) -> Flight:
@@ -658,10 +666,10 @@ def read_run(path: str | os.PathLike[str]) -> Flight:
         read_flight(bag),
         scenario=scenario,
         robot=robot,
-        goal=scenario.goal,
         end_effector_goal=scenario.end_effector_goal,
     )
     require_states(bag, flight)
+    flight = replace(flight, goal=scenario.goal.kept_at(*np.split(flight.pose[0], [3])))
     if len(flight.pose) != len(flight.q):
         raise RecordingError(
             f"The bag {bag.path} has {len(flight.pose)} poses of the base and {len(flight.q)} "

@@ -15,7 +15,7 @@ from spacerobot_ros.planning import Goal, PoseError
 from spacerobot_ros.planning.core.goal import EndEffectorGoal
 from spacerobot_ros.planning.execution.status import PlannerStatus
 
-_FLOWN_STATES = frozenset(("executing", "reached", "failed", "aborted"))
+_FLOWN_STATES = frozenset(("executing", "reached", "reached_partly", "failed", "aborted"))
 """States of a status whose goal the robot flies to, or has flown to."""
 
 

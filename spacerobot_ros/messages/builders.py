@@ -201,9 +201,13 @@ def state_message(
 
 
 def goal_message(goal: Goal, frame: str, stamp_ns: int = 0) -> bytes:
-    """Return the pose of a goal as geometry_msgs/PoseStamped."""
-    position = dict(zip("xyz", goal.position, strict=True))
-    orientation = dict(zip("xyzw", goal.quaternion, strict=True))
+    """Return the pose of a goal as geometry_msgs/PoseStamped; NaN: a part is not asked for."""
+    r, quaternion = (
+        values if part in goal.asked else np.full(len(values), np.nan)
+        for part, values in (("position", goal.position), ("attitude", goal.quaternion))
+    )
+    position = dict(zip("xyz", r, strict=True))
+    orientation = dict(zip("xyzw", quaternion, strict=True))
     return encode(
         POSE_STAMPED,
         {

@@ -81,6 +81,7 @@ _MARKS = {
     EventKind.PLAN_DISTURBED: _Mark("plan disturbed", "<", _WARN, 0, hollow=True),
     EventKind.CORRECTION: _Mark("correction", "s", _PLAIN, 0, hollow=True),
     EventKind.GOAL_REACHED: _Mark("goal reached", "*", _GOOD, 0),
+    EventKind.GOAL_REACHED_PARTLY: _Mark("goal reached in part", "*", _WARN, 0),
     EventKind.GOAL_FAILED: _Mark("goal failed", "X", _BAD, 0),
     EventKind.GOAL_ABORTED: _Mark("aborted", "X", _WARN, 0),
     EventKind.FAULT_INJECTED: _Mark("fault on", "^", _WARN, 1),

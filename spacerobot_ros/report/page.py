@@ -116,10 +116,10 @@ def _outcome_html(flight: FlightReport) -> str:
     word, sentence = tone.capitalize(), last if isinstance(last, str) else last.message
     if tone == "executing":
         sentence += " The recording ends before the outcome is known."
-    if tone in ("reached", "failed"):
+    if tone in ("reached", "reached_partly", "failed"):
         word, sentence = verdict.word, verdict.sentence
-    if tone == "reached" and not verdict.complete:
-        tone += " partly"
+    if tone.startswith("reached"):
+        tone = "reached" if verdict.complete else "reached partly"
     state = f"<b>{escape(word)}</b>" if word else ""
     return f'<p class="outcome {escape(tone)}">{state}{unbroken(sentence)}</p>'
 

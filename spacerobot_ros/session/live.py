@@ -10,6 +10,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import rclpy
 from lifecycle_msgs.msg import State
 from lifecycle_msgs.srv import GetState
@@ -102,7 +103,7 @@ def _summary(stack: MultiProcessStack, wall_time: float) -> dict[str, Any]:
         scenario=scenario,
         outcome=outcome,
         message=message,
-        goal=scenario.goal,
+        goal=scenario.goal.kept_at(*np.split(flight.pose[0], [3])),
         end_effector_goal=scenario.end_effector_goal,
         status=client.status,
         gait=client.gait,

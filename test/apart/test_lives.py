@@ -39,8 +39,8 @@ QUICK_KILLS = [
     ("coordinated_control", "coordinated_control", "tracking"),
 ]
 AT_REST = {
-    "planner": ("idle", "reached", "failed", "refused", "aborted"),
-    "coordinated_control": ("holding", "reached", "failed", "refused", "aborted"),
+    "planner": ("idle", "reached", "reached_partly", "failed", "refused", "aborted"),
+    "coordinated_control": ("holding", "reached", "reached_partly", "failed", "refused", "aborted"),
 }
 """States of a commander whose plant publishes states, and which pursues no goal."""
 

@@ -178,6 +178,30 @@ def test_flights_in_lanes_are_interrupted_or_left_to_the_controller() -> None:
     assert {lanes[number].fallback for number in lost} == {"lost control"}
 
 
+def test_a_goal_out_of_the_plane_is_refused_in_lanes_as_elsewhere() -> None:
+    disperse = {"goal.position.z": {"choice": [0.0, 0.4]}}
+    lanes, _ = assert_same_flights(controlled(flights=6, disperse=disperse, longest=0.2))
+    assert {row.outcome for row in lanes.values()} == {"interrupted", "refused"}
+    for row in lanes.values():
+        refused = row.outcome == "refused"
+        assert row.engine == ("flights" if refused else "lanes")
+        assert ("in z of the world" in row.reason) is refused
+
+
+def test_a_part_that_is_asked_for_and_not_controlled_is_missed_in_lanes_as_elsewhere() -> None:
+    """An arm turns its spacecraft, and leaves the place that a draw asks for."""
+    settings = {"planner.max_corrections": 0, "planner.method": "optimal"}
+    for disperse, outcome in (
+        ({"goal.position.x": {"uniform": [0.1, 0.1]}}, "reached_partly"),
+        ({"goal.rotvec.x": {"uniform": [0.0, 1e-3]}}, "reached"),
+    ):
+        wanted = {"scenario": "arm_attitude", "seed": 2, "flights": 3, "set": settings}
+        made = parse_campaign("arm", {**wanted, "disperse": disperse})
+        lanes, _ = assert_same_flights(made)
+        assert {(row.engine, row.outcome) for row in lanes.values()} == {("lanes", outcome)}
+        assert all(row.passed is (outcome == "reached") for row in lanes.values())
+
+
 @pytest.mark.slow
 def test_a_draw_that_is_refused_leaves_the_others_of_its_batch_in_lanes() -> None:
     """Each has its own reason: a start beyond the joint limits, noise below zero."""

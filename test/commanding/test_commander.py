@@ -338,10 +338,10 @@ def test_goals_that_are_pursued_together_are_aborted_together(arm: SpaceRobot) -
     rig.use(arm)
     rig.commander.activate()
     rig.state(1)
-    client = MagicMock()
-    rig.commander.receive_fly_to("a", lambda: FlyTo(GOAL), client)
+    client, flat = MagicMock(), Goal.checked([0.05, -0.03, 0.0], [0.0, 0.0, 0.0, 1.0])
+    rig.commander.receive_fly_to("a", lambda: FlyTo(flat), client)
     rig.state(2)
-    rig.commander.receive_goal(END_EFFECTOR, 8, 0, lambda: GOAL)
+    rig.commander.receive_goal(END_EFFECTOR, 8, 0, lambda: flat)
     for tick in (3, 4):
         rig.state(tick)
     client.end.assert_not_called()

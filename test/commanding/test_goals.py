@@ -351,6 +351,7 @@ def test_decisions_are_events(kind: type[PlannerStatus] | type[ControllerStatus]
     states = PlannerState if kind is PlannerStatus else ControllerState
     expected = {
         "reached": (EventKind.GOAL_REACHED, 0),
+        "reached_partly": (EventKind.GOAL_REACHED_PARTLY, 1),
         "failed": (EventKind.GOAL_FAILED, 2),
         "refused": (EventKind.GOAL_REFUSED, 2),
         "aborted": (EventKind.GOAL_ABORTED, 1),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 import math
+import re
 from pathlib import Path
 from typing import Any
 
@@ -50,6 +51,37 @@ from spacerobot_ros.resources import robot_file
 from spacerobot_ros.simulation import EffortPlant, InitialState
 
 # -- goals ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("key", "position", "rotvec", "named"),
+    [
+        ("base", [0.1, 0.05, 0.011], [0.0, 0.0, 0.1], "position of the base is 0.011 m .* in z "),
+        ("base", AIM, [0.3, 0.4, 0.0], "attitude of the base is 0.5 rad .* in rx and ry "),
+        ("end_effector", TIP - [0, 0, 3], [0.3, 0, 0], "position of the end-effector is 3 m .* z "),
+    ],
+)
+def test_a_goal_out_of_the_plane_is_refused_and_the_earlier_one_goes_on(
+    key: str, position: Any, rotvec: Any, named: str
+) -> None:
+    """Tolerances are 0.01 m and 0.02 rad; the law leaves the end-effector's attitude free."""
+    loop = ExecutiveLoop(position_tolerance=0.01, attitude_tolerance=0.02)
+    loop.answer()
+    loop.aim(base=goal_at(AIM, "first"))
+    commanded = loop.answer()
+    goal = Goal(np.array(position), Rotation.from_rotvec(rotvec).as_quat())
+    loop.aim(**{key: IdentifiedGoal(goal, "second")})
+    np.testing.assert_array_equal(np.concatenate(loop.answer()), np.concatenate(commanded))
+    refused = [each for each in loop.statuses if each.state is ControllerState.REFUSED]
+    assert [each.goal_id for each in refused] == ["second"]
+    assert_one_sentence(refused[0].message, "transposed_jacobian", "base.rz")
+    assert re.search(named, refused[0].message)
+    assert (loop.state, loop.status.goal_id) == ("tracking", "first")
+    # Within the tolerances it is accepted.
+    goal = Goal(np.array([0.5, 0.25, 0.009]), Rotation.from_rotvec([0.01, 0.015, 0.0]).as_quat())
+    loop.aim(base=IdentifiedGoal(goal, "third"))
+    loop.answer()
+    assert (loop.state, loop.status.goal_id) == ("tracking", "third")
 
 
 def test_without_a_goal_the_pose_of_the_first_state_is_held() -> None:
@@ -477,6 +509,9 @@ def test_a_status_is_reported_on_changes_and_every_period() -> None:
     assert len(loop.statuses) == count + 1
 
 
+_DECIDED = ("reached", "reached_partly", "failed", "refused", "aborted")
+
+
 @given(
     state=st.sampled_from(ControllerState),
     goal_id=st.sampled_from(["", "12.000000345", "unstamped-2"]),
@@ -496,7 +531,7 @@ def test_a_status_survives_its_values(
     assert again.to_values() == values
     assert (again.state, again.goal_id, again.message) == (state, goal_id, "A sentence.")
     assert again.ends_at_s == ends_at
-    assert state.decided == (state.value in ("reached", "failed", "refused", "aborted"))
+    assert state.decided == (state.value in _DECIDED)
 
 
 @pytest.mark.parametrize("values", [{}, {"state": "flying"}, {"state": "holding", "law": "a"}])

@@ -10,8 +10,10 @@ import pytest
 import yaml
 from scipy.spatial.transform import Rotation
 
+from spacerobot_ros import fly
 from spacerobot_ros.control import ControlState, Reference
 from spacerobot_ros.control.status import ControllerState, ControllerStatus
+from spacerobot_ros.errors import PlanningError
 from spacerobot_ros.flight.flight import Flight
 from spacerobot_ros.flight.lockstep import fly_scenario
 from spacerobot_ros.measures import Outcome
@@ -77,6 +79,44 @@ def flown(
     text = yaml.safe_dump({name: {"ros__parameters": of} for name, of in sections.items()})
     file.write_text(text, "utf-8")
     return fly_scenario(load_scenario(str(file)), longest=600.0, contacts=False)
+
+
+def test_an_end_effector_is_brought_to_the_goal_of_the_caller_by_a_law() -> None:
+    """In place of the scenario's goal; and a position alone where the law leaves attitudes free."""
+    scenario = load_scenario("coordinated_control")
+    goal = np.array([1.2, 1.4, 0.0])
+    flight = fly(scenario, end_effector_position=goal)
+    assert flight.succeeded
+    assert flight.end_effector_errors["end_effector"].distance < 1e-3
+    robot = SpaceRobot.from_file(robot_file("planar_manipulator"))
+    R_BE, r_BE = robot.link_pose("end_effector", flight.q[-1])
+    turn = Rotation.from_quat(flight.pose[-1, 3:])
+    np.testing.assert_allclose(flight.pose[-1, :3] + turn.apply(r_BE), goal, atol=1e-3)
+    assert abs((turn * Rotation.from_matrix(R_BE)).as_rotvec()[2]) > 0.5
+    cases: tuple[tuple[dict[str, Any], str], ...] = (
+        ({"end_effector_position": [1.2, 1.4, 2.0]}, "end-effector is 2 m from .* in z of"),
+        ({"goal": [0.5, 0.5, 0.2]}, "base is 0.2 m from the present one in z of the world"),
+        ({"end_effector_position": goal, "end_effector": "link_1"}, "'link_1', which the law"),
+    )
+    for given, named in cases:
+        with pytest.raises(PlanningError, match=named):
+            fly(scenario, **given)
+
+
+def test_a_part_that_is_not_asked_for_is_kept() -> None:
+    """Where the base is at the start, by a law and by a gait method."""
+    attitude = [0.0, 0.6, 0.0, 0.8]
+    start = {"plant.initial_position": [0.4, -0.2, 0.1], "plant.initial_orientation": attitude}
+    turned = fly("free_flyer", rotvec=[0, 0, 0.3], method="model_based", parameters=start)
+    assert turned.succeeded
+    np.testing.assert_allclose(turned.pose[-1, :3], [0.4, -0.2, 0.1], atol=2e-3)
+    sliders = SpaceRobot.from_file(robot_file("sliding_masses"))
+    moved = fly(sliders, position=[0.42, -0.2, 0.1], method="lie_bracket", parameters=start)
+    assert moved.succeeded
+    turn = Rotation.from_quat(attitude).inv() * Rotation.from_quat(moved.pose[-1, 3:])
+    assert turn.magnitude() < 2e-3
+    assert moved.goal is not None
+    np.testing.assert_allclose(moved.goal.quaternion, attitude, atol=1e-12)
 
 
 def statuses(flight: Flight) -> list[tuple[float, ControllerStatus]]:

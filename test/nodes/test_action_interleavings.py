@@ -279,7 +279,8 @@ class Interleaving:
             status
             for status in self.probe.messages[self.status_topic]
             if values_of(status).get("goal_id") == sent.goal_id
-            and values_of(status)["state"] in ("reached", "failed", "refused", "aborted")
+            and values_of(status)["state"]
+            in ("reached", "reached_partly", "failed", "refused", "aborted")
         ]
         # A controller repeats the state of its goal until there is another one.
         (outcome,) = {values_of(status)["state"] for status in decided}

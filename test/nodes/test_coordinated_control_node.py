@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,10 @@ from support.control_loop import KD, KP, SHAPE, TICK_NS, TIP, URDF, Loop, pose
 from support.ros_harness import LATCHED, Harness, nanoseconds
 from support.sentences import assert_one_sentence
 
+from spacerobot_ros.control import ControlState, Reference
+from spacerobot_ros.control.laws.registry import LAWS
+from spacerobot_ros.control.laws.transposed_jacobian import TransposedJacobianLaw
+from spacerobot_ros.control.state import Actuation
 from spacerobot_ros.nodes import CoordinatedControlNode, PlantNode
 
 Array = npt.NDArray[np.float64]
@@ -165,7 +170,8 @@ REFUSED: dict[str, tuple[PoseStamped, tuple[str, ...]]] = {
 def test_a_bad_goal_is_refused_and_the_earlier_one_goes_on(
     harness: Harness, group: str, goal: PoseStamped, mentions: tuple[str, ...]
 ) -> None:
-    loop = Loop(harness)
+    # A position alone will do for an end-effector whose attitude is free, which this one's is not.
+    loop = Loop(harness, base_outputs="x y", end_effector_outputs="x y rz")
     loop.aim(base=pose([1.0, 0.0, 0.0]))
     before = loop.answer()[0]
     loop.goals[group].publish(goal)
@@ -174,6 +180,35 @@ def test_a_bad_goal_is_refused_and_the_earlier_one_goes_on(
     assert_one_sentence(status.message, *mentions)
     np.testing.assert_array_equal(loop.answer()[0], before)
     loop.wait_for("tracking")
+
+
+class _Failing(TransposedJacobianLaw):
+    name = "failing"
+
+    def command(self, state: ControlState, reference: Reference) -> Actuation:
+        if self.time > 0.035:
+            sys.exit("no model")
+        return super().command(state, reference)
+
+
+def test_a_law_that_fails_is_the_reason_for_the_end_of_its_goal(
+    harness: Harness, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(LAWS, "failing", _Failing)
+    loop = Loop(harness, law="failing")
+    loop.aim(base=pose([1.0, 0.0, 0.0]))
+    for _ in range(3):
+        loop.answer()
+    goal_id = loop.status["goal_id"]
+    assert (loop.status["state"], bool(goal_id)) == ("tracking", True)
+    loop.show()
+    message = loop.wait_for("aborted").message
+    assert message.startswith(
+        "Aborted: The law 'failing' has failed at 0.04 s: SystemExit: no model"
+    )
+    assert "deactivated" not in message
+    assert loop.status["goal_id"] == goal_id
+    loop.harness.spin_until(lambda: not loop.node.is_active, "the node is inactive")
 
 
 @pytest.mark.slow

@@ -72,7 +72,8 @@ class ActionFlight(Flight):
             (values_of(status)["state"], status.message)
             for status in self.probe.messages["planner/status"]
             if values_of(status).get("goal_id") == goal_id
-            and values_of(status)["state"] in ("reached", "failed", "refused", "aborted")
+            and values_of(status)["state"]
+            in ("reached", "reached_partly", "failed", "refused", "aborted")
         ]
 
     def check(self, sent: SentGoal) -> str:
@@ -230,13 +231,13 @@ def test_an_end_effector_is_brought_to_a_place(harness: Harness, name: str) -> N
 
 def test_the_base_is_turned_and_the_joints_are_left_in_a_shape(harness: Harness) -> None:
     flight = arm_flight(harness)
-    turned = ([0.0, 0.0, 0.0], [0.0, 0.0, 0.1])
+    turned = ([math.nan] * 3, [0.0, 0.0, 0.1])
     names = ["elbow_pitch", "shoulder_yaw", "shoulder_pitch"]
     wanted = JointState(name=names, position=[1.4, 0.2, -0.7])
     goal = {**base_at(goal_at(turned)), "joint_positions": wanted, "joint_tolerance": 2e-3}
     sent = flight.fly_to.send(**goal)
     assert flight.check(sent) == "reached"
-    assert flight.error_to(turned)[1] <= 1e-3
+    assert flight.error_to(([0.0, 0.0, 0.0], turned[1]))[1] <= 1e-3
     np.testing.assert_allclose(shapes_of(flight)[-1], [0.2, -0.7, 1.4], atol=2e-3)
     assert sent.result.errors.joints <= 2e-3
     assert sent.feedback[0].errors.joints == pytest.approx(0.3, rel=1e-6)
@@ -249,9 +250,19 @@ def test_a_tolerance_for_a_part_that_the_method_leaves_open_is_refused(harness: 
     assert flight.check(sent) == "refused"
     assert "a tolerance for its position, which optimal does not control" in sent.result.message
     sent = flight.fly_to.send(**turned, attitude_tolerance=1e-4)
-    assert flight.check(sent) == "reached"
+    assert flight.check(sent) == "reached_partly"
+    assert sent.state == "aborted"
+    assert "but for its position, which is " in sent.result.message
     assert sent.result.errors.attitude <= 1e-4
     assert sent.result.errors.position > 1e-3
+    # A position of NaN is not asked for.
+    turned = base_at(goal_at(([math.nan] * 3, [0.0, 0.0, 0.02])))
+    sent = flight.fly_to.send(**turned, attitude_tolerance=1e-4)
+    assert flight.check(sent) == "reached"
+    assert sent.state == "succeeded"
+    assert math.isnan(sent.result.errors.position)
+    result = flight.navigate.end_of(flight.navigate.send(pose=goal_at(([1.0, 0, 0], [0, 0, 0.02]))))
+    assert (result.error_code, "but for its position" in result.error_msg) == (9000, True)
 
 
 def test_a_goal_of_another_kind_replaces_one_that_is_flown(harness: Harness) -> None:

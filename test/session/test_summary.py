@@ -14,7 +14,12 @@ from support.made_bags import array, joint_states, made_bag, odometry, pose
 
 from spacerobot_ros.bag import BagWriter, iterate_raw
 from spacerobot_ros.control.status import CommandReport, ControllerState, ControllerStatus
-from spacerobot_ros.flight.reading import open_flight_bag, read_flight, with_propellant
+from spacerobot_ros.flight.reading import (
+    open_flight_bag,
+    read_flight,
+    read_run,
+    with_propellant,
+)
 from spacerobot_ros.measures import Outcome, flown_time
 from spacerobot_ros.model.thrusters import find_thrusters
 from spacerobot_ros.model.urdf import parse_robot
@@ -217,6 +222,33 @@ def test_a_schedule_that_begins_with_the_last_status_has_not_been_flown() -> Non
     assert flown_time(statuses, 13.0) == pytest.approx(11.0)
 
 
+@pytest.mark.parametrize("nodes", [False, True])
+def test_status_events_and_summary_of_a_goal_that_is_reached_partly_agree(
+    tmp_path: Path, nodes: bool
+) -> None:
+    """With nodes as without: the message of the goal tells what is asked for, NaN what is not."""
+    quick: dict[str, Any] = {"square_path.t1": 0.5, "square_path.t2": 0.75, "square_path.t3": 1.25}
+    quick |= {"square_path.t4": 1.5, "method": "square_path"}
+    scenario = load_scenario("planar_chain").with_overrides("planner", quick)
+    cases = (
+        ({"rotvec": [0.0, 0.0, 0.2]}, "reached", [True] * 3),
+        ({"pose": [1.0, 0.0, 0.0], "rotvec": [0.0, 0.0, 0.2]}, "reached_partly", [False] * 3),
+    )
+    for number, (goal, state, unasked) in enumerate(cases):
+        path = tmp_path / f"{number}.mcap"
+        result = run_scenario(scenario.with_goal(**goal), path, nodes=nodes)
+        assert (result.summary["state"], result.succeeded) == (state, state == "reached")
+        assert result.summary["succeeded_by_measurement"] is (state == "reached")
+        flight = read_run(path)
+        assert (flight.outcome.value, flight.succeeded) == (state, result.succeeded)
+        kinds = {event.kind.value for event in flight.events}
+        assert f"goal_{state}" in kinds
+        assert len(kinds & {"goal_reached", "goal_reached_partly"}) == 1
+        ((_, message),) = open_flight_bag(path).messages("goal_pose")
+        at = message.pose.position
+        assert [math.isnan(each) for each in (at.x, at.y, at.z)] == unasked
+
+
 def test_a_part_that_was_asked_for_and_is_not_controlled_is_not_reached(tmp_path: Path) -> None:
     """As numbers, that is: an attitude alone asks for no place of the base."""
     scenario = load_scenario("planar_chain").with_overrides("planner", {"method": "square_path"})
@@ -225,4 +257,5 @@ def test_a_part_that_was_asked_for_and_is_not_controlled_is_not_reached(tmp_path
     place = [1.0, 0.0, 0.0, 0.0, 0.0, math.sin(0.05), math.cos(0.05)]
     result = run_scenario(scenario.with_goal(place), tmp_path / "place.mcap")
     assert (result.summary["state"], result.succeeded) == ("reached_partly", False)
-    assert "'square_path' does not control the position, which is 1" in result.message
+    assert "but for its position, which is 1.25 m off" in result.message  # It drifts by 0.25 m.
+    assert result.summary["verdict"] == result.message

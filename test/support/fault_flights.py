@@ -34,7 +34,7 @@ TOPICS = {
     "controller/status": DiagnosticStatus,
     "/diagnostics": DiagnosticArray,
 }
-_DECIDED = ("reached", "failed", "refused", "aborted")
+_DECIDED = ("reached", "reached_partly", "failed", "refused", "aborted")
 
 
 class FaultFlight:

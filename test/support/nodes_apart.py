@@ -35,7 +35,7 @@ STATUS_OF = {
     "planner": "planner/status",
     "coordinated_control": "controller/status",
 }
-DECIDED = ("reached", "failed", "refused", "aborted")
+DECIDED = ("reached", "reached_partly", "failed", "refused", "aborted")
 _COMPLAINT = re.compile(r"^\[(WARN|ERROR|FATAL)\]|Traceback|Warning: |Error: ")
 
 

@@ -143,7 +143,7 @@ class CommanderNode(FlightNode):
 
     def deactivate(self) -> None:
         """Drop all goals and stop sending commands."""
-        self.commander.deactivate()
+        self.commander.deactivate(self._failure)
 
     def destroy_node(self) -> None:
         """Destroy the node with its action servers."""

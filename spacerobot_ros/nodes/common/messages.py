@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -118,6 +119,8 @@ def goal_of(
 ) -> Goal:
     """Return the goal of a pose message in ``frame``; ``shape`` goes with it.
 
+    A position or an orientation of nothing but NaN is not asked for.
+
     ``pose_of`` returns the pose (7,) of another frame in that one, None for one that is not known.
 
     Raises
@@ -129,11 +132,11 @@ def goal_of(
 
     pose = _pose_of_frame(message.header.frame_id, frame, what, pose_of)
     p, o = message.pose.position, message.pose.orientation
-    goal = Goal.checked([p.x, p.y, p.z], [o.x, o.y, o.z, o.w], shape)
+    goal = Goal.received([p.x, p.y, p.z], [o.x, o.y, o.z, o.w], shape)
     if pose is None:
         return goal
     moved = compose_poses(pose, np.concatenate([goal.position, goal.quaternion]))
-    return Goal.checked(moved[:3], moved[3:], shape)
+    return replace(Goal.checked(moved[:3], moved[3:], shape), asked=goal.asked)
 
 
 def end_effector_goal(

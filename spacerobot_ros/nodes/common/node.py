@@ -374,13 +374,13 @@ class FlightNode(LifecycleNode):
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Call :meth:`configure`; if it fails, destroy the entities that it has created."""
         self._liveness.configure(float(getattr(self.config, "watchdog_timeout", 0.0)))
+        if unknown := unknown_parameters(self):
+            self.get_logger().warning(printable(unknown), once=True)
         result = self._run(self.configure)
         if result is TransitionCallbackReturn.FAILURE:
             self._destroy_configured()
         if result is TransitionCallbackReturn.SUCCESS:
             self._set_parameters_read_only(fixed=True)
-            if unknown := unknown_parameters(self):
-                self.get_logger().warning(printable(unknown), once=True)
         return self._report_transition(result, EventKind.CONFIGURED)
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Literal
@@ -192,6 +192,9 @@ class Goal:
     base
         The parts of the pose of the base that are asked for. With end-effectors it may be any of
         them or none; the base is then where the motion leaves it.
+    asked
+        The parts of the pose of the base that the sender has given as numbers. Others are those
+        of the start (:meth:`kept_at`), and the goal is reached without them.
     """
 
     position: Array
@@ -199,6 +202,7 @@ class Goal:
     joint_positions: Array | None = None
     end_effectors: tuple[EndEffectorGoal, ...] = ()
     base: frozenset[Controlled] = POSE
+    asked: frozenset[Controlled] = POSE
 
     @classmethod
     def of_end_effectors(
@@ -282,6 +286,31 @@ class Goal:
             ) from None
 
     @classmethod
+    def received(
+        cls,
+        position: Sequence[float],
+        quaternion: Sequence[float],
+        joint_positions: npt.ArrayLike | None = None,
+    ) -> Goal:
+        """Return the goal of a message, as :meth:`checked`; a part of NaN is not asked for.
+
+        Raises
+        ------
+        GoalError
+            As for :meth:`checked`, or all of the pose is NaN.
+        """
+        parts: dict[Controlled, Sequence[float]] = {"position": position, "attitude": quaternion}
+        asked = frozenset(part for part, numbers in parts.items() if not np.isnan(numbers).all())
+        if not asked:
+            raise GoalError("The goal is a pose of NaN, which asks for nothing.")
+        made = cls.checked(
+            position if "position" in asked else [0.0, 0.0, 0.0],
+            quaternion if "attitude" in asked else [0.0, 0.0, 0.0, 1.0],
+            joint_positions,
+        )
+        return replace(made, asked=asked)
+
+    @classmethod
     def from_rotvec(cls, position: npt.ArrayLike, rotvec: npt.ArrayLike) -> Goal:
         """Return the goal at a position (m) with the attitude ``exp(hat(rotvec))`` (rad).
 
@@ -354,6 +383,16 @@ class Goal:
         of_base = other if other.base else self
         shape = self.joint_positions if other.joint_positions is None else other.joint_positions
         return replace(of_base, joint_positions=shape, end_effectors=tuple(links.values()))
+
+    def kept_at(self, position: Array, quaternion: Array) -> Goal:
+        """Return the goal with the parts of a pose of the base in place of those not asked for."""
+        if self.asked == POSE or not self.base:
+            return self
+        return replace(
+            self,
+            position=self.position if "position" in self.asked else position.copy(),
+            quaternion=self.quaternion if "attitude" in self.asked else quaternion.copy(),
+        )
 
     @property
     def has_path(self) -> bool:
@@ -530,6 +569,30 @@ def uncontrolled_parts(goal: Goal, controls: frozenset[Controlled]) -> tuple[Con
     if goal.joint_positions is not None:
         asked.append("shape")
     return tuple(part for part in asked if part not in controls)
+
+
+def missed_parts(
+    goal: Goal, error: PoseError, controls: frozenset[Controlled], tolerance: Tolerance
+) -> dict[Controlled, str]:
+    """Return the parts of the base that were asked for, are out of tolerance and not controlled,
+    each with its error and unit.
+    """
+    errors: dict[Controlled, tuple[float, float, str]] = {
+        "position": (error.distance, tolerance.position, "m"),
+        "attitude": (error.angle, tolerance.attitude, "rad"),
+    }
+    return {
+        part: f"{size:.3g} {unit}"
+        for part, (size, most, unit) in errors.items()
+        if part in goal.base & goal.asked - controls and size > most
+    }
+
+
+def reached_message(remaining: str, missed: Mapping[Controlled, str]) -> str:
+    """Return the message about a reached goal; ``missed`` are its :func:`missed_parts`."""
+    parts = " and ".join(f"its {part}, which is {error} off" for part, error in missed.items())
+    but = f" but for {parts} and not controlled" if parts else ""
+    return f"The goal is reached{but}: {remaining}."
 
 
 @dataclass(frozen=True)

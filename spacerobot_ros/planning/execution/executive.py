@@ -26,6 +26,8 @@ from spacerobot_ros.planning.core.goal import (
     PoseError,
     RobotState,
     Tolerance,
+    missed_parts,
+    reached_message,
     uncontrolled_parts,
 )
 from spacerobot_ros.planning.core.method import PlanRequest
@@ -658,8 +660,10 @@ class Executive:
         tolerance = self._tolerance_of(active.identified)
         if tolerance.admits(error, controls):
             left = describe_remaining_error(error, controls, tolerance, goal)
-            message = f"The goal is reached: {left}."
-            self._add_status(PlannerState.REACHED, message, active.identified, active, error)
+            missed = missed_parts(goal, error, controls, tolerance)
+            decided = PlannerState.REACHED_PARTLY if missed else PlannerState.REACHED
+            message = reached_message(left, missed)
+            self._add_status(decided, message, active.identified, active, error)
             self._end_goal(Event.REACHED)
             return
         if active.not_flown_reason:
@@ -722,6 +726,7 @@ class Executive:
         if averages:
             state = self._tracker.path_check.average_pose(state)
         self._reset_plan_count()
+        waiting = waiting.kept_at(state.position, state.quaternion)
         job = TakeOverJob(waiting, PlanReason.IN_MOTION, take_over, waiting.goal)
         self._request_plan(job, state)
 
@@ -842,15 +847,15 @@ class Executive:
     def _plan_new_goal(self, waiting: IdentifiedGoal) -> None:
         """Request a plan for a new goal that begins at rest, or with braking."""
         reason = PlanReason.BLEND if self._tracker.is_active else PlanReason.NEW_GOAL
-        job = PlanJob(waiting, reason)
         self._reset_plan_count()
         try:
             state = self._average.state()
         except PlanningError as refusal:
             self._change_phase(Event.PLAN_REQUESTED, Phase.PLANNING)
-            self._act_on_result(job, Refused(str(refusal)))
+            self._act_on_result(PlanJob(waiting, reason), Refused(str(refusal)))
         else:
-            self._request_plan(job, state)
+            waiting = waiting.kept_at(state.position, state.quaternion)
+            self._request_plan(PlanJob(waiting, reason), state)
 
     def _reset_plan_count(self) -> None:
         self._new_goal = None

@@ -11,6 +11,7 @@ from typing import Any
 
 from spacerobot_ros.errors import ParameterError, PlanningError
 from spacerobot_ros.files import UntrustedFileError, read_private, write_whole
+from spacerobot_ros.model.description import Array
 from spacerobot_ros.planning.core.goal import (
     NO_TOLERANCE,
     POSE,
@@ -48,6 +49,10 @@ class IdentifiedGoal:
     tolerance: Tolerance | None = None
     resumes: bool = True
     required: Tolerance = NO_TOLERANCE
+
+    def kept_at(self, position: Array, quaternion: Array) -> IdentifiedGoal:
+        """Return it with its goal of :meth:`Goal.kept_at`."""
+        return replace(self, goal=self.goal.kept_at(position, quaternion))
 
 
 @dataclass(frozen=True)
@@ -197,6 +202,8 @@ def _decode_goal(entry: Mapping[str, Any]) -> Goal:
         else EndEffectorGoal.checked(link, values)
         for link, values in entry.get("end_effectors", {}).items()
     ]
+    asked = entry.get("asked", POSE)
+    goal = replace(goal, asked=frozenset(part for part in POSE if part in asked))
     if not goals:
         return goal
     parts = frozenset(part for part in POSE if part in entry["base"])
@@ -211,6 +218,8 @@ def _encode_goal(identified: IdentifiedGoal) -> dict[str, Any]:
         "quaternion": goal.quaternion.tolist(),
         "joint_positions": None if shape is None else shape.tolist(),
     }
+    if goal.asked != POSE:
+        entry["asked"] = sorted(goal.asked)
     if goal.end_effectors:
         entry["end_effectors"] = {each.link: list(each.values) for each in goal.end_effectors}
         entry["base"] = sorted(goal.base)

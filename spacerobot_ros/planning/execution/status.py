@@ -36,6 +36,8 @@ class PlannerState(str, Enum):
     PLANNING = "planning"
     EXECUTING = "executing"
     REACHED = "reached"
+    REACHED_PARTLY = "reached_partly"
+    """A part of the base that was asked for is out of tolerance, and not controlled."""
     FAILED = "failed"
     REFUSED = "refused"
     ABORTED = "aborted"
@@ -45,7 +47,7 @@ class PlannerState(str, Enum):
     def decided(self) -> bool:
         """Whether the goal of the status is decided: it is not pursued any more."""
         return self in (
-            *(PlannerState.REACHED, PlannerState.FAILED),
+            *(PlannerState.REACHED, PlannerState.REACHED_PARTLY, PlannerState.FAILED),
             *(PlannerState.REFUSED, PlannerState.ABORTED),
         )
 
@@ -54,7 +56,7 @@ class PlannerState(str, Enum):
         """Level of diagnostic_msgs/DiagnosticStatus: 0 OK, 1 WARN, 2 ERROR."""
         if self in (PlannerState.FAILED, PlannerState.REFUSED):
             return 2
-        return 1 if self is PlannerState.ABORTED else 0
+        return 1 if self in (PlannerState.ABORTED, PlannerState.REACHED_PARTLY) else 0
 
 
 @dataclass(frozen=True)
