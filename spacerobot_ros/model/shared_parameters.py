@@ -189,6 +189,11 @@ class CommanderConfig(WatchdogConfig, AssumedRobotConfig):
     resume_file: str = parameter(
         "", "file of the present goals, from which a node that is restarted resumes; '': none"
     )
+    plan_in_background: bool = parameter(
+        True,
+        "plan in a thread while states are answered; false, and with a plant in lockstep: states "
+        "wait",
+    )
     stop_when_decided: bool = parameter(
         False, "answer no states once a goal is decided: a lockstep plant stays at that tick"
     )

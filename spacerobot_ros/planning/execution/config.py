@@ -119,11 +119,6 @@ class PlannerConfig(CommanderConfig):
         minimum=0,
         maximum=1000000.0,
     )
-    plan_in_background: bool = parameter(
-        True,
-        "plan in a thread while states are answered; false, and with a plant in lockstep: states "
-        "wait",
-    )
     options: Mapping[str, Any] = registered(METHODS)
 
     def described(self, robot: RobotDescription) -> RobotDescription:

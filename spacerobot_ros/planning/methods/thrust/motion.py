@@ -91,6 +91,11 @@ class ThrustMotion:
         self._grid = self._integrate(knots.states[0])
 
     @property
+    def joints(self) -> int:
+        """n."""
+        return int(self._q.shape[1])
+
+    @property
     def duration(self) -> float:
         """s."""
         return self.step * len(self.levels)
@@ -136,6 +141,20 @@ class ThrustMotion:
         return MotionSample(
             frames[0], frames[1] if self._functions.link else None, q, qdot, qddot, wrench, tau
         )
+
+    def effort_share(self, limit: Array) -> float:
+        """Return the largest ratio of a joint effort to its limit (n,), at both ends of intervals
+        and in their middle.
+        """
+        limited = np.isfinite(limit)
+        if not limited.any():
+            return 0.0
+        share = 0.0
+        for k in range(len(self.levels)):
+            for part in (0.0, 0.5, 1.0 - 1e-9):
+                tau = self.at((k + part) * self.step).tau
+                share = max(share, float(np.max(np.abs(tau[limited]) / limit[limited])))
+        return share
 
     def path(self) -> tuple[Array, BasePoses]:
         """Return shapes (K, n) and poses of the base at all instants of the exact integration."""

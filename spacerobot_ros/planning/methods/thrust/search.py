@@ -1,4 +1,4 @@
-"""Motions under thrust for goals: a guess, the shortest time, the least propellant, clear and exact.
+"""Motions under thrust for goals: a guess, the shortest time, the least propellant, and clear.
 
 The search is short, as base and arm are pushed in every direction: a straight guess leads to the
 solution in most cases. It is solved for the shortest time, then in a longer time for the least
@@ -19,9 +19,14 @@ import numpy as np
 
 from spacerobot_ros.collision import Approach, BasePoses
 from spacerobot_ros.collision.planes import support_distance
-from spacerobot_ros.errors import PlanningError, UnreachableError
+from spacerobot_ros.errors import PlanningError, Proof, UnreachableError
 from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.model.description import Array
+from spacerobot_ros.model.description import Array, Pose
+from spacerobot_ros.model.inverse_kinematics import (
+    REACHED_DISTANCE,
+    FixedBaseArm,
+    is_reached,
+)
 from spacerobot_ros.model.rotations import (
     attitude_error,
     compose_poses,
@@ -67,6 +72,9 @@ _EXACT_END, _MAX_CORRECTIONS = 1e-5, 6
 _LARGEST_END_ERROR = 1e-4
 """Error at the end beyond which a motion is no solution, m and rad."""
 
+_END_REACH = 0.3
+"""Distance of the joints at the end from the shape that inverse kinematics finds, m or rad."""
+
 _INSTANTS = 2
 """Instants of an interval at which pairs are kept apart."""
 
@@ -81,6 +89,9 @@ _LARGEST_LACK = 1e-4
 
 _MAX_ROUNDS = 6
 """Times that a path is made clear of pairs by new planes."""
+
+_LARGEST_STRETCH = 4.0
+"""Largest factor of the time of a motion whose efforts are too large."""
 
 _BOW_SHARES = (0.0, 0.25, 0.5, 0.75, 1.0, 1.5, 2.0)
 _BOW_DIRECTIONS = 12
@@ -247,6 +258,13 @@ class ThrustPlanner:
                 base = compose_poses(goal.end_effector, relative_pose(hand, start.pose))
         if base is None:
             base = start.pose
+        given = np.isfinite(shape)
+        shapes = np.where(given, shape, np.array([[-np.inf], [np.inf]]))
+        if goal.end_effector is not None and goal.base is not None:
+            q = np.where(given, q, self._shape_at(base, goal.end_effector, q))
+            # Near to this family of shapes: others may lie beyond a contact of the arm.
+            near = q + np.array([[-_END_REACH], [_END_REACH]])
+            shapes = np.where(given | self._wheels, shapes, near)
         self._require_within(q)
         final_velocity = np.where(self._wheels, start.qdot, 0.0)
         spin = robot.inertia_matrix(q)[3:6, 6:] @ final_velocity
@@ -257,12 +275,27 @@ class ThrustPlanner:
                 start.q,
                 start.qdot,
                 np.concatenate(goals) if goals else np.zeros(0),
-                shape,
+                shapes,
                 final_velocity,
                 matrix_from_quaternion(base[3:]) @ spin,
             ),
             _End(base, q),
         )
+
+    def _shape_at(self, base: Array, hand: Array, q: Array) -> Array:
+        """Return the shape (n,) near to one in which the end-effector is at a pose."""
+        poses = [Pose(matrix_from_quaternion(each[3:]), each[:3]) for each in (base, hand)]
+        arm = FixedBaseArm(self.robot, self.link, poses[0])
+        found, distance = arm.nearest_shape(q, poses[1])
+        if distance > REACHED_DISTANCE:
+            found, distance, angle = arm.search_shape(q, poses[1])
+            if not is_reached(distance, angle):
+                raise UnreachableError(
+                    f"The goal of '{self.link}' is out of reach from that of the base: "
+                    f"{distance:.3g} m and {angle:.3g} rad remain.",
+                    Proof.LIMITS,
+                )
+        return found
 
     def _require_within(self, q: Array) -> None:
         for name, value, low, high in zip(
@@ -271,7 +304,8 @@ class ThrustPlanner:
             if not low <= value <= high:
                 raise UnreachableError(
                     f"Joint '{name}' would end at {value:.4g}, beyond its limits "
-                    f"[{low:.4g}, {high:.4g}]."
+                    f"[{low:.4g}, {high:.4g}].",
+                    Proof.LIMITS,
                 )
 
     def _guess(self, boundary: ThrustBoundary, end: _End, bow: Array) -> ThrustKnots:
@@ -344,7 +378,7 @@ class ThrustPlanner:
         at_end = np.arange(len(tau)) >= len(tau) - _INSTANTS
         at_end |= np.arange(len(tau)) < _INSTANTS
         for pair in pairs:
-            distances, planes = geometry.planes(pair, poses)
+            _, planes = geometry.planes(pair, poses)
             wanted = np.where(at_end, required[pair], required[pair] + _ROOM)
             planes[:, 3] += wanted
             found.append(np.hstack([planes, tau]))
@@ -367,20 +401,19 @@ class ThrustPlanner:
     def bows(
         self, boundary: ThrustBoundary, end: _End, required: Array, near: Sequence[Approach]
     ) -> Iterator[ThrustKnots]:
-        """Yield guesses beside the straight line that are clear of obstacles, lowest first."""
+        """Yield the straight guess and those beside it that are clear, the straightest first."""
         assert self.clearance is not None
-        if all(each.place_on_obstacle is None for each in near):
-            return
         geometry, r0 = self.clearance.geometry, boundary.state[7:10]
         along = end.base[:3] - r0
         length = max(float(np.linalg.norm(along)), 1e-9)
         frame = np.linalg.svd(along[np.newaxis] / length)[2]
         angles = 2 * math.pi * np.arange(_BOW_DIRECTIONS) / _BOW_DIRECTIONS
         sides = np.outer(np.cos(angles), frame[1]) + np.outer(np.sin(angles), frame[2])
-        pairs = np.flatnonzero(geometry.with_obstacles).tolist()
-        for height in _BOW_SHARES[1:]:
+        in_way = any(each.place_on_obstacle is not None for each in near)
+        pairs = {each.pair for each in near} | {*np.flatnonzero(geometry.with_obstacles).tolist()}
+        for height in _BOW_SHARES if in_way else _BOW_SHARES[:1]:
             found = []
-            for side in sides:
+            for side in sides if height else sides[:1]:
                 guess = self._guess(boundary, end, height * max(length / 2, 0.5) * side)
                 shapes, base, _ = self.along(guess)
                 poses = geometry.poses(shapes, base)
@@ -402,6 +435,8 @@ class _End:
     q: Array
 
 
+_NEAREST = Weights(0.0, 0.0, 1.0, 1.0, _COST_OF_LACK)
+
 _FREE_TIME = DurationBounds(1e-3, 1e5)
 
 
@@ -420,6 +455,10 @@ class _Search:
         stop: StopRule,
     ) -> None:
         self.planner, self.boundary, self.kinds, self.stop = planner, boundary, kinds, stop
+        options = planner.options
+        self._is_timed = options.duration > 0 or options.time_factor > 1
+        """Whether the duration is given, or follows from the shortest one."""
+        self._effort_limit = (1.0 - options.reserve) * planner.robot.effort_limit
         self._pairs: tuple[int, ...] = ()
         self._required = self._require_start()
 
@@ -439,12 +478,26 @@ class _Search:
         PlanningError
             There is none, or none is found.
         """
-        planner = self.planner
         fastest = self._fastest(guess)
         if fastest is None:
             raise PlanningError(self._failure("no motion to the goal was found"))
         time = self._time(fastest)
-        path = fastest.stretched(time / fastest.duration)
+        for _ in range(_MAX_ROUNDS):
+            motion = self._motion(fastest.stretched(time / fastest.duration), end)
+            share = motion.effort_share(self._effort_limit)
+            if share <= 1.0:
+                return motion
+            # Efforts of a motion at rest are about as the square of its speed.
+            time = motion.duration * min(1.01 * math.sqrt(share), _LARGEST_STRETCH)
+            self._is_timed = True
+        raise PlanningError(
+            self._failure(f"its joints need {share:.3g} times the efforts that a plan may use")
+        )
+
+    def _motion(self, path: ThrustKnots, end: _End) -> ThrustMotion:
+        """Return the exact and clear motion near a path, in its time if that is given."""
+        planner = self.planner
+        self._pairs = ()
         if self._is_timed:
             # Roughly, for a look at what is in the way.
             path = self._solve(path, self._cheap(path, _ROUNDINGS[0]), _fixed(path)) or path
@@ -463,18 +516,13 @@ class _Search:
             self._add(approaches)
         raise PlanningError(self._failure(planner.reason(approaches[0])))
 
-    @property
-    def _is_timed(self) -> bool:
-        """Whether the duration is given, or follows from the shortest one."""
-        options = self.planner.options
-        return options.duration > 0 or options.time_factor > 1
-
     def _time(self, fastest: ThrustKnots) -> float:
         options = self.planner.options
         if 0 < options.duration < fastest.duration:
             raise UnreachableError(
                 f"The motion takes {fastest.duration:.4g} s at least, and thrust.duration is "
-                f"{options.duration:g} s."
+                f"{options.duration:g} s.",
+                Proof.LIMITS,
             )
         return options.duration or options.time_factor * fastest.duration
 
@@ -489,12 +537,12 @@ class _Search:
         duration: DurationBounds,
         defects: Array | None = None,
         planes: Array | None = None,
+        center: ThrustKnots | None = None,
     ) -> ThrustKnots | None:
         self.stop.cancellation.raise_if_requested()
         solver = self.planner.solver(self.kinds, self._pairs)
-        return solver.solve(
-            self.boundary, self.planner.limits, guess, weights, self.stop, duration, defects, planes
-        )
+        limits, args = self.planner.limits, (self.stop, duration, defects, planes)
+        return solver.solve(self.boundary, limits, guess, weights, *args, center=center)
 
     def _fastest(self, guess: ThrustKnots) -> ThrustKnots | None:
         return self._solve(guess, self._fast(guess), _FREE_TIME)
@@ -528,9 +576,9 @@ class _Search:
             last = self._fast(guess)
         for each in others:
             knots = self._solve(knots, each, duration, planes=planes) or knots
-        defects, best, error = None, None, math.inf
+        defects, center, best, error = None, None, None, math.inf
         for _ in range(_MAX_CORRECTIONS):
-            solved = self._solve(knots, last, duration, defects, planes)
+            solved = self._solve(knots, last, duration, defects, planes, center)
             if solved is None:
                 break
             knots, motion = solved, planner.motion(solved)
@@ -540,6 +588,9 @@ class _Search:
             if error < _EXACT_END:
                 break
             defects = planner.solver(self.kinds, self._pairs).defects(knots, defects)
+            if self._is_timed:
+                # The nearest controls that fly exactly: solutions of least propellant are flat.
+                last, center = _NEAREST, knots
         if best is None or error > _LARGEST_END_ERROR:
             raise PlanningError(self._failure("no motion to the goal was found that flies there"))
         return best
@@ -548,7 +599,8 @@ class _Search:
         """Return the largest error of the poses at the end, m or rad."""
         last = motion.at(motion.duration)
         frames = [last.base] if self.kinds[0] else []
-        frames += [last.end_effector] if self.kinds[1] else []
+        if self.kinds[1] and last.end_effector is not None:
+            frames.append(last.end_effector)
         errors = [0.0]
         for frame, goal in zip(frames, self.boundary.goals.reshape(-1, 7), strict=True):
             errors.append(float(np.linalg.norm(frame.position - goal[:3])))

@@ -22,9 +22,9 @@ from spacerobot_ros.planning.methods.optimal.multiple_shooting import (
     StopRule,
 )
 from spacerobot_ros.planning.methods.optimal.problem import MotionLimits
+from spacerobot_ros.planning.methods.optimal.transcription import ConstraintBlock
 from spacerobot_ros.planning.methods.thrust.transcription import (
     DEFECT_SIZE,
-    ConstraintBlock,
     ThrustLayout,
     ThrustStages,
     thrust_program,
@@ -109,8 +109,8 @@ class ThrustBoundary:
         ``[X; L; r; V]`` (13,), positions and velocities (n,) of the joints at the start.
     goals
         (7 k,) poses of the base, of the end-effector, or of both at the end: position, quaternion.
-    final_shape
-        (n,) joint positions at the end; NaN for joints that are free.
+    final_shapes
+        (2, n) least and largest joint positions at the end; infinite for joints that are free.
     final_velocity, final_momentum
         (n,) velocities of the joints and angular momentum (3,) at the end, where the centre of mass
         rests: zero, but for wheels that go on spinning.
@@ -120,7 +120,7 @@ class ThrustBoundary:
     shape: Array
     velocity: Array
     goals: Array
-    final_shape: Array
+    final_shapes: Array
     final_velocity: Array
     final_momentum: Array
 
@@ -211,6 +211,8 @@ class ThrustSolver:
         duration: DurationBounds,
         defects: Array | None = None,
         planes: Array | None = None,
+        *,
+        center: ThrustKnots | None = None,
     ) -> ThrustKnots | None:
         """Return the best motion near ``guess``; None if none.
 
@@ -226,6 +228,8 @@ class ThrustSolver:
             (N, 12) those of the intervals; None: zero.
         planes
             (P, N K, 8) planes of the pairs and their instants; None: there are no pairs.
+        center
+            Controls whose differences are squared; None: zero.
         """
         N, layout, propulsion = self.intervals, self._layout, self.stages.propulsion
         places = layout.knots()
@@ -247,8 +251,8 @@ class ThrustSolver:
         least[v[N]] = most[v[N]] = boundary.final_velocity
         if layout.has_lack:
             least[-1] = 0.0
-        given = np.isfinite(boundary.final_shape)
-        least[s[N, given]] = most[s[N, given]] = boundary.final_shape[given]
+        least[s[N]] = np.maximum(limits.lower, boundary.final_shapes[0])
+        most[s[N]] = np.minimum(limits.upper, boundary.final_shapes[1])
         h = guess.step
         x0[0] = h
         for place, value in zip(
@@ -267,7 +271,8 @@ class ThrustSolver:
         ):
             x0[place] = value
         last, self._last = self._last, None
-        solver, begin = (self._warm if self.pairs.rows else self._solver), {"x0": x0}
+        solver = self._warm if self.pairs.rows else self._solver
+        begin: Mapping[str, Array | ca.DM] = {"x0": x0}
         if last is not None and last[0] is guess:
             solver, begin = self._continuing, last[1]
         self._monitor.begin(stop)
@@ -276,6 +281,9 @@ class ThrustSolver:
             [
                 *(boundary.shape, boundary.goals, propulsion.wrenches.ravel(order="F")),
                 *(lacking.ravel(), limits.acceleration, list(weights)),
+                np.hstack([center.accelerations, center.levels]).ravel()
+                if center is not None
+                else np.zeros(a.size + u.size),
                 np.zeros(0) if planes is None else planes.ravel(),
             ]
         )
@@ -313,7 +321,7 @@ class ThrustSolver:
             self.stages.propulsion.wrenches @ knots.levels.T,
             np.full((1, N), knots.step),
         )
-        return found.full().T.reshape(N, -1, 13).transpose(0, 2, 1)
+        return np.asarray(found.full().T.reshape(N, -1, 13).transpose(0, 2, 1))
 
     def defects(self, knots: ThrustKnots, before: Array | None = None) -> Array:
         """Return the defects (N, 12) with which these knots would be an exact flight.

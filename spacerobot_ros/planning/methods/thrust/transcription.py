@@ -1,9 +1,9 @@
 """Motions of base and joints under thrust as a nonlinear program, by direct multiple shooting.
 
 To the attitude X, the vertices s and the velocities v of the joints' parabolas
-(:mod:`spacerobot_ros.planning.methods.optimal.transcription`) knots add the angular momentum L about
-the centre of mass, its position r and its velocity V, in W. The controls of an interval are the
-joint accelerations a and the levels u of the propulsion, whose wrench ``(f, n) = W u`` is constant
+(:mod:`spacerobot_ros.planning.methods.optimal.transcription`) knots add the angular momentum L
+about the centre of mass, its position r and its velocity V, in W. The controls of an interval are
+the joint accelerations a and the levels u of the propulsion, whose wrench ``(f, n) = W u`` is constant
 in the base. With ``R_i``, ``c_i`` the attitude and the centre of mass in the base at the Gauss
 points tau_i of an interval,
 
@@ -283,8 +283,9 @@ def flown_interval(robot: SpaceRobot) -> ca.Function:
 def pair_block(joints: int, distance: ca.Function) -> ConstraintBlock:
     """Return the distance of a pair from a plane at an instant of an interval, plus the lack.
 
-    ``distance`` is :func:`.support_distance`. The variables are ``[h; X; s; v; r; V; X+; v+; r+; V+; lack]``
-    of the interval, the parameters the plane and a point, in W if one of the pair is an obstacle, and the instant from 0 to 1.
+    ``distance`` is :func:`.support_distance`. The variables are ``[h; X; s; v; r; V; X+; v+; r+;
+    V+; lack]`` of the interval, the parameters the plane and a point, in W if one of the pair is an
+    obstacle, and the instant from 0 to 1.
     """
     n = joints
     sizes = [1, 4, n, n, 3, 3, 4, n, 3, 3, 1]
@@ -313,7 +314,7 @@ def thrust_program(
     Its parameters are the start of the shape (n,) and the goals (7 each), position and quaternion;
     the wrenches (6 m,); the defects (12 N,); typical accelerations (n,); weights of the duration,
     of the propellant, of the squares of accelerations and levels, of the lack, and the level at
-    which the cost of a norm is rounded off (6,); and the planes (8,) of every pair, interval and
+    which the cost of a norm is rounded off (6,); centres of the squares (n + m, N); and the planes (8,) of every pair, interval and
     instant.
     """
     n, N, propulsion = stages.joints, intervals, stages.propulsion
@@ -325,8 +326,14 @@ def thrust_program(
     p = {
         name: ca.MX.sym(name, size)
         for name, size in (
-            *(("start", n), ("goals", goals), ("wrenches", 6 * m), ("defects", DEFECT_SIZE * N)),
-            *(("typical", n), ("weights", 6), ("planes", len(pairs) * N * instants * 8)),
+            ("start", n),
+            ("goals", goals),
+            ("wrenches", 6 * m),
+            ("defects", DEFECT_SIZE * N),
+            ("typical", n),
+            ("weights", 6),
+            ("centers", (n + m) * N),
+            ("planes", len(pairs) * N * instants * 8),
         )
     }
     zero = np.zeros((N, 1), dtype=np.int64)
@@ -381,11 +388,14 @@ def thrust_program(
         )
         rows += count
     levels = ca.reshape(x[u.ravel().tolist()], m, N)
-    change = ca.reshape(x[a.ravel().tolist()], n, N) / ca.repmat(p["typical"], 1, N)
+    centers = ca.reshape(p["centers"], n + m, N)
+    change = (ca.reshape(x[a.ravel().tolist()], n, N) - centers[:n, :]) / ca.repmat(
+        p["typical"], 1, N
+    )
     spent = _spent(propulsion, levels, p["weights"][5])
     w = p["weights"]
     f = w[0] * N * x[0] + w[1] * x[0] * spent
-    f += (w[2] * ca.sumsqr(change) + w[3] * ca.sumsqr(levels)) / N
+    f += (w[2] * ca.sumsqr(change) + w[3] * ca.sumsqr(levels - centers[n:, :])) / N
     if pairs:
         f += w[4] * x[-1]
     return layout, assembled(x, ca.vertcat(*p.values()), f, placed, rows, equalities)
