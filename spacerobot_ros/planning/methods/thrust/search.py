@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -57,8 +57,12 @@ from spacerobot_ros.planning.methods.thrust.solver import (
 from spacerobot_ros.planning.methods.thrust.transcription import ThrustStages, pair_block
 
 _REGULARISATION = 1e-3
-"""Weight of the squares of accelerations and levels: it makes solutions unique. 1e-2 costs 1 % of
-propellant, 1e-4 saves 0.1 % and takes twice the steps."""
+"""Weight of the squares of levels, which makes solutions unique. 1e-2 costs 1 % of propellant, 1e-4
+saves 0.1 % and takes twice the steps."""
+
+_SMOOTHNESS = 1.0
+"""Weight of the squares of joint accelerations: arms that swing as counterweights save 5 % of
+propellant, and swing into their own robot."""
 
 _TIME_REGULARISATION = 1e-5
 
@@ -66,8 +70,11 @@ _ROUNDINGS = (0.1, 0.01, 0.003)
 """Levels at which costs of norms are rounded off, one after the other: the last one alone takes
 three times the steps."""
 
-_EXACT_END, _MAX_CORRECTIONS = 1e-5, 6
+_EXACT_END, _MAX_CORRECTIONS = 1e-5, 10
 """Largest error at the end, m and rad, and the largest number of corrections that lead there."""
+
+_NEAR_END = 1e-2
+"""Error at the end from which on the nearest exact motion will do, m and rad."""
 
 _LARGEST_END_ERROR = 1e-4
 """Error at the end beyond which a motion is no solution, m and rad."""
@@ -368,8 +375,8 @@ class ThrustPlanner:
         r = knots.r_WC[k] + h * (tau * V[k] + tau**2 / 2 * (V[k + 1] - V[k]))
         return shapes, self.base_poses(shapes, X, r), tau
 
-    def planes(self, pairs: Sequence[int], required: Array, knots: ThrustKnots) -> Array:
-        """Return the planes (P, N K, 8) of pairs along a path, with their room."""
+    def planes(self, room: Mapping[int, float], required: Array, knots: ThrustKnots) -> Array:
+        """Return the planes (P, N K, 8) of pairs along a path, with the room of each, m."""
         assert self.clearance is not None
         geometry = self.clearance.geometry
         shapes, base, tau = self.along(knots)
@@ -377,9 +384,9 @@ class ThrustPlanner:
         found = []
         at_end = np.arange(len(tau)) >= len(tau) - _INSTANTS
         at_end |= np.arange(len(tau)) < _INSTANTS
-        for pair in pairs:
+        for pair in sorted(room):
             _, planes = geometry.planes(pair, poses)
-            wanted = np.where(at_end, required[pair], required[pair] + _ROOM)
+            wanted = np.where(at_end, required[pair], required[pair] + room[pair])
             planes[:, 3] += wanted
             found.append(np.hstack([planes, tau]))
         return np.array(found)
@@ -459,7 +466,7 @@ class _Search:
         self._is_timed = options.duration > 0 or options.time_factor > 1
         """Whether the duration is given, or follows from the shortest one."""
         self._effort_limit = (1.0 - options.reserve) * planner.robot.effort_limit
-        self._pairs: tuple[int, ...] = ()
+        self._room: dict[int, float] = {}
         self._required = self._require_start()
 
     def _require_start(self) -> Array:
@@ -497,7 +504,7 @@ class _Search:
     def _motion(self, path: ThrustKnots, end: _End) -> ThrustMotion:
         """Return the exact and clear motion near a path, in its time if that is given."""
         planner = self.planner
-        self._pairs = ()
+        self._room = {}
         if self._is_timed:
             # Roughly, for a look at what is in the way.
             path = self._solve(path, self._cheap(path, _ROUNDINGS[0]), _fixed(path)) or path
@@ -509,7 +516,7 @@ class _Search:
                 return motion
         path = self._clear(path, end, near)
         for _ in range(_MAX_ROUNDS):
-            motion = self._exact(path, planner.planes(self._pairs, self._required, path))
+            motion = self._exact(path, planner.planes(self._room, self._required, path))
             approaches = planner.approaches(motion, self._required)
             if not approaches:
                 return motion
@@ -527,8 +534,11 @@ class _Search:
         return options.duration or options.time_factor * fastest.duration
 
     def _add(self, approaches: Sequence[Approach]) -> None:
-        """Keep more pairs apart."""
-        self._pairs = tuple(sorted({*self._pairs, *(each.pair for each in approaches)}))
+        """Keep more pairs apart, and give those that are kept as much room as they lack."""
+        for each in approaches:
+            lack = float(self._required[each.pair]) - each.distance
+            before = self._room.get(each.pair)
+            self._room[each.pair] = _ROOM if before is None else before + lack + _ROOM
 
     def _solve(
         self,
@@ -540,7 +550,7 @@ class _Search:
         center: ThrustKnots | None = None,
     ) -> ThrustKnots | None:
         self.stop.cancellation.raise_if_requested()
-        solver = self.planner.solver(self.kinds, self._pairs)
+        solver = self.planner.solver(self.kinds, tuple(sorted(self._room)))
         limits, args = self.planner.limits, (self.stop, duration, defects, planes)
         return solver.solve(self.boundary, limits, guess, weights, *args, center=center)
 
@@ -556,7 +566,7 @@ class _Search:
         """Return the weights of least propellant, in units of the guess."""
         spent = guess.step * float(np.sum(self.planner.propulsion.cost_of(guess.levels)))
         small = _REGULARISATION
-        return Weights(0.0, 1 / max(spent, 1e-12), small, small, _COST_OF_LACK, rounding)
+        return Weights(0.0, 1 / max(spent, 1e-12), _SMOOTHNESS, small, _COST_OF_LACK, rounding)
 
     def _exact(self, guess: ThrustKnots, planes: Array | None = None) -> ThrustMotion:
         """Return the motion of least propellant, or of least time, near a path, as it flies.
@@ -587,8 +597,8 @@ class _Search:
                 best, error = motion, found
             if error < _EXACT_END:
                 break
-            defects = planner.solver(self.kinds, self._pairs).defects(knots, defects)
-            if self._is_timed:
+            defects = planner.solver(self.kinds, tuple(sorted(self._room))).defects(knots, defects)
+            if self._is_timed and found < _NEAR_END:
                 # The nearest controls that fly exactly: solutions of least propellant are flat.
                 last, center = _NEAREST, knots
         if best is None or error > _LARGEST_END_ERROR:
@@ -614,18 +624,18 @@ class _Search:
         for guess in itertools.chain(
             planner.bows(self.boundary, end, self._required, near), [path]
         ):
-            self._pairs = ()
+            self._room = {}
             self._add(near)
             at = guess.stretched(max(time / guess.duration, 1.0))
             for _ in range(_MAX_ROUNDS):
-                planes = planner.planes(self._pairs, self._required, at)
+                planes = planner.planes(self._room, self._required, at)
                 weights = self._cheap(at, _ROUNDINGS[0]) if self._is_timed else self._fast(at)
                 duration = _fixed(at) if self._is_timed else _FREE_TIME
                 solved = self._solve(at, weights, duration, planes=planes)
                 if solved is None:
                     break
                 at = solved
-                if planner.solver(self.kinds, self._pairs).lack > _LARGEST_LACK:
+                if planner.solver(self.kinds, tuple(sorted(self._room))).lack > _LARGEST_LACK:
                     continue
                 approaches = planner.approaches(planner.motion(at), self._required)
                 if not approaches:
