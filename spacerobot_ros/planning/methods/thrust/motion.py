@@ -162,7 +162,7 @@ class ThrustMotion:
         t = steps[np.newaxis, :, np.newaxis]
         q = self._q[:-1, np.newaxis] + t * self._qdot[:-1, np.newaxis]
         q = q + t**2 / 2 * self._qddot[:, np.newaxis]
-        shapes = np.vstack([q.reshape(-1, self._q.shape[1]), self._q[-1:]])
+        shapes = np.vstack([q.reshape(q.shape[0] * q.shape[1], self.joints), self._q[-1:]])
         X, r = self._grid[:, :4], self._grid[:, 7:10]
         c = self._functions.center_of_mass(shapes.T).full().T
         r_WB = r - np.einsum("kij,kj->ki", matrices_from_quaternions(X), c)
