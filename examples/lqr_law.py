@@ -74,6 +74,6 @@ class LqrLaw(NumpyLaw):
 if __name__ == "__main__":
     for seconds in (1.0, 2.0, 4.0):
         flight = fly(
-            "free_flyer", (0.4, 0.1, 0.2), law=LqrLaw, law_options={"response_time": seconds}
+            "surveyor", (0.4, 0.1, 0.2), law=LqrLaw, law_options={"response_time": seconds}
         )
         print(f"response time {seconds:g} s: {flight.message}")

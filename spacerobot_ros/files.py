@@ -174,6 +174,35 @@ def _limit_values(root: Any) -> None:
 # -- files of this user -----------------------------------------------------------------------
 
 
+_FILE_KINDS = (
+    (stat.S_ISDIR, "a folder"),
+    (stat.S_ISFIFO, "a pipe"),
+    (stat.S_ISSOCK, "a socket"),
+    (stat.S_ISCHR, "a device"),
+    (stat.S_ISBLK, "a device"),
+)
+
+
+def irregular_kind(mode: int) -> str:
+    """Return the words for a file that is not regular, by its mode; empty: it is regular."""
+    if stat.S_ISREG(mode):
+        return ""
+    return next((words for test, words in _FILE_KINDS if test(mode)), "no file")
+
+
+def read_regular(path: str | os.PathLike[str]) -> bytes:
+    """Return the content of a file; a pipe would block, and a device may never end.
+
+    Raises
+    ------
+    OSError
+        It cannot be read, or is no regular file.
+    """
+    if kind := irregular_kind(os.stat(path).st_mode):
+        raise OSError(f"it is {kind}")
+    return Path(path).read_bytes()
+
+
 def read_private(path: Path) -> bytes:
     """Return the content of a file that only this user, or root, can have written.
 

@@ -600,12 +600,12 @@ def _names_robot(plant: Mapping[str, Any]) -> bool:
 
 
 def _with_files_beside(path: Path, values: dict[str, Any]) -> dict[str, Any]:
-    """Return the parameters of a scenario file; robots and worlds beside it have their paths."""
+    """Return the parameters of a scenario file; files beside it have their whole paths."""
     beside = {
         name: str((path.parent / file).resolve())
-        for name in ("robot", "world", "target.robot")
+        for name in ("robot", "world", "target.robot", "srdf", "thrusters")
         if isinstance(file := values.get(name), str)
-        and is_path(file)
+        and (is_path(file) or name in ("srdf", "thrusters"))
         and (path.parent / file).is_file()
     }
     return {**values, **beside}

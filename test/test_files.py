@@ -192,3 +192,36 @@ def test_a_cache_gives_what_was_stored_under_a_key(
     empty = cache.store("z", "key", b"")
     assert empty is not None
     assert cache.load("z", "key") == (empty, b"")
+
+
+@pytest.mark.parametrize(
+    ("words", "kind"),
+    [
+        ("plan three_joint_arm --goal-rotvec 0 0 0.01 --set planner.srdf={}", "SRDF"),
+        ("run planar_manipulator --goal-rotvec 0 0 0.1 --set plant.world={}", "URDF"),
+        ("run servicer_thrusters --set plant.thrusters={}", "thruster file"),
+    ],
+)
+def test_a_file_that_would_never_end_is_refused(tmp_path: Path, words: str, kind: str) -> None:
+    """A pipe that nobody writes, and a device without an end."""
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    for path, is_what in ((pipe, "a pipe"), (Path("/dev/zero"), "a device")):
+        result = CliRunner().invoke(main, words.format(path).split())
+        assert result.exit_code == 2
+        assert f"{kind} {path} cannot be read: it is {is_what}." in result.stderr
+
+
+def test_an_srdf_in_an_encoding_that_is_none_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "e.srdf").write_text('<?xml version="1.0" encoding="foo-9"?>\n<robot name="x"/>')
+    words = [
+        "plan",
+        "three_joint_arm",
+        "--goal-rotvec",
+        *"001",
+        "--set",
+        f"planner.srdf={tmp_path}/e.srdf",
+    ]
+    result = CliRunner().invoke(main, words)
+    assert result.exit_code == 2
+    assert "e.srdf is no XML (unknown encoding: foo-9)." in result.stderr

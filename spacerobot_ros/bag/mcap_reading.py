@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import os
 import shlex
-import stat
 import struct
 import tempfile
 import weakref
@@ -44,6 +43,7 @@ from mcap.writer import MCAP0_MAGIC
 from numpy.typing import NDArray
 
 from spacerobot_ros.errors import RecordingError
+from spacerobot_ros.files import irregular_kind
 
 RecordT = TypeVar("RecordT", bound=McapRecord)
 
@@ -81,19 +81,10 @@ DAMAGE_ERRORS = (
 
 # -- files ------------------------------------------------------------------------------------
 
-_FILE_KINDS = (
-    (stat.S_ISDIR, "a folder"),
-    (stat.S_ISFIFO, "a pipe"),
-    (stat.S_ISSOCK, "a socket"),
-    (stat.S_ISCHR, "a device"),
-    (stat.S_ISBLK, "a device"),
-)
-
 
 def require_regular(mode: int, path: Path, action: str = "read") -> None:
     """Raise RecordingError unless a file is regular: pipes block, devices may be damaged."""
-    if not stat.S_ISREG(mode):
-        kind = next((words for test, words in _FILE_KINDS if test(mode)), "no file")
+    if kind := irregular_kind(mode):
         raise RecordingError(f"Cannot {action} the bag {path}: it is {kind}.")
 
 

@@ -197,11 +197,13 @@ class BatchController:
         """
         if any(
             gains.integral_diagonal(self.law.outputs.selection).any()
+            or gains.kp_matrix
+            or gains.kd_matrix
             for gains in (*self.program.gains, self._config.gains)
         ):
             raise ParameterError(
-                "Controllers with integral gains (ki) are not flown in lanes; engine 'flights' "
-                "flies them."
+                "Controllers with integral gains (ki) or matrices of gains are not flown in lanes; "
+                "engine 'flights' flies them."
             )
         n, law, size = self._n, self.law, profile_size(*self._groups)
         fixed = law.fixed_inputs

@@ -402,6 +402,8 @@ class _ControlledLanes:
             for each in campaign.dispersions
         ):
             return "its controller has integral gains, which engine 'flights' flies"
+        if law.couples:
+            return "its gains are matrices, which engine 'flights' flies"
         if law.fixed_inputs is None:
             return f"the law '{law.name}' with these options is more than one function"
         for key, goal in _goals_by_frame(scenario).items():

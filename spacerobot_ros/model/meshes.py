@@ -26,7 +26,8 @@ from xml.etree.ElementTree import ParseError, tostring
 import numpy as np
 import numpy.typing as npt
 
-from spacerobot_ros.errors import MeshError, SpaceRobotError
+from spacerobot_ros.errors import MeshError, SpaceRobotError, reason
+from spacerobot_ros.files import read_regular
 from spacerobot_ros.model.description import Array, Pose, Shape, editable_root
 from spacerobot_ros.model.xacro_files import package_around
 from spacerobot_ros.resources import share_directory
@@ -199,9 +200,9 @@ def read_mesh(path: str | Path) -> TriangleMesh:
                 f"The mesh {path} has {size / 1e6:.0f} MB; at most "
                 f"{_MAX_MESH_BYTES / 1e6:.0f} MB are read. Make it coarser."
             )
-        data = path.read_bytes()
+        data = read_regular(path)
     except OSError as error:
-        raise MeshError(f"The mesh {path} cannot be read: {error.strerror}.") from error
+        raise MeshError(f"The mesh {path} cannot be read: {reason(error)}.") from error
     try:
         if suffix == ".stl":
             mesh = _read_stl(data)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -34,10 +35,11 @@ from control.servicer_motion import (
     rates,
     well_conditioned_state,
 )
-from scipy.linalg import block_diag
+from scipy.linalg import block_diag, expm
 from scipy.spatial.transform import Rotation
 from support.random_robots import random_chain_urdf
 
+from spacerobot_ros import fly as fly_robot
 from spacerobot_ros.control import (
     LAWS,
     Actuation,
@@ -249,7 +251,8 @@ def test_the_units_of_gains_in_the_parameters_are_those_of_the_laws() -> None:
 
 @pytest.mark.parametrize("law", list(LAWS))
 def test_gains_are_bounded_so_that_commands_are_numbers(law: str) -> None:
-    names = [f"gains.{group}.{gain}" for group in vars(Gains()) for gain in ("kp", "kd")]
+    groups = [name for name in vars(Gains()) if not name.endswith("_matrix")]
+    names = [f"gains.{group}.{gain}" for group in groups for gain in ("kp", "kd")]
     for name in names:
         with pytest.raises(ParameterError, match=name.replace(".", r"\.")):
             configured(ControllerConfig, {"law": law, name: 1e300})
@@ -283,6 +286,76 @@ def test_model_based_law_gives_the_error_dynamics(seed: int) -> None:
     np.testing.assert_allclose(law.error_rate, edot, atol=1e-12)
     assert not law.status.singular
     assert law.status.damping == 0.0
+
+
+def positive_matrix(rng: np.random.Generator, size: int) -> Array:
+    A = rng.normal(size=(size, size))
+    return np.asarray(A @ A.T + size * np.eye(size))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_gains_may_be_matrices_of_all_outputs(seed: int) -> None:
+    """Eq. (28) by Pinocchio's accelerations, and eq. (29); gains that change take effect."""
+    rng = np.random.default_rng(seed)
+    robot = load("servicer")
+    state, reference = well_conditioned_state(rng), random_reference(rng)
+    Kp, Kd = positive_matrix(rng, 12), positive_matrix(rng, 12)
+    gains = replace(
+        GAINS, kp_matrix=tuple(Kp.ravel().tolist()), kd_matrix=tuple(Kd.ravel().tolist())
+    )
+    law = LAWS["model_based"](robot, POSES, GAINS)
+    law.set_gains(gains)
+    motion = OutputMotion(robot, state, law.command(state, reference))
+    velocity, acceleration = rates(reference)
+    e, edot = motion.error(reference), velocity - motion.velocity
+    np.testing.assert_allclose(
+        acceleration - motion.acceleration + Kd @ edot + Kp @ e, 0.0, atol=1e-8
+    )
+    law = LAWS["transposed_jacobian"](robot, POSES, gains)
+    matrices = PaperMatrices(state)
+    expected = paper_actuation(matrices.J_z.T @ (Kp @ e + Kd @ edot), matrices)
+    given = np.concatenate(law.command(state, reference))
+    np.testing.assert_allclose(given, expected, rtol=1e-9, atol=1e-9)
+    law.set_gains(GAINS)
+    expected = paper_actuation(matrices.J_z.T @ (KP * e + KD * edot), matrices)
+    given = np.concatenate(law.command(state, reference))
+    np.testing.assert_allclose(given, expected, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("matrix", "sentence"),
+    [
+        ([1.0, 0.0, 0.0, 1.0], "has 4 numbers; the 5 outputs of the law .* take 25"),
+        (np.triu(np.ones((5, 5))), "is not symmetric"),
+        (np.diag([1.0, 1.0, 0.0, 1.0, 1.0]), "is not positive definite"),
+    ],
+)
+def test_matrices_that_are_no_gains_are_refused(matrix: Any, sentence: str) -> None:
+    for name in ("kp_matrix", "kd_matrix"):
+        numbers = np.ravel(matrix).tolist()
+        config = configured(ControllerConfig, {f"gains.{name}": numbers})
+        with pytest.raises(ParameterError, match=rf"^The gains\.{name} {sentence}"):
+            build_controller(load("planar_manipulator"), config)
+
+
+def test_a_flight_with_matrices_of_gains_moves_along_their_modes() -> None:
+    """A free body under a step: its way is that of the linear system, by the exponential."""
+    K, D = np.array([[0.5, 0.2], [0.2, 0.3]]), np.array([[1.0, -0.3], [-0.3, 1.2]])
+    parameters = {
+        **{"plant.tick_rate": 100.0, "coordinated_control.tick_rate": 100.0},
+        **{"coordinated_control.base_outputs": "x y", "coordinated_control.profile": "step"},
+        "coordinated_control.gains.kp_matrix": K.ravel().tolist(),
+        "coordinated_control.gains.kd_matrix": D.ravel().tolist(),
+    }
+    flight = fly_robot(
+        "planar_manipulator", position=[0.4, 0.0, 0.0], method="model_based", parameters=parameters
+    )
+    assert flight.succeeded
+    motion = np.block([[np.zeros((2, 2)), np.eye(2)], [-K, -D]])
+    for tick in range(0, 800, 50):
+        error = expm(motion * flight.time[tick]) @ [0.4, 0.0, 0.0, 0.0]
+        np.testing.assert_allclose([0.4, 0.0] - flight.pose[tick, :2], error[:2], atol=2e-3)
+    assert np.abs(flight.pose[:, 1]).max() > 0.02, "the errors are coupled"
 
 
 class PaperMatrices:

@@ -198,6 +198,27 @@ def test_a_robot_beside_its_scenario_is_found_and_integers_go_with_floats(tmp_pa
     assert given["initial_joint_positions"] == (0.0, 0.5)
 
 
+def test_files_beside_a_scenario_come_before_those_of_the_present_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder, here = tmp_path / "mine", tmp_path / "here"
+    for each in (folder, here):
+        each.mkdir()
+        for name in ("pairs.srdf", "jets.yaml"):
+            (each / name).touch()
+    monkeypatch.chdir(here)
+    file = folder / "mine.yaml"
+    file.write_text(
+        "scenario: {ros__parameters: {goal_rotvec: [0, 0, 0.1]}}\n"
+        "plant: {ros__parameters: {robot: planar_chain, thrusters: jets.yaml}}\n"
+        "planner: {ros__parameters: {robot: planar_chain, srdf: pairs.srdf}}\n",
+        "utf-8",
+    )
+    scenario = load_scenario(str(file))
+    assert scenario.parameters("plant")["thrusters"] == str(folder / "jets.yaml")
+    assert scenario.parameters("planner")["srdf"] == str(folder / "pairs.srdf")
+
+
 def test_a_robot_alone_is_a_scenario_without_a_goal() -> None:
     alone = scenario_or_robot("three_joint_arm")
     with pytest.raises(ParameterError, match="'three_joint_arm' has no goal"):

@@ -29,6 +29,7 @@ FAULTS = {
     "stuck_elbow": {"fault on: joint_stuck elbow_pitch", "stuck joint: elbow_pitch"},
     "stuck_slider": {"fault on: joint_stuck", "stuck joint: slider_1", "goal failed"},
     "broken_thrusters": {"fault on: thruster_stuck force_y", "fault off: thruster_stuck force_y"},
+    "closed_nozzle": {"fault on: nozzle_closed plus_y_2"},
     "late_poses": {"fault on: sensor_dropout odom", "fault off: sensor_dropout odom"},
     "weak_motors": {"fault on: joint_slow slider_1", "correction"},
     "wrong_masses": {"correction"},

@@ -27,6 +27,7 @@ EXPECTED: dict[str, tuple[bool, float | None, float | None]] = {
     "stuck_elbow": (True, None, 1e-3),
     "stuck_slider": (False, None, None),
     "broken_thrusters": (True, 4e-3, 4e-3),
+    "closed_nozzle": (True, 5e-3, 1e-2),
     "weak_motors": (True, 2e-3, 2e-3),
     "wheel_failure": (True, 4e-3, 4e-3),
     "late_poses": (True, 2e-3, 2e-3),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Any, ClassVar
 
@@ -96,9 +96,23 @@ class GainPair:
     )
 
 
+def _matrix_parameter(name: str) -> Any:
+    return parameter(
+        (),
+        f"matrix {name} of all outputs, row by row in the order of the statuses' errors, symmetric "
+        f"and positive definite, in place of the {name.lower()} of the groups; []: those",
+        unit="by law",
+        maximum=1e9,
+        minimum=-1e9,
+        read_only=False,
+    )
+
+
 @dataclass(frozen=True)
 class Gains:
-    """The diagonals of Kp, Kd (paper 4, eqs 27 and 29) and Ki; 0 in Kp or Kd: automatic.
+    """Kp, Kd (paper 4, eqs 27 and 29) and Ki: their diagonals by group, 0 in Kp or Kd: automatic.
+
+    ``kp_matrix`` and ``kd_matrix`` (m * m,), if given, are Kp and Kd of all outputs instead.
 
     Raises
     ------
@@ -111,26 +125,42 @@ class Gains:
     end_effector_position: GainPair = group(GainPair())
     end_effector_attitude: GainPair = group(GainPair())
     joints: GainPair = group(GainPair())
+    kp_matrix: tuple[float, ...] = _matrix_parameter("Kp")
+    kd_matrix: tuple[float, ...] = _matrix_parameter("Kd")
 
     def __post_init__(self) -> None:
-        for each in fields(self):
-            pair: GainPair = getattr(self, each.name)
-            for name, value in vars(pair).items():
+        for group_name in _GAIN_GROUPS:
+            for name, value in vars(getattr(self, group_name)).items():
                 if not (math.isfinite(value) and value >= 0):
                     raise ParameterError(
-                        f"The gain {each.name}.{name} is {value}; it must be finite and not "
+                        f"The gain {group_name}.{name} is {value}; it must be finite and not "
                         "negative."
                     )
 
     @classmethod
     def uniform(cls, kp: float, kd: float, ki: float = 0.0) -> Gains:
         """Return the same gains for every group."""
-        return cls(*(GainPair(kp, kd, ki) for _ in fields(cls)))
+        pair = GainPair(kp, kd, ki)
+        return cls(pair, pair, pair, pair, pair)
+
+    def matrices(self, selection: OutputSelection) -> tuple[Array, Array]:
+        """Return Kp and Kd (m, m) of the selected outputs; 0 in their diagonals: automatic.
+
+        Raises
+        ------
+        ParameterError
+            A matrix is not one of m * m numbers, symmetric and positive definite.
+        """
+        pairs = self._pairs(selection)
+        return (
+            _checked_matrix("kp_matrix", self.kp_matrix, [pair.kp for pair in pairs], selection),
+            _checked_matrix("kd_matrix", self.kd_matrix, [pair.kd for pair in pairs], selection),
+        )
 
     def diagonals(self, selection: OutputSelection) -> tuple[Array, Array]:
         """Return the diagonals of Kp and Kd (m,) of the selected outputs; 0: automatic."""
-        pairs = self._pairs(selection)
-        return np.array([pair.kp for pair in pairs]), np.array([pair.kd for pair in pairs])
+        kp, kd = map(np.diag, self.matrices(selection))
+        return kp.copy(), kd.copy()
 
     def integral_diagonal(self, selection: OutputSelection) -> Array:
         """Return the diagonal of Ki (m,) of the selected outputs."""
@@ -145,6 +175,28 @@ class Gains:
             ),
             *(self.joints for _ in selection.joints),
         ]
+
+
+_GAIN_GROUPS = tuple(each.name for each in fields(Gains) if not each.name.endswith("_matrix"))
+
+
+def _checked_matrix(
+    name: str, numbers: Sequence[float], diagonal: Sequence[float], selection: OutputSelection
+) -> Array:
+    if not len(numbers):
+        return np.diag(np.array(diagonal, dtype=float))
+    m, labels = len(selection.labels), ", ".join(selection.labels)
+    if len(numbers) != m * m:
+        raise ParameterError(
+            f"The gains.{name} has {len(numbers)} numbers; the {m} outputs of the law ({labels}) "
+            f"take {m * m}, row by row."
+        )
+    matrix = np.reshape(numbers, (m, m)).astype(float)
+    if not np.allclose(matrix, matrix.T, rtol=1e-9, atol=0.0):
+        raise ParameterError(f"The gains.{name} is not symmetric.")
+    if np.linalg.eigvalsh(matrix).min() <= 0.0:
+        raise ParameterError(f"The gains.{name} is not positive definite.")
+    return matrix
 
 
 @dataclass(frozen=True)
@@ -365,6 +417,12 @@ class ControlLaw(ABC):
             self._use_function(weighs=True)
             for name, value in before.items():
                 self._in[name][:] = value
+        couplings = tuple(K - np.diag(np.diag(K)) for K in gains.matrices(selection))
+        self.couples = any(coupling.any() for coupling in couplings)
+        """Whether a gain matrix has numbers beside its diagonal."""
+        if self.couples and not self.takes_matrices:
+            raise ParameterError(f"The law '{self.name}' takes no matrices of gains.")
+        self._couplings = couplings
         self._in["kp"][:], self._in["kd"][:] = self.gain_arguments(gains)
         self._integral[self._ki == 0.0] = 0.0
         self._in["integral"][:] = self._ki * self._integral
@@ -416,6 +474,17 @@ class ControlLaw(ABC):
         return self._filled(self._in["kp"], self._in["kd"])
 
     @property
+    def gain_matrices(self) -> tuple[Array, Array]:
+        """Kp and Kd (m, m), as :attr:`gain_diagonals` and with the couplings between outputs."""
+        (kp, kd), (beside_p, beside_d) = self.gain_diagonals, self._couplings
+        return np.diag(kp) + beside_p, np.diag(kd) + beside_d
+
+    @property
+    def takes_matrices(self) -> bool:
+        """Whether gains may be matrices: a law with an integral term takes them by that."""
+        return self._has_integral
+
+    @property
     def integral_gains(self) -> Array:
         """The diagonal of Ki (m,), in the order of ``outputs.labels``."""
         return self._ki.copy()
@@ -434,11 +503,16 @@ class ControlLaw(ABC):
         """
         self.outputs.pack_state(state, self._in["state"])
         self.outputs.pack_reference(reference, self._in["reference"])
+        if self.couples:
+            # Errors act on other outputs too, in the place of their integral.
+            self._function.evaluate()
+            between = zip(self._couplings, (self.error, self.error_rate), strict=True)
+            self._in["integral"][:] = self._ki * self._integral + sum(K @ e for K, e in between)
         return self.actuation(reference)
 
     def slowest_decay(self) -> float:
         """Return the rate (1/s) at which the slowest error decays, near the last state at rest."""
-        Kp, Kd = (np.diag(gains) for gains in self.gain_diagonals)
+        Kp, Kd = self.gain_matrices
         if self.gain_units != ACCELERATION_GAINS and not self._weighs:
             J, q = self._out["J_z"], self.state.q
             H = self.robot.inertia_matrix(q)[3:, 3:]
@@ -462,7 +536,7 @@ class ControlLaw(ABC):
         """Return the errors (m,) whose ``Kp e`` is a pull (m,), at rest in the shape of a state."""
         kp, given = self.gain_diagonals[0], self._in["kp"]
         if not self._weighs:
-            return np.asarray(pull / kp)
+            return np.asarray(np.linalg.solve(self.gain_matrices[0], pull))
         mobility = self._evaluate_at(state, self._in["integral"])["mobility"]
         # Automatic gains act through the mass matrix of all outputs.
         Kp = np.diag(given) + np.linalg.solve(mobility, np.diag(np.where(given > 0, 0.0, kp)))

@@ -19,8 +19,9 @@ class NumpyLaw(ControlLaw):
 
     A subclass gives ``name`` and :meth:`compute`. Before each call the base class evaluates
     :attr:`error`, :attr:`error_rate` and :attr:`J_z` of the outputs; :attr:`gain_diagonals` are the
-    parameters ``gains``. A law with a state keeps it in its attributes, and starts it anew in
-    :meth:`start`. All engines but the lanes of campaigns fly such a law.
+    parameters ``gains``, which :attr:`gain_matrices` has whole. A law with a state keeps it in its
+    attributes, and starts it anew in :meth:`start`. All engines but the lanes of campaigns fly
+    such a law.
 
     See :class:`ControlLaw` for the parameters and errors of the constructor.
     """
@@ -45,6 +46,11 @@ class NumpyLaw(ControlLaw):
             ``wrench_B`` (6,), force (N) over torque (N m) at the origin of the base link in base
             components, and ``tau`` (n,), joint efforts (N or N m).
         """
+
+    @property
+    def takes_matrices(self) -> bool:
+        """Whether gains may be matrices: :attr:`gain_matrices` are for :meth:`compute` to use."""
+        return True
 
     @property
     def J_z(self) -> Array:

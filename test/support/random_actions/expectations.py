@@ -22,7 +22,7 @@ from spacerobot_ros.simulation.status import PlantState, PlantStatus
 
 SECOND = 10**9
 
-_DECIDED = ("reached", "failed", "refused", "aborted")
+_DECIDED = ("reached", "reached_partly", "failed", "refused", "aborted")
 
 
 @dataclass(frozen=True)

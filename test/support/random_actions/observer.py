@@ -225,7 +225,10 @@ class Observer:
         state, goal_id = values["state"], values.get("goal_id", "")
         book = self.books[name]
         self._heard.append(f"{name}: {state} {goal_id}: {message.message}")
-        if state in ("reached", "failed", "refused", "aborted") and goal_id not in book.decided:
+        if (
+            state in ("reached", "reached_partly", "failed", "refused", "aborted")
+            and goal_id not in book.decided
+        ):
             self.figures.decisions[state] += 1
         if state == "refused" and name == self._setup.decider:
             self.situation.goals_since_stop.discard(goal_id)
