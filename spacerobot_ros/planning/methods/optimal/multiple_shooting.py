@@ -377,6 +377,7 @@ class SolverMonitor(ca.Callback):
         self.construct("watch", {})
 
     def begin(self, stop: StopRule) -> None:
+        """Forget the iterates of earlier solves; stop the next one by a rule."""
         self.best, self._least, self._stop, self._iterates = None, math.inf, stop, 0
 
     def get_n_in(self) -> int:
@@ -398,6 +399,7 @@ class SolverMonitor(ca.Callback):
     def eval_buffer(
         self, arguments: tuple[memoryview, ...], results: tuple[memoryview, ...]
     ) -> int:
+        """Look at an iterate; return whether the solver stops, by its results."""
         x, f, g = (np.frombuffer(each) for each in arguments[:3])
         if f[0] < self._least:
             worst = max((self._lower - g).max(), (g - self._upper).max())

@@ -197,8 +197,8 @@ class ThrustPlanner:
         link: str = "",
     ) -> None:
         self.robot, self.propulsion, self.options, self.link = robot, propulsion, options, link
-        self.limits = MotionLimits.of(robot, options, "thrust")
-        self.clearance = Clearance.wanted(robot.description, options.clearance)
+        self.limits = MotionLimits.of(robot, options, "plan")
+        self.clearance = Clearance.wanted(robot.description, options.clearance, "plan.clearance")
         wheels = ReactionWheels.of(robot.description)
         self._wheels = np.zeros(robot.n, dtype=bool)
         self._wheels[wheels.index] = True
@@ -223,7 +223,7 @@ class ThrustPlanner:
         kinds = goal.base is not None, self.link if goal.end_effector is not None else ""
         stop = StopRule(self.options.iterations, cancellation)
         guess = self._guess(boundary, end, np.zeros(3))
-        search = _Search(self, boundary, kinds, stop)
+        search = _Search(self, boundary, end, kinds, stop)
         return search.run(guess, end)
 
     def solver(self, kinds: tuple[bool, str], pairs: tuple[int, ...] = ()) -> ThrustSolver:
@@ -458,6 +458,7 @@ class _Search:
         self,
         planner: ThrustPlanner,
         boundary: ThrustBoundary,
+        end: _End,
         kinds: tuple[bool, str],
         stop: StopRule,
     ) -> None:
@@ -467,15 +468,20 @@ class _Search:
         """Whether the duration is given, or follows from the shortest one."""
         self._effort_limit = (1.0 - options.reserve) * planner.robot.effort_limit
         self._room: dict[int, float] = {}
-        self._required = self._require_start()
+        self._required = self._require_ends(end)
 
-    def _require_start(self) -> Array:
+    def _require_ends(self, end: _End) -> Array:
         clearance, boundary = self.planner.clearance, self.boundary
         if clearance is None:
             return np.zeros(0)
         q, X, r = boundary.shape[np.newaxis], boundary.state[np.newaxis, :4], boundary.state[7:10]
         base = self.planner.base_poses(q, X, r[np.newaxis])
-        return clearance.required(boundary.shape, base if clearance.has_obstacles else None)
+        required = clearance.required(boundary.shape, base if clearance.has_obstacles else None)
+        if self.kinds[0]:
+            goal, q = boundary.goals[np.newaxis, :7], end.q
+            base = BasePoses(goal[:, :3], goal[:, 3:])
+            clearance.require_shape(q, required, base if clearance.has_obstacles else None)
+        return required
 
     def run(self, guess: ThrustKnots, end: _End) -> ThrustMotion:
         """Return the motion.
@@ -527,7 +533,7 @@ class _Search:
         options = self.planner.options
         if 0 < options.duration < fastest.duration:
             raise UnreachableError(
-                f"The motion takes {fastest.duration:.4g} s at least, and thrust.duration is "
+                f"The motion takes {fastest.duration:.4g} s at least, and plan.duration is "
                 f"{options.duration:g} s.",
                 Proof.LIMITS,
             )

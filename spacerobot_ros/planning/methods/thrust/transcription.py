@@ -3,9 +3,9 @@
 To the attitude X, the vertices s and the velocities v of the joints' parabolas
 (:mod:`spacerobot_ros.planning.methods.optimal.transcription`) knots add the angular momentum L
 about the centre of mass, its position r and its velocity V, in W. The controls of an interval are
-the joint accelerations a and the levels u of the propulsion, whose wrench ``(f, n) = W u`` is constant
-in the base. With ``R_i``, ``c_i`` the attitude and the centre of mass in the base at the Gauss
-points tau_i of an interval,
+the joint accelerations a and the levels u of the propulsion, whose wrench ``(f, n) = W u`` is
+constant in the base. With ``R_i``, ``c_i`` the attitude and the centre of mass in the base at the
+Gauss points tau_i of an interval,
 
 ``V+ = V + h/m sum R_i f / 2``, ``r+ = r + h V + h^2/m sum (1 - tau_i) R_i f / 2``,
 ``L+ = L + h sum R_i (n - c_i x f) / 2``, ``X+ = X exp(Omega)``,
@@ -314,8 +314,8 @@ def thrust_program(
     Its parameters are the start of the shape (n,) and the goals (7 each), position and quaternion;
     the wrenches (6 m,); the defects (12 N,); typical accelerations (n,); weights of the duration,
     of the propellant, of the squares of accelerations and levels, of the lack, and the level at
-    which the cost of a norm is rounded off (6,); centres of the squares (n + m, N); and the planes (8,) of every pair, interval and
-    instant.
+    which the cost of a norm is rounded off (6,); centres of the squares (n + m, N); and the planes
+    (8,) of every pair, interval and instant.
     """
     n, N, propulsion = stages.joints, intervals, stages.propulsion
     m = propulsion.size
