@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import cache
+from typing import Any
 
 import coal
 import numpy as np
@@ -14,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from spacerobot_ros.errors import ParameterError, PlanningError, UnreachableError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
-from spacerobot_ros.model.thrusters import thrusters_of_urdf
+from spacerobot_ros.model.thrusters import ThrusterTable, thrusters_of_urdf
 from spacerobot_ros.model.urdf import parse_world
 from spacerobot_ros.model.world import with_world
 from spacerobot_ros.planning.methods.thrust.motion import ThrustMotion
@@ -36,7 +37,7 @@ START = np.array([0.4, -1.3, 0.7, *Rotation.from_rotvec([0.5, -0.3, 1.1]).as_qua
 FOLDED = np.array([0.0, -1.2, 2.0, 0.0, 0.8, 0.0])
 
 
-def cube_planner(robot: SpaceRobot | None = None, **options: float) -> ThrustPlanner:
+def cube_planner(robot: SpaceRobot | None = None, **options: Any) -> ThrustPlanner:
     robot = robot or SpaceRobot.from_urdf(CUBE)
     return ThrustPlanner(robot, Propulsion.within(FORCE, TORQUE), ThrustOptions(**options))
 
@@ -153,6 +154,9 @@ def test_accelerations_are_the_derivatives_of_velocities() -> None:
     time, dt = 7.37 * motion.step, 1e-4
     before, at, after = (motion.at(time + by) for by in (-dt, 0.0, dt))
     for one, frame, other in zip(before[:2], at[:2], after[:2], strict=True):
+        assert one is not None
+        assert frame is not None
+        assert other is not None
         assert frame.velocity == pytest.approx((other.position - one.position) / (2 * dt), abs=1e-7)
         slope = (other.velocity - one.velocity) / (2 * dt)
         assert frame.acceleration == pytest.approx(slope, abs=1e-7)
@@ -207,8 +211,11 @@ def test_what_cannot_be_planned_is_refused_in_a_sentence() -> None:
     with pytest.raises(UnreachableError, match=r"takes 11\.3\d* s at least, and plan\.duration"):
         cube_planner(duration=5.0).plan(start, goal)
     table = thrusters_of_urdf(servicer().robot.description)
-    one_way = type(table)(
-        *(x[:1] for x in (table.names, table.r_B, table.direction_B, table.force)),
+    one_way = ThrusterTable(
+        table.names[:1],
+        table.r_B[:1],
+        table.direction_B[:1],
+        table.force[:1],
         table.min_on_time[:1],
         table.isp[:1],
     )
