@@ -176,7 +176,7 @@ class Scenario:
             return config.decided("effort" if efforts else "")
         if node in COMMANDERS and not config.tick_rate:
             changes["tick_rate"] = self.plant.tick_rate
-        if node == "planner" and config.plan_in_background and self.lockstep:
+        if node in COMMANDERS and config.plan_in_background and self.lockstep:
             changes["plan_in_background"] = False
         if node in COMMANDERS and not config.position_tolerance:
             changes["position_tolerance"] = self._automatic_tolerance(config)

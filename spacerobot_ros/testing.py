@@ -21,7 +21,7 @@ from spacerobot_ros.nodes import NODE_TYPES, FlightNode
 from spacerobot_ros.nodes.common.process import free_domain, use_loopback_discovery
 from spacerobot_ros.nodes.common.streams import MatchedEndpoints, topics_without_all_matches
 from spacerobot_ros.planning import Goal
-from spacerobot_ros.scenario import scenario_or_robot
+from spacerobot_ros.scenario import COMMANDERS, scenario_or_robot
 from spacerobot_ros.session.mission_client import MissionClient
 
 __all__ = ["Arrival", "Stack"]
@@ -70,8 +70,9 @@ class Stack:
         timeout: float = 60.0,
     ) -> None:
         scenario = scenario_or_robot(robot).with_overrides("plant", {"time_mode": "lockstep"})
-        # Before the plant tells its time mode, the planner would let it go on during a first plan.
-        scenario = scenario.with_overrides("planner", {"plan_in_background": False})
+        # Before the plant tells its time mode, a commander would let it go on during a first plan.
+        for name in COMMANDERS:
+            scenario = scenario.with_overrides(name, {"plan_in_background": False})
         for name, values in parameters.items():
             scenario = scenario.with_overrides(name, values)
         self._world, self._timeout, self._sent = scenario.plant.world_frame, timeout, 0
@@ -116,8 +117,9 @@ class Stack:
     ) -> Arrival:
         """Send a goal and spin until the planner, or else the controller, has decided it.
 
-        ``goal`` is any goal; None: the base at ``x``, ``y``, ``z`` (m), rotated by ``rotvec`` (rad),
-        0 unless given; without a coordinate any position will do, without ``rotvec`` any attitude.
+        ``goal`` is any goal; None: the base at ``x``, ``y``, ``z`` (m), rotated by ``rotvec``
+        (rad), 0 unless given; without a coordinate any position will do, without ``rotvec`` any
+        attitude.
         Raises :class:`.SpaceRobotError` if a node fails, or time is up.
         """
         if goal is None:

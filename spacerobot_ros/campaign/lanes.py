@@ -35,6 +35,7 @@ from spacerobot_ros.control.controller import build_controller, controlled_outpu
 from spacerobot_ros.control.executive import controlled_parts, decided_message
 from spacerobot_ros.control.laws.registry import LAWS
 from spacerobot_ros.control.outputs import OutputDistance
+from spacerobot_ros.control.planned_reference import PlannedReference
 from spacerobot_ros.control.status import ControllerState
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.flight.lockstep import fly_scenario
@@ -385,6 +386,8 @@ class _ControlledLanes:
             return "the plant refuses commands beyond limits"
         if nominal_robots(scenario).controller.description.wheel_names:
             return "the robot has reaction wheels, which engine 'flights' flies"
+        if scenario.controller.profile == PlannedReference.name:
+            return "its references are planned, which engine 'flights' does"
         if scenario.controller.tasks:
             return "its controller has tasks before goals, which engine 'flights' does"
         for dispersion in campaign.dispersions:

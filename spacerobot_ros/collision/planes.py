@@ -87,6 +87,41 @@ class PlaneDistance:
         )
 
 
+_EDGE_ROUNDING = 0.03
+"""Rounds off the corners of projections, m: the distance is a little smaller for it."""
+
+
+def support_distance(
+    geometry: CollisionGeometry, pair: int, center_of_mass: ca.Function
+) -> ca.Function:
+    """Return ``(y, plane) -> d``, m: how far all of the second solid is in front of a plane.
+
+    The arguments are those of :class:`PlaneDistance`, whose point is not used: the solid is its
+    rounded box, whose extent along the normal is ``sum h_i |n e_i| + radius``. So the distance
+    holds however the solid has turned, and is smaller than that of a shape within the box.
+    """
+    robot, of_obstacle = geometry.robot, bool(geometry.with_obstacles[pair])
+    n = len(robot.joint_names)
+    y, plane = ca.SX.sym("y", n + 4 if of_obstacle else n), ca.SX.sym("plane", PLANE_SIZE)
+    q, normal = y[:n], plane[:3]
+    first, second = (geometry.solids[i] for i in geometry.pairs[pair])
+    if of_obstacle:
+        X = y[n:]
+        solid = first
+        R, r = _pose_of_link(robot, first, _chain_of(robot, first.body), joint_positions(robot, q))
+        R_X = symbolic_rotations.matrix_from_quaternion(X / ca.norm_2(X))
+        R, r = R_X @ R, R_X @ (r - center_of_mass(q))
+    else:
+        solid = second
+        (R_A, r_A), (R_P, r_P) = _relative_poses(robot, first, second, q)
+        R, r = R_A.T @ R_P, R_A.T @ (r_P - r_A)
+    box = solid.enclosure
+    along = ca.DM(box.pose.R).T @ R.T @ normal
+    extent = ca.dot(ca.DM(box.half), ca.sqrt(along**2 + _EDGE_ROUNDING**2)) + box.radius
+    d = ca.dot(normal, r + R @ ca.DM(box.pose.r)) - extent - plane[3]
+    return ca.Function("support", [y, plane], [ca.cse(d)])
+
+
 def _relative_poses(
     robot: RobotDescription, first: Solid, second: Solid, q: ca.SX
 ) -> list[tuple[ca.SX, ca.SX]]:

@@ -121,6 +121,10 @@ class GoalExecutive(Protocol):
         None: there is no prediction.
         """
 
+    def plan_at_once(self) -> None:
+        """Make later plans while states wait for them: the plant is in lockstep."""
+        ...
+
     def configure(self, config: Any) -> None:
         """Use the live parameters of another configuration from the next state on."""
 
@@ -735,6 +739,10 @@ class Commander(ABC):
                     self.executive.plant_reset()
             elif self.executive is not None:
                 self.executive.on_plant_obeying()
+        if self.plant.in_lockstep and self.config.plan_in_background:
+            self.config = self._adapted(self.config)
+            if self.executive is not None:
+                self.executive.plan_at_once()
         self._forward_outputs()
         self._forward_plant_state()
         if self._actuation_refusal:
@@ -793,7 +801,9 @@ class Commander(ABC):
             self.executive.configure(self.config)
 
     def _adapted(self, config: Any) -> Any:
-        config = replace(config, tick_rate=self.config.tick_rate)
+        """Return a configuration for the robot and the plant: one in lockstep waits for plans."""
+        background = config.plan_in_background and not self.plant.in_lockstep
+        config = replace(config, tick_rate=self.config.tick_rate, plan_in_background=background)
         return config if self._described is None else config.for_robot(self._described.description)
 
     @property

@@ -126,13 +126,6 @@ class PlannerCommander(Commander):
         assert self.executive is not None
         return self.executive.setpoint
 
-    def _adapted(self, config: PlannerConfig) -> PlannerConfig:
-        """Return a configuration for the plant: one in lockstep waits for its plans."""
-        adapted: PlannerConfig = super()._adapted(config)
-        if not self.plant.in_lockstep:
-            return adapted
-        return replace(adapted, plan_in_background=False)
-
     def interrupt(self) -> None:
         """Cancel the requested plan; any thread may call this."""
         if self.executive is not None:
@@ -283,10 +276,6 @@ class PlannerCommander(Commander):
     def receive_plant_status(self, status: PlantStatus, name: str = "plant") -> None:
         """React to a status of the named plant."""
         super().receive_plant_status(status, name)
-        if self.plant.in_lockstep and self.config.plan_in_background:
-            self.config = self._adapted(self.config)
-            if self.executive is not None:
-                self.executive.plan_at_once()
         begun = [each for each in status.disturbances if each not in self._disturbances]
         self._disturbances = status.disturbances
         if self._status is not None and self._status.state is PlannerState.EXECUTING:

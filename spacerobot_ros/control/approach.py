@@ -19,7 +19,6 @@ from itertools import product
 import numpy as np
 
 from spacerobot_ros.collision import BasePoses, CollisionGeometry, LinkPair
-from spacerobot_ros.control.inverse_kinematics import REACHED_DISTANCE, FixedBaseArm
 from spacerobot_ros.control.limits import MotionLimits
 from spacerobot_ros.control.reference import quintic_duration
 from spacerobot_ros.control.state import ControlState, PoseReference
@@ -32,6 +31,7 @@ from spacerobot_ros.control.target_motion import (
 )
 from spacerobot_ros.errors import PlanningError
 from spacerobot_ros.model.description import Array, Pose, RobotDescription
+from spacerobot_ros.model.inverse_kinematics import REACHED_DISTANCE, FixedBaseArm
 from spacerobot_ros.model.rotations import matrix_from_quaternion, quaternion_from_matrix
 from spacerobot_ros.model.space_robot import SpaceRobot
 from spacerobot_ros.parameters import parameter

@@ -12,6 +12,7 @@ from spacerobot_ros.control.detumbling import DetumbleOptions
 from spacerobot_ros.control.laws.law import Gains
 from spacerobot_ros.control.laws.registry import LAWS
 from spacerobot_ros.control.limits import MotionLimits
+from spacerobot_ros.control.planned_reference import PlannedOptions, PlannedReference
 from spacerobot_ros.control.reference import PROFILES, OutputErrors
 from spacerobot_ros.control.wheels import WheelOptions
 from spacerobot_ros.model.shared_parameters import CommanderConfig
@@ -53,7 +54,12 @@ class ControllerConfig(CommanderConfig):
     )
     end_effector_outputs: str = parameter("", "axes of the end-effector that are outputs")
     joint_outputs: str = parameter("", "joints that are outputs")
-    profile: str = parameter("quintic", "profile of references to goals", choices=tuple(PROFILES))
+    profile: str = parameter(
+        "quintic",
+        "profile of references to goals; planned: for the thrust there is, around obstacles",
+        choices=(*PROFILES, PlannedReference.name),
+    )
+    plan: PlannedOptions = group(PlannedOptions())
     motion: MotionLimits = group(MotionLimits())
     use_thrusters: bool = parameter(
         True,

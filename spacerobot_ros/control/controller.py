@@ -23,10 +23,16 @@ from spacerobot_ros.control.limits import (
     MotionLimits,
     Saturated,
 )
-from spacerobot_ros.control.outputs import AXES, OutputDistance, OutputSelection
+from spacerobot_ros.control.outputs import OutputDistance, OutputSelection
+from spacerobot_ros.control.planned_reference import (
+    PlanJob,
+    PlannedReference,
+    ReferencePlanner,
+)
 from spacerobot_ros.control.reference import (
     PROFILES,
     OutputErrors,
+    QuinticReference,
     ReferenceProfile,
     StepReference,
 )
@@ -47,6 +53,7 @@ from spacerobot_ros.errors import (
 )
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.grasp import Payload
+from spacerobot_ros.model.inverse_kinematics import AXES
 from spacerobot_ros.model.rotations import (
     attitude_error,
     compose_poses,
@@ -54,6 +61,7 @@ from spacerobot_ros.model.rotations import (
     relative_pose,
 )
 from spacerobot_ros.model.space_robot import SpaceRobot
+from spacerobot_ros.planning.core.cancellation import Cancellation
 
 _BRAKE_RATE = 2.0
 """Decay rate of joint motion when the base is no longer known, 1/s."""
@@ -98,6 +106,8 @@ class CoordinatedController:
         (paper 4, section IV), s. Then the thrusters are off and the joints are brought to rest.
     wheels
         The reaction wheels of a robot that has some: the law's robot is its gyrostat.
+    planner
+        Plans the references of goals; None: they have the profile.
     """
 
     def __init__(
@@ -110,8 +120,10 @@ class CoordinatedController:
         control_period: float,
         estimation_time: float,
         wheels: WheelControl | None = None,
+        planner: ReferencePlanner | None = None,
     ) -> None:
         self.wheels = wheels
+        self._planner = planner
         self.law, selection = law, law.outputs.selection
         self._kinds, self._distances = selection.error_kinds, selection.distances
         self._limits, self.joint_rate_limits = limits, rates
@@ -163,9 +175,22 @@ class CoordinatedController:
 
         An end-effector without a goal since the robot was held or brought to rest has none: the
         base carries it, so that the arm keeps its shape. The integral of the errors begins again.
+        The reference has the profile that is not planned.
         """
         if self.coming_to_rest:
             self.profile, self.coming_to_rest = None, False
+        start, goal, carries = self._motion_to(time, state, base, end_effector, joints)
+        self._begin_motion(time, state, start, goal, carries=carries)
+
+    def _motion_to(
+        self,
+        time: float,
+        state: ControlState,
+        base: PoseReference | None,
+        end_effector: PoseReference | None,
+        joints: Array | None,
+    ) -> tuple[Reference, Reference, bool]:
+        """Return the reference at a time, the goal, and whether the base carries the hand."""
         start = self._present_reference(time, state)
         goal = start if self.profile is None else self.profile.goal
         carries = end_effector is None and (self.profile is None or self.profile.carries)
@@ -177,7 +202,50 @@ class CoordinatedController:
             goal = replace(goal, end_effector=end_effector)
         if joints is not None:
             goal = replace(goal, joints=JointReference.at_rest(joints))
-        self._begin_motion(time, state, start, goal, carries=carries)
+        return start, goal, carries
+
+    @property
+    def plans(self) -> bool:
+        """Whether references of goals are planned."""
+        return self._planner is not None
+
+    def plan_goals(
+        self,
+        time: float,
+        state: ControlState,
+        *,
+        base: PoseReference | None = None,
+        end_effector: PoseReference | None = None,
+        joints: Array | None = None,
+        in_background: bool,
+        lead: float = 0.0,
+    ) -> PlanJob:
+        """Begin to plan a reference towards new goals.
+
+        The arguments are those of :meth:`set_goals`. If the reference moves, the plan begins
+        ``lead`` s later, where the reference will be then.
+        """
+        planner = self._planner
+        assert planner is not None
+        if self.coming_to_rest:
+            self.profile, self.coming_to_rest = None, False
+        moving = self.profile is not None and not self.reference_at_rest(time)
+        begins = time + lead if moving else -math.inf
+        start, goal, carries = self._motion_to(
+            begins if moving else time, state, base, end_effector, joints
+        )
+        limits = self._motion
+
+        def work(cancellation: Cancellation) -> PlannedReference:
+            return planner.plan(start, goal, state, limits, cancellation, carries=carries)
+
+        return PlanJob(work, begins, in_background=in_background)
+
+    def begin_planned(self, time: float, profile: PlannedReference) -> None:
+        """Follow a planned reference from a time on."""
+        self.profile, self._began = profile, time
+        with self._failures_of_law(time):
+            self.law.start(time, profile.start, profile.goal)
 
     def require_controlled_axes(
         self,
@@ -357,6 +425,9 @@ class CoordinatedController:
             self.law.time = time
             with self._failures_of_law(time):
                 commanded = self.law.command(state, self._reference_at(time))
+            if isinstance(self.profile, PlannedReference) and not self.law.follows_accelerations:
+                planned = self.profile.actuation(time - self._began)
+                commanded = Actuation(*(a + b for a, b in zip(commanded, planned, strict=True)))
             if self.coming_to_rest:
                 commanded = self._to_rest(state)
         if state is not None:
@@ -581,15 +652,18 @@ def build_controller(robot: SpaceRobot, config: ControllerConfig) -> Coordinated
         raise ParameterError(
             f"The control law '{config.law}' cannot be built: {describe_exception(error)}."
         ) from error
+    limits = ActuatorLimits(force, torque, robot.effort_limit)
+    planned = config.profile == PlannedReference.name
     return CoordinatedController(
         law,
-        ActuatorLimits(force, torque, robot.effort_limit),
+        limits,
         JointRateLimits(robot, config.joint_rates * robot.velocity_limit, config.control_period),
-        PROFILES[config.profile],
+        QuinticReference if planned else PROFILES[config.profile],
         config.motion,
         config.control_period,
         config.estimation_time,
         wheels,
+        ReferencePlanner(robot, outputs, limits, config.plan) if planned else None,
     )
 
 

@@ -5,9 +5,10 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from enum import IntEnum
 from types import MappingProxyType
+from typing import TypedDict
 
 import numpy as np
 
@@ -16,6 +17,7 @@ from spacerobot_ros.control.controller import CoordinatedController, Mode
 from spacerobot_ros.control.goal_monitor import Decision, GoalMonitor
 from spacerobot_ros.control.limits import Saturated
 from spacerobot_ros.control.outputs import OutputDistance
+from spacerobot_ros.control.planned_reference import PlanJob, PlannedReference
 from spacerobot_ros.control.servicing import Servicing, Task, TaskProgress, TaskState
 from spacerobot_ros.control.stall_monitor import StallMonitor
 from spacerobot_ros.control.state import Actuation, ControlState, PoseReference, Reference
@@ -67,6 +69,30 @@ class _Next(IntEnum):
 _MEASURED, _TRACKING, _NO_DECISION = Mode.MEASURED, ControllerState.TRACKING, Decision.NONE
 
 
+_PLANNING_TIME = 2.0
+"""Time from which a reference that moves is continued by a plan, s; twice as much if planning takes
+longer."""
+
+
+class _Aims(TypedDict):
+    """Poses and joint positions that goals ask for; None: they do not."""
+
+    base: PoseReference | None
+    end_effector: PoseReference | None
+    joints: Array | None
+
+
+@dataclass(frozen=True)
+class _Plan:
+    """A reference in the making for pending goals, ``lead`` s ahead if the robot moves."""
+
+    pending: dict[str, IdentifiedGoal]
+    aims: _Aims
+    asked: frozenset[Controlled]
+    job: PlanJob
+    lead: float
+
+
 class ControlExecutive:
     """Gives a :class:`CoordinatedController` its goals, and reports their outcome.
 
@@ -109,11 +135,15 @@ class ControlExecutive:
         self.servicing = Servicing(config)
         """The tasks before goals, with the target; the owner tells it the body that is held."""
         self._longest_gap = _longest_gap(config)
+        self.plans_in_background = config.plan_in_background
+        """Whether references are planned in a thread."""
+        self._plan: _Plan | None = None
         self.reset()
 
     def reset(self) -> None:
         """Drop goals and measurements, without a status: the next state is the first."""
         self.controller.reset()
+        self._drop_plan()
         self._time: float | None = None
         """Time of the last state, s."""
         self._next = _Next.GO_ON
@@ -145,6 +175,10 @@ class ControlExecutive:
         self._next_report = 0.0
         self._limited = False
         self._command_report: CommandReport | None = None
+
+    def plan_at_once(self) -> None:
+        """Make later plans while states wait for them: the plant is in lockstep."""
+        self.plans_in_background = False
 
     def configure(self, config: ControllerConfig) -> None:
         """Use other tolerances, times and gains from the next state on."""
@@ -373,7 +407,13 @@ class ControlExecutive:
             self.servicing.end()
             self.controller.follow(Reference())
         self._pending.clear()
+        self._drop_plan()
         self._abort_message = message
+
+    def _drop_plan(self) -> None:
+        if self._plan is not None:
+            self._plan.job.cancel()
+            self._plan = None
 
     def _report_abort(self) -> None:
         self._goal_state = self._reported_state = ControllerState.ABORTED
@@ -421,6 +461,9 @@ class ControlExecutive:
             reaction, self._next = self._next, _Next.GO_ON
             if reaction >= _Next.HOLD or self.plant_blocked:
                 self._hold_pose(time, measured, aborted=reaction is _Next.ABORT)
+            elif reaction is _Next.BEGIN_ANEW and self.controller.plans:
+                self.controller.hold_here(time, measured)
+                self._pending = {**self._goals, **self._pending}
             elif reaction is _Next.BEGIN_ANEW:
                 self.controller.restart_motion(time, measured)
                 self._monitor.restart_settling()
@@ -628,40 +671,113 @@ class ControlExecutive:
 
     def _begin_goals(self, time: float, state: ControlState, *, carried: bool = False) -> None:
         """Start towards the pending goals, after tasks from the measured pose."""
-        self._goal_id = self._latest_id()
+        if self.controller.plans:
+            planned = self._planned(time, state, carried=carried)
+            if planned is None:
+                return
+            poses, asked, profile, began = planned
+        else:
+            (poses, asked), profile, began = self._aims(state), None, time
         pursued = self._goals if self._goal_state is ControllerState.TRACKING else {}
+        again = self._goal_id == self._latest_id() and bool(pursued)
+        self._goal_id = self._latest_id()
         self._goals = {**pursued, **self._pending}
         self._after_tasks = dict(self._pending) if carried else {}
-        goals = {key: pending.goal for key, pending in self._pending.items()}
         self._resumes = all(pending.resumes for pending in self._pending.values())
         self._take_tolerance(next(reversed(self._pending.values())).tolerance)
+        if BASE_GOAL_KEY in self._pending or BASE_GOAL_KEY not in pursued:
+            self._asked = asked
         self._pending.clear()
-        if BASE_GOAL_KEY in goals:
-            goal = goals[BASE_GOAL_KEY].kept_at(state.r_WB, state.quaternion_WB)
-            goals[BASE_GOAL_KEY], self._asked = goal, goal.asked
-        elif BASE_GOAL_KEY not in pursued:
-            self._asked = frozenset()
-        poses = {key: PoseReference(goal.position, goal.quaternion) for key, goal in goals.items()}
-        shapes = [g.joint_positions for g in goals.values() if g.joint_positions is not None]
-        if self.controller.wheels is not None:
-            shapes = [shape[self.controller.wheels.wheels.other] for shape in shapes]
-        if carried:
-            # Tasks have left the earlier reference behind.
-            self.controller.hold_here(time, state)
-        self.controller.set_goals(
-            time,
-            state,
-            base=poses.get(BASE_GOAL_KEY),
-            end_effector=poses.get(END_EFFECTOR),
-            joints=shapes[0] if shapes else None,
-        )
-        if not carried:
+        if profile is not None:
+            self.controller.begin_planned(began, profile)
+        else:
+            if carried:
+                # Tasks have left the earlier reference behind.
+                self.controller.hold_here(time, state)
+            self.controller.set_goals(time, state, **poses)
+        if not (carried or again):
             self._report_acceptance()
         self._goal_state = ControllerState.TRACKING
         self._monitor.begin(time)
         self._stall.restart()
         self._next_report, self._error_bounds = time, None
         self.outputs.append(PursuedGoals(self._goals_to_save()))
+
+    def _aims(self, state: ControlState) -> tuple[_Aims, frozenset[Controlled]]:
+        """Return the poses and the shape of the pending goals, and the parts of the base's pose
+        that they ask for.
+        """
+        goals = {key: pending.goal for key, pending in self._pending.items()}
+        asked: frozenset[Controlled] = frozenset()
+        if BASE_GOAL_KEY in goals:
+            goal = goals[BASE_GOAL_KEY].kept_at(state.r_WB, state.quaternion_WB)
+            goals[BASE_GOAL_KEY], asked = goal, goal.asked
+        poses = {key: PoseReference(goal.position, goal.quaternion) for key, goal in goals.items()}
+        shapes = [g.joint_positions for g in goals.values() if g.joint_positions is not None]
+        if self.controller.wheels is not None:
+            shapes = [shape[self.controller.wheels.wheels.other] for shape in shapes]
+        aims = _Aims(
+            base=poses.get(BASE_GOAL_KEY),
+            end_effector=poses.get(END_EFFECTOR),
+            joints=shapes[0] if shapes else None,
+        )
+        return aims, asked
+
+    def _planned(
+        self, time: float, state: ControlState, *, carried: bool
+    ) -> tuple[_Aims, frozenset[Controlled], PlannedReference, float] | None:
+        """Return what the pending goals aim at, their planned reference, and when it begins.
+
+        None: it is in the making, or the goals have been refused.
+        """
+        plan = self._plan
+        if plan is None or plan.pending != self._pending:
+            if plan is not None:
+                plan.job.cancel()
+            if carried:
+                self.controller.hold_here(time, state)
+            aims, asked = self._aims(state)
+            lead = _PLANNING_TIME if plan is None else plan.lead
+            plan = self._plan = self._begin_plan(time, state, aims, asked, lead)
+        if not plan.job.done:
+            return None
+        try:
+            profile = plan.job.result()
+        except PlanningError as error:
+            goal_id, self._plan = self._latest_id(), None
+            self._pending.clear()
+            self.refuse(str(error), goal_id)
+            return None
+        begins = plan.job.begins
+        if begins < time and begins > -math.inf and self.plans_in_background:
+            # The reference has gone on: a plan from where it will be in twice the time.
+            self._plan = self._begin_plan(time, state, plan.aims, plan.asked, 2 * plan.lead)
+            return None
+        if begins > time and self.plans_in_background:
+            return None
+        self._plan = None
+        return plan.aims, plan.asked, profile, max(begins, time)
+
+    def _begin_plan(
+        self,
+        time: float,
+        state: ControlState,
+        aims: _Aims,
+        asked: frozenset[Controlled],
+        lead: float,
+    ) -> _Plan:
+        background = self.plans_in_background
+        # The memory of a state may be used again for the next one.
+        memory = np.empty(13 + 2 * len(state.q))
+        state.stack(memory)
+        job = self.controller.plan_goals(
+            time,
+            ControlState.unstack(memory),
+            **aims,
+            in_background=background,
+            lead=lead if background else 0.0,
+        )
+        return _Plan(dict(self._pending), aims, asked, job, lead)
 
     def _take_tolerance(self, tolerance: Tolerance | None) -> None:
         self._goal_tolerance, self._goal_config = tolerance, self._config_with(tolerance)

@@ -29,6 +29,7 @@ from spacerobot_ros.control.state import (
 )
 from spacerobot_ros.errors import ParameterError, quantity
 from spacerobot_ros.model.description import Array, RobotDescription, plane_normal
+from spacerobot_ros.model.inverse_kinematics import AXES
 from spacerobot_ros.model.kinematics import link_quaternion
 from spacerobot_ros.model.space_robot import SpaceRobot
 from spacerobot_ros.model.symbolic_rotations import (
@@ -36,9 +37,6 @@ from spacerobot_ros.model.symbolic_rotations import (
     quaternion_multiply,
     rotation_error,
 )
-
-AXES: tuple[str, ...] = ("x", "y", "z", "rx", "ry", "rz")
-"""Components in W of a position and of a rotation."""
 
 _PARALLEL_TOLERANCE = 1e-6
 """Sine of the largest angle between axes that count as parallel."""

@@ -254,7 +254,7 @@ class LinkPlacement:
         link_R, link_r
             (3, 3 L) attitudes side by side and (3, L) positions of the links in B, m.
         """
-        self._base[:], self._R[...], self._r[...] = base, link_R, link_r
+        self._base[:], self._R[...], self._r[...] = base, link_R, link_r.reshape(self._r.shape)
         self._function.evaluate()
 
 

@@ -185,6 +185,11 @@ class CommanderConfig(WatchdogConfig, AssumedRobotConfig):
     resume_file: str = parameter(
         "", "file of the present goals, from which a restarted node resumes; '': none"
     )
+    plan_in_background: bool = parameter(
+        True,
+        "plan in a thread while the robot keeps moving; false, or a lockstep plant: states wait "
+        "for the plan",
+    )
     stop_when_decided: bool = parameter(
         False, "send no commands after a goal is decided: a lockstep plant stays at that tick"
     )

@@ -57,6 +57,16 @@ def relative_vector(a: ca.SX, b: ca.SX) -> ca.SX:
     return a[3] * b[:3] - b[3] * a[:3] - ca.cross(a[:3], b[:3])
 
 
+_HALF_TURN_ROUNDING = 1e-9
+"""Keeps the derivatives of half an angle finite at half a turn."""
+
+
+def half_angle_vector(R: ca.SX) -> ca.SX:
+    """Return twice the sine of half the angle of a rotation (3, 3), about its axis (3,)."""
+    vector = ca.inv_skew((R - R.T) / 2) * 2
+    return vector / ca.sqrt(ca.fmax(1 + ca.trace(R), 0) + _HALF_TURN_ROUNDING)
+
+
 def quaternion_rate(quaternion: ca.SX, omega_WB_B: ca.SX) -> ca.SX:
     """Return the rate (4,) of the quaternion of ``R_WB`` at body rate ``omega_WB_B``."""
     vector, scalar = quaternion[:3], quaternion[3]

@@ -178,7 +178,8 @@ def time_figure(
     """Return a figure with a panel for each group, and close-ups of a gait of equal cycles; a
     sentence where nothing was recorded over time.
 
-    ``caption`` is its beginning. ``flights``: labels of several flights whose traces the groups have.
+    ``caption`` is its beginning. ``flights``: labels of several flights, whose traces the groups
+    have.
     """
     if all(len(signal) < 2 for group in groups for signal in group.signals):
         return ONE_STATE_TEXT
@@ -268,11 +269,8 @@ def figure_of_flights(
     if not merged:
         return "It is of one flight: name one bag."
     first, labels = figures[0], [each.label for each in flights]
-    small = len(merged) > 1 and len({group.label for group in merged}) == 1
     only = replace(flights[0], timed_events=[])
-    return time_figure(
-        only, first.name, first.heading, first.heading, merged, small=small, flights=labels
-    )
+    return time_figure(only, first.name, first.heading, first.heading, merged, flights=labels)
 
 
 def _layout(

@@ -203,7 +203,7 @@ class MultiProcessStack:
     def launch(self, name: str, **parameters: Any) -> None:
         """Start one node of the scenario, for the first time or again, with more parameters."""
         overrides: dict[str, Any] = dict(self.scenario.parameters(name))
-        if name == "planner" and self.scenario.lockstep:
+        if name in COMMANDERS and self.scenario.lockstep:
             overrides["plan_in_background"] = False  # Known before the plant says so.
         if name == "recorder":
             overrides |= {"bag": str(self.bag), "when_exists": self.when_exists}

@@ -27,10 +27,10 @@ from typing import IO
 
 import numpy as np
 
-from spacerobot_ros.control.inverse_kinematics import FixedBaseArm, is_reached
 from spacerobot_ros.errors import GoalError, SpaceRobotError, quantity
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import DEFAULT_END_EFFECTOR, Array, Pose, RobotDescription
+from spacerobot_ros.model.inverse_kinematics import FixedBaseArm, is_reached
 from spacerobot_ros.model.rotations import matrix_from_quaternion
 from spacerobot_ros.model.shared_parameters import (
     DEFAULT_POSITION_TOLERANCE,

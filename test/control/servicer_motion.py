@@ -25,8 +25,8 @@ from spacerobot_ros.control import (
     OutputSelection,
     Reference,
 )
-from spacerobot_ros.control.outputs import AXES
 from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.model.inverse_kinematics import AXES
 
 GAINS = Gains(
     GainPair(3.0, 4.0), GainPair(2.0, 3.5), GainPair(5.0, 6.0), GainPair(7.0, 5.5), GainPair(1, 2)

@@ -51,9 +51,9 @@ from spacerobot_ros.control import (
 )
 from spacerobot_ros.control.laws.model_based import ModelBasedLaw
 from spacerobot_ros.control.laws.transposed_jacobian import TransposedJacobianLaw
-from spacerobot_ros.control.outputs import AXES
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.model.inverse_kinematics import AXES
 
 ROBOTS = ("planar_chain", "random_0", "random_1", "random_2", "servicer")
 

@@ -55,9 +55,9 @@ from spacerobot_ros.control import (
 )
 from spacerobot_ros.control.config import ControllerConfig
 from spacerobot_ros.control.controller import build_controller
-from spacerobot_ros.control.outputs import AXES
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.model import SpaceRobot, compilation
+from spacerobot_ros.model.inverse_kinematics import AXES
 from spacerobot_ros.parameters import configured, declared, parameter
 
 

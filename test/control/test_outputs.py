@@ -29,9 +29,10 @@ from spacerobot_ros.control import (
     default_selection,
     plane_normal,
 )
-from spacerobot_ros.control.outputs import AXES, OutputVector
+from spacerobot_ros.control.outputs import OutputVector
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.model import RobotDescription, SpaceRobot, parse_robot
+from spacerobot_ros.model.inverse_kinematics import AXES
 
 STEP = 1e-6
 

@@ -44,10 +44,10 @@ from spacerobot_ros.control import (
     Reference,
     ReferenceProfile,
 )
-from spacerobot_ros.control.inverse_kinematics import FixedBaseArm, is_reached
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array, Pose
+from spacerobot_ros.model.inverse_kinematics import FixedBaseArm, is_reached
 
 MILLIMETRE = 1e-3
 TENTH_OF_A_DEGREE = np.radians(0.1)

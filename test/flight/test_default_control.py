@@ -138,7 +138,7 @@ def test_a_body_without_a_joint_docks_past_a_panel_by_its_thrusters() -> None:
         assert flight.clearance is not None
         assert flight.clearance.nearest.distance == pytest.approx(0.69 - edges.max(), abs=2e-3)
     assert flown[1].manoeuvre_time > flown[0].manoeuvre_time
-    assert all(each.propellant > 0.005 for each in flown if each.propellant is not None)
+    assert all(each.propellant > 0.003 for each in flown if each.propellant is not None)
 
 
 def statuses(flight: Flight) -> list[tuple[float, ControllerStatus]]:

@@ -30,7 +30,7 @@ from spacerobot_ros.planning.methods.optimal.problem import (
     PossibleEnd,
     Trajectory,
 )
-from spacerobot_ros.planning.methods.optimal.transcription import Stages, program
+from spacerobot_ros.planning.methods.optimal.transcription import Layout, Stages, program
 from spacerobot_ros.resources import robot_file
 
 Array = npt.NDArray[np.float64]
@@ -140,7 +140,7 @@ def _wavy(joints: int, intervals: int) -> Trajectory:
 def _program(stages: Stages, boundary: BoundaryConditions) -> dict[str, Any]:
     intervals = 5
     made = program(stages, intervals)
-    s = np.arange(1, made.layout.size + 1)
+    s = np.arange(1, Layout.of(stages, intervals).size + 1)
     x = 0.3 + 0.2 * np.sin(1.3 * s)
     p = _pack_parameters(boundary, WITHIN, _wavy(stages.joints, intervals), fixed=True)
     multipliers = np.cos(0.9 * np.arange(made.lower.size))

@@ -348,6 +348,11 @@ class ControlLaw(ABC):
         has_integral = bool(ca.depends_on(results["actuation"], symbols["integral"]))
         return function, has_integral
 
+    @property
+    def follows_accelerations(self) -> bool:
+        """Whether commands contain what the accelerations of the reference take, by the masses."""
+        return self.gain_units != FORCE_GAINS or self._weighs
+
     def automatic_effort(self, symbols: Mapping[str, ca.SX]) -> ca.SX:
         """Return the efforts (m,) of automatic gains, for a law that commands forces; else zeros.
 

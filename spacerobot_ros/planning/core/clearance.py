@@ -57,15 +57,21 @@ class Clearance:
         The robot, with its world.
     distance
         Smallest distance of links that no joint connects, and of links and obstacles, m.
+    parameter
+        Name of its parameter, for messages.
     """
 
-    def __init__(self, robot: RobotDescription, distance: float) -> None:
-        self._robot = robot
+    def __init__(
+        self, robot: RobotDescription, distance: float, parameter: str = "planner.clearance"
+    ) -> None:
+        self._robot, self._parameter = robot, parameter
         self.distance = distance
         self._warned: set[str] = set()
 
     @classmethod
-    def wanted(cls, robot: RobotDescription, distance: float) -> Clearance | None:
+    def wanted(
+        cls, robot: RobotDescription, distance: float, parameter: str = "planner.clearance"
+    ) -> Clearance | None:
         """Return the clearance of a robot that is asked for; None: none, by a distance of zero.
 
         Among obstacles, a distance of zero stands for 0.01 m.
@@ -79,11 +85,11 @@ class Clearance:
             raise ParameterError(f"clearance is {distance}; it must be a distance in m, 0 or more.")
         if robot.world is not None:
             distance = distance or _CLEARANCE_OF_OBSTACLES
-        return cls(robot, distance) if distance else None
+        return cls(robot, distance, parameter) if distance else None
 
     def of(self, robot: RobotDescription) -> Clearance:
         """Return the same clearance of another robot among the same obstacles."""
-        return Clearance(replace(robot, world=self._robot.world), self.distance)
+        return Clearance(replace(robot, world=self._robot.world), self.distance, self._parameter)
 
     @cached_property
     def geometry(self) -> CollisionGeometry:
@@ -141,7 +147,7 @@ class Clearance:
                 remedy = "" if isinstance(links, ObstaclePair) else _SRDF_REMEDY
                 raise PlanningError(
                     f"{sentence_case(links.subject)} are {distance:.3g} m apart at the start, "
-                    f"nearer than planner.clearance = {self.distance:g} m: make it smaller{remedy}."
+                    f"nearer than {self._parameter} = {self.distance:g} m: make it smaller{remedy}."
                 )
             else:
                 required[pair] = min(self.distance, distance)
@@ -162,7 +168,7 @@ class Clearance:
             ):
                 raise UnreadMeshError(
                     f"Link '{each.link}' cannot be kept clear of others: {each.reason} Or have an "
-                    "SRDF disable its pairs (planner.srdf), or set planner.clearance to 0."
+                    f"SRDF disable its pairs (planner.srdf), or set {self._parameter} to 0."
                 )
             warn_once(each.note)
 
@@ -238,7 +244,7 @@ class Clearance:
             when = f" after {approach.tick * control_period:.4g} s,"
         shape = np.round(approach.shape, 3).tolist()
         return (
-            f"{approach}{when} at the shape {shape}, and planner.clearance is {self.distance:g} m"
+            f"{approach}{when} at the shape {shape}, and {self._parameter} is {self.distance:g} m"
         )
 
     def require_shape(self, shape: Array, required: Array, base: BasePoses | None = None) -> None:
@@ -256,7 +262,7 @@ class Clearance:
         if found:
             subject = "shape" if found[0].place_on_obstacle is None else "pose"
             raise UnreachableError(
-                f"The {subject} of the goal is in collision: {found[0]}; planner.clearance is "
+                f"The {subject} of the goal is in collision: {found[0]}; {self._parameter} is "
                 f"{self.distance:g} m.",
                 Proof.COLLISION,
             )

@@ -126,11 +126,6 @@ class PlannerConfig(CommanderConfig):
         minimum=0,
         maximum=1000000.0,
     )
-    plan_in_background: bool = parameter(
-        True,
-        "plan in a thread while the robot keeps moving; false, or a lockstep plant: states wait "
-        "for the plan",
-    )
     options: Mapping[str, Any] = registered(METHODS)
 
     def described(self, robot: RobotDescription) -> RobotDescription:

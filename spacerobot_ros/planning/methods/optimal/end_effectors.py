@@ -33,6 +33,7 @@ from spacerobot_ros.model.rotations import (
     quaternions_from_rotvecs,
     swing_angle,
 )
+from spacerobot_ros.model.symbolic_rotations import half_angle_vector
 from spacerobot_ros.model.symbolic_rotations import (
     matrix_from_quaternion as symbolic_matrix_from_quaternion,
 )
@@ -63,9 +64,6 @@ _MIN_MOTION = 1e-9
 
 _PARAMETERS_PER_LINK = 7
 """Numbers that a goal of a link takes: r_CE and a quaternion."""
-
-_HALF_TURN_ROUNDING = 1e-9
-"""Keeps the derivatives of the rotation error finite at half a turn."""
 
 _STARTS, _ADDITIONAL_STARTS = 16, 96
 """Start shapes of inverse kinematics, and additional ones where none of these succeeds."""
@@ -147,10 +145,7 @@ class EndEffectorRows:
             if len(each.rotations):
                 R_E = R_X @ R_all[:, 3 * index : 3 * index + 3]
                 turned = R_E @ symbolic_matrix_from_quaternion(goal[3:]).T
-                # Twice the sine of half the angle, about the axis of the rotation.
-                vector = ca.inv_skew((turned - turned.T) / 2) * 2
-                scale = ca.sqrt(ca.fmax(1 + ca.trace(turned), 0) + _HALF_TURN_ROUNDING)
-                rows.append(ca.DM(each.rotations) @ (vector / scale))
+                rows.append(ca.DM(each.rotations) @ half_angle_vector(turned))
         return ca.Function("end_effectors", [X, q, parameters], [ca.vertcat(*rows)])
 
     def pack(self, state: RobotState, goals: Sequence[EndEffectorGoal]) -> Array:

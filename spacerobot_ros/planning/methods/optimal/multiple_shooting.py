@@ -30,7 +30,7 @@ _INFEASIBLE = "Infeasible_Problem_Detected"
 TOLERANCE = 1e-5
 """Durations within a thousandth of a control period, for manoeuvres of some seconds."""
 
-_IPOPT_OPTIONS = {
+IPOPT_OPTIONS = {
     "print_time": False,
     # All derivatives are given: the solver is not to derive more.
     "no_nlp_grad": True,
@@ -177,9 +177,10 @@ class MultipleShooting:
         self.turn = stages.rotation_of_step
         self._drifting = stages.drifting
         self._program = program(stages, intervals)
+        self._layout = Layout.of(stages, intervals)
         # The solver's matrices are small: threads of its linear algebra would wait for each other.
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-        self._monitor = _SolverMonitor(
+        self._monitor = SolverMonitor(
             self._program.problem, self._program.lower, self._program.upper
         )
         self._has_distances = stages.distances is not None
@@ -193,7 +194,7 @@ class MultipleShooting:
             "ipopt",
             self._program.problem,
             {
-                **_IPOPT_OPTIONS,
+                **IPOPT_OPTIONS,
                 **options,
                 "ipopt.tol": self._tolerance,
                 "jac_g": self._program.jac_g,
@@ -243,7 +244,7 @@ class MultipleShooting:
         refining
             Whether the guess is a solution on a coarser grid.
         """
-        N, layout = self.intervals, self._program.layout
+        N, layout = self.intervals, self._layout
         vertices = np.array([np.tile(x, (N + 1, 1)) for x in (limits.lower, limits.upper)])
         if near is not None:
             middle = np.clip(guess.shapes + guess.step * guess.velocities / 2, *vertices)
@@ -313,13 +314,13 @@ class MultipleShooting:
     def _initial_variables(self, guess: Trajectory, lack: float) -> Array:
         h, v = guess.step, guess.velocities
         a = np.diff(v, axis=0) / h
-        x = _pack_knots(self._program.layout, h, guess.quaternions, guess.shapes + h * v / 2, v, a)
-        if self._program.layout.has_lack:
+        x = _pack_knots(self._layout, h, guess.quaternions, guess.shapes + h * v / 2, v, a)
+        if self._layout.has_lack:
             x[-1] = lack / 2
         return x
 
     def _unpack_trajectory(self, x: Array) -> Trajectory:
-        h, (X, s, v, _) = float(x[0]), (x[each] for each in self._program.layout.knots())
+        h, (X, s, v, _) = float(x[0]), (x[each] for each in self._layout.knots())
         return Trajectory(h, s - h * v / 2, v, X)
 
 
@@ -364,7 +365,7 @@ def _pack_knots(layout: Layout, step: float, *knots: Array) -> Array:
     return x
 
 
-class _SolverMonitor(ca.Callback):
+class SolverMonitor(ca.Callback):
     """Receives every iterate: keeps the best feasible one, and stops the solver."""
 
     def __init__(self, problem: dict[str, ca.MX], lower: Array, upper: Array) -> None:
@@ -376,6 +377,7 @@ class _SolverMonitor(ca.Callback):
         self.construct("watch", {})
 
     def begin(self, stop: StopRule) -> None:
+        """Forget the iterates of earlier solves; stop the next one by a rule."""
         self.best, self._least, self._stop, self._iterates = None, math.inf, stop, 0
 
     def get_n_in(self) -> int:
@@ -397,6 +399,7 @@ class _SolverMonitor(ca.Callback):
     def eval_buffer(
         self, arguments: tuple[memoryview, ...], results: tuple[memoryview, ...]
     ) -> int:
+        """Look at an iterate; return whether the solver stops, by its results."""
         x, f, g = (np.frombuffer(each) for each in arguments[:3])
         if f[0] < self._least:
             worst = max((self._lower - g).max(), (g - self._upper).max())

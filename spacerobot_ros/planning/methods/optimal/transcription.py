@@ -267,55 +267,106 @@ def _interval_block(
     h, direction = ca.SX.sym("h"), ca.SX.sym("direction", _DIRECTION_SIZE)
     L_0 = ca.SX.sym("L_0", 3 if drifting else 0)
     z = ca.vertcat(h, X, s, v, a, X_next, s_next, v_next)
-    # Common subexpressions are found in this function: in the expressions of an interval that takes
-    # several times as long, and finds one more in a hundred.
-    rotation = _rotation_with_derivatives(robot, drifting=drifting)
-    points = [_state_within_interval(tau, s, h * v, h * v_next) for tau in GAUSS]
+    points = [state_within_interval(tau, s, h * v, h * v_next) for tau in GAUSS]
     if drifting:
         points = [
-            ca.vertcat(point, h * _momentum_in_base(tau, X, X_next, L_0))
+            ca.vertcat(point, h * momentum_in_base(tau, X, X_next, L_0))
             for tau, point in zip(GAUSS, points, strict=True)
         ]
-    weights = [ca.SX.sym(f"mu_{i}", 3) for i in range(len(GAUSS))]
-    at_points = [rotation(point, mu) for point, mu in zip(points, weights, strict=True)]
-    rates = [w for w, _, _ in at_points]
+    attitude = AttitudeRows.of(
+        z, X, X_next, points, rotation_with_derivatives(robot, drifting=drifting)
+    )
     motion = ca.vertcat(v_next - v - h * a, s_next - s - h * v_next)
 
-    # The attitude is derived by the chain rule, as only terms with the robot's inertia are large.
-    w = [ca.SX.sym(f"w_{i}", 3) for i in range(len(GAUSS))]
-    by_attitude = ca.SX.sym("lambda_X", 4)
-    inner = ca.vertcat(X, *w)
-    stepped = quaternion_multiply(X, quaternion_from_small_rotvec(magnus(*w)))
-    outer_hess, outer_grad = ca.hessian(-ca.dot(by_attitude, stepped), inner)
-    stepped, outer_jac, outer_hess, outer_grad = ca.substitute(
-        [stepped, ca.jacobian(stepped, inner), outer_hess, outer_grad], w, rates
+    kept = _path_constraint_rows(
+        n, constraints, inequalities, z, attitude.rotations, direction, L_0
     )
-    by_rate = ca.vertsplit(outer_grad[4:], 3)
-    point_jac = [ca.jacobian(point, z) for point in points]
-    inner_jac = ca.vertcat(
-        ca.jacobian(X, z), *(W @ P for (_, W, _), P in zip(at_points, point_jac, strict=True))
-    )
-    attitude_jac = ca.jacobian(X_next, z) - outer_jac @ inner_jac
-    attitude_hess = inner_jac.T @ outer_hess @ inner_jac
-    for point, P, (_, W, H), mu in zip(points, point_jac, at_points, weights, strict=True):
-        weight = ca.SX.sym("weight", point.numel())
-        bend = ca.substitute(ca.hessian(ca.dot(weight, point), z)[0], weight, ca.densify(W.T @ mu))
-        attitude_hess += P.T @ H @ P + bend
-    attitude_hess = ca.substitute(attitude_hess, ca.vertcat(*weights), ca.vertcat(*by_rate))
-
-    kept = _path_constraint_rows(n, constraints, inequalities, z, rates, direction, L_0)
     by_motion, by_path = ca.SX.sym("lambda_v", 2 * n), ca.SX.sym("lambda_g", kept.shape[0])
     plain = ca.dot(by_motion, motion) + ca.dot(by_path, kept)
     return ConstraintBlock.with_derivatives(
         "interval",
         z,
         ca.vertcat(direction, L_0),
-        ca.vertcat(by_motion, by_attitude, by_path),
-        ca.vertcat(motion, X_next - stepped, kept),
-        ca.vertcat(ca.jacobian(motion, z), attitude_jac, ca.jacobian(kept, z)),
-        ca.hessian(plain, z)[0] + attitude_hess,
+        ca.vertcat(by_motion, attitude.multiplier, by_path),
+        ca.vertcat(motion, attitude.rows, kept),
+        ca.vertcat(ca.jacobian(motion, z), attitude.jacobian, ca.jacobian(kept, z)),
+        ca.hessian(plain, z)[0] + attitude.hessian,
         repetitive=kept.numel() > 0,
     )
+
+
+@dataclass(frozen=True)
+class AttitudeRows:
+    """Rows (4,) of an interval that vanish where its attitudes follow from the rotations at the
+    Gauss points, with their derivatives by its variables.
+
+    Attributes
+    ----------
+    rotations
+        The rotations (3,) at the Gauss points, as if each lasted the whole interval.
+    rows, jacobian
+        The rows and their Jacobian.
+    multiplier, hessian
+        Multipliers (4,) of the rows, and the Hessian of their product.
+    """
+
+    rotations: list[ca.SX]
+    rows: ca.SX
+    jacobian: ca.SX
+    multiplier: ca.SX
+    hessian: ca.SX
+
+    @classmethod
+    def of(
+        cls,
+        z: ca.SX,
+        X: ca.SX,
+        X_next: ca.SX,
+        points: Sequence[ca.SX],
+        rotation: ca.Function,
+        defect: ca.SX | None = None,
+    ) -> AttitudeRows:
+        """Derive the rows by the chain rule, as only terms with the robot's inertia are large.
+
+        Parameters
+        ----------
+        z, X, X_next
+            Variables of the interval, and the attitudes (4,) at its ends among them.
+        points
+            The arguments of ``rotation`` at the Gauss points.
+        rotation
+            Rotation, its Jacobian and the Hessian of its product with multipliers. Common
+            subexpressions are found in it: in the expressions of an interval that takes several
+            times as long, and finds one more in a hundred.
+        defect
+            A parameter (3,) that is added to the rotation vector of the step; None: none.
+        """
+        weights = [ca.SX.sym(f"mu_{i}", 3) for i in range(len(points))]
+        at_points = [rotation(point, mu) for point, mu in zip(points, weights, strict=True)]
+        rates = [w for w, _, _ in at_points]
+        w = [ca.SX.sym(f"w_{i}", 3) for i in range(len(points))]
+        multiplier = ca.SX.sym("lambda_X", 4)
+        inner = ca.vertcat(X, *w)
+        step = magnus(*w) if defect is None else magnus(*w) + defect
+        stepped = quaternion_multiply(X, quaternion_from_small_rotvec(step))
+        outer_hess, outer_grad = ca.hessian(-ca.dot(multiplier, stepped), inner)
+        stepped, outer_jac, outer_hess, outer_grad = ca.substitute(
+            [stepped, ca.jacobian(stepped, inner), outer_hess, outer_grad], w, rates
+        )
+        by_rate = ca.vertsplit(outer_grad[4:], 3)
+        point_jac = [ca.jacobian(point, z) for point in points]
+        inner_jac = ca.vertcat(
+            ca.jacobian(X, z), *(W @ P for (_, W, _), P in zip(at_points, point_jac, strict=True))
+        )
+        hessian = inner_jac.T @ outer_hess @ inner_jac
+        for point, P, (_, W, H), mu in zip(points, point_jac, at_points, weights, strict=True):
+            weight = ca.SX.sym("weight", point.numel())
+            by_point = ca.densify(W.T @ mu)
+            bend = ca.substitute(ca.hessian(ca.dot(weight, point), z)[0], weight, by_point)
+            hessian += P.T @ H @ P + bend
+        hessian = ca.substitute(hessian, ca.vertcat(*weights), ca.vertcat(*by_rate))
+        jacobian = ca.jacobian(X_next, z) - outer_jac @ inner_jac
+        return cls(rates, X_next - stepped, jacobian, multiplier, hessian)
 
 
 def _distance_block(n: int, pairs: Sequence[PlaneDistance], instants: int) -> ConstraintBlock:
@@ -403,19 +454,19 @@ def _path_constraint_rows(
             rows.append(1 - ca.sumsqr(w / fastest))
     for each in inequalities:
         for tau in each.instants:
-            point = _state_within_interval(tau, s, h * v, h * v_next)
-            drift = [_momentum_in_base(tau, X, X_next, L_0)] if L_0.numel() else []
+            point = state_within_interval(tau, s, h * v, h * v_next)
+            drift = [momentum_in_base(tau, X, X_next, L_0)] if L_0.numel() else []
             rows.append(each.function(point[:n], point[n:] / h, a, *drift))
     return ca.vertcat(*rows)
 
 
-def _state_within_interval(tau: float, s: ca.SX, u: ca.SX, u_next: ca.SX) -> ca.SX:
+def state_within_interval(tau: float, s: ca.SX, u: ca.SX, u_next: ca.SX) -> ca.SX:
     """Return shape and step (2 n,) in an interval with vertex s, tau of the way."""
     change = u_next - u
     return ca.vertcat(s + (tau - 1 / 2) * u + tau**2 / 2 * change, u + tau * change)
 
 
-def _momentum_in_base(tau: float, X: ca.SX, X_next: ca.SX, L_0: ca.SX) -> ca.SX:
+def momentum_in_base(tau: float, X: ca.SX, X_next: ca.SX, L_0: ca.SX) -> ca.SX:
     """Return the angular momentum (3,) in the base, tau of the way between two attitudes."""
     mean = (1 - tau) * X + tau * X_next
     v, w = mean[:3], mean[3]
@@ -440,7 +491,7 @@ def _rotation_symbols(robot: SpaceRobot, drifting: bool) -> list[tuple[str, int]
     return [("q", robot.n), ("u", robot.n), ("l", 3 if drifting else 0)]
 
 
-def _rotation_with_derivatives(robot: SpaceRobot, *, drifting: bool) -> ca.Function:
+def rotation_with_derivatives(robot: SpaceRobot, *, drifting: bool) -> ca.Function:
     """Return the rotation w, its Jacobian, and the Hessian of ``mu' w``, of the point and mu.
 
     By differentiating ``D w + D_q u = 0``, or l on the right, once and twice.
@@ -478,7 +529,7 @@ def turn_function(robot: SpaceRobot, *, drifting: bool = False) -> ca.Function:
     impulse = ca.SX.sym("impulse", 3 if drifting else 0)
     rotation = _rotation(robot, drifting=drifting)
     rates = [
-        rotation(ca.vertcat(_state_within_interval(tau, q + u / 2, u, u_next), impulse))
+        rotation(ca.vertcat(state_within_interval(tau, q + u / 2, u, u_next), impulse))
         for tau in GAUSS
     ]
     arguments = [q, u, u_next, impulse] if drifting else [q, u, u_next]
@@ -496,6 +547,11 @@ class Layout:
     joints: int
     intervals: int
     has_lack: bool = False
+
+    @classmethod
+    def of(cls, stages: Stages, intervals: int) -> Layout:
+        """Return the indices of the problem of some stages."""
+        return cls(stages.joints, intervals, stages.distances is not None)
 
     @property
     def _knot(self) -> int:
@@ -518,7 +574,6 @@ class Layout:
 class Program:
     """Functions of variables x and parameters p, as IPOPT takes them; the bounds are those of g."""
 
-    layout: Layout
     problem: dict[str, ca.MX]
     jac_g: ca.Function
     hess_lag: ca.Function
@@ -527,7 +582,7 @@ class Program:
 
 
 @dataclass(frozen=True)
-class _PlacedBlock:
+class PlacedBlock:
     """A block placed at every interval or end of the program.
 
     ``variables`` and ``rows`` (count, ...) are the places of its variables in x and of its rows in
@@ -561,7 +616,7 @@ class _PlacedBlock:
 def program(stages: Stages, intervals: int) -> Program:
     """Assemble the program from the stages of a problem."""
     n, N = stages.joints, intervals
-    layout = Layout(n, N, stages.distances is not None)
+    layout = Layout.of(stages, N)
     X, s, v, a = layout.knots()
     x = ca.MX.sym("x", layout.size)
     kept = 0 if stages.distances is None else stages.distances.rows
@@ -581,19 +636,19 @@ def program(stages: Stages, intervals: int) -> Program:
     equalities = first + N * dynamics + stages.end.rows
     of_path = equalities + np.arange(N * stages.path_row_count).reshape(N, stages.path_row_count)
     placed = [
-        _PlacedBlock(
+        PlacedBlock(
             stages.beginning,
             np.hstack([zero[:1], s[:1], v[:1]]),
             np.arange(first)[np.newaxis],
             p["start"],
         ),
-        _PlacedBlock(
+        PlacedBlock(
             stages.interval,
             np.hstack([zero, X[:-1], s[:-1], v[:-1], a, X[1:], s[1:], v[1:]]),
             np.hstack([of_intervals, of_path]),
             ca.vertcat(p["direction"], p["angular_momentum"]),
         ),
-        _PlacedBlock(
+        PlacedBlock(
             stages.end,
             np.hstack([X[-1:], s[-1:]]),
             of_end,
@@ -606,20 +661,32 @@ def program(stages: Stages, intervals: int) -> Program:
         lack = np.full((N, 1), layout.size - 1)
         variables = np.hstack([zero, X[:-1], s[:-1], v[:-1], X[1:], v[1:], lack])
         of_places = ca.reshape(p["distances"], -1, N)
-        placed.append(_PlacedBlock(stages.distances, variables, of_distances, of_places))
+        placed.append(PlacedBlock(stages.distances, variables, of_distances, of_places))
     change = ca.reshape(x[a.ravel().tolist()], n, N) / ca.repmat(p["typical"], 1, N)
     f = p["weights"][0] * N * x[0] + p["weights"][1] * ca.sumsqr(change) / N
     if layout.has_lack:
         f += p["weights"][2] * x[-1]
 
+    return assembled(x, ca.vertcat(*p.values()), f, placed, rows, equalities)
+
+
+def assembled(
+    x: ca.MX,
+    parameters: ca.MX,
+    f: ca.MX,
+    placed: Sequence[PlacedBlock],
+    rows: int,
+    equalities: int,
+) -> Program:
+    """Return the program of an objective f and of blocks, whose rows after the equalities are
+    ``>= 0``.
+    """
     g = _gather_rows(rows, [(each.rows, each.called(each.block.values, x)[0]) for each in placed])
     values, jacobian = _jacobian(placed, x, rows)
     lam_f, lam_g = ca.MX.sym("lam_f"), ca.MX.sym("lam_g", rows)
     of_objective = ca.triu(ca.hessian(lam_f * f, x)[0])
     hessian = of_objective + _hessian(placed, x, lam_g)
-    parameters = ca.vertcat(*p.values())
     return Program(
-        layout,
         {"x": x, "p": parameters, "f": f, "g": g},
         ca.Function("jac_g", [x, parameters], [values, jacobian]),
         ca.Function("hess_lag", [x, parameters, lam_f, lam_g], [hessian]),
@@ -636,7 +703,7 @@ def _gather_rows(rows: int, parts: Sequence[tuple[Indices, ca.MX]]) -> ca.MX:
     return ca.vertcat(*(values for _, values in parts))[order.tolist()]
 
 
-def _jacobian(placed: Sequence[_PlacedBlock], x: ca.MX, rows: int) -> tuple[ca.MX, ca.MX]:
+def _jacobian(placed: Sequence[PlacedBlock], x: ca.MX, rows: int) -> tuple[ca.MX, ca.MX]:
     values, nonzeros, at_row, at_column = [], [], [], []
     for each in placed:
         g, J = each.called(each.block.jacobian, x)
@@ -650,7 +717,7 @@ def _jacobian(placed: Sequence[_PlacedBlock], x: ca.MX, rows: int) -> tuple[ca.M
     )
 
 
-def _hessian(placed: Sequence[_PlacedBlock], x: ca.MX, lam_g: ca.MX) -> ca.MX:
+def _hessian(placed: Sequence[PlacedBlock], x: ca.MX, lam_g: ca.MX) -> ca.MX:
     """Return the upper triangle of the Hessian of ``lambda' g``."""
     nonzeros, at_row, at_column = [], [], []
     for each in placed:

@@ -10,10 +10,12 @@ import math
 
 import numpy as np
 
-from spacerobot_ros.control.outputs import AXES
 from spacerobot_ros.model.description import Array, Pose
 from spacerobot_ros.model.rotations import quaternion_from_matrix, rotvec_from_quaternion
 from spacerobot_ros.model.space_robot import SpaceRobot
+
+AXES: tuple[str, ...] = ("x", "y", "z", "rx", "ry", "rz")
+"""Components in W of a position and of a rotation."""
 
 REACHED_DISTANCE = 1e-3
 """Error of an end-effector (m, rad) below which an arm follows its path."""

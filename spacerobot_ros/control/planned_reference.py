@@ -1,0 +1,246 @@
+"""References that a plan under thrust gives, and the work of planning beside the control loop."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from threading import Thread
+from typing import ClassVar
+
+import numpy as np
+
+from spacerobot_ros.control.limits import ActuatorLimits, MotionLimits
+from spacerobot_ros.control.outputs import OutputSelection
+from spacerobot_ros.control.reference import ReferenceProfile
+from spacerobot_ros.control.state import (
+    Actuation,
+    ControlState,
+    JointReference,
+    PoseReference,
+    Reference,
+)
+from spacerobot_ros.errors import ParameterError, PlanningError
+from spacerobot_ros.model.description import Array
+from spacerobot_ros.model.rotations import matrix_from_quaternion
+from spacerobot_ros.model.space_robot import SpaceRobot
+from spacerobot_ros.model.thrusters import find_thrusters
+from spacerobot_ros.parameters import parameter
+from spacerobot_ros.planning.core.cancellation import Cancellation, PlanningCancelled
+from spacerobot_ros.planning.methods.thrust.motion import FrameSample, ThrustMotion
+from spacerobot_ros.planning.methods.thrust.propulsion import Propulsion
+from spacerobot_ros.planning.methods.thrust.search import (
+    ThrustGoal,
+    ThrustOptions,
+    ThrustPlanner,
+    ThrustStart,
+)
+
+
+@dataclass(frozen=True)
+class PlannedOptions(ThrustOptions):
+    """The options of planned references."""
+
+    thrusters: str = parameter(
+        "",
+        "table of the thrusters that a plan uses: 'urdf' or a YAML file; '': a wrench within "
+        "max_force and max_torque",
+    )
+
+
+class PlannedReference(ReferenceProfile):
+    """A motion of base and joints that is planned under the thrust there is, around obstacles.
+
+    Parameters
+    ----------
+    start, goal, limits, carries
+        Those of every profile.
+    motion
+        The plan.
+    """
+
+    name: ClassVar[str] = "planned"
+
+    def __init__(
+        self,
+        start: Reference,
+        goal: Reference,
+        limits: MotionLimits,
+        motion: ThrustMotion,
+        *,
+        carries: bool = False,
+    ) -> None:
+        super().__init__(start, goal, limits, carries=carries)
+        self.motion, self.duration = motion, motion.duration
+
+    def at(self, time: float) -> Reference:
+        """Return the reference ``time`` s after its start."""
+        if time >= self.duration:
+            return self.goal
+        sample, goal = self.motion.at(time), self.goal
+        hand = sample.end_effector
+        return Reference(
+            None if goal.base is None else _pose(sample.base),
+            None if goal.end_effector is None or hand is None else _pose(hand),
+            None if goal.joints is None else JointReference(sample.q, sample.qdot, sample.qddot),
+        )
+
+    def actuation(self, time: float) -> Actuation:
+        """Return the wrench and efforts of the plan ``time`` s after its start; none at its end."""
+        if not 0.0 <= time < self.duration:
+            return Actuation(np.zeros(6), np.zeros(self.motion.joints))
+        sample = self.motion.at(time)
+        return Actuation(sample.wrench_B, sample.tau)
+
+
+def _pose(frame: FrameSample) -> PoseReference:
+    return PoseReference(*frame)
+
+
+class ReferencePlanner:
+    """Plans the references of one controller.
+
+    Parameters
+    ----------
+    robot
+        The model that the law controls: without wheels, whose torque a plan does not use.
+    outputs
+        The outputs of the law.
+    limits
+        Limits of the thrusters, which count without a table.
+    options
+        The options of the plan.
+
+    Raises
+    ------
+    ParameterError
+        The thrust has no limits, or cannot produce every wrench; or an option is refused.
+    """
+
+    def __init__(
+        self,
+        robot: SpaceRobot,
+        outputs: OutputSelection,
+        limits: ActuatorLimits,
+        options: PlannedOptions,
+    ) -> None:
+        self._outputs = outputs
+        if options.thrusters:
+            table = find_thrusters(options.thrusters, robot.description)
+            propulsion = Propulsion.of_table(table, options.reserve)
+        else:
+            propulsion = Propulsion.within(limits.force, limits.torque, options.reserve)
+        if not outputs.base:
+            raise ParameterError(
+                "The profile 'planned' moves a base whose pose is controlled: set base_outputs, or "
+                "profile to quintic."
+            )
+        self._planner = ThrustPlanner(robot, propulsion, options, outputs.end_effector_link)
+
+    def plan(
+        self,
+        start: Reference,
+        goal: Reference,
+        state: ControlState,
+        limits: MotionLimits,
+        cancellation: Cancellation,
+        *,
+        carries: bool,
+    ) -> PlannedReference:
+        """Return the planned reference from one reference to another, at rest.
+
+        ``state`` has the joints where no reference does. With ``carries`` the arm keeps its shape.
+
+        Raises
+        ------
+        PlanningError
+            No motion is found.
+        """
+        base, joints = start.base, start.joints if self._outputs.joints else None
+        assert base is not None
+        assert goal.base is not None
+        R_BW = matrix_from_quaternion(base.quaternion).T
+        q, qdot = (state.q, state.qdot) if joints is None else (joints.q, joints.qdot)
+        begin = ThrustStart(
+            np.concatenate([base.position, base.quaternion]),
+            R_BW @ base.velocity,
+            R_BW @ base.angular_velocity,
+            q.copy(),
+            qdot.copy() if _moves(base) else np.zeros(len(q)),
+        )
+        hand, shape = None, None
+        if self._outputs.joints and goal.joints is not None:
+            shape = goal.joints.q
+        elif carries or not self._outputs.end_effector:
+            shape = q
+        if shape is None and goal.end_effector is not None:
+            hand = _numbers(goal.end_effector)
+        end = ThrustGoal(_numbers(goal.base), hand, shape)
+        motion = self._planner.plan(begin, end, cancellation)
+        return PlannedReference(start, goal, limits, motion, carries=carries)
+
+
+def _moves(pose: PoseReference) -> bool:
+    return bool(np.any(pose.velocity) or np.any(pose.angular_velocity))
+
+
+def _numbers(pose: PoseReference) -> Array:
+    return np.concatenate([pose.position, pose.quaternion])
+
+
+class PlanJob:
+    """A plan in the making, in a thread or at once.
+
+    Parameters
+    ----------
+    work
+        Returns the plan, or raises PlanningError.
+    begins
+        Time at which the plan begins if it is ready by then, s; minus infinity: when it is ready.
+    in_background
+        Whether a thread does the work.
+    """
+
+    def __init__(
+        self,
+        work: Callable[[Cancellation], PlannedReference],
+        begins: float,
+        *,
+        in_background: bool,
+    ) -> None:
+        self.begins = begins
+        self.done = False
+        self._cancellation = Cancellation()
+        self._work = work
+        self._result: PlannedReference | None = None
+        self._error: BaseException | None = None
+        if in_background:
+            Thread(target=self._run, daemon=True).start()
+        else:
+            self._run()
+
+    def _run(self) -> None:
+        try:
+            self._result = self._work(self._cancellation)
+        except PlanningCancelled:
+            pass
+        except BaseException as error:
+            self._error = error
+        self.done = True
+
+    def cancel(self) -> None:
+        """End the work; its result is dropped."""
+        self._cancellation.cancel()
+
+    def result(self) -> PlannedReference:
+        """Return the plan.
+
+        Raises
+        ------
+        PlanningError
+            There is none.
+        """
+        if self._error is not None:
+            raise self._error
+        if self._result is None:
+            raise PlanningError("Planning was cancelled.")
+        return self._result

@@ -1,0 +1,96 @@
+"""What pushes a base: a table of thrusters, or a wrench in any direction within two norms."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from spacerobot_ros.errors import ParameterError
+from spacerobot_ros.model.description import Array
+from spacerobot_ros.model.thrusters import ThrusterTable
+
+
+@dataclass(frozen=True)
+class Propulsion:
+    """Levels (m,) whose wrench on the base is ``wrenches @ levels``, and what they cost.
+
+    Attributes
+    ----------
+    wrenches
+        (6, m) force (N) over torque (N m) at the origin of the base link, in base components, at
+        level one.
+    cost
+        (m,) cost of a second at level one: kg of propellant where there is a table, else N s of
+        impulse.
+    norms
+        Groups of levels whose Euclidean norm is at most one, and which go from -1 to 1. All other
+        levels go from 0 to 1.
+    """
+
+    wrenches: Array
+    cost: Array
+    norms: tuple[tuple[int, ...], ...] = ()
+
+    @property
+    def size(self) -> int:
+        """m."""
+        return int(self.wrenches.shape[1])
+
+    @property
+    def lowest(self) -> Array:
+        """Lowest levels (m,): -1 within norms, else 0."""
+        lowest = np.zeros(self.size)
+        lowest[[i for group in self.norms for i in group]] = -1.0
+        return lowest
+
+    @classmethod
+    def of_table(cls, table: ThrusterTable, reserve: float = 0.0) -> Propulsion:
+        """Return thrusters of a table, of whose levels a share is left to feedback.
+
+        Raises
+        ------
+        ParameterError
+            They cannot produce every wrench.
+        """
+        missing = table.missing()
+        if missing:
+            raise ParameterError(
+                f"The thrusters cannot produce {missing}; motions under thrust are planned for "
+                "bases that can be pushed and turned in every direction."
+            )
+        share = 1.0 - reserve
+        return cls(share * table.wrenches, share * table.mass_flow)
+
+    @classmethod
+    def within(cls, force: float, torque: float, reserve: float = 0.0) -> Propulsion:
+        """Return a wrench of a largest force (N) and torque (N m), each in Euclidean norm.
+
+        Raises
+        ------
+        ParameterError
+            A limit is not positive, or not finite.
+        """
+        for name, value in (("force", force), ("torque", torque)):
+            if not (value > 0 and math.isfinite(value)):
+                raise ParameterError(
+                    f"The {name} limit of the thrusters is {value:g}; a motion under thrust is "
+                    f"planned within a finite one: set max_{name}."
+                )
+        limits = (1.0 - reserve) * np.repeat([force, torque], 3)
+        return cls(np.diag(limits), limits, ((0, 1, 2), (3, 4, 5)))
+
+    def cost_of(self, levels: Array) -> Array:
+        """Return what levels (..., m) cost a second (...)."""
+        within = [i for group in self.norms for i in group]
+        cost = np.delete(levels, within, -1) @ np.delete(self.cost, within)
+        for group in self.norms:
+            cost = cost + self.cost[group[0]] * np.linalg.norm(levels[..., list(group)], axis=-1)
+        return np.asarray(cost)
+
+    def levels_for(self, wrenches: Array) -> Array:
+        """Return levels (K, m) that come nearest to wrenches (K, 6), clipped to their limits."""
+        # Least squares of thrusters that pull too, then without pulling: a guess for a solver.
+        levels = wrenches @ np.linalg.pinv(self.wrenches).T
+        return np.clip(levels, self.lowest, 1.0)

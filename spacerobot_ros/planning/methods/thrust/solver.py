@@ -1,0 +1,336 @@
+"""The program of a motion under thrust (:mod:`.transcription`), solved by IPOPT."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import NamedTuple
+
+import casadi as ca
+import numpy as np
+
+from spacerobot_ros.model.description import Array
+from spacerobot_ros.model.rotations import (
+    quaternion_multiply,
+    rotvecs_from_quaternions,
+)
+from spacerobot_ros.planning.methods.optimal.multiple_shooting import (
+    IPOPT_OPTIONS,
+    DurationBounds,
+    SolverMonitor,
+    StopRule,
+)
+from spacerobot_ros.planning.methods.optimal.problem import MotionLimits
+from spacerobot_ros.planning.methods.optimal.transcription import ConstraintBlock
+from spacerobot_ros.planning.methods.thrust.transcription import (
+    DEFECT_SIZE,
+    ThrustLayout,
+    ThrustStages,
+    thrust_program,
+)
+
+_TOLERANCE = 1e-6
+
+_WARM = {
+    "ipopt.mu_init": 1e-2,
+    "ipopt.bound_push": 1e-3,
+    "ipopt.bound_frac": 1e-3,
+    "ipopt.tol": 1e-3,
+    "ipopt.dual_inf_tol": 1e-1,
+}
+"""The guess is clear of its planes, or nearly so; planes made anew follow its solution."""
+
+_CONTINUED = {
+    "ipopt.mu_init": 1e-5,
+    "ipopt.constr_viol_tol": 1e-9,
+    "ipopt.tol": 1e-8,
+    "ipopt.warm_start_init_point": "yes",
+    **{
+        f"ipopt.warm_start_{of}": 1e-7
+        for of in (
+            *("bound_push", "bound_frac", "slack_bound_push", "slack_bound_frac"),
+            "mult_bound_push",
+        )
+    },
+}
+"""The guess is a solution with other defects or weights."""
+
+
+@dataclass(frozen=True)
+class ThrustKnots:
+    """N intervals of ``step`` seconds: states at N + 1 knots, controls of N intervals.
+
+    ``quaternions`` (N + 1, 4) of R_WB; ``shapes``, ``velocities`` (N + 1, n) of the joints;
+    ``L_W`` (N + 1, 3) about the centre of mass, N m s; ``r_WC``, ``v_WC`` (N + 1, 3) of the centre
+    of mass, m; ``accelerations`` (N, n) and ``levels`` (N, m).
+    """
+
+    step: float
+    quaternions: Array
+    shapes: Array
+    velocities: Array
+    L_W: Array
+    r_WC: Array
+    v_WC: Array
+    accelerations: Array
+    levels: Array
+
+    @property
+    def duration(self) -> float:
+        """s."""
+        return self.step * len(self.levels)
+
+    @property
+    def states(self) -> Array:
+        """``[X; L; r; V]`` (N + 1, 13)."""
+        return np.hstack([self.quaternions, self.L_W, self.r_WC, self.v_WC])
+
+    def stretched(self, factor: float) -> ThrustKnots:
+        """Return the same path in ``factor`` times its duration."""
+        return replace(
+            self,
+            step=self.step * factor,
+            velocities=self.velocities / factor,
+            L_W=self.L_W / factor,
+            v_WC=self.v_WC / factor,
+            accelerations=self.accelerations / factor**2,
+            levels=self.levels / factor**2,
+        )
+
+
+@dataclass(frozen=True)
+class ThrustBoundary:
+    """Both ends of a motion, in W.
+
+    Attributes
+    ----------
+    state, shape, velocity
+        ``[X; L; r; V]`` (13,), positions and velocities (n,) of the joints at the start.
+    goals
+        (7 k,) poses of the base, of the end-effector, or of both at the end: position, quaternion.
+    final_shapes
+        (2, n) least and largest joint positions at the end; infinite for joints that are free.
+    final_velocity, final_momentum
+        (n,) velocities of the joints and angular momentum (3,) at the end, where the centre of mass
+        rests: zero, but for wheels that go on spinning.
+    """
+
+    state: Array
+    shape: Array
+    velocity: Array
+    goals: Array
+    final_shapes: Array
+    final_velocity: Array
+    final_momentum: Array
+
+
+class Weights(NamedTuple):
+    """What a motion is to be least in.
+
+    Weights of the duration (1/s), of the cost of propulsion, of the squares of joint accelerations
+    over their limits, and of those of levels; of the distance that pairs lack (1/m), and the level
+    at which the cost of a norm is rounded off.
+    """
+
+    duration: float
+    cost: float
+    accelerations: float
+    levels: float
+    lack: float = 0.0
+    rounding: float = 1.0
+
+
+@dataclass(frozen=True)
+class KeptPairs:
+    """Pairs that are kept apart at K instants of every interval, each with its rows."""
+
+    rows: tuple[ConstraintBlock, ...] = ()
+    instants: int = 0
+
+
+class ThrustSolver:
+    """Solves the problem of one robot for many boundary conditions.
+
+    Parameters
+    ----------
+    stages, intervals
+        The functions of the problem, and the number of intervals N.
+    pairs
+        The pairs that are kept apart.
+    """
+
+    def __init__(
+        self, stages: ThrustStages, intervals: int, pairs: KeptPairs = KeptPairs()
+    ) -> None:
+        self.stages, self.intervals, self.pairs = stages, intervals, pairs
+        self.iterations, self.converged = 0, False
+        self.lack = 0.0
+        """Distance by which pairs are nearer in the last solution than they ought to be, m."""
+        layout, program = thrust_program(stages, intervals, pairs.rows, pairs.instants)
+        self._layout: ThrustLayout = layout
+        self._program = program
+        self._monitor = SolverMonitor(program.problem, program.lower, program.upper)
+        self._flown = stages.flown.map(intervals)
+        self._last: tuple[ThrustKnots, Mapping[str, ca.DM]] | None = None
+
+    def _build(self, options: Mapping[str, object]) -> ca.Function:
+        return ca.nlpsol(
+            "thrust",
+            "ipopt",
+            self._program.problem,
+            {
+                **IPOPT_OPTIONS,
+                "ipopt.tol": _TOLERANCE,
+                **options,
+                "jac_g": self._program.jac_g,
+                "hess_lag": self._program.hess_lag,
+                "iteration_callback": self._monitor,
+            },
+        )
+
+    @cached_property
+    def _solver(self) -> ca.Function:
+        return self._build({})
+
+    @cached_property
+    def _warm(self) -> ca.Function:
+        return self._build(_WARM)
+
+    @cached_property
+    def _continuing(self) -> ca.Function:
+        return self._build(_CONTINUED)
+
+    def solve(
+        self,
+        boundary: ThrustBoundary,
+        limits: MotionLimits,
+        guess: ThrustKnots,
+        weights: Weights,
+        stop: StopRule,
+        duration: DurationBounds,
+        defects: Array | None = None,
+        planes: Array | None = None,
+        *,
+        center: ThrustKnots | None = None,
+    ) -> ThrustKnots | None:
+        """Return the best motion near ``guess``; None if none.
+
+        The solver continues at its own last solution if that is the guess.
+
+        Parameters
+        ----------
+        boundary, limits, guess, weights
+            The problem, and where the solver begins.
+        stop, duration
+            Conditions on which it stops early, and bounds of the duration.
+        defects
+            (N, 12) those of the intervals; None: zero.
+        planes
+            (P, N K, 8) planes of the pairs and their instants; None: there are no pairs.
+        center
+            Controls whose differences are squared; None: zero.
+        """
+        N, layout, propulsion = self.intervals, self._layout, self.stages.propulsion
+        places = layout.knots()
+        least, most = np.full(layout.size, -np.inf), np.full(layout.size, np.inf)
+        x0 = np.zeros(layout.size)
+        X, s, v, L, r, V, a, u = places
+        least[0], most[0] = duration.shortest / N, duration.longest / N
+        least[X], most[X] = -1.1, 1.1
+        least[s], most[s] = limits.lower, limits.upper
+        least[v], most[v] = -limits.velocity, limits.velocity
+        least[a], most[a] = -limits.acceleration, limits.acceleration
+        least[u], most[u] = propulsion.lowest, 1.0
+        start = np.split(boundary.state, [4, 7, 10])
+        for place, value in zip((X, L, r, V), start, strict=True):
+            least[place[0]] = most[place[0]] = value
+        least[v[0]] = most[v[0]] = boundary.velocity
+        least[V[N]] = most[V[N]] = 0.0
+        least[L[N]] = most[L[N]] = boundary.final_momentum
+        least[v[N]] = most[v[N]] = boundary.final_velocity
+        if layout.has_lack:
+            least[-1] = 0.0
+        least[s[N]] = np.maximum(limits.lower, boundary.final_shapes[0])
+        most[s[N]] = np.minimum(limits.upper, boundary.final_shapes[1])
+        h = guess.step
+        x0[0] = h
+        for place, value in zip(
+            places,
+            (
+                guess.quaternions,
+                guess.shapes + h * guess.velocities / 2,
+                guess.velocities,
+                guess.L_W,
+                guess.r_WC,
+                guess.v_WC,
+                guess.accelerations,
+                guess.levels,
+            ),
+            strict=True,
+        ):
+            x0[place] = value
+        last, self._last = self._last, None
+        solver = self._warm if self.pairs.rows else self._solver
+        begin: Mapping[str, Array | ca.DM] = {"x0": x0}
+        if last is not None and last[0] is guess:
+            solver, begin = self._continuing, last[1]
+        self._monitor.begin(stop)
+        lacking = np.zeros((N, DEFECT_SIZE)) if defects is None else defects
+        parameters = np.concatenate(
+            [
+                *(boundary.shape, boundary.goals, propulsion.wrenches.ravel(order="F")),
+                *(lacking.ravel(), limits.acceleration, list(weights)),
+                np.hstack([center.accelerations, center.levels]).ravel()
+                if center is not None
+                else np.zeros(a.size + u.size),
+                np.zeros(0) if planes is None else planes.ravel(),
+            ]
+        )
+        result = solver(
+            **begin,
+            lbx=least,
+            ubx=most,
+            lbg=self._program.lower,
+            ubg=self._program.upper,
+            p=parameters,
+        )
+        stats = solver.stats()
+        self.iterations, self.converged = int(stats["iter_count"]), bool(stats["success"])
+        x = result["x"].full().ravel()
+        if not self.converged:
+            if self._monitor.best is None:
+                return None
+            x = self._monitor.best
+        X_, s_, v_, L_, r_, V_, a_, u_ = (x[place] for place in places)
+        h, self.lack = float(x[0]), float(x[-1]) if layout.has_lack else 0.0
+        knots = ThrustKnots(h, X_, s_ - h * v_ / 2, v_, L_, r_, V_, a_, u_)
+        if self.converged:
+            kept = {"x0": result["x"], "lam_x0": result["lam_x"], "lam_g0": result["lam_g"]}
+            self._last = knots, kept
+        return knots
+
+    def flown(self, knots: ThrustKnots) -> Array:
+        """Return the states (N, 13, K) in all intervals, exactly integrated from their knots."""
+        N = self.intervals
+        found = self._flown(
+            knots.states[:-1].T,
+            knots.shapes[:-1].T,
+            knots.velocities[:-1].T,
+            (np.diff(knots.velocities, axis=0) / knots.step).T,
+            self.stages.propulsion.wrenches @ knots.levels.T,
+            np.full((1, N), knots.step),
+        )
+        return np.asarray(found.full().T.reshape(N, -1, 13).transpose(0, 2, 1))
+
+    def defects(self, knots: ThrustKnots, before: Array | None = None) -> Array:
+        """Return the defects (N, 12) with which these knots would be an exact flight.
+
+        ``before`` are those with which they were solved.
+        """
+        ends, states = self.flown(knots)[:, :, -1], knots.states
+        # Knots obey the program with the defects before: what they miss is the rest.
+        inverse = states[1:, :4] * [-1.0, -1.0, -1.0, 1.0]
+        turn = rotvecs_from_quaternions(quaternion_multiply(inverse, ends[:, :4]))
+        rest = np.hstack([turn, ends[:, 4:] - states[1:, 4:]])
+        return rest if before is None else before + rest

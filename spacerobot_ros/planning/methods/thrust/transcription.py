@@ -1,0 +1,414 @@
+"""Motions of base and joints under thrust as a nonlinear program, by direct multiple shooting.
+
+To the attitude X, the vertices s and the velocities v of the joints' parabolas
+(:mod:`spacerobot_ros.planning.methods.optimal.transcription`) knots add the angular momentum L
+about the centre of mass, its position r and its velocity V, in W. The controls of an interval are
+the joint accelerations a and the levels u of the propulsion, whose wrench ``(f, n) = W u`` is
+constant in the base. With ``R_i``, ``c_i`` the attitude and the centre of mass in the base at the
+Gauss points tau_i of an interval,
+
+``V+ = V + h/m sum R_i f / 2``, ``r+ = r + h V + h^2/m sum (1 - tau_i) R_i f / 2``,
+``L+ = L + h sum R_i (n - c_i x f) / 2``, ``X+ = X exp(Omega)``,
+
+and Omega is the Magnus expansion of the rates at the Gauss points, ``D w + D_q u = h R_i' L_i``.
+Momenta as states keep what is exact in the equations exact: without thrust both rest, whatever the
+joints do. Every interval has a defect as a parameter, added to its end: the difference to an exact
+integration of the same controls, found beforehand, so that solutions obey the equations themselves
+and not their discretisation (deferred correction).
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+from itertools import pairwise
+
+import casadi as ca
+import numpy as np
+
+from spacerobot_ros.collision.planes import PLANE_SIZE
+from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.model.compilation import cached_function, source_hash
+from spacerobot_ros.model.dynamics import solve_positive_definite
+from spacerobot_ros.model.momentum_derivatives import momentum_derivatives
+from spacerobot_ros.model.symbolic_rotations import (
+    half_angle_vector,
+    matrix_from_quaternion,
+    quaternion_multiply,
+    quaternion_rate,
+    relative_vector,
+)
+from spacerobot_ros.planning.methods.optimal import transcription as shooting
+from spacerobot_ros.planning.methods.optimal.transcription import (
+    GAUSS,
+    AttitudeRows,
+    ConstraintBlock,
+    Indices,
+    PlacedBlock,
+    Program,
+    assembled,
+    momentum_in_base,
+    rotation_with_derivatives,
+    state_within_interval,
+)
+from spacerobot_ros.planning.methods.thrust.propulsion import Propulsion
+
+DEFECT_SIZE = 12
+"""Numbers of an interval's defect: rotation vector, then L, r and V at its end."""
+
+
+@dataclass(frozen=True)
+class ThrustLayout:
+    """Indices of the variables of N intervals: the step, then knot after knot
+    ``X, s, v, L, r, V, a, u``; the last knot has no controls. With pairs that are kept apart, the
+    last variable is by how much they are nearer than they ought to be, m.
+    """
+
+    joints: int
+    levels: int
+    intervals: int
+    has_lack: bool = False
+
+    @property
+    def _sizes(self) -> list[int]:
+        return [4, self.joints, self.joints, 3, 3, 3, self.joints, self.levels]
+
+    @property
+    def size(self) -> int:
+        """Number of variables."""
+        return 1 + sum(self._sizes) * self.intervals + sum(self._sizes[:6]) + self.has_lack
+
+    def knots(self) -> tuple[Indices, ...]:
+        """Return the places of X, s, v, L, r, V (N + 1, ...), and of a and u (N, ...)."""
+        first = 1 + sum(self._sizes) * np.arange(self.intervals + 1)[:, np.newaxis]
+        ends = np.cumsum([0, *self._sizes])
+        places = [first + np.arange(i, j) for i, j in pairwise(ends)]
+        return (*places[:6], places[6][:-1], places[7][:-1])
+
+
+@dataclass(frozen=True)
+class ThrustStages:
+    """The functions of one robot's problem, whatever the number of intervals.
+
+    Attributes
+    ----------
+    joints
+        n.
+    propulsion
+        What pushes the base.
+    beginning, interval, end
+        Rows of the first knot, of two neighbouring knots, and of the last one.
+    flown
+        The states of an interval, exactly integrated (:func:`flown_interval`).
+    """
+
+    joints: int
+    propulsion: Propulsion
+    beginning: ConstraintBlock
+    interval: ConstraintBlock
+    end: ConstraintBlock
+    flown: ca.Function
+
+    @classmethod
+    def of(
+        cls, robot: SpaceRobot, propulsion: Propulsion, base: bool = True, link: str = ""
+    ) -> ThrustStages:
+        """Derive the functions of a robot's problem, or read them from the cache.
+
+        The wrenches are parameters: thrusters that break have the same functions.
+
+        Parameters
+        ----------
+        robot, propulsion
+            The model, and what pushes its base.
+        base, link
+            Whether the pose of the base is given at the end, and the link whose pose is; empty:
+            none. Their poses (7,) are the parameters of the end.
+        """
+        n = robot.n
+        h, s, v = ca.SX.sym("h"), ca.SX.sym("s", n), ca.SX.sym("v", n)
+        start = ca.SX.sym("start", n)
+        begins = ConstraintBlock.of("beginning", ca.vertcat(h, s, v), start, s - h * v / 2 - start)
+        ends = _end_block(robot, base, link)
+        key = hashlib.sha256(
+            "\n".join(
+                [
+                    source_hash(
+                        *(__name__, shooting.__name__, momentum_derivatives.__module__),
+                        *(solve_positive_definite.__module__, quaternion_multiply.__module__),
+                    ),
+                    robot.equations_key,
+                    f"levels {propulsion.size}",
+                ]
+            ).encode()
+        ).hexdigest()
+        derived = cache(lambda: _interval_block(robot, propulsion.size))
+        interval = ConstraintBlock(
+            cached_function("thrust", key, lambda: derived().values),
+            cached_function("thrust_jac", key, lambda: derived().jacobian),
+            cached_function("thrust_hess", key, lambda: derived().hessian),
+        )
+        flown = cached_function("flown", key, lambda: flown_interval(robot))
+        return cls(n, propulsion, begins, interval, ends, flown)
+
+
+def _end_block(robot: SpaceRobot, base: bool, link: str) -> ConstraintBlock:
+    n = robot.n
+    X, s, r = ca.SX.sym("X", 4), ca.SX.sym("s", n), ca.SX.sym("r", 3)
+    goals = ca.SX.sym("goals", 7 * (base + bool(link)))
+    R, center = matrix_from_quaternion(X), robot.function("center_of_mass", compile=False)(s)
+    reached = [ca.SX(0, 1)]
+    if base:
+        reached += [r - R @ center - goals[:3], relative_vector(goals[3:7], X)]
+    if link:
+        R_all, r_all = robot.function("link_poses", compile=False)(s)
+        i, goal = robot.link_names.index(link), goals[-7:]
+        R_E = R @ R_all[:, 3 * i : 3 * i + 3]
+        turned = R_E @ matrix_from_quaternion(goal[3:]).T
+        reached += [r + R @ (r_all[:, i] - center) - goal[:3], half_angle_vector(turned)]
+    return ConstraintBlock.of("end", ca.vertcat(X, s, r), goals, ca.vertcat(*reached))
+
+
+def _interval_block(robot: SpaceRobot, levels: int) -> ConstraintBlock:
+    n = robot.n
+    sizes = [1, 4, n, n, 3, 3, 3, n, levels, 4, n, n, 3, 3, 3]
+    z = ca.SX.sym("z", sum(sizes))
+    h, X, s, v, L, r, V, a, u, X_next, s_next, v_next, L_next, r_next, V_next = ca.vertsplit(
+        z, np.cumsum([0, *sizes]).tolist()
+    )
+    defect, wrenches = ca.SX.sym("defect", DEFECT_SIZE), ca.SX.sym("wrenches", 6, levels)
+    points = [state_within_interval(tau, s, h * v, h * v_next) for tau in GAUSS]
+    impulses = [h * momentum_in_base(tau, X, X_next, (1 - tau) * L + tau * L_next) for tau in GAUSS]
+    attitude = AttitudeRows.of(
+        z,
+        X,
+        X_next,
+        [ca.vertcat(*both) for both in zip(points, impulses, strict=True)],
+        rotation_with_derivatives(robot, drifting=True),
+        defect[:3],
+    )
+    center_of_mass = robot.function("center_of_mass", compile=False)
+    wrench = wrenches @ u
+    force, torque = wrench[:3], wrench[3:]
+    pushed, shifted, twisted = ca.SX(3, 1), ca.SX(3, 1), ca.SX(3, 1)
+    for tau, point in zip(GAUSS, points, strict=True):
+        mean = (1 - tau) * X + tau * X_next
+        R = matrix_from_quaternion(mean / ca.norm_2(mean))
+        f_W = R @ force / 2
+        pushed += f_W
+        shifted += (1 - tau) * f_W
+        twisted += R @ (torque - ca.cross(center_of_mass(point[:n]), force)) / 2
+    m = robot.total_mass
+    plain = ca.vertcat(
+        v_next - v - h * a,
+        s_next - s - h * v_next,
+        L_next - L - h * twisted - defect[3:6],
+        r_next - r - h * V - h**2 / m * shifted - defect[6:9],
+        V_next - V - h / m * pushed - defect[9:],
+    )
+    multiplier = ca.SX.sym("lambda", plain.numel())
+    return ConstraintBlock.with_derivatives(
+        "thrust",
+        z,
+        ca.vertcat(defect, ca.vec(wrenches)),
+        ca.vertcat(multiplier, attitude.multiplier),
+        ca.vertcat(plain, attitude.rows),
+        ca.vertcat(ca.jacobian(plain, z), attitude.jacobian),
+        ca.hessian(ca.dot(multiplier, plain), z)[0] + attitude.hessian,
+    )
+
+
+def rates_function(robot: SpaceRobot) -> ca.Function:
+    """Return ``(X, q, qdot, L, wrench) -> (Xdot, Ldot, F)``: rates of attitude and angular momentum
+    and the force in W.
+    """
+    n = robot.n
+    X, q, qdot = ca.SX.sym("X", 4), ca.SX.sym("q", n), ca.SX.sym("qdot", n)
+    L, wrench = ca.SX.sym("L", 3), ca.SX.sym("wrench", 6)
+    D, D_q = robot.function("locked_inertia", compile=False)(q)
+    R = matrix_from_quaternion(X)
+    omega = solve_positive_definite(D, R.T @ L - D_q @ qdot)
+    c = robot.function("center_of_mass", compile=False)(q)
+    twisted = R @ (wrench[3:] - ca.cross(c, wrench[:3]))
+    rates = [quaternion_rate(X, omega), twisted, R @ wrench[:3]]
+    return ca.Function("rates", [X, q, qdot, L, wrench], rates)
+
+
+EXACT_STEPS = 8
+"""Steps of Runge-Kutta in an interval that is integrated exactly."""
+
+
+def flight_step(robot: SpaceRobot) -> ca.Function:
+    """Return ``(x, q, qdot, qddot, wrench, t) -> x+``: a step of Runge-Kutta 4 of
+    ``x = [X; L; r; V]`` over t seconds, with joints on a parabola and a wrench held in the base.
+    """
+    n, m = robot.n, robot.total_mass
+    rates = rates_function(robot)
+    x, wrench, t = ca.SX.sym("x", 13), ca.SX.sym("wrench", 6), ca.SX.sym("t")
+    q, qdot, qddot = (ca.SX.sym(name, n) for name in ("q", "qdot", "qddot"))
+
+    def slope(at: ca.SX, tau: float) -> ca.SX:
+        X, L, _, V = ca.vertsplit(at, [0, 4, 7, 10, 13])
+        elapsed = tau * t
+        q_at, qdot_at = q + elapsed * qdot + elapsed**2 / 2 * qddot, qdot + elapsed * qddot
+        Xdot, Ldot, F = rates(X, q_at, qdot_at, L, wrench)
+        return ca.vertcat(Xdot, Ldot, V, F / m)
+
+    first = slope(x, 0.0)
+    second = slope(x + t / 2 * first, 0.5)
+    third = slope(x + t / 2 * second, 0.5)
+    fourth = slope(x + t * third, 1.0)
+    reached = x + t / 6 * (first + 2 * second + 2 * third + fourth)
+    X = reached[:4]
+    reached = ca.vertcat(X / ca.norm_2(X), reached[4:])
+    return ca.Function("flight_step", [x, q, qdot, qddot, wrench, t], [ca.cse(reached)])
+
+
+def flown_interval(robot: SpaceRobot) -> ca.Function:
+    """Return ``(x, q, qdot, qddot, wrench, h) -> (13, EXACT_STEPS)``: states on an interval."""
+    n, step = robot.n, flight_step(robot)
+    x, wrench, h = ca.MX.sym("x", 13), ca.MX.sym("wrench", 6), ca.MX.sym("h")
+    q, qdot, qddot = (ca.MX.sym(name, n) for name in ("q", "qdot", "qddot"))
+    at, states, t = x, [], h / EXACT_STEPS
+    for number in range(EXACT_STEPS):
+        begins = number * t
+        q_at = q + begins * qdot + begins**2 / 2 * qddot
+        at = step(at, q_at, qdot + begins * qddot, qddot, wrench, t)
+        states.append(at)
+    return ca.Function("flown", [x, q, qdot, qddot, wrench, h], [ca.horzcat(*states)])
+
+
+def pair_block(joints: int, distance: ca.Function) -> ConstraintBlock:
+    """Return the distance of a pair from a plane at an instant of an interval, plus the lack.
+
+    ``distance`` is :func:`.support_distance`. The variables are ``[h; X; s; v; r; V; X+; v+; r+;
+    V+; lack]`` of the interval, the parameters the plane and a point, in W if one of the pair is an
+    obstacle, and the instant from 0 to 1.
+    """
+    n = joints
+    sizes = [1, 4, n, n, 3, 3, 4, n, 3, 3, 1]
+    z, p = ca.SX.sym("z", sum(sizes)), ca.SX.sym("p", PLANE_SIZE + 1)
+    h, X, s, v, r, V, X_next, v_next, _, V_next, lack = ca.vertsplit(
+        z, np.cumsum([0, *sizes]).tolist()
+    )
+    plane, tau = p[:PLANE_SIZE], p[PLANE_SIZE]
+    q = state_within_interval(tau, s, h * v, h * v_next)[:n]
+    if distance.size1_in(0) == n:
+        return ConstraintBlock.of("pair", z, p, distance(q, plane) + lack)
+    at = ca.vertcat(q, (1 - tau) * X + tau * X_next)
+    center = r + h * (tau * V + tau**2 / 2 * (V_next - V))
+    d = distance(at, plane) + ca.dot(plane[:3], center) + lack
+    return ConstraintBlock.of("pair", z, p, d)
+
+
+def thrust_program(
+    stages: ThrustStages,
+    intervals: int,
+    pairs: Sequence[ConstraintBlock] = (),
+    instants: int = 0,
+) -> tuple[ThrustLayout, Program]:
+    """Assemble the program from the stages of a problem.
+
+    Its parameters are the start of the shape (n,) and the goals (7 each), position and quaternion;
+    the wrenches (6 m,); the defects (12 N,); typical accelerations (n,); weights of the duration,
+    of the propellant, of the squares of accelerations and levels, of the lack, and the level at
+    which the cost of a norm is rounded off (6,); centres of the squares (n + m, N); and the planes
+    (8,) of every pair, interval and instant.
+    """
+    n, N, propulsion = stages.joints, intervals, stages.propulsion
+    m = propulsion.size
+    layout = ThrustLayout(n, m, N, bool(pairs))
+    X, s, v, L, r, V, a, u = layout.knots()
+    x = ca.MX.sym("x", layout.size)
+    goals = int(stages.end.values.size1_in(1))
+    p = {
+        name: ca.MX.sym(name, size)
+        for name, size in (
+            ("start", n),
+            ("goals", goals),
+            ("wrenches", 6 * m),
+            ("defects", DEFECT_SIZE * N),
+            ("typical", n),
+            ("weights", 6),
+            ("centers", (n + m) * N),
+            ("planes", len(pairs) * N * instants * 8),
+        )
+    }
+    zero = np.zeros((N, 1), dtype=np.int64)
+    knot = np.hstack([X, s, v, L, r, V])
+    first, dynamics, last = n, stages.interval.rows, stages.end.rows
+    equalities = first + N * dynamics + last
+    defects = ca.reshape(p["defects"], DEFECT_SIZE, N)
+    placed = [
+        PlacedBlock(
+            stages.beginning,
+            np.hstack([zero[:1], s[:1], v[:1]]),
+            np.arange(first)[np.newaxis],
+            p["start"],
+        ),
+        PlacedBlock(
+            stages.interval,
+            np.hstack([zero, knot[:-1], a, u, knot[1:]]),
+            first + np.arange(N * dynamics).reshape(N, dynamics),
+            ca.vertcat(defects, ca.repmat(p["wrenches"], 1, N)),
+        ),
+        PlacedBlock(
+            stages.end,
+            np.hstack([X[-1:], s[-1:], r[-1:]]),
+            first + N * dynamics + np.arange(last)[np.newaxis],
+            p["goals"],
+        ),
+    ]
+    rows = equalities
+    if propulsion.norms:
+        group = ca.SX.sym("u", 3)
+        norm = ConstraintBlock.of("norm", group, ca.SX(0, 1), 1 - ca.sumsqr(group))
+        groups = np.vstack([u[:, list(each)] for each in propulsion.norms])
+        count = len(groups)
+        placed.append(
+            PlacedBlock(norm, groups, rows + np.arange(count)[:, np.newaxis], ca.MX(0, 1))
+        )
+        rows += count
+    for number, block in enumerate(pairs):
+        count = N * instants
+        lack = np.full((N, 1), layout.size - 1)
+        variables = np.hstack(
+            [zero, *(each[:-1] for each in (X, s, v, r, V)), *(e[1:] for e in (X, v, r, V)), lack]
+        )
+        planes = p["planes"][8 * count * number : 8 * count * (number + 1)]
+        placed.append(
+            PlacedBlock(
+                block,
+                np.repeat(variables, instants, axis=0),
+                rows + np.arange(count)[:, np.newaxis],
+                ca.reshape(planes, 8, count),
+            )
+        )
+        rows += count
+    levels = ca.reshape(x[u.ravel().tolist()], m, N)
+    centers = ca.reshape(p["centers"], n + m, N)
+    change = (ca.reshape(x[a.ravel().tolist()], n, N) - centers[:n, :]) / ca.repmat(
+        p["typical"], 1, N
+    )
+    spent = _spent(propulsion, levels, p["weights"][5])
+    w = p["weights"]
+    f = w[0] * N * x[0] + w[1] * x[0] * spent
+    f += (w[2] * ca.sumsqr(change) + w[3] * ca.sumsqr(levels - centers[n:, :])) / N
+    if pairs:
+        f += w[4] * x[-1]
+    return layout, assembled(x, ca.vertcat(*p.values()), f, placed, rows, equalities)
+
+
+def _spent(propulsion: Propulsion, levels: ca.MX, rounding: ca.MX) -> ca.MX:
+    """Return what levels (m, N) cost that each last for a second."""
+    within = {i for group in propulsion.norms for i in group}
+    single = [i for i in range(propulsion.size) if i not in within]
+    spent = ca.MX(0)
+    if single:
+        spent += ca.sum2(ca.DM(propulsion.cost[single]).T @ levels[single, :])
+    for group in propulsion.norms:
+        sizes = ca.sqrt(ca.sum1(levels[list(group), :] ** 2) + rounding**2)
+        spent += propulsion.cost[group[0]] * ca.sum2(sizes - rounding)
+    return spent

@@ -1,0 +1,228 @@
+"""Motions under thrust: closed forms, and Pinocchio under their wrenches and efforts."""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any
+
+import coal
+import numpy as np
+import pinocchio as pin
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.spatial.transform import Rotation
+
+from spacerobot_ros.errors import ParameterError, PlanningError, UnreachableError
+from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.model.description import Array
+from spacerobot_ros.model.thrusters import ThrusterTable, thrusters_of_urdf
+from spacerobot_ros.model.urdf import parse_world
+from spacerobot_ros.model.world import with_world
+from spacerobot_ros.planning.methods.thrust.motion import ThrustMotion
+from spacerobot_ros.planning.methods.thrust.propulsion import Propulsion
+from spacerobot_ros.planning.methods.thrust.search import (
+    ThrustGoal,
+    ThrustOptions,
+    ThrustPlanner,
+    ThrustStart,
+)
+from spacerobot_ros.resources import robot_file
+
+MASS, INERTIA, FORCE, TORQUE = 16.0, np.array([0.3, 0.35, 0.4]), 0.5, 0.05
+CUBE = f"""<robot name="cube"><link name="base_link"><inertial><mass value="{MASS}"/>
+<inertia ixx="{INERTIA[0]}" iyy="{INERTIA[1]}" izz="{INERTIA[2]}" ixy="0" ixz="0" iyz="0"/>
+</inertial><collision><geometry><box size="0.4 0.3 0.2"/></geometry></collision></link></robot>"""
+
+START = np.array([0.4, -1.3, 0.7, *Rotation.from_rotvec([0.5, -0.3, 1.1]).as_quat()])
+FOLDED = np.array([0.0, -1.2, 2.0, 0.0, 0.8, 0.0])
+
+
+def cube_planner(robot: SpaceRobot | None = None, **options: Any) -> ThrustPlanner:
+    robot = robot or SpaceRobot.from_urdf(CUBE)
+    return ThrustPlanner(robot, Propulsion.within(FORCE, TORQUE), ThrustOptions(**options))
+
+
+@cache
+def servicer() -> ThrustPlanner:
+    robot = SpaceRobot.from_file(robot_file("servicer"))
+    propulsion = Propulsion.of_table(thrusters_of_urdf(robot.description), 0.2)
+    return ThrustPlanner(robot, propulsion, ThrustOptions(), "end_effector")
+
+
+def beyond(start: Array, displacement: Array, rotvec: Array) -> Array:
+    """Return the pose that is displaced and rotated from one, in the components of its frame."""
+    R = Rotation.from_quat(start[3:])
+    turned = R * Rotation.from_rotvec(rotvec)
+    return np.concatenate([start[:3] + R.apply(displacement), turned.as_quat()])
+
+
+def coasting(time: float, distance: float, acceleration: float) -> float:
+    """Return for how long one accelerates, and brakes, over a distance in a given time, s."""
+    return (time - np.sqrt(time**2 - 4 * distance / acceleration)) / 2
+
+
+@pytest.mark.parametrize("rotates", [False, True])
+def test_shortest_times_and_least_impulses_are_those_of_closed_forms(rotates: bool) -> None:
+    way, turn = np.array([0.0, 1.2, 0.0]), np.array([0.0, 0.0, 1.1])
+    displacement, rotvec = (0 * way, turn) if rotates else (way, 0 * turn)
+    distance, limit, inertia = (1.1, TORQUE, INERTIA[2]) if rotates else (1.2, FORCE, MASS)
+    start = ThrustStart.at_rest(START, np.zeros(0))
+    goal = ThrustGoal(beyond(START, displacement, rotvec))
+    fastest = cube_planner(time_factor=1.0).plan(start, goal)
+    shortest = 2 * np.sqrt(distance * inertia / limit)
+    assert fastest.duration == pytest.approx(shortest, rel=1e-3)
+    cheapest = cube_planner(time_factor=1.5).plan(start, goal)
+    burn = coasting(1.5 * shortest, distance, limit / inertia)
+    assert cheapest.duration == pytest.approx(1.5 * shortest, rel=1e-3)
+    assert cheapest.spent == pytest.approx(2 * limit * burn, rel=5e-3)
+
+
+def flown_by_pinocchio(robot: SpaceRobot, motion: ThrustMotion, start: ThrustStart) -> Array:
+    """Return where Pinocchio ends under the wrenches and efforts of a motion: q of its model."""
+    model = pin.buildModelFromXML(robot.description.urdf, pin.JointModelFreeFlyer())
+    model.gravity = pin.Motion.Zero()
+    data = model.createData()
+    ids = [model.getJointId(name) for name in robot.joint_names]
+    q0 = pin.neutral(model)
+    q0[:7] = start.pose
+    for index, value in zip(ids, start.q, strict=True):
+        joint = model.joints[index]
+        q0[joint.idx_q : joint.idx_q + joint.nq] = (
+            [value] if joint.nq == 1 else [np.cos(value), np.sin(value)]
+        )
+
+    def rate(time: float, y: Array) -> Array:
+        # On the tangent space of the start: its displacement moves with the velocity.
+        q, v = y[: model.nq], y[model.nq :]
+        q = pin.normalize(model, q)
+        sample = motion.at(time)
+        efforts = np.zeros(model.nv)
+        for index, tau in zip(ids, sample.tau, strict=True):
+            efforts[model.joints[index].idx_v] = tau
+        external = [pin.Force.Zero() for _ in range(model.njoints)]
+        external[1] = pin.Force(sample.wrench_B[:3], sample.wrench_B[3:])
+        a = pin.aba(model, data, q, v, efforts, external)
+        step = 1e-7
+        qdot = (pin.integrate(model, q, v * step) - pin.integrate(model, q, -v * step)) / (2 * step)
+        return np.concatenate([qdot, a])
+
+    y = np.concatenate([q0, np.zeros(model.nv)])
+    for k in range(len(motion.levels)):
+        # Wrenches and accelerations jump between intervals.
+        ends = k * motion.step + 1e-12, (k + 1) * motion.step - 1e-12
+        y = solve_ivp(rate, ends, y, rtol=1e-8, atol=1e-9).y[:, -1]
+    return np.asarray(y[: model.nq])
+
+
+def test_pinocchio_ends_at_the_goal_under_the_wrenches_and_efforts_of_a_plan() -> None:
+    planner = servicer()
+    start = ThrustStart.at_rest(START, FOLDED)
+    goal = beyond(START, np.array([1.0, 0.4, -0.2]), np.array([0.1, -0.2, 0.5]))
+    shape = FOLDED + np.array([0.3, 0.2, -0.4, 0.5, -0.3, 0.6])
+    motion = planner.plan(start, ThrustGoal(base=goal, shape=shape))
+    ended = flown_by_pinocchio(planner.robot, motion, start)
+    assert ended[:3] == pytest.approx(goal[:3], abs=1e-3)
+    apart = Rotation.from_quat(goal[3:]).inv() * Rotation.from_quat(ended[3:7])
+    assert apart.magnitude() < 1e-3
+    last = motion.at(motion.duration)
+    assert last.q == pytest.approx(shape, abs=1e-8)
+    assert np.abs(np.concatenate(last.base[2:4])).max() < 1e-5
+    assert motion.levels.min() >= -1e-7
+    assert motion.levels.max() <= 1 + 1e-7
+    straight = 2 * motion.duration / 1.5
+    assert 0 < motion.spent < straight * planner.propulsion.cost.sum()
+
+
+def test_hand_and_base_reach_their_poses_together() -> None:
+    planner = servicer()
+    pose = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
+    base = np.array([1.0, 0.4, -0.2, *Rotation.from_rotvec([0.1, -0.2, 0.5]).as_quat()])
+    hand = np.array([2.28, 1.85, 0.79, *Rotation.from_rotvec([-0.56, 0.95, 1.05]).as_quat()])
+    motion = planner.plan(ThrustStart.at_rest(pose, FOLDED), ThrustGoal(base, hand))
+    last = motion.at(motion.duration)
+    assert last.end_effector is not None
+    for frame, goal in ((last.base, base), (last.end_effector, hand)):
+        assert frame.position == pytest.approx(goal[:3], abs=1e-4)
+        apart = Rotation.from_quat(goal[3:]).inv() * Rotation.from_quat(frame.quaternion)
+        assert apart.magnitude() < 1e-4
+
+
+def test_accelerations_are_the_derivatives_of_velocities() -> None:
+    planner = servicer()
+    goal = beyond(START, np.array([-0.5, 0.4, 0.3]), np.array([0.4, 0.1, -0.3]))
+    motion = planner.plan(ThrustStart.at_rest(START, FOLDED), ThrustGoal(base=goal, shape=FOLDED))
+    time, dt = 7.37 * motion.step, 1e-4
+    before, at, after = (motion.at(time + by) for by in (-dt, 0.0, dt))
+    for one, frame, other in zip(before[:2], at[:2], after[:2], strict=True):
+        assert one is not None
+        assert frame is not None
+        assert other is not None
+        assert frame.velocity == pytest.approx((other.position - one.position) / (2 * dt), abs=1e-7)
+        slope = (other.velocity - one.velocity) / (2 * dt)
+        assert frame.acceleration == pytest.approx(slope, abs=1e-7)
+        slope = (other.angular_velocity - one.angular_velocity) / (2 * dt)
+        assert frame.angular_acceleration == pytest.approx(slope, abs=1e-7)
+
+
+def test_a_box_in_the_way_is_passed_clear_of_it() -> None:
+    goal = beyond(START, np.array([2.5, 0.3, -0.2]), np.array([0.3, 0.8, -0.5]))
+    middle, size = (START[:3] + goal[:3]) / 2, np.array([0.5, 0.4, 0.3])
+    rpy = np.array([0.3, -0.2, 0.6])
+    numbers = [" ".join(map(str, each)) for each in (size, middle, rpy)]
+    world = parse_world(
+        f'<robot name="w"><link name="world"/><link name="box"><collision><geometry><box size='
+        f'"{numbers[0]}"/></geometry></collision></link><joint name="j" type="fixed"><parent '
+        f'link="world"/><child link="box"/><origin xyz="{numbers[1]}" rpy="{numbers[2]}"/></joint>'
+        "</robot>"
+    )
+    robot = SpaceRobot(with_world(SpaceRobot.from_urdf(CUBE).description, world))
+    start = ThrustStart.at_rest(START, np.zeros(0))
+    motion = cube_planner(robot).plan(start, ThrustGoal(goal))
+    free = cube_planner().plan(start, ThrustGoal(goal))
+    body, box = coal.Box(0.4, 0.3, 0.2), coal.Box(*size)
+    placed = coal.Transform3s(Rotation.from_euler("xyz", rpy).as_matrix(), middle)
+    distances = []
+    for flight in (motion, free):
+        nearest = np.inf
+        for time in np.linspace(0, flight.duration, 400):
+            frame = flight.at(time).base
+            R = Rotation.from_quat(frame.quaternion).as_matrix()
+            result = coal.DistanceResult()
+            nearest = min(
+                nearest,
+                coal.distance(
+                    body,
+                    coal.Transform3s(R, frame.position),
+                    box,
+                    placed,
+                    coal.DistanceRequest(),
+                    result,
+                ),
+            )
+        distances.append(nearest)
+    assert distances[0] >= 0.01 - 1e-6
+    assert distances[1] < 0
+    assert motion.spent < 1.4 * free.spent
+
+
+def test_what_cannot_be_planned_is_refused_in_a_sentence() -> None:
+    start = ThrustStart.at_rest(START, np.zeros(0))
+    goal = ThrustGoal(beyond(START, np.array([1.0, 0.0, 0.0]), np.zeros(3)))
+    with pytest.raises(UnreachableError, match=r"takes 11\.3\d* s at least, and plan\.duration"):
+        cube_planner(duration=5.0).plan(start, goal)
+    table = thrusters_of_urdf(servicer().robot.description)
+    one_way = ThrusterTable(
+        table.names[:1],
+        table.r_B[:1],
+        table.direction_B[:1],
+        table.force[:1],
+        table.min_on_time[:1],
+        table.isp[:1],
+    )
+    with pytest.raises(ParameterError, match="cannot produce"):
+        Propulsion.of_table(one_way)
+    with pytest.raises(ParameterError, match="set max_force"):
+        Propulsion.within(np.inf, 1.0)
+    far = np.array([9.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
+    with pytest.raises(PlanningError, match="out of reach from that of the base"):
+        servicer().plan(ThrustStart.at_rest(START, FOLDED), ThrustGoal(START, far))
