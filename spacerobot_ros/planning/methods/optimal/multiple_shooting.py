@@ -69,6 +69,8 @@ _COST_OF_LACK = 300.0
 """Cost of a distance that is lacking, in durations or efforts of the guess per m."""
 
 _CONTINUED_OPTIONS = {
+    # Most take ten to thirty steps; the others are begun anew.
+    "ipopt.max_iter": 40,
     "ipopt.mu_init": 1e-6,
     "ipopt.warm_start_init_point": "yes",
     **{
@@ -180,6 +182,8 @@ class MultipleShooting:
         self.turn = stages.rotation_of_step
         self._drifting = stages.drifting
         self._program = program(stages, intervals)
+        self.nonzeros = int(self._program.jac_g.nnz_out(1))
+        """Nonzeros of the constraints' Jacobian, in proportion to which a step takes time."""
         # The solver's matrices are small: threads of its linear algebra would wait for each other.
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
         self._monitor = _SolverMonitor(
