@@ -181,8 +181,8 @@ the largest reach at which paths are not made faster any more."""
 
 _MAX_CLEAR_STARTS, _MAX_CLEAR_STARTS_IN_MOTION, _CLEAR_ANSWERS = 16, 1, 2
 """Guesses near which, or near whose solutions, manoeuvres that keep clear are looked for at most
-(in motion, the rest of the motion is the one: from rest, after braking, others are found sooner),
-and the number of clear paths on a coarse grid that ends the search."""
+(in motion, unless the base drifts, the rest of the motion is the one: from rest, after braking,
+others are found sooner), and the number of clear paths on a coarse grid that ends the search."""
 
 _REPORT_PERIOD = 1.0
 """Wall time after which a solver reports that it is still busy, s."""
@@ -757,7 +757,8 @@ class ManoeuvreSearch:
         problem = state.problem
         costs = [problem.cost(each) for each in known]
         solver = self._solver(problem, state.coarse)
-        most = _MAX_CLEAR_STARTS if problem.motion is None else _MAX_CLEAR_STARTS_IN_MOTION
+        brakes = problem.motion is not None and not problem.boundary.drifts
+        most = _MAX_CLEAR_STARTS_IN_MOTION if brakes else _MAX_CLEAR_STARTS
         starts, unused = min(problem.options.starts, most), []
         others = itertools.islice(self._guesses(state, solver), len(state.solved), starts)
         solved = ((guess, self._solve_start(state, solver, guess)) for guess in others)
