@@ -21,6 +21,10 @@ from spacerobot_ros.planning.core.schedule import BasePath
 _MIN_PATH_POSES = 200
 """Fewest poses of a predicted base path; a path has at most twice as many."""
 
+_LARGE_ERROR, _MAX_HALVINGS = 1e-7, 8
+"""Error of an integration, rad, from which its extrapolation is off by more than a nanoradian, and
+how often its steps are halved at most."""
+
 
 def coasting_positions(
     robot: SpaceRobot, state: RobotState, time: Array, shapes: Array, quaternions: Array
@@ -77,13 +81,20 @@ class BasePrediction:
         """Return the attitude (4,) at the end of the shapes (N + 1, n), whatever their speed.
 
         The ``attitudes`` (N + 1, 4) are those of the plant's steps. Their error, which is of order
-        four, is estimated from half of the steps (Richardson's extrapolation).
+        four, is estimated from half of the steps (Richardson's extrapolation); while it is large,
+        from half of these.
         """
-        halves = np.empty((2 * len(positions) - 1, positions.shape[1]))
-        halves[::2], halves[1::2] = positions, (positions[1:] + positions[:-1]) / 2
-        finer = self._integrate(halves, attitudes[0], L_W, self._control_period / 2)[-1]
-        error = attitude_error(attitudes[-1], finer) / 15
-        return quaternion_multiply(finer, quaternion_from_rotvec(error))
+        coarse, path, period = attitudes[-1], positions, self._control_period
+        for _ in range(_MAX_HALVINGS):
+            halves = np.empty((2 * len(path) - 1, path.shape[1]))
+            halves[::2], halves[1::2] = path, (path[1:] + path[:-1]) / 2
+            path, period = halves, period / 2
+            fine = self._integrate(path, attitudes[0], L_W, period)[-1]
+            error = attitude_error(coarse, fine) / 15
+            if np.linalg.norm(error) < _LARGE_ERROR:
+                break
+            coarse = fine
+        return quaternion_multiply(fine, quaternion_from_rotvec(error))
 
     def _integrate(self, positions: Array, quaternion: Array, L_W: Array, period: float) -> Array:
         """Return the attitude (N + 1, 4) at shapes (N + 1, n) that are a period, s, apart."""

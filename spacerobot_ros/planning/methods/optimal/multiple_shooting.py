@@ -40,6 +40,9 @@ IPOPT_OPTIONS = {
     "ipopt.linear_solver": "mumps",
     # Approximate minimum degree: the matrices are banded, and the choice of MUMPS fills them in.
     "ipopt.mumps_pivot_order": 0,
+    # A matching of large entries to the diagonal first undoes that order: legged robots took up to
+    # thirty times as long a step.
+    "ipopt.mumps_permuting_scaling": 0,
     "ipopt.mu_strategy": "monotone",
     "ipopt.constr_viol_tol": 1e-6,
     # Iterative refinement of steps is off.
@@ -66,6 +69,8 @@ _COST_OF_LACK = 300.0
 """Cost of a distance that is lacking, in durations or efforts of the guess per m."""
 
 _CONTINUED_OPTIONS = {
+    # Most take ten to thirty steps; the others are begun anew.
+    "ipopt.max_iter": 40,
     "ipopt.mu_init": 1e-6,
     "ipopt.warm_start_init_point": "yes",
     **{
@@ -178,6 +183,8 @@ class MultipleShooting:
         self._drifting = stages.drifting
         self._program = program(stages, intervals)
         self._layout = Layout.of(stages, intervals)
+        self.nonzeros = int(self._program.jac_g.nnz_out(1))
+        """Nonzeros of the constraints' Jacobian, in proportion to which a step takes time."""
         # The solver's matrices are small: threads of its linear algebra would wait for each other.
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
         self._monitor = SolverMonitor(

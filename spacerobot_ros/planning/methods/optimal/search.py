@@ -158,6 +158,14 @@ _MIN_LARGEST_LACK, _LACK_PER_DEPTH = 0.1, 2.0
 """Distance by which links on the way to a clear path may be nearer than they ought to be, m: at
 least, and as a multiple of the depth of their contact."""
 
+_MAX_WORK_PER_ITERATION, _WORK_FACTOR_WITHOUT_PATH = 2.2e5, 1.25
+"""Largest work on clear paths, in nonzeros of Jacobians over all steps of the solver, for each step
+that ``optimal.iterations`` allows from one guess, and its factor where there is no clear path yet:
+some 20 s of an idle core (0.3 us a nonzero, for six to fourteen joints on both grids)."""
+
+_MIN_SHORTENING_ROUNDS = 3
+"""Paths on the way to a fast one that are tried even so."""
+
 _NO_LACK = 1e-3
 """Lack of distance below which all planes are kept, m."""
 
@@ -173,8 +181,8 @@ the largest reach at which paths are not made faster any more."""
 
 _MAX_CLEAR_STARTS, _MAX_CLEAR_STARTS_IN_MOTION, _CLEAR_ANSWERS = 16, 1, 2
 """Guesses near which, or near whose solutions, manoeuvres that keep clear are looked for at most
-(in motion, the rest of the motion is the one: from rest, after braking, others are found sooner),
-and the number of clear paths on a coarse grid that ends the search."""
+(in motion, unless the base drifts, the rest of the motion is the one: from rest, after braking,
+others are found sooner), and the number of clear paths on a coarse grid that ends the search."""
 
 _REPORT_PERIOD = 1.0
 """Wall time after which a solver reports that it is still busy, s."""
@@ -321,7 +329,7 @@ class _SearchState:
 
     ``starts`` guesses were tried, ``rejection`` is the reason against the last candidate, ``best``
     the duration of the fastest path so far, s: of the clear ones if it ``is_clearing``. ``solved``
-    are guesses on the coarse grid with their solutions.
+    are guesses on the coarse grid with their solutions, ``work`` is that on clear paths.
     """
 
     problem: SearchProblem
@@ -334,11 +342,19 @@ class _SearchState:
     rejection: str = ""
     best: float = math.inf
     is_clearing: bool = False
+    work: float = 0.0
     solved: list[tuple[Trajectory, Trajectory | None]] = field(default_factory=list)
     _reported: float = 0.0
 
-    def stop_rule(self, *, found: bool = False) -> StopRule:
-        """Return when the solver stops in the present phase."""
+    def is_over(self, *, found: bool) -> bool:
+        """Whether wall time or work on clear paths is used up; ``found``: there is such a path."""
+        most = _MAX_WORK_PER_ITERATION * self.problem.options.iterations
+        if not found:
+            most *= _WORK_FACTOR_WITHOUT_PATH
+        return self.work > most or self.clock.is_over(found=found)
+
+    def stop_rule(self, *, found: bool = False, work: float = 0.0) -> StopRule:
+        """Return when the solver stops in the present phase; ``work`` is that of each step."""
         iterations, end = self.problem.options.iterations, self.clock.deadline
         last = end if found else self.clock.last_call
         if self.phase is SearchPhase.CLEARING:
@@ -346,9 +362,10 @@ class _SearchState:
             end = last = self.clock.last_call
         if self.phase in (SearchPhase.CLEARING, SearchPhase.SHORTENING):
             iterations = min(iterations, _MAX_CLEARING_ITERATIONS)
-        return StopRule(iterations, self.cancellation, end, last, self._watch)
+        return StopRule(iterations, self.cancellation, end, last, partial(self._watch, work))
 
-    def _watch(self) -> None:
+    def _watch(self, work: float) -> None:
+        self.work += work
         elapsed = self.clock.elapsed
         if elapsed >= self._reported + _REPORT_PERIOD:
             self.report("going on")
@@ -714,13 +731,13 @@ class ManoeuvreSearch:
         # A robot that drifts finds others sooner after it has coasted.
         if freed or (problem.boundary.drifts and problem.motion is None):
             return freed
-        others = self._other_paths(state, [each.solution for each in found])
+        clear: list[tuple[KeptDistances, Trajectory]] = []
+        others = self._other_paths(state, [each.solution for each in found], clear)
         if not self._has_coarse_paths(state):
             for path in itertools.islice(others, _MAX_FULL_GRID_STARTS):
                 with state.attempt():
                     return [self._clear_finely(state, kept.anew(), path)]
             return []
-        clear: list[tuple[KeptDistances, Trajectory]] = []
         for path in others:
             with state.attempt():
                 clear.append(self._clear_coarsely(state, kept.anew(), path))
@@ -732,20 +749,21 @@ class ManoeuvreSearch:
         return []
 
     def _other_paths(
-        self, state: _SearchState, known: Sequence[Trajectory]
+        self, state: _SearchState, known: Sequence[Trajectory], found: Sequence[object]
     ) -> Iterator[Trajectory]:
         """Yield other solutions that need not keep clear, from guesses on a coarse grid, then those
-        guesses that led to known ones.
+        guesses that led to known ones, while nothing is ``found``.
         """
         problem = state.problem
         costs = [problem.cost(each) for each in known]
         solver = self._solver(problem, state.coarse)
-        most = _MAX_CLEAR_STARTS if problem.motion is None else _MAX_CLEAR_STARTS_IN_MOTION
+        brakes = problem.motion is not None and not problem.boundary.drifts
+        most = _MAX_CLEAR_STARTS_IN_MOTION if brakes else _MAX_CLEAR_STARTS
         starts, unused = min(problem.options.starts, most), []
         others = itertools.islice(self._guesses(state, solver), len(state.solved), starts)
         solved = ((guess, self._solve_start(state, solver, guess)) for guess in others)
         for guess, solution in itertools.chain(state.solved[:starts], solved):
-            if state.clock.is_over(found=False):
+            if state.is_over(found=bool(found)):
                 return
             if solution is None:
                 continue
@@ -755,7 +773,10 @@ class ManoeuvreSearch:
             else:
                 costs.append(cost)
                 yield solution
-        yield from unused
+        for guess in unused:
+            if found or state.is_over(found=False):
+                return
+            yield guess
 
     def _has_coarse_paths(self, state: _SearchState) -> bool:
         """Whether paths are made clear on the coarse grid first."""
@@ -831,7 +852,8 @@ class ManoeuvreSearch:
             if not near:
                 return path, made
             lacks.append(lack)
-            if lack >= _NO_LACK and lack > _PROGRESS_SHARE * lacks[-3]:
+            goes_on = lack < _NO_LACK or lack <= _PROGRESS_SHARE * lacks[-3]
+            if not goes_on or (apart.hold is None and state.is_over(found=False)):
                 break
         period = None if made is None else self._period
         raise UnusableCandidateError(kept.message(near[0], period))
@@ -842,9 +864,10 @@ class ManoeuvreSearch:
         """Return a faster path near to a clear one, and its held commands; else that one itself."""
         state.phase = SearchPhase.SHORTENING
         reach, limits = 1.0, state.problem.limits
-        for _ in range(_MAX_SHORTENING_ROUNDS):
+        for number in range(_MAX_SHORTENING_ROUNDS):
             state.report("clear path", path.duration)
-            if reach < _MIN_REACH_SHARE or state.clock.is_over(found=True):
+            is_over = number >= _MIN_SHORTENING_ROUNDS and state.is_over(found=True)
+            if is_over or reach < _MIN_REACH_SHARE or state.clock.is_over(found=True):
                 break
             try:
                 faster, _ = self._solve_apart(
@@ -907,7 +930,8 @@ class ManoeuvreSearch:
             guess = source.with_initial_velocity(guess, lacking, problem.limits)
         within = kept.within(limits, guess, pushing=near.largest_lack > 0)
         # On the same grid, a solver continues at its own last solution.
-        solution = solver.solve(boundary, within, guess, state.stop_rule(found=True), bounds, near)
+        stop = state.stop_rule(found=True, work=solver.nonzeros)
+        solution = solver.solve(boundary, within, guess, stop, bounds, near)
         state.cancellation.raise_if_requested()
         pairs = f"{len(kept.pairs)} pair(s) apart"
         if solution is None:
