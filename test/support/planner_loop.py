@@ -246,6 +246,8 @@ class Loop:
         """Propose a goal; return its id."""
         self._goals += 1
         goal = place if isinstance(place, Goal) else goal_at(place)
+        if isinstance(self.method, StubMethod):
+            goal = replace(goal, asked=frozenset({"position"}))  # All that it controls.
         self.executive.propose_goal(IdentifiedGoal(goal, f"goal-{self._goals}"))
         self._take()
         return f"goal-{self._goals}"
