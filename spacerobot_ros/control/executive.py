@@ -223,6 +223,8 @@ class ControlExecutive:
     def progress(self, goal_id: str) -> tuple[str, float | None]:
         """Return the work that is done for a goal, and the predicted time until its end, s."""
         task, ends = self.servicing.task, self.controller.reference_ends
+        if self._plan is not None and goal_id in self.waiting_goals:
+            return "planning", None
         if task is not None:
             return task.value, None
         if goal_id != self._goal_id or self._time is None or ends is None:
