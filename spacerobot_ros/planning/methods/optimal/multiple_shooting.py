@@ -19,7 +19,12 @@ from spacerobot_ros.planning.methods.optimal.problem import (
     MotionLimits,
     Trajectory,
 )
-from spacerobot_ros.planning.methods.optimal.transcription import Layout, Stages, program
+from spacerobot_ros.planning.methods.optimal.transcription import (
+    Layout,
+    Program,
+    Stages,
+    program,
+)
 
 _FEASIBILITY_TOLERANCE = 1e-4
 """Violation of the constraints below which an iterate counts as a trajectory, SI units."""
@@ -30,7 +35,7 @@ _INFEASIBLE = "Infeasible_Problem_Detected"
 TOLERANCE = 1e-5
 """Durations within a thousandth of a control period, for manoeuvres of some seconds."""
 
-IPOPT_OPTIONS = {
+_IPOPT_OPTIONS = {
     "print_time": False,
     # All derivatives are given: the solver is not to derive more.
     "no_nlp_grad": True,
@@ -185,8 +190,6 @@ class MultipleShooting:
         self._layout = Layout.of(stages, intervals)
         self.nonzeros = int(self._program.jac_g.nnz_out(1))
         """Nonzeros of the constraints' Jacobian, in proportion to which a step takes time."""
-        # The solver's matrices are small: threads of its linear algebra would wait for each other.
-        os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
         self._monitor = SolverMonitor(
             self._program.problem, self._program.lower, self._program.upper
         )
@@ -196,19 +199,8 @@ class MultipleShooting:
         self._last: _Solution | None = None
 
     def _build_solver(self, options: Mapping[str, object]) -> ca.Function:
-        return ca.nlpsol(
-            "manoeuvre",
-            "ipopt",
-            self._program.problem,
-            {
-                **IPOPT_OPTIONS,
-                **options,
-                "ipopt.tol": self._tolerance,
-                "jac_g": self._program.jac_g,
-                "hess_lag": self._program.hess_lag,
-                "iteration_callback": self._monitor,
-            },
-        )
+        options = {**options, "ipopt.tol": self._tolerance}
+        return build_solver("manoeuvre", self._program, self._monitor, options)
 
     @cached_property
     def _continuing_solver(self) -> ca.Function:
@@ -329,6 +321,17 @@ class MultipleShooting:
     def _unpack_trajectory(self, x: Array) -> Trajectory:
         h, (X, s, v, _) = float(x[0]), (x[each] for each in self._layout.knots())
         return Trajectory(h, s - h * v / 2, v, X)
+
+
+def build_solver(
+    name: str, program: Program, monitor: SolverMonitor, options: Mapping[str, object]
+) -> ca.Function:
+    """Return IPOPT for a program, with options beside those of all solvers."""
+    # The solver's matrices are small: threads of its linear algebra would wait for each other.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    derivatives = {"jac_g": program.jac_g, "hess_lag": program.hess_lag}
+    given = {**_IPOPT_OPTIONS, **options, **derivatives, "iteration_callback": monitor}
+    return ca.nlpsol(name, "ipopt", program.problem, given)
 
 
 def _pack_parameters(

@@ -16,10 +16,10 @@ from spacerobot_ros.model.rotations import (
     rotvecs_from_quaternions,
 )
 from spacerobot_ros.planning.methods.optimal.multiple_shooting import (
-    IPOPT_OPTIONS,
     DurationBounds,
     SolverMonitor,
     StopRule,
+    build_solver,
 )
 from spacerobot_ros.planning.methods.optimal.problem import MotionLimits
 from spacerobot_ros.planning.methods.optimal.transcription import ConstraintBlock
@@ -175,19 +175,8 @@ class ThrustSolver:
         self._last: tuple[ThrustKnots, Mapping[str, ca.DM]] | None = None
 
     def _build(self, options: Mapping[str, object]) -> ca.Function:
-        return ca.nlpsol(
-            "thrust",
-            "ipopt",
-            self._program.problem,
-            {
-                **IPOPT_OPTIONS,
-                "ipopt.tol": _TOLERANCE,
-                **options,
-                "jac_g": self._program.jac_g,
-                "hess_lag": self._program.hess_lag,
-                "iteration_callback": self._monitor,
-            },
-        )
+        options = {"ipopt.tol": _TOLERANCE, **options}
+        return build_solver("thrust", self._program, self._monitor, options)
 
     @cached_property
     def _solver(self) -> ca.Function:
