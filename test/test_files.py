@@ -224,4 +224,4 @@ def test_an_srdf_in_an_encoding_that_is_none_is_refused(tmp_path: Path) -> None:
     ]
     result = CliRunner().invoke(main, words)
     assert result.exit_code == 2
-    assert "e.srdf is no XML (unknown encoding: foo-9)." in result.stderr
+    assert "e.srdf is not XML (unknown encoding: foo-9)." in result.stderr

@@ -2,17 +2,24 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import coal
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from spacerobot_ros.control.controller import build_controller
+from spacerobot_ros.control.executive import ControlExecutive
+from spacerobot_ros.control.state import ControlState
 from spacerobot_ros.control.status import ControllerState, ControllerStatus
 from spacerobot_ros.flight.flight import Flight
 from spacerobot_ros.flight.lockstep import fly_scenario
 from spacerobot_ros.measures import Outcome
+from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.planning import Goal
+from spacerobot_ros.planning.execution.goal_file import IdentifiedGoal
+from spacerobot_ros.resources import robot_file
 from spacerobot_ros.scenario import load_scenario
 
 STRAIGHT: dict[str, Any] = {
@@ -77,3 +84,45 @@ def test_a_goal_without_a_plan_is_refused_and_the_robot_holds() -> None:
         assert words in refusals[0].message
         assert flight.outcome is Outcome.REFUSED
         assert np.linalg.norm(flight.pose[-1, :3]) < 1e-6
+
+
+def test_states_are_answered_while_a_thread_plans() -> None:
+    """``plan_in_background``: the robot holds its pose, and later goes on to its last goal."""
+    scenario = load_scenario("free_flyer")
+    config = replace(scenario.controller, plan_in_background=True, tick_rate=50.0)
+    robot = SpaceRobot.from_file(robot_file("jet_cube"))
+    executive = ControlExecutive(build_controller(robot, config), config)
+    place, upright = np.array([0.3, -0.2, 0.1]), np.array([0.0, 0.0, 0.0, 1.0])
+    none, time = np.zeros(0), 0.0
+
+    def answer() -> None:
+        """Answer the state of a robot that follows its reference exactly."""
+        nonlocal time
+        profile = executive.controller.profile
+        pose = None if profile is None else executive.controller.reference_at(time, state).base
+        if pose is None:
+            measured = state
+        else:
+            R_BW = Rotation.from_quat(pose.quaternion).inv()
+            twist = R_BW.apply(pose.velocity), R_BW.apply(pose.angular_velocity)
+            measured = ControlState(pose.position, pose.quaternion, *twist, none, none)
+        executive.evaluate(time, executive.command(time, measured, none, none))
+        time += 0.02
+
+    state = ControlState.at_rest(place, upright, none)
+    answer()
+    executive.submit("base", IdentifiedGoal(Goal.from_rotvec([0.9, 0.1, 0.3], [0.2, 0.1, 0.4])))
+    held = 0
+    while executive.state is not ControllerState.TRACKING:
+        held += 1
+        still = executive.controller.reference_at(time, state).base
+        assert still is not None
+        np.testing.assert_allclose(still.position, place, atol=1e-12)
+        answer()
+    assert held > 2, "the test is sharp: planning takes longer than a state"
+    ends = executive.controller.reference_ends
+    assert ends is not None
+    while executive.state is ControllerState.TRACKING:
+        answer()
+    assert executive.state is ControllerState.REACHED
+    assert time < ends + 5.0

@@ -265,9 +265,9 @@ def test_a_remaining_error_names_what_is_controlled() -> None:
         np.array([0.03, 0.04, 0.0]), np.array([0.0, 0.0, -0.2]), np.array([0.5, -0.75])
     )
     for controls, words in (
-        ({"position"}, "0.05 m from the goal"),
+        ({"position"}, "50 mm from the goal"),
         ({"attitude"}, "0.2 rad from the goal"),
-        ({"position", "attitude"}, "0.05 m and 0.2 rad from the goal"),
+        ({"position", "attitude"}, "50 mm and 0.2 rad from the goal"),
         ({"attitude", "shape"}, "0.2 rad and 0.75 at the joints from the goal"),
     ):
         assert describe_remaining_error(error, frozenset(controls)) == words  # type: ignore[arg-type]
@@ -280,23 +280,23 @@ def test_a_remaining_error_names_what_is_controlled() -> None:
         assert describe_remaining_error(of_hands, frozenset({"end_effectors"})) == words
     within, goal = Tolerance(0.02, 0.06, 0.3), Goal.checked([1, 2, 3], [0, 0, 0, 1], [0.5, 0.25])
     for controls, words in (
-        ({"position"}, "tolerance 0.02 m; attitude and shape not controlled"),
-        ({"attitude", "shape"}, "tolerance 0.06 rad, 0.3 at the joints; position not controlled"),
-        ({"position", "attitude", "shape"}, "tolerance 0.02 m, 0.06 rad, 0.3 at the joints"),
+        ({"position"}, "tolerance 20 mm; attitude and shape not controlled"),
+        ({"attitude", "shape"}, "tolerance 60 mrad, 0.3 at the joints; position not controlled"),
+        ({"position", "attitude", "shape"}, "tolerance 20 mm, 60 mrad, 0.3 at the joints"),
     ):
         told = describe_remaining_error(error, frozenset(controls), within, goal)  # type: ignore[arg-type]
         assert told.endswith(f" from the goal ({words})")
     told = describe_remaining_error(of_hands, frozenset({"end_effectors"}), within)
     hands_words = "end-effectors at most 0.5 m and 0.2 rad from"
-    assert told == f"{hands_words} the goal (tolerance 0.02 m, 0.06 rad)"
+    assert told == f"{hands_words} the goal (tolerance 20 mm, 60 mrad)"
     told = describe_remaining_error(of_hands, frozenset({"position", "end_effectors"}), within)
-    assert told.startswith(f"0.05 m from the goal, {hands_words} theirs (")
+    assert told.startswith(f"50 mm from the goal, {hands_words} theirs (")
     one_hand = PoseError(error.position, error.rotvec, end_effectors=(hand,))
     told = describe_remaining_error(one_hand, frozenset({"position", "end_effectors"}))
-    assert told == "0.05 m from the goal, end-effector 0.5 m from its goal"
+    assert told == "50 mm from the goal, end-effector 0.5 m from its goal"
     unshaped = PoseError(error.position, error.rotvec)
     told = describe_remaining_error(unshaped, frozenset({"position", "shape"}), within)
-    assert told == "0.05 m from the goal (tolerance 0.02 m)"
+    assert told == "50 mm from the goal (tolerance 20 mm)"
     assert (
         describe_remaining_error(unshaped, frozenset({"attitude", "shape"}))
         == "0.2 rad from the goal"

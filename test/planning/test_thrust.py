@@ -16,6 +16,7 @@ from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.thrusters import ThrusterTable, thrusters_of_urdf
 from spacerobot_ros.model.urdf import parse_world
 from spacerobot_ros.model.world import with_world
+from spacerobot_ros.planning.methods.thrust.motion import ThrustMotion
 from spacerobot_ros.planning.methods.thrust.propulsion import Propulsion
 from spacerobot_ros.planning.methods.thrust.search import (
     ThrustGoal,
@@ -179,3 +180,41 @@ def test_what_cannot_be_planned_is_refused_in_a_sentence() -> None:
     far = np.array([9.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
     with pytest.raises(PlanningError, match="out of reach from that of the base"):
         servicer().plan(ThrustStart.at_rest(START, FOLDED), ThrustGoal(START, far))
+
+
+BOOM = CUBE.replace(
+    "</robot>",
+    """<link name="boom"><inertial><origin xyz="0.4 0 0"/><mass value="2"/>
+<inertia ixx="0.01" iyy="0.1" izz="0.1" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<joint name="hinge" type="revolute"><parent link="base_link"/><child link="boom"/>
+<origin xyz="0.2 0 0.1"/><axis xyz="0 0.6 0.8"/>
+<limit lower="-2" upper="2" velocity="0.5" effort="4"/></joint></robot>""",
+)
+
+
+def test_options_bound_the_motion_of_joints_and_the_levels() -> None:
+    robot = SpaceRobot.from_urdf(BOOM)
+    start = ThrustStart.at_rest(START, np.array([0.3]))
+    goal = ThrustGoal(beyond(START, np.array([0.4, 0.1, 0.0]), np.zeros(3)), shape=np.array([-1.2]))
+
+    def planned(**options: Any) -> ThrustMotion:
+        given = ThrustOptions(time_factor=1.0, clearance=0.0, **options)
+        return ThrustPlanner(robot, Propulsion.within(3.0, 1.0), given).plan(start, goal)
+
+    def fastest(motion: ThrustMotion) -> tuple[float, float, float]:
+        times = np.linspace(0, motion.duration, 500, endpoint=False)
+        samples = [motion.at(time) for time in times]
+        largest = (max(abs(float(s[i][0])) for s in samples) for i in (3, 4, 6))
+        speed, acceleration, effort = largest
+        return speed, acceleration, effort
+
+    free = fastest(planned())
+    assert 0.45 < free[0] <= 0.5 * (1 + 1e-6)
+    assert free[1] <= 0.5 / 0.5 * (1 + 1e-6), "the limit of the URDF within ramp_time"
+    assert fastest(planned(max_velocity=(0.2,)))[0] == pytest.approx(0.2, rel=1e-3)
+    assert fastest(planned(max_acceleration=(0.3,)))[1] == pytest.approx(0.3, rel=1e-3)
+    assert fastest(planned(ramp_time=2.5))[1] == pytest.approx(0.2, rel=1e-3)
+    assert len(planned(intervals=14).levels) == 14
+    assert fastest(planned(reserve=0.9))[2] <= 0.1 * 4 * (1 + 1e-3)
+    with pytest.raises(PlanningError, match="no motion to the goal was found"):
+        planned(iterations=1)
