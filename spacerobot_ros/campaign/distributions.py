@@ -259,6 +259,10 @@ def _read_distribution(target: DispersionTarget, given: Any) -> Distribution:
             if len(arguments) != 2:
                 raise ParameterError(f"'{name}': uniform takes [least, largest], two numbers.")
             least, most = (read_real_number(f"{name}: uniform", each) for each in arguments)
+            if not least < most:
+                raise ParameterError(
+                    f"'{name}': uniform is from {least:g} to {most:g}; the first must be the lower."
+                )
             arguments = [least, most - least]
         if len(arguments) > len(words):
             raise ParameterError(

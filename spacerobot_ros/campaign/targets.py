@@ -553,7 +553,8 @@ def _fault_target(name: str, index: int, part: str, scenario: Scenario) -> Dispe
     faults = scenario.plant.faults
     if index >= len(faults):
         raise ParameterError(
-            f"'{name}': plant.faults has {len(faults)} fault(s); the first is faults[0]."
+            f"'{name}': plant.faults has {len(faults)} fault(s)"
+            + ("; the first is faults[0]." if faults else ": add one to plant.faults.")
         )
     kind = _require_fault(faults[index], scenario).kind
     if part == "value" and not FAULT_KINDS[kind].value:

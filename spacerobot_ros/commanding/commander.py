@@ -121,6 +121,10 @@ class GoalExecutive(Protocol):
         None: there is no prediction.
         """
 
+    def cancel_plan(self) -> None:
+        """Cancel the plan that is being made; any thread may call this."""
+        ...
+
     def plan_at_once(self) -> None:
         """Make later plans while states wait for them: the plant is in lockstep."""
         ...
@@ -726,6 +730,11 @@ class Commander(ABC):
             self.host.log("error", message)
 
     # -- the plant ----------------------------------------------------------------------------
+
+    def interrupt(self) -> None:
+        """Cancel the plan that is being made; any thread may call this."""
+        if self.executive is not None:
+            self.executive.cancel_plan()
 
     def receive_plant_status(self, status: PlantStatus, name: str = "plant") -> None:
         """React to a status of the named plant."""

@@ -126,11 +126,6 @@ class PlannerCommander(Commander):
         assert self.executive is not None
         return self.executive.setpoint
 
-    def interrupt(self) -> None:
-        """Cancel the requested plan; any thread may call this."""
-        if self.executive is not None:
-            self.executive.cancel_plan()
-
     def _build_executive(self, robot: SpaceRobot, decoder: StateDecoder) -> None:
         worker = self._make_worker(robot, self._method)
         self.executive = Executive(robot, self.config, worker)

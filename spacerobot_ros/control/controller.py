@@ -217,10 +217,9 @@ class CoordinatedController:
         base: PoseReference | None = None,
         end_effector: PoseReference | None = None,
         joints: Array | None = None,
-        in_background: bool,
         lead: float = 0.0,
     ) -> PlanJob:
-        """Begin to plan a reference towards new goals.
+        """Return the work on a reference towards new goals, which is not begun yet.
 
         The arguments are those of :meth:`set_goals`. If the reference moves, the plan begins
         ``lead`` s later, where the reference will be then.
@@ -239,7 +238,7 @@ class CoordinatedController:
         def work(cancellation: Cancellation) -> PlannedReference:
             return planner.plan(start, goal, state, limits, cancellation, carries=carries)
 
-        return PlanJob(work, begins, in_background=in_background)
+        return PlanJob(work, begins)
 
     def begin_planned(self, time: float, profile: PlannedReference) -> None:
         """Follow a planned reference from a time on."""

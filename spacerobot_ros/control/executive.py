@@ -92,6 +92,11 @@ class _Plan:
     job: PlanJob
     lead: float
 
+    def is_for(self, pending: Mapping[str, IdentifiedGoal]) -> bool:
+        """Whether these goals wait for it."""
+        same = (goal is pending.get(part) for part, goal in self.pending.items())
+        return len(pending) == len(self.pending) and all(same)
+
 
 class ControlExecutive:
     """Gives a :class:`CoordinatedController` its goals, and reports their outcome.
@@ -138,12 +143,16 @@ class ControlExecutive:
         self.plans_in_background = config.plan_in_background
         """Whether references are planned in a thread."""
         self._plan: _Plan | None = None
+        self.plan_time = 0.0
+        """Wall time for which references have been planned, s."""
         self.reset()
 
     def reset(self) -> None:
         """Drop goals and measurements, without a status: the next state is the first."""
         self.controller.reset()
-        self._drop_plan()
+        if self._plan is not None:
+            self._plan.job.close()
+            self._plan = None
         self._time: float | None = None
         """Time of the last state, s."""
         self._next = _Next.GO_ON
@@ -175,6 +184,12 @@ class ControlExecutive:
         self._next_report = 0.0
         self._limited = False
         self._command_report: CommandReport | None = None
+
+    def cancel_plan(self) -> None:
+        """Cancel the reference in the making; any thread may call this."""
+        plan = self._plan
+        if plan is not None:
+            plan.job.cancel()
 
     def plan_at_once(self) -> None:
         """Make later plans while states wait for them: the plant is in lockstep."""
@@ -733,16 +748,17 @@ class ControlExecutive:
         None: it is in the making, or the goals have been refused.
         """
         plan = self._plan
-        if plan is None or plan.pending != self._pending:
+        if plan is None or not plan.is_for(self._pending):
             if plan is not None:
                 plan.job.cancel()
             if carried:
                 self.controller.hold_here(time, state)
             aims, asked = self._aims(state)
             lead = _PLANNING_TIME if plan is None else plan.lead
-            plan = self._plan = self._begin_plan(time, state, aims, asked, lead)
+            plan = self._begin_plan(time, state, aims, asked, lead)
         if not plan.job.done:
             return None
+        self.plan_time += plan.job.wall_time
         try:
             profile = plan.job.result()
         except PlanningError as error:
@@ -753,7 +769,7 @@ class ControlExecutive:
         begins = plan.job.begins
         if begins < time and begins > -math.inf and self.plans_in_background:
             # The reference has gone on: a plan from where it will be in twice the time.
-            self._plan = self._begin_plan(time, state, plan.aims, plan.asked, 2 * plan.lead)
+            self._begin_plan(time, state, plan.aims, plan.asked, 2 * plan.lead)
             return None
         if begins > time and self.plans_in_background:
             return None
@@ -776,10 +792,12 @@ class ControlExecutive:
             time,
             ControlState.unstack(memory),
             **aims,
-            in_background=background,
             lead=lead if background else 0.0,
         )
-        return _Plan(dict(self._pending), aims, asked, job, lead)
+        # Known before the work begins, so that it can be cancelled.
+        self._plan = plan = _Plan(dict(self._pending), aims, asked, job, lead)
+        job.start(in_background=background)
+        return plan
 
     def _take_tolerance(self, tolerance: Tolerance | None) -> None:
         self._goal_tolerance, self._goal_config = tolerance, self._config_with(tolerance)
@@ -853,6 +871,8 @@ class ControlExecutive:
                 away = self.controller.distance_from_reference()
                 if self._guided:
                     return f"Following references; {away} from them."
+                if self._plan is not None:
+                    return f"Planning a motion to the goal; holding, {away} from the reference."
                 return f"Waiting for a goal; holding, {away} from the reference."
             case ControllerState.TRACKING if self.servicing.task is not None:
                 return self.servicing.message

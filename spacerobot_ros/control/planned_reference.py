@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from threading import Thread
+from time import perf_counter
 from typing import ClassVar
 
 import numpy as np
@@ -26,6 +27,7 @@ from spacerobot_ros.model.space_robot import SpaceRobot
 from spacerobot_ros.model.thrusters import find_thrusters
 from spacerobot_ros.parameters import parameter
 from spacerobot_ros.planning.core.cancellation import Cancellation, PlanningCancelled
+from spacerobot_ros.planning.execution.worker import MAX_THREAD_END_TIME
 from spacerobot_ros.planning.methods.thrust.motion import FrameSample, ThrustMotion
 from spacerobot_ros.planning.methods.thrust.propulsion import Propulsion
 from spacerobot_ros.planning.methods.thrust.search import (
@@ -188,7 +190,7 @@ def _numbers(pose: PoseReference) -> Array:
 
 
 class PlanJob:
-    """A plan in the making, in a thread or at once.
+    """A plan in the making.
 
     Parameters
     ----------
@@ -196,40 +198,47 @@ class PlanJob:
         Returns the plan, or raises PlanningError.
     begins
         Time at which the plan begins if it is ready by then, s; minus infinity: when it is ready.
-    in_background
-        Whether a thread does the work.
     """
 
-    def __init__(
-        self,
-        work: Callable[[Cancellation], PlannedReference],
-        begins: float,
-        *,
-        in_background: bool,
-    ) -> None:
+    def __init__(self, work: Callable[[Cancellation], PlannedReference], begins: float) -> None:
         self.begins = begins
         self.done = False
+        self.wall_time = 0.0
+        """Wall time of the work, s."""
         self._cancellation = Cancellation()
         self._work = work
         self._result: PlannedReference | None = None
         self._error: BaseException | None = None
+        self._thread = Thread(target=self._run, daemon=True)
+
+    def start(self, *, in_background: bool) -> None:
+        """Do the work, in a thread or at once."""
         if in_background:
-            Thread(target=self._run, daemon=True).start()
+            self._thread.start()
         else:
             self._run()
 
     def _run(self) -> None:
+        began = perf_counter()
         try:
             self._result = self._work(self._cancellation)
         except PlanningCancelled:
             pass
         except BaseException as error:
             self._error = error
+        self.wall_time = perf_counter() - began
         self.done = True
 
     def cancel(self) -> None:
-        """End the work; its result is dropped."""
+        """End the work; its result is dropped. Any thread may call this."""
         self._cancellation.cancel()
+
+    def close(self) -> None:
+        """End the work, and wait until its thread has ended."""
+        self.cancel()
+        if self._thread.is_alive():
+            # A thread inside CasADi would crash a process that ends.
+            self._thread.join(MAX_THREAD_END_TIME)
 
     def result(self) -> PlannedReference:
         """Return the plan.

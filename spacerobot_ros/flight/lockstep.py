@@ -311,8 +311,9 @@ class LockstepFlight:
     def interrupt(self) -> None:
         """End the flight, and the plan that is being made; called from another thread."""
         self._interrupted = True
-        if self._planner is not None:
-            self._planner.interrupt()
+        for commander in (self._planner, self._controller):
+            if commander is not None:
+                commander.interrupt()
 
     def _fly(self, progress: Progress, longest: float) -> str:
         """Fly; return why the flight was interrupted, empty if the goal was decided."""
@@ -557,6 +558,8 @@ class LockstepFlight:
         plan_time = 0.0
         if self._planner is not None:
             plan_time = self._planner.statistics.plan_time_s
+        if self._controller is not None and self._controller.executive is not None:
+            plan_time += self._controller.executive.plan_time
         return self.log.flight(
             self._scenario,
             self._robots.description or self._robots.plant.description,

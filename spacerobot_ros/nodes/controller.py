@@ -66,7 +66,7 @@ class CoordinatedControlNode(CommanderNode):
     def make_commander(self) -> ControllerCommander:
         """Return the controller behind this node, which is independent of ROS."""
         self._published: Any = None
-        """State of the last status."""
+        """State and goal of the last status."""
         self._busy: set[str] = set()
         """Nodes that plan or compile, by their heartbeats."""
         return ControllerCommander(self.config, self, partner_is_busy=lambda: bool(self._busy))
@@ -159,10 +159,14 @@ class CoordinatedControlNode(CommanderNode):
     def publish_status(self, status: Status) -> None:
         """Publish a status of the goal, and log it where something is wrong."""
         super().publish_status(status)
-        lasts, self._published = self._published is status.state, status.state
+        decision = status.state, status.goal_id
+        lasts, self._published = self._published == decision, decision
         # One lost message is no matter for the log.
-        if status.state.level and (lasts or status.state is not ControllerState.ESTIMATING):
-            self.get_logger().warning(status.message, throttle_duration_sec=5.0)
+        if status.state is ControllerState.ESTIMATING:
+            if lasts:
+                self.get_logger().warning(status.message, throttle_duration_sec=5.0)
+        elif status.state.level and not lasts:
+            self.get_logger().warning(status.message)
         elif status.state is ControllerState.REACHED and not lasts:
             self.get_logger().info(status.message)
 

@@ -137,10 +137,6 @@ class PlannerNode(CommanderNode):
             self.config.trajectory_action, self.commander.end_schedule
         )
 
-    def interrupt(self) -> None:
-        """Cancel the plan that is being made."""
-        self.commander.interrupt()
-
     def parameters_changed(self) -> None:
         """Plan and evaluate with the new tolerances."""
         self.commander.reconfigure(self.config)

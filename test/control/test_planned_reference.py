@@ -112,17 +112,23 @@ def test_states_are_answered_while_a_thread_plans() -> None:
     state = ControlState.at_rest(place, upright, none)
     answer()
     executive.submit("base", IdentifiedGoal(Goal.from_rotvec([0.9, 0.1, 0.3], [0.2, 0.1, 0.4])))
-    held = 0
+    held, second = 0, Goal.from_rotvec([0.5, -0.9, 0.4], [-0.3, 0.2, 0.1])
     while executive.state is not ControllerState.TRACKING:
         held += 1
+        if held == 3:
+            # Another goal while a plan for the first one is made.
+            executive.submit("base", IdentifiedGoal(second))
         still = executive.controller.reference_at(time, state).base
         assert still is not None
         np.testing.assert_allclose(still.position, place, atol=1e-12)
         answer()
-    assert held > 2, "the test is sharp: planning takes longer than a state"
+    assert held > 5, "the test is sharp: planning takes longer than a state"
     ends = executive.controller.reference_ends
     assert ends is not None
     while executive.state is ControllerState.TRACKING:
         answer()
     assert executive.state is ControllerState.REACHED
     assert time < ends + 5.0
+    ended = executive.controller.reference_at(time, state).base
+    assert ended is not None
+    np.testing.assert_allclose(ended.position, second.position, atol=1e-9)

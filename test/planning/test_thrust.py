@@ -204,8 +204,8 @@ def test_options_bound_the_motion_of_joints_and_the_levels() -> None:
     def fastest(motion: ThrustMotion) -> tuple[float, float, float]:
         times = np.linspace(0, motion.duration, 500, endpoint=False)
         samples = [motion.at(time) for time in times]
-        largest = (max(abs(float(s[i][0])) for s in samples) for i in (3, 4, 6))
-        speed, acceleration, effort = largest
+        rates = np.array([[s.qdot[0], s.qddot[0], s.tau[0]] for s in samples])
+        speed, acceleration, effort = np.abs(rates).max(axis=0).tolist()
         return speed, acceleration, effort
 
     free = fastest(planned())

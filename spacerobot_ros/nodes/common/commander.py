@@ -145,6 +145,10 @@ class CommanderNode(FlightNode):
         """Drop all goals and stop sending commands."""
         self.commander.deactivate(self._failure)
 
+    def interrupt(self) -> None:
+        """Cancel the plan that is being made."""
+        self.commander.interrupt()
+
     def destroy_node(self) -> None:
         """Destroy the node with its action servers."""
         if self._goal_actions is not None:

@@ -351,13 +351,14 @@ class Goal:
             The robot has no such link, or it is the base, or a link has two goals.
         """
         names = ", ".join(each.name for each in robot.links[1:])
+        remedy = f": name one of its links {names}" if names else ", nor any other than its base"
         goals = []
         for each in self.end_effectors:
             link = robot.end_effector(each.link)
             if not link:
                 raise GoalError(
                     f"The goal is for the end-effector, and robot '{robot.name}' has no link "
-                    f"'{DEFAULT_END_EFFECTOR}': name one of its links {names}."
+                    f"'{DEFAULT_END_EFFECTOR}'{remedy}."
                 )
             if link == robot.base_link:
                 raise GoalError(

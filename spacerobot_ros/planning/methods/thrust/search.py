@@ -607,8 +607,16 @@ class _Search:
             if self._is_timed and found < _NEAR_END:
                 # The nearest controls that fly exactly: solutions of least propellant are flat.
                 last, center = _NEAREST, knots
-        if best is None or error > _LARGEST_END_ERROR:
-            raise PlanningError(self._failure("no motion to the goal was found that flies there"))
+        if best is None:
+            raise PlanningError(self._failure("no motion to the goal was found"))
+        if error > _LARGEST_END_ERROR:
+            least = planner.options.intervals
+            raise PlanningError(
+                self._failure(
+                    f"its plan ends {error:.3g} m or rad beside it; set plan.intervals to more "
+                    f"than {least}"
+                )
+            )
         return best
 
     def _end_error(self, motion: ThrustMotion) -> float:
