@@ -20,6 +20,7 @@ from spacerobot_ros.cli.options import (
     NumberRange,
     attitude_options,
     bag_option,
+    complete_scenario,
     end_effector_options,
     goal_options,
     json_option,
@@ -41,7 +42,7 @@ if TYPE_CHECKING:
 
 
 @click.command("run", cls=GoalCommand)
-@click.argument("scenario", metavar="SCENARIO|ROBOT")
+@click.argument("scenario", metavar="SCENARIO|ROBOT", shell_complete=complete_scenario)
 @end_effector_options
 @goal_options
 @registered_option(
@@ -269,7 +270,7 @@ def _published_lines(scenario: Scenario, summary: dict[str, Any]) -> list[str]:
 
 
 @click.command("up")
-@click.argument("scenario", metavar="SCENARIO|ROBOT")
+@click.argument("scenario", metavar="SCENARIO|ROBOT", shell_complete=complete_scenario)
 @settings_option
 @bag_option("Bag to write [none].")
 @click.option(

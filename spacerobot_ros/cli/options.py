@@ -308,6 +308,15 @@ def _read_path(file: Path) -> list[list[float]]:
     return found
 
 
+def complete_scenario(_: click.Context, __: click.Parameter, incomplete: str) -> list[str]:
+    """Return the scenarios and robots whose names begin so, for shells."""
+    from spacerobot_ros.resources import resource_names
+    from spacerobot_ros.scenario import scenario_names
+
+    names = {*scenario_names(), *resource_names("urdf", ".urdf")}
+    return sorted(name for name in names if name.startswith(incomplete))
+
+
 def goal_options(command: Callable[..., None]) -> Callable[..., None]:
     """Add the options of a goal to a command, as its argument ``goal``."""
 

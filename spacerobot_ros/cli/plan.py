@@ -16,6 +16,7 @@ from spacerobot_ros.cli.options import (
     METHODS,
     GoalCommand,
     GoalOptions,
+    complete_scenario,
     end_effector_options,
     goal_options,
     json_option,
@@ -38,7 +39,7 @@ _NO_GOAL = GoalOptions(None, None, None)
 
 
 @click.command("plan", cls=GoalCommand)
-@click.argument("scenario", metavar="SCENARIO|ROBOT")
+@click.argument("scenario", metavar="SCENARIO|ROBOT", shell_complete=complete_scenario)
 @end_effector_options
 @goal_options
 @registered_option("--method", registries=(METHODS,), help="Gait method [the scenario's].")

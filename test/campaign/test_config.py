@@ -52,7 +52,10 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     ({"disperse": {"mass": {"beta": {"a": 1}}}}, "beta needs its argument 'b'"),
     ({"disperse": {"mass": {"norm": [1, 2, 3]}}}, "norm takes loc, scale, not 3 numbers"),
     ({"disperse": {"mass": {"uniform": [1]}}}, r"uniform takes \[least, largest\], two numbers"),
-    ({"disperse": {"mass": {"uniform": [2, 1]}}}, "uniform is from 2 to 1; the first must be the lower"),
+    (
+        {"disperse": {"mass": {"uniform": [2, 1]}}},
+        "uniform is from 2 to 1; the first must be the lower",
+    ),
     ({"disperse": {"mass": 1.0}}, "must have one distribution"),
     ({"disperse": {"mass": NORM, "mass.mass_1": NORM}}, "set the same numbers"),
     ({"disperse": {"mass.mass_1": NORM, "mass": NORM}}, "'mass.mass_1' and 'mass' set the same"),

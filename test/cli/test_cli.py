@@ -12,6 +12,7 @@ from pathlib import Path
 import click
 import pytest
 import yaml
+from click.shell_completion import ShellComplete
 from sensor_msgs.msg import JointState
 from support.altered_bags import altered
 from support.command_line import CliRunner, Result
@@ -544,3 +545,21 @@ def test_replay_has_the_options_of_its_node() -> None:
     result = CliRunner().invoke(main, ["replay", str(BAG), "--remap", "/odom=/b"])
     assert result.exit_code == 2
     assert_one_sentence(result.stderr, "'/odom=/b'", "'old:=new'")
+
+
+def test_shells_complete_scenarios_robots_and_commands() -> None:
+    completion = ShellComplete(main, {}, "spacerobot", "_SPACEROBOT_COMPLETE")
+
+    def completed(words: list[str], begun: str) -> list[str]:
+        return [each.value for each in completion.get_completions(words, begun)]
+
+    found = completed(["run"], "servicer")
+    assert found == ["servicer", "servicer_thrusters", "servicer_wheels"]
+    assert completed(["plan"], "faults/stuck_s") == ["faults/stuck_slider"]
+    assert {"replay", "report"} <= set(completed([], "re"))
+
+
+def test_an_argument_of_xacro_without_a_value_is_refused() -> None:
+    result = CliRunner().invoke(main, ["--xacro-arg", "foo", "robots"])
+    assert result.exit_code == 2
+    assert "'foo' is not NAME:=VALUE." in result.output
