@@ -74,9 +74,6 @@ class CommandGroup(click.Group):
 )
 def main(plugins: tuple[Path, ...], xacro_arguments: tuple[str, ...]) -> None:
     """Plan, fly, record and report the motion of free-floating space robots with ROS 2."""
-    for each in xacro_arguments:
-        if ":=" not in each:
-            raise click.BadParameter(f"'{each}' is not NAME:=VALUE.", param_hint="--xacro-arg")
     if xacro_arguments:
         from spacerobot_ros.model.urdf import XACRO_ARGUMENTS_VARIABLE
 

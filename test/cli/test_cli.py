@@ -557,9 +557,3 @@ def test_shells_complete_scenarios_robots_and_commands() -> None:
     assert found == ["servicer", "servicer_thrusters", "servicer_wheels"]
     assert completed(["plan"], "faults/stuck_s") == ["faults/stuck_slider"]
     assert {"replay", "report"} <= set(completed([], "re"))
-
-
-def test_an_argument_of_xacro_without_a_value_is_refused() -> None:
-    result = CliRunner().invoke(main, ["--xacro-arg", "foo", "robots"])
-    assert result.exit_code == 2
-    assert "'foo' is not NAME:=VALUE." in result.output
