@@ -15,6 +15,7 @@ import array
 import os
 import socket
 import sys
+from contextlib import suppress
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -138,7 +139,9 @@ def _serve(path: str) -> None:
                 _, status = os.waitpid(key.data, 0)
                 if connection in selector.get_map():
                     selector.unregister(connection)
-                    connection.send(str(os.waitstatus_to_exitcode(status)).encode())
+                    # Who waited may have gone since.
+                    with suppress(BrokenPipeError, ConnectionResetError):
+                        connection.send(str(os.waitstatus_to_exitcode(status)).encode())
                 connection.close()
 
 
