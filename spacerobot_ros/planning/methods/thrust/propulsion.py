@@ -88,9 +88,3 @@ class Propulsion:
         for group in self.norms:
             cost = cost + self.cost[group[0]] * np.linalg.norm(levels[..., list(group)], axis=-1)
         return np.asarray(cost)
-
-    def levels_for(self, wrenches: Array) -> Array:
-        """Return levels (K, m) that come nearest to wrenches (K, 6), clipped to their limits."""
-        # Least squares of thrusters that pull too, then without pulling: a guess for a solver.
-        levels = wrenches @ np.linalg.pinv(self.wrenches).T
-        return np.clip(levels, self.lowest, 1.0)
