@@ -131,15 +131,15 @@ _NUMBER = re.compile(r"(< )?\d[\d.]* [mµ]?(m|rad)\b")
 class _StatusPrinter:
     """Prints the message of a status if it differs from the one before by more than quantities."""
 
-    def __init__(self, client: MissionClient, show: Callable[[str], None]) -> None:
-        self._client, self._show, self._shown = client, show, ""
+    def __init__(self, show: Callable[[str], None]) -> None:
+        self._show, self._shown = show, ""
 
-    def show(self) -> None:
-        told = _NUMBER.sub("", self._client.message)
-        if told != self._shown:
+    def __call__(self, message: str) -> None:
+        told = _NUMBER.sub("", message)
+        if told and told != self._shown:
             self._shown = told
             with suppress(OSError):  # A closed terminal must not stop the robot.
-                self._show(self._client.message)
+                self._show(message)
 
 
 def run_until_stopped(
@@ -171,10 +171,10 @@ def run_until_stopped(
                 with suppress(OSError):
                     topic = f"{stack.namespace}/goal_pose" if stack.namespace else "goal_pose"
                     show(f"{scenario.name} is up; goals on '{topic}', Ctrl-C ends it.")
-                statuses = _StatusPrinter(stack.client, show)
+                stack.client.on_message = _StatusPrinter(show)
+                stack.client.on_message(stack.client.message)
 
                 def look() -> bool:
-                    statuses.show()
                     supervise()
                     return stopped()
 
@@ -231,17 +231,15 @@ def send_goal(
                 clients, executor, min(timeout or _LONGEST_DISCOVERY, _LONGEST_DISCOVERY), goal
             )
             with graceful_shutdown() as stopped:
+                client.on_message = _StatusPrinter(show)
                 client.send(goal)
-                began, statuses = time.monotonic(), _StatusPrinter(client, show)
+                began = time.monotonic()
 
                 def look() -> bool:
-                    statuses.show()
                     late = timeout > 0 and time.monotonic() - began > timeout
                     return stopped() or late
 
-                outcome = client.follow(executor, look, _CHECK_PERIOD)
-                statuses.show()
-                return outcome
+                return client.follow(executor, look, _CHECK_PERIOD)
         finally:
             for each in clients:
                 each.node.destroy_node()

@@ -76,6 +76,8 @@ class MissionClient:
         """Last status of the commander that decides the goal."""
         self.message = ""
         """Message of the last status that another goal is not the subject of; empty before."""
+        self.on_message: Callable[[str], None] = lambda message: None
+        """Called with each such message as it comes: the next may come before anybody looks."""
         self.decider = decider
         """The commander that decides."""
         self._done = rclpy.task.Future(executor=None)
@@ -240,6 +242,7 @@ class MissionClient:
         self.status = self._read(dict(message.values), message.message)
         if not self._is_about_another_goal(self.status):
             self.message = self.status.message
+            self.on_message(self.message)
         if self._follower.update(self.status):
             self._end(Outcome(self.status.state.value))
 

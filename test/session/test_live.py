@@ -124,7 +124,7 @@ def test_a_planner_that_dies_is_started_again_within_the_limit(
         assert robot.wait(PATIENCE) == 2
 
 
-@pytest.mark.slow  # In real time: an interruption may overtake the line before it.
+@pytest.mark.slow  # In real time, which a busy machine does not keep.
 def test_a_robot_that_is_up_reports_changes_and_not_each_number(spacerobot: Command) -> None:
     settings = ("--rate", "5", "--set", "coordinated_control.time_limit=8")
     with spacerobot.start("up", "coordinated_control", *settings) as robot:

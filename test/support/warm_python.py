@@ -103,6 +103,8 @@ def _serve(path: str) -> None:
     os.write(1, b"ready\n")
     while True:
         for key, _ in selector.select():
+            if selector.get_map().get(key.fd) is not key:
+                continue  # Its program's end stood before it in the list.
             if key.fileobj is sys.stdin:
                 for pid, _ in running.values():
                     os.killpg(pid, signal.SIGKILL)
