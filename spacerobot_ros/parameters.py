@@ -210,10 +210,15 @@ def _named_entries(value: Any) -> dict[str, Any] | None:
     return named if len(named) == len(pairs) else None
 
 
-def parameter(default: Value, description: str, **attributes: Any) -> Any:
+def parameter(default: Value, description: str, unit: str = "", **attributes: Any) -> Any:
     """Return a field of a configuration; ``attributes`` are further ones of :class:`Parameter`."""
-    declaration = Parameter("", default, description=description, **attributes)
+    declaration = Parameter("", default, unit, description, **attributes)
     return field(default=default, metadata={_PARAMETER: declaration})
+
+
+def nonnegative(default: Value, description: str, unit: str = "", **attributes: Any) -> Any:
+    """Return a :func:`parameter` whose number, or every entry, is at least 0."""
+    return parameter(default, description, unit, minimum=0.0, **attributes)
 
 
 def group(default: Any) -> Any:

@@ -32,7 +32,6 @@ from spacerobot_ros.planning.methods.registry import METHODS
 from spacerobot_ros.registry import PLUGINS_VARIABLE, add_plugin
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
-GOAL = [0.3, -0.2, 0.1, 0.0, 0.3826834323650898, 0.0, 0.9238795325112867]
 
 _ENTRY_POINTS = """
 [spacerobot_ros.control_laws]

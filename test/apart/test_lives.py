@@ -44,8 +44,6 @@ AT_REST = {
 }
 """States of a commander whose plant publishes states, and which pursues no goal."""
 
-IN_FLIGHT = ("planning", "executing", "tracking")
-
 
 def begin(apart: NodesApart, commander: str) -> None:
     apart.start("plant", robot=ROBOTS[commander])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import itertools
 from typing import Any
 
 import numpy as np
@@ -177,59 +176,6 @@ def test_what_the_law_cannot_give_in_one_step_is_given_by_the_controller() -> No
         here, there = fly_lanes(flights), fly_one_by_one(flights)
         assert_same(here, there)
         assert 0 < here.fallback_ticks.sum() <= 9 * 120
-
-
-@needs_compiler
-@pytest.mark.slow
-def test_the_servicer_is_controlled_in_lanes() -> None:
-    shape = np.array([0.0, -1.2, 2.0, 0.0, 0.8, 0.0])
-    # The wrist is light: large gains of its attitude would shake it, and rounding would decide how.
-    careful = Gains(
-        *(GainPair(400.0, 900.0), GainPair(200.0, 400.0)),
-        *(GainPair(200.0, 200.0), GainPair(3.0, 2.0)),
-    )
-    for law, gains in (
-        ("transposed_jacobian", careful),
-        ("model_based", Gains.uniform(1.0, 2.0)),
-    ):
-        flights = controlled("servicer", shape, ticks=100, law=law, gains=gains)
-        assert_same(fly_lanes(flights), fly_one_by_one(flights))
-    gains = Gains.uniform(4.0, 4.0)
-    flights = controlled("servicer", shape, ticks=60, law="computed_torque", gains=gains)
-    program = flights.program
-    assert isinstance(program, ControlledGoals)
-    shaped = dataclasses.replace(program, base=None, joints=shape + 0.1)
-    flights = dataclasses.replace(flights, program=shaped)
-    here, there = fly_lanes(flights), fly_one_by_one(flights)
-    assert_same(here, there)
-    assert np.abs(here.q[:, -1] - shape).max() > 0.001
-
-
-@needs_compiler
-@pytest.mark.slow
-def test_the_noise_of_a_flight_is_that_of_its_seed() -> None:
-    """Of flights that are equal but for their seeds, those of one seed alone are equal."""
-    flights = controlled(
-        *("planar_manipulator", SHAPE),
-        ticks=8,
-        count=4,
-        noise=1e-3,
-        gains=Gains.uniform(30.0, 60.0),
-    )
-    assert flights.sensors is not None
-    flights.initial_states.position[:], flights.sensors.pose_bias[:] = 0.0, 0.0
-    flights.sensors.noise[:], flights.sensors.seeds[:] = 1e-3, [7, 8, 7, 9]
-    program = flights.program
-    assert isinstance(program, ControlledGoals)
-    alike = dataclasses.replace(
-        flights, program=dataclasses.replace(program, gains=()), inertial=None
-    )
-    for result in (fly_lanes(alike), fly_one_by_one(alike)):
-        for values in (result.measured_pose[:, -1], result.qdot[:, -1]):
-            np.testing.assert_array_equal(values[0], values[2])
-            others = (values[0], values[1], values[3])
-            for one, other in itertools.combinations(others, 2):
-                assert np.abs(one - other).max() > 1e-7
 
 
 def test_a_controller_at_another_rate_is_refused() -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import itertools
 from pathlib import Path
 
 import numpy as np
@@ -223,26 +222,6 @@ def test_the_widest_registers_that_there_are_are_chosen(monkeypatch: pytest.Monk
 
 @needs_compiler
 @pytest.mark.slow
-@pytest.mark.parametrize("unit", [*native.VECTOR_UNITS, "plain"])
-def test_narrower_registers_give_the_same_flights(
-    robots: dict[str, SpaceRobot], monkeypatch: pytest.MonkeyPatch, unit: str
-) -> None:
-    widest = native.vector_unit()
-    chosen = native._PORTABLE_UNIT if unit == "plain" else native.VECTOR_UNITS[unit]
-    if chosen.lanes > widest.lanes:
-        pytest.skip(f"this processor has no {chosen.name}")
-    monkeypatch.setattr(native, "vector_unit", lambda: chosen)
-    for flights in (
-        velocity_flights(robots["servicer"], 19, each=True, deadband=0.0),
-        effort_flights(robots["servicer"], 19),
-    ):
-        here = fly_lanes(flights)
-        assert f"{chosen.lanes} lanes" in here.engine
-        assert_equal_flights(here, fly_one_by_one(flights))
-
-
-@needs_compiler
-@pytest.mark.slow
 def test_without_vector_functions_of_the_c_library_lanes_fly_as_well(
     robots: dict[str, SpaceRobot], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
@@ -256,21 +235,3 @@ def test_without_vector_functions_of_the_c_library_lanes_fly_as_well(
     here = fly_lanes(flights)
     assert here.engine == with_functions.engine
     assert_equal_flights(here, with_functions)
-
-
-@needs_compiler
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["sliding_masses", "servicer"])
-def test_a_thousand_draws_are_the_plants_to_twelve_digits(
-    robots: dict[str, SpaceRobot], name: str
-) -> None:
-    robot = robots[name]
-    for flights in (
-        velocity_flights(robot, 1000, each=True, deadband=0.0),
-        effort_flights(robot, 1000),
-    ):
-        here, there = fly_lanes(flights), fly_one_by_one(flights)
-        assert_equal_flights(here, there)
-        for counts in there.limited_ticks.values():
-            assert counts.any(axis=1).sum() >= 10
-        assert len(set(itertools.chain(map(tuple, here.pose[:, -1])))) == 1000

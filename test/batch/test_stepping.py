@@ -149,30 +149,6 @@ def test_stepped_lanes_are_plants_with_resets_and_other_masses(
     assert at_stops > 3
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("actuation", ["velocity", "effort"])
-def test_flights_without_lanes_are_plants_too(sliders: SpaceRobot, actuation: str) -> None:
-    flights, _ = fly_with_resets(sliders, actuation, 0.02, 16, in_lanes=False, link="mass_3")
-    assert flights.engine == "scalar"
-
-
-@needs_compiler
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("name", "actuation", "period", "link"),
-    [("three_joint_arm", "velocity", 0.05, "link_3"), ("servicer", "effort", 0.01, "tool_link")],
-)
-def test_three_hundred_steps_of_arm_and_servicer_are_those_of_the_plant(
-    name: str, actuation: str, period: float, link: str
-) -> None:
-    robot = SpaceRobot(load_robot(robot_file(name)))
-    flights, at_stops = fly_with_resets(
-        robot, actuation, period, 300, in_lanes=True, link=link, shifted=True
-    )
-    assert "lanes" in flights.engine
-    assert at_stops > 3
-
-
 @needs_compiler
 @pytest.mark.slow
 def test_reaction_wheels_in_lanes_are_those_of_the_plant() -> None:

@@ -24,7 +24,6 @@ from spacerobot_ros.campaign.draws import Draws
 from spacerobot_ros.campaign.running import run_campaign
 from spacerobot_ros.campaign.workers import (
     Cluster,
-    TaskDistributor,
     open_workers,
     serialise_campaign,
     this_code,
@@ -257,34 +256,3 @@ def test_workers_end_with_a_campaign_that_is_killed(tmp_path: Path) -> None:
         run.kill()
         _, alive = psutil.wait_procs(workers, timeout=60.0)
     assert not alive
-
-
-def test_what_lanes_leave_is_flown_in_small_tasks(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Rows of a slow campaign come while it flies, and are those of one process."""
-    corrected = {"planner.attitude_tolerance": 0.002, "planner.max_corrections": 3}
-    made = campaign(
-        disperse={"mass.*": {"norm": {"loc": 1.0, "scale": 0.03}}}, flights=70, set=corrected
-    )
-    tasks: list[tuple[int, str]] = []
-    deal = TaskDistributor._submit_task
-
-    def dealt(self: Any, numbers: list[int], engine: str, **options: Any) -> None:
-        tasks.append((len(numbers), engine))
-        deal(self, numbers, engine, **options)
-
-    monkeypatch.setattr(TaskDistributor, "_submit_task", dealt)
-    run_campaign(made, tmp_path / "here", engine="lanes")
-    run_campaign(made, tmp_path / "there", engine="lanes", cluster=Cluster(workers=2))
-    here, there = (
-        {row["flight"]: row for row in rows(tmp_path / name)} for name in ("here", "there")
-    )
-    assert here.keys() == there.keys() == set(range(70))
-    named = ("engine", "fallback", "outcome", "reason", "position_error_m", "duration_s")
-    assert all(here[n][name] == there[n][name] for n in here for name in named)
-    left = sum(row["fallback"] == "needed corrections" for row in there.values())
-    assert 5 < left < 70
-    assert sum(size for size, engine in tasks if engine == "flights") == left
-    assert max(size for size, engine in tasks if engine == "flights") < 64
-    assert sum(size for size, engine in tasks if engine == "lanes") == 70

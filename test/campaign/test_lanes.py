@@ -4,24 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import casadi as ca
-import numpy as np
 import pytest
 from support.campaigns import campaign
 from support.slow import some_fast
 
-from spacerobot_ros.campaign import lanes
 from spacerobot_ros.campaign.config import Campaign, parse_campaign
-from spacerobot_ros.campaign.dataset import Dataset
 from spacerobot_ros.campaign.draws import Draws
 from spacerobot_ros.campaign.engines import fly_all, select_engine
 from spacerobot_ros.campaign.lanes import LanesEngine
 from spacerobot_ros.campaign.one_by_one import FlightsEngine
 from spacerobot_ros.campaign.rows import Row
-from spacerobot_ros.campaign.running import RERUN_TOLERANCE, largest_deviation, run_campaign
+from spacerobot_ros.campaign.running import RERUN_TOLERANCE, largest_deviation
 from spacerobot_ros.control.laws.registry import LAWS
 from spacerobot_ros.control.laws.transposed_jacobian import TransposedJacobianLaw
 from spacerobot_ros.control.state import Actuation, Reference
@@ -42,26 +38,6 @@ DISPERSED: dict[str, Any] = {
 def flown(engine: LanesEngine | FlightsEngine, made: Campaign) -> dict[int, Row]:
     rows = fly_all(engine, made, list(Draws(made)), lambda: False)
     return {row.draw.number: row for row in rows}
-
-
-@pytest.mark.slow
-def test_a_flight_has_the_same_row_in_any_batch(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Schedules to different goals end at different ticks, and batches end where time is up."""
-    goals = {"goal.rotvec.z": {"uniform": [0.05, 0.65]}, "mass.*": {"uniform": [0.95, 1.05]}}
-    made = campaign(disperse=goals, flights=4, seed=3, set={"planner.max_corrections": 0})
-    together = flown(LanesEngine(), made)
-    monkeypatch.setattr(lanes, "_MAX_BATCH_PREPARATION_TIME", 0.0)
-    apart = flown(LanesEngine(), made)
-    assert len({row.metrics["duration_s"] for row in together.values()}) == 4
-    wall = {"wall_time_s", "plan_time_s"}
-    for number, row in together.items():
-        other = apart[number]
-        assert row.engine == other.engine == "lanes"
-        here, there = (
-            {name: x for name, x in each.metrics.items() if name not in wall}
-            for each in (row, other)
-        )
-        np.testing.assert_equal(here, there)
 
 
 @pytest.mark.slow
@@ -250,14 +226,6 @@ def test_draws_that_are_no_robot_and_no_number_end_no_other_flight() -> None:
     assert 0 < len(weightless) < 6
     assert set(weightless) == {"The total mass of the robot is zero."}
     assert {row.engine for row in lanes.values()} == {"lanes"}
-
-
-@pytest.mark.slow
-def test_control_in_lanes_is_flown_in_this_process_too(tmp_path: Path) -> None:
-    """Where no workers take the draws apart, lanes do."""
-    end = run_campaign(controlled(flights=3, longest=0.2), tmp_path)
-    assert end.flown == 3
-    assert Dataset(tmp_path).table()["engine"].to_pylist() == ["lanes"] * 3
 
 
 class HalfLaw(TransposedJacobianLaw):

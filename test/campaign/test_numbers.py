@@ -18,8 +18,7 @@ from spacerobot_ros.campaign import draws as sampling
 from spacerobot_ros.campaign import running as reruns
 from spacerobot_ros.campaign.config import Criterion, load_campaign, meets_criterion
 from spacerobot_ros.campaign.dataset import Dataset, self_contained
-from spacerobot_ros.campaign.distributions import Distribution
-from spacerobot_ros.campaign.draws import Draw, Draws, drawn_flight, drawn_flights, sobol_problem
+from spacerobot_ros.campaign.draws import Draw, Draws, drawn_flight, sobol_problem
 from spacerobot_ros.campaign.rows import Row
 from spacerobot_ros.campaign.running import Progress, Rerun, largest_deviation
 from spacerobot_ros.campaign.statistics import (
@@ -205,14 +204,6 @@ def test_criteria_include_their_bounds() -> None:
     assert not meets_criterion(criterion, {})
 
 
-def test_choices_are_equally_likely() -> None:
-    three = Distribution("choice", {}, ("a", "b", "c"))
-    shares = np.array([0.0, 0.333, 0.334, 0.666, 0.667, 1.0])
-    assert three.quantiles(shares) == ["a", "a", "b", "b", "c", "c"]
-    assert str(three) == "one of a, b, c"
-    assert str(Distribution("norm", {"loc": 1.0, "scale": 0.05})) == "norm (loc 1, scale 0.05)"
-
-
 @pytest.mark.parametrize(
     ("given", "sentence"),
     [
@@ -254,22 +245,6 @@ def test_what_is_refused_of_a_campaign(given: dict[str, Any], sentence: str) -> 
     assert str(refused.value).startswith(sentence)
 
 
-def test_a_campaign_has_defaults() -> None:
-    made = campaign()
-    assert (made.flights, made.seed, made.sampler, made.max_flight_time) == (
-        100,
-        0,
-        "random",
-        100_000.0,
-    )
-    assert (made.engine, made.description, made.dispersions, made.criteria) == ("auto", "", (), ())
-    assert campaign(flights=10_000_000, seed=2**63 - 1, longest=0).max_flight_time == 0.0
-    (criterion,) = campaign(criteria={"duration_s": {"max": 2}}).criteria
-    assert (criterion.minimum, criterion.maximum) == (-math.inf, 2.0)
-    assert not made.measures_clearance
-    assert campaign(criteria={"clearance_m": {"min": 0}}).measures_clearance
-
-
 def test_a_file_that_is_refused_is_named(tmp_path: Path) -> None:
     file = tmp_path / "a.yaml"
     file.write_text("campaign: {scenario: 3}")
@@ -282,22 +257,6 @@ def test_a_file_that_is_refused_is_named(tmp_path: Path) -> None:
 
 
 # -- draws ----------------------------------------------------------------------------------------
-
-
-def test_seeds_and_values_of_draws() -> None:
-    """Of the campaign's seed and the number of the draw, as numpy makes them."""
-    made = campaign(flights=3, seed=7, disperse={"mass": {"uniform": [1.0, 3.0]}})
-    draws = Draws(made)
-    assert len(draws) == 3
-    for number, draw in enumerate(draws):
-        own = np.random.SeedSequence(7, spawn_key=(number,))
-        assert (draw.number, draw.seed) == (number, int(own.generate_state(1)[0]) // 2)
-        u = np.random.default_rng(own.spawn(1)[0]).random(1)[0]
-        assert draw.values == {"mass": pytest.approx(1.0 + 2.0 * u)}
-    for number in (-1, 3):
-        with pytest.raises(IndexError) as refused:
-            draws[number]
-        assert str(refused.value) == f"There is no draw {number} of 3."
 
 
 @pytest.mark.parametrize("sampler", ["sobol", "halton", "latin_hypercube"])
@@ -322,57 +281,6 @@ def test_a_draw_changes_its_flight() -> None:
     assert str(refused.value) == "The value drawn for 'mass.mass_1' is inf."
     common = DrawnFlight.of(MADE.scenario)
     assert drawn_flight(MADE, Draw(3, 17, {"mass.mass_1": 1.5}), common).nominal is common.nominal
-
-
-def test_draws_that_are_made_together_are_those_made_alone() -> None:
-    """Each is the robot times its own factors, and errors are those of their draws alone."""
-    names = ("mass.mass_1", "inertia", "com.mass_2.y", "planner.position_tolerance")
-    even = {"uniform": [0.5, 1.5]}
-    made = campaign(disperse=dict.fromkeys(names, even))
-    values = [
-        (1.25, 2.0, 0.5, 0.01),
-        (1.0, 1.0, 0.0, 0.02),
-        (math.inf, 1.0, 0.0, 0.02),
-        (0.5, 1.0, math.nan, -1.0),
-        (-1.0, 1.0, 0.0, 0.02),
-        (2.0, 1.0, 0.0, 0.04),
-        (1.0, 0.5, 0.0, 0.03),
-    ]
-    draws = [Draw(k, 10 + k, dict(zip(names, row, strict=True))) for k, row in enumerate(values)]
-    usual = DrawnFlight.of(made.scenario)
-    found = list(drawn_flights(made, iter(draws), usual))
-    assert [draw for draw, _ in found] == draws
-    errors = {k: each for k, (_, each) in enumerate(found) if isinstance(each, Exception)}
-    flights = {k: each for k, (_, each) in enumerate(found) if isinstance(each, DrawnFlight)}
-    for k, error in errors.items():
-        with pytest.raises(type(error)) as raised:
-            drawn_flight(made, draws[k])
-        assert str(raised.value) == str(error)
-    for k, words in {
-        2: "The value drawn for 'mass.mass_1' is inf.",
-        3: "The value drawn for 'com.mass_2.y' is nan.",
-        4: "The mass of 'mass_1'",
-    }.items():
-        assert words in str(errors.pop(k))
-    assert not errors
-    nominal = usual.parameters
-    for k, flight in flights.items():
-        mass, inertia, shift, tolerance = values[k]
-        alone = drawn_flight(made, draws[k])
-        assert flight.seed == alone.seed == 10 + k
-        assert flight.scenario.planner.position_tolerance == tolerance
-        if (mass, inertia, shift) == (1.0, 1.0, 0.0):
-            assert flight.inertial is alone.inertial is None
-            continue
-        masses = nominal.masses * [1.0, mass, 1.0, 1.0]
-        centers = nominal.centers + shift * np.outer([0, 0, 1, 0], [0, 1, 0])
-        tensors = nominal.inertias * inertia * np.reshape([1.0, mass, 1.0, 1.0], (4, 1, 1))
-        assert flight.inertial is not None
-        assert alone.inertial is not None
-        np.testing.assert_allclose(flight.inertial.masses, masses, rtol=1e-15)
-        np.testing.assert_allclose(flight.inertial.centers, centers, rtol=1e-15)
-        np.testing.assert_allclose(flight.inertial.inertias, tensors, rtol=1e-15)
-        assert flight.inertial.vector.tobytes() == alone.inertial.vector.tobytes()
 
 
 def test_a_seed_that_is_dispersed_is_that_of_the_flight() -> None:

@@ -4,9 +4,6 @@ from __future__ import annotations
 
 import math
 import re
-import resource
-import subprocess
-import sys
 from collections.abc import Callable
 from html import unescape
 from pathlib import Path
@@ -395,8 +392,6 @@ DISPERSIONS = {
     "mass.*": {"norm": {"loc": 1.0, "scale": 0.03}},
     "plant.sensors.position_noise": {"uniform": [0.0, 0.001]},
 }
-BYTES = 1e9
-FLIGHTS, COPIES = 500, 2000
 
 
 def multiply(folder: Path, copies: int) -> None:
@@ -441,18 +436,3 @@ def test_columns_are_in_the_order_of_the_flights_and_read_where_they_are_needed(
     messages, forms = Results.of(tmp_path).messages
     assert len(messages) == 21
     assert all("…" in form for form in forms.values())
-
-
-@pytest.mark.slow
-def test_a_million_flights_are_reported_in_a_gigabyte(tmp_path: Path) -> None:
-    run_campaign(campaign(disperse=DISPERSIONS, flights=FLIGHTS, seed=3), tmp_path)
-    multiply(tmp_path, COPIES)
-    command = (
-        "import sys; from spacerobot_ros.cli import start; sys.argv[0] = 'spacerobot'; start()"
-    )
-    arguments = [sys.executable, "-c", command, "campaign", "report", str(tmp_path)]
-    ended = subprocess.run(arguments, capture_output=True, text=True, check=True)
-    peak = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss * 1024
-    print(f"{peak / 1e9:.2f} GB", flush=True)
-    assert re.search(r"of 1000000;", ended.stdout), ended.stdout
-    assert peak <= BYTES

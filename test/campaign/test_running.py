@@ -7,8 +7,6 @@ import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -23,7 +21,6 @@ from spacerobot_ros.campaign.config import Campaign, parse_campaign
 from spacerobot_ros.campaign.dataset import Dataset
 from spacerobot_ros.campaign.draws import Draw, Draws, require_module
 from spacerobot_ros.campaign.engines import fly_all
-from spacerobot_ros.campaign.lanes import LanesEngine
 from spacerobot_ros.campaign.one_by_one import FlightsEngine
 from spacerobot_ros.campaign.results import Results
 from spacerobot_ros.campaign.rows import ERROR, Fallback, Row
@@ -35,7 +32,6 @@ from spacerobot_ros.campaign.running import (
     rerun_flight,
     run_campaign,
 )
-from spacerobot_ros.campaign.workers import Cluster
 from spacerobot_ros.cli.main import main
 from spacerobot_ros.errors import ParameterError, RecordingError, SpaceRobotError
 from spacerobot_ros.resources import robot_file
@@ -84,49 +80,6 @@ def test_a_campaign_that_is_ended_goes_on_where_it_was(tmp_path: Path) -> None:
     read = require_module("pyarrow.parquet").read_table
     parts = (tmp_path / "cut" / "flights").glob("*.parquet")
     assert sum(len(read(part)) for part in parts) == 6, "none is flown twice"
-
-
-@pytest.mark.slow
-def test_a_scheduler_that_is_not_there_is_refused_before_a_folder_is_made(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    asked: list[tuple[str, int]] = []
-
-    @contextmanager
-    def refuse(cluster: Cluster, flights: int) -> Iterator[Any]:
-        asked.append((cluster.scheduler, flights))
-        raise SpaceRobotError("There is no scheduler.")
-        yield
-
-    monkeypatch.setattr(running, "open_workers", refuse)
-    nowhere, folder = Cluster(scheduler="nowhere:1"), tmp_path / "out" / "made"
-    with pytest.raises(SpaceRobotError, match="no scheduler"):
-        run_campaign(small(flights=2), folder, cluster=nowhere)
-    assert asked == [("nowhere:1", 2)]
-    assert not (tmp_path / "out").exists()
-    # A campaign that is flown already asks for no scheduler.
-    run_campaign(small(flights=2), folder)
-    assert run_campaign(small(flights=2), folder, cluster=nowhere).flown == 2
-    assert len(asked) == 1
-    with pytest.raises(SpaceRobotError, match="no scheduler"):
-        run_campaign(small(flights=3), folder, cluster=nowhere)
-    assert run_campaign(small(flights=3), folder).flown == 3, "the folder is free"
-
-
-@pytest.mark.slow
-def test_the_numbers_of_a_row_are_those_of_its_flight(tmp_path: Path) -> None:
-    made = small(flights=2)
-    run_campaign(made, tmp_path)
-    _, row = rows(tmp_path)
-    (again,) = FlightsEngine().fly(made, [_draw(made, 1)], lambda: False)
-    assert largest_deviation({name: row[name] for name in again.metrics}, again.metrics) == (
-        0.0,
-        "",
-    )
-    assert row["engine"] == "flights"
-    assert row["draw.mass.mass_2"] == again.draw.values["mass.mass_2"]
-    assert row["passed"] is (row["position_error_m"] <= 0.01 and row["rate_margin.slider_2"] >= 0.2)
-    assert '"spacerobot_ros"' in row["versions"]
 
 
 def _draw(made: Campaign, number: int) -> Any:
@@ -420,40 +373,6 @@ def test_a_row_that_is_another_flight_is_noticed(tmp_path: Path) -> None:
     lost = {**row.metrics, "duration_s": float("nan")}
     assert not largest_deviation(row.metrics, lost)[0] <= 1.0
     assert isinstance(row, Row)
-
-
-SERVICER: dict[str, Any] = {
-    "mass.*": {"uniform": {"loc": 0.95, "scale": 0.1}},
-    "com.base_link.*": {"norm": {"scale": 0.01}},
-    "goal.position.x": {"norm": {"scale": 0.02}},
-    "end_effector_goal.rotvec.z": {"norm": {"scale": 0.02}},
-    "initial.joints.elbow_pitch": {"norm": {"scale": 0.01}},
-    "plant.sensors.position_noise": {"uniform": [0.0, 0.00005]},
-    "plant.sensors.joint_rate_noise": {"uniform": [0.0, 0.0001]},
-    "coordinated_control.gains.base_attitude.kd": {"uniform": [390.0, 410.0]},
-}
-NEARLY: dict[str, Any] = {
-    "coordinated_control.time_limit": 31.5,
-    "plant.sensors.attitude_bias": [0.0001, 0.0, 0.0],
-}
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("settings", "outcome"), [({}, "reached"), (NEARLY, "failed")])
-def test_the_servicer_is_the_same_in_lanes_and_one_by_one(
-    settings: dict[str, Any], outcome: str
-) -> None:
-    section = {"scenario": "servicer", "flights": 3, "seed": 5, "disperse": SERVICER}
-    made = parse_campaign("servicer", {**section, "set": settings})
-    draws = list(Draws(made))
-    lanes = list(fly_all(LanesEngine(), made, draws, lambda: False))
-    one_by_one = list(FlightsEngine().fly(made, draws, lambda: False))
-    assert [row.engine for row in lanes] == ["lanes"] * 3
-    assert {row.outcome for row in lanes} == {outcome}
-    for here, there in zip(lanes, one_by_one, strict=True):
-        assert (here.outcome, here.reason) == (there.outcome, there.reason)
-        deviation, at = largest_deviation(there.metrics, here.metrics)
-        assert deviation < RERUN_TOLERANCE, at
 
 
 def test_the_clearance_is_measured_where_a_criterion_names_it() -> None:

@@ -22,7 +22,7 @@ from spacerobot_ros.cli.robots import (
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.planning import METHODS
 from spacerobot_ros.planning.analysis import analyze
-from spacerobot_ros.resources import resource_names, robot_file
+from spacerobot_ros.resources import robot_file
 
 
 @pytest.fixture(autouse=True)
@@ -83,15 +83,6 @@ def test_the_papers_nominal_shape() -> None:
     assert any("condition 3.6" in line for line in analysis_lines(findings))
 
 
-@pytest.mark.slow
-def test_the_best_shape_is_better_than_the_papers() -> None:
-    found = analysis_json(analyze(SpaceRobot.from_file(robot_file("three_joint_arm"))))
-    assert found["at_shape"]["condition"] < 3.60
-    over = found["condition_over_shapes"]
-    assert over["best"] <= over["median"]
-    assert over["spanning"] == over["shapes"]
-
-
 def jointed(*limits: str) -> SpaceRobot:
     """Return a robot with a revolute joint for each text of limits, and a slider."""
     body = '<link name="{}"><inertial><mass value="2"/><inertia ixx="1" iyy="1" izz="1" '
@@ -146,17 +137,6 @@ def test_masses_and_limits_are_those_of_the_urdf() -> None:
     # A joint without limits has none.
     assert [joint["lower"] for joint in found["joints"]] == [None, None]
     assert "144 kg, of which the base 120 kg" in analysis_lines(findings)[0]
-
-
-@pytest.mark.slow
-def test_a_urdf_of_ones_own(tmp_path: Path) -> None:
-    urdf = tmp_path / "own.urdf"
-    urdf.write_text(random_robot_urdf(np.random.default_rng(7), 4))
-    found, lines, picture = analyzed(tmp_path, str(urdf))
-    assert found["anywhere"]["rank"] == 3
-    assert found["auto"] == "optimal"
-    assert picture.is_file()
-    assert len(lines) <= 27
 
 
 @pytest.mark.slow
@@ -220,11 +200,3 @@ def test_what_is_refused_with_a_sentence(arguments: list[str], sentence: str) ->
     assert result.exit_code == 2
     assert sentence in result.output
     assert len(result.output.splitlines()) == 1
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("robot", resource_names("urdf", ".urdf"))
-def test_every_robot_of_the_package_is_drawn(tmp_path: Path, robot: str) -> None:
-    _, lines, picture = analyzed(tmp_path, robot)
-    assert picture.is_file()
-    assert len(lines) <= 42

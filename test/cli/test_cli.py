@@ -123,25 +123,6 @@ def test_broken_scenario_file_is_named(tmp_path: Path) -> None:
     assert "is refused" in spacerobot("run", str(path)).output
 
 
-@pytest.mark.slow
-def test_own_robot_in_an_own_scenario(tmp_path: Path) -> None:
-    """Another robot is a URDF and a parameter file, nothing else."""
-    urdf = (
-        load_scenario("sliding_masses").path.parent.parent / "urdf/sliding_masses.urdf"
-    ).read_text()
-    (tmp_path / "mine.urdf").write_text(urdf.replace('value="10"', 'value="5"'))
-    (tmp_path / "mine.yaml").write_text(
-        f"""
-scenario: {{ros__parameters: {{goal_position: [0.1, 0.0, 0.05]}}}}
-plant: {{ros__parameters: {{robot: {tmp_path}/mine.urdf, tick_rate: 10}}}}
-planner:
-  ros__parameters: {{robot: {tmp_path}/mine.urdf, tick_rate: 10, lie_bracket.t1: 4}}
-"""
-    )
-    result = spacerobot("run", str(tmp_path / "mine.yaml"), "--bag", str(tmp_path / "a.mcap"))
-    assert result.exit_code == 0, result.output
-
-
 def test_scenarios_are_listed() -> None:
     output = spacerobot("scenarios").output
     assert all(name in output for name in scenario_names())
@@ -434,9 +415,6 @@ def test_a_path_that_is_no_text_is_refused(option: str) -> None:
     assert ended.returncode == 2
     assert "bytes that are not UTF-8" in ended.stderr
     assert "Traceback" not in ended.stderr
-
-
-# -- findings of `analyze`, plans and flights as lines, from results made by hand ----------------
 
 
 # -- flights --------------------------------------------------------------------------------------

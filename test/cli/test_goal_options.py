@@ -26,7 +26,6 @@ from spacerobot_ros.cli.options import (
     GoalOptions,
     RegisteredName,
     goal_options,
-    viewer_if_requested,
     warn_of_large_angles,
 )
 from spacerobot_ros.cli.terminal import sentences
@@ -142,32 +141,6 @@ def test_a_choice_of_names_in_registries_is_sorted(monkeypatch: pytest.MonkeyPat
     monkeypatch.setitem(sys.modules, "some_registry", module)
     choice = RegisteredName("some_registry:A", "some_registry:B")
     assert tuple(choice.choices) == ("one", "three", "two")
-
-
-def test_a_viewer_runs_beside_a_command_that_wants_one(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    import spacerobot_ros.session.viewing as module
-
-    class Viewing:
-        def __init__(self, parameters: Any, show: Any, namespace: str) -> None:
-            show(f"{parameters} {namespace!r}")
-
-        def __enter__(self) -> None:
-            pass
-
-        def __exit__(self, *of: object) -> None:
-            pass
-
-    monkeypatch.setattr(module, "viewing", Viewing)
-    with viewer_if_requested(False, {"port": 1}):
-        pass
-    assert capsys.readouterr() == ("", "")
-    with viewer_if_requested(True, {"port": 1}):
-        pass
-    with viewer_if_requested(True, {}, "left"):
-        pass
-    assert capsys.readouterr() == ("", "{'port': 1} ''\n{} 'left'\n")
 
 
 # -- how commands end -----------------------------------------------------------------------------

@@ -19,9 +19,7 @@ import spacerobot_ros.nodes.common.process as process
 import spacerobot_ros.report
 import spacerobot_ros.session.live as session
 from spacerobot_ros.cli.main import main
-from spacerobot_ros.flight.trials import PlanningProblem
 from spacerobot_ros.measures import Outcome
-from spacerobot_ros.scenario import load_scenario
 
 RPY = (20.0, -35.0, 50.0)
 """Roll, pitch and yaw whose order matters, deg."""
@@ -58,118 +56,6 @@ def test_the_attitude_of_a_goal_that_is_sent_is_given_in_degrees(
     assert named == {"namespace": "left", "timeout": 2.5}
     assert call("goal", 0.1, -0.2, 0.3).exit_code == 1
     assert sent[1][1] == {"namespace": "", "timeout": 0.0}
-
-
-@pytest.mark.parametrize("command", ["plan", "run"])
-def test_attitude_in_degrees_and_position_of_a_goal_reach_the_scenario(
-    command: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    found: list[Any] = []
-    scenario = load_scenario("arm_attitude")
-    with_goal = type(scenario).with_goal
-
-    def noted(self: Any, *arguments: Any, **named: Any) -> Any:
-        found.append(with_goal(self, *arguments, **named))
-        raise ValueError("enough")
-
-    monkeypatch.setattr(type(scenario), "with_goal", noted)
-    call(command, "arm_attitude", "--goal-rpy-deg", *RPY)
-    attitude = Rotation.from_quat(PlanningProblem.of(found[0]).goal.quaternion)
-    assert (attitude.inv() * attitude_of_rpy()).magnitude() < 1e-12
-    call(command, "arm_attitude", "--goal-position", 0.5, -0.25, 1.0)
-    np.testing.assert_array_equal(found[1].goal.position, [0.5, -0.25, 1.0])
-    np.testing.assert_array_equal(found[1].goal.quaternion, scenario.goal.quaternion)
-
-
-HANDS = (
-    *("--end-effector", "left", "--end-effector", "right"),
-    *("--end-effector-goal", 0.5, -0.25, 1.0, 0.0, 0.6, 0.0, 0.8),
-    *("--end-effector-position", 0.125, 2.0, -1.0),
-)
-"""Goals of two end-effectors: a pose, and a position in any attitude."""
-
-
-def assert_hands(end_effectors: Any) -> None:
-    left, right = end_effectors
-    assert (left.link, right.link) == ("left", "right")
-    np.testing.assert_array_equal(left.position, [0.5, -0.25, 1.0])
-    np.testing.assert_allclose(left.quaternion, [0.0, 0.6, 0.0, 0.8])
-    np.testing.assert_array_equal(right.position, [0.125, 2.0, -1.0])
-    assert right.quaternion is None
-
-
-@pytest.mark.parametrize("command", ["plan", "run"])
-def test_goals_of_end_effectors_reach_the_scenario(
-    command: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    found: list[Any] = []
-
-    def noted(self: Any, hands: Any, *_: Any) -> Any:
-        found.append(hands)
-        raise ValueError("enough")
-
-    monkeypatch.setattr(type(load_scenario("arm_attitude")), "with_end_effectors", noted)
-    call(command, "arm_attitude", *HANDS)
-    (hands,) = found
-    assert_hands(hands)
-
-
-@pytest.mark.parametrize("pose", [(), (0.25, -0.5, 0.75), (0.25, -0.5, 0.75, 0.6, 0.0, 0.0, 0.8)])
-def test_goals_of_end_effectors_are_sent_with_and_without_one_of_the_base(
-    pose: tuple[float, ...], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    sent: list[Any] = []
-
-    def send_goal(goal: Any, show: Callable[[str], None], **named: Any) -> Outcome:
-        sent.append(goal)
-        return Outcome.REACHED
-
-    monkeypatch.setattr(session, "send_goal", send_goal)
-    assert call("goal", *pose, *HANDS).exit_code == 0
-    (goal,) = sent
-    assert_hands(goal.end_effectors)
-    if pose:
-        np.testing.assert_array_equal(goal.position, pose[:3])
-        np.testing.assert_allclose(goal.quaternion, pose[3:] or (0, 0, 0, 1))
-
-
-def way_in(folder: Path) -> Path:
-    """Return a file with a path: the hand of the other options goes elsewhere."""
-    (folder / "way.txt").write_text("0.5 -0.1 0.7\n0.4 0.1 0.8\n", encoding="utf-8")
-    return folder / "way.txt"
-
-
-@pytest.mark.parametrize("command", ["plan", "run"])
-def test_paths_of_end_effectors_reach_the_scenario(
-    command: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    found: list[Any] = []
-
-    def noted(self: Any, hands: Any, *_: Any) -> Any:
-        found.extend(hands)
-        raise ValueError("enough")
-
-    monkeypatch.setattr(type(load_scenario("arm_attitude")), "with_end_effectors", noted)
-    call(command, "arm_attitude", "--end-effector-path", way_in(tmp_path))
-    (hand,) = found
-    assert hand.path_values.tolist() == [[0.5, -0.1, 0.7], [0.4, 0.1, 0.8]]
-
-
-def test_a_path_of_an_end_effector_is_sent(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    sent: list[Any] = []
-
-    def send_goal(goal: Any, *_: Any, **named: Any) -> Outcome:
-        sent.append(goal)
-        return Outcome.REACHED
-
-    monkeypatch.setattr(session, "send_goal", send_goal)
-    words = ("--end-effector", "tip", "--end-effector-path", way_in(tmp_path))
-    assert call("goal", *words).exit_code == 0
-    assert sent[0].links_with_paths == {"tip"}
-    assert sent[0].end_effectors[0].values == (0.4, 0.1, 0.8)
 
 
 # -- stacks -------------------------------------------------------------------------------------

@@ -14,9 +14,7 @@ from support.command_line import CliRunner, Result
 from spacerobot_ros import fly, load_scenario
 from spacerobot_ros import plan as python_plan
 from spacerobot_ros.cli.main import main
-from spacerobot_ros.cli.plan import problem_of_scenario
 from spacerobot_ros.errors import PlanningError
-from spacerobot_ros.flight.trials import PlanEvaluation, random_goals, try_goals
 from spacerobot_ros.planning.execution.config import PlannerConfig
 
 URDF = Path(__file__).parents[2] / "urdf"
@@ -177,27 +175,3 @@ def test_a_goal_that_cannot_be_reached_is_exit_1_and_one_sentence(
     assert result.exit_code == 1, result.output
     assert sentence in result.output
     assert len(result.output.strip().splitlines()) == 1
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("robot", "within", "options"),
-    [
-        ("sliding_masses", (0.3, 60.0), []),
-        ("three_joint_arm", (0.3, 180.0), ["plant.initial_joint_positions=[0, -0.785, 1.57]"]),
-        ("planar_chain", (0.3, 180.0), ["planner.optimal.final_shape=1"]),
-    ],
-)
-def test_random_goals_are_met(
-    robot: str,
-    within: tuple[float, float],
-    options: list[str],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.delenv("SPACEROBOT_COMPILE")
-    settings = [*options, "planner.optimal.answers=1", "planner.optimal.cache=0"]
-    problem = problem_of_scenario(robot, settings=settings)
-    goals = random_goals(problem, 20, within[0], np.radians(within[1]))
-    results = try_goals(problem, goals, ["optimal"])["optimal"]
-    assert len(results) == 20
-    assert all(isinstance(each, PlanEvaluation) and each.reached for each in results)

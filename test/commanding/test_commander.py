@@ -390,7 +390,6 @@ def test_a_plant_that_is_reset_shows_another_pose_of_one_time(controller: Rig) -
 
 HELD = Payload("link_1", Inertia(4.0, np.array([0.1, -0.2, 0.3]), np.diag([0.2, 0.3, 0.4])))
 CAPTURED = PlantStatus(PlantState.RUNNING, "A command is in force.", payload=HELD.to_text())
-RELEASED = PlantStatus(PlantState.RUNNING, "A command is in force.")
 
 
 def test_a_planner_plans_again_for_the_robot_with_the_body_that_it_holds(

@@ -112,10 +112,6 @@ SERVICER_GAINS = {
 SERVICER_PACE = MotionLimits(
     speed=0.15, acceleration=0.02, angular_speed=0.15, angular_acceleration=0.02
 )
-# Within a tenth of the thrust and torque that the pace above takes.
-SERVICER_SLOW_PACE = MotionLimits(
-    speed=0.15, acceleration=0.0015, angular_speed=0.15, angular_acceleration=0.0015
-)
 
 
 def servicer_start() -> ControlState:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from dataclasses import replace
 from functools import cache
 
@@ -25,15 +24,6 @@ from control.flights import (
     pose,
     random_state,
 )
-from control.servicer_motion import (
-    GAINS,
-    KD,
-    KP,
-    OutputMotion,
-    random_reference,
-    rates,
-    well_conditioned_state,
-)
 from scipy.spatial.transform import Rotation
 from support.random_robots import random_robot_urdf
 from support.slow import some_fast
@@ -44,9 +34,7 @@ from spacerobot_ros.control import (
     ControlState,
     Gains,
     JointReference,
-    MotionLimits,
     OutputSelection,
-    QuinticReference,
     Reference,
 )
 from spacerobot_ros.control.laws.model_based import ModelBasedLaw
@@ -82,32 +70,6 @@ def test_shape_obeys_the_commanded_acceleration(name: str) -> None:
     _, qddot = plant_of(robot, state).acceleration(actuation)
     np.testing.assert_allclose(qddot, u, atol=1e-10)
     np.testing.assert_array_equal(actuation.wrench_B, 0.0)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("spinning", [False, True])
-@pytest.mark.parametrize("name", ["planar_chain", "random_1"])
-def test_shape_follows_its_reference_and_momentum_stays(name: str, spinning: bool) -> None:
-    rng = np.random.default_rng(31)
-    robot = robot_of(name)
-    state = replace(random_state(rng, robot.n), qdot=np.zeros(robot.n))
-    if not spinning:
-        state = ControlState.at_rest(state.r_WB, state.quaternion_WB, state.q)
-    goal = JointReference.at_rest(state.q + rng.uniform(-0.5, 0.5, robot.n))
-    start = Reference(joints=JointReference.at_rest(state.q))
-    profile = QuinticReference(
-        start, Reference(joints=goal), MotionLimits(joint_speed=0.5, joint_acceleration=0.5)
-    )
-    law, plant = law_for(robot, 4.0, 4.0), plant_of(robot, state, longest_step=0.005)
-    before = plant.momentum()
-    lag: list[Array] = []
-    for tick in range(round((profile.duration + 6.0) * 100)):
-        plant.step(law.command(plant.state, profile.at(tick / 100)), 0.01)
-        lag.append(law.error)
-    # Commands are held for a tick: on the way the shape lags by that much, no more.
-    assert np.abs(lag).max() < (1e-2 if spinning else 2e-3)
-    np.testing.assert_allclose(plant.state.q, goal.q, atol=1e-3 if spinning else 1e-6)
-    np.testing.assert_allclose(plant.momentum(), before, atol=1e-8)
 
 
 def test_shape_settles_like_a_double_integrator() -> None:
@@ -226,32 +188,6 @@ def largest_distance(path: Array, start: Array) -> float:
 
 
 # -- fewer outputs than degrees of freedom: what the other motion does ---------------------------
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", range(3))
-def test_fewer_outputs_keep_their_error_dynamics(seed: int) -> None:
-    """Operational space: what is left free does not show in the outputs, however it is used."""
-    rng = np.random.default_rng(200 + seed)
-    robot = load("servicer")
-    state, reference = well_conditioned_state(rng), random_reference(rng)
-    reference = replace(reference, joints=JointReference.at_rest(rng.uniform(-1, 1, 6)))
-    selection = OutputSelection(("x", "y", "z"), ("x", "y", "z", "rx"), (), END_EFFECTOR)
-    rows = [0, 1, 2, 6, 7, 8, 9]
-    commands = []
-    for options in ({"null_space_damping": 0.0}, {"null_space_damping": 3.0}, {}):
-        extra = {"posture_stiffness": 2.0} if not options else {}
-        chosen = ModelBasedLaw.Options(**options, **extra)
-        law = ModelBasedLaw(robot, selection, GAINS, chosen)
-        command = law.command(state, reference)
-        commands.append(command)
-        motion = OutputMotion(robot, state, command)
-        velocity, acceleration = rates(reference)
-        e, edot = motion.error(reference), velocity - motion.velocity
-        residual = acceleration - motion.acceleration + KD * edot + KP * e
-        np.testing.assert_allclose(residual[rows], 0.0, atol=1e-9)
-    for one, other in itertools.combinations(commands, 2):
-        assert np.abs(one.tau - other.tau).max() > 1e-3
 
 
 def test_null_space_damping_and_posture() -> None:

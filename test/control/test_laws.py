@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import casadi as ca
@@ -37,7 +36,6 @@ from control.servicer_motion import (
 )
 from scipy.linalg import block_diag, expm
 from scipy.spatial.transform import Rotation
-from support.random_robots import random_chain_urdf
 
 from spacerobot_ros import fly as fly_robot
 from spacerobot_ros.control import (
@@ -48,16 +46,12 @@ from spacerobot_ros.control import (
     GainPair,
     Gains,
     LawOptions,
-    OutputSelection,
-    PoseReference,
     Reference,
     TargetNotSetError,
 )
 from spacerobot_ros.control.config import ControllerConfig
 from spacerobot_ros.control.controller import build_controller
 from spacerobot_ros.errors import ParameterError
-from spacerobot_ros.model import SpaceRobot, compilation
-from spacerobot_ros.model.inverse_kinematics import AXES
 from spacerobot_ros.parameters import configured, declared, parameter
 
 
@@ -70,24 +64,6 @@ def test_sign_of_a_quaternion_does_not_matter(name: str) -> None:
     other = law.command(replace(state, quaternion_WB=-state.quaternion_WB), reference)
     np.testing.assert_allclose(one.tau, other.tau, rtol=1e-12)
     np.testing.assert_allclose(one.wrench_B, other.wrench_B, rtol=1e-12)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", INVERTIBLE)
-@pytest.mark.parametrize("degrees", [179.9, 180.0, 180.1])
-def test_half_a_turn_of_the_spacecraft(name: str, degrees: float) -> None:
-    robot = load("planar_manipulator")
-    law = law_of(name, robot, PLANAR_GAINS)
-    start = planar_start()
-    turned = Rotation.from_euler("z", degrees, degrees=True)
-    attitude = turned * Rotation.from_quat(start.quaternion_WB)
-    end = np.array([0.2, -0.1, 0.0]) + turned.apply(
-        plant_of(robot, start).frame(END_EFFECTOR)[0] - start.r_WB
-    )
-    goal = Reference(PoseReference(np.array([0.2, -0.1, 0.0]), attitude.as_quat()), pose(end))
-    flight = fly(plant_of(robot, start), law, lambda _: goal, 16.0, rate=50.0, every=10)
-    assert np.abs(flight.errors[0]).max() > 3.0
-    assert np.abs(flight.errors[-1]).max() < 5e-3
 
 
 def test_a_law_without_its_reference_says_which() -> None:
@@ -128,45 +104,6 @@ def test_registry_and_options() -> None:
                 options = law.Options(**{option.name: value})
                 with pytest.raises(ParameterError, match=f"'{option.name}'"):
                     law(robot, built.outputs.selection, PLANAR_GAINS, options)
-
-
-@pytest.mark.slow
-def test_compiled_law_gives_the_numbers_of_the_interpreted(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    robot = load("planar_manipulator")
-    interpreted = {name: law_of(name, robot, PLANAR_GAINS) for name in INVERTIBLE}
-    monkeypatch.setenv("SPACEROBOT_COMPILE", "1")
-    monkeypatch.setenv("SPACEROBOT_CACHE_DIR", str(tmp_path))
-    if compilation.c_compiler() is None:
-        pytest.skip("no C compiler")
-    for name, law in interpreted.items():
-        fast = law_of(name, robot, PLANAR_GAINS)
-        one = law.command(planar_start(), PLANAR_GOAL)
-        other = fast.command(planar_start(), PLANAR_GOAL)
-        np.testing.assert_allclose(one.wrench_B, other.wrench_B, rtol=1e-12)
-        np.testing.assert_allclose(one.tau, other.tau, rtol=1e-12)
-
-
-@pytest.mark.slow
-def test_a_random_chain_flies_both_poses() -> None:
-    """Six turning joints with axes and masses anyhow, the base's centre of mass off its origin."""
-    rng = np.random.default_rng(4)
-    robot = SpaceRobot.from_urdf(random_chain_urdf(rng, 6))
-    q = rng.uniform(-0.8, 0.8, 6)
-    start = ControlState.at_rest(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), q)
-    tip = "link_6"
-    end = ControlState.at_rest(
-        np.array([0.3, -0.2, 0.1]), pose([0] * 3, [0.2, 0.1, -0.3]).quaternion, q + 0.2
-    )
-    present = Reference.present(robot, end, tip)
-    goal = Reference(present.base, present.end_effector)
-    law = LAWS["model_based"](robot, OutputSelection(AXES, AXES, (), tip), Gains.uniform(2.0, 3.0))
-    plant = plant_of(robot, start)
-    for _ in range(600):
-        plant.step(law.command(plant.state, goal), 0.02)
-    law.command(plant.state, goal)
-    assert np.abs(law.error).max() < 1e-4
 
 
 @dataclass(frozen=True)

@@ -9,13 +9,11 @@ import numpy as np
 import pytest
 from control.flights import (
     END_EFFECTOR,
-    INVERTIBLE,
     PLANAR_GAINS,
     PLANAR_GOAL,
     SERVICER_GAINS,
     SERVICER_GOAL,
     SERVICER_PACE,
-    SERVICER_SLOW_PACE,
     Flight,
     fly,
     law_of,
@@ -90,49 +88,6 @@ def flown(
     return flight
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", INVERTIBLE)
-def test_both_poses_are_reached(name: str) -> None:
-    robot, profile = load("servicer"), profile_of("quintic")
-    assert profile.duration == pytest.approx(24.7, abs=0.05)
-    flight = flown(name, profile, 5.0)
-    assert flight.peak_force < 5.1
-    assert flight.peak_torque < 1.5
-    for state, actuation, status in zip(
-        flight.states, flight.actuations, flight.statuses, strict=True
-    ):
-        assert np.all((robot.lower < state.q) & (state.q < robot.upper))
-        assert np.all(np.abs(state.qdot) < robot.velocity_limit)
-        assert np.all(np.abs(actuation.tau) < robot.effort_limit)
-        assert not status.singular
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", INVERTIBLE)
-def test_both_poses_are_reached_with_a_tenth_of_the_thrust(name: str) -> None:
-    """The goal at once, and thrusters that give a tenth of what that demands."""
-    robot = load("servicer")
-    first = law_of(name, robot, SERVICER_GAINS[name]).command(servicer_start(), SERVICER_GOAL)
-    force, torque = (float(np.linalg.norm(part)) / 10 for part in np.split(first.wrench_B, 2))
-    limits = ActuatorLimits(force, torque, np.full(robot.n, np.inf))
-    flight = flown(name, profile_of("step"), 22.0, limits=limits)
-    assert flight.peak_force < force * (1 + 1e-9)
-    assert flight.peak_torque < torque * (1 + 1e-9)
-    assert flight.limited > 100
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", INVERTIBLE)
-def test_a_smooth_reference_is_slowed_to_a_tenth_of_the_thrust(name: str) -> None:
-    """Demand falls with the square of the time taken."""
-    force, torque = {"transposed_jacobian": (0.49, 0.136), "model_based": (0.47, 0.126)}[name]
-    limits = ActuatorLimits(force, torque, load("servicer").effort_limit)
-    profile = profile_of("quintic", SERVICER_SLOW_PACE)
-    assert profile.duration == pytest.approx(87.3, abs=0.1)
-    flight = flown(name, profile, 5.0, limits=limits)
-    assert flight.limited == 0
-
-
 def ten_percent_heavier() -> Callable[[], float]:
     return lambda: 1.1
 
@@ -196,29 +151,6 @@ def test_true_model_follows_the_plant(seed: int) -> None:
     assert estimator.elapsed == pytest.approx(0.5)
     estimator.reset(plant.state)
     assert estimator.elapsed == 0.0
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", range(3))
-def test_measured_joints_need_no_joint_efforts(seed: int) -> None:
-    """Momentum and measured joints place the base, whatever drives the joints."""
-    rng = np.random.default_rng(20 + seed)
-    robot = SpaceRobot.from_urdf(random_robot_urdf(rng, 4))
-    start = random_state(rng, robot.n)
-    plant = plant_of(robot, start, longest_step=1e-3)
-    informed, blind = (DeadReckoning(robot, 0.01) for _ in range(2))
-    informed.reset(start)
-    blind.reset(start)
-    for _ in range(100):
-        actuation = Actuation(rng.uniform(-5, 5, 6), rng.uniform(-0.5, 0.5, robot.n))
-        unknown = Actuation(actuation.wrench_B, np.zeros(robot.n))
-        plant.step(actuation, 0.01)
-        estimate = informed.step(unknown, plant.state.q, plant.state.qdot)
-        blind.step(unknown)
-    np.testing.assert_allclose(estimate.q, plant.state.q)
-    np.testing.assert_allclose(estimate.qdot, plant.state.qdot)
-    assert difference(estimate, plant.state) < 2e-3
-    assert difference(blind.state, plant.state) > 100 * difference(estimate, plant.state)
 
 
 def fly_blind(believed: SpaceRobot, *, joints: bool) -> float:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from pathlib import Path
 from typing import Any
 
@@ -329,10 +328,6 @@ def test_what_a_thruster_leaves_open(tmp_path: Path) -> None:
 TICK = 0.01
 
 
-def with_shortest(shortest: float) -> ThrusterTable:
-    return dataclasses.replace(SERVICER, min_on_time=np.full(24, shortest))
-
-
 def pair(shortest: float) -> ThrusterTable:
     """Return two thrusters of 2 N through the origin, along x and against it."""
     return ThrusterTable(
@@ -358,42 +353,6 @@ def pulse_lengths(on_times: Array) -> list[float]:
             lengths.append(running)
             running = 0.0
     return lengths
-
-
-@pytest.mark.slow
-@settings(max_examples=25, deadline=None)
-@given(
-    seed=st.integers(0, 2**31),
-    shortest=st.sampled_from([0.0, 0.004, 0.01, 0.02, 0.033]),
-)
-def test_impulse_is_met_within_a_shortest_pulse_of_each_thruster(
-    seed: int, shortest: float
-) -> None:
-    rng = np.random.default_rng(seed)
-    table = with_shortest(shortest)
-    pulses = ThrusterModulator(table, TICK)
-    wanted, given_, fired = np.zeros(6), np.zeros(6), []
-    # Both ways along every axis at most 12 N and 5 N m: far within the thrust of the table.
-    wrench = np.zeros(6)
-    for tick in range(100):
-        if tick % 7 == 0:
-            wrench = rng.uniform(-1.0, 1.0, 6) * [12.0, 12.0, 12.0, 5.0, 5.0, 5.0]
-        on_time = pulses.fire(wrench)
-        assert not pulses.unmet.any() or np.abs(pulses.unmet).max() < 1e-9
-        assert np.all((on_time >= 0.0) & (on_time <= TICK * (1 + 1e-9)))
-        fired.append(on_time)
-        wanted += TICK * wrench
-        given_ += table.wrenches @ on_time
-    for lengths in map(pulse_lengths, np.array(fired).T):
-        assert all(length >= shortest * (1 - 1e-6) for length in lengths)
-    # What is missing is what thrusters owe, none more than a shortest pulse, and what is under way.
-    missing = wanted - given_
-    np.testing.assert_allclose(
-        missing, pulses.pending_impulse + pulses.begun_pulse_impulse, atol=1e-9
-    )
-    assert np.all(np.abs(missing) <= shortest * np.abs(table.wrenches).sum(axis=1) + 1e-9)
-    if not shortest:
-        assert np.abs(missing).max() <= 1e-9
 
 
 @pytest.mark.parametrize("force", [0.013, 0.5, 1.9, 2.0, -0.7])

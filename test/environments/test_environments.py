@@ -31,7 +31,6 @@ from spacerobot_ros.environments.tasks import (
 )
 from spacerobot_ros.errors import CommandError, ParameterError, SpaceRobotError
 from spacerobot_ros.model import SpaceRobot, load_robot, parse_robot
-from spacerobot_ros.model.compilation import cxx_compiler
 from spacerobot_ros.model.rotations import matrix_from_quaternion, quaternion_from_rotvec
 from spacerobot_ros.resources import robot_file, share_directory
 from spacerobot_ros.scenario import load_scenario
@@ -127,16 +126,6 @@ def fly_beside_single_ones(name: str, mode: str, arguments: dict[str, Any], step
 @pytest.mark.parametrize("mode", MODES)
 def test_a_vector_environment_is_as_many_single_ones(mode: str) -> None:
     assert fly_beside_single_ones(ARM, mode, SHORT, 12) > 5
-
-
-@pytest.mark.usefixtures("strict")
-@pytest.mark.slow
-@pytest.mark.skipif(cxx_compiler() is None, reason="there is no C++ compiler")
-@pytest.mark.parametrize("mode", MODES)
-@pytest.mark.parametrize("name", [ARM, "spacerobot/Reach-v0"])
-def test_environments_in_lanes_are_as_many_single_ones(name: str, mode: str) -> None:
-    arguments = {"hold": 3, "time_limit": 4.0, "spread": 0.05}
-    assert fly_beside_single_ones(name, mode, arguments, 100) > 5
 
 
 @pytest.mark.usefixtures("strict")

@@ -162,14 +162,6 @@ def test_seeds_repeat_a_flight_and_change_it() -> None:
 
 
 @pytest.mark.slow
-def test_arrays_are_copies() -> None:
-    flight = fly("faults/stuck_slider", parameters=QUICK)
-    assert not np.shares_memory(flight.q, fly("faults/stuck_slider", parameters=QUICK).q)
-    assert len(np.unique(flight.q[:20, 0])) > 5  # Not the last state again and again.
-    assert flight.summary()["final_joint_positions"] == flight.q[-1].tolist()
-
-
-@pytest.mark.slow
 def test_an_animation_shows_every_frame(tmp_path: Path) -> None:
     flight = fly("faults/stuck_slider", parameters=QUICK)
     shown = flight.animate(seconds=1.0, frames=3)
@@ -241,18 +233,6 @@ def test_a_flight_takes_a_law_that_is_in_no_registry() -> None:
     assert _HalfLaw.thresholds == [0.25, 0.1]
     assert fly("coordinated_control", parameters=short).method == "transposed_jacobian"
     assert len(_HalfLaw.thresholds) == 2
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("_laws")
-def test_a_law_of_ones_own_flies_and_is_named() -> None:
-    class Fast(_HalfLaw):
-        name = "fast"
-
-    own, known = fly("coordinated_control", law=Fast), fly("coordinated_control")
-    np.testing.assert_array_equal(own.pose, known.pose)
-    assert own.method == "fast"
-    assert known.method == "transposed_jacobian"
 
 
 @pytest.mark.usefixtures("_laws")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,20 +12,14 @@ from foreign_robots.run import (
     OUT_OF_REACH,
     ROBOTS,
     TABLE,
-    TOLERANCE,
     Outcome,
-    Trials,
     classes,
-    integrated,
-    out_of_reach,
     tasks,
-    worst_error,
 )
 from scipy.spatial.transform import Rotation
 
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.urdf import load_robot
-from spacerobot_ros.planning import plan
 from spacerobot_ros.resources import robot_file
 
 JOINTS = {
@@ -78,22 +71,6 @@ def test_tasks_are_the_same_every_time_and_of_all_kinds() -> None:
         assert turn.magnitude() == pytest.approx(one.size)
 
 
-@pytest.mark.slow
-def test_a_long_search_finds_the_positions_that_shapes_bring() -> None:
-    """The position of a shape is within reach; one far beyond the longest arm is not."""
-    robot = SpaceRobot.from_file(Path(robot_file("seven_joint_arm")))
-    task = next(each for each in tasks(robot, 12) if each.kind == "position")
-    lower, upper = robot.lower, robot.upper
-    shape = lower + 0.4 * (np.clip(upper, None, 3.0) - lower)
-    start, turned = task.state, Rotation.from_quat(task.goal.quaternion)
-    center = Rotation.from_quat(start.quaternion).apply(robot.center_of_mass(start.q))
-    within = center - turned.apply(robot.center_of_mass(shape))
-    for goal, nearest in ((within, 0.0), (within + 100 * center / np.linalg.norm(center), 99.0)):
-        asked = replace(task, goal=replace(task.goal, position=goal))
-        found = out_of_reach(robot, asked, starts=2)
-        assert found < 1e-4 if nearest == 0 else found > nearest
-
-
 def test_positions_that_no_search_reaches_are_counted_apart() -> None:
     outcomes = [
         Outcome(0, "position", 0.1, "not found", beyond=0.02),
@@ -102,32 +79,3 @@ def test_positions_that_no_search_reaches_are_counted_apart() -> None:
         Outcome(3, "attitude", 0.1, "met"),
     ]
     assert classes(outcomes) == {OUT_OF_REACH: 1, "not found": 2, "met": 1}
-
-
-@pytest.mark.slow
-def test_the_second_integration_notices_what_is_wrong() -> None:
-    trials = Trials("solar_booms")
-    schedule = plan(trials.robot, rotvec=(0.02, 0.0, 0.01), starts=2, answers=1, cache=0)
-    task = next(tasks(trials.robot, 1))
-    state = task.state
-    state = type(state)(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), schedule.positions[0])
-    end = integrated(trials._oracle, state, schedule)
-    assert worst_error(end, schedule.goal, schedule) < 1e-2
-    turned = Rotation.from_quat(end.quaternion) * Rotation.from_rotvec([0, 0, 1.5e-3])
-    off = type(end)(end.position, turned.as_quat(), end.q)
-    assert worst_error(off, schedule.goal, schedule) == pytest.approx(
-        1.5e-3 / TOLERANCE.attitude, rel=0.02
-    )
-
-
-@pytest.mark.slow
-def test_commands_near_the_ends_of_joints_are_bent_within_them() -> None:
-    """Fast legs move far within a tick: what makes up for chords must not leave the limits."""
-    trials = Trials("quadruped")
-    task = list(tasks(trials.robot, 3))[2]
-    schedule = plan(trials.robot, task.goal, start=task.state, base_position=1, starts=2, cache=0)
-    assert schedule.duration < 3.0
-    assert np.all(schedule.positions >= trials.robot.lower - 1e-9)
-    assert np.all(schedule.positions <= trials.robot.upper + 1e-9)
-    end = integrated(trials._oracle, task.state, schedule)
-    assert worst_error(end, task.goal, schedule) <= 1.0

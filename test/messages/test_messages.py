@@ -13,8 +13,6 @@ from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from geometry_msgs.msg import WrenchStamped
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
-from mcap.records import Schema
-from mcap_ros2.decoder import DecoderFactory
 from rclpy.serialization import deserialize_message, serialize_message
 from rosbags.typesys import Stores, get_typestore
 from sensor_msgs.msg import JointState
@@ -22,7 +20,6 @@ from std_msgs.msg import Header
 from support.random_messages import few as few_trajectories
 from trajectory_msgs.msg import JointTrajectory
 
-from spacerobot_ros.bag import message_definition
 from spacerobot_ros.errors import CommandError, SpaceRobotError
 from spacerobot_ros.events import (
     INTEGER,
@@ -173,30 +170,6 @@ def test_a_robot_without_joints_takes_an_empty_message() -> None:
 
 
 # -- commands of a plant ----------------------------------------------------------------------
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("actuation", ["velocity", "effort"])
-def test_a_command_that_does_not_name_all_joints_is_malformed(actuation: Any) -> None:
-    config = PlantConfig(actuation=actuation, command_timeout=0.0)
-    robot = SpaceRobot(load_robot(robot_file("sliding_masses")))
-    commands = CommandValidator(build_plant(robot, config), config)
-    source = commands.sources[0]
-    reader = CommandReader(source, robot)
-    # All three joints, in another order and a frame that is not read; then two of them.
-    order = [2, 0, 1]
-    names = [robot.joint_names[i] for i in order]
-    everything = message(names, 0, **{actuation: [0.3, 0.1, 0.2]})
-    everything.header.frame_id = "moon"
-    assert reader.offer(commands, serialize_message(everything), 0) is None
-    assert source.command.tolist() == [0.1, 0.2, 0.3]
-    two = message([robot.joint_names[i] for i in (1, 0)], 0, **{actuation: [0.25, 0.5]})
-    refusal = reader.offer(commands, serialize_message(two), 0)
-    assert refusal is not None
-    assert refusal.reason is Reason.MALFORMED
-    assert f"'{robot.joint_names[2]}' is missing" in refusal.clause
-    assert source.command.tolist() == [0.1, 0.2, 0.3], "the command before stays in force"
-    assert commands.counts == {Reason.MALFORMED: 1}
 
 
 def test_a_wrench_in_another_frame_is_malformed() -> None:
@@ -367,34 +340,3 @@ def test_a_schedule_is_serialised_as_rclpy_would(
     raw = trajectory_message(schedule, stamp_ns, frame)
     message = deserialize_message(raw, JointTrajectory)
     check_trajectory(message, schedule, stamp_ns, frame)
-
-
-@pytest.mark.slow
-@few_trajectories
-@given(schedules(), st.integers(0, 2**31 * 10**9 - 1), st.text("lmnop", max_size=9))
-@example(THREE, 0, "base_link")
-def test_other_readers_take_a_serialised_schedule(
-    schedule: GaitSchedule, stamp_ns: int, frame: str
-) -> None:
-    raw = trajectory_message(schedule, stamp_ns, frame)
-    kind = "trajectory_msgs/msg/JointTrajectory"
-    by_rosbags = get_typestore(Stores.ROS2_JAZZY).deserialize_cdr(raw, kind)
-    check_trajectory(by_rosbags, schedule, stamp_ns, frame)
-    schema = Schema(id=1, name=kind, encoding="ros2msg", data=message_definition(kind).encode())
-    decode = DecoderFactory().decoder_for("cdr", schema)
-    assert decode is not None
-    check_trajectory(decode(raw), schedule, stamp_ns, frame)
-
-
-@pytest.mark.slow
-def test_a_long_schedule_is_whole() -> None:
-    # The gait of paper 1 has 98,001 points.
-    rng = np.random.default_rng(4)
-    schedule = schedule_of(("slider_1", "slider_2", "slider_3"), rng.normal(size=(98_001, 3)), 0.05)
-    raw = trajectory_message(schedule, 50_000_000, "base_link")
-    kind = "trajectory_msgs/msg/JointTrajectory"
-    message: Any = get_typestore(Stores.ROS2_JAZZY).deserialize_cdr(raw, kind)
-    assert len(message.points) == 98_001
-    np.testing.assert_array_equal([p.positions for p in message.points], schedule.positions)
-    last = message.points[-1].time_from_start
-    assert (last.sec, last.nanosec) == (4900, 0)

@@ -208,20 +208,6 @@ def test_compiled_and_interpreted_numbers_agree(
         assert interpreted.function(name).class_name() != "External"
 
 
-@pytest.mark.slow
-def test_compiled_numbers_agree_with_the_engines(compiled_code: Path) -> None:
-    case = random_case(0)
-    robot, m = SpaceRobot(case.robot.description), case.motion
-    for engine in case.engines.values():
-        assert_agrees(QUANTITIES["inertia_matrix"](robot, case), engine.mass_matrix(m))
-        assert_agrees(QUANTITIES["bias"](robot, case), engine.bias(m))
-        assert_agrees(
-            QUANTITIES["forward_dynamics"](robot, case),
-            engine.forward_dynamics(m, case.wrench_B, case.tau),
-        )
-        assert_agrees(QUANTITIES["connection"](robot, case), engine.connection(m.q))
-
-
 def test_buffers_keep_the_last_arguments_and_results_in_place() -> None:
     case = random_case(0)
     buffer = case.robot.buffered("inertia_matrix")

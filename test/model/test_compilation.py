@@ -272,31 +272,6 @@ def test_a_full_disk_keeps_nothing_and_harms_nothing(
     assert not list(cache.iterdir())
 
 
-@pytest.mark.slow
-def test_two_processes_that_build_one_object_both_have_it(cache: Path, compiler: Compiler) -> None:
-    """Either ends its compiler only when the other has begun."""
-    compiler(
-        f'touch {cache.parent}/began.$$; while [ "$(ls {cache.parent}/began.* | wc -l)" -lt 2 ]; '
-        'do sleep 0.01; done; exec $CC "$@"'
-    )
-    code = (
-        "import casadi as ca\n"
-        "from spacerobot_ros.model.compilation import compiled\n"
-        "x = ca.SX.sym('x', 3)\n"
-        "f = compiled(ca.Function('probe', [x], [2 * ca.sin(x)], ['x'], ['y']))\n"
-        "assert f.class_name() == 'External'\n"
-        "f([1, 2, 3])\n"
-    )
-    command = [sys.executable, "-c", code]
-    builders = [subprocess.Popen(command, stderr=subprocess.PIPE, text=True) for _ in range(2)]
-    for builder in builders:
-        _, said = builder.communicate(timeout=60)
-        assert (said, builder.returncode) == ("", 0)
-    assert only_file(cache)
-    compiler("exit 1")
-    assert is_compiled()
-
-
 def test_equal_robots_share_functions_and_others_do_not(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("SPACEROBOT_COMPILE", "0")
     text = robot_file("planar_chain").read_text("utf-8")

@@ -5,14 +5,10 @@ from __future__ import annotations
 import ast
 import inspect
 import textwrap
-from pathlib import Path
 
 import pytest
 import rclpy
 from rclpy.lifecycle import LifecycleNode
-from rclpy.parameter import Parameter
-from support.recorded_stack import STREAMS, Stack
-from support.ros_harness import Harness
 
 from spacerobot_ros.nodes import (
     CoordinatedControlNode,
@@ -71,21 +67,3 @@ def test_no_private_method_of_rclpy_is_replaced(kind: type, rclpy_attributes: se
     assert not {name for name in own & rclpy_attributes if name.startswith("_")} - {
         "__init__", "__module__", "__doc__", "__annotations__",
     }  # fmt: skip
-
-
-@pytest.mark.slow
-def test_a_parameter_of_rclpy_does_not_end_a_recording(harness: Harness, tmp_path: Path) -> None:
-    """``ros2 param set /recorder use_sim_time false`` while it records."""
-    stack = Stack(harness, tmp_path / "flight.mcap")
-    stack.configure(*STREAMS)
-    recorder = stack.recorder
-    recorder.trigger_activate()
-    for value in (False, True, False):
-        result = recorder.set_parameters([Parameter("use_sim_time", value=value)])[0]
-        assert result.successful, result.reason
-    stack.fly()
-    assert recorder.is_active
-    assert recorder.failure is None
-    stack.stop()
-    bag = stack.close_bag()
-    assert len(bag["/odom"]) > 40

@@ -11,20 +11,19 @@ from typing import Any
 import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticStatus
-from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry
 from rclpy.lifecycle import TransitionCallbackReturn
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
-from support.control_loop import JOINTS, KD, KP, SHAPE, STATUS, TICK_NS, TIP, URDF, Loop, pose
+from support.control_loop import JOINTS, KD, KP, STATUS, TICK_NS, TIP, URDF, Loop, pose
 from support.executive_loop import STEP, Array
 from support.ros_harness import LATCHED, Harness, Probe, construction, nanoseconds
 from support.sentences import assert_one_sentence
 from support.warm_python import WarmPython
 
 from spacerobot_ros.errors import ParameterError
-from spacerobot_ros.nodes import CoordinatedControlNode, FlightNode, PlannerNode, PlantNode
+from spacerobot_ros.nodes import CoordinatedControlNode, FlightNode, PlannerNode
 
 
 def test_without_odom_the_base_is_estimated_and_then_the_thrusters_are_off(
@@ -149,34 +148,6 @@ def test_a_silent_reference_is_done_without_until_it_comes_again(harness: Harnes
     )
 
 
-def test_a_goal_is_reached_although_a_reference_is_silent(harness: Harness) -> None:
-    loop = Referenced(harness, reference_timeout=0.2, settle_time=0.02)
-    loop.aim(base=pose([0.0, 0.0, 0.0]))
-    for _ in range(4):
-        loop.answer()
-    assert "base_reference" in loop.wait_for("reached").message
-
-
-def test_in_real_time_a_silent_reference_costs_no_answer_and_odom_is_not_blamed(
-    harness: Harness,
-) -> None:
-    """States go on: each is answered when the next one comes, until the reference is given up."""
-    loop = Referenced(harness, reference_timeout=0.05)
-    for _ in range(10):
-        loop.show()
-        harness.settle(loop.probe)
-    stamps = [nanoseconds(each.header.stamp) for each in loop.probe.messages["base_wrench"]]
-    assert stamps == [TICK_NS * tick for tick in range(1, 11)]
-    states = [value_of(each, "state") for each in loop.probe.messages[STATUS]]
-    assert set(states) == {"waiting", "holding"}
-    assert loop.probe.last(STATUS).message.endswith(" There is no reference on base_reference.")
-
-
-def test_without_a_timeout_states_wait_for_references(harness: Harness) -> None:
-    loop = Referenced(harness, reference_timeout=0.0)
-    loop.force(0.0)
-
-
 def value_of(status: DiagnosticStatus, key: str) -> str:
     return next(pair.value for pair in status.values if pair.key == key)
 
@@ -200,7 +171,6 @@ def test_the_goal_that_is_refused_is_named(harness: Harness) -> None:
 
 
 AIM = np.array([0.5, 0.25, 0.0])
-CONTROL = {"robot": "planar_manipulator", "tick_rate": 50.0, "settle_time": 0.5}
 
 
 @pytest.fixture
@@ -228,67 +198,6 @@ def replaced(loop: Loop, file: Path, **settings: Any) -> None:
 
 
 # -- going on ---------------------------------------------------------------------------------
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("profile", ["step", "quintic"])
-def test_the_goals_are_met_by_the_next_controller(
-    harness: Harness, file: Path, profile: str
-) -> None:
-    plant = {
-        "robot": "planar_manipulator",
-        "actuation": "effort",
-        "time_mode": "lockstep",
-        "tick_rate": 50.0,
-        "initial_joint_positions": SHAPE.tolist(),
-    }
-    control = {**CONTROL, "profile": profile, "motion.speed": 0.3, "motion.acceleration": 0.1}
-    harness.make(PlantNode, plant, name="plant")
-    probe = harness.probe(
-        {"odom": Odometry, "end_effector_pose": PoseStamped, STATUS: DiagnosticStatus},
-        latched=(STATUS,),
-    )
-    make = probe.create_publisher
-    tip_goal = TIP + np.array([0.1, 0.4, 0.0])
-    goals = {
-        make(PoseStamped, "goal_pose", 10): pose([0.3, 0.2, 0.0]),
-        make(PoseStamped, "end_effector/goal_pose", 10): pose(tip_goal),
-    }
-
-    def start() -> CoordinatedControlNode:
-        return harness.make(CoordinatedControlNode, {**control, "resume_file": str(file)})
-
-    def pass_time(seconds: float) -> None:
-        end = nanoseconds(probe.last("odom").header.stamp) + seconds * 1e9
-        harness.spin_until(
-            lambda: nanoseconds(probe.last("odom").header.stamp) >= end, f"{seconds} s", 30.0
-        )
-
-    def states() -> list[str]:
-        return [
-            pair.value for m in probe.messages[STATUS] for pair in m.values if pair.key == "state"
-        ]
-
-    node = start()
-    harness.spin_until(lambda: probe.count(STATUS), "the robot is held")
-    assert not file.exists()
-    for publisher, message in goals.items():
-        harness.matched(publisher).publish(message)
-    harness.spin_until(lambda: file.exists() and len(json.loads(file.read_text())) == 2, "the file")
-    for seconds in (0.5, 1.5):
-        pass_time(seconds)
-        assert "reached" not in states(), "in mid-flight"
-        kill(harness, probe, node)
-        before = probe.count("odom")
-        harness.spin_for(0.5)
-        assert probe.count("odom") == before, "a plant in lockstep waits"
-        assert file.exists()
-        node = start()
-    harness.spin_until(lambda: states()[-1] == "reached", "the goal is met", 60.0)
-    assert not file.exists()
-    base, tip = probe.last("odom").pose.pose.position, probe.last("end_effector_pose").pose.position
-    np.testing.assert_allclose([base.x, base.y, base.z], [0.3, 0.2, 0.0], atol=1e-3)
-    np.testing.assert_allclose([tip.x, tip.y, tip.z], tip_goal, atol=1e-3)
 
 
 def test_a_node_that_is_activated_again_goes_on(harness: Harness, file: Path) -> None:

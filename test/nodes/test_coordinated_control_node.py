@@ -11,10 +11,8 @@ import numpy.typing as npt
 import pytest
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseStamped
-from nav_msgs.msg import Odometry
-from sensor_msgs.msg import JointState
 from std_msgs.msg import String
-from support.control_loop import KD, KP, SHAPE, TICK_NS, TIP, URDF, Loop, pose
+from support.control_loop import KD, KP, TICK_NS, TIP, URDF, Loop, pose
 from support.ros_harness import LATCHED, Harness, nanoseconds
 from support.sentences import assert_one_sentence
 
@@ -22,7 +20,6 @@ from spacerobot_ros.control import ControlState, Reference
 from spacerobot_ros.control.laws.registry import LAWS
 from spacerobot_ros.control.laws.transposed_jacobian import TransposedJacobianLaw
 from spacerobot_ros.control.state import Actuation
-from spacerobot_ros.nodes import CoordinatedControlNode, PlantNode
 
 Array = npt.NDArray[np.float64]
 
@@ -52,41 +49,6 @@ def test_without_a_goal_the_pose_of_the_first_state_is_held(harness: Harness) ->
     np.testing.assert_allclose(wrench[3:], [0.0, 0.0, torque], atol=1e-12)
     np.testing.assert_allclose(effort, efforts, atol=1e-12)
     assert nanoseconds(loop.probe.last("base_wrench").header.stamp) == 2 * TICK_NS
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("law", ["transposed_jacobian", "model_based"])
-def test_a_drifting_robot_is_brought_back_to_where_it_was(harness: Harness, law: str) -> None:
-    """The whole loop: a plant that drifts and tumbles, and nobody who gives a goal."""
-    harness.make(
-        PlantNode,
-        {
-            "robot": "planar_manipulator",
-            "actuation": "effort",
-            "time_mode": "lockstep",
-            "tick_rate": 50.0,
-            "initial_joint_positions": SHAPE.tolist(),
-            "linear_momentum": [4.7, -2.35, 0.0],
-            "angular_momentum": [0.0, 0.0, 1.0],
-        },
-        name="plant",
-    )
-    probe = harness.probe({"odom": Odometry, "joint_states": JointState})
-    harness.spin_until(lambda: probe.count("joint_states"), "the first state")
-    harness.make(
-        CoordinatedControlNode,
-        {"robot": "planar_manipulator", "tick_rate": 50.0, "law": law},
-        name="control",
-    )
-    harness.spin_until(
-        lambda: nanoseconds(probe.last("odom").header.stamp) >= 20_000_000_000, "20 s", 60.0
-    )
-    places = np.array(
-        [[m.pose.pose.position.x, m.pose.pose.position.y] for m in probe.messages["odom"]]
-    )
-    assert np.abs(places).max() > 5e-4
-    np.testing.assert_allclose(places[-1], 0.0, atol=1e-3)
-    np.testing.assert_allclose(probe.last("joint_states").position, SHAPE, atol=2e-3)
 
 
 def test_both_goals_are_pursued(harness: Harness) -> None:
@@ -136,22 +98,6 @@ def test_gains_that_change_in_flight_take_effect(harness: Harness) -> None:
     np.testing.assert_allclose(loop.answer()[0][:3], [70.0, -2 * KD * 0.5, 0.0], atol=1e-12)
     assert loop.set("gains.end_effector_position.kd", 10.0).successful
     np.testing.assert_allclose(loop.answer()[0][:3], [70.0, -(KD + 10.0) * 0.5, 0.0], atol=1e-12)
-
-
-@pytest.mark.parametrize("value", [-1.0, math.nan, math.inf])
-@pytest.mark.parametrize("name", ["gains.base_position.kp", "gains.end_effector_position.kd"])
-def test_bad_gains_are_refused_and_the_loop_goes_on(
-    harness: Harness, name: str, value: float
-) -> None:
-    loop = Loop(harness)
-    loop.aim(base=pose([1.0, 0.0, 0.0]))
-    loop.velocity = np.array([0.0, 0.5, 0.0])
-    before = loop.answer()[0]
-    result = loop.set(name, value)
-    assert not result.successful
-    assert name in result.reason
-    assert "\n" not in result.reason
-    np.testing.assert_array_equal(loop.answer()[0], before)
 
 
 # -- goals ------------------------------------------------------------------------------------
@@ -231,21 +177,6 @@ def test_a_goal_for_what_is_not_controlled_is_refused(
     assert_one_sentence(refusal, law, group.replace("_", "-"), "joint.shoulder")
     wrench, effort = loop.answer()
     np.testing.assert_allclose([*wrench, *effort], 0.0, atol=1e-12)
-
-
-def test_goals_are_taken_in_the_frame_that_the_world_is_called(harness: Harness) -> None:
-    loop = Loop(harness, world_frame="orbit")
-    loop.answer()
-    loop.aim(base=pose([1.0, 0.0, 0.0], frame="orbit"))
-    wrench, _ = loop.answer()
-    assert wrench[0] > 0.5 * KP
-    assert "'orbit'" in loop.node.start_message()
-
-
-def test_a_goal_without_a_frame_is_taken(harness: Harness) -> None:
-    loop = Loop(harness)
-    loop.aim(base=pose([1.0, 0.0, 0.0], frame=""))
-    np.testing.assert_allclose(loop.answer()[0][:3], [2 * KP, 0.0, 0.0], atol=1e-12)
 
 
 # -- abort, life ------------------------------------------------------------------------------

@@ -333,27 +333,6 @@ def test_twists_on_a_topic_move_the_hand_until_they_stop(harness: Harness) -> No
     assert commands[-1].tolist() == [0.0, 0.0, 0.0]
 
 
-@pytest.mark.slow
-def test_a_goal_ends_the_twists(harness: Harness) -> None:
-    flight = flight_of(harness)
-    sender = flight.probe.create_publisher(TwistStamped, "end_effector/twist", 10)
-    goals = flight.probe.create_publisher(
-        type(place([0.0, 0.0, 0.0])), "end_effector/goal_pose", 10
-    )
-    harness.connect()
-    flight.start()
-    sender.publish(twist("base_link"))
-
-    def states() -> list[str]:
-        return [values_of(each)["state"] for each in flight.probe.messages["planner/status"]]
-
-    harness.spin_until(lambda: "teleoperating" in states(), "the twist is followed")
-    goals.publish(place(reachable("end_effector"), 3))
-    harness.spin_until(lambda: "reached" in states(), "the goal is reached")
-    assert states()[-1] == "reached"
-    assert states().index("teleoperating") < states().index("executing")
-
-
 LATCHED = QoSProfile(
     depth=1,
     reliability=ReliabilityPolicy.RELIABLE,

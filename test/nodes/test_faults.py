@@ -6,17 +6,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-import rclpy
 from diagnostic_msgs.msg import DiagnosticStatus
 from rcl_interfaces.msg import Log
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from support.fault_flights import FaultFlight, values_of
-from support.ros_harness import Harness, construction, nanoseconds
+from support.ros_harness import Harness, nanoseconds
 from support.sentences import assert_one_sentence
-
-from spacerobot_ros.errors import SpaceRobotError
-from spacerobot_ros.nodes import PlantNode
 
 PLANT: dict[str, Any] = {"robot": "sliding_masses"}
 TICK = 0.05
@@ -164,41 +160,6 @@ def test_time_goes_on_over_a_reset(harness: Harness) -> None:
     flight.run(10)
     # Of ticks 3 to 12, 4 to 7 are under the fault.
     np.testing.assert_allclose(flight.plant.plant.q, TICK * RATES * [6, 10, 10])
-
-
-BAD: dict[str, tuple[Any, tuple[str, ...]]] = {
-    "no fault": (["joint_stuck elbow"], ("joint_stuck elbow", "slider_1")),
-    "no thrusters": (["thruster_off all"], ("thruster_off all", "no target")),
-    "a number": (3.0, ("'faults'", "list of texts")),
-    "text of several": ("joint_stuck slider_1; joint_slow slider_2", ("joint_slow slider_2",)),
-}
-
-
-@pytest.mark.parametrize(("faults", "mentions"), BAD.values(), ids=BAD)
-def test_bad_faults_are_refused_with_a_sentence(
-    ros_context: rclpy.Context, faults: Any, mentions: tuple[str, ...]
-) -> None:
-    with pytest.raises(SpaceRobotError) as refusal:
-        PlantNode(**construction(ros_context, {**PLANT, "faults": faults}))
-    assert_one_sentence(str(refusal.value), *mentions)
-
-
-@pytest.mark.parametrize(
-    "faults",
-    [
-        ["joint_stuck slider_1", "joint_slow slider_2 0.5 at 9"],
-        "joint_stuck slider_1; joint_slow slider_2 0.5 at 9",
-        "joint_stuck slider_1\njoint_slow slider_2 0.5 at 9\n",
-    ],
-)
-def test_faults_are_a_list_or_a_text(ros_context: rclpy.Context, faults: Any) -> None:
-    plant = PlantNode(**construction(ros_context, {**PLANT, "faults": faults}))
-    assert [str(f) for f in plant.plant.timeline.entries] == [
-        "joint_stuck slider_1 at 0",
-        "joint_slow slider_2 0.5 at 9",
-    ]
-    assert tuple(plant.get_parameter("faults").value) == plant.config.faults
-    plant.destroy_node()
 
 
 def test_stamps_are_of_the_tick_they_show(harness: Harness) -> None:

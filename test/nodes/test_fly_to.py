@@ -19,7 +19,7 @@ from rosbags.highlevel import AnyReader
 from sensor_msgs.msg import JointState
 from support.action_clients import Sender, SentGoal, base_at
 from support.hand_motion import end_of_motion
-from support.planner_flight import HERE, NEAR, PLANT, TURNED, Flight, goal_at, values_of
+from support.planner_flight import NEAR, PLANT, TURNED, Flight, goal_at, values_of
 from support.ros_harness import Harness
 
 from spacerobot_ros.bag import read_bag
@@ -229,20 +229,6 @@ def test_an_end_effector_is_brought_to_a_place(harness: Harness, name: str) -> N
     assert last.errors.end_effector_position < farthest
 
 
-def test_the_base_is_turned_and_the_joints_are_left_in_a_shape(harness: Harness) -> None:
-    flight = arm_flight(harness)
-    turned = ([math.nan] * 3, [0.0, 0.0, 0.1])
-    names = ["elbow_pitch", "shoulder_yaw", "shoulder_pitch"]
-    wanted = JointState(name=names, position=[1.4, 0.2, -0.7])
-    goal = {**base_at(goal_at(turned)), "joint_positions": wanted, "joint_tolerance": 2e-3}
-    sent = flight.fly_to.send(**goal)
-    assert flight.check(sent) == "reached"
-    assert flight.error_to(([0.0, 0.0, 0.0], turned[1]))[1] <= 1e-3
-    np.testing.assert_allclose(shapes_of(flight)[-1], [0.2, -0.7, 1.4], atol=2e-3)
-    assert sent.result.errors.joints <= 2e-3
-    assert sent.feedback[0].errors.joints == pytest.approx(0.3, rel=1e-6)
-
-
 def test_a_tolerance_for_a_part_that_the_method_leaves_open_is_refused(harness: Harness) -> None:
     flight = arm_flight(harness)
     turned = base_at(goal_at(([0.01, 0.0, 0.0], [0.0, 0.0, 0.02])))
@@ -263,36 +249,6 @@ def test_a_tolerance_for_a_part_that_the_method_leaves_open_is_refused(harness: 
     assert math.isnan(sent.result.errors.position)
     result = flight.navigate.end_of(flight.navigate.send(pose=goal_at(([1.0, 0, 0], [0, 0, 0.02]))))
     assert (result.error_code, "but for its position" in result.error_msg) == (9000, True)
-
-
-def test_a_goal_of_another_kind_replaces_one_that_is_flown(harness: Harness) -> None:
-    flight = arm_flight(harness)
-    turned = flight.fly_to.send(**base_at(goal_at(([0.0, 0.0, 0.0], [0.0, 0.1, 0.2]))))
-    flight.wait("executing")
-    flight.ticks(5)
-    place = place_at(np.add(end_of([START, START]), [-0.05, 0.04, 0.0]))
-    moved = flight.fly_to.send(end_effectors=["end_effector"], end_effector_poses=[place])
-    assert flight.check(turned) == "aborted"
-    assert turned.state == "aborted"
-    assert turned.result.message == f"Aborted: replaced by goal {moved.goal_id}."
-    assert flight.check(moved) == "reached"
-    assert flight.error_to(([0.0, 0.0, 0.0], [0.0, 0.1, 0.2]))[1] > 1e-3
-
-
-def test_goals_of_two_clients_end_one_after_the_other(harness: Harness) -> None:
-    flight = ActionFlight(harness)
-    other = harness.probe({}, name="other")
-    second = Sender(harness, other, FLY_TO, "planner/fly_to")
-    second.connect()
-    flight.start()
-    here = flight.fly_to.post(**base_at(goal_at(NEAR)))
-    there = second.post(**base_at(goal_at(TURNED)))
-    harness.spin_until(lambda: here.ended and there.ended, "both results")
-    # Whichever the planner heard last is flown.
-    outcomes = {here.result.outcome: here, there.result.outcome: there}
-    assert set(outcomes) == {"reached", "aborted"}
-    replaced = f"Aborted: replaced by goal {outcomes['reached'].goal_id}."
-    assert outcomes["aborted"].result.message == replaced
 
 
 def test_a_goal_is_cancelled_while_it_is_planned(
@@ -408,31 +364,6 @@ def test_goals_that_are_refused_have_a_result(harness: Harness) -> None:
     sent = flight.fly_to.send(**base_at(goal_at(NEAR)))
     assert flight.check(sent) == "refused"
     assert sent.result.message == "The goal is refused: this node is inactive."
-
-
-def test_a_deactivated_planner_ends_the_goal(harness: Harness) -> None:
-    flight = ActionFlight(harness)
-    flight.start()
-    sent = flight.fly_to.send(**base_at(goal_at(NEAR)))
-    flight.wait("executing")
-    flight.planner.trigger_deactivate()
-    flight.planner.trigger_cleanup()
-    assert flight.check(sent) == "aborted"
-    assert sent.result.message == "Aborted: this node was deactivated."
-    flight.planner.trigger_configure()
-    flight.planner.trigger_activate()
-    flight.fly_to.connect()
-    assert flight.check(flight.fly_to.send(**base_at(goal_at(HERE)))) == "reached"
-
-
-def test_the_time_limit_gives_a_goal_up(harness: Harness) -> None:
-    flight = ActionFlight(harness)
-    flight.start()
-    limit = Duration(sec=1, nanosec=250_000_000)
-    sent = flight.fly_to.send(**base_at(goal_at(NEAR)), time_limit=limit)
-    assert flight.check(sent) == "aborted"
-    assert sent.state == "aborted"
-    assert sent.result.message.startswith("Aborted after its time limit of 1.25 s. The joints")
 
 
 def test_navigate_to_pose_moves_the_base(harness: Harness) -> None:

@@ -17,7 +17,6 @@ from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 from support.planner_flight import (
-    HERE,
     NEAR,
     TOPICS,
     TURNED,
@@ -74,27 +73,6 @@ def test_every_state_is_answered_with_one_command_of_its_stamp(harness: Harness)
     for message in flight.probe.messages["joint_commands"]:
         assert list(message.name) == SLIDERS
         assert np.all(np.isfinite([*message.position, *message.velocity]))
-
-
-def test_a_goal_without_a_frame_is_taken_in_the_world(harness: Harness) -> None:
-    flight = Flight(harness, {"world_frame": "map"}, {"world_frame": "map"})
-    flight.send(goal_at(NEAR, frame=""))
-    flight.start()
-    flight.wait("reached")
-    assert flight.probe.last("planned_path").header.frame_id == "map"
-    flight.send(goal_at(HERE, frame="world"))
-    assert_one_sentence(flight.wait("refused").message, "'world'", "'map'")
-
-
-def test_a_quaternion_of_any_length_is_an_attitude(harness: Harness) -> None:
-    flight = Flight(harness)
-    goal = goal_at(TURNED)
-    o = goal.pose.orientation
-    o.x, o.y, o.z, o.w = (-3.0 * value for value in (o.x, o.y, o.z, o.w))
-    flight.send(goal)
-    flight.start()
-    flight.wait("reached")
-    assert max(flight.error_to(TURNED)) <= 1e-3
 
 
 def changed(place: Place = NEAR, frame: str = "world", **fields: float) -> PoseStamped:
@@ -184,18 +162,6 @@ def test_the_schedule_is_what_is_flown(flown: Flight) -> None:
     assert list(schedule.points[-1].velocities) == [0.0] * 3
 
 
-def test_the_path_is_what_is_flown(flown: Flight) -> None:
-    (path,) = flown.probe.messages["planned_path"]
-    measured = {stamp_of(m): m.pose.pose for m in flown.probe.messages["odom"]}
-    assert path.header.frame_id == "world"
-    assert len(path.poses) > 20
-    for knot in path.poses:
-        assert knot.header.frame_id == "world"
-        planned, flown_there = pose_arrays(knot.pose), pose_arrays(measured[stamp_of(knot)])
-        np.testing.assert_allclose(planned[0], flown_there[0], rtol=0, atol=1e-9)
-        assert (planned[1].inv() * flown_there[1]).magnitude() <= 1e-9
-
-
 def test_schedule_and_path_fit_each_other(flown: Flight) -> None:
     (schedule,), (path,) = (flown.probe.messages[t] for t in ("gait_schedule", "planned_path"))
     assert path.header.stamp == schedule.header.stamp
@@ -249,7 +215,6 @@ def test_markers_show_the_goal_and_the_path(harness: Harness) -> None:
 
 REAL_TIME = {"time_mode": "realtime"}
 THOROUGH = {"optimal.cache": 0, "optimal.answers": 9999, "optimal.starts": 9999}
-FAR = ([50.0, 0.0, 0.0], [0.0, 0.0, 0.0])
 
 
 class Gate:
@@ -309,22 +274,6 @@ def test_states_are_answered_at_rest_until_the_plan_is_there(flight: Flight, gat
     assert set(answered) <= set(states)
     assert len(answered) > 0.5 * len(states)
     assert flight.probe.count("gait_schedule") >= 1
-
-
-def test_an_abort_drops_what_is_being_planned(flight: Flight, gate: Gate) -> None:
-    client = flight.probe.create_client(Trigger, "/planner/abort")
-    flight.send(NEAR)
-    flight.start()
-    flight.harness.spin_until(gate.waiting.is_set, "the planner plans")
-    answer = flight.harness.call(client, Trigger.Request())
-    assert answer.success
-    gate.open.set()
-    flight.ticks(40)
-    assert flight.states[-1] == "aborted"
-    assert not any(speeds(flight))
-    # Another goal is taken up as ever.
-    flight.decide(NEAR)
-    assert flight.states[-1] == "reached"
 
 
 def test_a_node_that_ends_has_its_search_given_up(harness: Harness) -> None:

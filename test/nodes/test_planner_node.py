@@ -10,7 +10,6 @@ import pytest
 import rclpy
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseStamped
-from rcl_interfaces.msg import Log
 from rcl_interfaces.srv import SetParameters
 from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.parameter import Parameter
@@ -33,7 +32,6 @@ from support.sentences import assert_one_sentence
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.nodes import PlannerNode
 from spacerobot_ros.nodes.common.fly_to import action_class
-from spacerobot_ros.planning.execution.status import PlannerStatistics
 
 pytestmark = pytest.mark.usefixtures("one_plant")
 
@@ -168,37 +166,6 @@ def test_abortion_brings_the_joints_to_rest(harness: Harness) -> None:
     flight.decide(NEAR)
     assert flight.states[-1] == "reached"
     assert max(flight.error_to(NEAR)) <= 1e-3
-
-
-def test_statistics_are_those_of_the_flight(harness: Harness) -> None:
-    flight = Flight(harness)
-    client = flight.probe.create_client(Trigger, "planner/statistics")
-    flight.decide(NEAR)
-    flight.plant.trigger_deactivate()
-    harness.settle(flight.probe)
-    answer = harness.call(client, Trigger.Request())
-    assert answer.success
-    statistics = PlannerStatistics.from_json(answer.message)
-    assert statistics == flight.planner.statistics
-    assert statistics.commands_published == flight.probe.count("joint_commands")
-    assert statistics.plans == 1
-    assert 0.0 < statistics.plan_time_s < 15.0
-
-
-def test_a_reset_of_the_plant_does_not_keep_the_goal_from_being_met(harness: Harness) -> None:
-    flight = Flight(harness)
-    flight.send(NEAR)
-    flight.start()
-    flight.wait("executing")
-    flight.ticks(15)
-    flight.probe.watch("/rosout", Log)
-    harness.connect()
-    harness.call(flight.probe.create_client(Trigger, "plant/reset"), Trigger.Request())
-    flight.wait("reached", "failed")
-    assert flight.states[-1] == "reached"
-    assert max(flight.error_to(NEAR)) <= 1e-3
-    # The state of the same time that the plant then shows is no other plant's.
-    assert not [log.msg for log in flight.probe.messages["/rosout"] if "more than one" in log.msg]
 
 
 # -- corrections ------------------------------------------------------------------------------

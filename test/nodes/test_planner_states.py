@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +21,6 @@ from support.planner_flight import (
     TOPICS,
     goal_at,
     pose_arrays,
-    stamp_of,
     values_of,
 )
 from support.plant_rig import SLIDERS, TICK_NS
@@ -113,101 +111,6 @@ class FakePlant:
             lambda: self.probe.count("joint_commands") >= count, f"{count} command(s)"
         )
         return list(self.probe.messages["joint_commands"])
-
-
-@pytest.mark.parametrize("joints_first", [False, True])
-def test_a_state_is_complete_with_odom_and_joints_in_any_order(
-    harness: Harness, joints_first: bool
-) -> None:
-    fake = FakePlant(harness, {})
-    fake.planner.trigger_activate()
-    for tick in range(3):
-        fake.show(tick, joints_first)
-        fake.answers(tick + 1)
-    harness.settle(fake.probe)
-    assert [stamp_of(m) for m in fake.answers(3)] == [0, TICK_NS, 2 * TICK_NS]
-    assert fake.probe.count("joint_commands") == 3
-
-
-def test_a_state_that_is_shown_again_is_answered_once_and_whole(harness: Harness) -> None:
-    # As after a reset of the plant: the same tick, another state.
-    fake = FakePlant(harness, {})
-    fake.planner.trigger_activate()
-    fake.show(0)
-    fake.answers(1)
-    fake.show(0, slider_1=0.1, slider_2=0.2, slider_3=0.3)
-    fake.answers(2)
-    harness.settle(fake.probe)
-    assert [list(m.position) for m in fake.answers(2)] == [[0.0, 0.0, 0.0], [0.1, 0.2, 0.3]]
-
-
-def test_joint_states_go_by_name_and_not_by_place(harness: Harness) -> None:
-    fake = FakePlant(harness, {})
-    fake.planner.trigger_activate()
-    fake.show(0, slider_3=0.3, slider_1=0.1, slider_2=0.2)
-    (command,) = fake.answers(1)
-    assert dict(zip(command.name, command.position, strict=True)) == {
-        "slider_1": 0.1,
-        "slider_2": 0.2,
-        "slider_3": 0.3,
-    }
-
-
-def test_joint_states_of_another_robot_are_refused_with_a_reason(harness: Harness) -> None:
-    fake = FakePlant(harness, {})
-    fake.planner.trigger_activate()
-    fake.show(0, elbow=0.3)
-    fake.wait_for_log("elbow")
-    fake.show(1)
-    assert [stamp_of(m) for m in fake.answers(1)] == [TICK_NS]
-
-
-def test_joint_states_that_lack_a_joint_are_refused_with_a_reason(harness: Harness) -> None:
-    # Zero would be a guess, and the plan would start from it.
-    fake = FakePlant(harness, {})
-    fake.planner.trigger_activate()
-    fake.show(0, slider_1=0.1, slider_3=0.3)
-    fake.wait_for_log("slider_2")
-    fake.show(1)
-    assert [stamp_of(m) for m in fake.answers(1)] == [TICK_NS]
-
-
-def test_joint_states_without_velocities_do_not_end_the_planner(harness: Harness) -> None:
-    fake = FakePlant(harness, {})
-    fake.planner.trigger_activate()
-    fake.goals.publish(goal_at(NEAR))
-    harness.settle(fake.probe)
-    fake.show(0, rates=False)
-    # Flown as from rest, or refused with a reason.
-    harness.spin_until(
-        lambda: values_of(fake.probe.last("planner/status"))["state"] in ("executing", "refused"),
-        "the goal is decided",
-    )
-    count = fake.probe.count("joint_commands")
-    fake.show(1)
-    fake.answers(count + 1)
-
-
-@pytest.mark.parametrize("broken", [{"x": math.nan}, dict.fromkeys(SLIDERS, math.nan)])
-def test_a_state_that_is_not_finite_does_not_end_the_planner(
-    harness: Harness, broken: dict[str, float]
-) -> None:
-    fake = FakePlant(harness, {})
-    fake.planner.trigger_activate()
-    fake.goals.publish(goal_at(NEAR))
-    harness.settle(fake.probe)
-    fake.show(0, **broken)  # type: ignore[arg-type]
-    harness.settle(fake.probe)
-    assert values_of(fake.probe.last("planner/status"))["state"] != "executing"
-    fake.goals.publish(goal_at(NEAR))
-    harness.settle(fake.probe)
-    fake.show(1)
-    harness.spin_until(
-        lambda: values_of(fake.probe.last("planner/status"))["state"] == "executing",
-        "a plan from a state that is finite",
-    )
-    for command in fake.probe.messages["joint_commands"]:
-        assert np.all(np.isfinite(command.velocity))
 
 
 def test_a_broken_description_is_refused_and_the_next_is_taken(harness: Harness) -> None:

@@ -18,13 +18,11 @@ from support.odometry import pose_of, twist_of
 from support.oracles import PinocchioOracle
 from support.planner_flight import values_of
 from support.ros_harness import Harness
-from support.sentences import assert_one_sentence
 
 from spacerobot_ros.nodes import PlantNode
 
 MASS = 47.0
 URDF = Path(__file__).parents[2] / "urdf" / "planar_manipulator.urdf"
-EFFORT_LIMIT = 200.0  # of both joints, as the URDF says
 
 
 class Effort:
@@ -107,14 +105,6 @@ def test_a_lockstep_plant_waits_for_both_commands(harness: Harness, first: str) 
     assert rig.speed == pytest.approx(3 * 0.01 * 4.7 / MASS, rel=1e-12)
 
 
-def test_efforts_alone_do_where_nobody_gives_a_wrench(harness: Harness) -> None:
-    rig = Effort(harness, wrench=False)
-    for tick in range(1, 4):
-        rig.turn(1.0, -1.0)
-        rig.wait(tick + 1)
-    assert list(rig.probe.last("joint_states").effort) == [1.0, -1.0]
-
-
 def test_a_lockstep_plant_does_not_wait_for_a_commander_that_is_gone(harness: Harness) -> None:
     rig = Effort(harness, wrench=True)
     rig.turn(1.0, 0.0)
@@ -135,42 +125,6 @@ def test_thrusters_are_off_when_their_commander_is_gone(harness: Harness) -> Non
     rig.turn(0.0, 0.0)
     rig.wait(3)
     assert rig.speed == pytest.approx(speed, rel=1e-12)
-
-
-def test_a_wrench_in_another_frame_is_refused_and_time_goes_on(harness: Harness) -> None:
-    rig = Effort(harness, wrench=True)
-    rig.push(4.7, frame="world")
-    rig.turn(0.0, 0.0)
-    rig.wait(2)
-    assert rig.speed == 0.0
-    assert rig.diagnosed("commands")["refused"] == "1"
-    (status,) = (s for s in rig.probe.last("/diagnostics").status if s.name == "plant: commands")
-    assert status.level == DiagnosticStatus.WARN
-    assert_one_sentence(status.message, "base_wrench", "'world'", "base_link")
-    rig.push(4.7, frame="")
-    rig.turn(0.0, 0.0)
-    rig.wait(3)
-    assert rig.speed == pytest.approx(0.01 * 4.7 / MASS, rel=1e-12)
-
-
-def test_efforts_beyond_the_limits_are_clipped_and_counted(harness: Harness) -> None:
-    rig = Effort(harness, wrench=False)
-    rig.turn(3 * EFFORT_LIMIT, -10.0)
-    rig.wait(2)
-    rig.turn(0.0, -1e6)
-    rig.wait(3)
-    efforts = [list(m.effort) for m in rig.probe.messages["joint_states"]]
-    assert efforts == [[0.0, 0.0], [EFFORT_LIMIT, -10.0], [0.0, -EFFORT_LIMIT]]
-    counted = rig.diagnosed("actuators")
-    assert counted["effort_limited.shoulder"] == counted["effort_limited.elbow"] == "1"
-    # The motion is that of the clipped efforts: energy is their work, by another engine.
-    joints, odom = (rig.probe.messages[t][1] for t in ("joint_states", "odom"))
-    oracle = PinocchioOracle(URDF.read_text("utf-8"), JOINTS)
-    oracle.set_configuration(np.zeros(2))
-    acceleration = oracle.own_acceleration(np.zeros(6), np.array([EFFORT_LIMIT, -10.0]))
-    rates = np.array(joints.velocity) / 0.01
-    np.testing.assert_allclose(rates, acceleration[6:], rtol=0.05)
-    assert odom.twist.twist.angular.z == pytest.approx(0.01 * acceleration[5], rel=0.05)
 
 
 TICK = 0.02
@@ -267,15 +221,6 @@ def test_a_wrench_decides_and_pushes_by_newton(harness: Harness, drift: float) -
     assert abs(gained[1]) < 0.05
     moved = pose_of(plant.probe.last("odom"))[0] - at
     assert moved[1] == pytest.approx(drift / 47.0 * 10 * TICK, abs=2e-3)
-
-
-def test_efforts_alone_decide(harness: Harness) -> None:
-    plant = Plant(harness, wrenches=False)
-    plant.step(effort=[3.0, -1.0])
-    harness.settle(plant.probe)
-    assert plant.actuation == "effort"
-    assert np.linalg.norm(plant.probe.last("joint_states").velocity) > 1e-3
-    np.testing.assert_allclose(plant.momentum(), 0.0, atol=1e-12)
 
 
 def test_faults_from_before_the_decision_stay(harness: Harness) -> None:

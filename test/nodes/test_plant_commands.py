@@ -2,27 +2,17 @@
 
 from __future__ import annotations
 
-import math
-from typing import Any
-
 import numpy as np
 import pytest
-import rclpy
 from diagnostic_msgs.msg import DiagnosticStatus
-from geometry_msgs.msg import WrenchStamped
 from sensor_msgs.msg import JointState
 from support.bad_commands import BAD_COMMANDS
 from support.odometry import pose_of, twist_of
-from support.plant_rig import SLIDERS, STATE, TICK, TICK_NS, Rig
-from support.ros_harness import Harness, construction, nanoseconds
+from support.plant_rig import STATE, TICK, TICK_NS, Rig
+from support.ros_harness import Harness, nanoseconds
 from support.sentences import assert_one_sentence
 
-from spacerobot_ros.errors import SpaceRobotError
-from spacerobot_ros.nodes import PlantNode
 from spacerobot_ros.simulation.status import PlantState
-
-RATE_LIMIT, STROKE = 0.7, 2.5  # of each slider, as its <limit> says
-
 
 # -- commands ---------------------------------------------------------------------------------
 
@@ -126,59 +116,6 @@ def test_a_command_that_leaves_a_joint_out_is_a_tick_at_rest(
     assert rig.diagnosed("commands", "refused") == 1
 
 
-def test_joints_go_by_name_and_not_by_place(harness: Harness) -> None:
-    rig = Rig(harness)
-    rng = np.random.default_rng(2)
-    for _ in range(6):
-        wanted = dict(zip(SLIDERS, rng.uniform(-0.5, 0.5, 3), strict=True))
-        names = [str(name) for name in rng.permutation(SLIDERS)]
-        joints = rig.step([wanted[name] for name in names], names)
-        assert dict(zip(joints.name, joints.velocity, strict=True)) == wanted
-
-
-def test_positions_and_efforts_of_a_command_are_not_looked_at(harness: Harness) -> None:
-    rig = Rig(harness)
-    joints = rig.step([0.1, 0.2, 0.3], position=[math.nan], effort=[math.inf] * 5)
-    np.testing.assert_array_equal(joints.velocity, [0.1, 0.2, 0.3])
-    assert rig.diagnosed("commands", "refused") == 0
-
-
-def test_rates_are_limited_as_the_urdf_says_and_counted(harness: Harness) -> None:
-    rig = Rig(harness)
-    joints = rig.step([1.0, -5.0, RATE_LIMIT])
-    np.testing.assert_array_equal(joints.velocity, [RATE_LIMIT, -RATE_LIMIT, RATE_LIMIT])
-    np.testing.assert_allclose(joints.position, np.array([1, -1, 1]) * RATE_LIMIT * TICK)
-    status = rig.diagnosis("actuators")
-    assert status.level == DiagnosticStatus.WARN
-    counts = {pair.key: int(pair.value) for pair in status.values}
-    assert counts == {
-        "rate_limited.slider_1": 1,
-        "rate_limited.slider_2": 1,
-        "rate_limited.slider_3": 0,
-        "stroke_limited.slider_1": 0,
-        "stroke_limited.slider_2": 0,
-        "stroke_limited.slider_3": 0,
-    }
-    rig.wait_for_log("slider_1")
-    rig.step([0.1, 0.1, 0.1])
-    assert rig.diagnosis("actuators").level == DiagnosticStatus.OK
-
-
-def test_strokes_are_limited_as_the_urdf_says_and_counted(harness: Harness) -> None:
-    rig = Rig(harness, {"initial_joint_positions": [2.48, -2.48, 0.0]})
-    joints = rig.step([0.6, -0.5, 0.1])
-    # 0.02 m are left, in 0.05 s.
-    np.testing.assert_allclose(joints.velocity, [0.4, -0.4, 0.1], rtol=1e-12)
-    np.testing.assert_allclose(joints.position, [STROKE, -STROKE, 0.005], rtol=1e-14)
-    joints = rig.step([0.6, 0.5, 0.1])
-    np.testing.assert_allclose(joints.velocity, [0.0, 0.5, 0.1], atol=1e-12)
-    np.testing.assert_allclose(joints.position, [STROKE, -STROKE + 0.025, 0.01], rtol=1e-14)
-    assert rig.diagnosed("actuators", "stroke_limited.slider_1") == 2
-    assert rig.diagnosed("actuators", "stroke_limited.slider_2") == 1
-    assert rig.diagnosed("actuators", "stroke_limited.slider_3") == 0
-    assert rig.diagnosed("actuators", "rate_limited.slider_1") == 0
-
-
 # -- services ---------------------------------------------------------------------------------
 
 
@@ -245,7 +182,6 @@ def test_pause_without_a_command_changes_nothing(harness: Harness) -> None:
 
 
 REALTIME = {"time_mode": "realtime", "real_time_factor": 10.0, "command_timeout": 0.0}
-ARM = ["joint_1", "joint_2", "joint_3"]
 
 
 def velocity(rig: Rig) -> float:
@@ -270,19 +206,6 @@ def assert_nothing_moves(rig: Rig, states: int = 5) -> None:
 
 def assert_state(rig: Rig, state: PlantState) -> None:
     assert rig.plant.state is state
-
-
-def test_a_command_older_than_the_one_in_force_is_refused(harness: Harness) -> None:
-    rig = Rig(harness, REALTIME)
-    stamp = started(rig)
-    harness.spin_until(lambda: rig.now_ns > stamp, "a third state")
-    rig.send([0.1, 0.0, 0.0], stamp_ns=stamp + TICK_NS)
-    wait_for_velocity(rig, 0.1)
-    rig.send([0.3, 0.0, 0.0], stamp_ns=stamp)
-    rig.wait_for_log("0.05 s older than the one in force")
-    rig.wait_for_refusals(1)
-    assert rig.diagnosed("commands", "refused.out_of_order") == 1
-    assert velocity(rig) == 0.1
 
 
 def test_a_second_commander_latches_a_fault_until_it_is_rearmed(harness: Harness) -> None:
@@ -358,19 +281,6 @@ def command_at(stamp_ns: int) -> JointState:
     return message
 
 
-def test_two_commanders_may_be_accepted(harness: Harness) -> None:
-    rig = Rig(harness, {**REALTIME, "second_commander": "accept"})
-    intruder = harness.probe({}, name="intruder")
-    other = intruder.create_publisher(JointState, "joint_commands", 100)
-    harness.connect()
-    stamp = started(rig)
-    rig.send([0.3, 0.0, 0.0], stamp_ns=stamp)
-    wait_for_velocity(rig, 0.3)
-    other.publish(command_at(stamp))
-    wait_for_velocity(rig, 0.1)
-    assert rig.diagnosed("commands", "refused") == 0
-
-
 @pytest.mark.parametrize("mode", ["realtime", "lockstep"])
 def test_abort_holds_everything_until_rearm(harness: Harness, mode: str) -> None:
     rig = Rig(harness, {**REALTIME, "time_mode": mode})
@@ -396,84 +306,3 @@ def test_abort_holds_everything_until_rearm(harness: Harness, mode: str) -> None
     assert "No fault" in rig.trigger("plant/rearm").message
     rig.plant.trigger_deactivate()
     assert_state(rig, PlantState.INACTIVE)
-
-
-@pytest.mark.parametrize(
-    ("reason", "command"),
-    [("not_finite", [float("nan"), 0.0, 0.0]), ("malformed", [0.1, 0.1])],
-)
-def test_chosen_reasons_latch(harness: Harness, reason: str, command: list[float]) -> None:
-    rig = Rig(harness, {"latched_faults": "not_finite malformed"})
-    assert rig.step([0.2, 0.0, 0.0]).velocity[0] == 0.2
-    assert not any(rig.step(command).velocity)
-    assert rig.diagnosed("commands", f"refused.{reason}") == 1
-    assert not any(rig.step([0.2, 0.0, 0.0]).velocity)
-    assert rig.diagnosed("commands", "refused.latched") == 1
-    rig.trigger("plant/rearm")
-    assert rig.step([0.2, 0.0, 0.0]).velocity[0] == 0.2
-
-
-def test_commands_beyond_limits_may_be_refused_as_a_whole(harness: Harness) -> None:
-    rig = Rig(harness, {"beyond_limits": "refuse"})
-    assert not any(rig.step([0.1, 0.71, 0.0]).velocity)
-    status = rig.diagnosis("commands")
-    assert_one_sentence(status.message, "0.71", "beyond the limits", "0.7")
-    assert rig.diagnosed("commands", "refused.beyond_limits") == 1
-    assert list(rig.step([0.1, 0.7, 0.0]).velocity) == [0.1, 0.7, 0.0]
-
-
-def test_an_unknown_reason_to_latch_is_refused(ros_context: rclpy.Context) -> None:
-    given = {"robot": "sliding_masses", "latched_faults": "stale bad_luck"}
-    with pytest.raises(SpaceRobotError) as refusal:
-        PlantNode(**construction(ros_context, given))
-    assert_one_sentence(str(refusal.value), "'latched_faults'", "bad_luck", "stale")
-
-
-ARM_MOVES = {
-    "robot": "three_joint_arm",
-    "actuation": "effort",
-    "tick_rate": 100.0,
-    "initial_joint_velocities": [0.2, -0.3, 0.25],
-}
-
-
-def rates(rig: Rig) -> Any:
-    return np.abs(np.array(rig.probe.last("joint_states").velocity))
-
-
-@pytest.mark.slow
-def test_motors_bring_the_joints_to_rest_when_their_commander_falls_silent(
-    harness: Harness,
-) -> None:
-    rig = Rig(harness, {**REALTIME, **ARM_MOVES, "real_time_factor": 2.0, "command_timeout": 0.5})
-    momentum = np.array(rig.wait("momentum", 1).data[:6])
-    assert rates(rig).max() > 0.2
-    names = list(rig.probe.last("joint_states").name)
-    effort = JointState(name=names, effort=[0.0, 0.0, 0.0])
-    rig.commands.publish(effort)
-    rig.wait_for_log("No command on 'joint_commands' for 0.5 s")
-    stopped = rig.now_ns
-    harness.spin_until(lambda: rates(rig).max() < 1e-4, "rest")
-    assert rig.now_ns - stopped < 1_000_000_000
-    # What brakes is inside the robot: the momenta are what they were.
-    np.testing.assert_allclose(rig.probe.last("momentum").data[:6], momentum, atol=1e-9)
-
-
-@pytest.mark.slow
-def test_a_latched_fault_ends_thrust_and_brakes_joints(harness: Harness) -> None:
-    rig = Rig(harness, {**REALTIME, **ARM_MOVES, "real_time_factor": 2.0})
-    thrust = rig.probe.create_publisher(WrenchStamped, "base_wrench", 10)
-    harness.connect()
-    push = WrenchStamped()
-    push.wrench.force.x = 10.0
-    thrust.publish(push)
-    names = list(rig.probe.last("joint_states").name)
-    rig.commands.publish(JointState(name=names, effort=[0.0, 0.0, 0.0]))
-    rig.wait("momentum", 1)
-    harness.spin_until(lambda: rig.probe.last("momentum").data[0] > 1.0, "thrust")
-    rig.trigger("plant/abort")
-    harness.spin_until(lambda: rates(rig).max() < 1e-4, "rest")
-    given = np.array(rig.probe.last("momentum").data[:3])
-    before = rig.probe.count("momentum")
-    rig.wait("momentum", before + 20)
-    np.testing.assert_allclose(rig.probe.last("momentum").data[:3], given, rtol=1e-9)

@@ -29,7 +29,6 @@ JOINTS = ["slider_1", "slider_2", "slider_3"]
 Array = npt.NDArray[np.float64]
 
 URDF = Path(__file__).parents[2] / "urdf"
-MASS = 10 + 3 * 2.0
 
 
 def momentum_by_pinocchio(robot: str, odom: Odometry, joints: JointState) -> tuple[Array, float]:
@@ -192,52 +191,6 @@ def test_a_namespace_moves_all_but_the_clock_and_the_diagnostics(harness: Harnes
 
 
 # -- momentum ---------------------------------------------------------------------------------
-
-
-def test_a_robot_with_linear_momentum_drifts_at_p_over_m(harness: Harness) -> None:
-    p = np.array([1.6, -3.2, 0.8])
-    rig = Rig(harness, {"linear_momentum": p.tolist(), "initial_position": [5.0, 0.0, 0.0]})
-    for _ in range(20):
-        rig.step([0.0, 0.0, 0.0])
-    harness.settle(rig.probe)
-    for k, odom in enumerate(rig.probe.messages["odom"]):
-        position, quaternion = pose_of(odom)
-        np.testing.assert_allclose(position, [5, 0, 0] + p / MASS * k * TICK, atol=1e-13)
-        np.testing.assert_allclose(quaternion, [0, 0, 0, 1], atol=1e-14)
-        np.testing.assert_allclose(twist_of(odom)[0], p / MASS, rtol=1e-13)
-    for message in rig.probe.messages["momentum"]:
-        np.testing.assert_allclose(message.data[:3], p, rtol=1e-13)
-        assert message.data[6] == pytest.approx(p @ p / (2 * MASS), rel=1e-12)
-
-
-def test_a_robot_with_angular_momentum_turns_about_a_principal_axis(harness: Harness) -> None:
-    # At the shape zero the point masses stand at the origin: I_zz is the base's.
-    rig = Rig(harness, {"angular_momentum": [0.0, 0.0, 0.75]})
-    for _ in range(20):
-        rig.step([0.0, 0.0, 0.0])
-    harness.settle(rig.probe)
-    for k, odom in enumerate(rig.probe.messages["odom"]):
-        _, quaternion = pose_of(odom)
-        turned = Rotation.from_quat(quaternion).as_rotvec()
-        np.testing.assert_allclose(turned, [0, 0, 0.75 / 1.5 * k * TICK], atol=1e-11)
-
-
-def test_published_momentum_is_constant_while_the_shape_moves(harness: Harness) -> None:
-    p, L = [0.5, 1.0, -0.25], [0.1, -0.4, 0.3]
-    rig = Rig(harness, {"linear_momentum": p, "angular_momentum": L})
-    rng = np.random.default_rng(3)
-    for _ in range(20):
-        rig.step(rng.uniform(-0.7, 0.7, 3).tolist())
-    harness.settle(rig.probe)
-    for k, message in enumerate(rig.probe.messages["momentum"]):
-        np.testing.assert_allclose(message.data[:6], p + L, atol=1e-13)
-        by_pinocchio, energy = momentum_by_pinocchio(
-            "sliding_masses", rig.probe.messages["odom"][k], rig.probe.messages["joint_states"][k]
-        )
-        np.testing.assert_allclose(by_pinocchio, p + L, atol=1e-12)
-        assert message.data[6] == pytest.approx(energy, rel=1e-11)
-    assert rig.diagnosed("momentum", "linear_change") < 1e-12
-    assert rig.diagnosed("momentum", "angular_change") < 1e-12
 
 
 # -- lockstep with latecomers -----------------------------------------------------------------

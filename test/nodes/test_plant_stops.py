@@ -7,13 +7,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from diagnostic_msgs.msg import DiagnosticStatus
 from rcl_interfaces.msg import Log
 from rclpy.publisher import Publisher
-from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool, Trigger
-from support.control_loop import STATUS, Loop, pose
-from support.planner_flight import NEAR, PLANNER, Flight, stamp_of, values_of
+from support.control_loop import Loop, pose
+from support.planner_flight import NEAR, PLANNER, Flight, stamp_of
 from support.ros_harness import LATCHED, Harness, Probe
 from support.sentences import assert_one_sentence
 
@@ -159,39 +158,6 @@ def test_a_goal_on_file_is_not_resumed_while_the_plant_is_latched(
     assert not np.any(place(flight))
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("ahead", [1e6, 3.0, -0.5])
-def test_a_state_of_another_time_does_not_end_a_flight(harness: Harness, ahead: float) -> None:
-    flight = Flight(harness, {**SLOW, "max_corrections": 0})
-    rogue = flight.probe.create_publisher(JointState, "joint_states", 10)
-    diagnostics = harness.probe({"/diagnostics": DiagnosticArray}, name="doctor")
-    harness.connect()
-    flight.start()
-    flight.send(NEAR)
-    flight.wait("executing")
-    flight.ticks(15)
-    message = flight.probe.last("joint_states")
-    stamp = round((message.header.stamp.sec + ahead) * 1e9) + message.header.stamp.nanosec
-    message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp, 10**9)
-    before = flight.probe.count("joint_commands")
-    rogue.publish(message)
-    flight.wait("reached", "failed")
-    assert flight.states == ["idle", "executing", "reached"]
-    answered = [stamp_of(m) for m in flight.probe.messages["joint_commands"][before:]]
-    assert answered == sorted(set(answered))
-
-    def warnings() -> list[DiagnosticStatus]:
-        arrays = diagnostics.messages["/diagnostics"]
-        of_all = [status for array in arrays for status in array.status]
-        return [status for status in of_all if status.level != DiagnosticStatus.OK]
-
-    harness.spin_until(warnings, "a word about what is ignored")
-    (status,) = warnings()
-    assert (status.name, status.level) == ("planner: states", DiagnosticStatus.WARN)
-    assert_one_sentence(status.message, "joint_states", "stamp")
-    assert values_of(status)["ignored"] == "1"
-
-
 # -- statuses of others -----------------------------------------------------------------------
 
 
@@ -321,25 +287,6 @@ def test_control_characters_of_a_status_reach_no_status_and_no_log(harness: Harn
     texts = [status.message, *(line.msg for line in logs.messages["/rosout"])]
     texts += [text for pair in status.values for text in (pair.key, pair.value)]
     assert all(text.isprintable() for text in texts)
-
-
-def test_states_of_another_time_do_not_disturb_the_controller(harness: Harness) -> None:
-    loop = Loop(harness, time_limit=5.0)
-    loop.aim(base=pose([1.0, 0.0, 0.0]))
-    for _ in range(3):
-        before = loop.answer()[0]
-    tick = loop.tick
-    for jump in (10**8, 300, -2):
-        loop.tick = tick + jump - 1
-        loop.show()
-        harness.settle(loop.probe)
-        loop.tick = tick
-        tick += 1
-        after = loop.answer()[0]
-        np.testing.assert_allclose(after, before, rtol=1e-9)
-        assert loop.status["state"] == "tracking"
-    assert loop.probe.count("joint_commands") == 6
-    assert {values_of(s)["state"] for s in loop.probe.messages[STATUS]} == {"waiting", "tracking"}
 
 
 def test_a_restarted_plant_does_not_end_the_goal_of_the_controller(harness: Harness) -> None:

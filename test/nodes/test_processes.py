@@ -6,7 +6,6 @@ import os
 import resource
 import signal
 from collections.abc import Callable, Iterator
-from contextlib import suppress
 from functools import partial
 from importlib import import_module
 from importlib.util import find_spec
@@ -19,10 +18,7 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseStamped
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
-from mcap.exceptions import EndOfFile
 from mcap.reader import make_reader
-from mcap.records import Channel, Message
-from mcap.stream_reader import StreamReader
 from nav_msgs.msg import Odometry
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import JointState
@@ -116,26 +112,6 @@ def test_a_parameter_that_a_node_does_not_have_is_named_with_the_nearest(
         harness.spin_until(warned, "a warning", timeout=START)
         (warning,) = (line for line in process.said.splitlines() if line.startswith("[WARN]"))
         assert_one_sentence(warning.partition("]: ")[2], f"'{given}'", f"'{meant}'", "'fuel'")
-
-
-@pytest.mark.slow
-def test_a_signal_ends_a_node_with_exit_code_0(
-    start: Start, harness: Harness, tmp_path: Path
-) -> None:
-    # Interruption is for the flight below.
-    bag = tmp_path / "flight.mcap"
-    started = [
-        start("plant", {**FAST, "time_mode": "lockstep"}),
-        start("recorder", {"bag": str(bag)}),
-    ]
-    await_nodes(harness, harness.probe({}), started)
-    for process in started:
-        process.signal(signal.SIGTERM)
-    for process in started:
-        assert process.end() == 0, process.said
-        assert "Traceback" not in process.said
-    with bag.open("rb") as file:
-        assert make_reader(file).get_summary() is not None
 
 
 def await_nodes(harness: Harness, probe: Probe, processes: list[NodeProcess]) -> None:
@@ -234,38 +210,6 @@ def messages_of(bag: Path) -> dict[str, list[Any]]:
             kind = getattr(import_module(f"{package}.msg"), name)
             content.setdefault(channel.topic, []).append(deserialize_message(record.data, kind))
     return content
-
-
-@pytest.mark.slow
-def test_a_killed_recorder_leaves_whole_chunks(
-    start: Start, harness: Harness, tmp_path: Path
-) -> None:
-    bag = tmp_path / "flight.mcap"
-    probe = harness.probe({"odom": Odometry})
-    recorder = start("recorder", {"bag": str(bag), "flush_period": "0.1"})
-    plant = start("plant", {**FAST, "real_time_factor": "20"})
-    await_nodes(harness, probe, [recorder, plant])
-    count = probe.count("odom")
-    harness.spin_until(lambda: probe.count("odom") >= count + 400, "a second of flight")
-    recorder.signal(signal.SIGKILL)
-    recorder.end()
-    stamps = stamps_of_cut_bag(bag, "/odom")
-    assert len(stamps) > 200
-    assert set(np.diff(stamps)) == {TICK_NS}
-
-
-def stamps_of_cut_bag(bag: Path, topic: str) -> list[int]:
-    """Return the stamps of a topic from the whole chunks of a bag that has no end."""
-    stamps = []
-    topics: dict[int, str] = {}
-    with bag.open("rb") as file, suppress(EndOfFile):
-        for record in StreamReader(file).records:
-            if isinstance(record, Channel):
-                topics[record.id] = record.topic
-            elif isinstance(record, Message) and topics[record.channel_id] == topic:
-                odom = deserialize_message(record.data, Odometry)
-                stamps.append(nanoseconds(odom.header.stamp))
-    return stamps
 
 
 @pytest.mark.slow

@@ -41,35 +41,6 @@ from spacerobot_ros.nodes.recorder import loss_events
 ROOT = Path(__file__).parents[2]
 
 
-def test_a_recording_is_split_by_size(harness: Harness, tmp_path: Path) -> None:
-    probe = harness.probe({})
-    publisher = probe.create_publisher(String, "/talk", 1000)
-    recorder = harness.make(
-        RecorderNode,
-        {
-            "bag": str(tmp_path / "flight.mcap"),
-            "topics": "/talk",
-            "max_size": 0.05,
-            "clock_wait": 0.0,
-            "compression": "none",
-        },
-    )
-    harness.matched(publisher)
-    for n in range(300):
-        publisher.publish(String(data=f"{n:04d}" + "x" * 1000))
-        if n % 50 == 49:
-            harness.spin_until(lambda n=n: recorder.messages_recorded > n, "they are recorded")  # type: ignore[misc]
-            recorder.flush()
-    recorder.trigger_deactivate()
-    recorder.trigger_cleanup()
-    files = sorted(tmp_path.iterdir(), key=lambda path: int(path.stem.split("_")[1]))
-    assert len(files) >= 3
-    texts = [m.data[:4] for path in files for _, m in read_bag(path).messages("/talk")]
-    assert texts == [f"{n:04d}" for n in range(300)]
-    assert all("spacerobot" in read_bag(path).metadata for path in files)
-    assert read_bag(files[-1]).metadata["recorder"] == {"messages": "300", "messages_lost": "0"}
-
-
 def test_a_recording_is_split_by_time_and_flushed_as_often_as_it_is_to(
     harness: Harness, tmp_path: Path
 ) -> None:

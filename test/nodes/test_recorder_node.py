@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import time
 from pathlib import Path
 
 import numpy as np
@@ -14,8 +13,7 @@ from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.qos import qos_profile_system_default
 from rclpy.serialization import deserialize_message
 from rclpy.service_introspection import ServiceIntrospectionState
-from sensor_msgs.msg import JointState
-from std_msgs.msg import Header, String
+from std_msgs.msg import String
 from std_srvs.srv import SetBool
 from support.planner_flight import PLANNER
 from support.recorded_stack import LATCHED_TOPICS, PLANT, STREAMS, BagContent, Stack, parameters_of
@@ -176,22 +174,6 @@ def test_events_of_services_are_recorded(
     assert [event.info.event_type for _, event in raw] == [1, 2]
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("compression", ["lz4", "none"])
-def test_compression_is_chosen(harness: Harness, tmp_path: Path, compression: str) -> None:
-    stack = Stack(harness, tmp_path / "flight.mcap", compression=compression)
-    stack.configure(*STREAMS, *LATCHED_TOPICS)
-    stack.recorder.trigger_activate()
-    stack.fly()
-    stack.stop()
-    stack.close_bag()
-    with stack.bag.open("rb") as file:
-        summary = make_reader(file).get_summary()
-    assert summary is not None
-    used = {index.compression for index in summary.chunk_indexes}
-    assert used == {"" if compression == "none" else compression}
-
-
 def test_topics_can_be_chosen(harness: Harness, tmp_path: Path) -> None:
     stack = Stack(harness, tmp_path / "flight.mcap", topics="/clock odom planner/status")
     stack.configure("/clock", "/odom", "/planner/status")
@@ -201,24 +183,6 @@ def test_topics_can_be_chosen(harness: Harness, tmp_path: Path) -> None:
     bag = stack.close_bag()
     assert set(bag.by_topic) == {"/clock", "/odom", "/planner/status"}
     assert bag["/odom"] == stack.probe.messages["/odom"]
-
-
-def test_chosen_topics_carry_simulated_time_without_the_clock_among_them(
-    harness: Harness, tmp_path: Path
-) -> None:
-    stack = Stack(harness, tmp_path / "flight.mcap", topics="odom momentum planner/status")
-    stack.configure("/odom", "/momentum", "/planner/status")
-    stack.recorder.trigger_activate()
-    stack.fly()
-    stack.stop()
-    # Not kept in memory until the end, where a kill would lose it.
-    harness.spin_until(
-        lambda: stack.recorder.messages_recorded >= stack.probe.count("/odom"), "the bag is written"
-    )
-    bag = stack.close_bag()
-    assert set(bag.by_topic) == {"/odom", "/momentum", "/planner/status"}
-    for odom, momentum in zip(bag.by_topic["/odom"], bag.by_topic["/momentum"], strict=True):
-        assert odom.log_ns == momentum.log_ns == nanoseconds(odom.message.header.stamp)
 
 
 # -- when it records --------------------------------------------------------------------------
@@ -288,30 +252,6 @@ def test_a_shutdown_completes_the_bag(stack: Stack) -> None:
     stack.stop()
     assert stack.recorder.trigger_shutdown() is TransitionCallbackReturn.SUCCESS
     assert BagContent(stack.bag)["/odom"] == stack.probe.messages["/odom"]
-
-
-def test_without_a_clock_messages_carry_wall_time(harness: Harness, tmp_path: Path) -> None:
-    bag = tmp_path / "notes.mcap"
-    probe = harness.probe({"/heard": String})
-    publisher = probe.create_publisher(String, "/heard", 10)
-    stamped = probe.create_publisher(JointState, "/stamped", 10)
-    recorder = harness.make(RecorderNode, {"bag": str(bag)})
-    harness.spin_until(lambda: {"/heard", "/stamped"} <= recorder.topics, "subscriptions")
-    harness.connect()
-    sent = []
-    for k in range(5):
-        publisher.publish(String(data=str(k)))
-        stamped.publish(JointState(header=Header(frame_id=str(k))))
-        sent.append(time.time_ns())
-        harness.spin_for(0.2)
-    recorder.trigger_shutdown()
-    content = BagContent(bag)
-    assert [entry.message.data for entry in content.by_topic["/heard"]] == list("01234")
-    assert content.log_times == sorted(content.log_times)
-    for topic in ("/heard", "/stamped"):
-        for entry, sent_ns in zip(content.by_topic[topic], sent, strict=True):
-            assert abs(entry.log_ns - sent_ns) < 400_000_000
-            assert abs(entry.publish_ns - sent_ns) < 400_000_000
 
 
 def test_a_recorder_that_is_up_before_the_plant_keeps_one_time(

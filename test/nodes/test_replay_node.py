@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import os
-import signal
 import struct
 import subprocess
 import sys
@@ -24,7 +23,7 @@ from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Float64, String
 from std_srvs.srv import SetBool, Trigger
-from support.ros_harness import Harness, Probe, construction, nanoseconds
+from support.ros_harness import Harness, Probe, construction
 from support.sentences import assert_one_sentence
 
 from spacerobot_ros.bag import LATCHED, BagWriter, QosProfile
@@ -210,18 +209,6 @@ def status_of(probe: Probe) -> ReplayStatus:
     return ReplayStatus.from_values({pair.key: pair.value for pair in message.values})
 
 
-def test_a_part_of_a_bag_is_replayed_at_its_rate(harness: Harness, bag: Path) -> None:
-    played = Played(harness, bag, start=0.1, duration=0.2, rate=40.0, topics="/stream", hold=True)
-    probe = played.probe
-    probe.watch("/replay/status", DiagnosticStatus, latched=True)
-    harness.spin_until(lambda: probe.count("/replay/status") and status_of(probe).ended, "its end")
-    harness.spin_until(lambda: probe.count("/stream") >= 20, "all are heard")
-    assert played.texts() == ALL[10:31][: probe.count("/stream")]
-    end = status_of(probe)
-    assert end.rate == 40.0
-    assert end.duration_s == pytest.approx(0.2)
-
-
 def test_a_replay_that_holds_goes_back_in_time(harness: Harness, bag: Path) -> None:
     played = Played(harness, bag, hold=True)
     probe = played.probe
@@ -268,18 +255,6 @@ def test_a_recorded_replay_status_is_not_replayed(harness: Harness, tmp_path: Pa
     played = Played(harness, path)
     played.finish()
     assert played.node.messages_replayed == 3
-
-
-def test_a_clock_of_its_own_is_never_behind_a_message(harness: Harness, bag: Path) -> None:
-    played = Played(harness, bag, clock=50.0, topics="/stream")
-    now: list[int] = []
-    played.probe.react["/clock"] = lambda m: now.append(nanoseconds(m.clock))
-    at: list[int] = []
-    played.probe.react["/stream"] = lambda m: at.append(now[-1])
-    played.finish()
-    harness.spin_until(lambda: played.probe.count("/stream") == COUNT, "all are heard")
-    assert at == [BEGAN + k * SPACING for k in range(COUNT)]
-    assert now == sorted(now)
 
 
 def test_meshes_that_only_the_bag_has_are_files_while_it_is_replayed(
@@ -373,27 +348,6 @@ def test_meshes_of_a_configuration_that_failed_are_not_those_of_the_next_bag(
     assert probe.last("/robot_description").data == line
 
 
-def test_a_loop_goes_on_until_it_is_told_to_stop(harness: Harness, bag: Path) -> None:
-    played = Played(harness, bag, loop=True, start=0.5, topics="/stream", rate=2.0)
-    harness.spin_until(lambda: played.probe.count("/stream") >= 25, "three turns are heard")
-    played.node.trigger_deactivate()
-    assert played.texts()[:25] == (ALL[50:] * 3)[:25]
-    assert played.codes == []
-    before = played.node.messages_replayed
-    played.node.trigger_activate()
-    harness.spin_until(lambda: played.node.messages_replayed > before, "it goes on")
-
-
-def test_topics_get_other_names(harness: Harness, bag: Path) -> None:
-    probe = harness.probe({"/other/name": String})
-    node = harness.make(
-        ReplayNode,
-        {"bag": str(bag), "remap": "/stream:=/other/name", "rate": 50.0, "topics": "/stream"},
-    )
-    harness.spin_until(lambda: probe.count("/other/name") == COUNT, "all are heard")
-    assert node.count_publishers("/stream") == 0
-
-
 @pytest.mark.parametrize(
     ("parameters", "mention"),
     [
@@ -476,23 +430,3 @@ def test_the_command_loses_nothing_and_ends_with_the_bag(
         recorded = [m.data for _, c, m in make_reader(file).iter_messages() if c.topic == "/stream"]
     assert [string(message.data) for message in probe.messages["/stream"]] == recorded
     assert [message.data for message in probe.messages["/latched"]] == ["for ever"]
-
-
-@pytest.mark.slow
-def test_the_command_ends_cleanly_on_a_signal(harness: Harness, bag: Path, ros_domain: int) -> None:
-    probe = harness.probe({"/stream": String})
-    with command(bag, ros_domain, "--loop") as process:
-        harness.spin_until(lambda: probe.count("/stream") > 0, "it plays")
-        process.send_signal(signal.SIGTERM)
-        _, errors = process.communicate(timeout=30)
-    assert process.returncode == 0
-    assert "Traceback" not in errors
-
-
-@pytest.mark.slow
-def test_the_command_refuses_a_bag_that_was_cut(bag: Path, ros_domain: int) -> None:
-    bag.write_bytes(bag.read_bytes()[:-20])
-    with command(bag, ros_domain) as process:
-        _, errors = process.communicate(timeout=30)
-    assert process.returncode == 2
-    assert_one_sentence(errors, f"'spacerobot salvage {bag}'")

@@ -80,42 +80,6 @@ def test_violated_tolerances_are_corrected(flight: DrivenFlight) -> None:
     assert max(flight.error_to(TURNED)) <= 1e-3
 
 
-@pytest.mark.parametrize("finishes_at", [0.0, 1.0])
-def test_a_server_that_says_done_early_is_corrected(
-    flight: DrivenFlight, finishes_at: float
-) -> None:
-    flight.server.lag, flight.server.finishes_at = 0.0, finishes_at
-    flight.send(TURNED)
-    flight.harness.spin_until(lambda: flight.server.ends == ["succeeded"], "the early end")
-    flight.server.finishes_at = None
-    status = flight.wait("reached", "failed")
-    assert (status.level, values_of(status)["corrections"]) == (status.OK, "1"), status.message
-    assert flight.server.ends == ["succeeded"] * 2
-    assert max(flight.error_to(TURNED)) <= 1e-3
-
-
-def test_a_server_that_always_says_done_fails_the_goal(flight: DrivenFlight) -> None:
-    flight.server.lag, flight.server.finishes_at = 0.0, 0.0
-    state, corrections, message = flight.ended(TURNED)
-    assert (state, int(corrections)) == ("failed", flight.planner.commander.config.max_corrections)
-    assert flight.server.ends == ["succeeded"] * (int(corrections) + 1)
-    assert f"after {corrections} correction(s)" in message
-    assert flight.plant.time_ns < 60e9
-
-
-def test_refused_trajectories_fail_their_goals(flight: DrivenFlight) -> None:
-    flight.server.rejects = True
-    state, corrections, message = flight.ended(NEAR)
-    assert (state, corrections) == ("failed", "0")
-    assert message.endswith("follow_joint_trajectory' has rejected the trajectory.")
-    flight.server.rejects, flight.server.answer = False, -2
-    state, _, message = flight.ended(NEAR)
-    assert state == "failed"
-    assert message.endswith("the trajectory has ended early by INVALID_JOINTS: told so.")
-    flight.server.answer = 0
-    assert flight.ended(NEAR)[0] == "reached"
-
-
 def test_an_abort_and_another_goal_cancel_the_trajectory(flight: DrivenFlight) -> None:
     flight.send(NEAR)
     flight.wait("executing")
@@ -142,55 +106,6 @@ def test_a_node_that_is_cleaned_up_leaves_the_robot_at_rest(flight: DrivenFlight
     flight.planner.start()
     flight.find_server()
     assert flight.ended(NEAR)[0] == "reached"
-
-
-def test_a_server_that_does_not_answer_fails_the_goal(flight: DrivenFlight) -> None:
-    flight.server.server.silent = True
-    sent = flight.plant.time_ns
-    state, corrections, message = flight.ended(NEAR)
-    assert (state, corrections) == ("failed", "0")
-    assert message.endswith("follow_joint_trajectory' has not answered.")
-    assert 5e9 < flight.plant.time_ns - sent < 5.5e9
-    flight.server.server.silent = False
-    assert flight.ended(NEAR)[0] == "reached"
-    assert flight.server.ends == ["succeeded"]
-
-
-def test_a_server_that_goes_fails_the_goal_and_one_that_comes_late_flies_the_next(
-    flight: DrivenFlight,
-) -> None:
-    flight.send(NEAR)
-    flight.wait("executing")
-    flight.ticks(5)
-    flight.server.close()
-    gone = flight.plant.time_ns
-    status = flight.wait("failed")
-    assert status.message.endswith("follow_joint_trajectory' is gone.")
-    assert flight.plant.time_ns - gone < 1.5e9
-    flight.ticks(3)
-    assert np.abs(flight.plant.plant.qdot).max() == 0.0
-    assert "no server of the action" in flight.ended(NEAR)[2]
-    flight.server.open()
-    flight.find_server()
-    assert flight.ended(NEAR)[0] == "reached"
-
-
-def test_a_result_that_never_comes_is_waited_for_and_the_trajectory_cancelled(
-    flight: DrivenFlight,
-) -> None:
-    flight.server.loses_results = True
-    state, corrections, message = flight.ended(NEAR)
-    assert (state, corrections) == ("reached", "0"), message
-    flight.harness.spin_until(lambda: flight.server.ends == ["canceled"], "the cancellation")
-    (trajectory,) = flight.server.goals
-    last = trajectory.trajectory.points[-1].time_from_start
-    assert flight.plant.time_ns * 1e-9 > last.sec + last.nanosec * 1e-9 + 5.0
-
-
-def test_texts_of_servers_are_printable(flight: DrivenFlight) -> None:
-    flight.server.answer, flight.server.text = -6, "stop\n\x1b[31m pressed"
-    _, _, message = flight.ended(NEAR)
-    assert message.endswith("ended early by error code -6: stop \ufffd[31m pressed.")
 
 
 class Lost(DrivenFlight):

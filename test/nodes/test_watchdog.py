@@ -4,22 +4,18 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
-import casadi as ca
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.lifecycle import TransitionCallbackReturn
 from sensor_msgs.msg import JointState
-from std_msgs.msg import String
 from std_srvs.srv import Trigger
 from support.planner_flight import NEAR, PLANNER, Flight, values_of
 from support.plant_rig import Rig
 from support.ros_harness import Harness
 from support.sentences import assert_one_sentence
 
-from spacerobot_ros.model.compilation import c_compiler, compiled
 from spacerobot_ros.nodes import RecorderNode
 from spacerobot_ros.nodes.common.node import FlightNode
 from spacerobot_ros.nodes.common.watchdog import (
@@ -229,29 +225,6 @@ def test_a_planner_says_when_it_plans(harness: Harness) -> None:
     assert flight.events("node_silent") == []
 
 
-@pytest.mark.slow
-def test_an_active_node_that_compiles_is_busy_and_not_silent(
-    harness: Harness, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    """At a first start functions are compiled when a state needs them: that took 0.88 s here."""
-    if c_compiler() is None:
-        pytest.skip("there is no C compiler")
-    monkeypatch.setenv("SPACEROBOT_CACHE_DIR", str(tmp_path))
-    monkeypatch.delenv("SPACEROBOT_COMPILE", raising=False)
-    flight = Watched(harness)
-    harness.executor.remove_node(flight.planner)  # Its timer says nothing meanwhile.
-    before = len(flight.pulses("/planner"))
-    x = ca.SX.sym("x", 3)
-    with flight.planner.long_work():
-        compiled(ca.Function("watched_sine", [x], [ca.sin(1.7 * x)]))
-    flight.planner.trigger_deactivate()
-    compiled(ca.Function("watched_cosine", [x], [ca.cos(1.7 * x)]))
-    harness.spin_until(lambda: "inactive" in flight.pulses("/planner"), "its end")
-    # It is not active before the whole work is done.
-    expected = ["busy", "busy", "busy", "active", "inactive"]
-    assert flight.pulses("/planner")[before:][-5:] == expected
-
-
 @dataclass(frozen=True)
 class NoParameters:
     """The node has none of its own."""
@@ -304,25 +277,6 @@ def test_an_exception_of_a_callback_deactivates_the_node_which_says_why(
     assert node.is_active
 
 
-def test_a_timer_that_is_destroyed_fires_no_more_though_it_is_due(harness: Harness) -> None:
-    node = harness.add(Fragile("fragile", context=harness.context))
-    fired: list[str] = []
-
-    def first() -> None:
-        fired.append("first")
-        for timer in timers:
-            node.destroy_timer(timer)
-
-    # Both are due when the executor looks: whichever comes first destroys the other.
-    timers = [node.create_timer(0.001, first) for _ in range(2)]
-    due = time.monotonic() + 0.01
-    while time.monotonic() < due:
-        pass
-    harness.spin_for(0.05)
-    assert fired == ["first"]
-    assert node.is_active
-
-
 @pytest.mark.parametrize("mode", ["lockstep", "realtime"])
 def test_a_step_that_raises_leaves_a_plant_that_says_why_and_can_be_started_again(
     harness: Harness, mode: str, monkeypatch: pytest.MonkeyPatch
@@ -356,19 +310,6 @@ def test_a_step_that_raises_leaves_a_plant_that_says_why_and_can_be_started_agai
         lambda: list(rig.probe.last("joint_states").velocity) == [0.2, 0.0, 0.0],
         "joints that move as commanded",
     )
-
-
-@pytest.mark.parametrize(
-    "line", ["sensor_noise position 1e200", "sensor_noise joints 1e155", "sensor_delay odom 1e9"]
-)
-def test_a_fault_of_any_size_stops_no_plant(harness: Harness, line: str) -> None:
-    rig = Rig(harness)
-    faults = rig.probe.create_publisher(String, "fault_injection", 10)
-    harness.connect()
-    faults.publish(String(data=line))
-    rig.wait_for_log("is refused")
-    assert list(rig.step([0.2, 0.0, 0.0]).velocity) == [0.2, 0.0, 0.0]
-    assert rig.plant.state is PlantState.RUNNING
 
 
 def test_a_callback_that_was_queued_when_its_subscription_was_destroyed_is_no_failure(

@@ -28,14 +28,7 @@ DISPLAYED = {
     "rviz_default_plugins/Pose": "geometry_msgs/msg/PoseStamped",
     "rviz_default_plugins/Path": "nav_msgs/msg/Path",
 }
-TITLES = {"foxglovePanelTitle", "lichtblickPanelTitle"}
-"""Keys of a panel's title: Foxglove reads the first, Lichtblick the second; `title` nobody."""
 
-# Facts: the fields of the types below in the sources of Lichtblick 66adecb (August 2026), the open
-# continuation of Foxglove Studio, under packages/suite-base/src. Each is read there; other keys are
-# dropped silently. A question mark there (may be missing) is one here.
-LAYOUT = {"configById", "layout?", "globalVariables", "playbackConfig", "userNodes?", "version?"}
-"""LayoutData of context/CurrentLayoutContext/actions.ts, without what is deprecated."""
 
 KEYS = {
     # RendererConfig of panels/ThreeDeeRender/IRenderer.ts
@@ -79,48 +72,6 @@ KEYS = {
         "showPoints?",
     },
 }  # fmt: skip
-PATHS = {
-    # PlotPath of panels/Plot/utils/config.ts
-    "Plot": {
-        "value", "enabled", "color?", "label?", "timestampMethod", "showLine?", "lineSize?",
-    },
-    # StateTransitionPath of panels/StateTransitions/types.ts
-    "StateTransitions": {"color?", "value", "label?", "enabled?", "timestampMethod"},
-}  # fmt: skip
-# Within the 3D panel: CameraState of camera.ts, RendererConfig, LayerSettingsGrid of
-# renderables/Grids.ts, LayerSettingsCustomUrdf of renderables/Urdfs.ts, BaseSettings of
-# settings.ts.
-CAMERA = {
-    "distance", "perspective", "phi", "target", "targetOffset", "targetOrientation", "thetaOffset",
-    "fovy", "near", "far",
-}  # fmt: skip
-CLICKS = {
-    "type", "poseTopic", "pointTopic", "poseEstimateTopic", "poseEstimateXDeviation?",
-    "poseEstimateYDeviation?", "poseEstimateThetaDeviation?",
-}  # fmt: skip
-SETTINGS = {"visible", "frameLocked?"}
-LAYER = {*SETTINGS, "instanceId", "layerId", "label", "order?"}
-LAYERS = {
-    "foxglove.Grid": {
-        *LAYER, "frameId", "size", "divisions", "lineWidth", "color", "position", "rotation",
-    },
-    "foxglove.Urdf": {
-        *LAYER, "sourceType", "url?", "filePath?", "parameter?", "topic?", "framePrefix",
-        "displayMode", "fallbackColor?",
-    },
-}  # fmt: skip
-VALUES = {
-    "legendDisplay": {"floating", "top", "left", "none"},
-    "xAxisVal": {"timestamp", "index", "custom", "currentCustom"},
-    "timestampMethod": {"receiveTime", "headerStamp"},
-    "diffMethod": {"custom", "previous message"},
-    "followMode": {"follow-pose", "follow-position", "follow-none"},
-    "sourceType": {"url", "filePath", "param", "topic"},
-    "displayMode": {"auto", "visual", "collision"},
-    "type": {"pose_estimate", "pose", "point"},
-    "direction": {"row", "column"},
-}
-"""Values that the types there allow, by the key."""
 PANELS = set(KEYS)
 
 
@@ -204,43 +155,6 @@ def test_rviz_names_topics_of_the_type_that_its_displays_take(types: dict[str, s
         assert topic["Durability Policy"] == ("Transient Local" if latched else "Volatile")
     goals = [tool["Topic"]["Value"] for tool in manager["Tools"] if "Topic" in tool]
     assert set(goals) == set(SENT_BY_PEOPLE)
-
-
-def check(found: dict[str, Any], known: set[str], where: str) -> None:
-    """Check that every key is known, and each is there that may not be missing."""
-    assert set(found) <= {key.removesuffix("?") for key in known}, where
-    assert {key for key in known if not key.endswith("?")} <= set(found), where
-    for key, value in found.items():
-        if key in VALUES:
-            assert value in VALUES[key], f"{where}, {key}"
-
-
-def test_foxglove_reads_every_key_of_the_layout(foxglove: dict[str, Any]) -> None:
-    check(foxglove, LAYOUT, "the layout")
-    for name, panel in foxglove["configById"].items():
-        kind = name.split("!")[0]
-        own = {key: value for key, value in panel.items() if key not in TITLES}
-        assert set(panel) - set(own) == TITLES
-        assert len({panel[key] for key in TITLES}) == 1
-        check(own, KEYS[kind], name)
-        for path in panel.get("paths", ()):
-            check(path, PATHS[kind], name)
-
-
-def test_foxglove_reads_every_key_of_the_scene(foxglove: dict[str, Any]) -> None:
-    scene = foxglove["configById"]["3D!robot"]
-    check(scene["cameraState"], CAMERA, "cameraState")
-    check(scene["publish"], CLICKS, "publish")
-    for topic, settings in scene["topics"].items():
-        check(settings, SETTINGS, topic)
-    assert {layer["layerId"] for layer in scene["layers"].values()} == set(LAYERS)
-    for name, layer in scene["layers"].items():
-        check(layer, LAYERS[layer["layerId"]], name)
-        assert layer["instanceId"] == name
-    # The robot's links are placed by /tf, whose names have no prefix in bags.
-    robot = next(each for each in scene["layers"].values() if each["layerId"] == "foxglove.Urdf")
-    assert (robot["sourceType"], robot["topic"]) == ("topic", "/robot_description")
-    assert robot["framePrefix"] == ""
 
 
 def test_foxglove_draws_a_line_for_each_joint_of_every_robot(foxglove: dict[str, Any]) -> None:

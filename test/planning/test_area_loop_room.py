@@ -13,7 +13,7 @@ from support.planners import planner_of
 from spacerobot_ros.errors import PlanningError
 from spacerobot_ros.model import SpaceRobot, load_robot
 from spacerobot_ros.model.description import Array
-from spacerobot_ros.planning import Goal, PlanRequest, RobotState, Tolerance, plan
+from spacerobot_ros.planning import Goal, PlanRequest, RobotState, Tolerance
 from spacerobot_ros.planning.core.clearance import Clearance
 from spacerobot_ros.planning.methods.area_loop import AreaLoopGait
 from spacerobot_ros.planning.methods.nominal_shape import (
@@ -162,14 +162,3 @@ def test_required_distances_are_kept_at_all_shapes() -> None:
         float(geometry.distances(k, geometry.poses(near[np.newaxis]))[0]) for k in range(len(free))
     )
     assert clearance.is_clear(near[np.newaxis], np.minimum(free, others[1] - 1e-9))
-
-
-@pytest.mark.slow
-def test_an_arm_beside_its_base_turns_it_by_loops_elsewhere() -> None:
-    """Round the best nominal shape links come nearer than the clearance on any loop."""
-    schedule = plan("servicer", method="area_loop", rotvec=(0.0, 0.0, 0.04), clearance=0.02)
-    assert float(str(schedule.notes["expected_cycles"])) < 200
-    robot = load_robot(robot_file("servicer"))
-    geometry = Clearance(robot, 0.02).geometry
-    start = geometry.nearest_along(schedule.positions[:1])[0][0]
-    assert geometry.nearest_along(schedule.positions)[0].min() >= min(0.02, start) - 1e-4

@@ -188,16 +188,6 @@ def test_loops_do_not_begin_for_a_goal_shape_in_collision(arm: SpaceRobot) -> No
         plan(flat, rotvec=(0.0, 0.0, 0.1), joint_positions=folded, method="square_path")
 
 
-@pytest.mark.slow
-def test_loops_of_three_joints_shrink(arm: SpaceRobot) -> None:
-    goal = (0.1, -0.05, 0.08), (0.0, -np.pi / 4, np.pi / 2)
-    clearance = Clearance(arm.description, 0.01)
-    plain = planned(arm, "area_loop", *goal, None)
-    clear = planned(arm, "area_loop", *goal, clearance)
-    assert nearest_of(clearance.geometry, plain.positions) < -0.1
-    assert nearest_of(clearance.geometry, clear.positions) >= 0.01
-
-
 def test_cycles_of_sliders_shrink() -> None:
     robot = bare("sliding_masses")
     goal = (0.02, 0.01, -0.02), (0.35, -0.07, 0.28)

@@ -154,29 +154,6 @@ def efforts_of_servos(robot: SpaceRobot, schedule: GaitSchedule) -> Array:
 @pytest.mark.parametrize(
     ("name", "start", "turn"),
     [
-        ("three_joint_arm", [0.0, -np.pi / 4, np.pi / 2], [0.2, -0.3, 0.25]),
-        ("sliding_masses", [0.0, 0.0, 0.0], [0.2, -0.1, 0.1]),
-        ("servicer", [0.0, -1.2, 2.0, 0.0, 0.8, 0.0], [0.1, -0.2, 0.5]),
-        ("seven", [0.0, 0.5, 0.0, -1.2, 0.0, 0.8, 0.0], [0.05, -0.03, 0.04]),
-    ],
-)
-def test_a_tenth_of_the_efforts(name: str, start: list[float], turn: list[float]) -> None:
-    urdf = seven_joints()
-    if name != "seven":
-        urdf = (FOLDER / f"{name}.urdf").read_text(encoding="utf-8")
-    free = SpaceRobot.from_urdf(urdf)
-    asked: dict[str, Any] = {"rotvec": turn, "start": start, **QUICK, "intervals": 80}
-    fast = plan(free, **asked)
-    robot = tenth(urdf, np.abs(track(free, fast).asked).max(axis=0))
-    slow = plan(robot, **asked, effort_limits=1)
-    assert_flies(robot, slow, turn, 1e-4)
-    assert slow.duration < fast.duration * 3.5
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("name", "start", "turn"),
-    [
         ("planar_chain", CHAIN_START, [0.0, 0.0, 0.3]),
         ("three_joint_arm", [0.0, -np.pi / 4, np.pi / 2], [0.2, -0.3, 0.25]),
         ("sliding_masses", [0.0, 0.0, 0.0], [0.2, -0.1, 0.1]),

@@ -15,7 +15,7 @@ from spacerobot_ros.errors import GoalError, NotFoundError, PlanningError, Proof
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.planning import GaitSchedule, Goal, RobotState, build_method, plan
 from spacerobot_ros.planning.core.goal import EndEffectorGoal, PoseError, Tolerance
-from spacerobot_ros.planning.core.method import InitialMotion, PlanRequest
+from spacerobot_ros.planning.core.method import PlanRequest
 from spacerobot_ros.planning.methods.optimal.end_effectors import (
     EndEffectorRows,
     reach_of_end_effector,
@@ -84,22 +84,6 @@ def test_a_position_is_reached_with_the_base_free() -> None:
 
 SEVEN = np.array([0.3, 0.2, -0.4, -1.7, 0.5, 1.6, 0.8])
 SEVEN_END = np.array([-0.6, 0.8, 0.3, -1.1, -0.4, 2.3, 0.1])
-
-
-@pytest.mark.slow
-def test_a_pose_is_reached_with_the_base_free() -> None:
-    r, R = beside("seven_joint_arm", SEVEN, SEVEN_END, "link_7")
-    schedule = plan(
-        "seven_joint_arm",
-        end_effector_pose=[*r, *R.as_quat()],
-        end_effector="link_7",
-        start=at_rest(SEVEN),
-        **QUICK,
-    )
-    reached, R_reached = ends("seven_joint_arm", schedule, "link_7")["link_7"]
-    np.testing.assert_allclose(reached, r, atol=1e-6)
-    assert (R_reached.inv() * R).magnitude() < 1e-6
-    assert_within_limits(robot_of("seven_joint_arm"), schedule)
 
 
 @pytest.mark.slow
@@ -288,48 +272,6 @@ def test_methods_of_loops_leave_the_goal_to_optimal(method: str) -> None:
             PlanningError, match=r"area_loop plans for the pose of the base.*optimal"
         ):
             planner.plan(request)
-
-
-@pytest.mark.slow
-def test_a_cached_plan_is_that_of_the_same_goal_alone(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    monkeypatch.setenv("SPACEROBOT_CACHE_DIR", str(tmp_path))
-    r, _ = beside("three_joint_arm", ARM, np.array([-0.3, -0.5, 1.5]), "end_effector")
-    options = {**QUICK, "cache": 1}
-
-    def planned(goal: Array) -> GaitSchedule:
-        return plan("three_joint_arm", end_effector_position=goal, start=at_rest(ARM), **options)
-
-    first, again = planned(r), planned(r)
-    assert again.notes["from_cache"] == 1.0
-    np.testing.assert_array_equal(first.positions, again.positions)
-    assert "from_cache" not in planned(r + np.array([0.0, 0.0, 1e-3])).notes
-
-
-@pytest.mark.slow
-def test_a_motion_takes_another_goal_without_a_stop() -> None:
-    robot = robot_of("three_joint_arm")
-    r, _ = beside("three_joint_arm", ARM, np.array([-0.7, -0.2, 1.9]), "end_effector")
-    other, _ = beside("three_joint_arm", ARM, np.array([0.9, -0.7, 0.4]), "end_effector")
-    options = {"optimal": method_options("optimal", {"cache": 0, "answers": 1, "intervals": 30})}
-    planner = build_method("optimal", robot, 0.1, 0.01, options)
-    goal = Goal.of_end_effectors([EndEffectorGoal("end_effector", r)])
-    tolerance = Tolerance(1e-6, 1e-6)
-    first = planner.plan(PlanRequest(at_rest(ARM), goal, tolerance))
-    tick = first.ticks // 3
-    path = planner._prediction.path(at_rest(ARM), first.positions[: tick + 1])
-    state = RobotState(path.position[-1], path.quaternion[-1], first.positions[tick])
-    motion = InitialMotion(first.velocities[tick - 1], first.positions[tick:])
-    aim = Goal.of_end_effectors([EndEffectorGoal("end_effector", other)])
-    second = planner.plan(PlanRequest(state, aim, tolerance, motion=motion))
-    positions = np.vstack([first.positions[:tick], second.positions])
-    flown = end_of_motion(
-        *(urdf_of("three_joint_arm"), robot.joint_names, positions, ["end_effector"]),
-        PLACE,
-        ATTITUDE,
-    )
-    np.testing.assert_allclose(flown["end_effector"][0], other, atol=1e-6)
 
 
 def test_errors_are_those_of_the_links() -> None:

@@ -72,13 +72,6 @@ def test_refinement_meets_the_tolerance_where_first_order_is_far_off(
     assert distance <= TIGHT.position
 
 
-@pytest.mark.parametrize("seed", range(6))
-def test_three_sliders_have_one_final_shape(seed: int) -> None:
-    robot, state, goal, z_f = random_case(3, seed)
-    schedule = planner(robot, Tolerance(1.0, 1.0)).plan(state, goal)
-    np.testing.assert_allclose(note(schedule, "zf"), z_f, atol=1e-9)
-
-
 @pytest.mark.parametrize(("sliders", "seed"), [(4, 1), (4, 2), (5, 0), (5, 1)])
 def test_more_sliders_share_the_least_displacement(sliders: int, seed: int) -> None:
     robot, state, goal, _ = random_case(sliders, seed)
@@ -121,28 +114,6 @@ def first_order_brackets(robot: SlidingRobot, z: Array) -> Array:
     for i, j in itertools.product(range(n), repeat=2):
         w[:, i, j] = np.cross(Ft[j], Ft[i]) + slope[i, j] - slope[j, i]
     return w
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("sliders", "seed"), [(4, 0), (4, 3), (4, 5), (5, 1), (5, 3), (5, 9)])
-def test_the_turn_is_made_by_the_best_triple_of_sliders(sliders: int, seed: int) -> None:
-    robot, state, goal, _ = random_case(sliders, seed)
-    schedule = planner(robot, Tolerance(1.0, 1.0)).plan(state, goal)
-    w = first_order_brackets(robot, note(schedule, "zf"))
-    conditions = {
-        triple: np.linalg.cond(
-            np.column_stack(
-                [w[:, i, j] for i, j in (triple[:2], triple[1:], (triple[0], triple[2]))]
-            )
-        )
-        for triple in itertools.combinations(range(sliders), 3)
-    }
-    best = min(conditions, key=lambda triple: conditions[triple])
-    assert schedule.notes["sliders"] == ", ".join(f"s{k + 1}" for k in best)
-    # The others rest while it turns.
-    turning = schedule.positions[round(5.0 / PERIOD) :]
-    moved = np.ptp(turning, axis=0) > 1e-12
-    assert [k for k in range(sliders) if moved[k]] == list(best)
 
 
 def test_alpha_solves_for_the_attitude_that_is_missing() -> None:
@@ -288,14 +259,6 @@ def test_a_slow_servo_stretches_the_slide() -> None:
     assert max(misses(goal, position, attitude)) <= 1e-5
 
 
-def test_the_speed_that_is_told_is_that_of_the_stretched_slide() -> None:
-    goal = goal_at([0.1, 0.0, 0.0], Rotation.identity())
-    schedule = planner(paper_robot(rate=0.05)).plan(origin(), goal)
-    # v = c sin^2: c is the peak.
-    peak = np.abs(schedule.velocities[:, 0]).max()
-    assert abs(note(schedule, "c")[0]) == pytest.approx(peak, rel=1e-3)
-
-
 def test_a_servo_that_does_not_move_is_refused() -> None:
     goal = goal_at([0.1, 0.0, 0.0], Rotation.identity())
     assert "'s1'" in refusal_of(paper_robot(rate=0.0), origin(), goal)
@@ -305,34 +268,6 @@ def test_a_slide_that_takes_too_long_is_refused_with_the_time() -> None:
     # 0.8 m at a mean of 5 mm/s.
     goal = goal_at([0.1, 0.0, 0.0], Rotation.identity())
     assert "100 s" in refusal_of(paper_robot(rate=0.01), origin(), goal, longest=100.0)
-
-
-def test_a_fourth_slider_takes_what_the_others_have_no_stroke_for() -> None:
-    # Two slots along x. Alone, or in equal shares, the first cannot do it.
-    axes = np.vstack([np.eye(3), [[1.0, 0.0, 0.0]]])
-    sliders = tuple(
-        Slider(2.0, axis, np.array([0.0, 0.1 * k, 0.1]), stroke=stroke)
-        for k, (axis, stroke) in enumerate(
-            zip(axes, [(-0.2, 0.2), (-2.5, 2.5), (-2.5, 2.5), (-2.5, 2.5)], strict=True)
-        )
-    )
-    robot = SlidingRobot(10.0, np.diag([1.0, 1.5, 1.5]), np.zeros(3), sliders)
-    # 0.1 m of 18 kg is 0.9 m of 2 kg.
-    goal = goal_at([-0.1, 0.0, 0.0], Rotation.identity())
-    method = planner(robot).method
-    assert isinstance(method, LieBracketGait)
-    z_f = method.final_shape(origin(4), goal)
-    assert z_f[0] + z_f[3] == pytest.approx(0.9, abs=1e-9)
-    assert -0.2 <= z_f[0] <= 0.2
-    np.testing.assert_allclose(z_f[1:3], 0.0, atol=1e-9)
-
-
-def test_a_shape_at_the_end_of_a_stroke_is_reached_without_a_turn() -> None:
-    # 2.5 m of 2 kg is 0.3125 m of 16 kg; a mass through the centre turns nothing.
-    goal = goal_at([-0.3125, 0.0, 0.0], Rotation.identity())
-    schedule = planner(paper_robot()).plan(origin(), goal)
-    np.testing.assert_allclose(schedule.positions[-1], [2.5, 0.0, 0.0], atol=1e-12)
-    assert schedule.positions.max() <= 2.5
 
 
 # -- refusals ---------------------------------------------------------------------------------
@@ -398,18 +333,6 @@ def test_a_drifting_robot_is_refused(momentum: dict[str, Array], shown: str) -> 
     text = refusal_of(paper_robot(), replace(origin(), **momentum), NEAR)
     assert "drifts" in text
     assert shown in text
-
-
-def test_a_slider_that_is_not_used_may_have_no_rate_and_no_room() -> None:
-    """A fourth one that neither the slide nor the turn moves: it rests at the end of its stroke."""
-    fourth = Slider(0.5, np.array([0.6, 0.8, 0.0]), np.zeros(3), stroke=(-1.0, 0.0), rate=0.0)
-    robot = paper_robot()
-    robot = replace(robot, sliders=(*robot.sliders, fourth))
-    state = state_at(np.zeros(3), Rotation.identity(), np.zeros(4))
-    goal = goal_at([0.0, 0.0, 0.0], Rotation.from_rotvec([0.01, 0.0, -0.02]))
-    schedule = planner(robot, Tolerance(1e-3, 1e-3)).plan(state, goal)
-    assert np.all(schedule.positions[:, 3] == 0.0)
-    assert np.ptp(schedule.positions[:, :3]) > 0.01
 
 
 # -- the gait of sliding masses: paper 1's manoeuvre and its numbers -----------------------------
@@ -479,18 +402,6 @@ def test_the_manoeuvre_of_the_paper_integrated_otherwise(paper_gait: GaitSchedul
     assert (predicted.inv() * after).magnitude() < 1e-8
     end = -after.apply(robot.center_of_mass(shapes[-1]))
     np.testing.assert_allclose(paper_gait.path.position[-1], end, atol=1e-8)
-
-
-def test_a_tighter_tolerance_refines_the_manoeuvre_of_the_paper() -> None:
-    method = planner_of(
-        "lie_bracket", SpaceRobot.from_file(URDF), PERIOD, Tolerance(1e-4, 1e-5), **PAPER_OPTIONS
-    )
-    schedule = method.plan(origin(), PAPER_GOAL)
-    assert schedule.ticks == 98_000
-    end = Rotation.from_quat(schedule.path.quaternion[-1])
-    distance, angle = misses(PAPER_GOAL, schedule.path.position[-1], end)
-    assert angle <= 1e-5
-    assert distance <= 1e-4
 
 
 def test_a_correction_asks_for_little(paper_gait: GaitSchedule) -> None:

@@ -156,19 +156,6 @@ def test_optimal_goes_round_a_rock(arm: SpaceRobot) -> None:
     assert min(distances_to(*rock, arm, clear, start)) >= 0.01 - 1e-4
 
 
-@pytest.mark.slow
-def test_other_methods_refuse_with_link_obstacle_and_place(arm: SpaceRobot) -> None:
-    world = ball_at((1.5, 0, 0.2), 0.2)
-    # The shape round which loops are best; no other is looked for where one is given.
-    nominal = (0.0, -0.1, 1.88)
-    with pytest.raises(PlanningError, match=r"link 'link_3' and obstacle 'rock' .* near \[.*\] m"):
-        plan(arm, rotvec=(0, 0, 0.2), world=world, method="area_loop", nominal=nominal)
-    elsewhere = plan(arm, rotvec=(0, 0, 0.2), world=world, method="area_loop")
-    start = RobotState(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(3))
-    rock = Pose(np.eye(3), np.array([1.5, 0, 0.2])), coal.Sphere(0.2)
-    assert min(distances_to(*rock, arm, elsewhere, start)) >= 0.01 - 1e-4
-
-
 def test_the_pose_of_a_goal_in_an_obstacle_is_refused_before_a_search(arm: SpaceRobot) -> None:
     goal, shape = Rotation.from_rotvec([0.5, -0.3, 1.0]), np.array([0.3, -0.4, 0.5])
     start = Rotation.from_quat(ELSEWHERE.quaternion)

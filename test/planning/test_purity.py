@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
@@ -17,7 +16,6 @@ from spacerobot_ros.errors import PlanningError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.planning import (
     METHODS,
-    NEVER,
     Cancellation,
     GaitMethod,
     GaitSchedule,
@@ -170,29 +168,7 @@ def test_a_schedule_says_what_it_controls_and_who_made_it(name: str) -> None:
     assert method.controls == before
 
 
-@pytest.mark.parametrize("kind", [*METHODS.values(), RemainingJointsGait])
-def test_every_method_and_every_wrapper_is_called_alike(kind: type[GaitMethod]) -> None:
-    assert issubclass(kind, GaitMethod)
-    of_all = inspect.signature(GaitMethod.plan)
-    assert inspect.signature(kind.plan) == of_all
-    built_with = list(inspect.signature(kind).parameters)[:3]
-    assert built_with == ["robot", "control_period", "integration_step"]
-
-
 # -- pieces of one goal -----------------------------------------------------------------------
-
-
-def test_cycles_are_counted_along_the_schedules_of_one_goal() -> None:
-    case = CASES["area_loop"]
-    method = built(case, robot_named(case.robot))
-    request = requests(case)[0]
-    first = method.plan(request)
-    again = method.plan(replace(request, correction=True, previous=first))
-    # A plant that does not turn at all: one more cycle is done, and as many are to come.
-    expected = [float(str(piece.notes["expected_cycles"])) for piece in (first, again)]
-    assert expected[1] == pytest.approx(expected[0] + 1.0)
-    alone = method.plan(replace(request, correction=True))
-    assert float(str(alone.notes["expected_cycles"])) == expected[0]
 
 
 def test_a_goal_keeps_its_nominal_shape_while_the_other_joints_rest() -> None:
@@ -300,11 +276,3 @@ def test_a_search_is_cancelled_from_another_thread(
     thread.join(20.0)
     assert not thread.is_alive()
     assert [type(reason) for reason in ended] == [PlanningCancelled]
-
-
-def test_what_is_never_cancelled_cannot_be() -> None:
-    assert not NEVER.requested
-    NEVER.raise_if_requested()
-    with pytest.raises(RuntimeError, match="NEVER"):
-        NEVER.cancel()
-    assert not NEVER.requested

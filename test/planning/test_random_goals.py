@@ -5,17 +5,14 @@ from __future__ import annotations
 import inspect
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import pytest
-from planning.flown import STEP, fly, plant_at
 from planning.sliding_robots import Slider, SlidingRobot, paper_robot
 from scipy.spatial.transform import Rotation
 from support.planar_manoeuvres import phase_density
 from support.planner_loop import NEAR, TICK, Loop, StubMethod
-from support.planners import Planner, planner_of
+from support.planners import planner_of
 from support.planning_refusals import refusal_in
 from support.slides_and_turns import PERIOD as GAIT_PERIOD
 from support.slides_and_turns import goal_at, note, origin, state_at
@@ -23,7 +20,7 @@ from support.slides_and_turns import planner as gait_planner
 
 from spacerobot_ros.events import Event
 from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.planning import Goal, Tolerance, plan
+from spacerobot_ros.planning import Tolerance, plan
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.execution.executive import Phase
 from spacerobot_ros.planning.execution.status import PlannerState
@@ -34,85 +31,12 @@ from spacerobot_ros.planning.methods.geometric_phase import (
 )
 from spacerobot_ros.planning.methods.lie_bracket import LieBracketGait
 
-Array = npt.NDArray[np.float64]
-
 FOLDER = Path(__file__).parents[2] / "urdf"
-PERIOD = {"lie_bracket": 0.05, "area_loop": 0.25, "square_path": 0.05}
-TOLERANCE = Tolerance(2e-3, 2e-3, 1e-6)
-STROKE, MASSES, TOTAL = 2.5, 2.0, 16.0
-"""Paper 1's robot: sliders of 2 kg of 16 kg, slots along the axes of the base."""
 
 
 @pytest.fixture(autouse=True)
 def _interpreted() -> None:
     """Compile, in place of the folder's choice: these flights are long."""
-
-
-@pytest.fixture(scope="module")
-def robots() -> dict[str, SpaceRobot]:
-    names = {
-        "lie_bracket": "sliding_masses",
-        "area_loop": "three_joint_arm",
-        "square_path": "planar_chain",
-    }
-    return {method: SpaceRobot.from_file(FOLDER / f"{name}.urdf") for method, name in names.items()}
-
-
-def planner(method: str, robot: SpaceRobot, **options: Any) -> Planner:
-    if method == "lie_bracket":
-        options = {"t1": 10.0, "n1": 1, "loop_area": 0.2, **options}
-    return planner_of(method, robot, PERIOD[method], TOLERANCE, STEP, **options)
-
-
-def pose_of_sliders(z0: Array, attitude: Rotation, zf: Array, turn: Rotation) -> Goal:
-    """Return the pose in which the sliders are at ``zf``: eq. (9), the mass centre rests."""
-    end = attitude * turn
-    r = MASSES / TOTAL * (attitude.apply(z0) - end.apply(zf))
-    return Goal.checked(r, end.as_quat())
-
-
-def some_turn(rng: np.random.Generator, least: float, most: float) -> Rotation:
-    axis = rng.normal(size=3)
-    return Rotation.from_rotvec(axis / np.linalg.norm(axis) * rng.uniform(least, most))
-
-
-# -- goals that can be reached ----------------------------------------------------------------
-
-
-def reachable(method: str, rng: np.random.Generator, robot: SpaceRobot) -> tuple[Array, Any, Goal]:
-    """Return a shape and an attitude to start from, and a goal."""
-    attitude = Rotation.random(random_state=rng)
-    if method == "lie_bracket":
-        z0, zf = rng.uniform(-1.8, 1.8, (2, 3))
-        return z0, attitude, pose_of_sliders(z0, attitude, zf, some_turn(rng, 0.02, 0.5))
-    if method == "area_loop":
-        q, final = rng.uniform(robot.lower, robot.upper, (2, 3))
-        shape = final if rng.uniform() < 0.5 else None
-        goal = (attitude * some_turn(rng, 0.05, 1.5)).as_quat()
-        return q, attitude, Goal.checked(np.zeros(3), goal, shape)
-    q, final = rng.uniform(-np.pi, np.pi, (2, 2))
-    turn = Rotation.from_rotvec([0.0, 0.0, rng.uniform(-np.pi, np.pi)])
-    shape = final if rng.uniform() < 0.5 else None
-    return q, attitude, Goal.checked(np.zeros(3), (attitude * turn).as_quat(), shape)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("method", ["lie_bracket", "area_loop", "square_path"])
-def test_fifty_goals_are_planned_and_met_in_the_plant(
-    robots: dict[str, SpaceRobot], method: str
-) -> None:
-    robot, rng = robots[method], np.random.default_rng(1994)
-    gait = planner(method, robot)
-    for number in range(50):
-        q, attitude, goal = reachable(method, rng, robot)
-        flight = fly(gait, plant_at(robot, q, PERIOD[method], attitude), goal)
-        angle = np.linalg.norm(flight.left(goal)[-1])
-        assert angle <= TOLERANCE.attitude + 1e-9, f"goal {number}: {angle} rad"
-        if method == "lie_bracket":
-            distance = np.linalg.norm(flight.poses[-1][:3] - goal.position)
-            assert distance <= TOLERANCE.position, f"goal {number}: {distance} m"
-        if goal.joint_positions is not None:
-            np.testing.assert_allclose(flight.shapes[-1], goal.joint_positions, atol=1e-6)
 
 
 # -- numbers that methods state, and defaults of tolerances: against other ways to get them ------

@@ -100,14 +100,6 @@ KINDS = ["tree", "chain", "planar", "sliders"]
 
 
 @pytest.mark.slow
-@settings(max_examples=2, deadline=None)
-@given(seed=SEEDS)
-@pytest.mark.parametrize("kind", KINDS)
-def test_what_a_random_motion_reaches_is_never_called_unreachable(kind: str, seed: int) -> None:
-    check_what_a_random_motion_reaches(kind, seed)
-
-
-@pytest.mark.slow
 @settings(max_examples=100, deadline=None)
 @given(seed=SEEDS)
 @pytest.mark.parametrize("kind", KINDS)
@@ -390,22 +382,6 @@ def test_singular_shapes_of_a_spatial_arm_lie_in_the_path_dependent_workspace() 
     assert covered(limited, np.array(radii)).all()
     assert covered(free, np.array(radii)).all()
     assert limited.path_independent, "else the test would be of nothing"
-
-
-@pytest.mark.slow
-def test_limits_of_the_joints_leave_less_of_both() -> None:
-    text = urdf_of_pair().replace('type="continuous"', 'type="revolute"')
-    text = text.replace("<limit ", '<limit lower="-1.9" upper="0.4" ')
-    free, limited = workspaces(SpaceRobot.from_urdf(text), "tool")
-    assert limited.within_limits
-    q = np.linspace(-1.9, 0.4, 300)
-    distance, det = planar_pair(*np.meshgrid(q, q, indexing="ij"))
-    crossed = det[:, 1:] * det[:, :-1] <= 0
-    assert limited.distance_range == pytest.approx((distance.min(), distance.max()), abs=1e-4)
-    assert limited.distance_range[0] > free.distance_range[0] + 0.1
-    (only,) = limited.path_dependent
-    ends = distance[:, 1:][crossed].min(), distance[:, 1:][crossed].max()
-    assert only == pytest.approx(ends, abs=0.01)
 
 
 def test_sliders_have_no_singular_shape_and_one_joint_has_no_other() -> None:

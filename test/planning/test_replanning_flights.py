@@ -248,36 +248,6 @@ def test_the_shrinking_horizon_makes_up_for_wrong_masses() -> None:
         assert share < 1.15
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("robot", sorted(TRIALS))
-def test_with_wrong_masses_and_noise_the_shrinking_horizon_reaches_goals(robot: str) -> None:
-    """A hundred draws, of which some are flown without the shrinking horizon, too."""
-    method: GaitMethod | None = None
-    shares, errors, without = [], [], 0
-    began = time.process_time()
-    for seed in range(100):
-        loop, share = with_wrong_masses(robot, seed, method)
-        method = loop.method
-        goal = Rotation.from_quat(loop.starts[0].schedule.goal.quaternion)
-        errors.append((goal.inv() * Rotation.from_quat(loop.plant.pose[3:])).magnitude())
-        shares.append(share if loop.states[-1] == "reached" else np.inf)
-    used = time.process_time() - began
-    for seed in range(20):
-        loop, _ = with_wrong_masses(robot, seed, method, horizon=False)
-        without += loop.states[-1] == "reached"
-    within = int(np.sum(np.array(shares) <= 1.15 + 1e-9))
-    quantiles = np.quantile(shares, [0.5, 0.9, 1.0])
-    of_errors = np.quantile(errors, [0.5, 0.95, 1.0])
-    print(
-        f"{robot}: of 100, {np.sum(np.isfinite(shares))} reached without a correction, {within} "
-        f"within 1.15 of the nominal duration (median, 90 %, longest: {quantiles.round(3)}); true "
-        f"errors at the end (median, 95 %, largest): {of_errors.round(4)} rad; {used:.0f} s of "
-        f"processor time; without the shrinking horizon {without} of 20 reached"
-    )
-    assert within >= 95
-    assert without <= 14, "the goals are too easy to show anything"
-
-
 def test_no_momentum_arises_where_a_plan_takes_over() -> None:
     """The momentum of all bodies by Pinocchio, from what the plant reports at every tick."""
     robot = "planar_chain"

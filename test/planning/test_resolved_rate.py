@@ -10,15 +10,13 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 from scipy.interpolate import CubicSpline
-from scipy.spatial.transform import Rotation, Slerp
+from scipy.spatial.transform import Rotation
 from support.hand_motion import end_of_motion
 from support.planner_loop import Loop
 
 from spacerobot_ros.errors import ParameterError, PlanningError, Proof, UnreachableError
-from spacerobot_ros.flight.trials import PlanningProblem, compare
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.planning import GaitSchedule, Goal, RobotState, Tolerance, build_method, plan
-from spacerobot_ros.planning.analysis import analyze
 from spacerobot_ros.planning.core.cancellation import Cancellation, PlanningCancelled
 from spacerobot_ros.planning.core.clearance import Clearance
 from spacerobot_ros.planning.core.goal import EndEffectorGoal
@@ -34,7 +32,6 @@ Pose = tuple[Array, Rotation]
 FOLDER = Path(__file__).parents[2] / "urdf"
 PLACE, ATTITUDE = np.array([0.4, -0.3, 0.2]), Rotation.from_rotvec([0.3, -0.5, 0.4])
 ARM = np.array([0.4, -0.9, 1.1])
-SEVEN = np.array([0.3, 0.2, -0.4, -1.7, 0.5, 1.6, 0.8])
 LINK = "left_link_7"
 DUAL = np.array([0.2, -0.3, 0.4, 0.5, 0.1, -0.2, 1.0, 1.2, 0.3, 0.1, 0.6, 0.7, -0.1, 0.2])
 PERIOD = 0.08
@@ -120,21 +117,6 @@ def test_lower_limits_are_kept(
     change = np.array(options.get("max_acceleration", fastest / options.get("ramp_time", 0.5)))
     assert np.all(np.abs(rates) <= fastest * (1 + 1e-8))
     assert np.all(np.abs(np.diff(rates, axis=0)) / PERIOD <= change * (1 + 1e-8))
-
-
-@pytest.mark.slow
-def test_a_pose_turns_about_one_axis_in_step_with_the_way() -> None:
-    start = poses("seven_joint_arm", SEVEN[np.newaxis], "link_7")["link_7"]
-    turn = Rotation.from_rotvec([0.3, -0.2, 0.25])
-    goal = start[0] + np.array([0.08, -0.05, -0.1]), turn * start[1]
-    schedule = planned("seven_joint_arm", SEVEN, "link_7", [*goal[0], *goal[1].as_quat()])
-    line = Slerp([0.0, 1.0], Rotation.concatenate([start[1], goal[1]]))
-    for tick in (schedule.ticks // 3, schedule.ticks):
-        r, R = poses("seven_joint_arm", schedule.positions[: tick + 1], "link_7")["link_7"]
-        share = min(1.0, float(np.linalg.norm(r - start[0]) / np.linalg.norm(goal[0] - start[0])))
-        np.testing.assert_allclose(r, start[0] + share * (goal[0] - start[0]), atol=1e-8)
-        assert (line([share])[0].inv() * R).magnitude() < 1e-7
-    assert share == pytest.approx(1.0, abs=1e-8)
 
 
 @pytest.mark.slow
@@ -340,35 +322,6 @@ def test_a_robot_that_drifts_is_refused_and_a_search_is_cancelled() -> None:
     state = RobotState(PLACE, ATTITUDE.as_quat(), ARM)
     with pytest.raises(PlanningCancelled):
         method.plan(PlanRequest(state, goal, Tolerance(1e-6, 1e-6)), cancelled)
-
-
-# -- among the other methods --------------------------------------------------------------------
-
-
-@pytest.mark.slow
-def test_it_is_compared_for_goals_of_end_effectors_alone() -> None:
-    from spacerobot_ros.scenario import load_scenario
-
-    quick = {"optimal.answers": 1, "optimal.intervals": 20, "optimal.cache": 0}
-    problem = PlanningProblem.of(load_scenario("planar_chain").with_overrides("planner", quick))
-    assert "resolved_rate" not in compare(problem)
-    robot = robot_of("planar_chain")
-    found = analyze(robot)
-    assert found.objections["resolved_rate"] is None
-    assert found.chosen == "optimal"
-    options = {"optimal": method_options("optimal", {"cache": 0, "answers": 1, "intervals": 20})}
-    method = build_method("auto", robot, PERIOD, 0.01, options)
-    state = RobotState(PLACE, ATTITUDE.as_quat(), np.array([0.4, -0.9]))
-    goal = Goal.of_end_effectors(
-        [
-            EndEffectorGoal(
-                "segment_2",
-                poses("planar_chain", np.array([[0.6, -1.2]]), "segment_2")["segment_2"][0],
-            )
-        ]
-    )
-    schedule = method.plan(PlanRequest(state, goal, Tolerance(1e-6, 1e-6)))
-    assert "resolved_rate: " in str(schedule.notes["compared"])
 
 
 # -- paper 4 ------------------------------------------------------------------------------------

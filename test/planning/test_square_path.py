@@ -15,7 +15,6 @@ from support.planar_manoeuvres import (
     DEPLOYED,
     FOLDED,
     PERIOD,
-    TIGHT,
     URDF,
     Case,
     about_z,
@@ -31,7 +30,6 @@ from support.planar_manoeuvres import (
     wrapped,
 )
 from support.planar_trees import Part, PlanarTree, random_tree
-from support.planners import planner_of
 from support.planning_refusals import refusal_in
 
 from spacerobot_ros.errors import ParameterError, PlanningError
@@ -68,22 +66,6 @@ def test_random_goals_of_random_robots(seed: int, links: int, branched: bool) ->
     check_flight(case, planner(case.robot).plan(case.state, case.goal))
 
 
-@pytest.mark.parametrize("degrees", [-170.0, 170.0, 15.0])
-def test_a_chain_of_five_links(degrees: float) -> None:
-    case = random_case(11, 5, float(np.radians(degrees)))
-    gait = planner(case.robot).plan(case.state, case.goal)
-    check_flight(case, gait)
-    # Two joints go round; the others wait in their final position.
-    names = str(gait.notes["joints"]).split(", ")
-    others = [k for k, name in enumerate(gait.joint_names) if name not in names]
-    assert (len(names), len(others)) == (2, 2)
-    waiting = gait.positions[round(8.0 / PERIOD) :, others]
-    assert case.goal.joint_positions is not None
-    np.testing.assert_allclose(
-        waiting, np.tile(case.goal.joint_positions[others], (len(waiting), 1)), atol=1e-12
-    )
-
-
 def test_all_loops_are_the_same_square(chain: SpaceRobot) -> None:
     method = planner(chain, t3=24.0, t4=28.0)
     gait = method.plan(at_rest(DEPLOYED), goal_of(about_z(np.radians(-170))))
@@ -99,47 +81,6 @@ def test_all_loops_are_the_same_square(chain: SpaceRobot) -> None:
     assert theta[80:320].sum() == pytest.approx(np.radians(-85), abs=1e-9)
 
 
-def test_the_phase_does_not_depend_on_the_ticks(chain: SpaceRobot) -> None:
-    goal = goal_of(about_z(np.pi / 2), DEPLOYED)
-    coarse = planner_of("square_path", chain, 0.7, TIGHT).plan(at_rest(FOLDED), goal)
-    fine = paper_gait(chain)
-    assert coarse.notes["z_star"] == fine.notes["z_star"]
-    assert turns(closed_forms, coarse.positions).sum() == pytest.approx(np.pi / 2, abs=1e-9)
-
-
-@pytest.mark.slow
-def test_the_pair_with_the_smallest_square_goes_round() -> None:
-    case = random_case(21, 4, 0.8)
-    best = planner(case.robot).plan(case.state, case.goal).notes
-    found = {}
-    for pair in itertools.combinations(range(1, 4), 2):
-        # Joints without speed go round no square; they are where they are to be.
-        parts = tuple(
-            replace(part, rate=2.0 if k in pair else 0.0) for k, part in enumerate(case.tree.parts)
-        )
-        robot = SpaceRobot.from_urdf(replace(case.tree, parts=parts).urdf)
-        assert case.goal.joint_positions is not None
-        state = at_rest(case.goal.joint_positions, Rotation.from_quat(case.state.quaternion))
-        axis = case.tree.plane[:, 2]
-        turn = Rotation.from_rotvec(float(best["wanted_phase"]) * axis)  # type: ignore[arg-type]
-        goal = goal_of(Rotation.from_quat(case.state.quaternion) * turn)
-        notes = planner(robot).plan(state, goal).notes
-        found[f"j{pair[0]}, j{pair[1]}"] = (notes["loops"], notes["z_star"])
-    winner = min(found, key=lambda names: found[names])
-    assert best["joints"] == winner
-    assert best["z_star"] == pytest.approx(found[winner][1], abs=1e-6)
-
-
-def test_the_sense_of_the_axes_is_no_matter(chain: SpaceRobot) -> None:
-    text = URDF.read_text().replace('<axis xyz="0 0 1"/>', '<axis xyz="0 0 -1"/>')
-    mirrored = SpaceRobot.from_urdf(text)
-    np.testing.assert_allclose(planar_axis(mirrored), [0, 0, 1], atol=1e-15)
-    goal = goal_of(about_z(np.pi / 2), DEPLOYED)
-    gait = planner(mirrored).plan(at_rest(-FOLDED), goal)
-    assert gait.notes["wanted_phase"] == pytest.approx(0.571293, abs=5e-7)
-    assert turns(closed_forms, -gait.positions).sum() == pytest.approx(np.pi / 2, abs=1e-9)
-
-
 def test_without_a_shape_the_present_one_is_kept() -> None:
     case = random_case(31, 3, 1.0)
     case = replace(case, goal=replace(case.goal, joint_positions=None))
@@ -153,13 +94,6 @@ def test_a_goal_that_is_met_takes_no_time(chain: SpaceRobot) -> None:
     assert (gait.ticks, gait.duration, gait.notes["loops"]) == (0, 0.0, 0.0)
     np.testing.assert_array_equal(gait.positions, [FOLDED])
     np.testing.assert_array_equal(gait.path.position, [at_rest(FOLDED).position])
-
-
-def test_a_turn_well_within_the_tolerance_is_left_as_it_is(chain: SpaceRobot) -> None:
-    method = planner(chain, Tolerance(1e-3, 1e-3))
-    assert method.plan(at_rest(FOLDED), goal_of(about_z(9e-5))).ticks == 0
-    gait = method.plan(at_rest(FOLDED), goal_of(about_z(2e-4)), correction=True)
-    assert turns(closed_forms, gait.positions).sum() == pytest.approx(2e-4, abs=1e-10)
 
 
 # -- square paths within joint limits, or the true reason why there is none ----------------------
@@ -239,20 +173,6 @@ def test_slow_joints_take_longer(chain: SpaceRobot) -> None:
     assert np.abs(gait.velocities).max() == pytest.approx(0.1, rel=1e-3)
     assert np.abs(gait.velocities).max() <= 0.1
     assert gait.notes["z_star"] == pytest.approx(paper_gait(chain).notes["z_star"], abs=1e-9)
-
-
-def test_a_wide_range_is_used_round_the_shape(chain: SpaceRobot) -> None:
-    # Three turns of room; the shape is near one end of it.
-    kind = 'type="revolute"'
-    text = URDF.read_text().replace('type="continuous"', kind)
-    text = text.replace("<limit velocity", '<limit lower="-9.5" upper="9.5" velocity')
-    robot = SpaceRobot.from_urdf(text)
-    gait = planner(robot).plan(at_rest(np.array([9.3, 9.0])), goal_of(about_z(1.0)))
-    assert np.abs(gait.positions).max() <= 9.5
-    assert turns(closed_forms, gait.positions).sum() == pytest.approx(1.0, abs=1e-9)
-    free = planner(chain).plan(at_rest(np.array([9.3, 9.0])), goal_of(about_z(1.0)))
-    # The same square up to whole turns and the mirror image.
-    assert gait.notes["z_star"] == pytest.approx(free.notes["z_star"], abs=1e-3)
 
 
 # -- square paths of the robot of paper 3: the printed numbers -----------------------------------
@@ -340,31 +260,6 @@ def test_the_centre_is_where_the_phase_density_is_largest(chain: SpaceRobot) -> 
     assert top >= heights.max() - 1e-6
 
 
-def test_the_nearer_of_two_equal_centres_is_taken(chain: SpaceRobot) -> None:
-    for sign in (1, -1):
-        shape = sign * np.array([2.0, 1.5])
-        gait = planner(chain).plan(at_rest(shape), goal_of(about_z(0.3)))
-        centre = np.array(gait.notes["psi_star"])
-        np.testing.assert_allclose(sign * np.degrees(centre), [153, 121], atol=0.6)
-    # A turn further it is the image a turn further.
-    shape = np.array([2.0 + 2 * np.pi, 1.5])
-    gait = planner(chain).plan(at_rest(shape), goal_of(about_z(0.3)))
-    np.testing.assert_allclose(np.degrees(gait.notes["psi_star"]), [513, 121], atol=0.6)
-
-
-def test_velocities_are_the_mean_of_the_papers_over_each_tick(chain: SpaceRobot) -> None:
-    gait = paper_gait(chain, **RIGHT)
-    T, D = 4.0, np.array(gait.notes["corner"]) - DEPLOYED
-
-    def speed(t: float) -> float:
-        # The integral of u = (2 pi D / T^2) sin(2 pi t / T), for D = 1.
-        return quad(lambda tau: 2 * np.pi / T**2 * np.sin(2 * np.pi * tau / T), 0, t)[0]
-
-    for k in (0, 1, 39, 40, 60, 79):
-        mean = quad(speed, k * PERIOD, (k + 1) * PERIOD)[0] / PERIOD
-        np.testing.assert_allclose(gait.velocities[160 + k], mean * D, atol=1e-9)
-
-
 def test_the_paper_chain_turns_by_minus_170_degrees(chain: SpaceRobot) -> None:
     goal = goal_of(about_z(np.radians(-170)), DEPLOYED)
     gait = planner(chain).plan(at_rest(FOLDED), goal)
@@ -373,14 +268,6 @@ def test_the_paper_chain_turns_by_minus_170_degrees(chain: SpaceRobot) -> None:
     assert gait.notes["wanted_phase"] == pytest.approx(np.radians(190) - 0.999503, abs=1e-6)
     assert theta == pytest.approx(np.radians(190), abs=1e-9)
     assert gait.notes["loops"] == 2
-
-
-def test_times_are_the_options(chain: SpaceRobot) -> None:
-    gait = paper_gait(chain, t1=10.0, t2=16.0, t3=36.0, t4=40.0)
-    assert gait.duration == pytest.approx(40.0)
-    corner = np.array(gait.notes["corner"])
-    for seconds, shape in ((10, DEPLOYED), (16, corner), (36, corner), (40, DEPLOYED)):
-        np.testing.assert_allclose(gait.positions[round(seconds / PERIOD)], shape, atol=1e-9)
 
 
 # -- robots and goals that no square path will do for --------------------------------------------

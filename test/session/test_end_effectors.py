@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -13,11 +12,9 @@ from support.hand_motion import end_of_motion
 
 from spacerobot_ros import fly
 from spacerobot_ros.bag import read_bag
-from spacerobot_ros.cli.main import main
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.flight.reading import read_run
 from spacerobot_ros.measures import Outcome
-from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.planning.core.goal import EndEffectorGoal
 from spacerobot_ros.resources import robot_file
 from spacerobot_ros.scenario import Scenario, load_scenario, scenario_or_robot, scenario_text
@@ -28,43 +25,6 @@ QUICK = {"optimal.answers": 1, "optimal.intervals": 20, "optimal.cache": 0}
 
 def quick(name: str) -> Scenario:
     return load_scenario(name).with_overrides("planner", QUICK)
-
-
-TEN_GOALS = [
-    *(("three_joint_arm", ("end_effector",), seed) for seed in range(4)),
-    *(("seven_joint_arm", ("link_7",), seed) for seed in range(3)),
-    *(("dual_arm", ("left_link_7", "right_link_7"), seed) for seed in range(3)),
-]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("name", "links", "seed"), TEN_GOALS)
-def test_random_goals_on_the_topics_of_hands_are_reached(
-    name: str, links: tuple[str, ...], seed: int, tmp_path: Path
-) -> None:
-    """Positions where a random motion of the joints leads; the bag has the poses of the hands."""
-    urdf, rng = robot_file(name).read_text("utf-8"), np.random.default_rng(seed)
-    robot = SpaceRobot.from_urdf(urdf)
-    start = rng.uniform(-0.4, 0.4, robot.n).clip(robot.lower, robot.upper)
-    end = (start + rng.uniform(-0.5, 0.5, robot.n)).clip(robot.lower, robot.upper)
-    way = start + np.linspace(0.0, 1.0, 60)[:, np.newaxis] * (end - start)
-    aims = end_of_motion(urdf, robot.joint_names, way, list(links))
-    settings = {"initial_joint_positions": start.tolist(), "tick_rate": 20.0}
-    scenario = (
-        scenario_or_robot(name)
-        .with_overrides("plant", {**settings, "end_effectors": list(links)})
-        .with_overrides("planner", {**QUICK, "method": "optimal", "tick_rate": 20.0})
-        .with_overrides("planner", {"clearance": 0.0})
-        .with_end_effectors([EndEffectorGoal(link, aims[link][0]) for link in links], frozenset())
-    )
-    result = run_scenario(scenario, tmp_path / "run.mcap")
-    assert result.succeeded
-    bag = read_bag(tmp_path / "run.mcap")
-    for link in links:
-        goal, pose = bag[f"/{link}/goal_pose"], bag[f"/{link}/pose"]
-        xyz = [f"pose.position.{axis}" for axis in "xyz"]
-        np.testing.assert_allclose(goal.table(xyz, 3)[-1], aims[link][0], atol=1e-12)
-        np.testing.assert_allclose(pose.table(xyz, 3)[-1], aims[link][0], atol=1e-5)
 
 
 @pytest.mark.slow
@@ -182,46 +142,3 @@ def test_a_part_of_the_base_is_not_sent_with_an_end_effector(tmp_path: Path) -> 
     scenario = load_scenario("reach").with_end_effectors([aim], frozenset({"attitude"}))
     with pytest.raises(ParameterError, match="whole pose of the base or with none"):
         run_scenario(scenario, tmp_path / "run.mcap", nodes=True)
-
-
-# -- random goals by the command ---------------------------------------------------------------
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("number", range(2))
-@pytest.mark.parametrize(
-    ("name", "link"), [("three_joint_arm", "end_effector"), ("seven_joint_arm", "link_7")]
-)
-def test_goals_of_the_command_are_reached(
-    name: str, link: str, number: int, tmp_path: Path
-) -> None:
-    """Positions and poses by turns, where the link is after a straight way of the joints."""
-    urdf, robot = robot_file(name).read_text("utf-8"), SpaceRobot.from_file(robot_file(name))
-    rng = np.random.default_rng([number, 26])
-    lower, upper = np.maximum(robot.lower, -np.pi), np.minimum(robot.upper, np.pi)
-    q, end = (lower + (upper - lower) * rng.uniform(a, 1 - a, robot.n) for a in (0.3, 0.1))
-    place, attitude = rng.normal(size=3), Rotation.from_rotvec(rng.normal(size=3))
-    way = q + np.linspace(0, 1, 60)[:, np.newaxis] * (end - q)
-    r, R = end_of_motion(urdf, robot.joint_names, way, [link], place, attitude)[link]
-    goal: list[Any] = ["--end-effector-position", *r]
-    if number % 2:
-        goal = ["--end-effector-goal", *r, *R.as_quat()]
-    settings = {
-        "planner.clearance": 0.0,
-        "planner.position_tolerance": 1e-6,
-        "planner.attitude_tolerance": 1e-6,
-        "plant.initial_joint_positions": q.tolist(),
-        "plant.initial_position": place.tolist(),
-        "plant.initial_orientation": attitude.as_quat().tolist(),
-    }
-    words = ["run", name, "--method", "optimal", "--end-effector", link, *map(str, goal)]
-    words += [f"--set={each}={value}" for each, value in settings.items()]
-    bag = tmp_path / "hand.mcap"
-    with pytest.raises(SystemExit) as ended:
-        main([*words, "--bag", str(bag)])
-    assert ended.value.code == 0
-    flown = read_run(bag).q
-    reached, turned = end_of_motion(urdf, robot.joint_names, flown, [link], place, attitude)[link]
-    np.testing.assert_allclose(reached, r, atol=1e-6)
-    if number % 2:
-        assert (turned.inv() * R).magnitude() < 1e-6

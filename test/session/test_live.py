@@ -6,7 +6,6 @@ import json
 import os
 import signal
 import subprocess
-import sys
 import time
 from collections import defaultdict
 from collections.abc import Iterator
@@ -230,81 +229,6 @@ def test_a_stack_in_a_namespace_has_a_clock_and_a_bag_of_its_own(tmp_path: Path)
     assert outside <= {"/diagnostics"}
     assert {"/fleet/one/clock", "/fleet/one/tf", "/fleet/one/odom"} <= set(bag.topics)
     assert verify_bag(tmp_path / "a.mcap").difference is None
-
-
-@pytest.mark.slow
-def test_two_stacks_of_the_command_fly_side_by_side(ros_domain: int, tmp_path: Path) -> None:
-    """Each takes its own goal and records its own topics."""
-    environment = {**os.environ, "ROS_DOMAIN_ID": str(ros_domain), "PYTHONPATH": str(ROOT)}
-    flown = {"one": "0.05", "two": "-0.04"}
-    started = {
-        name: subprocess.Popen(
-            [
-                *(
-                    sys.executable,
-                    *COMMAND,
-                    "up",
-                    "sliding_masses",
-                    "--rate",
-                    "5",
-                    "--bag",
-                    f"{name}.mcap",
-                ),
-                *("--namespace", name, *GAIT),
-            ],
-            env=environment,
-            cwd=tmp_path,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.PIPE,
-            text=True,
-            start_new_session=True,
-        )
-        for name in flown
-    }
-    try:
-        for name, x in flown.items():
-            sent = subprocess.run(
-                [
-                    sys.executable,
-                    *COMMAND,
-                    "goal",
-                    x,
-                    "0",
-                    "0",
-                    "--namespace",
-                    name,
-                    "--timeout",
-                    "60",
-                ],
-                env=environment,
-                cwd=tmp_path,
-                capture_output=True,
-                text=True,
-                timeout=PATIENCE,
-                check=False,
-            )
-            assert sent.returncode == 0, sent.stdout + sent.stderr
-            assert "The goal is reached" in sent.stdout
-        for process in started.values():
-            process.send_signal(signal.SIGINT)
-            _, errors = process.communicate(timeout=PATIENCE)
-            assert process.returncode == 0, errors
-    finally:
-        for process in started.values():
-            if process.poll() is None:
-                os.killpg(process.pid, signal.SIGKILL)
-            process.wait(PATIENCE)
-    for name, x in flown.items():
-        bag = read_bag(tmp_path / f"{name}.mcap")
-        outside = {topic for topic in bag.topics if not topic.startswith(f"/{name}/")}
-        assert outside <= {"/diagnostics"}
-        assert {f"/{name}/clock", f"/{name}/tf", f"/{name}/odom"} <= set(bag.topics)
-        end = bag[f"/{name}/odom"].field("pose.pose.position.x")[-1]
-        assert abs(end - float(x)) < 1e-3
-        # One clock: time goes on in steps of one tick, and never back.
-        steps = np.unique(np.diff(bag[f"/{name}/clock"].time_ns))
-        assert steps.min() > 0
-        assert steps.max() <= 2 * steps.min()
 
 
 @pytest.mark.parametrize("name", ["my robot", "1", "a//b", "a-b", "~", "."])

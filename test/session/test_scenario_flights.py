@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from spacerobot_ros import fly
 from spacerobot_ros.bag import Bag, read_bag
-from spacerobot_ros.errors import ParameterError, PlanningError
+from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.events import EventKind
 from spacerobot_ros.flight.flight import Flight
 from spacerobot_ros.flight.verification import verify_bag
@@ -187,30 +187,6 @@ def test_thrusters_of_a_robot_that_nothing_pushes_are_refused(tmp_path: Path) ->
         run_scenario(scenario, tmp_path / "no.mcap")
 
 
-@pytest.mark.slow
-def test_a_short_flight_tells_what_thrusters_do(tmp_path: Path) -> None:
-    """Two seconds of it: topics, diagnostics, and the warning of a direction that is missing."""
-    path = tmp_path / "run.mcap"
-    has_contact_forces = " ".join(f"minus_x_{number}" for number in range(1, 5))
-    scenario = (
-        load_scenario("servicer_thrusters")
-        .with_overrides("plant", {"thrusters_excluded": has_contact_forces})
-        .with_overrides("coordinated_control", {"time_limit": 2.0})
-    )
-    run_scenario(scenario, path)
-    bag = read_bag(path)
-    assert bag.topics["/thrusters"] == "sensor_msgs/msg/JointState"
-    assert bag.message_count("/base_wrench_realised") == bag.message_count("/odom")
-    sentences = [
-        entry.message
-        for _, message in bag["/diagnostics"].messages()
-        for entry in message.status
-        if entry.name.endswith("thrusters")
-    ]
-    assert sentences
-    assert all("cannot give negative force along x" in sentence for sentence in sentences)
-
-
 # -- the scenario `servicing` ------------------------------------------------------------------
 
 
@@ -317,20 +293,3 @@ def test_mujoco_flies_the_same_flight_from_its_commands(flight: Flight) -> None:
         left = np.abs(flown["momentum"] - flown["expected"])[:, part].max() / largest
         print(f"momentum: {left:.1e} of the largest")
         assert left < 1e-6
-
-
-@pytest.mark.slow
-def test_in_mujoco_the_satellite_is_placed_as_well() -> None:
-    pytest.importorskip("mujoco")
-    flown = fly(load_scenario("servicing").with_overrides("plant", {"engine": "mujoco"}))
-    assert flown.succeeded, flown.message
-    assert not [each for each in flown.events if each.kind is EventKind.CONTACT]
-    np.testing.assert_allclose(flown.pose[-1, :3], [-0.8, 0.3, 0.2], atol=0.002)
-
-
-@pytest.mark.slow
-def test_a_satellite_that_tumbles_too_fast_is_refused() -> None:
-    fast = {"target.angular_velocity": (0.0, 0.5, -0.5)}
-    words = "The approach is refused: the target moves too fast to be met"
-    with pytest.raises(PlanningError, match=words):
-        fly(load_scenario("servicing").with_overrides("plant", fast))

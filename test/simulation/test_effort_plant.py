@@ -27,7 +27,7 @@ from support.wheels import HULL, WHEELS, text, wheeled_robot
 
 from spacerobot_ros.errors import CommandError, ParameterError, SpaceRobotError
 from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.model.compilation import BufferedFunction, c_compiler
+from spacerobot_ros.model.compilation import BufferedFunction
 from spacerobot_ros.model.composite_rigid_body import state_slices
 from spacerobot_ros.model.integration import repeat_step
 from spacerobot_ros.model.rotations import matrix_from_quaternion
@@ -213,27 +213,6 @@ def test_a_long_tick_is_many_short_ones_in_little_code() -> None:
         return len(generator.dump())
 
     assert code(count) < 1.4 * code(1)
-
-
-@pytest.mark.slow
-def test_compiled_flight_is_the_interpreted_one(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    rng = np.random.default_rng(81)
-    robot = robot_of(random_urdf(0))
-    start = tumbling(robot, rng)
-    interpreted = EffortPlant(robot, TICK, start)
-    monkeypatch.setenv("SPACEROBOT_COMPILE", "1")
-    monkeypatch.setenv("SPACEROBOT_CACHE_DIR", str(tmp_path))
-    if c_compiler() is None:
-        pytest.skip("no C compiler")
-    compiled = EffortPlant(SpaceRobot.from_urdf(random_urdf(0)), TICK, start)
-    assert list(tmp_path.glob("effort_tick_10-*.so"))
-    for effort, wrench in thrusts(rng, robot.n, 50):
-        interpreted.step(effort, wrench)
-        compiled.step(effort, wrench)
-    np.testing.assert_allclose(compiled.pose, interpreted.pose, rtol=1e-13, atol=1e-15)
-    np.testing.assert_allclose(compiled.momentum, interpreted.momentum, rtol=1e-12, atol=1e-14)
 
 
 # -- the plant under efforts: clipped commands, start and reset, refusals ------------------------

@@ -392,22 +392,6 @@ def test_a_held_joint_is_like_one_that_is_fixed_in_the_urdf() -> None:
     assert held.q[2] == place
 
 
-@pytest.mark.slow
-def test_a_joint_can_jam_on_its_stop_while_another_meets_its_own() -> None:
-    text = urdf("sliding_masses")
-    robot = robot_of(text)
-    plant = pushed(
-        EffortPlant(robot, TICK, InitialState(joint_positions=np.array([2.5, 2.4, 0.0]))),
-        "joint_stuck slider_1",
-    )
-    for _ in range(60):
-        plant.step(np.array([-5.0, 5.0, 0.1]))
-    np.testing.assert_array_equal(plant.q[:2], [2.5, 2.5])
-    assert plant.limit_counts["stroke"][0] == 0, "it is held by the jam and not by its stop"
-    assert plant.limit_counts["stroke"][1] > 0
-    np.testing.assert_allclose(momenta(text, plant), 0.0, atol=1e-10)
-
-
 # -- thrusters --------------------------------------------------------------------------------
 
 
