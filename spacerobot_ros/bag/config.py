@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from spacerobot_ros.model.shared_parameters import WatchdogConfig
-from spacerobot_ros.parameters import parameter
+from spacerobot_ros.parameters import nonnegative, parameter
 
 
 @dataclass(frozen=True)
@@ -21,30 +21,24 @@ class RecorderConfig(WatchdogConfig):
     )
     topics: str = parameter("", "names to record, separated by spaces; '': all of the stack")
     compression: str = parameter("zstd", "compression of chunks", choices=("zstd", "lz4", "none"))
-    clock_wait: float = parameter(
-        2.0, "wall time to wait for a clock before using the wall's", unit="s"
-    )
+    clock_wait: float = parameter(2.0, "wall time to wait for a clock before using the wall's", "s")
     describe: str = parameter("", "JSON file of named objects to put into the bag as metadata")
-    diagnostics_period: float = parameter(
-        0.0, "wall time between diagnostics; 0: losses only", unit="s", minimum=0.0
+    diagnostics_period: float = nonnegative(
+        0.0, "wall time between diagnostics; 0: losses only", "s"
     )
-    tf_period: float = parameter(
+    tf_period: float = nonnegative(
         0.1,
         "bag time between transforms that the recorder writes if no node publishes /tf; 0: none",
-        unit="s",
-        minimum=0.0,
+        "s",
     )
     flush_period: float = parameter(
-        0.5, "longest wall time of messages that a killed recorder can lose", unit="s", minimum=0.01
+        0.5, "longest wall time of messages that a killed recorder can lose", "s", minimum=0.01
     )
-    max_size: float = parameter(
-        0.0,
-        "file size after which the next file (NAME_0, NAME_1, ...) begins; 0: never",
-        unit="MB",
-        minimum=0.0,
+    max_size: float = nonnegative(
+        0.0, "file size after which the next file (NAME_0, NAME_1, ...) begins; 0: never", "MB"
     )
-    max_duration: float = parameter(
-        0.0, "bag time after which the next file begins; 0: never", unit="s", minimum=0.0
+    max_duration: float = nonnegative(
+        0.0, "bag time after which the next file begins; 0: never", "s"
     )
 
 
@@ -54,18 +48,14 @@ class ReplayConfig:
 
     bag: str = parameter("", "MCAP file to replay, or a folder with one")
     rate: float = parameter(1.0, "bag time over wall time", minimum=0.001, maximum=1000000.0)
-    start: float = parameter(0.0, "start, from the first message", unit="s", minimum=0.0)
-    duration: float = parameter(0.0, "how much of the bag to replay; 0: all", unit="s", minimum=0.0)
+    start: float = nonnegative(0.0, "start, from the first message", "s")
+    duration: float = nonnegative(0.0, "how much of the bag to replay; 0: all", "s")
     loop: bool = parameter(False, "repeat the replay when it ends")
     topics: str = parameter("", "names to replay, separated by spaces; '': all")
     remap: str = parameter("", "other names for topics: 'old:=new', separated by spaces")
-    clock: float = parameter(
-        0.0,
-        "publish bag time on /clock at this rate; 0: as recorded",
-        unit="Hz",
-        minimum=0.0,
-        maximum=10000.0,
+    clock: float = nonnegative(
+        0.0, "publish bag time on /clock at this rate; 0: as recorded", "Hz", maximum=10000.0
     )
     paused: bool = parameter(False, "begin paused")
     hold: bool = parameter(False, "pause at the end instead of ending")
-    wait: float = parameter(3.0, "longest wall time to wait for readers", unit="s", minimum=0.0)
+    wait: float = nonnegative(3.0, "longest wall time to wait for readers", "s")

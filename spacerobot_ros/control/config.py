@@ -16,24 +16,22 @@ from spacerobot_ros.control.planned_reference import PlannedOptions, PlannedRefe
 from spacerobot_ros.control.reference import PROFILES, OutputErrors
 from spacerobot_ros.control.wheels import WheelOptions
 from spacerobot_ros.model.shared_parameters import CommanderConfig
-from spacerobot_ros.parameters import group, parameter, registered
+from spacerobot_ros.parameters import group, nonnegative, parameter, registered
 
 
 @dataclass(frozen=True)
 class ErrorMargin:
     """Margin beyond twice the distance of a goal at which growing errors abort it."""
 
-    position: float = parameter(
+    position: float = nonnegative(
         1.0,
         "abort a goal if a position error exceeds twice its distance by more than this; 0: never",
-        unit="m",
-        minimum=0.0,
+        "m",
     )
-    attitude: float = parameter(
+    attitude: float = nonnegative(
         1.0,
         "abort a goal if an attitude error exceeds twice its angle by more than this; 0: never",
-        unit="rad",
-        minimum=0.0,
+        "rad",
     )
 
     def as_errors(self) -> OutputErrors:
@@ -66,45 +64,32 @@ class ControllerConfig(CommanderConfig):
         "whether the base has thrusters; false: only reaction wheels rotate it, and its position "
         "is not controlled",
     )
-    max_force: float = parameter(
-        0.0, "largest force of the thrusters; 0: no limit", unit="N", minimum=0.0
+    max_force: float = nonnegative(0.0, "largest force of the thrusters; 0: no limit", "N")
+    max_torque: float = nonnegative(0.0, "largest torque of the thrusters; 0: no limit", "N m")
+    joint_rates: float = nonnegative(
+        1.0, "limit of the joint rates, as a share of the URDF's; 0: no limit", maximum=1000.0
     )
-    max_torque: float = parameter(
-        0.0, "largest torque of the thrusters; 0: no limit", unit="N m", minimum=0.0
+    estimation_time: float = nonnegative(
+        1.0, "time for which the base is estimated while odom is missing", "s"
     )
-    joint_rates: float = parameter(
-        1.0,
-        "limit of the joint rates, as a share of the URDF's; 0: no limit",
-        minimum=0.0,
-        maximum=1000.0,
-    )
-    estimation_time: float = parameter(
-        1.0, "time for which the base is estimated while odom is missing", unit="s", minimum=0.0
-    )
-    reference_timeout: float = parameter(
+    reference_timeout: float = nonnegative(
         1.0,
         "time that states wait for a silent publisher of joint_reference or base_reference, "
         "simulated or, in lockstep, wall time; 0: forever",
-        unit="s",
-        minimum=0.0,
+        "s",
     )
-    settle_time: float = parameter(
-        1.0,
-        "time for which all errors must stay within the tolerances",
-        unit="s",
-        minimum=0.0,
-        read_only=False,
+    settle_time: float = nonnegative(
+        1.0, "time for which all errors must stay within the tolerances", "s", read_only=False
     )
-    time_limit: float = parameter(
+    time_limit: float = nonnegative(
         0.0,
         "time after which an unreached goal fails; 0: 300 s after the end of its reference",
-        unit="s",
-        minimum=0.0,
+        "s",
     )
     wheels: WheelOptions = group(WheelOptions())
     error_margin: ErrorMargin = group(ErrorMargin())
     status_period: float = parameter(
-        1.0, "simulated time between status messages", unit="s", minimum=0.01
+        1.0, "simulated time between status messages", "s", minimum=0.01
     )
     tasks: str = parameter(
         "",

@@ -19,26 +19,23 @@ from spacerobot_ros.model.compilation import BufferedFunction, dense_function
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.grasp import Payload
 from spacerobot_ros.model.space_robot import SpaceRobot
-from spacerobot_ros.parameters import parameter
+from spacerobot_ros.parameters import nonnegative, parameter
 
 
 @dataclass(frozen=True)
 class DetumbleOptions:
     """The load on a grasp while a robot is brought to rest, and when it is at rest."""
 
-    grapple_torque_limit: float = parameter(
-        0.0, "largest torque of the grasp on the target; 0: no limit", unit="N m", minimum=0.0
+    grapple_torque_limit: float = nonnegative(
+        0.0, "largest torque of the grasp on the target; 0: no limit", "N m"
     )
     rate: float = parameter(
-        0.002,
-        "largest rate of the base and of the joints at rest",
-        unit="rad/s or m/s",
-        minimum=1e-9,
+        0.002, "largest rate of the base and of the joints at rest", "rad/s or m/s", minimum=1e-9
     )
     speed: float = parameter(
-        0.002, "largest speed of the centre of mass at rest", unit="m/s", minimum=1e-9
+        0.002, "largest speed of the centre of mass at rest", "m/s", minimum=1e-9
     )
-    settle_time: float = parameter(1.0, "time at rest", unit="s", minimum=0.0)
+    settle_time: float = nonnegative(1.0, "time at rest", "s")
 
 
 def shortest_detumbling(momentum: float, torque: float) -> float:

@@ -21,7 +21,7 @@ from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.rotations import cross
 from spacerobot_ros.model.space_robot import SpaceRobot
 from spacerobot_ros.model.wheels import ReactionWheels
-from spacerobot_ros.parameters import parameter
+from spacerobot_ros.parameters import nonnegative, parameter
 
 _MIN_PERIODS_TO_LIMIT = 2
 """Shortest time for a wheel to reach its largest rate, in control periods."""
@@ -65,11 +65,10 @@ class WheelOptions:
         minimum=0.01,
         maximum=1.0,
     )
-    dump_rate: float = parameter(
+    dump_rate: float = nonnegative(
         0.0,
         "share of a wheel's largest rate at which the momentum of the wheels is dumped; 0: on "
         "request only",
-        minimum=0.0,
         maximum=1.0,
     )
     excluded: str = parameter("", "joints of disabled wheels, separated by spaces")

@@ -11,7 +11,7 @@ from spacerobot_ros.model.model_functions import SymbolicModels
 from spacerobot_ros.model.space_robot import SpaceRobot
 from spacerobot_ros.model.urdf import load_robot, load_world, parse_robot
 from spacerobot_ros.model.world import with_world
-from spacerobot_ros.parameters import parameter, replaced
+from spacerobot_ros.parameters import nonnegative, parameter, replaced
 from spacerobot_ros.resources import robot_file
 from spacerobot_ros.times import SECOND
 
@@ -72,10 +72,10 @@ class RobotConfig:
 class AssumedRobotConfig(RobotConfig):
     """The robot of flight software, whose model may differ from the plant's."""
 
-    model_error: float = parameter(
-        0.0, "largest relative error of masses and inertias", minimum=0.0, maximum=0.9
+    model_error: float = nonnegative(
+        0.0, "largest relative error of masses and inertias", maximum=0.9
     )
-    model_error_seed: int = parameter(0, "seed of the draw of these errors", minimum=0)
+    model_error_seed: int = nonnegative(0, "seed of the draw of these errors")
 
     def assumed_robot(self, robot: RobotDescription) -> RobotDescription:
         """Return the robot with random errors of masses and inertias of up to ``model_error``."""
@@ -127,11 +127,10 @@ def _with_model_error(true: RobotDescription, config: RobotConfig) -> SpaceRobot
 class WatchdogConfig:
     """Supervision of the heartbeats of other nodes."""
 
-    watchdog_timeout: float = parameter(
+    watchdog_timeout: float = nonnegative(
         0.8,
         "wall time without a heartbeat after which a required node counts as silent; 0: never",
-        unit="s",
-        minimum=0.0,
+        "s",
     )
 
 
@@ -139,12 +138,8 @@ class WatchdogConfig:
 class CommanderConfig(WatchdogConfig, AssumedRobotConfig):
     """Parameters of the nodes that command a plant: rate, goals, tolerances."""
 
-    tick_rate: float = parameter(
-        0.0,
-        "commands per second; 0: the plant's rate",
-        unit="Hz",
-        minimum=0.0,
-        maximum=100000.0,
+    tick_rate: float = nonnegative(
+        0.0, "commands per second; 0: the plant's rate", "Hz", maximum=100000.0
     )
     world_frame: str = parameter("world", "frame of goals that name no known frame")
     state_reliability: str = parameter(
@@ -153,34 +148,24 @@ class CommanderConfig(WatchdogConfig, AssumedRobotConfig):
         "effort if a publisher offers no more",
         choices=("auto", "reliable", "best_effort"),
     )
-    diagnostics_period: float = parameter(
+    diagnostics_period: float = nonnegative(
         1.0,
         "simulated time between diagnostics; 0: ignored states only. Outside of a run in one "
         "process also once a second of wall time",
-        unit="s",
-        minimum=0.0,
+        "s",
     )
-    position_tolerance: float = parameter(
+    position_tolerance: float = nonnegative(
         0.0,
         "largest position error of a reached goal; 0: a thousandth of the robot's diameter of "
         "gyration",
-        unit="m",
-        minimum=0.0,
+        "m",
         read_only=False,
     )
-    attitude_tolerance: float = parameter(
-        0.001,
-        "largest attitude error of a reached goal",
-        unit="rad",
-        minimum=0.0,
-        read_only=False,
+    attitude_tolerance: float = nonnegative(
+        0.001, "largest attitude error of a reached goal", "rad", read_only=False
     )
-    joint_tolerance: float = parameter(
-        0.001,
-        "largest joint error of a reached goal",
-        unit="m or rad",
-        minimum=0.0,
-        read_only=False,
+    joint_tolerance: float = nonnegative(
+        0.001, "largest joint error of a reached goal", "m or rad", read_only=False
     )
     resume_file: str = parameter(
         "", "file of the present goals, from which a restarted node resumes; '': none"

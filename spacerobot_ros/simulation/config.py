@@ -7,7 +7,7 @@ from typing import Any
 
 from spacerobot_ros.model.description import RobotDescription
 from spacerobot_ros.model.shared_parameters import DEFAULT_TICK_RATE, RobotConfig, WatchdogConfig
-from spacerobot_ros.parameters import group, parameter
+from spacerobot_ros.parameters import group, nonnegative, parameter
 from spacerobot_ros.times import SECOND
 
 _MAX_SENSOR_ERROR = 1e6
@@ -22,99 +22,76 @@ def period_ns(tick_rate: float) -> int:
     return round(SECOND / tick_rate)
 
 
-def _bias_parameter(default: tuple[float, ...], description: str, unit: str) -> Any:
+def _noise(description: str, unit: str) -> Any:
+    return nonnegative(0.0, description, unit, maximum=_MAX_SENSOR_ERROR)
+
+
+def _bias(description: str, unit: str, default: tuple[float, ...] = (0.0, 0.0, 0.0)) -> Any:
     """Return a bias parameter with the length of its default, or of any length for ()."""
+    bound = _MAX_SENSOR_ERROR
     return parameter(
-        default,
-        description,
-        unit=unit,
-        minimum=-_MAX_SENSOR_ERROR,
-        maximum=_MAX_SENSOR_ERROR,
-        length=len(default) or None,
+        default, description, unit, minimum=-bound, maximum=bound, length=len(default) or None
     )
+
+
+def _initial(
+    description: str,
+    unit: str,
+    default: tuple[float, ...] = (0.0, 0.0, 0.0),
+    length: int | None = 3,
+) -> Any:
+    bound = _MAX_INITIAL_VALUE
+    return parameter(default, description, unit, minimum=-bound, maximum=bound, length=length)
+
+
+def _orientation(description: str) -> Any:
+    return parameter((0.0, 0.0, 0.0, 1.0), description, length=4)
+
+
+def _time(default: float, description: str) -> Any:
+    return nonnegative(default, description, "s", maximum=_MAX_INITIAL_VALUE)
 
 
 @dataclass(frozen=True)
 class SensorConfig:
     """Errors of the sensors: 1 sigma of their noise, their biases, and the seed."""
 
-    position_noise: float = parameter(
-        0.0, "1 sigma an axis of odom, in world", unit="m", minimum=0.0, maximum=_MAX_SENSOR_ERROR
-    )
-    attitude_noise: float = parameter(
-        0.0,
-        "likewise, a rotation vector in base",
-        unit="rad",
-        minimum=0.0,
-        maximum=_MAX_SENSOR_ERROR,
-    )
-    velocity_noise: float = parameter(
-        0.0, "likewise, of the twist", unit="m/s", minimum=0.0, maximum=_MAX_SENSOR_ERROR
-    )
-    angular_velocity_noise: float = parameter(
-        0.0, "likewise", unit="rad/s", minimum=0.0, maximum=_MAX_SENSOR_ERROR
-    )
-    joint_noise: float = parameter(
-        0.0,
-        "1 sigma of every joint position",
-        unit="m or rad",
-        minimum=0.0,
-        maximum=_MAX_SENSOR_ERROR,
-    )
-    joint_rate_noise: float = parameter(
-        0.0, "of every joint velocity", unit="m/s or rad/s", minimum=0.0, maximum=_MAX_SENSOR_ERROR
-    )
-    position_bias: tuple[float, ...] = _bias_parameter((0.0, 0.0, 0.0), "of odom, in world", "m")
-    attitude_bias: tuple[float, ...] = _bias_parameter(
-        (0.0, 0.0, 0.0), "rotation vector in base", "rad"
-    )
-    joint_bias: tuple[float, ...] = _bias_parameter(
-        (), "by joint order of the URDF; []: none", "m or rad"
-    )
-    seed: int = parameter(0, "of the noise of sensors and actuators", minimum=0)
+    position_noise: float = _noise("1 sigma an axis of odom, in world", "m")
+    attitude_noise: float = _noise("likewise, a rotation vector in base", "rad")
+    velocity_noise: float = _noise("likewise, of the twist", "m/s")
+    angular_velocity_noise: float = _noise("likewise", "rad/s")
+    joint_noise: float = _noise("1 sigma of every joint position", "m or rad")
+    joint_rate_noise: float = _noise("of every joint velocity", "m/s or rad/s")
+    position_bias: tuple[float, ...] = _bias("of odom, in world", "m")
+    attitude_bias: tuple[float, ...] = _bias("rotation vector in base", "rad")
+    joint_bias: tuple[float, ...] = _bias("by joint order of the URDF; []: none", "m or rad", ())
+    seed: int = nonnegative(0, "of the noise of sensors and actuators")
 
 
 @dataclass(frozen=True)
 class TargetSensorConfig:
     """Errors of target/odom: 1 sigma of its noise, biases, delay, loss and rate."""
 
-    position_noise: float = parameter(
-        0.0, "1 sigma an axis of target/odom", unit="m", minimum=0.0, maximum=_MAX_SENSOR_ERROR
+    position_noise: float = _noise("1 sigma an axis of target/odom", "m")
+    attitude_noise: float = _noise(
+        "likewise, a rotation vector in the frame of its root link", "rad"
     )
-    attitude_noise: float = parameter(
-        0.0,
-        "likewise, a rotation vector in the frame of its root link",
-        unit="rad",
-        minimum=0.0,
-        maximum=_MAX_SENSOR_ERROR,
+    velocity_noise: float = _noise("likewise, of the twist", "m/s")
+    angular_velocity_noise: float = _noise("likewise", "rad/s")
+    position_bias: tuple[float, ...] = _bias(
+        "of target/odom, in the rotating frame of the root link", "m"
     )
-    velocity_noise: float = parameter(
-        0.0, "likewise, of the twist", unit="m/s", minimum=0.0, maximum=_MAX_SENSOR_ERROR
+    attitude_bias: tuple[float, ...] = _bias("likewise, a rotation vector", "rad")
+    delay: float = nonnegative(
+        0.0, "age of the state that target/odom carries, in whole ticks", "s", maximum=60.0
     )
-    angular_velocity_noise: float = parameter(
-        0.0, "likewise", unit="rad/s", minimum=0.0, maximum=_MAX_SENSOR_ERROR
+    loss: float = nonnegative(
+        0.0, "share of the measurements that are lost, at random", maximum=1.0
     )
-    position_bias: tuple[float, ...] = _bias_parameter(
-        (0.0, 0.0, 0.0), "of target/odom, in the rotating frame of the root link", "m"
-    )
-    attitude_bias: tuple[float, ...] = _bias_parameter(
-        (0.0, 0.0, 0.0), "likewise, a rotation vector", "rad"
-    )
-    delay: float = parameter(
-        0.0,
-        "age of the state that target/odom carries, in whole ticks",
-        unit="s",
-        minimum=0.0,
-        maximum=60.0,
-    )
-    loss: float = parameter(
-        0.0, "share of the measurements that are lost, at random", minimum=0.0, maximum=1.0
-    )
-    rate: float = parameter(
+    rate: float = nonnegative(
         0.0,
         "measurements a second, with whole ticks between them; 0: one every tick",
-        unit="Hz",
-        minimum=0.0,
+        "Hz",
         maximum=100000.0,
     )
 
@@ -127,41 +104,19 @@ class TargetConfig:
     robot_description: str = parameter(
         "", "URDF text of the target; takes precedence over 'target.robot'"
     )
-    joint_positions: tuple[float, ...] = parameter(
-        (),
+    joint_positions: tuple[float, ...] = _initial(
         "locked joint positions of the target, by joint order of its URDF; []: zero",
-        unit="m or rad",
-        minimum=-_MAX_INITIAL_VALUE,
-        maximum=_MAX_INITIAL_VALUE,
+        "m or rad",
+        (),
+        length=None,
     )
     grapple_frame: str = parameter("grapple", "link of the target at which it is captured")
-    position: tuple[float, ...] = parameter(
-        (0.0, 0.0, 0.0),
-        "initial position of the target's root link in the world",
-        unit="m",
-        minimum=-_MAX_INITIAL_VALUE,
-        maximum=_MAX_INITIAL_VALUE,
-        length=3,
+    position: tuple[float, ...] = _initial(
+        "initial position of the target's root link in the world", "m"
     )
-    orientation: tuple[float, ...] = parameter(
-        (0.0, 0.0, 0.0, 1.0), "likewise, quaternion x, y, z, w", length=4
-    )
-    velocity: tuple[float, ...] = parameter(
-        (0.0, 0.0, 0.0),
-        "of the origin of its root link, in world",
-        unit="m/s",
-        minimum=-_MAX_INITIAL_VALUE,
-        maximum=_MAX_INITIAL_VALUE,
-        length=3,
-    )
-    angular_velocity: tuple[float, ...] = parameter(
-        (0.0, 0.0, 0.0),
-        "in world",
-        unit="rad/s",
-        minimum=-_MAX_INITIAL_VALUE,
-        maximum=_MAX_INITIAL_VALUE,
-        length=3,
-    )
+    orientation: tuple[float, ...] = _orientation("likewise, quaternion x, y, z, w")
+    velocity: tuple[float, ...] = _initial("of the origin of its root link, in world", "m/s")
+    angular_velocity: tuple[float, ...] = _initial("in world", "rad/s")
 
     sensors: TargetSensorConfig = group(TargetSensorConfig())
 
@@ -184,22 +139,17 @@ class CaptureConfig:
     end_effector: str = parameter(
         "", "link that captures; '': end_effector_frame, or 'end_effector'"
     )
-    distance: float = parameter(
-        0.05, "largest distance of the grapple frame from the link", unit="m", minimum=0.0
+    distance: float = nonnegative(0.05, "largest distance of the grapple frame from the link", "m")
+    angle: float = nonnegative(0.2, "largest angle between the two frames", "rad")
+    speed: float = nonnegative(
+        0.1, "largest speed of the grapple frame relative to the link", "m/s"
     )
-    angle: float = parameter(0.2, "largest angle between the two frames", unit="rad", minimum=0.0)
-    speed: float = parameter(
-        0.1, "largest speed of the grapple frame relative to the link", unit="m/s", minimum=0.0
-    )
-    rate: float = parameter(
-        0.1, "largest rate of rotation of one relative to the other", unit="rad/s", minimum=0.0
-    )
-    joint_impulse_limit: float = parameter(
+    rate: float = nonnegative(0.1, "largest rate of rotation of one relative to the other", "rad/s")
+    joint_impulse_limit: float = nonnegative(
         0.0,
         "impulse of the capture along a joint's coordinate beyond which its event is a warning; 0: "
         "none",
-        unit="N m s or N s",
-        minimum=0.0,
+        "N m s or N s",
     )
 
 
@@ -207,25 +157,18 @@ class CaptureConfig:
 class OrbitConfig:
     """A circular orbit, on which the origin of the world frame falls freely."""
 
-    altitude: float = parameter(
+    altitude: float = nonnegative(
         0.0,
         "height above the Earth's equatorial radius; 0: no orbit, unless mean_motion is set",
-        unit="m",
-        minimum=0.0,
+        "m",
         maximum=_MAX_INITIAL_VALUE,
     )
-    mean_motion: float = parameter(
-        0.0,
-        "mean motion of the orbit, instead of altitude",
-        unit="rad/s",
-        minimum=0.0,
-        maximum=100.0,
+    mean_motion: float = nonnegative(
+        0.0, "mean motion of the orbit, instead of altitude", "rad/s", maximum=100.0
     )
-    orientation: tuple[float, ...] = parameter(
-        (0.0, 0.0, 0.0, 1.0),
+    orientation: tuple[float, ...] = _orientation(
         "of the orbital frame in the world at time zero (x outward along the radius, z along the "
-        "orbit's normal), a quaternion x, y, z, w",
-        length=4,
+        "orbit's normal), a quaternion x, y, z, w"
     )
 
 
@@ -233,22 +176,19 @@ class OrbitConfig:
 class TableConfig:
     """A table with air bearings, in the x-y plane of the world, for planar robots."""
 
-    tilt: float = parameter(0.0, "tilt of the table", unit="rad", minimum=0.0, maximum=1.5707963)
+    tilt: float = nonnegative(0.0, "tilt of the table", "rad", maximum=1.5707963)
     direction: float = parameter(
         0.0,
         "direction downhill in the x-y plane, from x",
-        unit="rad",
+        "rad",
         minimum=-6.2831854,
         maximum=6.2831854,
     )
-    gravity: float = parameter(
-        9.80665, "acceleration of gravity", unit="m/s^2", minimum=0.0, maximum=1000.0
-    )
-    friction: float = parameter(
+    gravity: float = nonnegative(9.80665, "acceleration of gravity", "m/s^2", maximum=1000.0)
+    friction: float = nonnegative(
         0.0,
         "viscous friction of the bearings: force on every body over its momentum",
-        unit="1/s",
-        minimum=0.0,
+        "1/s",
         maximum=1000.0,
     )
 
@@ -274,22 +214,12 @@ class PlantConfig(WatchdogConfig, RobotConfig):
         choices=("realtime", "lockstep"),
     )
     tick_rate: float = parameter(
-        DEFAULT_TICK_RATE,
-        "ticks a second of simulated time",
-        unit="Hz",
-        minimum=0.001,
-        maximum=100000.0,
+        DEFAULT_TICK_RATE, "ticks a second of simulated time", "Hz", minimum=0.001, maximum=100000.0
     )
     real_time_factor: float = parameter(
         1.0, "simulated over wall time", minimum=0.001, maximum=1000.0
     )
-    command_timeout: float = parameter(
-        0.5,
-        "realtime: older commands stop the joints; 0: never",
-        unit="s",
-        minimum=0.0,
-        maximum=_MAX_INITIAL_VALUE,
-    )
+    command_timeout: float = _time(0.5, "realtime: older commands stop the joints; 0: never")
     beyond_limits: str = parameter(
         "clip", "commands beyond the rate or effort limits of the URDF", choices=("clip", "refuse")
     )
@@ -309,13 +239,7 @@ class PlantConfig(WatchdogConfig, RobotConfig):
         "reaction to a silent commander: report only, or also latch a fault",
         choices=("report", "latch"),
     )
-    integration_step: float = parameter(
-        0.0,
-        "longest step; 0: 0.01 (velocity), 0.001 (effort)",
-        unit="s",
-        minimum=0.0,
-        maximum=_MAX_INITIAL_VALUE,
-    )
+    integration_step: float = _time(0.0, "longest step; 0: 0.01 (velocity), 0.001 (effort)")
     thrusters: str = parameter("", "'urdf': those of the robot's URDF; a YAML file; '': any wrench")
     thrusters_excluded: str = parameter("", "names of disabled thrusters, separated by spaces")
     world_frame: str = parameter("world", "name of the inertial frame")
@@ -323,26 +247,15 @@ class PlantConfig(WatchdogConfig, RobotConfig):
     end_effectors: tuple[str, ...] = parameter(
         (), "links whose measured poses are published on NAME/pose", texts=True
     )
-    base_pose_period: float = parameter(
-        0.0,
-        "simulated time between base_pose; 0: every tick. Realtime: at most 0.5 s of wall time",
-        unit="s",
-        minimum=0.0,
-        maximum=_MAX_INITIAL_VALUE,
+    base_pose_period: float = _time(
+        0.0, "simulated time between base_pose; 0: every tick. Realtime: at most 0.5 s of wall time"
     )
-    marker_period: float = parameter(
-        0.5,
-        "simulated time between markers; 0: none. Realtime: at most 0.5 s of wall time",
-        unit="s",
-        minimum=0.0,
-        maximum=_MAX_INITIAL_VALUE,
+    marker_period: float = _time(
+        0.5, "simulated time between markers; 0: none. Realtime: at most 0.5 s of wall time"
     )
-    tf_period: float = parameter(
+    tf_period: float = _time(
         0.1,
         "simulated time between transforms on /tf; 0: none. Realtime: at most 0.1 s of wall time",
-        unit="s",
-        minimum=0.0,
-        maximum=_MAX_INITIAL_VALUE,
     )
     tf_links: bool = parameter(
         True,
@@ -353,78 +266,36 @@ class PlantConfig(WatchdogConfig, RobotConfig):
         "prefix of the robot's frames, such as 'robot_1/', but not of world_frame. '': none, or "
         "'robot/' if a link has the name of world_frame",
     )
-    diagnostics_period: float = parameter(
+    diagnostics_period: float = _time(
         1.0,
         "simulated time between diagnostics; 0: none. Realtime: at least once a second of wall "
         "time; a paused plant: once a second of wall time",
-        unit="s",
-        minimum=0.0,
-        maximum=_MAX_INITIAL_VALUE,
     )
-    clearance_period: float = parameter(
+    clearance_period: float = _time(
         1.0,
         "simulated time between clearances, the smallest distances between links; 0: none. "
         "Realtime: at most 0.5 s of wall time",
-        unit="s",
-        minimum=0.0,
-        maximum=_MAX_INITIAL_VALUE,
     )
     resume_bag: str = parameter(
         "", "bag from whose last state and time to continue; '': the initial state"
     )
-    initial_position: tuple[float, ...] = parameter(
-        (0.0, 0.0, 0.0),
-        "base link in the world",
-        unit="m",
-        minimum=-_MAX_INITIAL_VALUE,
-        maximum=_MAX_INITIAL_VALUE,
-        length=3,
+    initial_position: tuple[float, ...] = _initial("base link in the world", "m")
+    initial_orientation: tuple[float, ...] = _orientation("quaternion x, y, z, w")
+    initial_joint_positions: tuple[float, ...] = _initial(
+        "by joint order of the URDF; []: zero", "m or rad", (), length=None
     )
-    initial_orientation: tuple[float, ...] = parameter(
-        (0.0, 0.0, 0.0, 1.0), "quaternion x, y, z, w", length=4
+    initial_joint_velocities: tuple[float, ...] = _initial(
+        "likewise, under efforts; []: zero", "m/s or rad/s", (), length=None
     )
-    initial_joint_positions: tuple[float, ...] = parameter(
-        (),
-        "by joint order of the URDF; []: zero",
-        unit="m or rad",
-        minimum=-_MAX_INITIAL_VALUE,
-        maximum=_MAX_INITIAL_VALUE,
+    initial_center_of_mass: tuple[float, ...] = _initial(
+        "of the system in the world, instead of initial_position", "m", ()
     )
-    initial_joint_velocities: tuple[float, ...] = parameter(
-        (),
-        "likewise, under efforts; []: zero",
-        unit="m/s or rad/s",
-        minimum=-_MAX_INITIAL_VALUE,
-        maximum=_MAX_INITIAL_VALUE,
-    )
-    initial_center_of_mass: tuple[float, ...] = parameter(
-        (),
-        "of the system in the world, instead of initial_position",
-        unit="m",
-        minimum=-_MAX_INITIAL_VALUE,
-        maximum=_MAX_INITIAL_VALUE,
-        length=3,
-    )
-    linear_momentum: tuple[float, ...] = parameter(
-        (0.0, 0.0, 0.0),
-        "total, in world",
-        unit="kg m/s",
-        minimum=-_MAX_INITIAL_VALUE,
-        maximum=_MAX_INITIAL_VALUE,
-        length=3,
-    )
-    angular_momentum: tuple[float, ...] = parameter(
-        (0.0, 0.0, 0.0),
-        "total, about the centre of mass, in world",
-        unit="kg m^2/s",
-        minimum=-_MAX_INITIAL_VALUE,
-        maximum=_MAX_INITIAL_VALUE,
-        length=3,
+    linear_momentum: tuple[float, ...] = _initial("total, in world", "kg m/s")
+    angular_momentum: tuple[float, ...] = _initial(
+        "total, about the centre of mass, in world", "kg m^2/s"
     )
     faults: tuple[str, ...] = parameter(
-        (),
-        "fault lines, e.g. 'joint_stuck joint_2 at 10 until 50'; see docs/faults.md",
-        texts=True,
+        (), "fault lines, e.g. 'joint_stuck joint_2 at 10 until 50'; see docs/faults.md", texts=True
     )
     disturbances: tuple[str, ...] = parameter(
         (),

@@ -23,7 +23,7 @@ from spacerobot_ros.model.compilation import dense_function
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.dynamics import solve_positive_definite
 from spacerobot_ros.model.space_robot import SpaceRobot
-from spacerobot_ros.parameters import configured, group, parameter, values_of
+from spacerobot_ros.parameters import configured, group, nonnegative, parameter, values_of
 
 FORCE_GAINS = "N/m or N m/rad", "N s/m or N m s/rad"
 """Units of Kp and Kd of laws that command forces."""
@@ -65,32 +65,29 @@ class GainPair:
     attitude of an end-effector is that of the last wrist link about its joint).
     """
 
-    kp: float = parameter(
+    kp: float = nonnegative(
         0.0,
         "proportional gain; 0: automatic, by masses and control period. N/m or N m/rad with "
         "laws that command forces (transposed_jacobian), "
         "1/s^2 with laws that command accelerations (model_based, computed_torque)",
-        unit="by law",
-        minimum=0.0,
+        "by law",
         maximum=1e9,
         read_only=False,
     )
-    kd: float = parameter(
+    kd: float = nonnegative(
         0.0,
         "derivative gain; 0: automatic, by masses and control period. N s/m or N m s/rad "
         "with laws that command forces (transposed_jacobian), "
         "1/s with laws that command accelerations (model_based, computed_torque)",
-        unit="by law",
-        minimum=0.0,
+        "by law",
         maximum=1e9,
         read_only=False,
     )
-    ki: float = parameter(
+    ki: float = nonnegative(
         0.0,
         "integral gain, against constant disturbances; 0: none. N/(m s) or N m/(rad s) with laws "
         "that command forces, 1/s^3 with laws that command accelerations",
-        unit="by law",
-        minimum=0.0,
+        "by law",
         maximum=1e9,
         read_only=False,
     )
@@ -101,7 +98,7 @@ def _matrix_parameter(name: str) -> Any:
         (),
         f"matrix {name} of all outputs, row by row in the order of the statuses' errors, symmetric "
         f"and positive definite, in place of the {name.lower()} of the groups; []: those",
-        unit="by law",
+        "by law",
         maximum=1e9,
         minimum=-1e9,
         read_only=False,

@@ -15,25 +15,20 @@ from spacerobot_ros.control.laws.law import ACCELERATION_GAINS, ControlLaw, LawO
 from spacerobot_ros.control.state import Actuation, Reference
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.dynamics import solve_positive_definite
-from spacerobot_ros.parameters import parameter
+from spacerobot_ros.parameters import nonnegative
 
 
 @dataclass(frozen=True)
 class ModelBasedOptions(LawOptions):
     """The options of ``model_based``."""
 
-    null_space_damping: float = parameter(
-        1.0,
-        "decay rate of joint motion that moves no output",
-        unit="1/s",
-        minimum=0.0,
-        maximum=1000000000.0,
+    null_space_damping: float = nonnegative(
+        1.0, "decay rate of joint motion that moves no output", "1/s", maximum=1000000000.0
     )
-    posture_stiffness: float = parameter(
+    posture_stiffness: float = nonnegative(
         0.0,
         "pull of joints that are no outputs to the joint reference, as far as it moves no output",
-        unit="1/s^2",
-        minimum=0.0,
+        "1/s^2",
         maximum=1000000000.0,
     )
 

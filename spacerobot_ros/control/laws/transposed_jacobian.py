@@ -10,18 +10,17 @@ import casadi as ca
 import numpy.typing as npt
 
 from spacerobot_ros.control.laws.law import FORCE_GAINS, ControlLaw, LawOptions
-from spacerobot_ros.parameters import parameter
+from spacerobot_ros.parameters import nonnegative
 
 
 @dataclass(frozen=True)
 class TransposedJacobianOptions(LawOptions):
     """The options of ``transposed_jacobian``."""
 
-    joint_damping: float = parameter(
+    joint_damping: float = nonnegative(
         0.0,
         "viscous friction by joint efforts; damps motion that moves no output",
-        unit="N m s/rad",
-        minimum=0.0,
+        "N m s/rad",
         maximum=1000000000.0,
     )
 

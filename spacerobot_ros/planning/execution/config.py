@@ -9,7 +9,7 @@ from typing import Any
 from spacerobot_ros.model.description import DEFAULT_END_EFFECTOR, RobotDescription
 from spacerobot_ros.model.shared_parameters import DEFAULT_POSITION_TOLERANCE, CommanderConfig
 from spacerobot_ros.model.srdf import with_srdf
-from spacerobot_ros.parameters import parameter, registered
+from spacerobot_ros.parameters import nonnegative, parameter, registered
 from spacerobot_ros.planning.core.clearance import DEFAULT_CLEARANCE
 from spacerobot_ros.planning.core.goal import Tolerance
 from spacerobot_ros.planning.methods.optimal import OptimalGait
@@ -24,9 +24,7 @@ class PlannerConfig(CommanderConfig):
     """Parameters of planning, of tracking schedules, and of corrections."""
 
     method: str = parameter("auto", "gait method", choices=METHODS)
-    integration_step: float = parameter(
-        0.01, "longest step of the prediction", unit="s", minimum=1e-06
-    )
+    integration_step: float = parameter(0.01, "longest step of the prediction", "s", minimum=1e-06)
     end_effectors: tuple[str, ...] = parameter(
         (),
         "links with goals on NAME/goal_pose and paths on NAME/path, in addition to the link "
@@ -43,70 +41,59 @@ class PlannerConfig(CommanderConfig):
         "joint_trajectory_controller/follow_joint_trajectory",
         "name of the FollowJointTrajectory action to which `output` trajectory sends schedules",
     )
-    clearance: float = parameter(
+    clearance: float = nonnegative(
         DEFAULT_CLEARANCE,
         "smallest distance that plans keep between links that no joint connects; 0 disables "
         "collision checks",
-        unit="m",
-        minimum=0.0,
+        "m",
         maximum=1000.0,
     )
     srdf: str = parameter(
-        "",
-        "SRDF file with pairs of links that are not checked; '': NAME.srdf beside the URDF",
+        "", "SRDF file with pairs of links that are not checked; '': NAME.srdf beside the URDF"
     )
-    max_corrections: int = parameter(
-        3, "new plans after the first", minimum=0, maximum=1000, read_only=False
+    max_corrections: int = nonnegative(
+        3, "new plans after the first", maximum=1000, read_only=False
     )
     abort_time: float = parameter(
         1.0,
         "duration of the braking along the planned path, after ~/abort or for another goal",
-        unit="s",
+        "s",
         minimum=0.01,
         maximum=1000.0,
     )
     twist_timeout: float = parameter(
         0.5,
         "simulated time without a twist on NAME/twist after which the joints brake",
-        unit="s",
+        "s",
         minimum=0.001,
         maximum=1000.0,
     )
-    takeover_time: float = parameter(
+    takeover_time: float = nonnegative(
         1.0,
         "time along the present schedule before a plan for another goal takes over in motion, if "
         "the method supports it; 0: the joints brake first",
-        unit="s",
-        minimum=0.0,
+        "s",
         maximum=1000.0,
     )
     replan_period: float = parameter(
         -1.0,
         "period of planning the remaining motion again without a stop, if the method supports it; "
         "0: never, -1: 2 s with plan_in_background, else never",
-        unit="s",
+        "s",
         minimum=-1.0,
         maximum=1e6,
     )
-    drift_position: float = parameter(
+    drift_position: float = nonnegative(
         0.0,
         "tracking error of the base beyond which the remaining motion is planned again; 0: any",
-        unit="m",
-        minimum=0.0,
+        "m",
     )
-    drift_attitude: float = parameter(0.0, "likewise", unit="rad", minimum=0.0)
-    shape_gain: float = parameter(
-        2.0,
-        "feedback gain on joint positions while tracking",
-        unit="1/s",
-        minimum=0.0,
-        maximum=1000.0,
+    drift_attitude: float = nonnegative(0.0, "likewise", "rad")
+    shape_gain: float = nonnegative(
+        2.0, "feedback gain on joint positions while tracking", "1/s", maximum=1000.0
     )
-    shape_deadband: float = parameter(
-        0.0,
-        "joint position errors up to this are not fed back, as noise",
-        unit="m or rad",
-        minimum=0.0,
+    shape_deadband: float = nonnegative(
+        0.0, "joint position errors up to this are not fed back, as noise", "m or rad"
     )
     averaging: int = parameter(
         1,
@@ -114,16 +101,12 @@ class PlannerConfig(CommanderConfig):
         minimum=1,
         maximum=1000000.0,
     )
-    rest_tolerance: float = parameter(
-        0.0,
-        "measured rates up to this count as rest; 0: none",
-        unit="m/s or rad/s",
-        minimum=0.0,
+    rest_tolerance: float = nonnegative(
+        0.0, "measured rates up to this count as rest; 0: none", "m/s or rad/s"
     )
-    stuck_ticks: int = parameter(
+    stuck_ticks: int = nonnegative(
         40,
         "ticks of commanded motion after which a joint that does not follow is stuck; 0: never",
-        minimum=0,
         maximum=1000000.0,
     )
     options: Mapping[str, Any] = registered(METHODS)

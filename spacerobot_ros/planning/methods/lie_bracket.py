@@ -26,7 +26,7 @@ from spacerobot_ros.model.rotations import (
     quaternion_multiply,
     rotvec_from_quaternion,
 )
-from spacerobot_ros.parameters import parameter
+from spacerobot_ros.parameters import nonnegative, parameter
 from spacerobot_ros.planning.core.cancellation import NEVER, Cancellation
 from spacerobot_ros.planning.core.controllability import (
     MAX_CONDITION,
@@ -57,23 +57,17 @@ class LieBracketOptions:
     """The options of ``lie_bracket``."""
 
     t1: float = parameter(
-        100.0,
-        "duration of step 2, the slide to the final shape",
-        unit="s",
-        minimum=1e-3,
-        maximum=1e9,
+        100.0, "duration of step 2, the slide to the final shape", "s", minimum=1e-3, maximum=1e9
     )
     n1: int = parameter(
         10, "periods of the sin^2 velocity profile in step 2", minimum=1, maximum=10000
     )
     cycle_period: float = parameter(
-        3.0, "duration of one cycle of step 3, (tf - t1) / n", unit="s", minimum=1e-3, maximum=1e9
+        3.0, "duration of one cycle of step 3, (tf - t1) / n", "s", minimum=1e-3, maximum=1e9
     )
-    cycles: int = parameter(
-        0, "n, the number of cycles of step 3; 0: by loop_area", minimum=0, maximum=1e8
-    )
+    cycles: int = nonnegative(0, "n, the number of cycles of step 3; 0: by loop_area", maximum=1e8)
     loop_area: float = parameter(
-        0.04, "|alpha| / n when cycles is 0", unit="m^2", minimum=1e-9, maximum=1e9
+        0.04, "|alpha| / n when cycles is 0", "m^2", minimum=1e-9, maximum=1e9
     )
     a22_ratio: float = parameter(
         1.0, "free amplitude a22 over sqrt(|a22 b12|); 1: balanced", minimum=1e-3, maximum=1e9
@@ -82,7 +76,7 @@ class LieBracketOptions:
         1.0, "a31 over sqrt(|a31 (b21, b11)|); 1: balanced", minimum=1e-3, maximum=1e9
     )
     longest: float = parameter(
-        100000.0, "longest permitted manoeuvre", unit="s", minimum=1.0, maximum=1e9
+        100000.0, "longest permitted manoeuvre", "s", minimum=1.0, maximum=1e9
     )
 
 
@@ -265,10 +259,7 @@ class LieBracketGait(GaitMethod):
         least: int,
         enough: float,
     ) -> _TurnStep:
-        """Add the first-order error to the wanted turn until it is below ``enough`` (rad).
-
-        The number of cycles is chosen once, from ``least`` up, so that the answer is smooth.
-        """
+        """Add the first-order error to the wanted turn until it is below ``enough`` (rad)."""
         omega_d, best = wanted, None
         target = quaternion_from_rotvec(wanted)
         for _ in range(_MAX_REFINEMENTS):
@@ -287,10 +278,7 @@ class LieBracketGait(GaitMethod):
         return best
 
     def _best_triple(self, z_f: Array) -> tuple[tuple[int, int, int], Array]:
-        """Return the three sliders with the best conditioned brackets at zf, and these brackets.
-
-        The columns of the brackets (3, 3) are w12, w23 and w13.
-        """
+        """Return the three sliders with the best conditioned brackets at zf, and these brackets."""
         triple, M = best_triple(self.robot.curvature(z_f)[3:], self.sliders)
         # M holds the curvature of the pairs 12, 23 and 31; the brackets are its negative.
         brackets = M * np.array([-1.0, -1.0, 1.0])

@@ -34,7 +34,7 @@ from spacerobot_ros.model.rotations import (
     quaternion_multiply,
     rotvec_from_quaternion,
 )
-from spacerobot_ros.parameters import parameter
+from spacerobot_ros.parameters import nonnegative, parameter
 from spacerobot_ros.planning.core.cancellation import NEVER, Cancellation
 from spacerobot_ros.planning.core.controllability import sample_shapes
 from spacerobot_ros.planning.core.goal import (
@@ -96,33 +96,30 @@ _LIMIT_ROUNDING = 1e-9
 class ResolvedRateOptions(MotionOptions):
     """The options of ``resolved_rate``."""
 
-    keep_attitude: int = parameter(
+    keep_attitude: int = nonnegative(
         0,
         "1: the base keeps its attitude (reaction null space), 0: its attitude is free",
-        minimum=0,
         maximum=1,
     )
     waypoints: tuple[float, ...] = parameter(
         (),
         "positions x, y, z in the world, one after the other, of a smooth path of the "
         "end-effector to its goal; []: a straight line",
-        unit="m",
+        "m",
         minimum=-1e9,
         maximum=1e9,
     )
-    as_far_as_possible: int = parameter(
+    as_far_as_possible: int = nonnegative(
         0,
         "if a line meets a singularity, a joint limit or a contact: 1: stop shortly before, 0: "
         "refuse the goal",
-        minimum=0,
         maximum=1,
     )
-    corner_tolerance: float = parameter(
+    corner_tolerance: float = nonnegative(
         0.005,
         "largest deviation at the rounded corners of a path, in m and in as many rad; 0: stop at "
         "every corner",
-        unit="m",
-        minimum=0.0,
+        "m",
         maximum=1000.0,
     )
 
@@ -270,11 +267,7 @@ class _LinkPaths:
         return self.joint_scales * least, float(np.linalg.norm(miss))
 
     def tangent(self, q: Array, X: Array, share: float) -> tuple[Array, Array, float]:
-        """Return the path's tangent: (n,) of the shape, (4,) of the turn, and the progress.
-
-        It is of unit length with the joints scaled, the shortest way of the joints, and makes a
-        progress that is never negative.
-        """
+        """Return the path's tangent: (n,) of the shape, (4,) of the turn, and the progress."""
         M = np.column_stack(
             [self.scaled_jacobian(q, X), -self._scaled_derivative(share) / self.length]
         )
@@ -592,10 +585,7 @@ class ResolvedRateGait(GaitMethod):
         return self._schedule(request.state, goal, np.vstack(positions), notes, progress)
 
     def _route(self, request: PlanRequest, tolerance: float) -> PosePath:
-        """Return the path of a request in W, from where the end-effector is.
-
-        PlanningError if the goal has several end-effectors, or its path too many corners.
-        """
+        """Return the path of a request in W, from where the end-effector is."""
         state, goal = request.state, request.goal
         if len(goal.end_effectors) > 1:
             raise PlanningError(
@@ -625,10 +615,7 @@ class ResolvedRateGait(GaitMethod):
     def _trace_without_contact(
         self, lines: _LinkPaths, state: RobotState, cancellation: Cancellation
     ) -> tuple[Array, Array, Notes]:
-        """Return shapes (N + 1, n) and shares of the lines (N + 1,) at ticks, with notes.
-
-        PlanningError if the lines meet a singularity or a limit; :meth:`plan` says when they do.
-        """
+        """Return shapes (N + 1, n) and shares of the lines (N + 1,) at ticks, with notes."""
         path = trace_joint_path(lines, state.q, cancellation)
         notes: Notes = {}
         obstacle = self._find_obstacle(lines, path)
@@ -827,10 +814,7 @@ class ResolvedRateGait(GaitMethod):
         )
 
     def _held_commands(self, lines: _LinkPaths, state: RobotState, timed: _TimedPath) -> Array:
-        """Return the shapes (N + 1, n) at ticks, with the end-effectors on their lines at each.
-
-        PlanningError if no number of ticks keeps the limits of the joints.
-        """
+        """Return the shapes (N + 1, n) at ticks, with the end-effectors on their lines at each."""
         period = self.control_period
         ticks = max(1, math.ceil(timed.time[-1] / period - 1e-9))
         for _ in range(_MAX_CORRECTION_ITERATIONS):

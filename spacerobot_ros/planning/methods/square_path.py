@@ -29,7 +29,7 @@ from spacerobot_ros.errors import ParameterError, PlanningError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.rotations import quaternion_inverse, quaternion_multiply, swing_angle
-from spacerobot_ros.parameters import parameter
+from spacerobot_ros.parameters import nonnegative, parameter
 from spacerobot_ros.planning.core.cancellation import NEVER, Cancellation
 from spacerobot_ros.planning.core.controllability import tilted_goal_error
 from spacerobot_ros.planning.core.goal import Controlled, PoseError
@@ -66,37 +66,33 @@ class SquarePathOptions:
     """The options of ``square_path``."""
 
     t1: float = parameter(
-        8.0, "end of step 1, the motion to the final shape", unit="s", minimum=1e-3, maximum=1e9
+        8.0, "end of step 1, the motion to the final shape", "s", minimum=1e-3, maximum=1e9
     )
     t2: float = parameter(
-        12.0, "end of step 2, the motion to the square", unit="s", minimum=1e-3, maximum=1e9
+        12.0, "end of step 2, the motion to the square", "s", minimum=1e-3, maximum=1e9
     )
     t3: float = parameter(
         20.0,
         "end of step 3, one loop; more loops take as long each",
-        unit="s",
+        "s",
         minimum=1e-3,
         maximum=1e9,
     )
-    t4: float = parameter(
-        24.0, "end of step 4, the motion back", unit="s", minimum=1e-3, maximum=1e9
-    )
+    t4: float = parameter(24.0, "end of step 4, the motion back", "s", minimum=1e-3, maximum=1e9)
     most_loops: int = parameter(20, "largest number of loops", minimum=1, maximum=1000000)
-    given_centre: int = parameter(
-        0, "1: squares around (centre_1, centre_2); 0: the best centre", minimum=0, maximum=1
+    given_centre: int = nonnegative(
+        0, "1: squares around (centre_1, centre_2); 0: the best centre", maximum=1
     )
     centre_1: float = parameter(
-        0.0, "first coordinate of a given centre", unit="rad", minimum=-1000.0, maximum=1000.0
+        0.0, "first coordinate of a given centre", "rad", minimum=-1000.0, maximum=1000.0
     )
     centre_2: float = parameter(
-        0.0, "second coordinate of a given centre", unit="rad", minimum=-1000.0, maximum=1000.0
+        0.0, "second coordinate of a given centre", "rad", minimum=-1000.0, maximum=1000.0
     )
-    check_position: int = parameter(
-        0, "1: refuse goals whose position differs from the predicted one", minimum=0, maximum=1
+    check_position: int = nonnegative(
+        0, "1: refuse goals whose position differs from the predicted one", maximum=1
     )
-    longest: float = parameter(
-        3600.0, "longest permitted manoeuvre", unit="s", minimum=1.0, maximum=1e9
-    )
+    longest: float = parameter(3600.0, "longest permitted manoeuvre", "s", minimum=1.0, maximum=1e9)
 
 
 class SquarePathGait(GaitMethod):
@@ -407,10 +403,7 @@ class SquareSearch:
         return _SquareFamily(pair, plane, centres, sides, plane.turns_by_squares(centres, sides))
 
     def _solve_for_side(self, candidates: _SquareFamily, wanted: float) -> tuple[int, float]:
-        """Return the row of the smallest square that turns the base far enough, and its ``z*``.
-
-        ``wanted`` is the turn of one loop in either sense, rad, at most the largest there is.
-        """
+        """Return the row of the smallest square that turns the base far enough, and its ``z*``."""
         # The slack keeps rounding from excluding the largest square.
         enough = np.abs(candidates.geometric_phases) >= min(wanted, candidates.largest)
         row = int(np.argmax(enough))
