@@ -195,11 +195,7 @@ def _loaded(point: EntryPoint) -> Any:
 
 
 def _module_of(file: Path) -> ModuleType:
-    """Import a file, once, under a name of its own, so that its objects can be pickled.
-
-    A file may import what loads a registry: that one finds the file half imported, and gets its
-    classes at the end.
-    """
+    """Import a file, once, under a name of its own, so that its objects can be pickled."""
     name = f"spacerobot_plugin_{file.stem}_{hashlib.sha256(str(file).encode()).hexdigest()[:8]}"
     if name in sys.modules:
         return sys.modules[name]

@@ -612,10 +612,7 @@ def _with_files_beside(path: Path, values: dict[str, Any]) -> dict[str, Any]:
 def _with_world(
     in_file: dict[str, dict[str, Any]], world: str, path: Path
 ) -> dict[str, dict[str, Any]]:
-    """Return the parameters of a scenario file with its obstacles for the plant and the planner.
-
-    ParameterError if there is no such file, or it is refused.
-    """
+    """Return the parameters of a scenario file with its obstacles for the plant and the planner."""
     try:
         file = (path.parent / world).resolve()
         load_world(file)

@@ -409,8 +409,6 @@ _NOT_WANTED = -1
 
 class _Wanted:
     """The messages of a file to read: topics, whose numbers are their places in a list, and times.
-
-    ``numbers`` has the number of the topic of every channel; negative: it is not wanted.
     """
 
     def __init__(
@@ -480,10 +478,7 @@ def _messages_in(data: bytes, place: int, wanted: _Wanted) -> MessageBlock:
 
 
 class _Section(NamedTuple):
-    """A part of a file: a chunk by its index, or all of a file that has no index of chunks.
-
-    Sections are ordered by their earliest log times, those of one time as they were written.
-    """
+    """A part of a file: a chunk by its index, or all of a file that has no index of chunks."""
 
     start_ns: int
     written: tuple[int, int]

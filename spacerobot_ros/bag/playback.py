@@ -331,10 +331,7 @@ class Playback:
         return message
 
     def _last_messages(self, time_ns: int, since_ns: int, until_ns: int) -> list[ReplayMessage]:
-        """Return the last message of each topic, by age, as due at a time.
-
-        They are those of latched topics before that time, and of others in a span.
-        """
+        """Return the last message of each topic, by age, as due at a time."""
         latched = [topic.name for topic in self.topics if topic.latched]
         last: dict[str, ReplayMessage] = {}
         spans = (latched, 0, time_ns - 1), (self._names, since_ns, until_ns)

@@ -150,10 +150,7 @@ class Dataset:
             )
 
     def _write_description(self, campaign: Campaign, flights: int) -> None:
-        """Write the files that describe the campaign; the last one marks the folder as complete.
-
-        ``flights``: the largest number of flights that was ever asked for.
-        """
+        """Write the files that describe the campaign; the last one marks the folder as complete."""
         section = {**campaign.section, "scenario": _SCENARIO_FILE, "flights": flights}
         for key in ("set", "method"):
             section.pop(key, None)

@@ -81,11 +81,7 @@ class Draws:
         return self._made[place]
 
     def _draw_block(self, first: int) -> list[Draw]:
-        """Return the draws of a block, whose values are computed together.
-
-        The block is whole even where the campaign ends within it: values do not depend on the
-        number of flights.
-        """
+        """Return the draws of a block, whose values are computed together."""
         campaign = self._campaign
         numbers = range(first, first + _BLOCK_SIZE)
         seeds = [np.random.SeedSequence(campaign.seed, spawn_key=(number,)) for number in numbers]

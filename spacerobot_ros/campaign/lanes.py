@@ -542,10 +542,7 @@ def _batch_of_flights(
 def _end_effector_error(
     robot: SpaceRobot, flight: DrawnFlight, q: Array, pose: Array
 ) -> PoseError | None:
-    """Return the error of the end-effector to its goal; None without one of them.
-
-    ``q`` (n,) are the joint positions, ``pose`` (7,) is the pose of the base in W.
-    """
+    """Return the error of the end-effector to its goal; None without one of them."""
     goal = flight.scenario.end_effector_goal
     link = robot.description.end_effector(flight.scenario.plant.end_effector_frame)
     if goal is None or not link:

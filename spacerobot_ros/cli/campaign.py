@@ -146,10 +146,7 @@ def rerun(folder: Path, number: int, bag: Path | None) -> None:
 def _fly_campaign(
     file: Path, flights: int | None, engine: str, cluster: Cluster, out: Path | None, name: str = ""
 ) -> tuple[Path, Progress]:
-    """Fly a campaign, print its progress, and return its folder and its end.
-
-    ``name`` replaces its name.
-    """
+    """Fly a campaign, print its progress, and return its folder and its end."""
     from spacerobot_ros.campaign.config import load_campaign
     from spacerobot_ros.campaign.running import run_campaign
     from spacerobot_ros.termination import graceful_shutdown

@@ -30,10 +30,7 @@ else:  # click.Choice is generic only in newer versions of click.
 
 
 class _TextPath(click.Path):
-    """Path option that refuses names that are not UTF-8, which messages and bags cannot hold.
-
-    The name ``-``, which stands for standard output elsewhere, is refused too, but for ``--json``.
-    """
+    """Path option that refuses names that are not UTF-8, which messages and bags cannot hold."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         if str(value) == "-" and not (param and "--json" in param.opts):

@@ -315,8 +315,6 @@ class CoordinatedController:
         self, before: Reference, base: PoseReference, state: ControlState
     ) -> PoseReference | None:
         """Return the pose that an end-effector has with the base in a goal, and the arm as before.
-
-        A base whose position is not controlled turns about the system's centre of mass.
         """
         carrier, carried = before.base, before.end_effector
         if carrier is None or carried is None:

@@ -59,15 +59,15 @@ class MotionLimits:
         A limit is not positive; the message names it.
     """
 
-    speed: float = parameter(0.1, "largest speed of a reference", unit="m/s", minimum=1e-06)
+    speed: float = parameter(0.1, "largest speed of a reference", "m/s", minimum=1e-06)
     acceleration: float = parameter(
-        0.02, "largest acceleration of a reference", unit="m/s^2", minimum=1e-06
+        0.02, "largest acceleration of a reference", "m/s^2", minimum=1e-06
     )
     angular_speed: float = parameter(
-        0.1, "largest angular speed of a reference", unit="rad/s", minimum=1e-06
+        0.1, "largest angular speed of a reference", "rad/s", minimum=1e-06
     )
     angular_acceleration: float = parameter(
-        0.02, "largest angular acceleration of a reference", unit="rad/s^2", minimum=1e-06
+        0.02, "largest angular acceleration of a reference", "rad/s^2", minimum=1e-06
     )
     joint_speed: float = 0.1
     joint_acceleration: float = 0.02
@@ -358,8 +358,6 @@ def _affordable_push_share(wanted: Array, pushed: Array, effort: Array) -> float
 
 def _joint_dynamics(robot: SpaceRobot) -> ca.Function:
     """Return ``(q, omega_WB_B, qdot) -> (Js, Fs, G)``, which do not depend on the base's velocity.
-
-    It is not compiled: it is called only if a joint is fast, and takes microseconds.
     """
     q, qdot = ca.SX.sym("q", robot.n), ca.SX.sym("qdot", robot.n)
     omega = ca.SX.sym("omega", 3)

@@ -232,10 +232,7 @@ class RelativePath:
 
 
 def _quintic(start: Sequence[Array], end: Sequence[Array], T: float) -> Array:
-    """Return the coefficients (6, m) of polynomials of fifth order in time.
-
-    They lead from one value, rate and acceleration, (m,) each, to another within ``T`` s.
-    """
+    """Return the coefficients (6, m) of polynomials of fifth order in time."""
     (y, v, a), (y_1, v_1, a_1) = (
         (value, rate * T, acceleration * T**2) for value, rate, acceleration in (start, end)
     )

@@ -583,11 +583,7 @@ def recorded_actuation(robot: RecordedRobot) -> str:
 
 
 def _recorded_values(kind: type[Any], texts: Mapping[str, str]) -> dict[str, Any]:
-    """Return the recorded parameters of a node that this version can read.
-
-    Others belong to every node, to another version, or to a method of one's own that is not
-    imported here, whose name is none of the choices: they stop no report.
-    """
+    """Return the recorded parameters of a node that this version can read."""
     known = {parameter.name: parameter for parameter in declared(kind)}
     values = known_values(kind, {name: _parse_json(text) for name, text in texts.items()})
     return {

@@ -322,10 +322,7 @@ class _PublishedTopic:
         return sum(states[name].shape[1] for name in names) == self.values.shape[1]
 
     def expected(self, states: dict[str, Floats], rows: NDArray[np.int64]) -> Floats:
-        """Return the values of the re-simulation for each message, shaped as those of the bag.
-
-        A quaternion gets the sign of the recorded one: both signs are the same attitude.
-        """
+        """Return the values of the re-simulation for each message, shaped as those of the bag."""
         expected = np.hstack([states[each.quantity][rows] for each in self.topic.state])
         start = 0
         for each in self.topic.state:
@@ -374,10 +371,7 @@ def _published_topics(flight: _RecordedPlant) -> list[_PublishedTopic]:
 def _missing_states(
     flight: _RecordedPlant, published: list[_PublishedTopic], resimulation: _Resimulation
 ) -> str:
-    """Return a message about states that the bag lacks; empty for none.
-
-    Every command answers a state, and a recorder counts messages written and messages lost.
-    """
+    """Return a message about states that the bag lacks; empty for none."""
     recorded = flight.recorded
     counts = recorded.metadata.get("recorder", {})
     written, lost = (_parse_count(counts.get(name)) for name in ("messages", "messages_lost"))
@@ -477,11 +471,7 @@ def _resimulate(
     *,
     mujoco: bool,
 ) -> _Resimulation:
-    """Step the plant of a flight from tick ``first`` to tick ``last``, or as far as it goes.
-
-    ``rates`` (n,) are the joint velocities in the first state. ``mujoco``: MuJoCo flies beside it.
-    RecordingError where sensors err, whose noise is only known from the very first state on.
-    """
+    """Step the plant of a flight from tick ``first`` to tick ``last``, or as far as it goes."""
     plant = build_plant(flight.robot, flight.config, initial)
     state = ReportedState(plant, flight.config)
     commands = CommandValidator(plant, flight.config)

@@ -194,10 +194,7 @@ class _Skeleton:
         ]
 
     def points(self, poses: Array, q: Array) -> Array:
-        """Return the points (K, 2 L, 3) in the world, m: the frames, then the centres of mass.
-
-        ``poses`` (K, 7) are those of the base in the world, ``q`` (K, n) the joint positions.
-        """
+        """Return the points (K, 2 L, 3) in the world, m: the frames, then the centres of mass."""
         R_WL, r_WL = self._kinematics.poses_in_world(poses, q)
         centers = r_WL + np.einsum("klij,lj->kli", R_WL, self._com)
         return np.concatenate([r_WL, centers], axis=1)

@@ -315,10 +315,7 @@ def _parsed_within_limits(type_name: str, text: bytes) -> Any:
 
 
 def _count_fields(types: Fields, name: str, counts: dict[str, int], depth: int = 0) -> int:
-    """Return the number of fields of a type; ValueError if too large, unknown or recursive.
-
-    ``counts`` has the known numbers of other types.
-    """
+    """Return the number of fields of a type; ValueError if too large, unknown or recursive."""
     if name in counts:
         return counts[name]
     if name not in types:

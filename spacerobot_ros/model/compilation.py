@@ -216,10 +216,7 @@ def load_library(
 
 
 def _run_compiler(command: Sequence[str], folder: Path) -> None:
-    """Run the compiler in the contexts of :data:`compilation_contexts`.
-
-    NoLibraryError if it fails, OSError if it cannot be started.
-    """
+    """Run the compiler in the contexts of :data:`compilation_contexts`."""
     # The compiler's temporary files are deleted with the folder, also if it is killed.
     environment = {**os.environ, "TMPDIR": str(folder)}
     options = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "env": environment}

@@ -496,11 +496,7 @@ class ThrusterModulator:
         return on_time
 
     def _pulses(self, levels: Array) -> tuple[Array, Array]:
-        """Return the on-times (m,) of a period, and the parts of ``levels`` that pulses take, s.
-
-        A closed thruster opens if its level is a whole shortest pulse; an open one stays open as
-        long as it has a level.
-        """
+        """Return the on-times (m,) of a period, and the parts of ``levels`` that pulses take, s."""
         h, remaining = self._control_period, self._remaining
         levels = np.where(levels > _ROUNDING * h, levels, 0.0)
         whole = (levels > 0.0) & (levels >= (1.0 - _ROUNDING) * self._shortest)

@@ -718,11 +718,7 @@ _JOINT_TYPES = tuple(kind.value for kind in JointKind)
 
 
 def _checked_root(text: str) -> Element:
-    """Return the root of a URDF text, reduced to the :data:`_ELEMENTS_READ`.
-
-    RobotDescriptionError if the text is not XML or not URDF, or if an attribute or element is
-    missing, given twice, or not a number.
-    """
+    """Return the root of a URDF text, reduced to the :data:`_ELEMENTS_READ`."""
     try:
         root = fromstring(text)
     except (ParseError, ValueError) as error:

@@ -196,10 +196,7 @@ class PlannerNode(CommanderNode):
         return self._shape
 
     def _on_goal_shape(self, message: JointState) -> None:
-        """Keep the joint positions in which later goals must end, for methods that support them.
-
-        A message without joints removes the requirement.
-        """
+        """Keep the joint positions in which later goals must end, for methods that support them."""
         robot = self.commander.robot
         if robot is None:
             return

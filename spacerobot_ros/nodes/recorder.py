@@ -279,11 +279,7 @@ class RecorderNode(FlightNode):
     # -- subscriptions ------------------------------------------------------------------------
 
     def _is_chosen(self, topic: str, type_name: str) -> bool:
-        """Whether a topic is recorded: one that is asked for, or else all of the stack.
-
-        A stack in a namespace has the topics in it and the shared ones. Only one clock
-        gives the times of a bag; those of other stacks would say nothing in it.
-        """
+        """Whether a topic is recorded: one that is asked for, or else all of the stack."""
         if self._chosen_topics:
             return topic in self._chosen_topics
         if topic in self._shared_topics:
@@ -530,10 +526,7 @@ def _recording_callback(
     clock: str = _CLOCK_TOPIC,
     listener: RawCallback | None = None,
 ) -> RawCallback:
-    """Return the callback of a topic's messages: the clock sets the time of all others.
-
-    ``listener`` is called after each message.
-    """
+    """Return the callback of a topic's messages: the clock sets the time of all others."""
     record, time_of = recording.record, stamps.time_ns
     urdf_name = f"{topic.strip('/').replace('/', '.')}.urdf"
 

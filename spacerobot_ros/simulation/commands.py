@@ -477,10 +477,7 @@ def _parse_latching_reasons(words: str) -> frozenset[Reason]:
 
 
 class _JointBrakes:
-    """Efforts that brake the joints of a plant: internal forces, which keep its momenta.
-
-    Reaction wheels continue spinning, because braking them would turn the base.
-    """
+    """Efforts that brake the joints of a plant: internal forces, which keep its momenta."""
 
     def __init__(self, plant: Plant, control_period: float) -> None:
         robot: SpaceRobot = plant.robot

@@ -437,10 +437,7 @@ def tick_function(
 
 
 def _effort_bounds(robot: SpaceRobot, qdot: ca.MX) -> tuple[ca.MX | Array, ca.MX | Array]:
-    """Return the least and the largest efforts (n,) of the motors.
-
-    The motor of a reaction wheel that turns at its largest rate makes it no faster.
-    """
+    """Return the least and the largest efforts (n,) of the motors."""
     limit, wheels = robot.effort_limit, robot.description.wheel_names
     if not wheels:
         return -limit, limit

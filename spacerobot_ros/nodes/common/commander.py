@@ -269,10 +269,7 @@ class CommanderNode(FlightNode):
         return None
 
     def _pose_of(self, frame: str) -> Array | None:
-        """Return the pose (7,) of a frame in the world, None if that is not known.
-
-        The robot's own frames are where they were measured last, the others where /tf had them.
-        """
+        """Return the pose (7,) of a frame in the world, None if that is not known."""
         own: dict[str, tuple[str, Array]] = {}
         robot, states = self.commander.robot, self.commander.states
         if robot is not None and states.odom and states.joints:

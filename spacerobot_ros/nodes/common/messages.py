@@ -168,10 +168,7 @@ def end_effector_goal(
 def _pose_of_frame(
     name: str, frame: str, what: str, pose_of: Callable[[str], Array | None]
 ) -> Array | None:
-    """Return the pose (7,) of a frame by its name in ``frame``; None: it is that frame.
-
-    PlanningError if it is not known; ``what`` is in it.
-    """
+    """Return the pose (7,) of a frame by its name in ``frame``; None: it is that frame."""
     given = name.removeprefix("/")
     if given in ("", frame):
         return None

@@ -59,10 +59,7 @@ def use_loopback_discovery() -> None:
 
 
 def _use_sockets_without_shared_memory() -> None:
-    """Send messages through sockets where shared memory is missing or full, and say why.
-
-    The middleware also falls back to sockets, but its error messages do not name the cause.
-    """
+    """Send messages through sockets where shared memory is missing or full, and say why."""
     if any(os.environ.get(name) for name in _TRANSPORT_CHOICES):
         return
     try:

@@ -317,15 +317,7 @@ class GaitMethod(ABC):
         return np.clip(wanted, robot.lower, robot.upper)
 
     def _clear_goal_shape(self, request: PlanRequest) -> Array | None:
-        """Return the goal shape (n,) as :meth:`goal_shape`, and refuse one in collision.
-
-        Raises
-        ------
-        UnreachableError
-            It is beyond the joint limits, or links come too near in it.
-        PlanningError
-            Links are too near at the start.
-        """
+        """Return the goal shape (n,) as :meth:`goal_shape`, and refuse one in collision."""
         shape = self.goal_shape(request.goal)
         if shape is not None and self.clearance is not None:
             # Where the base will be among obstacles depends on the motion.
@@ -358,9 +350,6 @@ class GaitMethod(ABC):
         self, start: RobotState, positions: Array, attitudes: Array | None = None
     ) -> BasePoses | None:
         """Return the poses of the base at the ticks of shapes (N + 1, n); None without obstacles.
-
-        ``start`` is a state of the same motion: that of the first shape, unless ``attitudes``
-        (N + 1, 4) are given.
         """
         if not self._has_obstacles:
             return None
@@ -376,11 +365,7 @@ class GaitMethod(ABC):
     def _too_near(
         self, positions: Array, base: BasePoses | None = None, *, at_ticks: bool = True
     ) -> str:
-        """Return the clause that says where links come too near; empty: nowhere.
-
-        ``positions`` (K, n) are shapes with straight lines in between, ``at_ticks`` or not.
-        Without poses of the ``base``, obstacles do not count.
-        """
+        """Return the clause that says where links come too near; empty: nowhere."""
         if self.clearance is None:
             return ""
         found = self.clearance.approaches(positions, base=base)

@@ -680,10 +680,7 @@ class Executive:
     # -- in motion: EXECUTING and BRAKING -----------------------------------------------------
 
     def _measure_in_motion(self, waiting: IdentifiedGoal, measured: MeasuredState) -> None:
-        """Plan for a new goal from the present state, or brake first if planning takes time.
-
-        A plan takes over in motion where the methods allow for it.
-        """
+        """Plan for a new goal from the present state, or brake first if planning takes time."""
         take_over = None
         if (
             self.phase is Phase.EXECUTING
@@ -776,10 +773,7 @@ class Executive:
         )
 
     def _replan_remaining(self, active: ActiveGoal, state: RobotState) -> None:
-        """Plan the remaining motion again from the present state, at most once a period.
-
-        (Shrinking horizon.) A motion that ends near enough to the goal is not planned again.
-        """
+        """Plan the remaining motion again from the present state, at most once a period."""
         state = self._tracker.path_check.average_pose(state)
         if self._stamp_ns < self._replan_ns or active.schedule.partial:
             return
@@ -989,11 +983,7 @@ class Executive:
         *,
         in_motion: bool = False,
     ) -> None:
-        """Track a schedule for the active goal, from the stamp of its first tick on.
-
-        ``remaining`` is the error to the goal at its start; ``in_motion``: it takes over from
-        another schedule.
-        """
+        """Track a schedule for the active goal, from the stamp of its first tick on."""
         active, config = self._active_goal, self.config
         assert active is not None
         event, start = Event.PLANNED, ""

@@ -382,10 +382,7 @@ class PlanningWorker:
         rates: Array | None = None,
     ) -> GaitSchedule:
         """Return one schedule: braking in ``shapes`` (K + 1, n), then a gait from rest, at which
-        wheels have ``rates`` (n,).
-
-        No joint velocity jumps. The pose of the base at rest is predicted.
-        """
+        wheels have ``rates`` (n,)."""
         state, period = request.state, self._config.control_period
         shapes[0] = state.q
         at_rest, positions, attitudes = self._predict_motion(state, shapes)
@@ -400,10 +397,7 @@ class PlanningWorker:
         return replace(gait, positions=np.vstack([shapes[:-1], gait.positions]), path=path)
 
     def _predict_motion(self, state: RobotState, shapes: Array) -> tuple[RobotState, Array, Array]:
-        """Return the state after shapes (K + 1, n) at ticks, and the base poses at the ticks.
-
-        The positions are (K + 1, 3), the attitudes (K + 1, 4).
-        """
+        """Return the state after shapes (K + 1, n) at ticks, and the base poses at the ticks."""
         config = self._config
         # Most manoeuvres have few ticks: compiling the step would take longer.
         robot = self._robot.interpreted

@@ -65,15 +65,15 @@ class AreaLoopOptions:
         0.15, "share of the remaining rotation that one cycle corrects", minimum=1e-3, maximum=1.0
     )
     edge_time: float = parameter(
-        4.0, "duration of an edge; slow joints take longer", unit="s", minimum=1e-3, maximum=1e9
+        4.0, "duration of an edge; slow joints take longer", "s", minimum=1e-3, maximum=1e9
     )
     largest_edge: float = parameter(
-        1.0, "longest edge of a loop", unit="m or rad", minimum=1e-3, maximum=10.0
+        1.0, "longest edge of a loop", "m or rad", minimum=1e-3, maximum=10.0
     )
     nominal: tuple[float, ...] = parameter(
         (),
         "nominal shape, all joints; []: the best",
-        unit="m or rad",
+        "m or rad",
         minimum=-1e6,
         maximum=1e6,
         of_joints=True,
@@ -88,7 +88,7 @@ class AreaLoopOptions:
         1000, "largest number of cycles for a goal", minimum=1, maximum=1000000
     )
     longest: float = parameter(
-        100000.0, "longest permitted manoeuvre", unit="s", minimum=1.0, maximum=1e9
+        100000.0, "longest permitted manoeuvre", "s", minimum=1.0, maximum=1e9
     )
 
 
@@ -304,11 +304,7 @@ class AreaLoopGait(GaitMethod):
     def _count_cycles_within_limits(
         self, missing: float, share: float, enough: float, flown: int, too_near: str = ""
     ) -> float:
-        """Return the expected number of cycles for the goal, with those that are ``flown``.
-
-        PlanningError if it is above ``most_cycles``; the message has the clause ``too_near`` on
-        larger loops.
-        """
+        """Return the expected number of cycles for the goal, with those that are ``flown``."""
         cycles = flown + self._count_cycles_left(missing, share, enough)
         most = self.options.most_cycles
         if cycles > most:
@@ -348,11 +344,7 @@ class AreaLoopGait(GaitMethod):
         raise PlanningError(f"Even in the smallest of {_MAX_SHRINKS} loops {too_near}.")
 
     def _count_cycles_left(self, missing: float, share: float, enough: float) -> float:
-        """Return the number of cycles left for a missing turn (rad), to first order.
-
-        While edges are as long as they may be, every cycle turns the base as far; then the
-        missing turn shrinks by the factor 1 - k.
-        """
+        """Return the number of cycles left for a missing turn (rad), to first order."""
         unbounded = missing * share
         many = (1.0 / share - 1.0) / self.options.k
         if unbounded <= enough:

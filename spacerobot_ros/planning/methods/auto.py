@@ -130,11 +130,7 @@ class AutoGait(GaitMethod):
         return refusal_of_all(message, of_goal)
 
     def _comparable_methods(self, refusals: dict[str, SpaceRobotError]) -> list[str]:
-        """Return the methods to compare; add the refusals of the other methods.
-
-        The others do not control a part of the pose that one of the methods controls. Methods that
-        plan for end-effectors alone are not compared.
-        """
+        """Return the methods to compare; add the refusals of the other methods."""
         pose: dict[str, frozenset[Controlled]] = {}
         for name in self._candidates:
             if name in refusals or not self._candidates[name].method.plans_for_base:

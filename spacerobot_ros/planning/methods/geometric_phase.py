@@ -245,10 +245,7 @@ def _harmonics(angles: Array) -> Array:
 
 
 def _integrate_legs(s: Callable[[Array], Array], starts: Array, ends: Array) -> Array:
-    """Return the integrals (L,) of ``-s' dpsi`` along straight legs from (L, n) to (L, n).
-
-    Gauss-Legendre quadrature in pieces of at most half a radian.
-    """
+    """Return the integrals (L,) of ``-s' dpsi`` along straight legs from (L, n) to (L, n)."""
     moves = ends - starts
     count = max(1, math.ceil(np.abs(moves).max(initial=0.0) / _MAX_PANEL_ANGLE))
     along = ((np.arange(count)[:, np.newaxis] + _GAUSS_NODES) / count).ravel()

@@ -147,10 +147,7 @@ class RemainingJointsGait(GaitMethod):
     def _methods_to_try(
         self, previous: GaitSchedule | None
     ) -> tuple[list[str], GaitSchedule | None]:
-        """Return the names of the methods to try, and the previous schedule for these methods.
-
-        Progress with other joints does not count, but for that on a given path.
-        """
+        """Return the names of the methods to try, and the previous schedule for these methods."""
         progress = None if previous is None else previous.progress
         if isinstance(progress, _RemainingProgress) and isinstance(progress.inner, PathProgress):
             progress = progress.inner
