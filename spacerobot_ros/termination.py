@@ -281,8 +281,8 @@ def end_child(process: subprocess.Popen[bytes], signals: Mapping[int, float]) ->
 def tool(words: Sequence[str], **options: Any) -> Iterator[subprocess.Popen[bytes]]:
     """Start a program, such as a compiler, and kill it with its children at the end of the context.
 
-    It is in a session of its own, which is also killed when this process is gone, and has no
-    input. A signal raises :class:`Terminated` in this context, whatever else it would request.
+    It is in a session of its own, and has no input. A signal raises :class:`Terminated` in this
+    context, whatever else it would request.
 
     Parameters
     ----------
@@ -294,16 +294,12 @@ def tool(words: Sequence[str], **options: Any) -> Iterator[subprocess.Popen[byte
     FileNotFoundError
         There is no such program.
     """
-    import shutil
     import subprocess
 
-    if shutil.which(words[0]) is None:
-        raise FileNotFoundError(f"There is no program '{words[0]}'.")
-    keeper = [sys.executable, "-I", "-S", "-c", _TOOL_KEEPER_SCRIPT, *words]
     with (
         _on_first_signal(None),
         subprocess.Popen(
-            keeper, stdin=subprocess.PIPE, start_new_session=True, **options
+            words, stdin=subprocess.DEVNULL, start_new_session=True, **options
         ) as process,
     ):
         try:
@@ -311,17 +307,3 @@ def tool(words: Sequence[str], **options: Any) -> Iterator[subprocess.Popen[byte
         finally:
             if process.poll() is None:
                 os.killpg(process.pid, signal.SIGKILL)
-
-
-_TOOL_KEEPER_SCRIPT = """
-import os, signal, subprocess, sys, threading
-def kill_with_parent():
-    os.read(0, 1)
-    os.killpg(0, signal.SIGKILL)
-threading.Thread(target=kill_with_parent, daemon=True).start()
-code = subprocess.call(sys.argv[1:], stdin=subprocess.DEVNULL)
-if code < 0:
-    os.kill(os.getpid(), -code)
-os._exit(code)
-"""
-"""Runs a program in its session, which is killed when the pipe to the parent breaks."""
