@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 from hypothesis import settings
-from support import lost_values
 from support.warm_python import WarmPython
 
 if TYPE_CHECKING:
@@ -36,8 +35,6 @@ if not _WORKER:
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
     for name in ("ROS_STATIC_PEERS", "ROS_LOCALHOST_ONLY", "ROS_DOMAIN_ID"):
         os.environ.pop(name, None)
-
-lost_values.apply()
 
 # The same examples in every run, on every machine.
 settings.register_profile("repeatable", derandomize=True, deadline=None, max_examples=40)

@@ -7,7 +7,6 @@ import itertools
 import os
 import re
 import shlex
-import shutil
 import subprocess
 from collections.abc import Iterator
 from pathlib import Path
@@ -15,14 +14,11 @@ from typing import Any
 
 import pytest
 import yaml
-from support.colcon import COLCON
-from support.interface_package import generators
 
 from docs_build.blocks import blocks
 from spacerobot_ros.nodes import NODE_TYPES
 from spacerobot_ros.parameters import declared
 from spacerobot_ros.resources import robot_file
-from spacerobot_ros.scenario import scenario_names
 from spacerobot_ros.topics import TOPICS
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -130,13 +126,6 @@ def test_what_the_container_builds_is_what_readers_build() -> None:
     assert "never" in (ROOT / "package.xml").read_text("utf-8")
 
 
-def test_packages_of_ros_are_those_that_the_page_of_ros2_control_names() -> None:
-    page = (ROOT / "docs" / "ros2_control.md").read_text("utf-8")
-    named = {word for _, line in shell_lines() for word in re.findall(r"ros-jazzy-[\w-]+", line)}
-    assert len(named) == 3
-    assert named <= set(re.findall(r"`(ros-jazzy-[\w-]+)`", page))
-
-
 def test_executables_and_their_parameters_exist() -> None:
     started = lines_with("ros2 run spacerobot_ros")
     assert {"README.md", "operation.md", "launch_stack", "control_by_manager"} <= {
@@ -153,28 +142,6 @@ def test_executables_and_their_parameters_exist() -> None:
         assert set(given) <= known, (where, words)
         if "robot" in given and not given["robot"].startswith("my"):
             assert robot_file(given["robot"]).is_file()
-
-
-def test_both_pairs_are_started_with_nothing_but_a_robot() -> None:
-    for page in (ROOT / "README.md", ROOT / "docs" / "operation.md"):
-        for commander in ("planner", "coordinated_control"):
-            plant, *others, goal = block_with(page, f"ros2 run spacerobot_ros {commander}")
-            assert re.fullmatch(r"ros2 run spacerobot_ros plant --ros-args -p robot:=\w+", plant)
-            recorder = "ros2 run spacerobot_ros recorder --ros-args -p bag:=flight.mcap"
-            assert others == [f"ros2 run spacerobot_ros {commander}", recorder]
-            assert "--once -w 2 --keep-alive 1 /goal_pose" in goal
-
-
-def test_the_launch_file_takes_the_arguments() -> None:
-    launched = lines_with("ros2 launch spacerobot_ros")
-    assert "launch_stack" in {where for where, _ in launched}
-    for where, words in launched:
-        text = (ROOT / "launch" / words[3]).read_text("utf-8")
-        for word in words[4:]:
-            name, value = word.split(":=")
-            assert f'    ("{name}", ' in text, (where, name)
-            if name == "scenario":
-                assert value in scenario_names()
 
 
 def test_what_is_published_can_be_and_arrives() -> None:
@@ -204,29 +171,3 @@ def fill(message: Any, values: dict[str, Any]) -> None:
             assert isinstance(present, list)
         else:
             setattr(message, name, type(present)(value))
-
-
-@pytest.mark.slow
-def test_the_lines_for_a_ros_machine_build_both_packages(tmp_path: Path) -> None:
-    """A plain `colcon build` in a workspace with the clone and the link, with ament_cmake."""
-    workspace, tools = tmp_path / "workspace", tmp_path / "tools"
-    left_out = shutil.ignore_patterns(".*", "out", "build", "*.egg-info", "__pycache__")
-    shutil.copytree(ROOT, workspace / "src" / "spacerobot_ros", ignore=left_out)
-    found = generators(tools, *COLCON, "colcon-cmake")
-    environment = {**found, "HOME": str(tmp_path), "PATH": f"{tools}/bin:{os.defpath}"}
-    link, _rosdep, *built = block_with(ROOT / "docs" / "operation.md", "colcon build")
-    imported = "from spacerobot_msgs.action import FlyTo; import spacerobot_ros as s"
-    lines = [link, "colcon list", *built, f'python3 -c "{imported}; print(s.__file__)"']
-    done = subprocess.run(
-        ["sh", "-e"],
-        input="\n".join(lines),
-        cwd=workspace,
-        env=environment,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 0, f"{done.stdout[-3000:]}\n{done.stderr[-3000:]}"
-    assert "spacerobot_msgs\tsrc/spacerobot_msgs\t(ros.ament_cmake)" in done.stdout
-    assert "spacerobot_ros\tsrc/spacerobot_ros\t(ros.ament_python)" in done.stdout
-    assert done.stdout.splitlines()[-1].startswith(str(workspace / "install"))

@@ -175,11 +175,6 @@ def _become(job: bytes, streams: list[int]) -> None:
         warnings.filterwarnings(action, message, kind)  # type: ignore[arg-type]
     # What runs by its name has been imported by another before.
     warnings.filterwarnings("ignore", category=RuntimeWarning, module="runpy")
-    if "SPACEROBOT_TEST_LOSS" in os.environ or "SPACEROBOT_TEST_USES" in os.environ:
-        sys.path.append(os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
-        from support import lost_values
-
-        lost_values.apply()
     _job.extend(words)
 
 
