@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
+from builtin_interfaces.msg import Time
 
 from spacerobot_ros import errors, measures, resources, times
 from spacerobot_ros.bag import message_definition
@@ -97,7 +98,7 @@ def test_times_are_split_into_seconds_and_the_rest() -> None:
     with pytest.raises(SpaceRobotError) as refused:
         times.stamp_bytes(latest + 1)
     assert str(refused.value) == ("Stamps carry times up to 2^31 s (68 years), not 2147483648 s.")
-    stamp = SimpleNamespace(sec=0, nanosec=0)
+    stamp = Time()
     times.set_stamp(stamp, 5_000_000_001)
     assert (stamp.sec, stamp.nanosec, times.stamp_to_ns(stamp)) == (5, 1, 5_000_000_001)
     times.set_stamp(stamp, latest + 5)

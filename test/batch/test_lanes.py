@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from support.slow import some_fast
 
 from spacerobot_ros.batch import (
     BatchResult,
+    ControlledGoals,
+    Decision,
     Flights,
     FollowedSchedule,
     HeldCommands,
@@ -20,13 +24,24 @@ from spacerobot_ros.batch import (
     fly_one_by_one,
     native,
 )
+from spacerobot_ros.batch.controlling import BatchController
+from spacerobot_ros.control.config import ControllerConfig
+from spacerobot_ros.control.goal_monitor import GoalMonitor
+from spacerobot_ros.control.laws.law import GainPair, Gains
+from spacerobot_ros.control.limits import MotionLimits
+from spacerobot_ros.control.state import ControlState
+from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.model import (
     InertialParameters,
     SpaceRobot,
     load_robot,
+    parse_robot,
 )
 from spacerobot_ros.model.compilation import cxx_compiler
+from spacerobot_ros.model.description import Array
 from spacerobot_ros.resources import share_directory
+from spacerobot_ros.simulation import InitialState
+from spacerobot_ros.simulation.config import SensorConfig
 
 needs_compiler = pytest.mark.skipif(cxx_compiler() is None, reason="there is no C++ compiler")
 
@@ -235,3 +250,238 @@ def test_without_vector_functions_of_the_c_library_lanes_fly_as_well(
     here = fly_lanes(flights)
     assert here.engine == with_functions.engine
     assert_equal_flights(here, with_functions)
+
+
+CONTROLLED_NUMBERS = (
+    *("pose", "twist", "q", "qdot", "momentum", "measured_pose", "measured_q"),
+    *(
+        "peak_rate",
+        "peak_effort",
+        "peak_wrench",
+        "impulse",
+        "lowest",
+        "highest",
+    ),
+    *("decision", "decision_tick", "decision_distance", "end_tick", "end_state"),
+    "momentum_drift",
+)
+
+SHAPE = np.array([-1.0, 1.05])
+BASE = np.array([0.05, -0.03, 0.0, 0.0, 0.0, 0.02, 0.9998])
+
+
+def controlled(
+    name: str,
+    shape: Array,
+    *,
+    ticks: int,
+    count: int = 9,
+    end_effector: Array | None = None,
+    noise: float = 1e-5,
+    **parameters: Any,
+) -> Flights:
+    """Return flights to a pose nearby, each with other masses, noise, start and gains."""
+    rng = np.random.default_rng(2)
+    robot = SpaceRobot(load_robot(share_directory() / "urdf" / f"{name}.urdf"))
+    wanted: dict[str, Any] = {"tick_rate": 100.0, "settle_time": 0.2, "profile": "quintic"}
+    config = dataclasses.replace(ControllerConfig(), **(wanted | parameters))
+    starts = InitialStates.repeated(robot, InitialState(joint_positions=shape), count)
+    starts.position[:, :2] = 0.01 * rng.normal(size=(count, 2))
+    sensors = SensorErrors.none(robot, count)
+    sensors.noise[1:] = noise
+    sensors.pose_bias[2:] = 1e-4
+    sensors.seeds[:] = np.arange(count)
+    pair = config.gains.base_position
+    gains = tuple(
+        dataclasses.replace(config.gains, base_position=GainPair(pair.kp * f, pair.kd))
+        for f in rng.uniform(0.9, 1.1, count)
+    )
+    return Flights(
+        *(robot, "effort", 0.01, ticks, starts),
+        ControlledGoals(config, base=BASE, end_effector=end_effector, gains=gains),
+        robot.inertial.scaled(rng.uniform(0.95, 1.05, (count, len(robot.inertial.masses)))),
+        sensors,
+        report_ticks=(0, ticks // 2, ticks),
+    )
+
+
+CUBE = """<robot name="cube"><link name="hull"><inertial><mass value="12"/>
+  <inertia ixx="0.2" iyy="0.25" izz="0.3" ixy="0" ixz="0" iyz="0"/></inertial></link></robot>"""
+
+
+def test_a_robot_without_joints_has_rows_of_no_joint_in_each_flight() -> None:
+    robot = SpaceRobot(parse_robot(CUBE))
+    starts = InitialStates.of(
+        robot, [InitialState(position=np.array([0.1, 0.2, k])) for k in range(3)]
+    )
+    assert starts.position[:, 2].tolist() == [0.0, 1.0, 2.0]
+    assert starts.q.shape == starts.qdot.shape == (3, 0)
+    sensors = SensorErrors.of(robot, [SensorConfig(seed=k) for k in range(3)])
+    assert sensors.joint_bias.shape == (3, 0)
+    assert sensors.seeds.tolist() == [0, 1, 2]
+
+
+def assert_same(here: BatchResult, there: BatchResult) -> None:
+    for name in CONTROLLED_NUMBERS:
+        one, two = getattr(here, name), getattr(there, name)
+        np.testing.assert_allclose(one, two, rtol=1e-12, atol=1e-12, err_msg=name)
+    assert here.failures == there.failures == {}
+
+
+@needs_compiler
+def test_control_in_lanes_is_that_of_the_controller() -> None:
+    flights = controlled(
+        *("planar_manipulator", SHAPE),
+        ticks=220,
+        count=5,
+        law="transposed_jacobian",
+        position_tolerance=0.01,
+        attitude_tolerance=0.02,
+        gains=Gains.uniform(1000.0, 60.0),
+        max_force=10.0,
+        motion=MotionLimits(1.0, 1.0, 1.0, 1.0),
+    )
+    here, there = fly_lanes(flights), fly_one_by_one(flights)
+    assert "lanes" in here.engine
+    assert_same(here, there)
+    assert not here.fallback_ticks.any()
+    # Goals are reached at times of their own, and the force was at its limit.
+    assert set(there.decision.tolist()) == {Decision.REACHED}
+    assert len(set(there.decision_tick.tolist())) > 1
+    np.testing.assert_allclose(there.peak_wrench[:, 0].max(), 10.0)
+
+
+@needs_compiler
+def test_automatic_gains_in_lanes_are_those_of_the_controller() -> None:
+    """Of all flights, or of some: the others have gains of their own."""
+    chosen: dict[str, Any] = {
+        "law": "transposed_jacobian",
+        "ticks": 150,
+        "count": 5,
+        "max_force": 10.0,
+    }
+    flights = controlled("planar_manipulator", SHAPE, **chosen, gains=Gains())
+    here, there = fly_lanes(flights), fly_one_by_one(flights)
+    assert "lanes" in here.engine
+    assert_same(here, there)
+    given = controlled("planar_manipulator", SHAPE, **chosen, gains=Gains.uniform(30.0, 60.0))
+    program = given.program
+    assert isinstance(program, ControlledGoals)
+    mixed = dataclasses.replace(program, gains=(*program.gains[:2], *[Gains()] * 3))
+    flights = dataclasses.replace(given, program=mixed)
+    here, there = fly_lanes(flights), fly_one_by_one(flights)
+    assert_same(here, there)
+    assert np.abs(there.q[2:, -1] - fly_one_by_one(given).q[2:, -1]).max() > 1e-6
+
+
+@needs_compiler
+def test_what_the_law_cannot_give_in_one_step_is_given_by_the_controller() -> None:
+    """Through a singularity, and with joints that are held within a small rate."""
+    planar = share_directory() / "urdf" / "planar_manipulator.urdf"
+    cases: tuple[dict[str, Any], ...] = (
+        {"law": "model_based", "shape": np.array([0.3, 0.02]), "gains": Gains.uniform(4.0, 4.0)},
+        {
+            **{"law": "model_based", "shape": SHAPE, "gains": Gains.uniform(4.0, 4.0)},
+            **{"joint_rates": 0.02, "profile": "step"},
+        },
+    )
+    for case in cases:
+        shape = case.pop("shape")
+        tip = SpaceRobot.from_file(planar).link_pose("end_effector", shape)[1]
+        held = np.array([*tip, *BASE[3:]])
+        flights = controlled("planar_manipulator", shape, ticks=120, end_effector=held, **case)
+        here, there = fly_lanes(flights), fly_one_by_one(flights)
+        assert_same(here, there)
+        assert 0 < here.fallback_ticks.sum() <= 9 * 120
+
+
+def test_a_controller_at_another_rate_is_refused() -> None:
+    flights = controlled("planar_manipulator", SHAPE, ticks=5)
+    with pytest.raises(ParameterError, match="another rate"):
+        dataclasses.replace(flights, control_period=0.02)
+
+
+@pytest.mark.parametrize("law", ["transposed_jacobian", "model_based"])
+def test_the_function_of_lanes_is_the_controller_and_its_monitor(
+    monkeypatch: pytest.MonkeyPatch, law: str
+) -> None:
+    """State by state: measurements, commands, and what the monitor remembers and decides."""
+    monkeypatch.setenv("SPACEROBOT_COMPILE", "0")
+    flights = controlled(
+        *("planar_manipulator", SHAPE),
+        ticks=9,
+        count=3,
+        law=law,
+        gains=Gains.uniform(1000.0, 60.0) if law == "transposed_jacobian" else Gains.uniform(9, 6),
+        position_tolerance=0.2,
+        attitude_tolerance=0.03,
+        max_force=10.0,
+        motion=MotionLimits(1.0, 1.0, 1.0, 1.0),
+    )
+    control = BatchController.of(flights)
+    function = control.function()
+    # The base and two joints: their two rates, after the pose and the twist of the base.
+    assert dict(zip(function.name_in(), map(function.size1_in, range(11)), strict=True)) == {
+        **{"state": 17, "pose": 7, "twist": 6, "normals": 16, "bias": 8, "sigma": 6, "time": 1},
+        **{"profile": function.size1_in(7), "gains": 10, "bounds": 5, "monitor": 3},
+    }
+    rng = np.random.default_rng(8)
+    start = ControlState.at_rest(np.array([0.01, -0.02, 0.0]), np.array([0.0, 0, 0, 1]), SHAPE)
+    profile, bounds = control.begin_flight(1, start)
+    goal = profile.goal
+    numbers, gains = control.profile_argument(profile), control.gains_argument([2, 1])[1]
+    assert numbers[0] == profile.duration > 0
+    begun = control.begin_flight(1, start)
+    np.testing.assert_array_equal(begun[1], bounds)
+    monitor, decisions = GoalMonitor(), []
+    memory = np.array([-1.0, 0.0, 0.0])
+    assert goal.base is not None
+    upright = goal.base.quaternion / np.linalg.norm(goal.base.quaternion)
+    at_goal = ControlState.at_rest(goal.base.position, upright, SHAPE)
+    cases = [(tick, False, 1.0) for tick in range(4)] + [(900 + k, True, 1.0) for k in range(25)]
+    cases += [(925 + k, False, 40.0 if k < 4 else 400.0) for k in range(8)]
+    for tick, settled, size in cases:
+        spread = 1e-4 if settled else 0.003 * size
+        truth = at_goal if settled else start
+        q, qdot = truth.q + spread * rng.normal(size=2), 10 * spread * rng.normal(size=2)
+        twist = spread * np.array([1.0, -2.0, 0.0, 0.0, 0.0, 1.5])
+        normals, sigma = rng.normal(size=16), 1e-5 * np.arange(1.0, 7.0)
+        bias = 1e-5 * rng.normal(size=8)
+        for plane in (bias, normals):
+            plane[[2, 3, 4]] = 0.0
+        normals[[8, 9, 10]] = 0.0
+        turn = Rotation.from_rotvec(bias[3:6] + sigma[1] * normals[3:6])
+        measured = ControlState(
+            truth.r_WB + bias[:3] + sigma[0] * normals[:3],
+            (Rotation.from_quat(truth.quaternion_WB) * turn).as_quat(),
+            twist[:3] + sigma[2] * normals[6:9],
+            twist[3:] + sigma[3] * normals[9:12],
+            q + bias[6:] + sigma[4] * normals[12:14],
+            qdot + sigma[5] * normals[14:],
+        )
+        state = np.concatenate([q, truth.quaternion_WB, qdot, np.zeros(9)])
+        pose = np.concatenate([truth.r_WB, truth.quaternion_WB])
+        results = function(
+            *(state, pose, twist, normals, bias, sigma, control.time_of_tick(tick)),
+            *(numbers, gains, bounds, memory),
+        )
+        command, exact, seen, after, verdict = (np.array(each).ravel() for each in results)
+        wanted = np.zeros(17)
+        measured.stack(wanted)
+        np.testing.assert_allclose(seen, wanted, rtol=1e-12, atol=1e-15)
+        expected = np.concatenate(control.command(tick, measured))
+        if not exact[0]:
+            np.testing.assert_allclose(command, expected, rtol=1e-9, atol=1e-9)
+        assert bool(exact[0]) <= (size > 1.0)
+        saturated = control.exact_command(1, profile, tick, measured).realised
+        np.testing.assert_allclose(np.concatenate([saturated.tau, saturated.wrench_B]), expected)
+        decision = control.decide(monitor, tick, measured.qdot, bounds)
+        decisions.append(decision)
+        assert verdict[0] == decision
+        memory = after
+        np.testing.assert_allclose(memory, dataclasses.astuple(monitor)[1:])
+    assert decisions[:4] == [Decision.NONE] * 4
+    # Settled for 0.2 s, twenty ticks of 10 ms after the first.
+    assert decisions[4:29] == [Decision.NONE] * 20 + [Decision.REACHED] * 5
+    assert decisions[-1] is Decision.LOST
+    assert memory[1:].max() >= 3

@@ -6,30 +6,39 @@ import math
 import os
 import signal
 import subprocess
-import sys
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import click
 import numpy as np
 import pytest
-from support.command_line import CliRunner
+from scipy.spatial.transform import Rotation
+from support.command_line import CliRunner, Result
 from support.warm_python import WarmPython
 
 import spacerobot_ros.cli as cli
+import spacerobot_ros.cli.bags as bags
+import spacerobot_ros.cli.flights as flights
+import spacerobot_ros.nodes
+import spacerobot_ros.nodes.common.process as process
+import spacerobot_ros.report
+import spacerobot_ros.session.live as session
 from spacerobot_ros.cli import terminal
 from spacerobot_ros.cli.main import main
 from spacerobot_ros.cli.options import (
     EndEffectorOptions,
     GoalCommand,
     GoalOptions,
-    RegisteredName,
+    beside,
     goal_options,
+    numbers,
     warn_of_large_angles,
 )
 from spacerobot_ros.cli.terminal import sentences
-from spacerobot_ros.errors import GoalError
+from spacerobot_ros.errors import GoalError, ParameterError, PlanningError
+from spacerobot_ros.measures import Outcome
 from spacerobot_ros.scenario import load_scenario
 from spacerobot_ros.termination import Terminated
 
@@ -134,13 +143,6 @@ def test_a_rotation_of_more_than_a_turn_is_noted(
     asked: Any = RequestedPart()
     GoalOptions(None, rotvec, None).apply_to(asked)
     assert capsys.readouterr().err == said.replace("--here", "--goal-rpy-deg")
-
-
-def test_a_choice_of_names_in_registries_is_sorted(monkeypatch: pytest.MonkeyPatch) -> None:
-    module = SimpleNamespace(A={"two": 1, "one": 2}, B={"three": 3, "one": 4})
-    monkeypatch.setitem(sys.modules, "some_registry", module)
-    choice = RegisteredName("some_registry:A", "some_registry:B")
-    assert tuple(choice.choices) == ("one", "three", "two")
 
 
 # -- how commands end -----------------------------------------------------------------------------
@@ -315,3 +317,191 @@ def test_an_output_without_space_is_bad_input_and_no_verdict(warm_python: WarmPy
         told = shown.stderr.read()
         assert shown.wait(60) == 2
     assert told == "Standard output cannot be written: no space is left on its device.\n"
+
+
+@pytest.mark.parametrize(
+    ("error", "code"),
+    [
+        (PlanningError("No way."), 1),
+        (GoalError("No goal."), 2),
+        (ParameterError("No number."), 2),
+        (ImportError("No module named 'rclpy'", name="rclpy.node"), 2),
+        (ImportError("No module named 'other'", name="other"), None),
+        (ImportError("It is broken."), None),
+        (KeyError("x"), None),
+    ],
+)
+def test_exceptions_are_exit_codes_and_errors_of_programs_are_not(
+    capsys: pytest.CaptureFixture[str], error: Exception, code: int | None
+) -> None:
+    with pytest.raises(type(error) if code is None else SystemExit) as raised, sentences():
+        raise error
+    if isinstance(raised.value, SystemExit):
+        assert raised.value.code == code
+        text = capsys.readouterr().err
+        assert text == f"{error}\n" or text.startswith(f"ROS 2 was not found ({error}); source its")
+
+
+def test_files_beside_a_bag_have_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "flight.1").mkdir()
+    assert beside(tmp_path / "a.b.mcap", ".html") == tmp_path / "a.b.html"
+    assert beside(tmp_path / "flight.1", ".html") == tmp_path / "flight.1.html"
+    monkeypatch.chdir(tmp_path / "flight.1")
+    assert beside(Path("."), "_figures") == tmp_path / "flight.1_figures"
+    assert numbers([1.0, -0.123456]) == "1.00000, -0.12346"
+
+
+RPY = (20.0, -35.0, 50.0)
+"""Roll, pitch and yaw whose order matters, deg."""
+
+
+def call(*words: object) -> Result:
+    return CliRunner().invoke(main, [str(word) for word in words])
+
+
+def attitude_of_rpy() -> Rotation:
+    """Turns about the fixed axes x, y, z in this order."""
+    x, y, z = (Rotation.from_rotvec(np.radians(a) * e) for a, e in zip(RPY, np.eye(3), strict=True))
+    return z * y * x
+
+
+# -- goals --------------------------------------------------------------------------------------
+
+
+def test_the_attitude_of_a_goal_that_is_sent_is_given_in_degrees(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    sent: list[Any] = []
+
+    def send_goal(goal: Any, show: Callable[[str], None], **named: Any) -> Outcome:
+        sent.append((goal, named))
+        return Outcome.REACHED if len(sent) == 1 else Outcome.FAILED
+
+    monkeypatch.setattr(session, "send_goal", send_goal)
+    words = ("goal", 0.1, -0.2, 0.3, "--goal-rpy-deg", *RPY, "--namespace", "left")
+    assert call(*words, "--timeout", 2.5).exit_code == 0
+    ((goal, named),) = sent
+    np.testing.assert_array_equal(goal.position, [0.1, -0.2, 0.3])
+    assert (Rotation.from_quat(goal.quaternion).inv() * attitude_of_rpy()).magnitude() < 1e-12
+    assert named == {"namespace": "left", "timeout": 2.5}
+    assert call("goal", 0.1, -0.2, 0.3).exit_code == 1
+    assert sent[1][1] == {"namespace": "", "timeout": 0.0}
+
+
+# -- stacks -------------------------------------------------------------------------------------
+
+
+class _Viewer:
+    """A viewer that is not started; its supervision returns the limit of its restarts."""
+
+    def restart_within(self, restarts: int) -> None:
+        self.supervise = lambda: restarts
+
+
+@pytest.fixture
+def views(monkeypatch: pytest.MonkeyPatch) -> list[tuple[bool, str]]:
+    """Return whether pages are served, and the namespaces of their stacks."""
+    found: list[tuple[bool, str]] = []
+
+    @contextmanager
+    def viewer_if_requested(
+        view: bool, parameters: Mapping[str, Any], namespace: str = ""
+    ) -> Iterator[Any]:
+        found.append((view, namespace))
+        yield _Viewer() if view else None
+
+    monkeypatch.setattr(flights, "viewer_if_requested", viewer_if_requested)
+    return found
+
+
+def test_options_of_a_stack_that_stays_up(
+    monkeypatch: pytest.MonkeyPatch, views: list[tuple[bool, str]]
+) -> None:
+    kept: list[Any] = []
+
+    def run_until_stopped(scenario: Any, bag: Path | None, show: Any, **named: Any) -> Path | None:
+        kept.append((scenario, bag, named))
+        return bag
+
+    monkeypatch.setattr(session, "run_until_stopped", run_until_stopped)
+    line = "up planar_chain --rate 2.5 --bag b.mcap --namespace left --view --restarts 5"
+    result = call(*line.split(), "--set", "planner.tick_rate=12.5")
+    assert result.output.split() == ["bag", "b.mcap"]
+    assert call("up", "planar_chain").exit_code == 0
+    (given, bag, named), (usual, none, by_default) = kept[:2]
+    assert given.parameters("plant")["real_time_factor"] == 2.5
+    assert usual.parameters("plant")["real_time_factor"] == 1.0
+    assert given.parameters("planner")["tick_rate"] == 12.5
+    assert (bag, none) == (Path("b.mcap"), None)
+    assert named.pop("supervise")() == 5
+    assert named == {"namespace": "left", "restarts": 5}
+    assert by_default.pop("supervise")() is None
+    assert by_default == {"namespace": "", "restarts": 3}
+    # Stacks that stay up are always of the nodes.
+    for word in ("--nodes", "--processes"):
+        assert call("up", "planar_chain", word).exit_code == 0
+    assert views == [(True, "left"), *[(False, "")] * 3]
+
+
+# -- bags ---------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def replayed(monkeypatch: pytest.MonkeyPatch) -> list[Mapping[str, Any]]:
+    """Return the parameters of the nodes that are to replay, and whether a page is served."""
+    found: list[Mapping[str, Any]] = []
+    views: list[bool] = []
+
+    @contextmanager
+    def viewer_if_requested(view: bool, parameters: Mapping[str, Any]) -> Iterator[None]:
+        views.append(view)
+        yield
+
+    def node(*, parameter_overrides: list[Any]) -> None:
+        found.append({each.name: each.value for each in parameter_overrides} | {"view": views[-1]})
+
+    def run_node(make: Callable[[], None], words: list[str]) -> int:
+        make()
+        return 3
+
+    monkeypatch.setattr(bags, "viewer_if_requested", viewer_if_requested)
+    monkeypatch.setattr(spacerobot_ros.nodes, "ReplayNode", node)
+    monkeypatch.setattr(process, "run_node", run_node)
+    return found
+
+
+def test_options_of_a_replay_are_parameters_of_its_node(replayed: list[Mapping[str, Any]]) -> None:
+    line = "replay a.mcap --rate 2.5 --start 1.5 --duration 4 --loop --topic /odom --topic /tf"
+    line += " --remap /odom:=/old --remap /tf:=/tf_old --clock 30 --paused --view --wait 0.5"
+    assert call(*line.split()).exit_code == 3
+    assert call("replay", "b.mcap").exit_code == 3
+    assert call("replay", "b.mcap", "--clock").exit_code == 3
+    given, usual, clock = replayed
+    assert given == {
+        **{"bag": "a.mcap", "rate": 2.5, "start": 1.5, "duration": 4.0, "loop": True},
+        **{"topics": "/odom /tf", "remap": "/odom:=/old /tf:=/tf_old", "clock": 30.0},
+        **{"paused": True, "hold": True, "view": True, "wait": 0.5},
+    }
+    assert usual == {
+        **{"bag": "b.mcap", "rate": 1.0, "start": 0.0, "duration": 0.0, "loop": False},
+        **{"topics": "", "remap": "", "clock": 0.0},
+        **{"paused": False, "hold": False, "view": False, "wait": 3.0},
+    }
+    assert clock == {**usual, "clock": 100.0}
+
+
+def test_options_of_a_report_reach_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    made: list[Any] = []
+    for name in ("write_report", "write_picture"):
+        monkeypatch.setattr(
+            spacerobot_ros.report,
+            name,
+            lambda *arguments, _name=name, **named: made.append((_name, arguments, named)),
+        )
+    line = "report a.mcap --out r.html --picture p.svg --beside b.mcap --beside c.mcap"
+    assert call(*line.split(), "--namespace", "left").exit_code == 0
+    others = (Path("b.mcap"), Path("c.mcap"))
+    assert made == [
+        ("write_report", (Path("a.mcap"), Path("r.html"), others), {"namespace": "left"}),
+        ("write_picture", (Path("a.mcap"), Path("p.svg")), {"namespace": "left"}),
+    ]

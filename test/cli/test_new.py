@@ -326,3 +326,23 @@ def test_columns_of_the_list_of_robots_are_apart() -> None:
         assert float(mass) >= float(base) > 0
         assert (int(joints) > 0) == (mass != base), name
     assert len({len(line) for line in lines}) == 1
+
+
+@pytest.mark.parametrize(
+    ("limit", "code", "said"),
+    [
+        ("", 1, "'pin_1' has no velocity limit, within which gaits are planned"),
+        (RATES.replace("2", "60"), 0, "velocity limit. The same holds for 1 other joint."),
+    ],
+)
+def test_joints_of_a_new_robot_are_remarked(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, limit: str, code: int, said: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("SPACEROBOT_COMPILE", "0")
+    text = robot_file("planar_chain").read_text("utf-8")
+    assert RATES in text
+    Path("mine.urdf").write_text(text.replace(RATES, limit), "utf-8")
+    result = CliRunner().invoke(main, ["new", "mine.urdf"])
+    assert result.exit_code == code, result.output
+    assert said in " ".join(result.output.split())

@@ -8,7 +8,6 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 import rclpy
@@ -50,10 +49,11 @@ def test_discovery_is_on_this_machine_unless_the_user_chose(
 def with_free(monkeypatch: pytest.MonkeyPatch, free: int | None) -> None:
     """Let shared memory have so many bytes left; None: let there be none."""
 
-    def statvfs(_: object) -> SimpleNamespace:
+    def statvfs(_: object) -> os.statvfs_result:
         if free is None:
             raise FileNotFoundError
-        return SimpleNamespace(f_bavail=free // KILOBYTE, f_frsize=KILOBYTE, f_blocks=1)
+        left = free // KILOBYTE
+        return os.statvfs_result((KILOBYTE, KILOBYTE, 1, left, left, 0, 0, 0, 0, 255))
 
     monkeypatch.setattr("os.statvfs", statvfs)
 

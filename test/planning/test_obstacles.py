@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import casadi as ca
@@ -13,11 +11,10 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 from scipy.spatial.transform import Rotation, Slerp
-from support.planner_loop import TICK, Loop
-from support.planner_phases import executing, resting, stub_of
+from support.planner_phases import resting
 
 from spacerobot_ros.collision.planes import PlaneDistance
-from spacerobot_ros.errors import ParameterError, PlanningError, Proof, UnreachableError
+from spacerobot_ros.errors import ParameterError, Proof, UnreachableError
 from spacerobot_ros.flight.trials import PlanningProblem
 from spacerobot_ros.model import RobotDescription, SpaceRobot
 from spacerobot_ros.model.description import Array, Pose
@@ -27,8 +24,6 @@ from spacerobot_ros.planning import GaitSchedule, RobotState, plan
 from spacerobot_ros.planning.core.clearance import Clearance
 from spacerobot_ros.planning.core.schedule import BasePath
 from spacerobot_ros.planning.execution.config import PlannerConfig
-from spacerobot_ros.planning.execution.executive import Phase
-from spacerobot_ros.planning.execution.status import PlannerState
 from spacerobot_ros.planning.execution.worker import PlanningWorker
 from spacerobot_ros.planning.methods.optimal.transcription import _distance_block
 from spacerobot_ros.resources import robot_file, share_directory
@@ -204,57 +199,6 @@ BALL = (
     '</geometry></collision></link><joint name="a" type="fixed"><parent link="w"/>'
     '<child link="ball"/></joint></robot>'
 )
-
-
-def use(loop: Loop, approaches: Callable[..., Any], *, has_obstacles: bool = True) -> Any:
-    """Let a worker with a made-up clearance take the place of that of a loop."""
-    clearance = SimpleNamespace(
-        has_obstacles=has_obstacles,
-        approaches=approaches,
-        clause=lambda approach, period: (
-            f"link 'a' and obstacle 'b' touch at {approach}, {period:g}"
-        ),
-    )
-    worker: Any = PlanningWorker(loop.plant.robot, loop.config, loop.method)
-    worker.clearance = clearance
-    loop.executive.use_obstacles(lambda: worker)
-    loop._take()
-    return worker
-
-
-def test_the_joints_brake_before_an_obstacle_and_go_on_to_the_goal() -> None:
-    loop = executing(ticks=60, abort_time=0.4)
-    loop.tick(20)
-    use(loop, lambda positions, base: ["here", "there"])
-    said = (
-        f"Link 'a' and obstacle 'b' touch at here, {TICK:g}: the joints brake, and the remaining "
-        "motion is planned again."
-    )
-    status = loop.statuses[-1]
-    assert (status.state, status.message, status.goal_id) == ("executing", said, "goal-1")
-    assert said in loop.notices
-    assert loop.executive.phase is Phase.BRAKING
-    reached = loop.until(PlannerState.REACHED)
-    assert reached.corrections == 0
-    assert len(stub_of(loop).requests) == 2
-    assert not stub_of(loop).requests[-1].correction
-    assert np.abs(np.diff(loop.speeds)).max() < 0.5 * max(loop.speeds)
-
-
-def test_a_goal_behind_an_obstacle_has_failed_with_both_reasons() -> None:
-    loop = executing(ticks=60)
-    loop.tick(20)
-
-    def approaches(positions: Array, base: Any) -> list[str]:
-        raise PlanningError("Link 'a' and obstacle 'b' are 0.001 m apart at the start.")
-
-    use(loop, approaches)
-    assert loop.statuses[-1].message.startswith("Link 'a' and obstacle 'b' are 0.001 m apart at")
-    assert loop.statuses[-1].message.endswith(
-        "start: the joints brake, and the remaining motion is planned again."
-    )
-    stub_of(loop).refusing = True
-    assert "It is too far." in loop.until(PlannerState.FAILED).message
 
 
 # -- parts --------------------------------------------------------------------------------------
