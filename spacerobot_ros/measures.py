@@ -9,15 +9,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 from operator import attrgetter
+from typing import Any
 
 import numpy as np
 
 from spacerobot_ros.control.status import ControllerState, ControllerStatus, tracking_time
 from spacerobot_ros.model.description import Array, RobotDescription
-from spacerobot_ros.parameters import replaced
 from spacerobot_ros.planning.core.goal import PoseError
 from spacerobot_ros.planning.execution.status import PlannerStatus, manoeuvre_time
 
@@ -365,8 +365,10 @@ def metrics_of_each(
     """Return every metric by name, those of joints too, of flights of one robot; NaN: none."""
     if not measures:
         return []
-    joints = {name: np.array([getattr(each, name) for each in measures]) for name in _OF_JOINTS}
-    of_joints = replaced(measures[0], **joints)
+    joints: dict[str, Any] = {
+        name: np.array([getattr(each, name) for each in measures]) for name in _OF_JOINTS
+    }
+    of_joints = replace(measures[0], **joints)
     columns: dict[str, list[float]] = {}
     with np.errstate(divide="ignore", invalid="ignore"):
         for name, metric in METRICS.items():

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Collection, Hashable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import Field, dataclass, field, fields, replace
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
 from functools import cache
 from typing import Any, TypeVar
 
@@ -281,21 +281,7 @@ def configured(kind: type[C], values: Mapping[str, Any]) -> C:
     ParameterError
         A value is refused; the message names the parameter.
     """
-    defaults = _defaults(kind)
-    return _reconfigured(defaults, defaults, values, "")
-
-
-def reconfigured(config: C, values: Mapping[str, Any]) -> C:
-    """Return a configuration with other values by full name; those left out stay as they are.
-
-    Unchanged groups stay the same objects.
-
-    Raises
-    ------
-    ParameterError
-        A value is refused; the message names the parameter.
-    """
-    return _reconfigured(config, _defaults(type(config)), values, "")
+    return _configured(kind(), values, "")
 
 
 def values_of(config: Any) -> dict[str, Value]:
@@ -322,81 +308,24 @@ def require_known(owner: str, config: type[Any], names: Iterable[str]) -> None:
         raise ParameterError(f"{owner} has no option '{unknown[0]}'.")
 
 
-@cache
-def _fields(kind: Hashable) -> tuple[Field[Any], ...]:
-    return fields(kind)  # type: ignore[arg-type]
-
-
-@cache
-def _kept_defaults(kind: Hashable) -> Any:
-    """Return the defaults of a class; None where a registry, which users may extend, decides."""
-    defaults: Any = kind()  # type: ignore[operator]
-    return None if _has_registered_entries(defaults) else defaults
-
-
-def _has_registered_entries(config: Any) -> bool:
-    return any(
-        _REGISTERED in each.metadata
-        or (_GROUP in each.metadata and _has_registered_entries(getattr(config, each.name)))
-        for each in fields(config)
-    )
-
-
-def _defaults(kind: Any) -> Any:
-    """Return the defaults of a class, for which campaigns ask in every draw."""
-    kept = _kept_defaults(kind)
-    return kind() if kept is None else kept
-
-
-def _reconfigured(config: C, defaults: Any, values: Mapping[str, Any], prefix: str) -> C:
+def _configured(defaults: Any, values: Mapping[str, Any], prefix: str) -> Any:
     chosen: dict[str, Any] = {}
-    kind: Any = type(config)
     # Few of many fields change: the first words after the prefix say which.
     words = {name[len(prefix) :].partition(".")[0] for name in values if name.startswith(prefix)}
-    for each in _fields(kind):
-        if each.name not in words and _REGISTERED not in each.metadata:
-            continue
-        name = f"{prefix}{each.name}"
+    for each in fields(defaults) if words else ():
+        name, default = f"{prefix}{each.name}", getattr(defaults, each.name)
         if _PARAMETER in each.metadata:
             if name in values:
-                default = getattr(defaults, each.name)
-                declaration = replaced(each.metadata[_PARAMETER], name=name, default=default)
+                declaration = replace(each.metadata[_PARAMETER], name=name, default=default)
                 chosen[each.name] = declaration.checked(values[name])
-            continue
-        default = getattr(defaults, each.name)
-        if _GROUP in each.metadata:
-            if _has_parameter_below(f"{name}.", values):
-                before = getattr(config, each.name)
-                chosen[each.name] = _reconfigured(before, default, values, f"{name}.")
+        elif _GROUP in each.metadata and each.name in words:
+            chosen[each.name] = _configured(default, values, f"{name}.")
         elif _REGISTERED in each.metadata:
-            before = getattr(config, each.name)
-            changed = {
-                entry: _reconfigured(
-                    before.get(entry, options), options, values, f"{prefix}{entry}."
-                )
+            chosen[each.name] = {
+                entry: _configured(options, values, f"{prefix}{entry}.")
                 for entry, options in default.items()
-                if _has_parameter_below(f"{prefix}{entry}.", values)
             }
-            if changed:
-                chosen[each.name] = {**before, **changed}
-    return replaced(config, **chosen) if chosen else config
-
-
-def replaced(given: C, **changes: Any) -> C:
-    """Return ``dataclasses.replace(given, **changes)`` in a quarter of the time.
-
-    For dataclasses without slots. Fields that are no arguments of the class keep their values.
-    """
-    kind: Any = type(given)
-    before, made = vars(given), object.__new__(kind)
-    made.__dict__.update({each.name: before[each.name] for each in _fields(kind)} | changes)
-    if hasattr(kind, "__post_init__"):
-        made.__post_init__()
-    return made
-
-
-def _has_parameter_below(prefix: str, names: Iterable[str]) -> bool:
-    return any(name.startswith(prefix) for name in names)
+    return replace(defaults, **chosen) if chosen else defaults
 
 
 def _parameters_with_values(config: Any) -> Iterator[tuple[str, Parameter, Value]]:

@@ -32,8 +32,6 @@ from spacerobot_ros.parameters import (
     declared,
     is_of_every_node,
     known_values,
-    reconfigured,
-    replaced,
     values_of,
 )
 from spacerobot_ros.planning import Goal
@@ -151,10 +149,6 @@ class Scenario:
     has_goal: bool = True
     _configs: dict[str, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
     """Cached results of :meth:`config` by node."""
-    _changes: dict[str, tuple[Any, dict[str, Any]]] = field(
-        default_factory=dict, init=False, repr=False, compare=False
-    )
-    """For each node: configuration of the original scenario, and parameters changed since."""
 
     def config(self, node: str) -> Any:
         """Return the configuration of a node: defaults, the file's parameters, the overrides.
@@ -180,11 +174,11 @@ class Scenario:
             changes["plan_in_background"] = False
         if node in COMMANDERS and not config.position_tolerance:
             changes["position_tolerance"] = self._automatic_tolerance(config)
-        return replaced(config, **changes) if changes else config
+        return replace(config, **changes) if changes else config
 
     def _make_config(self, node: str) -> Any:
         known = {parameter.name: parameter for parameter in declared(CONFIGS[node])}
-        before, values = self._changes.get(node, (None, self._parameters_as_written(node)))
+        values = self._parameters_as_written(node)
         for name, value in values.items():
             if name not in known and not is_of_every_node(name):
                 raise ParameterError(f"Node '{node}' has no parameter '{name}'.")
@@ -192,8 +186,6 @@ class Scenario:
                 is_number = isinstance(known[name].default, (int, float))
                 values[name] = number_in(value) if is_number else value
         try:
-            if before is not None:
-                return reconfigured(before, values)
             return configured(CONFIGS[node], values)
         except ParameterError as error:
             raise ParameterError(f"Node '{node}': {error}") from error
@@ -314,12 +306,7 @@ class Scenario:
         """Return the scenario with more parameters of one node set."""
         merged = {**self.overrides, node: {**self.overrides.get(node, {}), **values}}
         made = self._replace_fields(overrides=merged)
-        known = made._configs.pop(node, None)
-        if known is not None:
-            made._changes[node] = known, dict(values)
-        elif node in made._changes:
-            before, earlier = made._changes[node]
-            made._changes[node] = before, {**earlier, **values}
+        made._configs.pop(node, None)
         return made
 
     def with_poses(self, goal: Goal, end_effector_goal: Goal | None) -> Scenario:
@@ -328,8 +315,9 @@ class Scenario:
 
     def _replace_fields(self, **changes: Any) -> Scenario:
         """Return a changed copy of the scenario, which reuses the configurations already made."""
-        configs, since = dict(self._configs), dict(self._changes)
-        return replaced(self, _configs=configs, _changes=since, **changes)
+        made = replace(self, **changes)
+        made._configs.update(self._configs)
+        return made
 
     def in_real_time(self, factor: float) -> Scenario:
         """Return the scenario in real time times a factor."""

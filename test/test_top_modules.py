@@ -6,8 +6,7 @@ import importlib
 import math
 import subprocess
 import sys
-from dataclasses import dataclass, field, replace
-from functools import cached_property
+from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 from types import SimpleNamespace
@@ -36,9 +35,6 @@ from spacerobot_ros.errors import (
 from spacerobot_ros.events import Event, EventKind
 from spacerobot_ros.flight.trials import PlanningProblem
 from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.parameters import (
-    replaced,
-)
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.scenario import (
@@ -144,32 +140,6 @@ def test_topics_of_end_effectors() -> None:
 
 
 # -- parameters --------------------------------------------------------------------------------
-
-
-def test_a_copy_with_other_fields_is_checked_and_knows_nothing_of_the_first() -> None:
-    @dataclass(frozen=True)
-    class Limited:
-        low: float
-        high: float = 2.0
-        kept: dict[str, int] = field(default_factory=dict, init=False, compare=False)
-
-        def __post_init__(self) -> None:
-            if self.low > self.high:
-                raise ValueError(f"{self.low} is above {self.high}")
-
-        @cached_property
-        def range(self) -> float:
-            return self.high - self.low
-
-    first = Limited(1.0)
-    first.kept["a"] = 1
-    assert first.range == 1.0
-    second = replaced(first, low=1.5)
-    assert second == replace(first, low=1.5)
-    assert (type(second), second.range, second.kept) == (Limited, 0.5, {"a": 1})
-    assert first == Limited(1.0)
-    with pytest.raises(ValueError, match=r"3.0 is above 2.0"):
-        replaced(first, low=3.0)
 
 
 # -- resources ---------------------------------------------------------------------------------

@@ -408,8 +408,7 @@ _NOT_WANTED = -1
 
 
 class _Wanted:
-    """The messages of a file to read: topics, whose numbers are their places in a list, and times.
-    """
+    """The messages of a file to read: topics, numbered by their places in a list, and times."""
 
     def __init__(
         self,

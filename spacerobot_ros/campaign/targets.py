@@ -18,7 +18,7 @@ from spacerobot_ros.model.inertial_parameters import InertialParameters
 from spacerobot_ros.model.rotations import quaternion_from_rotvec, quaternion_multiply
 from spacerobot_ros.model.shared_parameters import RobotConfig
 from spacerobot_ros.model.urdf import load_robot, parse_robot
-from spacerobot_ros.parameters import Parameter, declared, replaced, values_of
+from spacerobot_ros.parameters import Parameter, declared, values_of
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.core.goal import Controlled
 from spacerobot_ros.resources import robot_file, suggestion
@@ -154,7 +154,7 @@ class DrawnFlight:
 
     def with_overrides(self, node: str, parameters: Mapping[str, Any]) -> DrawnFlight:
         """Return the flight with other parameters of a node."""
-        return replaced(self, scenario=self.scenario.with_overrides(node, parameters))
+        return replace(self, scenario=self.scenario.with_overrides(node, parameters))
 
     @cached_property
     def seeded_scenario(self) -> Scenario:
@@ -185,18 +185,18 @@ class DrawnFlight:
 
     def repeated(self, count: int) -> DrawnFlight:
         """Return a flight as ``count`` equal ones."""
-        numbers = {name: getattr(self, name) for name in _FACTORS}
-        return replaced(
-            self, **{name: np.repeat(x[np.newaxis], count, axis=0) for name, x in numbers.items()}
-        )
+        numbers: dict[str, Any] = {
+            name: np.repeat(getattr(self, name)[np.newaxis], count, axis=0) for name in _FACTORS
+        }
+        return replace(self, **numbers)
 
     def separate(self, seeds: Sequence[int | None]) -> list[DrawnFlight]:
         """Return the flights one by one, with their seeds."""
         flights = []
         inertial, has_other_masses = self._scaled_parameters, self._has_other_masses.tolist()
         for row, (seed, has_other) in enumerate(zip(seeds, has_other_masses, strict=True)):
-            factors = {name: getattr(self, name)[row] for name in _FACTORS}
-            flight = replaced(self, seed=seed, **factors)
+            factors: dict[str, Any] = {name: getattr(self, name)[row] for name in _FACTORS}
+            flight = replace(self, seed=seed, **factors)
             # Known here: each flight would take as long as all of them together.
             vars(flight)["inertial"] = inertial[row] if has_other else None
             flights.append(flight)
@@ -419,7 +419,7 @@ def _mass_property_targets(
         def apply(flight: DrawnFlight, drawn: Any) -> DrawnFlight:
             factors = getattr(flight, kind).copy()
             factors[..., indices] *= np.asarray(drawn, dtype=float)[..., np.newaxis]
-            return replaced(flight, **{kind: factors})
+            return replace(flight, **{kind: factors})
 
         sets = frozenset(f"{kind}.{body}" for _, body in bodies)
         return DispersionTarget(name, apply, "1", False, sets, changes_masses_only=True)
@@ -450,7 +450,7 @@ def _center_target(index: int, column: int, name: str) -> DispersionTarget:
     def apply(flight: DrawnFlight, drawn: Any) -> DrawnFlight:
         com = flight.com.copy()
         com[..., index, column] += np.asarray(drawn, dtype=float)
-        return replaced(flight, com=com)
+        return replace(flight, com=com)
 
     return DispersionTarget(name, apply, "m", False, frozenset({name}), changes_masses_only=True)
 

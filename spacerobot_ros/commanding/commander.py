@@ -11,7 +11,7 @@ import time
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from enum import Enum
 from typing import Any, Literal, Protocol
 
@@ -190,21 +190,15 @@ class StateDecoder(Protocol):
         """Return positions and rates (n,) of a joint reference, or raise CommandError."""
 
 
+@dataclass(frozen=True, slots=True)
 class StateArrays:
     """A state as arrays: joints, and where it is measured the base; all messages in one."""
 
-    # Every state makes an object, and a frozen dataclass would take four times as long.
-    __slots__ = ("pose", "q", "qdot", "stamp_ns", "twist")
-
-    def __init__(
-        self,
-        stamp_ns: int,
-        q: Array,
-        qdot: Array,
-        pose: Array | None = None,
-        twist: Array | None = None,
-    ) -> None:
-        self.stamp_ns, self.q, self.qdot, self.pose, self.twist = stamp_ns, q, qdot, pose, twist
+    stamp_ns: int
+    q: Array
+    qdot: Array
+    pose: Array | None = None
+    twist: Array | None = None
 
 
 class ArrayDecoder:

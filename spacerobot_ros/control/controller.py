@@ -314,8 +314,7 @@ class CoordinatedController:
     def _carried_end_effector(
         self, before: Reference, base: PoseReference, state: ControlState
     ) -> PoseReference | None:
-        """Return the pose that an end-effector has with the base in a goal, and the arm as before.
-        """
+        """Return the pose of an end-effector with the base in a goal, and the arm as before."""
         carrier, carried = before.base, before.end_effector
         if carrier is None or carried is None:
             return carried

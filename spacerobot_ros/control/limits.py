@@ -357,8 +357,7 @@ def _affordable_push_share(wanted: Array, pushed: Array, effort: Array) -> float
 
 
 def _joint_dynamics(robot: SpaceRobot) -> ca.Function:
-    """Return ``(q, omega_WB_B, qdot) -> (Js, Fs, G)``, which do not depend on the base's velocity.
-    """
+    """Return ``(q, omega_WB_B, qdot) -> (Js, Fs, G)``, whatever the velocity of the base is."""
     q, qdot = ca.SX.sym("q", robot.n), ca.SX.sym("qdot", robot.n)
     omega = ca.SX.sym("omega", 3)
     H = robot.function("inertia_matrix", compile=False)(q)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeVar
 
 from spacerobot_ros.errors import ParameterError, RobotDescriptionError
@@ -11,7 +11,7 @@ from spacerobot_ros.model.model_functions import SymbolicModels
 from spacerobot_ros.model.space_robot import SpaceRobot
 from spacerobot_ros.model.urdf import load_robot, load_world, parse_robot
 from spacerobot_ros.model.world import with_world
-from spacerobot_ros.parameters import nonnegative, parameter, replaced
+from spacerobot_ros.parameters import nonnegative, parameter
 from spacerobot_ros.resources import robot_file
 from spacerobot_ros.times import SECOND
 
@@ -195,7 +195,7 @@ class CommanderConfig(WatchdogConfig, AssumedRobotConfig):
         """Return the configuration with the tolerance of a robot instead of an automatic one."""
         if self.position_tolerance:
             return self
-        return replaced(self, position_tolerance=automatic_tolerance(robot))
+        return replace(self, position_tolerance=automatic_tolerance(robot))
 
     @property
     def control_period(self) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -47,8 +48,7 @@ class RateRig(Rig):
         for _ in range(count):
             self.time += 1 / rate
             self.wall += 1 / rate
-            state = self.message(0)
-            state.stamp_ns = round(self.time * 1e9)
+            state = replace(self.message(0), stamp_ns=round(self.time * 1e9))
             self.commander.receive_odom(state.stamp_ns, state)
             self.commander.receive_joints(state.stamp_ns, state)
             self.commander.take_accepted_jump()

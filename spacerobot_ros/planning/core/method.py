@@ -349,8 +349,7 @@ class GaitMethod(ABC):
     def _base_poses(
         self, start: RobotState, positions: Array, attitudes: Array | None = None
     ) -> BasePoses | None:
-        """Return the poses of the base at the ticks of shapes (N + 1, n); None without obstacles.
-        """
+        """Return the poses of the base at shapes (N + 1, n) at ticks; None without obstacles."""
         if not self._has_obstacles:
             return None
         return self._prediction.poses(start, positions, attitudes)
