@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from functools import cached_property, partial
-from typing import Any, TypeVar
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -71,27 +71,6 @@ _ABSENT_MEANS_ZERO = (("planner", "clearance"), ("plant", "clearance_period"))
 
 WRENCH_COLUMNS = TOPICS["base_wrench_realised"].state[0].columns
 """Paths of force and torque in a message of a wrench."""
-
-T = TypeVar("T")
-
-
-class _LazyMapping(Mapping[str, T]):
-    """A mapping whose values are made when they are first asked for."""
-
-    def __init__(self, makers: Mapping[str, Callable[[], T]]) -> None:
-        self._makers = makers
-        self._made: dict[str, T] = {}
-
-    def __getitem__(self, key: str) -> T:
-        if key not in self._made:
-            self._made[key] = self._makers[key]()
-        return self._made[key]
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._makers)
-
-    def __len__(self) -> int:
-        return len(self._makers)
 
 
 class FlightBag(RecordedRobot):
@@ -217,9 +196,9 @@ class FlightBag(RecordedRobot):
         began, *_, ended = self._times(self[f"{name}_true"])[[0, -1]]
         return self.quantity(name, TOPICS[name].state[number]).between(began, ended)
 
-    def series(self) -> Mapping[str, Signal]:
+    def series(self) -> dict[str, Signal]:
         """Return all quantities of :attr:`Flight.series` that the bag has."""
-        makers: dict[str, Callable[[], Signal]] = {}
+        found: dict[str, Signal] = {}
         erring = "odom_true" in self
         for name, quantities in {
             "odom": ("pose", "twist"),
@@ -227,15 +206,15 @@ class FlightBag(RecordedRobot):
         }.items():
             for number, quantity in enumerate(quantities):
                 if name in self or f"{name}_true" in self:
-                    makers[quantity] = partial(self.true_signal, name, number)
+                    found[quantity] = self.true_signal(name, number)
                 if erring and quantity != "effort" and f"{name}_true" in self:
-                    makers[f"measured_{quantity}"] = partial(self.measured_signal, name, number)
+                    found[f"measured_{quantity}"] = self.measured_signal(name, number)
         for name in _QUANTITY_TOPICS:
             for field in TOPICS[name].state if name in self else ():
-                makers[field.quantity] = partial(self.quantity, name, field)
+                found[field.quantity] = self.quantity(name, field)
         for topic in self._poses_of_end_effectors():
-            makers[topic.state[0].quantity] = partial(self.quantity, topic.name, topic.state[0])
-        return _LazyMapping(makers)
+            found[topic.state[0].quantity] = self.quantity(topic.name, topic.state[0])
+        return found
 
     def _poses_of_end_effectors(self) -> Iterator[Topic]:
         for name in self.topic_names():
@@ -317,22 +296,22 @@ class FlightBag(RecordedRobot):
                 shapes.append((time_ns, [given[name] for name in names]))
         return shapes
 
-    def commands(self, scenario: Scenario) -> Mapping[str, Commands]:
+    def commands(self, scenario: Scenario) -> dict[str, Commands]:
         """Return the commands by topic."""
-        joints = self.names("joint_states")
-
-        def read(name: str) -> Commands:
-            config = scenario.plant
+        joints, config = self.names("joint_states"), scenario.plant
+        found = {}
+        for name in _COMMAND_TOPICS:
+            series = self.get(name)
+            if series is None:
+                continue
             efforts = name == "joint_commands" and config.actuation != "velocity"
-            series = self[name]
             values = (
                 series.table(WRENCH_COLUMNS, 6)
                 if name == "base_wrench"
                 else series.of_joints("effort" if efforts else "velocity", joints)
             )
-            return Commands(series.stamp_ns // config.period_ns, values)
-
-        return _LazyMapping({name: partial(read, name) for name in _COMMAND_TOPICS if name in self})
+            found[name] = Commands(series.stamp_ns // config.period_ns, values)
+        return found
 
 
 # -- any bag ----------------------------------------------------------------------------------
@@ -380,8 +359,6 @@ def namespaces(bag: Bag) -> list[str]:
 
 def read_flight(bag: FlightBag) -> Flight:
     """Return a flight with all parts that its bag holds.
-
-    Arrays are read when they are first asked for.
 
     Raises
     ------
@@ -470,26 +447,21 @@ def with_propellant(flight: Flight, thrusters: str, names: Sequence[str]) -> Fli
     if list(table.names) != list(names):
         return flight
 
-    def used() -> Signal:
-        return impulse(flight.signal("thruster_force"), table.mass_flow / table.force)
-
-    makers = {name: partial(series.__getitem__, name) for name in series}
-    return replace(flight, series=_LazyMapping({**makers, "propellant": used}))
+    used = impulse(flight.signal("thruster_force"), table.mass_flow / table.force)
+    return replace(flight, series={**series, "propellant": used})
 
 
 def since(flight: Flight, start: float) -> Flight:
     """Return a flight with times since ``start``, s."""
-    series = flight.series
-
-    def moved(name: str) -> Signal:
-        return Signal(series[name].time - start, series[name].values)
 
     def earlier(goals: tuple[SentGoal, ...]) -> tuple[SentGoal, ...]:
         return tuple(replace(sent, time=sent.time - start) for sent in goals)
 
     return replace(
         flight,
-        series=_LazyMapping({name: partial(moved, name) for name in series}),
+        series={
+            name: Signal(each.time - start, each.values) for name, each in flight.series.items()
+        },
         statuses=tuple((ns - round(start * SECOND), status) for ns, status in flight.statuses),
         events=tuple(
             each if each.time_s is None else replace(each, time_s=each.time_s - start)
