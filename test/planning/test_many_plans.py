@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import statistics
 import time
 from collections import Counter
 from collections.abc import Iterator
@@ -33,10 +34,12 @@ from spacerobot_ros.planning import (
     RobotState,
     Tolerance,
     method_options,
+    plan,
 )
 from spacerobot_ros.planning.core.clearance import Clearance
 from spacerobot_ros.planning.core.prediction import BasePrediction, coasting_positions
 from spacerobot_ros.planning.methods.optimal import OptimalGait
+from spacerobot_ros.planning.methods.optimal.problem import MotionLimits, OptimalOptions
 from spacerobot_ros.resources import robot_file, share_directory
 
 GOALS = int(os.environ.get("SPACEROBOT_CLEAR_GOALS", "2"))
@@ -317,10 +320,125 @@ def test_flights_with_errors_keep_clear(name: str, method: str, tmp_path: Path) 
 # -- plans to goals with a position or a shape are hardly longer than those of long --------------
 
 
+LONG_SEARCHES = int(os.environ.get("SPACEROBOT_LONG_SEARCHES", "1"))
+"""Goals of each robot."""
+
+SEARCHED_ROBOTS = ("seven_joint_arm", "servicer", "three_joint_arm")
+"""Arms that control the position of the base, and one that does not."""
+
+STARTS = 60
+"""Guesses of a long search, which no agreement ends."""
+
 PERIOD = 0.05
 
 
+def goal_of(robot: SpaceRobot, start: Array, number: int, rng: np.random.Generator) -> Goal:
+    """Return an attitude with a shape or, every second time, with a reachable position."""
+    last = rng.uniform(np.maximum(robot.lower, -1.2), np.minimum(robot.upper, 1.2))
+    axis = rng.normal(size=3)
+    turn = quaternion_from_rotvec(axis / np.linalg.norm(axis) * rng.uniform(0.1, 0.8))
+    if number % 2:
+        return Goal.checked(np.zeros(3), turn, last)
+    there = matrix_from_quaternion(turn) @ robot.center_of_mass(last)
+    return Goal.checked(robot.center_of_mass(start) - there, turn)
+
+
+@pytest.mark.slow
+def test_plans_are_as_short_as_those_of_long_searches() -> None:
+    """At least 97 % of the durations are within 2 % of those by a search from sixty guesses."""
+    ratios: list[float] = []
+    for name in SEARCHED_ROBOTS:
+        robot = SpaceRobot.from_file(robot_file(name))
+        rng = np.random.default_rng([SEARCHED_ROBOTS.index(name), 604])
+        plain = OptimalGait(robot, PERIOD, options=OptimalOptions(cache=0))
+        options = OptimalOptions(cache=0, starts=STARTS, answers=STARTS, agreeing=0)
+        long = OptimalGait(robot, PERIOD, options=options)
+        times: list[float] = []
+        for number in range(LONG_SEARCHES):
+            q = rng.uniform(np.maximum(robot.lower, -1.2), np.minimum(robot.upper, 1.2))
+            state = RobotState(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), q)
+            goal = goal_of(robot, q, number, rng)
+            request = PlanRequest(state, goal, Tolerance(np.inf if number % 2 else 2e-3, 2e-3))
+            began = time.process_time()
+            here = plain.plan(request).duration
+            times.append(time.process_time() - began)
+            there = long.plan(request).duration
+            ratios.append(here / there)
+            kind = "shape" if number % 2 else "position"
+            print(
+                f"{name}, {kind}: {here:.5g} s, {there:.5g} s by a search from {STARTS} guesses, "
+                f"{times[-1]:.2f} s of CPU time",
+                flush=True,
+            )
+        slowest = max(times) / statistics.median(times)
+        print(f"{name}: the slowest plan takes {slowest:.1f} times the median", flush=True)
+    within = np.mean(np.array(ratios) <= 1.02)
+    print(f"{len(ratios)} goals: {within:.1%} within 2 %, the worst {max(ratios):.3f} times")
+    assert within >= 0.97
+
+
 # -- held commands take hardly longer than the continuous solutions that they are made of --------
+
+
+FLOWN_GOALS = int(os.environ.get("SPACEROBOT_FLOWN_TIMES", "1"))
+"""Goals of each robot."""
+
+TIMED_ROBOTS = (
+    *("three_joint_arm", "planar_chain", "solar_booms", "station_arm", "tender"),
+    *("seven_joint_arm", "surveyor", "servicer", "quadruped", "dual_arm"),
+)
+"""Ten robots: planar ones, trees with sliders and revolute joints, two arms, four legs."""
+
+
+def planned(name: str, count: int) -> Iterator[GaitSchedule]:
+    """Yield plans to random attitudes, half of them with a shape, that may bring links near."""
+    robot = SpaceRobot.from_file(robot_file(name))
+    rng = np.random.default_rng([TIMED_ROBOTS.index(name), 29])
+    low, high = np.maximum(robot.lower, -1.0), np.minimum(robot.upper, 1.0)
+    found = 0
+    while found < count:
+        q, shape = rng.uniform(low, high, (2, robot.n))
+        turn = rng.normal(size=3)
+        turn *= rng.uniform(0.1, 0.6) / np.linalg.norm(turn)
+        goal: dict[str, Any] = {"rotvec": [0.0, 0.0, turn[2]] if "planar" in name else turn}
+        if found % 2:
+            goal["joint_positions"] = shape
+        state = RobotState(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), q)
+        try:
+            schedule = plan(robot, start=state, cache=0, base_position=2, clearance=0.0, **goal)
+        except PlanningError:
+            continue
+        limits = MotionLimits.of(robot, OptimalOptions())
+        factor, overrun = limits.excess(schedule.positions, schedule.control_period)
+        assert factor <= 1 + 1e-9
+        assert overrun <= 1e-9
+        found += 1
+        yield schedule
+
+
+@pytest.mark.slow
+def test_flown_times_are_those_of_the_solutions() -> None:
+    """Rounded up to a tick; beyond that, at most 3 % in 95 % of the cases and never three ticks."""
+    longer, beyond, ticks = [], [], []
+    for name in TIMED_ROBOTS:
+        for schedule in planned(name, FLOWN_GOALS):
+            solution, tick = schedule.notes["solution_time"], schedule.control_period
+            assert isinstance(solution, float)
+            longer.append(schedule.duration / solution - 1)
+            ticks.append(schedule.ticks - np.ceil(solution / tick - 0.02))
+            beyond.append(ticks[-1] * tick / solution)
+            print(
+                f"{name}: {schedule.duration:.5g} s, solution {solution:.5g} s: {longer[-1]:.2%} "
+                f"longer, {beyond[-1]:.2%} beyond the next tick",
+                flush=True,
+            )
+    print(
+        f"{len(longer)} plans: {np.mean(np.array(longer) <= 0.03):.1%} at most 3 % longer, largest "
+        f"{max(longer):.2%}; {np.mean(np.array(beyond) <= 0.03):.1%} at most 3 % beyond the next "
+        f"tick, largest {max(beyond):.2%}"
+    )
+    assert np.mean(np.array(beyond) <= 0.03) >= 0.95
+    assert max(ticks) <= 3
 
 
 # -- plans that begin while the joints move keep clear, of links and of a rock on the way ---------
