@@ -332,7 +332,7 @@ class Plots:
         with self._error_tab:
             self._logarithmic: Any = gui.add_checkbox("Logarithmic", initial_value=False)
             self._no_errors: Any = gui.add_html(content.hint_html("No goal is pursued."))
-        self._errors: dict[Part, _Plot] = {}
+        self._errors: dict[tuple[Part, int], _Plot] = {}
         with self._tab_group.add_tab("Momentum"):
             # In millionths, because axis labels have three decimals.
             units = ("1e-6 kg m/s", "1e-6 kg m²/s")
@@ -367,7 +367,8 @@ class Plots:
         time_s = measured.time_s
         self._show_parts(errors)
         for part, error in errors.items():
-            self._errors[part].history.add(time_s, 1e3 * np.array(error.numbers))
+            numbers = 1e3 * np.array(error.numbers)
+            self._errors[part, len(numbers)].history.add(time_s, numbers)
         if state.momenta is not None:
             if self._first is None:
                 self._first = state.momenta.actual
@@ -387,24 +388,27 @@ class Plots:
             self._budget_text.content = text
 
     def _show_parts(self, errors: Mapping[Part, content.GoalDistance]) -> None:
-        """Have one plot for each part with an error, and none for others."""
-        for part, plot in tuple(self._errors.items()):
-            if part not in errors or len(plot.names) != len(errors[part].numbers):
-                plot.handle.remove()
-                del self._errors[part]
-        for part, error in errors.items():
-            if part not in self._errors:
-                title, units = content.shortened(part), ("mm", "mrad")[: len(error.numbers)]
+        """Show one plot for each part with an error, and none for others.
+
+        A hidden plot is used again: browsers complain about curves of removed ones.
+        """
+        shown = [(part, len(error.numbers)) for part, error in errors.items()]
+        for part, count in shown:
+            if (part, count) not in self._errors:
+                title, units = f"Error of {content.shortened(part)}", ("mm", "mrad")[:count]
                 with self._error_tab:
-                    self._errors[part] = _Plot(
-                        self._gui, f"Error of {title}", units, 10.0, units, limited=True
-                    )
+                    plot = _Plot(self._gui, title, units, 10.0, units, limited=True)
+                self._errors[part, count] = plot
+        for key, plot in self._errors.items():
+            if plot.handle.visible and key not in shown:
+                plot.history = History(len(plot.names))
+            plot.handle.visible = key in shown
         self._no_errors.visible = not errors
 
     def draw(self, tolerance: Tolerance | None = None, time_s: float | None = None) -> None:
         """Redraw the curves, with tolerances of errors, and a line at a time that is shown, s."""
         limits = () if tolerance is None else (tolerance.position, tolerance.attitude)
-        for plot in self._errors.values():
+        for plot in [each for each in self._errors.values() if each.handle.visible]:
             plot.set_logarithmic(enabled=bool(self._logarithmic.value))
             plot.draw(time_s, [1e3 * limit for limit in limits])
         for each in (self._momentum, self._budget, self._shape):

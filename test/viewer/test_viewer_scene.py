@@ -222,11 +222,15 @@ def test_each_link_with_a_goal_has_a_plot_of_its_own(server: Any) -> None:
         plots.add(StackState(measured, goals=goals), errors)
         plots.draw()
 
+    def handles() -> dict[str, Any]:
+        every = [plot.handle for plot in plots._errors.values()]
+        return {each.title: each for each in every if each.visible}
+
     def shown() -> list[str]:
-        return [plot.handle.title for plot in plots._errors.values() if plot.handle.visible]
+        return list(handles())
 
     def numbers(part: str) -> list[list[float]]:
-        return [column.tolist() for column in plots._errors[part].handle.data]
+        return [column.tolist() for column in handles()[f"Error of {part}"].data]
 
     add(0.0, {})
     assert shown() == []
@@ -243,7 +247,7 @@ def test_each_link_with_a_goal_has_a_plot_of_its_own(server: Any) -> None:
     times, _, _, near, turned, line = numbers("base")
     assert (times, near, turned) == ([2.5, 2.5, 2.5, 3.0], [20.0] * 4, [5.0] * 4)
     assert line == [-1.0, 1.0, -1.0, -1.0]
-    handle = plots._errors["base"].handle
+    handle = handles()["Error of base"]
     assert [axis["scale"] for axis in handle.axes[1:]] == ["mm", "mrad"]
     # A logarithmic axis begins at a micrometre.
     plots._logarithmic.value = True
@@ -253,7 +257,7 @@ def test_each_link_with_a_goal_has_a_plot_of_its_own(server: Any) -> None:
     add(5.0, {"end_effector": base}, end_effector=GoalDistance(0.75, 0.5))
     assert shown() == ["Error of end_effector"], "that of a controller"
     plots.show_robot(None)
-    assert plots._errors == {}
+    assert shown() == []
 
 
 def test_a_link_is_where_its_joints_have_it() -> None:
