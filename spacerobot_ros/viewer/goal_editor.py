@@ -50,7 +50,7 @@ _BASE_GIZMO, _TOOL_GIZMO = "/goal", "/end_effector_goal"
 _DECIMALS = 4, 2
 """Decimals of the position (m) and of the angles (deg) of a goal that a user moves, and sees."""
 
-_MARK_SIZE = 0.12
+_MARK_SIZE = 0.15
 """Radius of the mark at the goal of an end-effector, as a share of the size of its gizmo."""
 
 
@@ -143,7 +143,7 @@ class GoalEditor:
     def add_tool(self, pose: Array | None) -> None:
         """Add a goal of the end-effector at a pose (7,)."""
         if pose is not None and self.placed:
-            self._add_gizmo(_TOOL_GIZMO, 0.15 * self._reach)
+            self._add_gizmo(_TOOL_GIZMO, 0.12 * self._reach)
             self._move_gizmo(_TOOL_GIZMO, pose)
             self.touch(time.monotonic())
 
@@ -172,7 +172,7 @@ class GoalEditor:
         """Set the goal to poses (7,) and the ghost to joint positions (n,)."""
         assert self._robot is not None
         if _BASE_GIZMO not in self._gizmos:
-            self._add_gizmo(_BASE_GIZMO, 0.3 * self._reach)
+            self._add_gizmo(_BASE_GIZMO, 0.2 * self._reach)
             self._ghost = RobotDrawing(
                 self._server.scene,
                 f"{_BASE_GIZMO}/ghost",
@@ -482,7 +482,7 @@ class GoalEditor:
             return
         name = _link_gizmo(link)
         if name not in self._gizmos:
-            self._add_gizmo(name, 0.18 * self._reach)
+            self._add_gizmo(name, 0.12 * self._reach)
             self._gizmos[name].visible = False
         self._move_gizmo(name, self._kinematics.link_in_world(link, *self._present))
 

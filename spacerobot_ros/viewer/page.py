@@ -557,17 +557,32 @@ _LAYERS = (
 """Layers of the scene: name, whether it is shown at first, and its explanation."""
 
 
-_PORTRAIT, _PORTRAIT_DISTANCE, _PORTRAIT_SHIFT = 0.8, 1.5, 0.35
+_PORTRAIT, _PORTRAIT_DISTANCE, _PORTRAIT_SHIFT, _PANEL_SHIFT = 0.8, 1.75, 0.36, 0.32
 """Width to height below which a window is a phone's; how much farther its camera is from the robot,
-and how far below it looks, as a share of the distance.
+and how far below it looks, else to its right, as shares of the distance.
 """
 
 
-def screen_up(away: Array) -> Array:
-    """Return the up direction (3,) of a camera at the position ``away`` (3,) from its target."""
-    back = away / np.linalg.norm(away)
-    up: Array = np.array([0.0, 0.0, 1.0]) - back[2] * back
-    return up / np.linalg.norm(up)
+def view_beside_panel(at: Array, away: Array, aspect: float) -> tuple[Array, Array]:
+    """Return where a camera is and looks (3,), m, so that the panel does not cover the robot.
+
+    Parameters
+    ----------
+    at, away
+        Position (3,) of the robot, and that of the camera relative to it on a desktop, m.
+    aspect
+        Width to height of the window. On a phone the panel is below, on a desktop on the right.
+    """
+    right = np.cross([0.0, 0.0, 1.0], away)
+    right /= np.linalg.norm(right)
+    up = np.cross(away, right) / np.linalg.norm(away)
+    if aspect < _PORTRAIT:
+        away = _PORTRAIT_DISTANCE * away
+        aside = -_PORTRAIT_SHIFT * up
+    else:
+        aside = _PANEL_SHIFT * right
+    look_at = at + float(np.linalg.norm(away)) * aside
+    return look_at + away, look_at
 
 
 class Page:
@@ -922,12 +937,9 @@ class Page:
         """Turn a camera to the robot; before its first state, to the origin."""
         seen = self._last if self._drawn is None else self._drawn
         at = np.zeros(3) if seen is None else seen.pose[:3]
-        away = self._reach * offset
-        if getattr(camera, "aspect", 1.0) < _PORTRAIT:
-            # On a phone the panel covers the lower half: the robot is seen above it.
-            away = _PORTRAIT_DISTANCE * away
-            at = at - _PORTRAIT_SHIFT * float(np.linalg.norm(away)) * screen_up(away)
-        camera.position, camera.look_at = at + away, at
+        camera.position, camera.look_at = view_beside_panel(
+            at, self._reach * offset, getattr(camera, "aspect", 1.0)
+        )
 
     def _aim_cameras(self) -> None:
         for client in self._server.get_clients().values():

@@ -201,9 +201,9 @@ class Page:
         self._window.mouse("mouseReleased", x, y, held=True)
         self.draw()
 
-    def pixel(self, point: Array, camera: Array) -> tuple[float, float]:
-        """Return where a point of the world is seen from a camera that looks at the origin."""
-        forward = -camera / np.linalg.norm(camera)
+    def pixel(self, point: Array, camera: Array, look_at: Array) -> tuple[float, float]:
+        """Return where a point of the world is seen from a camera."""
+        forward = (look_at - camera) / np.linalg.norm(look_at - camera)
         right = np.cross(forward, [0.0, 0.0, 1.0])
         right /= np.linalg.norm(right)
         up = np.cross(right, forward)

@@ -23,7 +23,7 @@ from support.viewer_page import ROOT, Page, Processes, processes
 from spacerobot_ros.model import load_robot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.scenario import load_scenario
-from spacerobot_ros.viewer.page import CAMERA
+from spacerobot_ros.viewer.page import CAMERA, view_beside_panel
 from spacerobot_ros.viewer.scene import reach_of
 
 pytestmark = [
@@ -241,9 +241,9 @@ def test_a_mission_is_flown_from_the_page(
         # The gizmo is dragged along the vertical axis, and the goal is checked anew.
         robot = load_robot(ROOT / "urdf" / "sliding_masses.urdf")
         reach = reach_of(robot)
-        tip, to = (np.array([0.0, 0.0, z * reach]) for z in (0.267, 0.327))
-        camera = reach * CAMERA
-        page.drag(page.pixel(tip, camera), page.pixel(to, camera))
+        tip, to = (np.array([0.0, 0.0, z * reach]) for z in (0.178, 0.238))
+        view = view_beside_panel(np.zeros(3), reach * CAMERA, 1.0)
+        page.drag(page.pixel(tip, *view), page.pixel(to, *view))
         x, y, z = page.numbers(POSITION)
         assert (x, y) == (0.0, 0.0)
         assert z == pytest.approx(0.06 * reach, rel=0.2)
@@ -327,12 +327,12 @@ def test_a_page_that_is_closed_in_the_middle_of_a_drag_leaves_a_goal_and_no_harm
     nodes.start("planner", *PLANNER, files=FILE)
     watched = Watched(harness)
     reach = reach_of(load_robot(ROOT / "urdf" / "sliding_masses.urdf"))
-    camera = reach * CAMERA
+    view = view_beside_panel(np.zeros(3), reach * CAMERA, 1.0)
     with browser(tmp_path / "first") as window:
         page = Page(window, url)
         page.wait_for_text("Goal reachable")
-        tip, to = (np.array([0.0, 0.0, z * reach]) for z in (0.267, 0.327))
-        page.drag(page.pixel(tip, camera), page.pixel(to, camera), release=False)
+        tip, to = (np.array([0.0, 0.0, z * reach]) for z in (0.178, 0.238))
+        page.drag(page.pixel(tip, *view), page.pixel(to, *view), release=False)
         moved = page.numbers(POSITION)
         assert moved[2] > 0.0
     with browser(tmp_path / "second") as window:

@@ -27,7 +27,7 @@ from spacerobot_ros.planning.core.goal import EndEffectorGoal, Tolerance
 from spacerobot_ros.resources import robot_file, share_directory
 from spacerobot_ros.viewer import scene
 from spacerobot_ros.viewer.content import GoalDistance
-from spacerobot_ros.viewer.page import CAMERA, Page, Plots, _Plot
+from spacerobot_ros.viewer.page import CAMERA, Page, Plots, _Plot, view_beside_panel
 from spacerobot_ros.viewer.server import ViewerConfig, start_server, stop_server
 from spacerobot_ros.viewer.state import Measured, Momenta, StackState
 
@@ -137,8 +137,9 @@ def test_a_robot_far_from_the_origin_is_looked_at_and_has_a_grid_below(server: A
     at, onward = np.array([1234.5, -67.0, 89.0]), np.array([50.0, 0.0, 0.0])
     first = Measured(0.0, np.concatenate([at, [0.0, 0.0, 0.0, 1.0]]), zeros, zeros, zeros)
     page.update(StackState(first, age_s=0.0), 1.0)
-    np.testing.assert_allclose(server.initial_camera.look_at, at)
-    np.testing.assert_allclose(server.initial_camera.position, at + reach * CAMERA)
+    position, look_at = view_beside_panel(at, reach * CAMERA, 1.6)
+    np.testing.assert_allclose(server.initial_camera.look_at, look_at)
+    np.testing.assert_allclose(server.initial_camera.position, position)
     grid = server.scene.get_handle_by_name("/grid")
     assert np.abs(grid.position[:2] - at[:2]).max() < grid.width / 4
     np.testing.assert_allclose(np.remainder(grid.position[:2], grid.section_size), 0.0, atol=1e-9)
@@ -146,10 +147,10 @@ def test_a_robot_far_from_the_origin_is_looked_at_and_has_a_grid_below(server: A
     # It goes on, and a user looks for it: only that camera is moved.
     later = replace(first, time_s=9.0, pose=first.pose + np.append(onward, np.zeros(4)))
     page.update(StackState(later, age_s=0.0), 2.0)
-    np.testing.assert_allclose(server.initial_camera.look_at, at)
+    np.testing.assert_allclose(server.initial_camera.look_at, look_at)
     camera = type("Camera", (), {})()
     page._aim_camera(camera)
-    np.testing.assert_allclose(camera.look_at, at + onward)
+    np.testing.assert_allclose(camera.look_at, look_at + onward)
 
 
 def test_curves_of_many_joints_differ(server: Any) -> None:
