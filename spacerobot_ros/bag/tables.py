@@ -307,6 +307,8 @@ class ExportFormat(str, Enum):
     CSV = "csv"
     PARQUET = "parquet"
     MAT = "mat"
+    TREE = "tree"
+    """CSV whose columns PlotJuggler shows as a tree: ``joint_states/position/elbow``."""
 
 
 def to_pandas(table: TopicTable) -> pandas.DataFrame:
@@ -354,9 +356,9 @@ def export(
 ) -> dict[str, int]:
     """Write tables for other programs; return the number of rows of each topic that is written.
 
-    CSV and Parquet make a folder with a file for each topic that has messages (``odom.csv``,
-    ``planner.status.csv``); MAT makes one file with a struct for each. Nothing is ever written
-    over, and what cannot be finished is removed.
+    CSV, tree and Parquet make a folder with a file for each topic that has messages
+    (``odom.csv``, ``planner.status.csv``); MAT makes one file with a struct for each. Nothing is
+    ever written over, and what cannot be finished is removed.
 
     Parameters
     ----------
@@ -381,7 +383,9 @@ def export(
     if format is ExportFormat.MAT:
         write_output(target, _mat_content(named))
     else:
-        write = _write_csv if format is ExportFormat.CSV else _write_parquet
+        write = _write_parquet if format is ExportFormat.PARQUET else _write_csv
+        if format is ExportFormat.TREE:
+            named = {name: _as_tree(table) for name, table in named.items()}
         try:
             target.mkdir(parents=True)
             write(named, target)
@@ -424,6 +428,17 @@ def _unused_name(name: str, taken: Mapping[str, Any]) -> str:
     others = {each.lower() for each in taken}
     names = (name, *(f"{name}_{number}" for number in range(2, len(others) + 3)))
     return next(each for each in names if each.lower() not in others)
+
+
+def _as_tree(table: TopicTable) -> TopicTable:
+    """Return a table whose columns are paths: ``odom/pose/pose/position/x``."""
+
+    def path(name: str) -> str:
+        return "/".join([table.topic.strip("/"), *re.split(r"[.\[]+", name.replace("]", ""))])
+
+    units, columns = table.units, table.columns.items()
+    fields = tuple(Field(path(name), values, (units[name],)) for name, values in columns)
+    return replace(table, fields=fields)
 
 
 def _write_csv(tables: dict[str, TopicTable], folder: Path) -> None:

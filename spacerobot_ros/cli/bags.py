@@ -29,10 +29,11 @@ from spacerobot_ros.errors import printable
 @click.command("export")
 @bag_argument
 @format_option(
-    ("csv", "parquet", "mat"),
-    "csv and parquet: a folder with a file for each topic; mat: one file for MATLAB.",
+    ("csv", "parquet", "mat", "tree"),
+    "csv and parquet: a folder with a file for each topic; mat: one file for MATLAB; tree: csv "
+    "whose columns PlotJuggler shows as a tree.",
 )
-@out_option("Folder or file to write [BAG_csv, BAG_parquet or BAG.mat].")
+@out_option("Folder or file to write [BAG_csv, BAG_parquet, BAG_tree or BAG.mat].")
 @topic_option("Export only this topic, with or without the slash before it [all].")
 def export_command(bag: Path, format_name: str, out: Path | None, topics: tuple[str, ...]) -> None:
     """Write the topics of a BAG as tables for other programs.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import keyword
 import math
@@ -208,8 +209,8 @@ def from_mat(struct: dict[str, Any], path: str) -> Any:
 def test_the_same_bag_in_three_formats_is_equal(which: str, tmp_path: Path, bag: Bag) -> None:
     opened = bag if which == "small" else read_bag(SERVICER)
     tables = [opened.table(topic) for topic in opened]
-    folder, parquet, mat = (tmp_path / kind.value for kind in ExportFormat)
-    for path, kind in zip((folder, parquet, mat), ExportFormat, strict=True):
+    folder, parquet, mat, tree = (tmp_path / kind.value for kind in ExportFormat)
+    for path, kind in zip((folder, parquet, mat, tree), ExportFormat, strict=True):
         assert export(tables, path, kind) == {t.topic: len(t) for t in tables}
     listed = pd.read_csv(folder / "_columns.csv", keep_default_na=False)
     structs = loadmat(mat, simplify_cells=True)
@@ -222,6 +223,13 @@ def test_the_same_bag_in_three_formats_is_equal(which: str, tmp_path: Path, bag:
         (file,) = set(rows["file"])
         read = from_csv(folder / file, expected)
         pd.testing.assert_frame_equal(read, expected, check_exact=True, check_dtype=False)
+        # PlotJuggler has a branch for each part between slashes.
+        head, numbers = (tree / file).read_text("utf-8").split("\n", 1)
+        first, *paths = next(csv.reader([head]))
+        assert (first, len(paths)) == ("time", len(expected.columns))
+        assert all(each.startswith(f"{table.topic.strip('/')}/") for each in paths)
+        assert not set(head) & set(".[]")
+        assert numbers == (folder / file).read_text("utf-8").split("\n", 1)[1]
         stored = parquet / Path(file).with_suffix(".parquet")
         read = pd.read_parquet(stored)
         pd.testing.assert_frame_equal(read, expected, check_exact=True)
