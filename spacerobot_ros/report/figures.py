@@ -37,9 +37,9 @@ _TOL = ("#332288", "#882255", "#999933", "#44AA99")
 PALETTE = (*_OKABE_ITO, *_TOL)
 """Colours that people with any colour vision tell apart."""
 
-BASE_COLOUR, HAND_COLOUR, PLANNED_COLOUR, GHOST_COLOUR = (PALETTE[i] for i in (0, 2, 4, 3))
-"""Colours of the paths of base and end-effector, of plans, and of goals in space: blue, green,
-orange, as on the live page, and pink."""
+BASE_COLOUR, HAND_COLOUR, PLANNED_COLOUR, GHOST_COLOUR = (PALETTE[i] for i in (0, 3, 4, 2))
+"""Colours of the paths of base and end-effector, of plans, and of goals in space: blue, pink,
+orange and green, as on the live page."""
 
 WIDTH = 9.6
 """Width of a figure of a page, inches."""

@@ -20,7 +20,6 @@ from spacerobot_ros.report.figures import (
     PALETTE,
     PLANNED_COLOUR,
     SECONDARY_COLOUR,
-    TEXT_COLOUR,
     TRACE_TIME_SLICES,
     ReportFigure,
     angle_unit,
@@ -60,8 +59,10 @@ _MAX_SHOWN_POSES = 6
 _FOOT_SHARE = 0.1
 """Share of the height of a picture of a robot that is left for the scale bar."""
 
-_NEAR_GOAL = 2.0
-"""Largest extent of the robot and its goal for which the whole goal is shown, in robot extents."""
+_NEAR = 2.0
+"""Largest extent of the robot and its goal, or obstacles, with which these are shown whole, in
+robot extents.
+"""
 
 
 def configurations_figure(flight: FlightReport) -> ReportFigure | str:
@@ -80,9 +81,8 @@ def configurations_figure(flight: FlightReport) -> ReportFigure | str:
     points = np.concatenate([corner_points(scene) for scene in scenes])
     view = view_of(flight)
     if (goal := goal_of_base(flight, MAX_MESH_FACES)) is not None:
-        both = np.concatenate([points, *outlines(goal)])
-        if np.ptp(view(both), axis=0).max() < _NEAR_GOAL * np.ptp(view(points), axis=0).max():
-            points = both
+        points = with_near(points, np.concatenate(outlines(goal)), view)
+    points = with_near(points, corner_points(around), view)
     places = [axes for row in panels for axes in row]
     for axes in places[len(indices) :]:
         axes.set_visible(False)
@@ -105,6 +105,13 @@ def configurations_figure(flight: FlightReport) -> ReportFigure | str:
         caption += " Dashed in the last, the base link at the goal."
     caption += flight.missing_meshes
     return ReportFigure("configurations", "Configurations", caption, figure)
+
+
+def with_near(points: Array, more: Array, view: View) -> Array:
+    """Return points (k, 3) of a robot, and those of other things unless these are far away, m."""
+    both = np.concatenate([points, more])
+    shown = np.ptp(view(both), axis=0).max() < _NEAR * np.ptp(view(points), axis=0).max()
+    return both if shown else points
 
 
 def view_of(flight: FlightReport) -> View:
@@ -183,8 +190,8 @@ def draw_goal_and_path(axes: Axes, flight: FlightReport, view: View) -> list[Lin
     if float(np.ptp(path, axis=0).max()) > 0.0:
         flat = view(path)
         dense = len(path) > 2 * TRACE_TIME_SLICES
-        axes.plot(flat[:, 0], flat[:, 1], color=TEXT_COLOUR, lw=0.8, zorder=5, rasterized=dense)
-        keys.append(legend_entry(TEXT_COLOUR, "path of the base"))
+        axes.plot(flat[:, 0], flat[:, 1], color=BASE_COLOUR, lw=0.8, zorder=5, rasterized=dense)
+        keys.append(legend_entry(BASE_COLOUR, "path of the base"))
     if (goal := goal_of_base(flight, MAX_MESH_FACES)) is not None:
         for line in outlines(goal):
             flat = view(line)

@@ -53,6 +53,9 @@ _LINE_TOLERANCE = 5e-4
 
 _MAX_CHART_EVENTS = 500
 
+_FOLDED = ("velocities", "efforts", "twist")
+"""Names of the figures that are folded up."""
+
 Figures = Sequence[ReportFigure | str | None]
 """Figures of a page; a text says why a figure is missing."""
 
@@ -175,7 +178,10 @@ def _figures_html(figures: Figures) -> list[str]:
         charts = f' data-charts="{numbers[each.name]}"' if each.name in numbers else ""
         heading = escape(each.heading)
         caption = f"<b>Figure {number}. {heading}.</b> {_caption_html(each)}"
-        parts.append(figure(each.name, each.svg, each.heading, caption, charts))
+        shown = figure(each.name, each.svg, each.heading, caption, charts)
+        if each.name in _FOLDED:
+            shown = f"<details><summary>{heading}</summary>{shown}</details>"
+        parts.append(shown)
     return parts
 
 

@@ -463,10 +463,10 @@ def _caption_text(flight: FlightReport, frames: KeyFrames, radius: float, ghosts
     )
     several = len(flight.link_poses) > 1
     if several:
-        text += " and of the end-effectors (green)"
+        text += " and of the end-effectors (pink)"
     elif len(flight.tool) or flight.link_poses:
-        text += " and of the end-effector (green)"
-    text += "; the ghost is the goal" if ghosts else ""
+        text += " and of the end-effector (pink)"
+    text += "; the green ghost is the goal" if ghosts else ""
     text += "; obstacles have the shapes by which distances are measured" * bool(flight.obstacles)
     text += "; the target moves as target/odom says" * (flight.target is not None)
     if len(flight.position) < 2:

@@ -77,7 +77,7 @@ def placed_solids(bodies: Iterable[Body], instant: int) -> list[PlacedSolid]:
 
 def corner_points(solids: Iterable[PlacedSolid]) -> Array:
     """Return all corners (k, 3) of solids."""
-    return np.concatenate([solid.corners.reshape(-1, 3) for solid in solids])
+    return np.concatenate([np.zeros((0, 3)), *(each.corners.reshape(-1, 3) for each in solids)])
 
 
 class View:

@@ -52,11 +52,12 @@ from spacerobot_ros.report.figures_space import (
     loops_figure,
     path_figure,
     view_of,
+    with_near,
 )
 from spacerobot_ros.report.flight import FlightReport, read_report
 from spacerobot_ros.report.page import page
 from spacerobot_ros.report.player import player_of, view_of_flight
-from spacerobot_ros.report.scene import bodies_of
+from spacerobot_ros.report.scene import bodies_of, obstacles_of
 from spacerobot_ros.report.solids import MAX_MESH_FACES, corner_points, placed_solids
 from spacerobot_ros.resources import suggestion
 
@@ -232,7 +233,7 @@ def _overview_figure(flight: FlightReport) -> Figure:
     groups = [position_group(flight), attitude_group(flight)]
     if len(flight.shape):
         groups += shape_groups(flight)[:1]
-    robot = None
+    robot, around = [], placed_solids(obstacles_of(flight), 0)
     if not flight.hidden_links_text:
         last = [len(flight.position) - 1]
         robot = placed_solids(bodies_of(flight, last, MAX_MESH_FACES), 0)
@@ -248,11 +249,12 @@ def _overview_figure(flight: FlightReport) -> Figure:
         if number < len(groups) - 1:
             axes.set_xlabel("")
             axes.tick_params(labelbottom=False)
-    if robot is not None:
+    if robot:
         size = _ROBOT_PANEL_WIDTH - 0.15
         axes = panel(figure, WIDTH - size - 0.1, 0.2, size, up - 1.0)
         view = view_of(flight)
-        draw_robot(axes, robot, corner_points(robot), view)
+        points = with_near(corner_points(robot), corner_points(around), view)
+        draw_robot(axes, [*robot, *around], points, view)
         legend_above(axes, draw_goal_and_path(axes, flight, view))
     title = ": ".join(filter(None, (flight.scenario.name, flight.scenario.description)))
     figure.text(0.1 / WIDTH, 1 - 0.24 / up, title, size=10.5, weight="bold")

@@ -272,7 +272,7 @@ def test_a_flight_without_obstacles_says_nothing_of_them(hands: FlightReport) ->
     assert f"{WORLD}/path of the end-effector" in drawn
     assert f"{WORLD}/path of {RIGHT}" in drawn
     assert f"{WORLD}/path of {LEFT}" not in drawn
-    assert "of the end-effectors (green)" in scene.caption
+    assert "of the end-effectors (pink)" in scene.caption
 
 
 def test_pictures_of_configurations_have_the_obstacles(strut: FlightReport) -> None:
