@@ -370,8 +370,9 @@ class ControlExecutive:
         elif not (pursued or self._pending):
             return False
         self._give_up(f"Aborted by the plant: {why}")
-        self._plan_next(_Next.HOLD)
-        self._report_abort()  # Reported at once: the next measured state may come late.
+        # Reported at once, as the next measured state may come late; an earlier abort is, too.
+        self._next = _Next.HOLD
+        self._report_abort()
         return True
 
     def on_plant_obeying(self) -> None:
@@ -626,6 +627,8 @@ class ControlExecutive:
                 self._begin_goals(time, state)
                 return
             self._begin_tasks(time, servicing.before_goals)
+        elif self._pending and self._latest_id() != self._goal_id:
+            self._wait_for_tasks()
         if servicing.task is None:
             return
         progress = servicing.step(time, state, self.controller)
@@ -664,13 +667,18 @@ class ControlExecutive:
 
     def _begin_tasks(self, time: float, tasks: tuple[Task, ...]) -> None:
         self.servicing.begin(tasks)
-        self._goals, self._goal_id = {}, self._latest_id() if self._pending else ""
-        if self._pending:
-            self._report_acceptance()
         self._goal_state = ControllerState.TRACKING
         self._monitor.begin(time)
         self._stall.restart()
         self._next_report, self._error_bounds = time, None
+        self._wait_for_tasks()
+
+    def _wait_for_tasks(self) -> None:
+        """Report and save the pending goals, which begin after the tasks."""
+        reported, self._goal_id = self._goal_id, self._latest_id() if self._pending else ""
+        self._goals = {}
+        if self._pending and self._goal_id != reported:
+            self._report_acceptance()
         self.outputs.append(PursuedGoals(dict(self._pending)))
 
     def _end_tasks(self, time: float, state: ControlState, progress: TaskProgress) -> None:

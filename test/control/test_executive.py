@@ -616,6 +616,16 @@ def test_a_plant_that_stops_ends_the_goal_at_once_and_once(tmp_path: Path) -> No
     np.testing.assert_allclose(wrench, 0.0, atol=1e-12)
 
 
+def test_a_plant_that_stops_before_an_abort_is_answered_decides_the_goal_once() -> None:
+    loop = ExecutiveLoop()
+    loop.aim(base=goal_at([1.0, 0.0, 0.0], "there"))
+    loop.answer(3)
+    loop.executive.abort()
+    assert loop.executive.plant_stopped("The plant is latched.")
+    loop.answer(3)
+    assert kinds(loop) == [("goal_accepted", "there"), ("goal_aborted", "there")]
+
+
 def test_a_plant_that_rested_before_a_goal_ends_only_older_ones() -> None:
     loop = ExecutiveLoop()
     loop.answer(3)

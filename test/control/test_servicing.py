@@ -313,9 +313,16 @@ def test_a_later_goal_replaces_the_one_that_waits_for_the_tasks() -> None:
     loop.aim(base=goal_at(AIM, "5"))
     loop.answer(2)
     loop.aim(base=goal_at(-AIM, "6"))
+    loop.answer(1)
+    assert (loop.status.task, loop.status.goal_id) == ("detumble", "6")
+    loop.executive.request(Task.DETUMBLE)
+    loop.answer(1)
+    accepted = [each.goal_id for each in loop.events if each.kind is EventKind.GOAL_ACCEPTED]
+    assert accepted == ["5", "6"]
     loop.rates = np.zeros(2)
     loop.answer(6)
     assert loop.status.goal_id == "6"
+    assert [each.goal_id for each in loop.events if each.kind.value == "goal_accepted"] == accepted
     goal = loop.executive.controller.goal.base
     assert goal is not None
     np.testing.assert_allclose(goal.position, -AIM)

@@ -21,6 +21,9 @@ class Kind(str, Enum):
     BAD_GOAL = "goal that is none"
     BAD_SHAPE = "shape that is none"
     TIP_GOAL = "goal of the end-effector"
+    TWIST = "twist of the end-effector"
+    BAD_TWIST = "twist that is none"
+    DETUMBLE = "detumble"
     ABORT = "abort"
     REARM = "rearm"
     PAUSE = "pause"
@@ -85,6 +88,9 @@ _WEIGHTS: dict[Kind, float] = {
     Kind.BAD_GOAL: 1.0,
     Kind.BAD_SHAPE: 0.5,
     Kind.TIP_GOAL: 3.0,
+    Kind.TWIST: 3.0,
+    Kind.BAD_TWIST: 1.0,
+    Kind.DETUMBLE: 1.5,
     Kind.ABORT: 4.0,
     Kind.REARM: 3.0,
     Kind.PAUSE: 1.5,
@@ -115,6 +121,7 @@ _BAD_FAULTS = (
 
 _BAD_GOALS = ("frame", "quaternion", "nan", "infinite")
 _BAD_SHAPES = ("unknown", "short", "nan", "twice")
+_BAD_TWISTS = ("1e308", "-1e155", "1e7", "nan", "inf")
 
 
 class Draw:
@@ -138,6 +145,10 @@ class Draw:
             unused |= {Kind.BAD_SHAPE}
         if not setup.tip:
             unused |= {Kind.TIP_GOAL}
+        if not setup.twists:
+            unused |= {Kind.TWIST, Kind.BAD_TWIST}
+        if not setup.controller or not setup.tip:
+            unused |= {Kind.DETUMBLE}
         kinds = [kind for kind in _WEIGHTS if kind not in unused]
         weights = np.array([_WEIGHTS[kind] for kind in kinds])
         self._kinds, self._chances = kinds, weights / weights.sum()
@@ -162,6 +173,13 @@ class Draw:
                 return Action(kind, aims=(self._aim(),), text=self._one(_BAD_GOALS), ticks=ticks)
             case Kind.BAD_SHAPE:
                 return Action(kind, text=self._one(_BAD_SHAPES), ticks=ticks)
+            case Kind.TWIST:
+                v, w = self._rng.uniform(-0.1, 0.1, (2, 3)).round(6).tolist()
+                return Action(kind, aims=(Aim(tuple(v), tuple(w)),), ticks=ticks)
+            case Kind.DETUMBLE:
+                return Action(kind, CONTROLLER, ticks=ticks)
+            case Kind.BAD_TWIST:
+                return Action(kind, text=self._one(_BAD_TWISTS), ticks=ticks)
             case Kind.ABORT:
                 return Action(kind, self._one(nodes), ticks=ticks)
             case Kind.DEACTIVATE | Kind.RECONFIGURE:

@@ -229,6 +229,7 @@ class EventBook:
 
     _DECISIONS = (
         EventKind.GOAL_REACHED,
+        EventKind.GOAL_REACHED_PARTLY,
         EventKind.GOAL_FAILED,
         EventKind.GOAL_ABORTED,
         EventKind.GOAL_REFUSED,
@@ -258,6 +259,11 @@ class EventBook:
             if goal in self.decided:
                 self._report(f"{node}: goal {event.goal_id} is accepted after its decision")
             self.accepted.add(goal)
+
+    @property
+    def undecided(self) -> set[tuple[str, str]]:
+        """Goals that were accepted and have no result, by node and id."""
+        return self.accepted - set(self.decided)
 
     def compare(self, changes: Counter[EventKind]) -> str | None:
         """Compare the plant's events with what its statuses say has happened."""
@@ -338,7 +344,10 @@ class MomentumCheck:
         assert now.expected is not None
         assert before.expected is not None
         wrench = self.wrenches.pop(before.time_ns, None)
-        self.wrenches = {t: w for t, w in self.wrenches.items() if t > before.time_ns}
+        # One that comes late, after time has begun again, is for no state that there will be.
+        self.wrenches = {
+            t: w for t, w in self.wrenches.items() if before.time_ns < t <= now.time_ns
+        }
         pushed = self._situation.acting(
             now.time_ns, self._period, "thruster_off", "thruster_weak", "thruster_stuck",
             "nozzle_open", "nozzle_closed", "nozzle_weak",

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import rclpy
-from geometry_msgs.msg import PoseStamped
+from geometry_msgs.msg import PoseStamped, TwistStamped
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
 from rclpy.node import Node
@@ -75,6 +75,7 @@ class RandomFlight:
         node = self._node = harness.add(Node("operator", context=harness.context))
         self._goals = node.create_publisher(PoseStamped, "goal_pose", 100)
         self._tip_goals = node.create_publisher(PoseStamped, "end_effector/goal_pose", 100)
+        self._twists = node.create_publisher(TwistStamped, "end_effector/twist", 100)
         self._shapes = node.create_publisher(JointState, "goal_joint_states", 100)
         self._faults = node.create_publisher(String, "fault_injection", 100)
         self._clients: dict[str, Any] = {}
@@ -244,6 +245,12 @@ class RandomFlight:
                     tip = self._seen.parts.get("end_effector_pose")
                     if tip is not None:
                         self._send(moved(tip, aim.offset, aim.turn), tip=True)
+            case Kind.TWIST:
+                self._send_twist((*action.aims[0].offset, *action.aims[0].turn))
+            case Kind.BAD_TWIST:
+                self._send_twist((float(action.text), *(0.0,) * 5))
+            case Kind.DETUMBLE:
+                self._trigger(f"{CONTROLLER}/detumble", may_refuse=True)
             case Kind.SHAPE_GOAL:
                 self._shapes.publish(JointState(name=self._names, position=list(action.shape)))
                 self._send(self._pose(action.aims[0].offset, action.aims[0].turn))
@@ -371,6 +378,15 @@ class RandomFlight:
         (self._tip_goals if tip else self._goals).publish(goal)
         return goal_id
 
+    def _send_twist(self, values: tuple[float, ...]) -> None:
+        message, time = TwistStamped(), self._setup.planner["twist_timeout"]
+        message.header.frame_id = "world"
+        v, w = message.twist.linear, message.twist.angular
+        v.x, v.y, v.z, w.x, w.y, w.z = values
+        self._seen.allow_stop(time + 1.0)
+        self._situation.goals_since_stop.add("twist")
+        self._twists.publish(message)
+
     # -- liveness -----------------------------------------------------------------------------
 
     def recover(self) -> None:
@@ -389,6 +405,7 @@ class RandomFlight:
         self._rearm()
         self._pass_ticks(10)
         if self.figures.violations or self._reaches():
+            self._require_results()
             return
         first = self._books[self._setup.decider].sentence
         self.figures.second_attempts += 1
@@ -398,6 +415,13 @@ class RandomFlight:
         if not self.figures.violations and not self._reaches():
             book = self._books[self._setup.decider]
             self._seen.violate(f"a fresh goal is {book.last}: {book.sentence}")
+        self._require_results()
+
+    def _require_results(self) -> None:
+        """Look that every goal that was accepted has its result, now that the last one is met."""
+        self._pass_ticks(10)
+        for name, goal_id in sorted(self._seen.events.undecided):
+            self._seen.violate(f"{name}: goal {goal_id} was accepted and has no result")
 
     def _reaches(self) -> bool:
         """Send a goal that can be reached, and return whether it is."""

@@ -70,7 +70,7 @@ class RestCheck:
         if self._fastest is None:
             self._fastest, self._since = rate, now.time_ns
         elapsed = (now.time_ns - self._since) / SECOND
-        bound = 1.5 * self._fastest * np.exp(-5.0 * elapsed) + 1e-6
+        bound = 1.5 * self._fastest * np.exp(-5.0 * elapsed) + 1e-5
         if rate > bound:
             return f"joints move at {rate:.3g} {elapsed:.3g} s after a latch ({bound:.3g} at most)"
         return None

@@ -36,6 +36,8 @@ class Setup:
         (n,) how far from zero the joints are in a shape that is asked for; empty: none is.
     tip
         Whether there are goals for the end-effector.
+    twists
+        Whether the end-effector is moved by twists.
     nozzles
         Names of thrusters that may fail.
     patience
@@ -51,6 +53,7 @@ class Setup:
     turn: tuple[float, float, float] = (0.0, 0.0, 0.0)
     shapes: tuple[float, ...] = ()
     tip: bool = False
+    twists: bool = False
     nozzles: tuple[str, ...] = ()
     patience: float = 120.0
 
@@ -140,6 +143,21 @@ SETUPS: dict[str, Setup] = {
         real_time={**_WALL, "real_time_factor": 15.0, "command_timeout": 8.0},
         reach=(0.1, 0.1, 0.1),
         turn=(0.1, 0.1, 0.1),
+    ),
+    # Loops turn its base, and its hand follows twists.
+    "three_joint_arm": Setup(
+        robot="three_joint_arm",
+        plant=_of("arm_attitude", "plant", **_QUIET),
+        planner=_of(
+            "arm_attitude",
+            "planner",
+            **{"area_loop.k": 1.0, "twist_timeout": 0.5},
+            attitude_tolerance=0.005,
+        ),
+        real_time={**_WALL, "real_time_factor": 5.0, "command_timeout": 4.0},
+        turn=(0.02, 0.02, 0.02),
+        twists=True,
+        patience=250.0,
     ),
     # The paper's path in a quarter of its time.
     "planar_chain": Setup(
