@@ -107,6 +107,7 @@ setup(
         "PyYAML",
         "rosbags>=0.10.4",
         "scipy",
+        "typing_extensions",
         "xacro",
         "zstandard",
     ],

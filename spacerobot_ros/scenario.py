@@ -373,11 +373,16 @@ class Scenario:
         Raises
         ------
         ParameterError
-            A text has another form, or names no node.
+            A text has another form, or names no node, or a commander that does not fly.
         """
         scenario = self
         for text in texts:
             node, name, value = parse_setting(text)
+            if node in COMMANDERS and node not in scenario.commanders:
+                raise ParameterError(
+                    f"'{text}' is for the node '{node}', which does not fly: the scenario "
+                    f"'{self.name}' flies with {' and '.join(self.commanders)}."
+                )
             scenario = scenario.with_overrides(node, {name: value})
         return scenario
 

@@ -439,6 +439,12 @@ def test_what_a_scenario_needs_is_said(tmp_path: Path) -> None:
         "'transposed_jacobian' is a control law, and the scenario 'own' has no section "
         "'coordinated_control' that could use it: it flies with planner."
     )
+    with pytest.raises(ParameterError) as unused:
+        found.with_settings(["coordinated_control.law=model_based"])
+    assert str(unused.value) == (
+        "'coordinated_control.law=model_based' is for the node 'coordinated_control', which does "
+        "not fly: the scenario 'own' flies with planner."
+    )
     with pytest.raises(GoalError) as twice:
         found.with_goal(None, (0.0, 0.0, 1.0), (0.0, 0.0, 1.0))
     assert str(twice.value) == "The attitude of the goal is given twice, in radians and in degrees."

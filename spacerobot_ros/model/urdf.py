@@ -172,6 +172,7 @@ def _expand_xacro(path: Path) -> str:
         reason = f"it takes longer than {6 * _XACRO_CPU_TIME} s"
     else:
         if done.returncode == 0:
+            _name_unused_arguments(path, done.stderr)
             return done.stdout
         reasons = [line for line in done.stderr.splitlines() if line.startswith("REASON ")]
         reason = reasons[-1][7:] if reasons else "it needs too much time or memory"
@@ -179,6 +180,17 @@ def _expand_xacro(path: Path) -> str:
         f"The xacro file {path} cannot be expanded: {reason.rstrip('.')}. Correct it, or expand it "
         f"by hand: {by_hand}."
     )
+
+
+def _name_unused_arguments(path: Path, told: str) -> None:
+    for line in told.splitlines():
+        kind, *names = line.split()
+        if kind == "UNUSED":
+            has = f"its arguments are: {', '.join(names[1:])}" if names[1:] else "it has none"
+            warn_once(
+                f"The xacro file {path} has no argument '{names[0]}', which is ignored; {has}."
+                f"{suggestion(names[0], names[1:])}"
+            )
 
 
 def parse_robot(text: str) -> RobotDescription:

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import resource
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from xml.etree.ElementTree import ParseError, parse
 
@@ -70,7 +70,7 @@ def main(file: str, seconds: int, arguments: Sequence[str]) -> int:
                 ) from None
 
         substitution_args._eval_find = find
-        given = dict(each.split(":=", 1) for each in arguments)
+        given = _Arguments(each.split(":=", 1) for each in arguments)
         text = str(xacro.process_file(file, mappings=given).toxml())
     except Exception as error:  # Of xacro, its expressions, the XML parser
         # xacro's exceptions repeat the one that they wrap.
@@ -78,8 +78,27 @@ def main(file: str, seconds: int, arguments: Sequence[str]) -> int:
         reason = " ".join(str(error).split()) or type(error).__name__
         print(f"REASON {reason}", file=sys.stderr)
         return 1
+    for name in given.keys() - given.used:
+        known = " ".join(sorted(given.used - {name}))
+        print(f"UNUSED {name} {known}", file=sys.stderr)
     sys.stdout.write(text)
     return 0
+
+
+class _Arguments(dict[str, str]):
+    """The arguments of a file, with the names of those that it declares or uses."""
+
+    def __init__(self, given: Iterable[Sequence[str]]) -> None:
+        super().__init__((name, value) for name, value in given)
+        self.used: set[str] = set()
+
+    def __contains__(self, name: object) -> bool:
+        self.used.add(str(name))
+        return super().__contains__(name)
+
+    def __getitem__(self, name: str) -> str:
+        self.used.add(name)
+        return super().__getitem__(name)
 
 
 if __name__ == "__main__":

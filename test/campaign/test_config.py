@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -66,6 +67,7 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     ({"disperse": {"mass": {"norm": {"mean": 1}}}}, "loc is its mean and scale its standard"),
     ({"disperse": {"mass": {"uniform": {"max": 1}}}}, "loc is its least value and scale its width"),
     ({"table": "none.csv"}, "the table 'none.csv' cannot be read: No such file"),
+    ({"table": "/dev/zero"}, "the table '/dev/zero' cannot be read: it is a device"),
     ({"table": 3}, "'table' must be the name of a CSV file, or its lines"),
     ({"table": "mass\n"}, "needs a line of names, and a line for each flight"),
     ({"table": "mass\n1,2\n"}, "row 1 of the table has 2 values for 1 names"),
@@ -183,6 +185,12 @@ def test_a_key_that_is_there_twice_is_refused(tmp_path: Path) -> None:
     file.write_text(shared + merged)
     made = load_campaign(file)
     assert (made.flights, made.seed) == (5, 4)
+
+
+def test_a_campaign_is_not_read_from_a_pipe(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "campaign.yaml")
+    with pytest.raises(ParameterError, match=r"campaign\.yaml cannot be read: it is a pipe"):
+        load_campaign(tmp_path / "campaign.yaml")
 
 
 def test_a_file_names_its_scenario_beside_it(tmp_path: Path) -> None:

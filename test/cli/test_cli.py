@@ -513,7 +513,7 @@ def test_a_path_that_never_ends_is_no_path() -> None:
     words = ["plan", "three_joint_arm", "--end-effector-path", "/dev/zero"]
     result = CliRunner().invoke(main, words)
     assert result.exit_code == 2
-    assert "The path /dev/zero is not a regular file." in result.output
+    assert "The path /dev/zero cannot be read: it is a device" in result.output
 
 
 def test_replay_has_the_options_of_its_node() -> None:

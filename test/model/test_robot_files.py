@@ -50,7 +50,9 @@ def test_a_xacro_file_is_expanded(tmp_path: Path, name: str) -> None:
     assert "xacro:property" not in found.urdf
 
 
-def test_a_xacro_file_takes_its_arguments(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_xacro_file_takes_its_arguments(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
     """By the command, and from the environment, where nodes and workers find them."""
     heading = ' xmlns:xacro="http://www.ros.org/wiki/xacro"'
     text = urdf(mass="$(arg mass)", attribute=heading)
@@ -63,6 +65,10 @@ def test_a_xacro_file_takes_its_arguments(tmp_path: Path, monkeypatch: pytest.Mo
     told = CliRunner().invoke(main, words)
     assert told.exit_code == 0, told.output
     assert re.search(r"44 kg", told.stdout)
+    (ignored,) = caplog.messages
+    assert ignored.endswith("no argument 'title', which is ignored; its arguments are: mass.")
+    CliRunner().invoke(main, ["--xacro-arg", "mas:=42", "analyze", str(path)])
+    assert caplog.messages[-1].endswith("its arguments are: mass. Did you mean 'mass'?")
     refused = CliRunner().invoke(main, ["--xacro-arg", "mass=42", "analyze", str(path)])
     assert refused.exit_code == 2
     assert refused.stderr == "The xacro argument 'mass=42' is not NAME:=VALUE.\n"

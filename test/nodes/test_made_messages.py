@@ -41,7 +41,7 @@ from spacerobot_ros.model.description import Pose, Shape
 from spacerobot_ros.model.rotations import matrix_from_quaternion
 from spacerobot_ros.model.urdf import parse_world
 from spacerobot_ros.model.world import with_world
-from spacerobot_ros.nodes.common.fly_to import NavigateToPoseAction
+from spacerobot_ros.nodes.common.fly_to import GoalClient, NavigateToPoseAction
 from spacerobot_ros.nodes.common.messages import goal_of, interface_class, message_class, shape_of
 from spacerobot_ros.planning import BasePath, Goal
 from spacerobot_ros.resources import robot_file
@@ -475,3 +475,39 @@ def test_the_result_of_a_goal_of_nav2() -> None:
     failed = ACTION.result(FlyToResult("failed", "Not there.", GoalErrors()))
     assert failed.error_code > 0
     assert failed.error_msg == "Not there."
+
+
+class Handle:
+    """What rclpy has for a goal, and a server beside it: both note what is done to them."""
+
+    def __init__(self, canceling: bool) -> None:
+        self.is_cancel_requested = canceling
+        self.done: list[tuple[Any, ...]] = []
+
+    def __getattr__(self, name: str) -> Any:
+        return lambda *values: self.done.append((name, *values))
+
+
+@pytest.mark.parametrize(
+    ("outcome", "canceling", "state"),
+    [
+        ("reached", False, "succeed"),
+        ("reached", True, "succeed"),
+        ("reached_partly", False, "abort"),
+        ("failed", False, "abort"),
+        ("aborted", True, "canceled"),
+        ("aborted", False, "abort"),
+        ("refused", False, "abort"),
+    ],
+)
+def test_the_final_state_of_a_goal_follows_its_outcome(
+    outcome: str, canceling: bool, state: str
+) -> None:
+    """`canceled` is for goals whose client asked for it, as ROS 2's design of actions has it."""
+    handle: Any = Handle(canceling)
+    server: Any = Handle(canceling)
+    GoalClient(server, handle, ACTION, "map").end(FlyToResult(outcome, "So.", GoalErrors()))
+    assert handle.done == [(state,)]
+    ((_, told_handle, result),) = server.done
+    assert told_handle is handle
+    assert (result.error_code == 0) is (outcome == "reached")

@@ -164,7 +164,7 @@ def test_everything_that_is_imported_is_known_to_these_tests() -> None:
     needed = {
         *("ament_index_python", "casadi", "click", "lz4", "matplotlib", "mcap", "meshcat"),
         *("mujoco", "numpy", "pandas", "rosbags", "rosidl_parser", "rpyutils", "scipy"),
-        *("viser", "websockets", "xacro", "xarray", "yaml", "zstandard"),
+        *("typing_extensions", "viser", "websockets", "xacro", "xarray", "yaml", "zstandard"),
         *("coal", "collada", "dask", "distributed", "gymnasium", "trimesh"),
     }
     others = {name.split(".")[0] for module in sources() for name in imports(module)} - known

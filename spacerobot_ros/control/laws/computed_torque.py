@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import ClassVar
 
 import casadi as ca
+from typing_extensions import override
 
 from spacerobot_ros.control.laws.law import ACCELERATION_GAINS, ControlLaw
 from spacerobot_ros.control.outputs import OutputSelection
@@ -28,6 +29,7 @@ class ComputedTorqueLaw(ControlLaw):
     gain_units: ClassVar[tuple[str, str]] = ACCELERATION_GAINS
 
     @classmethod
+    @override
     def accepted_outputs(cls, robot: SpaceRobot, outputs: OutputSelection) -> OutputSelection:
         """Return all the joints, in the order of q.
 
@@ -44,10 +46,12 @@ class ComputedTorqueLaw(ControlLaw):
         return OutputSelection(joints=robot.joint_names)
 
     @classmethod
+    @override
     def default_outputs(cls, robot: SpaceRobot, end_effector_link: str) -> OutputSelection:
         """Return all the joints."""
         return OutputSelection(joints=robot.joint_names)
 
+    @override
     def results(self, symbols: dict[str, ca.SX]) -> dict[str, ca.SX]:
         """Return the command's expressions; see :meth:`ControlLaw.results`."""
         z1 = self.outputs

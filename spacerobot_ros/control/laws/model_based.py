@@ -10,6 +10,7 @@ from typing import Any, ClassVar
 import casadi as ca
 import numpy as np
 import numpy.typing as npt
+from typing_extensions import override
 
 from spacerobot_ros.control.laws.law import ACCELERATION_GAINS, ControlLaw, LawOptions
 from spacerobot_ros.control.state import Actuation, Reference
@@ -67,9 +68,11 @@ class ModelBasedLaw(ControlLaw):
     gain_units: ClassVar[tuple[str, str]] = ACCELERATION_GAINS
     Options: ClassVar[Any] = ModelBasedOptions
 
+    @override
     def _damping(self, singular_value: float) -> float:
         return math.sqrt(max(0.0, self.singular_value_threshold**2 - singular_value**2))
 
+    @override
     def inputs(self) -> Mapping[str, npt.ArrayLike]:
         """Return arguments of the law's own; see :meth:`ControlLaw.inputs`."""
         return {
@@ -79,14 +82,17 @@ class ModelBasedLaw(ControlLaw):
         }
 
     @property
+    @override
     def fixed_inputs(self) -> Mapping[str, npt.ArrayLike] | None:
         """The fixed arguments; None with a posture: it is the reference's, or the present one."""
         return None if self.options.posture_stiffness else super().fixed_inputs
 
+    @override
     def is_complete(self, results: Mapping[str, ca.SX]) -> ca.SX:
         """Return whether the outputs are far enough from a singularity."""
         return results["margin"] >= self.singular_value_threshold
 
+    @override
     def results(self, symbols: dict[str, ca.SX]) -> dict[str, ca.SX]:
         """Return the command's expressions; see :meth:`ControlLaw.results`."""
         z1 = self.outputs
@@ -120,6 +126,7 @@ class ModelBasedLaw(ControlLaw):
             "z0dot": z1.z0dot,
         }
 
+    @override
     def actuation(self, reference: Reference) -> Actuation:
         """Return the command; see :meth:`ControlLaw.actuation`."""
         # Without a joint reference the posture is the present one, and pulls at nothing.

@@ -7,6 +7,7 @@ from typing import ClassVar
 
 import casadi as ca
 import numpy as np
+from typing_extensions import override
 
 from spacerobot_ros.control.laws.law import ACCELERATION_GAINS, ControlLaw
 from spacerobot_ros.control.state import Actuation, ControlState, Reference
@@ -48,6 +49,7 @@ class NumpyLaw(ControlLaw):
         """
 
     @property
+    @override
     def takes_matrices(self) -> bool:
         """Whether gains may be matrices: :attr:`gain_matrices` are for :meth:`compute` to use."""
         return True
@@ -57,6 +59,7 @@ class NumpyLaw(ControlLaw):
         """Jacobian (m, 6 + n) of the outputs from ``[v_cm; omega; qdot]`` (paper 4, eq. 23)."""
         return self._out["J_z"].copy()
 
+    @override
     def command(self, state: ControlState, reference: Reference) -> Actuation:
         """Return :meth:`compute`, after the errors of the outputs; see :class:`ControlLaw`."""
         super().command(state, reference)
@@ -73,6 +76,7 @@ class NumpyLaw(ControlLaw):
             )
         return Actuation(wrench, tau)
 
+    @override
     def results(self, symbols: dict[str, ca.SX]) -> dict[str, ca.SX]:
         """Return no command: :meth:`compute` does."""
         return {"actuation": ca.SX(6 + self.robot.n, 1)}

@@ -8,6 +8,7 @@ from typing import Any, ClassVar
 
 import casadi as ca
 import numpy.typing as npt
+from typing_extensions import override
 
 from spacerobot_ros.control.laws.law import FORCE_GAINS, ControlLaw, LawOptions
 from spacerobot_ros.parameters import nonnegative
@@ -47,10 +48,12 @@ class TransposedJacobianLaw(ControlLaw):
     gain_units: ClassVar[tuple[str, str]] = FORCE_GAINS
     Options: ClassVar[Any] = TransposedJacobianOptions
 
+    @override
     def inputs(self) -> Mapping[str, npt.ArrayLike]:
         """Return arguments of the law's own; see :meth:`ControlLaw.inputs`."""
         return {"joint_damping": self.options.joint_damping}
 
+    @override
     def results(self, symbols: dict[str, ca.SX]) -> dict[str, ca.SX]:
         """Return the command's expressions; see :meth:`ControlLaw.results`."""
         z1 = self.outputs

@@ -222,8 +222,20 @@ class _Server(ActionServer):
         self._result_futures[bytes(handle.goal_id.uuid)].set_result(response)
 
 
-class _Client:
-    """The client of one goal of a server; a :class:`.FlyToClient`."""
+class GoalClient:
+    """The client of one goal of a server; a :class:`.FlyToClient`.
+
+    Parameters
+    ----------
+    server
+        The server, which sends the result.
+    handle
+        The server's handle of the goal.
+    action
+        The type of action, which converts feedback and result.
+    world_frame
+        Name of the frame of poses.
+    """
 
     def __init__(
         self, server: _Server, handle: ServerGoalHandle, action: GoalAction, world_frame: str
@@ -232,9 +244,11 @@ class _Client:
         self._world_frame = world_frame
 
     def feedback(self, progress: Progress) -> None:
+        """Publish the course of the goal."""
         self._handle.publish_feedback(self._action.feedback(progress, self._world_frame))
 
     def end(self, result: FlyToResult) -> None:
+        """Send the result, with the final state that ROS 2 has for it."""
         handle = self._handle
         if result.outcome == "reached":
             handle.succeed()
@@ -281,7 +295,7 @@ class GoalActions:
             node.commander.receive_fly_to(
                 _goal_id(handle),
                 lambda: action.read(handle.request, surroundings),
-                _Client(server, handle, action, surroundings.world_frame),
+                GoalClient(server, handle, action, surroundings.world_frame),
             )
 
         def on_cancel(handle: ServerGoalHandle) -> CancelResponse:

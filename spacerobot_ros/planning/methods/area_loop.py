@@ -21,6 +21,7 @@ from functools import partial
 from typing import ClassVar
 
 import numpy as np
+from typing_extensions import override
 
 from spacerobot_ros.errors import PlanningError
 from spacerobot_ros.model import SpaceRobot
@@ -117,6 +118,7 @@ class AreaLoopGait(GaitMethod):
     Options: ClassVar[type[AreaLoopOptions]] = AreaLoopOptions
     options: AreaLoopOptions
 
+    @override
     def setup(self) -> None:
         """Compute what robot and options decide; see :meth:`GaitMethod.setup`."""
         robot, chosen = self.robot, self.options
@@ -131,6 +133,7 @@ class AreaLoopGait(GaitMethod):
         self._nominal.prepare()
 
     @classmethod
+    @override
     def require_suitable(cls, robot: SpaceRobot) -> None:
         """Refuse robots whose bases loops of three joints cannot turn about three axes."""
         if robot.n < 3:
@@ -140,6 +143,7 @@ class AreaLoopGait(GaitMethod):
             )
         best_sampled_brackets(robot).require()
 
+    @override
     def plan(self, request: PlanRequest, cancellation: Cancellation = NEVER) -> GaitSchedule:
         """Plan the way to the nominal shape and the next cycle; see :meth:`GaitMethod.plan`.
 

@@ -6,6 +6,8 @@ from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
+from typing_extensions import override
+
 from spacerobot_ros.errors import (
     ParameterError,
     PlanningError,
@@ -66,6 +68,7 @@ class AutoGait(GaitMethod):
                 self._unsuitable[name] = refusal
         self._built_methods: dict[str, GaitMethod] = {}
 
+    @override
     def plan(self, request: PlanRequest, cancellation: Cancellation = NEVER) -> GaitSchedule:
         """Plan by all suitable methods, and return the best plan; see :meth:`GaitMethod.plan`.
 

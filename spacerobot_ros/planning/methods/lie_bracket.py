@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
+from typing_extensions import override
 
 from spacerobot_ros.errors import PlanningError, Proof, UnreachableError
 from spacerobot_ros.model import SpaceRobot
@@ -88,6 +89,7 @@ class LieBracketGait(GaitMethod):
     Options: ClassVar[type[LieBracketOptions]] = LieBracketOptions
     options: LieBracketOptions
 
+    @override
     def setup(self) -> None:
         """Compute what robot and options decide; see :meth:`GaitMethod.setup`."""
         robot = self.robot
@@ -98,10 +100,12 @@ class LieBracketGait(GaitMethod):
         self.sliders = sliders_of(robot)
 
     @classmethod
+    @override
     def require_suitable(cls, robot: SpaceRobot) -> None:
         """Refuse robots whose sliders violate the conditions of paper 1."""
         check_sliding_masses(robot).require()
 
+    @override
     def plan(self, request: PlanRequest, cancellation: Cancellation = NEVER) -> GaitSchedule:
         """Plan steps 1 to 3; see :meth:`GaitMethod.plan`."""
         cancellation.raise_if_requested()

@@ -8,6 +8,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
+from typing_extensions import override
 
 from spacerobot_ros.errors import (
     ParameterError,
@@ -86,6 +87,7 @@ class RemainingJointsGait(GaitMethod):
         self._remaining: SpaceRobot | None = None
         self._methods: dict[str, GaitMethod] = {}
 
+    @override
     def plan(self, request: PlanRequest, cancellation: Cancellation = NEVER) -> GaitSchedule:
         """Plan with the joints that are not stuck; see :meth:`GaitMethod.plan`."""
         try:

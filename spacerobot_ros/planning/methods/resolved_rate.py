@@ -22,6 +22,7 @@ from typing import ClassVar
 
 import numpy as np
 import numpy.typing as npt
+from typing_extensions import override
 
 from spacerobot_ros.errors import ParameterError, PlanningError
 from spacerobot_ros.model import SpaceRobot
@@ -523,6 +524,7 @@ class ResolvedRateGait(GaitMethod):
 
     controls: frozenset[Controlled] = frozenset({"end_effectors"})
 
+    @override
     def setup(self) -> None:
         """Compute what robot and options decide; see :meth:`GaitMethod.setup`."""
         self._limits = MotionLimits.of(self.robot, self.options, self.name)
@@ -533,12 +535,14 @@ class ResolvedRateGait(GaitMethod):
             )
 
     @classmethod
+    @override
     def require_suitable(cls, robot: SpaceRobot) -> None:
         """Refuse robots without joints; see :meth:`GaitMethod.require_suitable`."""
         if robot.n == 0:
             name = robot.description.name
             raise PlanningError(f"Robot '{name}' has no joints that could move an end-effector.")
 
+    @override
     def plan(self, request: PlanRequest, cancellation: Cancellation = NEVER) -> GaitSchedule:
         """Plan the motion along the lines; see :meth:`GaitMethod.plan`."""
         self.require_rest(request.state)

@@ -24,6 +24,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
+from typing_extensions import override
 
 from spacerobot_ros.errors import ParameterError, PlanningError
 from spacerobot_ros.model import SpaceRobot
@@ -107,6 +108,7 @@ class SquarePathGait(GaitMethod):
     Options: ClassVar[type[SquarePathOptions]] = SquarePathOptions
     options: SquarePathOptions
 
+    @override
     def setup(self) -> None:
         """Compute what robot and options decide; see :meth:`GaitMethod.setup`."""
         robot, chosen = self.robot, self.options
@@ -129,10 +131,12 @@ class SquarePathGait(GaitMethod):
         )
 
     @classmethod
+    @override
     def require_suitable(cls, robot: SpaceRobot) -> None:
         """Refuse robots that are not planar, or have fewer than three links."""
         planar_axis(robot)
 
+    @override
     def plan(self, request: PlanRequest, cancellation: Cancellation = NEVER) -> GaitSchedule:
         """Plan steps 1 to 4; see :meth:`GaitMethod.plan`."""
         cancellation.raise_if_requested()

@@ -13,6 +13,7 @@ from collections.abc import Callable, Sequence
 
 import casadi as ca
 import numpy as np
+from typing_extensions import override
 
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.model import SpaceRobot
@@ -149,6 +150,7 @@ class EffortLimitedShooting(MultipleShooting):
         self._stages, self._efforts, self._tolerance = stages, efforts, tolerance
         self._limited: MultipleShooting | None = None
 
+    @override
     def solve(
         self,
         boundary: BoundaryConditions,

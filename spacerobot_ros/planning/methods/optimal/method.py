@@ -20,6 +20,7 @@ from typing import ClassVar
 
 import casadi as ca
 import numpy as np
+from typing_extensions import override
 
 from spacerobot_ros.errors import NotFoundError, PlanningError, UnreachableError
 from spacerobot_ros.files import Cache
@@ -194,6 +195,7 @@ class OptimalGait(GaitMethod):
     Options: ClassVar[type[OptimalOptions]] = OptimalOptions
     options: OptimalOptions
 
+    @override
     def setup(self) -> None:
         """Compute what robot and options decide; see :meth:`GaitMethod.setup`."""
         # A plan calls the model's functions a few times each.
@@ -238,10 +240,12 @@ class OptimalGait(GaitMethod):
         return self._end_effector_goals[key]
 
     @classmethod
+    @override
     def require_suitable(cls, robot: SpaceRobot) -> None:
         """Refuse robots that cannot turn their base; see :meth:`GaitMethod.require_suitable`."""
         GoalSpecification.of(robot, OptimalOptions()).require_suitable(robot)
 
+    @override
     def plan(self, request: PlanRequest, cancellation: Cancellation = NEVER) -> GaitSchedule:
         """Plan within the search budget; see :meth:`GaitMethod.plan`.
 

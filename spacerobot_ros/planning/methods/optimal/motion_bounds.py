@@ -27,6 +27,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from typing_extensions import override
 
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array, Body, JointKind
@@ -441,6 +442,7 @@ class DurationBound:
             return cls(0.0, "")
         return cls(math.ceil(seconds / period - _BOUND_ROUNDING) * period, reason)
 
+    @override
     def __str__(self) -> str:
         return f"no manoeuvre to this goal takes less than {self.seconds:.6g} s, as {self.reason}"
 
