@@ -125,6 +125,7 @@ setup(
         "campaign": CAMPAIGN,
         "data": DATA,
         "rl": RL,
+        "sb3": [*RL, "stable-baselines3"],
         "docs": [*DOCS, *DATA],  # The notebook makes tables.
         "test": [
             *CAMPAIGN,

@@ -7,48 +7,22 @@ import sys
 from pathlib import Path
 from typing import Any
 
-import gymnasium
 import matplotlib.pyplot as plt
 import numpy as np
 from policies.network import Policy
 from stable_baselines3 import PPO
-from stable_baselines3.common.vec_env import VecEnv, VecMonitor, VecNormalize
+from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
+
+from spacerobot_ros.environments.stable_baselines import SpaceRobotVecEnv
 
 LANES, LENGTH, WINDOW, SEED = 1024, 64, 1000, 1
 
 
-class _Lanes(VecEnv):
-    """The vector environment as stable-baselines3 takes it."""
-
-    def __init__(self) -> None:
-        arguments = {"hold": 5, "time_limit": 30.0, "autoreset_mode": "SameStep"}
-        self.env: Any = gymnasium.make_vec("spacerobot/ReorientArm-v0", LANES, **arguments)
-        super().__init__(LANES, self.env.single_observation_space, self.env.single_action_space)
-
-    def reset(self) -> Any:
-        return self.env.reset(seed=SEED)[0]
-
-    def step_async(self, actions: Any) -> None:
-        self.result = self.env.step(actions)
-
-    def step_wait(self) -> tuple[Any, Any, Any, list[dict[str, Any]]]:
-        seen, rewards, terminated, truncated, infos = self.result
-        told: list[dict[str, Any]] = [{} for _ in range(LANES)]
-        for i in np.flatnonzero(ended := terminated | truncated):
-            success, last = infos["final_info"]["is_success"][i], infos["final_obs"][i]
-            told[i] = {"is_success": success, "terminal_observation": last}
-            told[i]["TimeLimit.truncated"] = truncated[i]
-        return seen, rewards, ended, told
-
-    def get_attr(self, *_: Any, **__: Any) -> list[Any]:
-        return [None] * LANES  # No lane has attributes of its own.
-
-    set_attr = env_method = env_is_wrapped = close = get_attr
-
-
 def main(steps: int, file: Path) -> None:
     """Train, and write the network and the return curve."""
-    env = VecNormalize(VecMonitor(_Lanes()), norm_reward=False)
+    lanes = SpaceRobotVecEnv("spacerobot/ReorientArm-v0", LANES, hold=5, time_limit=30.0)
+    lanes.seed(SEED)
+    env = VecNormalize(VecMonitor(lanes), norm_reward=False)
     curve: list[list[float]] = []
 
     def note(known: dict[str, Any], _: Any) -> bool:

@@ -20,6 +20,7 @@ from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.inertial_parameters import InertialParameters
 from spacerobot_ros.model.integration import count_steps
+from spacerobot_ros.model.rotations import quaternion_multiply, quaternions_from_rotvecs
 from spacerobot_ros.simulation.actuators import PLANTS
 from spacerobot_ros.simulation.config import SensorConfig
 from spacerobot_ros.simulation.plant import InitialState
@@ -180,6 +181,24 @@ class SensorErrors:
             attitude_bias=tuple(self.pose_bias[index, 3:].tolist()),
             joint_bias=tuple(self.joint_bias[index].tolist()),
             seed=int(self.seeds[index]),
+        )
+
+    def measure(
+        self, normals: Array, pose: Array, twist: Array, q: Array, qdot: Array
+    ) -> tuple[Array, Array, Array, Array]:
+        """Return measurements of poses (N, 7), twists (N, 6), and joints and their rates (N, n).
+
+        ``normals`` (N, 12 + 2 n) are random numbers in the order of :class:`.Sensors`.
+        """
+        n, sigma = q.shape[1], self.noise
+        turns = self.pose_bias[:, 3:] + sigma[:, 1:2] * normals[:, 3:6]
+        position = pose[:, :3] + self.pose_bias[:, :3] + sigma[:, :1] * normals[:, :3]
+        attitude = quaternion_multiply(pose[:, 3:], quaternions_from_rotvecs(turns))
+        return (
+            np.hstack([position, attitude]),
+            twist + np.repeat(sigma[:, 2:4], 3, axis=1) * normals[:, 6:12],
+            q + self.joint_bias + sigma[:, 4:5] * normals[:, 12 : 12 + n],
+            qdot + sigma[:, 5:] * normals[:, 12 + n :],
         )
 
     @property

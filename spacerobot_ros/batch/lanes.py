@@ -32,7 +32,6 @@ from spacerobot_ros.files import warn_once
 from spacerobot_ros.model.compilation import NoLibraryError
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.model_functions import ModelFunctions
-from spacerobot_ros.model.rotations import quaternion_from_rotvec, quaternion_multiply
 from spacerobot_ros.simulation.effort_plant import EffortPlant
 from spacerobot_ros.times import SECOND
 
@@ -458,8 +457,7 @@ class LaneBlock:
             result.limited_ticks["stroke"][rows] = limits[:, n:]
         if self._tick.controller is not None:
             self._write_decisions(result, rows)
-        pose, q = self._noise.measure(result.pose[rows], result.q[rows])
-        result.measured_pose[rows], result.measured_q[rows] = pose, q
+        self._noise.measure(result, rows)
 
     def _write_decisions(self, result: BatchResult, rows: Counts) -> None:
         controller, count = self._tick.controller, len(rows)
@@ -552,18 +550,14 @@ class SensorNoise:
         grouped = kept.reshape(-1, alive.shape[1], *kept.shape[1:])
         return np.ascontiguousarray(np.moveaxis(grouped, 1, 3))
 
-    def measure(self, pose: Array, q: Array) -> tuple[Array, Array]:
-        """Return the measurements of poses (count, I, 7) and shapes (count, I, n)."""
-        if self._errors is None:
-            return pose, q
-        rows, count = self._rows[: len(pose)], len(pose)
-        noise = self._errors.noise[rows][:, None]
-        bias, drawn = self._errors.pose_bias[rows][:, None], self._at_instants[:count]
-        measured = pose.copy()
-        measured[..., :3] += bias[..., :3] + noise[..., :1] * drawn[..., :3]
-        turns = bias[..., 3:] + noise[..., 1:2] * drawn[..., 3:6]
-        for index in np.argwhere(turns.any(axis=2)):
-            at = tuple(index)
-            measured[at][3:] = quaternion_multiply(pose[at][3:], quaternion_from_rotvec(turns[at]))
-        of_joints = noise[..., 4:5] * drawn[..., 12 : 12 + self._n]
-        return measured, q + self._errors.joint_bias[rows][:, None] + of_joints
+    def measure(self, result: BatchResult, rows: Counts) -> None:
+        """Write the measurements of the reported states of the flights in some rows."""
+        measured = result.pose[rows], result.q[rows]
+        if self._errors is not None:
+            at = np.repeat(self._rows[: len(rows)], len(self._instants))
+            names = ("pose", "twist", "q", "qdot")
+            states = [np.concatenate(getattr(result, name)[rows]) for name in names]
+            normals = np.concatenate(self._at_instants[: len(rows)])
+            pose, _, q, _ = self._errors[at].measure(normals, *states)
+            measured = pose.reshape(measured[0].shape), q.reshape(measured[1].shape)
+        result.measured_pose[rows], result.measured_q[rows] = measured

@@ -7,7 +7,7 @@ lanes or, without them, in one plant for each flight.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import fields, replace
 from typing import Protocol
 
@@ -24,7 +24,8 @@ from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.compilation import NoLibraryError
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.inertial_parameters import InertialParameters
-from spacerobot_ros.simulation.actuators import PLANTS
+from spacerobot_ros.simulation.actuators import PLANTS, build_plant
+from spacerobot_ros.simulation.config import PlantConfig
 from spacerobot_ros.simulation.plant import Plant
 
 LINK_POSE_SIZE = 12
@@ -65,6 +66,9 @@ class SteppedFlights:
     in_lanes
         Whether the flights are in SIMD lanes; where these cannot be compiled, or if this is false,
         each flight has a plant. Both give the same states to rounding.
+    plants
+        Configurations of plants with thrusters, faults or external loads, which lanes do not have,
+        for each flight; a reset makes a plant of the one that is then in the list. Empty: none.
 
     Raises
     ------
@@ -93,6 +97,7 @@ class SteppedFlights:
         integration_step: float = 0.0,
         link: str = "",
         in_lanes: bool = True,
+        plants: Sequence[PlantConfig] = (),
     ) -> None:
         if link and link not in robot.link_names:
             raise ParameterError(
@@ -118,7 +123,11 @@ class SteppedFlights:
         self.ticks = np.zeros(count, dtype=np.int64)
         self.has_not_ended = np.ones(count, dtype=np.bool_)
         self.failures: dict[int, str] = {}
-        self._engine = self._choose_engine() if in_lanes else _PlantEngine(self._flights, link)
+        self._require_regular(self._flights)
+        scalar = plants or not in_lanes
+        self._engine = (
+            _PlantEngine(self._flights, link, plants) if scalar else self._choose_engine()
+        )
         width = 2 * robot.n + 20 + (LINK_POSE_SIZE if link else 0)
         self._reports = np.zeros((count, width))
         self._attach_reports()
@@ -247,12 +256,11 @@ class SteppedFlights:
             plant_of(flights, row)
 
     def _choose_engine(self) -> _Engine:
-        self._require_regular(self._flights)
         try:
             return _LaneEngine(self._flights, self._link)
         except NoLibraryError as reason:
             warn_once(f"Flights are flown one by one, not in lanes: {reason}.")
-            return _PlantEngine(self._flights, self._link)
+            return _PlantEngine(self._flights, self._link, ())
 
     def _attach_reports(self) -> None:
         """Let the attributes be parts of the reports."""
@@ -321,8 +329,8 @@ class _LaneEngine:
 class _PlantEngine:
     name = "scalar"
 
-    def __init__(self, flights: Flights, link: str) -> None:
-        self._flights, self._link = flights, link
+    def __init__(self, flights: Flights, link: str, configs: Sequence[PlantConfig]) -> None:
+        self._flights, self._link, self._configs = flights, link, configs
         self._plants: dict[int, Plant] = {}
         self._alive = np.ones(len(flights), dtype=np.bool_)
         self._masses = [b""] * len(flights)
@@ -337,6 +345,10 @@ class _PlantEngine:
         """Return the plant of a flight to a start; other masses need another plant."""
         flights = self._flights
         assert flights.inertial is not None
+        if self._configs:
+            start, robot = flights.initial_states.initial_state(row), flights.robot_of(row)
+            self._plants[row] = build_plant(robot, self._configs[row], start)
+            return
         masses = flights.inertial[row].vector.tobytes()
         if row in self._plants and self._masses[row] == masses:
             plant = self._plants[row]

@@ -1,8 +1,8 @@
 """Learning environments with the interface of Gymnasium, one robot each or thousands in SIMD lanes.
 
-Importing this package registers ``spacerobot/ReorientArm-v0`` and ``spacerobot/Reach-v0`` where
-Gymnasium is installed. Tasks and actions (:mod:`.tasks`) need no Gymnasium: a trained policy flies
-without it.
+Importing this package registers ``spacerobot/ReorientArm-v0``, ``spacerobot/Reach-v0`` and, for
+tasks of one's own, ``spacerobot/Task-v0`` where Gymnasium is installed. Tasks and actions
+(:mod:`.tasks`) need no Gymnasium: a trained policy flies without it.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ __all__ = ["register"]
 
 NAMESPACE = "spacerobot"
 
-ENVIRONMENTS = {"ReorientArm-v0": "reorient", "Reach-v0": "reach"}
-"""Names of the environments within :data:`NAMESPACE`, and their tasks."""
+ENVIRONMENTS = {"ReorientArm-v0": "reorient", "Reach-v0": "reach", "Task-v0": ""}
+"""Names of the environments within :data:`NAMESPACE`, and their tasks; empty: to be given."""
 
 
 def import_gymnasium() -> Any:

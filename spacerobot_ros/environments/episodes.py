@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from os import PathLike, fspath
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -17,9 +17,8 @@ from spacerobot_ros.campaign.draws import Draws, drawn_flight
 from spacerobot_ros.campaign.targets import DrawnFlight, description_of
 from spacerobot_ros.environments.tasks import (
     TASKS,
-    Reorient,
-    RewardWeights,
     RobotStates,
+    Step,
     Task,
     action_scale,
     command_of,
@@ -31,14 +30,22 @@ from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.inertial_parameters import InertialParameters
 from spacerobot_ros.parameters import as_numbers
 from spacerobot_ros.scenario import Scenario, scenario_or_robot
-from spacerobot_ros.simulation.config import OrbitConfig, TableConfig
+from spacerobot_ros.simulation.config import OrbitConfig, PlantConfig, TableConfig
+from spacerobot_ros.simulation.faults import FAULT_KINDS
 from spacerobot_ros.simulation.plant import InitialState
+
+if TYPE_CHECKING:
+    from spacerobot_ros.environments.rendering import Camera
 
 _MAX_DRAWS = 10_000
 _MAX_REFUSED_DRAWS = 100
-_DEFAULT_SCENARIOS = {"reorient": "arm_attitude", "reach": "reach"}
-
 _GOALS = ("random", "scenario")
+
+_CHANGEABLE = ("reward", "spread", "time_limit", "tolerance")
+"""Arguments that may change from episode to episode."""
+
+_BEYOND_LANES = "faults", "plant.thrusters", "plant.disturbances", "plant.orbit.", "plant.table."
+"""Beginnings of dispersions for which each robot has a plant."""
 
 Counts = npt.NDArray[np.int64]
 
@@ -50,7 +57,8 @@ class EpisodeConfig:
     Attributes
     ----------
     task
-        ``reorient``: the joints turn the base; ``reach``: a link goes to a position.
+        ``reorient``: the joints turn the base; ``reach``: a link goes to a position; one of
+        :data:`.TASKS`, or a class derived from :class:`.Task`.
     scenario
         Name or file of a scenario, or of a robot; empty: the task's own.
     campaign
@@ -67,7 +75,7 @@ class EpisodeConfig:
     spread
         Size of random goals, rad or m; 0: the task's own.
     link
-        Link that reaches; empty: that of the scenario, else the robot's end-effector.
+        Link of the goal; empty: that of the scenario, else the robot's end-effector.
     max_force, max_torque
         Force (N) and torque (N m) on the base of an action of one under efforts; 0: those of the
         scenario's controller, and if it has none, actions have no wrench.
@@ -77,7 +85,7 @@ class EpisodeConfig:
         Changed weights of :class:`.RewardWeights`.
     """
 
-    task: str
+    task: str | type[Task] = ""
     scenario: str = ""
     campaign: str = ""
     hold: int = 1
@@ -109,6 +117,8 @@ class EpisodeConfig:
         return cls(**arguments)
 
     def __post_init__(self) -> None:
+        if isinstance(self.task, type):
+            object.__setattr__(self, "task", TASKS.register(self.task).name)
         for name in ("task", "scenario", "campaign", "goals", "link"):
             value = getattr(self, name)
             if not isinstance(value, str | PathLike):
@@ -138,7 +148,7 @@ class EpisodeConfig:
             )
         if not self.time_limit:
             raise ParameterError("Argument 'time_limit' is 0; episodes take longer, in s.")
-        if self.link and self.task != "reach":
+        if self.link and not self.kind.has_link:
             raise ParameterError(
                 f"Argument 'link' is '{self.link}', and in task '{self.task}' no link reaches: "
                 "leave it out, or take spacerobot/Reach-v0."
@@ -148,14 +158,28 @@ class EpisodeConfig:
                 "Arguments 'scenario' and 'campaign' are both given: a campaign names its scenario."
             )
 
+    @property
+    def kind(self) -> type[Task]:
+        """Class of the task."""
+        assert isinstance(self.task, str)
+        return TASKS[self.task]
+
 
 @dataclass(frozen=True)
 class _Start:
-    """Start of an episode: a row of :class:`.InitialStates`, masses, and its scenario."""
+    """Start of an episode: its initial state, also as a row, masses, and its scenario."""
 
+    initial: InitialState
     starts: InitialStates
     inertial: InertialParameters | None
     scenario: Scenario
+
+    @classmethod
+    def of(
+        cls, robot: SpaceRobot, scenario: Scenario, inertial: InertialParameters | None = None
+    ) -> _Start:
+        initial = InitialState.of(scenario.plant)
+        return cls(initial, InitialStates.of(robot, [initial]), inertial, scenario)
 
 
 class EpisodeStarts:
@@ -177,15 +201,22 @@ class EpisodeStarts:
             draws = Draws(self._campaign)
             self._draws = [draws[number] for number in range(min(len(draws), _MAX_DRAWS))]
         else:
-            self.scenario = scenario_or_robot(config.scenario or _DEFAULT_SCENARIOS[config.task])
+            self.scenario = scenario_or_robot(config.scenario or config.kind.scenario)
         self.robot = SpaceRobot(description_of(self.scenario))
-        _require_steppable(self.scenario, self.robot)
-        self.nominal = _Start(self._row(self.scenario), None, self.scenario)
+        _require_steppable(self.scenario)
+        plant, dispersed = self.scenario.plant, self._campaign.names if self._campaign else ()
+        self.needs_plants = (
+            bool(plant.faults or plant.thrusters or plant.disturbances)
+            or (plant.orbit, plant.table) != (OrbitConfig(), TableConfig())
+            or any(name.startswith(_BEYOND_LANES) for name in dispersed)
+        )
+        """Whether each robot has a plant of its own, for what lanes lack."""
+        self.has_sensor_errors = bool(
+            SensorErrors.of(self.robot, [plant.sensors]).is_active[0]
+        ) or any(name.startswith("plant.sensors.") for name in dispersed)
+        self.nominal = _Start.of(self.robot, self.scenario)
         self._made: dict[int, _Start | str] = {}
         """Starts of the draws by their numbers; texts are the reasons of refusals."""
-
-    def _row(self, scenario: Scenario) -> InitialStates:
-        return InitialStates.of(self.robot, [InitialState.of(scenario.plant)])
 
     def draw(self, rng: np.random.Generator, flights: SteppedFlights) -> _Start:
         """Return a start of one of the flights; of a campaign, one of its draws at random.
@@ -214,9 +245,9 @@ class EpisodeStarts:
         """Return the start of a draw, or the reason why there is none."""
         try:
             flight = drawn_flight(campaign, self._draws[number], DrawnFlight.of(self.scenario))
-            start = self._row(flight.scenario)
             masses = flight.inertial or self.robot.inertial
-            flights.require_startable(start, InertialParameters.stacked([masses]))
+            start = _Start.of(self.robot, flight.scenario, masses)
+            flights.require_startable(start.starts, InertialParameters.stacked([masses]))
         except (ParameterError, RobotDescriptionError) as refusal:
             if not any(isinstance(each, str) for each in self._made.values()):
                 warn_once(
@@ -224,20 +255,17 @@ class EpisodeStarts:
                     f"{refusal}"
                 )
             return str(refusal)
-        _require_steppable(flight.scenario, self.robot)
-        return _Start(start, masses, flight.scenario)
+        _require_steppable(flight.scenario)
+        return start
 
 
-def _require_steppable(scenario: Scenario, robot: SpaceRobot) -> None:
+def _require_steppable(scenario: Scenario) -> None:
     plant = scenario.plant
+    kinds = FAULT_KINDS.keys() & {line.split(maxsplit=1)[0] for line in plant.faults}
     parts = {
-        "faults": bool(plant.faults),
+        "faults of sensors": any(FAULT_KINDS[kind].sensor for kind in kinds),
         "a target": plant.target.given,
         "a plant in MuJoCo": plant.engine == "mujoco",
-        "disturbances, an orbit or a table": (plant.disturbances, plant.orbit, plant.table)
-        != ((), OrbitConfig(), TableConfig()),
-        "thrusters that are on or off": bool(plant.thrusters),
-        "errors of sensors": bool(SensorErrors.of(robot, [plant.sensors]).is_active[0]),
     }
     for part, given in parts.items():
         if given:
@@ -266,38 +294,89 @@ class Episodes:
     def __init__(self, config: EpisodeConfig, count: int, *, in_lanes: bool) -> None:
         if not isinstance(count, int | np.integer) or count < 1:
             raise ParameterError(f"There are {count!r} environments to make; take at least one.")
-        self._config, self._weights = config, RewardWeights.of(config.reward)
+        self._config = config
         self._source = EpisodeStarts(config)
         scenario, self.robot = self._source.scenario, self._source.robot
         plant = scenario.plant
         self._goals_of_scenario = (config.goals or _GOALS[bool(config.campaign)]) == "scenario"
-        self._link = self._reaching_link(scenario) if config.task == "reach" else ""
-        first = self._source.nominal.starts
+        self._link = self._reaching_link(scenario) if config.kind.has_link else ""
+        self._plants = [plant] * count if self._source.needs_plants else []
         self._flights = SteppedFlights(
             self.robot,
             plant.actuation,
             plant.control_period,
-            InitialStates(
-                *(np.repeat(getattr(first, each.name), count, axis=0) for each in fields(first))
-            ),
+            self._source.nominal.starts[np.zeros(count, dtype=np.int64)],
             integration_step=plant.integration_step,
             link=self._link,
             in_lanes=in_lanes,
+            plants=self._plants,
         )
         self.scale, self.taken = self._action_scale(scenario)
         wrench = self.taken[self.taken >= self.robot.n] - self.robot.n
         pushed = bool((wrench < 3).any()), bool((wrench >= 3).any())
-        self.task: Task = TASKS[config.task](self.robot, self._link, pushed)
-        self._tolerance = config.tolerance or self.task.tolerance
-        self._spread = config.spread or self.task.spread
+        self._camera: Camera | None = None
+        self.task: Task = config.kind(self.robot, self._link, pushed)
+        self._weights = self.task.weights.of(config.reward)
         self._goals = np.zeros((count, self.task.goal_size))
         self._goals[:, -1] = 1.0
+        self._sensors = SensorErrors.of(self.robot, [plant.sensors] * count)
+        self._generators: Sequence[np.random.Generator] = ()
         self.step_duration = config.hold * plant.control_period
-        self.rewards = np.zeros(count)
+        self.rewards, self.errors = np.zeros(count), np.zeros(count)
+        self.observations = np.zeros((count, len(self.task.observation_bounds()[0])))
         self.terminations = np.zeros(count, dtype=np.bool_)
         self.truncations = np.zeros(count, dtype=np.bool_)
         self.reached = np.zeros(count, dtype=np.bool_)
-        self._observe()
+        if not self._source.has_sensor_errors:
+            self._observe()
+
+    @property
+    def spread(self) -> float:
+        """Size of random goals."""
+        return self._config.spread or self.task.spread
+
+    @property
+    def tolerance(self) -> float:
+        """Error within which the goal is reached."""
+        return self._config.tolerance or self.task.tolerance
+
+    @property
+    def time_limit(self) -> float:
+        """Simulated time after which an episode is truncated, s."""
+        return self._config.time_limit
+
+    @property
+    def reward(self) -> Mapping[str, float]:
+        """Weights of the reward."""
+        return vars(self._weights)
+
+    def has_attribute(self, name: str) -> bool:
+        """Return whether :meth:`change` knows a name."""
+        return name in _CHANGEABLE or (hasattr(self.task, name) and not name.startswith("_"))
+
+    def attribute(self, name: str) -> Any:
+        """Return the value that :meth:`change` changes."""
+        return getattr(self if name in _CHANGEABLE else self.task, name)
+
+    def change(self, name: str, value: Any) -> None:
+        """Change ``reward``, ``spread``, ``time_limit``, ``tolerance`` or an attribute of the task.
+
+        Raises
+        ------
+        ParameterError
+            There is no such attribute, or the value is refused.
+        """
+        if not self.has_attribute(name):
+            raise ParameterError(
+                f"There is no attribute '{name}' to change; there are {', '.join(_CHANGEABLE)}, "
+                "and those of the task."
+            )
+        if name not in _CHANGEABLE:
+            setattr(self.task, name, value)
+            return
+        config = replace(self._config, **{name: value})
+        self._weights = self.task.weights.of(config.reward)
+        self._config = config
 
     def _reaching_link(self, scenario: Scenario) -> str:
         link = self._config.link or scenario.plant.end_effector_frame
@@ -357,39 +436,91 @@ class Episodes:
         rows: Sequence[int] | Counts,
         generators: Sequence[np.random.Generator],
         goal: Any = None,
+        start: Any = None,
     ) -> None:
         """Begin the episodes of some rows again, by the random generators of all rows.
 
         ``goal``, one for all (goal_size,) or one for each row (N, goal_size), replaces the goals
-        that are drawn.
+        that are drawn. ``start``, a dictionary or one for each row, replaces some of the values of
+        :class:`.InitialState`.
 
         Raises
         ------
         ParameterError
-            A draw or the goal is refused.
+            A draw, the goal or the start is refused.
         """
         chosen = np.asarray(rows, dtype=np.int64)
-        given = None if goal is None else self._checked_goals(goal)
+        goals = None if goal is None else self._checked_goals(goal)
+        changes = None if start is None else self._checked_starts(start)
+        self._generators = generators
         drawn = [self._source.draw(generators[row], self._flights) for row in chosen.tolist()]
-        starts = InitialStates(
-            *(
-                np.concatenate([getattr(each.starts, part.name) for each in drawn])
-                for part in fields(InitialStates)
-            )
-        )
+        starts = [
+            self._start(each, generators[row], changes[row] if changes else {})
+            for row, each in zip(chosen.tolist(), drawn, strict=True)
+        ]
         masses = [each.inertial for each in drawn if each.inertial is not None]
-        self._flights.reset(chosen, starts, InertialParameters.stacked(masses) if masses else None)
         for row, each in zip(chosen.tolist(), drawn, strict=True):
-            if given is not None:
-                self._goals[row] = given[row]
+            if self._plants:
+                self._plants[row] = _with_seed(each.scenario.plant, generators[row])
+            if self._source.has_sensor_errors:
+                errors = SensorErrors.of(self.robot, [each.scenario.plant.sensors])
+                for part in fields(errors):
+                    getattr(self._sensors, part.name)[row] = getattr(errors, part.name)[0]
+        self._flights.reset(
+            chosen,
+            InitialStates(
+                *(
+                    np.concatenate([getattr(each, part.name) for each in starts])
+                    for part in fields(InitialStates)
+                )
+            ),
+            InertialParameters.stacked(masses) if masses else None,
+        )
+        for row, each in zip(chosen.tolist(), drawn, strict=True):
+            if goals is not None:
+                self._goals[row] = goals[row]
             elif self._goals_of_scenario:
-                self._goals[row] = self._goal_of(each.scenario)
+                self._goals[row] = self.task.goal_of(each.scenario)
             else:
-                start = self._states(slice(row, row + 1))
-                self._goals[row] = self.task.random_goal(start, self._spread, generators[row])
+                at = self._states(slice(row, row + 1))
+                self._goals[row] = self.task.random_goal(at, self.spread, generators[row])
         self.terminations[chosen] = self.truncations[chosen] = False
         self.rewards[chosen] = 0.0
-        self._observe()
+        self._observe(chosen)
+
+    def _start(
+        self, drawn: _Start, rng: np.random.Generator, changes: Mapping[str, Array]
+    ) -> InitialStates:
+        initial = self.task.start(drawn.initial, rng)
+        if initial is drawn.initial and not changes:
+            return drawn.starts
+        return InitialStates.of(self.robot, [replace(initial, **changes)])
+
+    def _checked_starts(self, start: Any) -> list[dict[str, Array]]:
+        """Return the given changes of the starts of all rows."""
+        count, n = len(self._goals), self.robot.n
+        each = list(start) if isinstance(start, list | tuple) else [start] * count
+        if len(each) != count or not all(isinstance(one, Mapping) for one in each):
+            raise ParameterError(
+                f"The start is {start!r}: give a dictionary, or a list of {count} of them."
+            )
+        known = {part.name: 3 for part in fields(InitialState)}
+        known |= {"quaternion": 4, "joint_positions": n, "joint_velocities": n}
+        made: list[dict[str, Array]] = []
+        for one in each:
+            made.append({})
+            for name, given in one.items():
+                if name not in known:
+                    raise ParameterError(
+                        f"There is no '{name}' of a start; there are {', '.join(known)}."
+                    )
+                values = as_numbers(given, f"The start's {name}")
+                if values.shape != (known[name],) or not np.isfinite(values).all():
+                    raise ParameterError(
+                        f"The start's {name} is {given!r}; it must be {known[name]} finite numbers."
+                    )
+                made[-1][name] = values
+        return made
 
     def _checked_goals(self, goal: Any) -> Array:
         """Return the given goals (N, goal_size) of all rows."""
@@ -400,24 +531,17 @@ class Episodes:
                 f"or ({count}, {size}) for the robots one by one."
             )
         goals = np.broadcast_to(values, (count, size))
-        if isinstance(self.task, Reorient):
-            sizes = np.linalg.norm(goals, axis=1, keepdims=True)
-            if sizes.min() < 1e-3:
-                raise ParameterError("The goal is a quaternion of zeros, which is not an attitude.")
-            return np.asarray(goals / sizes)
-        return goals
+        return self.task.checked_goals(goals)
 
-    def _goal_of(self, scenario: Scenario) -> Array:
-        if isinstance(self.task, Reorient):
-            return scenario.goal.quaternion
-        for each in scenario.goal.end_effectors:
-            if each.link == self._link:
-                return each.position
-        if scenario.end_effector_goal is None:
-            raise ParameterError(
-                f"Scenario '{scenario.name}' has no goal of link '{self._link}': take random goals."
-            )
-        return scenario.end_effector_goal.position
+    def picture(self, row: int) -> npt.NDArray[np.uint8]:
+        """Return a picture (rows, columns, 3) of a robot and its goal."""
+        # Slow to import, and few environments are drawn.
+        from spacerobot_ros.environments.rendering import Camera
+
+        if self._camera is None:
+            self._camera = Camera(self.task)
+        at = slice(row, row + 1)
+        return self._camera.picture(self._states(at), self._goals[at])
 
     def end(self, rows: Counts) -> None:
         """End episodes: they are not stepped until they begin again."""
@@ -437,30 +561,49 @@ class Episodes:
         shares = as_numbers(actions, "The array of actions", CommandError)
         if shares.shape != (count, size):
             raise CommandError(f"The actions are {shares.shape}, not ({count}, {size}).")
-        under_way, before = self._flights.has_not_ended.copy(), self.errors
+        under_way, errors = self._flights.has_not_ended.copy(), self.errors.copy()
+        states = self._states(slice(None))  # Views, which have the states after the step, too.
+        before = states.copy()
         self._flights.step(command_of(shares, self.scale, self.taken), self._config.hold)
-        self._observe()
-        weights, seconds = self._weights, self.step_duration
-        reached = self._flights.has_not_ended & (self.errors <= self._tolerance)
-        failed = under_way & ~self._flights.has_not_ended
-        square = np.mean(np.clip(shares, -1.0, 1.0) ** 2, axis=1)
-        reward = weights.progress * (before - self.errors)
-        reward -= seconds * (weights.time + weights.action * square)
-        reward += weights.reached * reached - weights.failed * failed
-        self.rewards = np.where(under_way, reward, 0.0)
-        self.reached = reached
-        self.terminations = reached | failed
-        late = self._flights.time > self._config.time_limit - 0.5 * seconds
-        self.truncations = self._flights.has_not_ended & late & ~reached
+        # Robots that stand still are not measured: they take no random numbers.
+        self._observe(np.flatnonzero(under_way) if self._source.has_sensor_errors else slice(None))
+        task, alive, duration = self.task, self._flights.has_not_ended, self.step_duration
+        reached = alive & task.reached(states, self.errors, self.tolerance)
+        failed = (under_way & ~alive) | (alive & ~reached & task.failed(states, self._goals))
+        shares = np.clip(shares, -1.0, 1.0)
+        done = (before, states, self._goals, shares, errors, self.errors, reached, failed, duration)
+        self.rewards = np.where(under_way, task.reward(Step(*done), self._weights), 0.0)
+        self.reached, self.terminations = reached, reached | failed
+        late = self._flights.time > self.time_limit - 0.5 * duration
+        self.truncations = alive & late & ~self.terminations
 
-    def _observe(self) -> None:
-        states = self._states(slice(None))
-        remaining = self.task.remaining(states, self._goals)
-        self.errors = self.task.errors(remaining)
-        self.observations = self.task.observe(states, remaining)
+    def _observe(self, rows: Any = slice(None)) -> None:
+        states, goals = self._states(rows), self._goals[rows]
+        remaining = self.task.remaining(states, goals)
+        self.errors[rows] = self.task.errors(remaining)
+        if self._source.has_sensor_errors:
+            states = self._measured(states, rows)
+            remaining = self.task.remaining(states, goals)
+        self.observations[rows] = self.task.observe(states, remaining)
 
-    def _states(self, rows: slice) -> RobotStates:
+    def _measured(self, states: RobotStates, rows: Counts) -> RobotStates:
+        size = 12 + 2 * self.robot.n
+        normals = [self._generators[row].standard_normal(size) for row in rows.tolist()]
+        parts = states.pose, states.twist, states.q, states.qdot
+        measured = self._sensors[rows].measure(np.array(normals).reshape(-1, size), *parts)
+        if not self._link:
+            return RobotStates(*measured)
+        places = self.robot.function("link_poses")(measured[2].T)[1].full()
+        link = self.robot.link_names.index(self._link)
+        return RobotStates(*measured, places.reshape(3, len(rows), -1)[:, :, link].T)
+
+    def _states(self, rows: Any) -> RobotStates:
         flights = self._flights
         link_r = flights.link_r[rows] if self._link else None
         pose, twist = flights.pose[rows], flights.twist[rows]
         return RobotStates(pose, twist, flights.q[rows], flights.qdot[rows], link_r)
+
+
+def _with_seed(plant: PlantConfig, rng: np.random.Generator) -> PlantConfig:
+    """Return the configuration of a plant whose actuators have another noise in each episode."""
+    return replace(plant, sensors=replace(plant.sensors, seed=int(rng.integers(2**31))))

@@ -29,27 +29,25 @@ def _spaces(episodes: Episodes) -> tuple[Any, Any]:
     return Box(low, high, dtype=np.float64), Box(-1.0, 1.0, size, dtype=np.float64)
 
 
-def _require_no_rendering(render_mode: str | None) -> None:
+def _require_render_mode(render_mode: str | None) -> None:
     """Refuse a render mode by the error after which libraries make environments without one."""
-    if render_mode is not None:
+    if render_mode not in (None, "rgb_array"):
         raise TypeError(
-            f"There is no render_mode '{render_mode}': environments are not rendered; leave it out."
+            f"There is no render_mode '{render_mode}': take 'rgb_array', or leave it out."
         )
 
 
-def _goal_in(options: Mapping[str, Any] | None) -> Any:
-    """Return the goal of options of a reset, which are refused if there are others."""
-    if options is None:
-        return None
-    if not isinstance(options, Mapping):
+def _begin_options(options: Mapping[str, Any] | None) -> dict[str, Any]:
+    """Return the goal and start of the options of a reset; refuse others."""
+    if not isinstance(options, Mapping | None):
         raise ParameterError(f"The options of a reset are {options!r}: give a dictionary.")
-    for name in options:
-        if name not in ("goal", "reset_mask"):
+    for name in options or {}:
+        if name not in ("goal", "start", "reset_mask"):
             raise ParameterError(
-                f"There is no option '{name}' of a reset; there are goal, and of vectors "
+                f"There is no option '{name}' of a reset; there are goal, start, and of vectors "
                 "reset_mask."
             )
-    return options.get("goal")
+    return {name: value for name, value in (options or {}).items() if name != "reset_mask"}
 
 
 def _seeds_of(seed: Any, count: int) -> list[int | None]:
@@ -73,31 +71,34 @@ def _seeds_of(seed: Any, count: int) -> list[int | None]:
 class SpaceRobotEnv(gymnasium.Env, EzPickle):
     """One robot; its step is that of the plant. The arguments are those of `EpisodeConfig`.
 
-    A copy, by pickle too, has the arguments and begins again.
+    A copy, by pickle too, has the arguments and begins again. `get_wrapper_attr` and
+    `set_wrapper_attr` read and change arguments and attributes of the task: see `Episodes.change`.
 
     Raises
     ------
     ParameterError
         An argument is refused.
     TypeError
-        A render mode is given.
+        There is no such render mode.
     """
 
-    metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 20}  # noqa: RUF012
 
     def __init__(self, *, render_mode: str | None = None, **arguments: Any) -> None:
-        _require_no_rendering(render_mode)
-        EzPickle.__init__(self, **arguments)
+        _require_render_mode(render_mode)
+        EzPickle.__init__(self, render_mode=render_mode, **arguments)
+        self.render_mode = render_mode
         self.episodes = Episodes(EpisodeConfig.of(arguments), 1, in_lanes=False)
         self.observation_space, self.action_space = _spaces(self.episodes)
+        self.metadata = {**self.metadata, "render_fps": 1.0 / self.episodes.step_duration}
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """Begin an episode; ``options["goal"]`` replaces the goal that is drawn."""
+        """Begin an episode; options ``goal`` and ``start`` replace what is drawn."""
         super().reset(seed=seed)
-        self.episodes.begin([0], [self.np_random], _goal_in(options))
-        return self.episodes.observations[0], self._info()
+        self.episodes.begin([0], [self.np_random], **_begin_options(options))
+        return self.episodes.observations[0].copy(), self._info()
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Step for the ticks of an action."""
@@ -107,7 +108,26 @@ class SpaceRobotEnv(gymnasium.Env, EzPickle):
         info = self._info()
         if any(ended):
             info["is_success"] = bool(episodes.reached[0])
-        return episodes.observations[0], float(episodes.rewards[0]), *ended, info
+        return episodes.observations[0].copy(), float(episodes.rewards[0]), *ended, info
+
+    def render(self) -> Any:
+        """Return a picture (480, 640, 3) of the robot and its goal; None without a render mode."""
+        return self.episodes.picture(0) if self.render_mode else None
+
+    def has_wrapper_attr(self, name: str) -> bool:
+        """Return whether there is an attribute of this name, here or of the episodes."""
+        return hasattr(self, name) or self.episodes.has_attribute(name)
+
+    def get_wrapper_attr(self, name: str) -> Any:
+        """Return an attribute."""
+        return getattr(self, name) if hasattr(self, name) else self.episodes.attribute(name)
+
+    def set_wrapper_attr(self, name: str, value: Any, *, force: bool = True) -> bool:
+        """Change an attribute; see `Episodes.change`."""
+        if not self.episodes.has_attribute(name):
+            return bool(super().set_wrapper_attr(name, value, force=force))
+        self.episodes.change(name, value)
+        return True
 
     def _info(self) -> dict[str, Any]:
         return {"error": float(self.episodes.errors[0])}
@@ -133,8 +153,10 @@ class SpaceRobotVectorEnv(VectorEnv, EzPickle):
     ParameterError
         An argument is refused.
     TypeError
-        A render mode is given.
+        There is no such render mode.
     """
+
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"]}  # noqa: RUF012
 
     def __init__(
         self,
@@ -144,12 +166,16 @@ class SpaceRobotVectorEnv(VectorEnv, EzPickle):
         render_mode: str | None = None,
         **arguments: Any,
     ) -> None:
-        _require_no_rendering(render_mode)
-        EzPickle.__init__(self, num_envs, autoreset_mode, **arguments)
-        self.num_envs, self.render_mode = num_envs, None
+        _require_render_mode(render_mode)
+        EzPickle.__init__(self, num_envs, autoreset_mode, render_mode=render_mode, **arguments)
+        self.num_envs, self.render_mode = num_envs, render_mode
         self.autoreset_mode = AutoresetMode(autoreset_mode)
-        self.metadata = {"render_modes": [], "autoreset_mode": self.autoreset_mode}
         self.episodes = Episodes(EpisodeConfig.of(arguments), num_envs, in_lanes=True)
+        self.metadata = {
+            **self.metadata,
+            "autoreset_mode": self.autoreset_mode,
+            "render_fps": 1.0 / self.episodes.step_duration,
+        }
         self.single_observation_space, self.single_action_space = _spaces(self.episodes)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
@@ -178,9 +204,9 @@ class SpaceRobotVectorEnv(VectorEnv, EzPickle):
     ) -> tuple[Any, dict[str, Any]]:
         """Begin all episodes, or those of ``options["reset_mask"]`` (num_envs,) alone.
 
-        ``options["goal"]``, one for all or one for each robot, replaces the goals that are drawn.
+        Options ``goal`` and ``start``, one for all or one for each robot, replace what is drawn.
         """
-        mask, goal = np.ones(self.num_envs, dtype=np.bool_), _goal_in(options)
+        mask, begin = np.ones(self.num_envs, dtype=np.bool_), _begin_options(options)
         if options is not None and "reset_mask" in options:
             mask = np.asarray(options["reset_mask"])
             if mask.shape != (self.num_envs,) or mask.dtype != np.bool_ or not mask.any():
@@ -191,7 +217,7 @@ class SpaceRobotVectorEnv(VectorEnv, EzPickle):
         for row in rows.tolist():
             if (own := seeds[row]) is not None:
                 self._generators[row], self._seeds[row] = np_random(own)
-        self._begin(rows, goal)
+        self._begin(rows, **begin)
         self._begun |= mask
         return self.episodes.observations.copy(), self._info(mask)
 
@@ -231,8 +257,22 @@ class SpaceRobotVectorEnv(VectorEnv, EzPickle):
         infos |= self._info(np.ones(self.num_envs, dtype=np.bool_))
         return episodes.observations.copy(), rewards, terminations, truncations, infos
 
-    def _begin(self, rows: Any, goal: Any = None) -> None:
-        self.episodes.begin(rows, self._generators, goal)
+    def render(self) -> Any:
+        """Return a picture (480, 640, 3) of each robot and its goal; None without a render mode."""
+        if self.render_mode is None:
+            return None
+        return tuple(self.episodes.picture(row) for row in range(self.num_envs))
+
+    def get_attr(self, name: str) -> tuple[Any, ...]:
+        """Return an attribute for each robot, which all share; see `Episodes.change`."""
+        return (self.episodes.attribute(name),) * self.num_envs
+
+    def set_attr(self, name: str, values: Any) -> None:
+        """Change an attribute of all robots; see `Episodes.change`."""
+        self.episodes.change(name, values)
+
+    def _begin(self, rows: Any, **options: Any) -> None:
+        self.episodes.begin(rows, self._generators, **options)
         self._ended[rows] = False
 
     def _info(self, mask: Any) -> dict[str, Any]:

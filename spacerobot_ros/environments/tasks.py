@@ -1,7 +1,8 @@
-"""Tasks of environments: observations, rewards, and the command of an action.
+"""Tasks of environments: goals, observations, rewards, ends, and the command of an action.
 
 All functions take the states of N robots at once, so that one robot in a plant, many in lanes and a
-robot behind ROS topics are observed by the same code.
+robot behind ROS topics are observed by the same code. A task of one's own is a class derived from
+:class:`Task`.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -28,11 +29,16 @@ from spacerobot_ros.model.rotations import (
 )
 from spacerobot_ros.planning.core.controllability import sample_shapes
 from spacerobot_ros.planning.methods.optimal.goal_specification import BaseRotations
+from spacerobot_ros.registry import Registry
+from spacerobot_ros.scenario import Scenario
+from spacerobot_ros.simulation.plant import InitialState
 
 _SAMPLED_SHAPE_COUNT = 12
 
 _MIN_SHARE_OF_MOTION = 1e-7
 """Singular values below this share of the largest are no motion."""
+
+Flags = npt.NDArray[np.bool_]
 
 LARGEST_OBSERVATION = 1e6
 """Bound of observed quantities that have none of their own; observations are clipped to it."""
@@ -59,6 +65,43 @@ class RobotStates:
     q: Array
     qdot: Array
     link_r: Array | None = None
+
+    def copy(self) -> RobotStates:
+        """Return a copy, which has these states when the arrays change."""
+        link_r = None if self.link_r is None else self.link_r.copy()
+        pose, twist, q, qdot = self.pose, self.twist, self.q, self.qdot
+        return RobotStates(pose.copy(), twist.copy(), q.copy(), qdot.copy(), link_r)
+
+
+@dataclass(frozen=True)
+class Step:
+    """What N robots did in a step.
+
+    Attributes
+    ----------
+    before, after
+        Their states.
+    goals
+        (N, goal_size) their goals.
+    actions
+        (N, entries) shares from -1 to 1 of the largest command.
+    errors_before, errors
+        (N,) errors before the step and after it; see :meth:`Task.errors`.
+    reached, failed
+        (N,) whether the goal is reached, and whether the episode ends without it.
+    duration
+        Simulated time, s.
+    """
+
+    before: RobotStates
+    after: RobotStates
+    goals: Array
+    actions: Array
+    errors_before: Array
+    errors: Array
+    reached: Flags
+    failed: Flags
+    duration: float
 
 
 @dataclass(frozen=True)
@@ -109,24 +152,38 @@ class RewardWeights:
 
 
 class Task(ABC):
-    """A kind of goal: its draws, its errors, and the observations of it.
+    """A kind of goal: its draws, errors, observations and rewards.
+
+    Subclasses give a name, :attr:`goal_size`, :meth:`random_goal` and :meth:`remaining`, and what
+    differs from the rest below.
 
     Parameters
     ----------
     robot
         The robot.
     link
-        Link that reaches, where one does.
+        Link of the argument ``link``, of the scenario, or the end-effector; empty: none.
     pushed
         Whether actions push the base by a force, and turn it by a torque.
     """
 
-    name: str
-    goal_size: int
-    tolerance: float
-    """Default error within which the goal is reached, rad or m."""
-    spread: float
-    """Default size of random goals, rad or m."""
+    name: ClassVar[str]
+    goal_size: ClassVar[int]
+    """Number of entries of a goal."""
+    scenario: ClassVar[str] = "arm_attitude"
+    """Default scenario."""
+    weights: ClassVar[type[RewardWeights]] = RewardWeights
+    """Class of the weights of the reward, which may have more of them."""
+    has_link: ClassVar[bool] = False
+    """Whether the task is about a link, whose place is then in :attr:`RobotStates.link_r`."""
+    tolerance: float = 0.01
+    """Default error within which the goal is reached."""
+    spread: float = 1.0
+    """Default size of random goals."""
+    error_size: int = 3
+    """Number of entries of :meth:`remaining`."""
+    largest_error: float = LARGEST_OBSERVATION
+    """Bound of the entries of :meth:`remaining`."""
 
     def __init__(
         self, robot: SpaceRobot, link: str = "", pushed: tuple[bool, bool] = (False, False)
@@ -134,44 +191,76 @@ class Task(ABC):
         self.robot, self.link = robot, link
         self.by_force, self.by_torque = pushed
 
-    @property
-    @abstractmethod
-    def directions(self) -> Array:
-        """Directions (m, 3) in B, orthonormal, in which random goals are drawn.
-
-        Raises
-        ------
-        ParameterError
-            There are none.
-        """
-
     @abstractmethod
     def random_goal(self, start: RobotStates, spread: float, rng: np.random.Generator) -> Array:
         """Return a random goal (goal_size,) for one robot at its start."""
 
     @abstractmethod
     def remaining(self, states: RobotStates, goals: Array) -> Array:
-        """Return the ways to the goals (N, 3) in B: rotation vectors (rad), or distances (m)."""
+        """Return what is left to the goals (N, error_size): rotation vectors (rad), ways (m)."""
 
-    @property
-    @abstractmethod
-    def largest_error(self) -> float:
-        """Bound of the entries of :meth:`remaining`."""
+    def start(self, initial: InitialState, rng: np.random.Generator) -> InitialState:
+        """Return the initial state of an episode, given that of the scenario or draw."""
+        return initial
+
+    def goal_of(self, scenario: Scenario) -> Array:
+        """Return the goal (goal_size,) of a scenario.
+
+        Raises
+        ------
+        ParameterError
+            The scenario has none for this task.
+        """
+        raise ParameterError(
+            f"Scenario '{scenario.name}' has no goal of task '{self.name}': take random goals."
+        )
+
+    def checked_goals(self, goals: Array) -> Array:
+        """Return given goals (N, goal_size) as the task uses them.
+
+        Raises
+        ------
+        ParameterError
+            One of them is refused.
+        """
+        return goals
+
+    def goal_poses(self, states: RobotStates, goals: Array) -> Array | None:
+        """Return poses (N, 7) in W at which pictures show the goals; None: they show none."""
+        return None
 
     def errors(self, remaining: Array) -> Array:
-        """Return the sizes of the errors (N,), rad or m."""
+        """Return the sizes of the errors (N,)."""
         return np.asarray(np.linalg.norm(remaining, axis=1))
 
+    def reached(self, states: RobotStates, errors: Array, tolerance: float) -> Flags:
+        """Return which goals are reached (N,), which ends their episodes."""
+        return np.asarray(errors <= tolerance)
+
+    def failed(self, states: RobotStates, goals: Array) -> Flags:
+        """Return which episodes end without success (N,), besides those that cannot continue."""
+        return np.zeros(len(states.q), dtype=np.bool_)
+
+    def reward(self, step: Step, weights: Any) -> Array:
+        """Return the rewards (N,) of a step."""
+        reward = weights.progress * (step.errors_before - step.errors)
+        square = np.mean(step.actions**2, axis=1)
+        reward -= step.duration * (weights.time + weights.action * square)
+        return np.asarray(reward + weights.reached * step.reached - weights.failed * step.failed)
+
     def observe(self, states: RobotStates, remaining: Array) -> Array:
-        """Return observations (N, 9 + 2 n): way to the goal, q, qdot, twist of the base."""
-        low, high = self.observation_bounds()
+        """Return observations: what is left to the goal, q, qdot, twist of the base."""
         parts = [remaining, states.q, states.qdot, states.twist]
-        return np.clip(np.concatenate(parts, axis=1), low, high)
+        return np.clip(np.concatenate(parts, axis=1), *self._bounds)
+
+    @cached_property
+    def _bounds(self) -> tuple[Array, Array]:
+        return self.observation_bounds()
 
     def observation_bounds(self) -> tuple[Array, Array]:
-        """Return the least and the largest observations (9 + 2 n,)."""
+        """Return the least and the largest observations (error_size + 2 n + 6,)."""
         robot, most = self.robot, LARGEST_OBSERVATION
-        error, rest = np.full(3, self.largest_error), np.full(robot.n + 6, most)
+        error, rest = np.full(self.error_size, self.largest_error), np.full(robot.n + 6, most)
         low = np.concatenate([-error, np.maximum(robot.lower, -most), -rest])
         return low, np.concatenate([error, np.minimum(robot.upper, most), rest])
 
@@ -184,7 +273,13 @@ class Reorient(Task):
 
     @cached_property
     def directions(self) -> Array:
-        """Axes of random turns: one of a planar robot; see :attr:`Task.directions`."""
+        """Axes of random turns (m, 3) in B, orthonormal: one of a planar robot.
+
+        Raises
+        ------
+        ParameterError
+            Nothing turns the base.
+        """
         axes = BaseRotations.of(self.robot).axes
         if len(axes):
             return axes
@@ -210,16 +305,37 @@ class Reorient(Task):
             quaternion_multiply(quaternion_inverse(states.pose[:, 3:]), goals)
         )
 
+    def goal_of(self, scenario: Scenario) -> Array:
+        """Return the attitude that the base goes to."""
+        return scenario.goal.quaternion
+
+    def checked_goals(self, goals: Array) -> Array:
+        """Return unit quaternions; see :meth:`Task.checked_goals`."""
+        sizes = np.linalg.norm(goals, axis=1, keepdims=True)
+        if sizes.min() < 1e-3:
+            raise ParameterError("The goal is a quaternion of zeros, which is not an attitude.")
+        return np.asarray(goals / sizes)
+
+    def goal_poses(self, states: RobotStates, goals: Array) -> Array:
+        """Return the goals where the bases are."""
+        return np.hstack([states.pose[:, :3], goals])
+
 
 class Reach(Task):
     """A link goes to a position; a goal is a position in W (3,), m."""
 
     name, goal_size, tolerance, spread = "reach", 3, 0.02, 0.3
-    largest_error = LARGEST_OBSERVATION
+    scenario, has_link = "reach", True
 
     @cached_property
     def directions(self) -> Array:
-        """Directions in which the link moves, two of a planar robot; :attr:`Task.directions`."""
+        """Directions (m, 3) in B, orthonormal, in which the link moves: two of a planar robot.
+
+        Raises
+        ------
+        ParameterError
+            There are none.
+        """
         robot = self.robot
         if self.by_force:
             return np.eye(3)
@@ -250,6 +366,21 @@ class Reach(Task):
         assert states.link_r is not None
         return np.asarray(of_base - states.link_r)
 
+    def goal_of(self, scenario: Scenario) -> Array:
+        """Return the position that the link goes to; see :meth:`Task.goal_of`."""
+        for each in scenario.goal.end_effectors:
+            if each.link == self.link:
+                return each.position
+        if scenario.end_effector_goal is None:
+            raise ParameterError(
+                f"Scenario '{scenario.name}' has no goal of link '{self.link}': take random goals."
+            )
+        return scenario.end_effector_goal.position
+
+    def goal_poses(self, states: RobotStates, goals: Array) -> Array:
+        """Return the goals, with the attitude of the world."""
+        return np.hstack([goals, np.tile([0.0, 0.0, 0.0, 1.0], (len(goals), 1))])
+
     def link_positions(self, states: RobotStates) -> Array:
         """Return the positions of the links in W (N, 3), m."""
         R = matrices_from_quaternions(states.pose[:, 3:])
@@ -257,8 +388,11 @@ class Reach(Task):
         return np.asarray(states.pose[:, :3] + np.einsum("nij,nj->ni", R, states.link_r))
 
 
-TASKS: dict[str, type[Task]] = {task.name: task for task in (Reorient, Reach)}
-"""Tasks by name."""
+TASKS: Registry[Task] = Registry(
+    "task", "spacerobot_ros.environment_tasks", Task, (Reorient, Reach)
+)
+"""Tasks by name; the registry's :meth:`~.Registry.register` adds one's own."""
+TASKS.load()
 
 
 def action_scale(robot: SpaceRobot, actuation: str, max_force: float, max_torque: float) -> Array:

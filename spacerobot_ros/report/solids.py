@@ -135,6 +135,11 @@ class Canvas:
             for ends in solid.edges[seen.any(axis=1)]:
                 self._draw_edge(ends)
 
+    def draw_lines(self, lines: Iterable[Array], color: str) -> None:
+        """Draw lines (2, 3) in the world over everything."""
+        for ends in lines:
+            self._draw_edge(ends, color, pixels_nearer=1e9)
+
     def image(self) -> Image:
         """Return the picture (rows, columns, 4), the top row first, transparent where empty."""
         n = _OVERSAMPLING
@@ -183,10 +188,12 @@ class Canvas:
         depth = offset - (across * x + up * y) / self._scale
         return np.asarray(depth / float(normal @ self._view.viewing_direction))
 
-    def _draw_edge(self, ends: Array) -> None:
+    def _draw_edge(
+        self, ends: Array, color: str = EDGE_COLOUR, pixels_nearer: float = 2.0 * _EDGE_WIDTH
+    ) -> None:
         at = self._to_pixels(ends)
         # An edge lies in the faces beside it and is drawn a little nearer.
-        at[:, 2] += 2.0 * _EDGE_WIDTH / self._scale
+        at[:, 2] += pixels_nearer / self._scale
         rows, columns = self._depth.shape
         brush = np.arange(_EDGE_WIDTH) - (_EDGE_WIDTH - 1) / 2
         offsets = np.stack(np.meshgrid(brush, brush), axis=-1).reshape(-1, 1, 2)
@@ -197,7 +204,7 @@ class Canvas:
         known = ((places >= 0) & (places < (columns, rows))).all(axis=1)
         column, row = places[known].T
         seen = depth[known] > self._depth[row, column]
-        self._pixels[row[seen], column[seen]] = [*to_rgb(EDGE_COLOUR), 1.0]
+        self._pixels[row[seen], column[seen]] = [*to_rgb(color), 1.0]
 
 
 def outlines(body: Body) -> list[Array]:

@@ -7,6 +7,7 @@ import pickle
 import re
 import warnings
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,10 +23,12 @@ import spacerobot_ros.environments
 from spacerobot_ros.environments import import_gymnasium
 from spacerobot_ros.environments.episodes import EpisodeConfig, Episodes
 from spacerobot_ros.environments.tasks import (
+    TASKS,
     Reach,
     Reorient,
     RewardWeights,
     RobotStates,
+    Task,
     action_scale,
     command_of,
 )
@@ -37,8 +40,11 @@ from spacerobot_ros.scenario import load_scenario
 from spacerobot_ros.simulation.actuators import build_plant
 
 MODES = "NextStep", "SameStep", "Disabled"
-ARM = "spacerobot/ReorientArm-v0"
+ARM, OWN = "spacerobot/ReorientArm-v0", "spacerobot/Task-v0"
 SHORT = {"scenario": "planar_chain", "hold": 2, "time_limit": 0.5, "spread": 0.02}
+
+ROOT = Path(__file__).resolve().parents[2]
+PAGE = (ROOT / "docs/environments.md").read_text("utf-8")
 
 
 @pytest.fixture(autouse=True)
@@ -63,6 +69,8 @@ def strict() -> Iterator[None]:
     [
         (ARM, {"scenario": "planar_chain"}, (13, 2)),
         ("spacerobot/Reach-v0", {"scenario": "planar_chain", "link": "segment_2"}, (13, 2)),
+        (ARM, {"scenario": "faults/noisy_sensors", "render_mode": "rgb_array"}, (15, 3)),
+        (OWN, {"task": "point", "scenario": "planar_chain"}, (13, 2)),
     ],
 )
 def test_gymnasium_checks_the_environments(
@@ -71,7 +79,7 @@ def test_gymnasium_checks_the_environments(
     environment = gymnasium.make(name, **arguments)
     assert environment.observation_space.shape == sizes[:1]
     assert environment.action_space.shape == sizes[1:]
-    check_env(environment.unwrapped, skip_render_check=True)
+    check_env(environment.unwrapped)
 
 
 def fly_beside_single_ones(name: str, mode: str, arguments: dict[str, Any], steps: int) -> int:
@@ -324,8 +332,10 @@ def test_goals_of_a_scenario() -> None:
         ({"time_limit": np.inf}, "Argument 'time_limit' is inf; it must be finite"),
         ({"scenario": "a", "campaign": "b"}, "both given: a campaign names its scenario"),
         ({"reward": {"speed": 1}}, "There is no weight 'speed' of the reward; there are progress"),
-        ({"scenario": "faults/stuck_slider"}, "has faults, which environments do not have"),
-        ({"scenario": "faults/noisy_sensors"}, "has errors of sensors, which environments do not"),
+        ({"scenario": "faults/late_poses"}, "has faults of sensors, which environments do not"),
+        ({"task": 3}, "Argument 'task' is 3; it must be a text"),
+        ({"task": "hover"}, "Argument 'task' is 'hover'; it may be reorient, reach"),
+        ({"task": Task}, "The task 'Task' lacks .*random_goal.*remaining"),
         ({"scenario": "capture"}, "has a target, which environments do not have"),
         ({"action_scale": [1.0]}, r"'action_scale' is \[1.0\]; robot .* takes a list of 8 finite"),
         ({"action_scale": 1.0}, "'action_scale' is 1.0; robot .* takes a list of 8 finite numbers"),
@@ -371,7 +381,10 @@ def test_bad_actions_goals_and_masks_are_refused() -> None:
         with pytest.raises(ParameterError, match=r"The goal .* is not a list of numbers\."):
             vector.reset(options={"goal": given})
     for options, message in (
-        ({"gaol": [0, 0, 0, 1]}, "There is no option 'gaol' of a reset; there are goal, and of"),
+        ({"gaol": [0, 0, 0, 1]}, "There is no option 'gaol' of a reset; there are goal, start, "),
+        ({"start": [{}]}, r"The start is \[{}\]: give a dictionary, or a list of 2 of them"),
+        ({"start": {"q": [0, 0]}}, "There is no 'q' of a start; there are position, quaternion, "),
+        ({"start": {"position": [0, 0]}}, r"The start's position is \[0, 0\]; it must be 3 finite"),
         ("goal", "The options of a reset are 'goal': give a dictionary"),
     ):
         with pytest.raises(ParameterError, match=message):
@@ -403,6 +416,145 @@ def test_robots_are_reset_before_they_are_stepped() -> None:
         vector.step(np.zeros((3, 2)))
     vector.reset(seed=1)
     vector.step(np.zeros((3, 2)))
+
+
+# -- tasks of one's own ------------------------------------------------------------------------
+
+
+(_SOURCE,) = re.findall(r"```python file=point.py\n(.*?)```", PAGE, re.DOTALL)
+_OF_PAGE: dict[str, Any] = {"__name__": __name__}
+exec(compile(_SOURCE, "point.py", "exec"), _OF_PAGE)
+Point: type[Task] = TASKS.register(_OF_PAGE["Point"])
+
+
+@pytest.mark.usefixtures("strict")
+@pytest.mark.parametrize("mode", MODES)
+def test_a_task_of_ones_own_in_vectors_is_as_many_single_ones(mode: str) -> None:
+    arguments = {**SHORT, "task": Point, "spread": 0.3, "time_limit": 0.1}
+    assert fly_beside_single_ones(OWN, mode, arguments, 12) > 5
+
+
+def test_a_task_of_ones_own_decides_starts_rewards_and_ends() -> None:
+    environment: Any = gymnasium.make(
+        OWN, task=Point, scenario="planar_chain", tolerance=0.2, reward={"time": 0.0, "spin": 2.0}
+    ).unwrapped
+    episodes = environment.episodes
+    _, first = environment.reset(seed=3)
+    goal, q = episodes.goals[0], episodes.flights.q[0].copy()
+    assert (np.abs(q - load_scenario("planar_chain").plant.initial_joint_positions) <= 0.2).all()
+    assert len(set(q.tolist())) == 2
+    # The angle between the x axis of the base and the goal, by another formula.
+    assert first["error"] == pytest.approx(np.arccos(goal[0]), abs=1e-9)
+    seen, reward, *ends, info = environment.step([0.5, -0.5])
+    axis = matrix_from_quaternion(episodes.flights.pose[0, 3:])[:, 0]
+    assert info["error"] == pytest.approx(np.arccos(axis @ goal), abs=1e-9)
+    spin = np.linalg.norm(episodes.flights.twist[0, 3:])
+    assert spin > 1e-4
+    wanted = 10.0 * (first["error"] - info["error"]) - 0.01 * (0.01 * 0.25 + 2.0 * spin)
+    assert reward == pytest.approx(wanted, rel=1e-9)
+    assert seen[3:5] == pytest.approx(episodes.flights.q[0])
+    assert ends == [False, False]
+    # Reached only if the base is nearly still; lost if it turns away.
+    environment.reset(options={"goal": [1.0, 0.0, 0.0]})
+    *_, reached, _, info = environment.step([0.0, 0.0])
+    assert (reached, info["is_success"]) == (True, True)
+    environment.reset(options={"goal": [-1.0, 0.0, 0.0]})
+    _, reward, lost, _, info = environment.step([0.0, 0.0])
+    assert (reward, lost, info["is_success"]) == (pytest.approx(-5.0), True, False)
+
+
+def test_arguments_change_from_episode_to_episode() -> None:
+    vector: Any = gymnasium.make_vec(OWN, num_envs=3, task="point", scenario="planar_chain")
+    single: Any = gymnasium.make(OWN, task="point", scenario="planar_chain")
+    for angle in (0.1, 0.4):
+        vector.set_attr("spread", angle)
+        single.set_wrapper_attr("spread", angle)
+        assert vector.get_attr("spread") == (angle,) * 3
+        assert single.get_wrapper_attr("spread") == angle
+        errors = [vector.reset(seed=seed)[1]["error"] for seed in range(20)]
+        assert 0.7 * angle < np.max(errors) <= angle
+        assert single.reset(seed=4)[1]["error"] == errors[4][0]
+    vector.set_attr("time_limit", 0.02)
+    vector.set_attr("reward", {"failed": 7.0})
+    vector.set_attr("largest_angle", 0.0)  # An attribute of the task.
+    *_, rewards, lost, truncated, _ = vector.step(np.zeros((3, 2)))
+    assert lost.all()
+    assert not truncated.any()
+    np.testing.assert_allclose(rewards, -7.0 - 0.01 * 0.02, atol=1e-3)
+    with pytest.raises(ParameterError, match="no attribute 'speed' to change; there are reward, "):
+        vector.set_attr("speed", 1.0)
+    with pytest.raises(ParameterError, match=r"'tolerance' is -1\.0; it must be finite"):
+        vector.set_attr("tolerance", -1.0)
+    assert vector.get_attr("tolerance") == (0.05,) * 3
+
+
+def test_starts_are_given() -> None:
+    vector: Any = gymnasium.make_vec(ARM, num_envs=2, scenario="servicer")
+    place, momentum = [0.5, 0.0, -1.0], [0.0, 3.0, 0.0]
+    vector.reset(options={"start": [{"position": place}, {"angular_momentum": momentum}]})
+    flights = vector.unwrapped.episodes.flights
+    np.testing.assert_allclose(flights.pose[:, :3], np.array([place, np.zeros(3)]), atol=1e-12)
+    np.testing.assert_allclose(
+        flights.momentum[:, 3:6], np.array([np.zeros(3), momentum]), atol=1e-9
+    )
+
+
+# -- what lanes lack ---------------------------------------------------------------------------
+
+
+@pytest.mark.usefixtures("strict")
+@pytest.mark.parametrize(
+    ("scenario", "arguments"),
+    [
+        ("faults/weak_motors", {}),
+        ("faults/noisy_sensors", {}),
+        pytest.param("servicer_thrusters", {}, marks=pytest.mark.slow),
+    ],
+)
+def test_scenarios_with_faults_noise_or_thrusters_in_vectors_are_as_many_single_ones(
+    scenario: str, arguments: dict[str, Any]
+) -> None:
+    arguments = {"scenario": scenario, "hold": 2, "time_limit": 0.4, **arguments}
+    assert fly_beside_single_ones(ARM, "NextStep", arguments, 10) >= 5
+
+
+def test_faults_and_thrusters_are_those_of_the_plant() -> None:
+    for name in ("faults/weak_motors", "free_flyer"):
+        environment: Any = gymnasium.make(ARM, scenario=name, hold=4).unwrapped
+        environment.reset(seed=2)
+        episodes, config = environment.episodes, load_scenario(name).plant
+        seed = episodes._plants[0].sensors.seed
+        config = replace(config, sensors=replace(config.sensors, seed=seed))
+        plant = build_plant(SpaceRobot(load_robot(robot_file(config.robot))), config)
+        action = np.linspace(-0.9, 0.7, environment.action_space.shape[0])
+        environment.step(action)
+        command = command_of(action[np.newaxis], episodes.scale, episodes.taken)[0]
+        n = episodes.robot.n
+        for _ in range(4):
+            plant.step(*([command[:n], command[n:]] if plant.takes_wrench else [command]))
+        np.testing.assert_array_equal(episodes.flights.twist[0], plant.twist)
+        np.testing.assert_array_equal(episodes.flights.q[0], plant.q)
+        # Another episode has other noise.
+        environment.reset()
+        assert episodes._plants[0].sensors.seed != seed
+
+
+def test_sensors_err_by_their_noise_and_bias() -> None:
+    count, sensors = 2000, load_scenario("faults/noisy_sensors").plant.sensors
+    vector: Any = gymnasium.make_vec(ARM, num_envs=count, scenario="faults/noisy_sensors")
+    seen, _ = vector.reset(seed=1, options={"goal": [0, 0, 0, 1]})
+    flights = vector.unwrapped.episodes.flights
+    parts = np.split(seen, [3, 6, 9, 12], axis=1)
+    truths = 0.0, flights.q, flights.qdot, flights.twist[:, :3], flights.twist[:, 3:]
+    names = "attitude", "joint", "joint_rate", "velocity", "angular_velocity"
+    for name, part, truth in zip(names, parts, truths, strict=True):
+        sigma = getattr(sensors, f"{name}_noise")
+        error = part - truth
+        assert sigma > 0
+        assert np.std(error) == pytest.approx(sigma, rel=0.05)
+        assert abs(np.mean(error)) < 0.05 * sigma
+    # The error that rewards and ends depend on is the true one.
+    np.testing.assert_allclose(vector.unwrapped.episodes.errors, 0.0, atol=1e-12)
 
 
 def states(n: int) -> RobotStates:
@@ -561,30 +713,48 @@ def test_copies_have_the_arguments_and_begin_anew() -> None:
             assert here is not there
 
 
-def test_environments_are_made_without_rendering_alone() -> None:
+def test_pictures_show_the_robot_and_its_goal() -> None:
+    arguments = {"scenario": "planar_chain", "render_mode": "rgb_array"}
+    environment: Any = gymnasium.make(ARM, **arguments)
+    pictures = []
+    for angle, joint in ((0.0, 0.0), (0.5, 0.0), (0.5, 1.0)):
+        start = {"joint_positions": [joint, 0.0]}
+        goal = quaternion_from_rotvec([0.0, 0.0, angle])
+        environment.reset(options={"goal": goal, "start": start})
+        pictures.append(environment.render())
+    assert {(each.shape, each.dtype.name) for each in pictures} == {((480, 640, 3), "uint8")}
+    aligned, turned, bent = (each.astype(int) for each in pictures)
+    # The lines of the goal move with it, the links with their joints.
+    assert 500 < (np.abs(turned - aligned).max(axis=2) > 20).sum() < 20_000
+    assert (np.abs(bent - turned).max(axis=2) > 20).sum() > 1000
+    vector: Any = gymnasium.make_vec(ARM, num_envs=2, **arguments)
+    vector.reset(options={"goal": goal, "start": [{"joint_positions": [0.0, 0.0]}, start]})
+    for picture, wanted in zip(vector.render(), pictures[1:], strict=True):
+        np.testing.assert_array_equal(picture, wanted)
+
+
+def test_other_render_modes_are_refused() -> None:
     # Libraries pass it always, and leave it out after a TypeError.
     for make in (gymnasium.make, gymnasium.make_vec):
-        make(ARM, scenario="planar_chain", render_mode=None)
+        assert make(ARM, scenario="planar_chain", render_mode=None).render_mode is None
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # Gymnasium may tell it before.
-            with pytest.raises(TypeError, match="There is no render_mode 'human'"):
-                make(ARM, scenario="planar_chain", render_mode="human")
+            with pytest.raises(TypeError, match="There is no render_mode 'ansi': take 'rgb_array'"):
+                make(ARM, scenario="planar_chain", render_mode="ansi")
 
 
 def test_the_defaults_are_those_of_the_page() -> None:
-    page = (Path(__file__).resolve().parents[2] / "docs/environments.md").read_text("utf-8")
     config, weights = EpisodeConfig("reorient"), RewardWeights()
-    told = re.findall(r"^\| `(hold|time_limit)` \| .* \| ([\d.]+) \|$", page, re.MULTILINE)
+    told = re.findall(r"^\| `(hold|time_limit)` \| .* \| ([\d.]+) \|$", PAGE, re.MULTILINE)
     assert {name: getattr(config, name) for name in ("hold", "time_limit")} == {
         name: float(value) for name, value in told
     }
-    told = re.findall(r"^\| `(\w+)` \| ([\d.]+) \| .* \|$", page, re.MULTILINE)
+    told = re.findall(r"^\| `(\w+)` \| ([\d.]+) \| .* \|$", PAGE, re.MULTILINE)
     assert vars(weights) == {name: float(value) for name, value in told}
 
 
 def test_the_campaign_of_the_page_draws_masses_starts_and_goals(tmp_path: Path) -> None:
-    page = (Path(__file__).resolve().parents[2] / "docs/environments.md").read_text("utf-8")
-    (text,) = re.findall(r"```yaml\n(campaign:.*?)```", page, re.DOTALL)
+    (text,) = re.findall(r"```yaml\n(campaign:.*?)```", PAGE, re.DOTALL)
     (file := tmp_path / "arm.yaml").write_text(text.replace("5000", "20"), "utf-8")
     config = EpisodeConfig("reorient", campaign=str(file))
     episodes = Episodes(config, 8, in_lanes=False)

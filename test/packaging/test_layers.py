@@ -165,7 +165,7 @@ def test_everything_that_is_imported_is_known_to_these_tests() -> None:
         *("ament_index_python", "casadi", "click", "lz4", "matplotlib", "mcap", "meshcat"),
         *("mujoco", "numpy", "pandas", "rosbags", "rosidl_parser", "rpyutils", "scipy"),
         *("typing_extensions", "viser", "websockets", "xacro", "xarray", "yaml", "zstandard"),
-        *("coal", "collada", "dask", "distributed", "gymnasium", "trimesh"),
+        *("coal", "collada", "dask", "distributed", "gymnasium", "stable_baselines3", "trimesh"),
     }
     others = {name.split(".")[0] for module in sources() for name in imports(module)} - known
     assert others <= needed
