@@ -384,7 +384,10 @@ class _ControlledLanes:
             return "its thrusters are on or off, which engine 'flights' flies"
         if plant.beyond_limits != "clip":
             return "the plant refuses commands beyond limits"
-        if nominal_robots(scenario).controller.description.wheel_names:
+        robots = nominal_robots(scenario)
+        if robots.plant.description.world is not None:
+            return "it has obstacles, and lanes notice no contacts"
+        if robots.controller.description.wheel_names:
             return "the robot has reaction wheels, which engine 'flights' flies"
         if scenario.controller.profile == PlannedReference.name:
             return "its references are planned, which engine 'flights' does"
@@ -615,9 +618,7 @@ class _PlannedValues:
 def _first_plan(flight: DrawnFlight) -> _Plan | None:
     """Let the executive plan for the first state; None if it makes no whole schedule."""
     period = flight.scenario.plant.control_period
-    first = fly_scenario(
-        flight.seeded_scenario, robots=robots_of(flight), longest=period, contacts=False
-    )
+    first = fly_scenario(flight.seeded_scenario, robots=robots_of(flight), longest=period)
     if len(first.schedules) != 1 or first.gait is None:
         return None
     ((begins_ns, schedule),) = first.schedules

@@ -62,7 +62,6 @@ class FlightsEngine:
             robots=robots_of(flight),
             progress=lambda now, end: stopped(),
             longest=campaign.max_flight_time,
-            contacts=False,
         )
 
 

@@ -316,6 +316,7 @@ class ControllerCommander(Commander):
     def _forward_plant_state(self) -> None:
         if self.executive is not None:
             self.executive.plant_blocked = bool(self.plant.refusal_of_goals)
+            self.executive.take_contacts(self.plant.status.contacts, self.plant.status.time_s)
 
     def _waits_for_first_pose(self) -> bool:
         """Whether the last state came before odom was connected: its pose is not lost."""

@@ -184,6 +184,10 @@ class ControlExecutive:
         self._next_report = 0.0
         self._limited = False
         self._command_report: CommandReport | None = None
+        self._contacts: tuple[str, ...] = ()
+        """The links that touch."""
+        self._touched = ""
+        """The first contact on the way to the present goal, and when; empty: there was none."""
 
     def cancel_plan(self) -> None:
         """Cancel the reference in the making; any thread may call this."""
@@ -375,6 +379,15 @@ class ControlExecutive:
         self._report_abort()
         return True
 
+    def take_contacts(self, contacts: tuple[str, ...], time: float) -> None:
+        """Take the links that touch from a time on, s: a goal that they are met on the way to is
+        not reached.
+        """
+        met = [each for each in contacts if each not in self._contacts]
+        if met and not self._touched and self._goal_state is _TRACKING:
+            self._touched = f"{met[0]} touched at {time:.4g} s"
+        self._contacts = contacts
+
     def on_plant_obeying(self) -> None:
         """Hold the pose of the next measured state, not an earlier one."""
         self._plan_next(_Next.HOLD)
@@ -543,7 +556,9 @@ class ControlExecutive:
         decision = monitor.decide_by_errors(time, at_rest, ends, controller.errors(), config)
         if decision != _NO_DECISION:
             self._goal_state, kind = _STATE_AND_EVENT_OF_DECISION[Decision(int(decision))]
-            if decision == Decision.REACHED and self._missed_parts():
+            if decision == Decision.REACHED and self._touched:
+                self._goal_state, kind = _STATE_AND_EVENT_OF_DECISION[Decision.FAILED]
+            elif decision == Decision.REACHED and self._missed_parts():
                 self._goal_state = ControllerState.REACHED_PARTLY
                 kind = EventKind.GOAL_REACHED_PARTLY
             message = self._message(self._goal_state)
@@ -641,10 +656,9 @@ class ControlExecutive:
             case TaskState.DONE if self._pending:
                 self._begin_goals(time, state, carried=True)
             case TaskState.DONE:
-                self._goal_state = ControllerState.REACHED
-                self._report_decision(
-                    EventKind.GOAL_REACHED, self._message(self._goal_state), self._goal_state
-                )
+                decision = Decision.FAILED if self._touched else Decision.REACHED
+                self._goal_state, kind = _STATE_AND_EVENT_OF_DECISION[decision]
+                self._report_decision(kind, self._message(self._goal_state), self._goal_state)
             case TaskState.REFUSED | TaskState.FAILED:
                 self._end_tasks(time, state, progress)
 
@@ -667,11 +681,15 @@ class ControlExecutive:
 
     def _begin_tasks(self, time: float, tasks: tuple[Task, ...]) -> None:
         self.servicing.begin(tasks)
+        self._touched = ""
+        self._begin_tracking(time)
+        self._wait_for_tasks()
+
+    def _begin_tracking(self, time: float) -> None:
         self._goal_state = ControllerState.TRACKING
         self._monitor.begin(time)
         self._stall.restart()
         self._next_report, self._error_bounds = time, None
-        self._wait_for_tasks()
 
     def _wait_for_tasks(self) -> None:
         """Report and save the pending goals, which begin after the tasks."""
@@ -722,10 +740,8 @@ class ControlExecutive:
             self.controller.set_goals(time, state, **poses)
         if not (carried or again):
             self._report_acceptance()
-        self._goal_state = ControllerState.TRACKING
-        self._monitor.begin(time)
-        self._stall.restart()
-        self._next_report, self._error_bounds = time, None
+            self._touched = ""
+        self._begin_tracking(time)
         self.outputs.append(PursuedGoals(self._goals_to_save()))
 
     def _aims(self, state: ControlState) -> tuple[_Aims, frozenset[Controlled]]:
@@ -893,7 +909,8 @@ class ControlExecutive:
             case ControllerState.REACHED | ControllerState.REACHED_PARTLY | ControllerState.FAILED:
                 away, config = self.controller.distance_to_goal(), self._goal_config
                 missed = self._missed_parts() if state is ControllerState.REACHED_PARTLY else {}
-                return decided_message(state, away, config, self._stall.cause, missed)
+                cause, touched = self._stall.cause, self._touched
+                return decided_message(state, away, config, cause, missed, touched)
             case ControllerState.ABORTED:
                 return self._abort_message
             case ControllerState.ESTIMATING:
@@ -914,11 +931,12 @@ def decided_message(
     config: ControllerConfig,
     cause: str = "",
     missed: Mapping[Controlled, str] = _NOTHING_MISSED,
+    touched: str = "",
 ) -> str:
     """Return the message about a goal that is reached or failed, at a distance from the goal.
 
     ``cause`` is why the robot came no nearer, as far as is known; ``missed`` are the parts of a
-    goal that is reached partly.
+    goal that is reached partly; ``touched`` is the contact for which it is not reached.
     """
     limits = (
         (distance.position, config.position_tolerance),
@@ -929,6 +947,8 @@ def decided_message(
     away = f"{distance} from it (tolerance {tolerance})"
     if state is not ControllerState.FAILED:
         return reached_message(away, missed)
+    if touched:
+        return f"The goal is not reached without contact, as {touched}: {away}."
     late = f"not reached in time, as {cause}" if cause else "not reached in time"
     if not any(off > most for off, most in limits):
         away += f", within tolerance for less than the settling time of {config.settle_time:g} s"

@@ -1,8 +1,7 @@
 """The clearance of a flight: the smallest distance between links, and to obstacles, in its true
 states.
 
-A flight without ROS reports clearances and contacts as the plant's node does:
-:meth:`FlightClearance.statuses` and :meth:`FlightClearance.contacts`.
+A flight without ROS reports clearances as the plant's node does: :meth:`FlightClearance.statuses`.
 """
 
 from __future__ import annotations
@@ -15,10 +14,9 @@ import numpy as np
 import numpy.typing as npt
 
 from spacerobot_ros.collision import Approach, BasePoses, CollisionGeometry, PathCheck
-from spacerobot_ros.events import Event
 from spacerobot_ros.model.description import Array, RobotDescription, Shape
 from spacerobot_ros.model.meshes import TriangleMesh, shape_mesh
-from spacerobot_ros.simulation.clearance import ClearanceMonitor, ClearanceStatus
+from spacerobot_ros.simulation.clearance import ClearanceStatus
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,31 +92,6 @@ class FlightClearance:
                 distances.tolist(), pairs.tolist(), self.time[::every].tolist(), strict=True
             )
         ]
-
-    def contacts(self, every: int, *, has_contact_forces: bool = False) -> list[Event]:
-        """Return the events of contacts in one state in ``every``, as the plant reports them.
-
-        ``has_contact_forces``: bodies that touch push each other.
-        """
-        if not self.geometry.exact:
-            return []
-        chosen = np.arange(0, len(self.time), every)
-        distances, _ = self._nearest_at(chosen)
-        touching = distances <= 0
-        touching[1:] |= touching[:-1]  # Contacts end in the state after.
-        monitor = ClearanceMonitor(
-            self.geometry, self.geometry.links, has_contact_forces=has_contact_forces
-        )
-        events: list[Event] = []
-        links = len(self.geometry.links)
-        for row in chosen[touching].tolist():
-            R, r = (each[:links] for each in self.geometry.poses(self.shapes[row]))
-            link_R = np.ascontiguousarray(R.transpose(1, 0, 2).reshape(3, -1))
-            pose = np.zeros(7)
-            if self.base is not None:
-                pose[:3], pose[3:] = self.base.position[row], self.base.quaternion[row]
-            events += monitor.measure(link_R, r.T, pose, float(self.time[row]))[1]
-        return events
 
     def _nearest_at(
         self, rows: slice | npt.NDArray[np.int64]

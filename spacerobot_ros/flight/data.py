@@ -581,7 +581,8 @@ class FlightData:
             controls -= {"end_effectors"}
         errors = describe_remaining_error(error, controls, tolerance, self.goal)
         within = tolerance.admits(error, controls)
-        if late and within:
+        touched = self.message.startswith("The goal is not reached without contact")
+        if late and within and not touched:
             settling = f"{self.scenario.controller.settle_time:g} s"
             errors += f", within tolerance for less than the settling time of {settling}"
         if reached and not within and "measured_pose" in self.series:
@@ -593,7 +594,7 @@ class FlightData:
         if self.outcome is Outcome.REACHED_PARTLY and parts and not missed:
             return Verdict(word, reached_message(errors, parts))
         fact = "The goal is reached" if reached else "The goal is not reached in time"
-        if late and self.message.startswith(fact):
+        if late and (touched or self.message.startswith(fact)):
             # The message of a controller names what kept it from the goal, if that is known.
             fact = self.message.partition(": ")[0]
         fact += ", but the target is not captured" * missed

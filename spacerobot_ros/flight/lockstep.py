@@ -35,7 +35,7 @@ from spacerobot_ros.commanding.planner import PlannerCommander
 from spacerobot_ros.commanding.plant_state import Stamped
 from spacerobot_ros.control.executive import END_EFFECTOR
 from spacerobot_ros.errors import ParameterError, SpaceRobotError
-from spacerobot_ros.events import CONTACTS, Event, EventKind
+from spacerobot_ros.events import Event
 from spacerobot_ros.flight.flight import Flight
 from spacerobot_ros.flight.log import FlightLog
 from spacerobot_ros.measures import Outcome
@@ -51,6 +51,7 @@ from spacerobot_ros.planning.execution.goal_file import BASE_GOAL_KEY, GoalIds
 from spacerobot_ros.planning.execution.status import PlannerStatus, ScheduleStart
 from spacerobot_ros.scenario import Scenario
 from spacerobot_ros.simulation.actuators import PlantWithFaults, build_plant
+from spacerobot_ros.simulation.clearance import ClearanceMonitor
 from spacerobot_ros.simulation.commands import CommandSource, CommandValidator
 from spacerobot_ros.simulation.sensors import ReportedState
 from spacerobot_ros.simulation.status import PlantMonitor, PlantState
@@ -146,7 +147,6 @@ def fly_scenario(
     robots: Robots | None = None,
     progress: Progress = lambda now, end: False,
     longest: float = math.inf,
-    contacts: bool = True,
 ) -> Flight:
     """Fly a scenario from its initial state to its goal, without ROS: as ``spacerobot run`` does.
 
@@ -160,8 +160,6 @@ def fly_scenario(
         Called with the progress of the flight; it may end it.
     longest
         Simulated time after which the flight is interrupted, s.
-    contacts
-        Whether contacts between links are among the events.
 
     Raises
     ------
@@ -172,30 +170,7 @@ def fly_scenario(
     """
     require_flyable(scenario)
     flight = LockstepFlight(scenario, robots or Robots.of(scenario))
-    return flight.fly(progress, longest, contacts=contacts)
-
-
-def _with_contacts(flight: Flight) -> Flight:
-    """Return a flight with the contacts among its events, where the plant's node reports them."""
-    if flight.clearance is None:
-        return flight
-    events = list(flight.events)
-    plant = flight.scenario.plant
-    has_contact_forces = plant.engine == "mujoco"
-    for contact in flight.clearance.contacts(
-        plant.clearance_ticks, has_contact_forces=has_contact_forces
-    ):
-        assert contact.time_s is not None
-        # After the beginning of the flight, and before the answers to that state.
-        earlier = [
-            each.kind is EventKind.RUNNING
-            or (each.time_s or 0.0) < contact.time_s
-            or each.kind in CONTACTS
-            for each in events
-        ]
-        place = earlier.index(False) if False in earlier else len(events)
-        events.insert(place, replace(contact, node="plant"))
-    return replace(flight, events=tuple(events))
+    return flight.fly(progress, longest)
 
 
 class _DecisionState(Enum):
@@ -263,6 +238,15 @@ class LockstepFlight:
         self._injected_seen = self._plant.injected
         self._diagnostics = PlantDiagnostics("/plant", self._plant, self._commands)
         self._report_ticks = config.ticks_of(config.diagnostics_period)
+        self._contact_ticks = config.contact_ticks
+        self._clearance: ClearanceMonitor | None = None
+        if self._contact_ticks:
+            self._clearance = ClearanceMonitor.of(
+                robots.plant.description,
+                tuple(robots.plant.link_names),
+                capturing=self._plant.capturing,
+                has_contact_forces=config.engine == "mujoco",
+            )
         self._diagnosed_ns: dict[str, int] = {}
         """When the diagnostics of each commander were published last, ns."""
         self._statuses: dict[str, StatusRecord] = {}
@@ -299,14 +283,11 @@ class LockstepFlight:
         self,
         progress: Progress = lambda now, end: False,
         longest: float = math.inf,
-        *,
-        contacts: bool = True,
     ) -> Flight:
         """Fly to the decision about the goal; parameters are those of :func:`fly_scenario`."""
         began = time.perf_counter()
         interrupted = self._fly(progress, longest)
-        flight = self.until_now(time.perf_counter() - began, interrupted)
-        return _with_contacts(flight) if contacts else flight
+        return self.until_now(time.perf_counter() - began, interrupted)
 
     def interrupt(self) -> None:
         """End the flight, and the plan that is being made; called from another thread."""
@@ -383,6 +364,16 @@ class LockstepFlight:
         self.log.add_state(self._tick)
         if self._report_ticks and self._tick % self._report_ticks == 0:
             self.log.diagnostics.append((self._now_ns, tuple(self._diagnostics.records())))
+        if self._clearance is not None and self._tick % self._contact_ticks == 0:
+            self._report_contacts(self._clearance)
+
+    def _report_contacts(self, clearance: ClearanceMonitor) -> None:
+        plant = self._plant
+        _, events = clearance.measure(plant.link_R, plant.link_r, plant.pose, self.time)
+        if events:
+            self.log.events += [replace(event, node="plant") for event in events]
+            self._monitor.contacts = clearance.contacts
+            self._report_plant_status(PlantState.RUNNING)
 
     def _step(self) -> bool:
         """Step under the commands of the tick; return whether the plant could."""

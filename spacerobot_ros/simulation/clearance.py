@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+
+import numpy as np
 
 from spacerobot_ros.collision import CollisionGeometry, LinkPair, NearestPair, ObstaclePair
 from spacerobot_ros.errors import quantity
@@ -23,6 +25,8 @@ from spacerobot_ros.events import (
 from spacerobot_ros.files import warn_first_time
 from spacerobot_ros.model.compilation import cache_directory
 from spacerobot_ros.model.description import Array, RobotDescription
+from spacerobot_ros.model.rotations import relative_pose
+from spacerobot_ros.simulation.capture import CapturePlant
 
 _LOG = logging.getLogger(__name__)
 
@@ -101,7 +105,7 @@ class ClearanceMonitor:
         The solids of the robot, with at least one pair, and exact distances.
     links
         The links in the order of the poses.
-    pushing
+    has_contact_forces
         Whether bodies that touch push each other, as the events say.
     """
 
@@ -113,7 +117,10 @@ class ClearanceMonitor:
         has_contact_forces: bool = False,
     ) -> None:
         self._nearest, self._pushing = NearestPair(geometry, links), has_contact_forces
-        self._touching: frozenset[LinkPair] = frozenset()
+        self.touching: frozenset[LinkPair] = frozenset()
+        """The links that touch in the last state."""
+        self._capturing: CapturePlant | None = None
+        self._from_target: NearestPair | None = None
 
     @classmethod
     def of(
@@ -122,11 +129,13 @@ class ClearanceMonitor:
         links: tuple[str, ...],
         before: ClearanceMonitor | None = None,
         *,
+        capturing: CapturePlant | None = None,
         has_contact_forces: bool = False,
     ) -> ClearanceMonitor | None:
         """Return the monitor of a robot; None: none of its links could touch.
 
-        ``before`` is that among other obstacles, whose contacts continue or end.
+        ``before`` is that among other obstacles, whose contacts continue or end. The target of
+        ``capturing``, while it is free, is to be touched by the body of the end-effector alone.
         It is None, too, where the package coal is not installed, which the log says.
         """
         geometry = CollisionGeometry(robot)
@@ -142,7 +151,14 @@ class ClearanceMonitor:
             return None
         monitor = cls(geometry, links, has_contact_forces=has_contact_forces)
         if before is not None:
-            monitor._touching = before._touching
+            monitor.touching = before.touching
+        if capturing is not None:
+            among = replace(robot, world=capturing.target.description)
+            around = CollisionGeometry(among, obstacles_alone=True)
+            bodies = np.array([around.solids[i].body for i, _ in around.pairs], dtype=int)
+            around.pairs = around.pairs[bodies != robot.frames[capturing.link][0]]
+            if len(around.pairs):
+                monitor._capturing, monitor._from_target = capturing, NearestPair(around, links)
         return monitor
 
     def measure(
@@ -161,14 +177,22 @@ class ClearanceMonitor:
         """
         distance, pair = self._nearest.nearest(link_R, link_r, pose)
         status = ClearanceStatus(distance, self._nearest.geometry.links_of(pair), time_s)
-        before = self._touching
-        if distance > 0 and not before:
-            return status, []
-        self._touching = self._nearest.links_in_contact(link_R, link_r, pose)
+        before, touching = self.touching, frozenset[LinkPair]()
+        if distance <= 0:
+            touching = self._nearest.links_in_contact(link_R, link_r, pose)
+        if self._from_target is not None and self._capturing and self._capturing.payload is None:
+            seen = relative_pose(self._capturing.target_pose, pose)
+            touching |= self._from_target.links_in_contact(link_R, link_r, seen)
+        self.touching = touching
         return status, [
-            *(self._begun(each, time_s) for each in sorted(self._touching - before)),
-            *(_ended(each, time_s) for each in sorted(before - self._touching)),
+            *(self._begun(each, time_s) for each in sorted(touching - before)),
+            *(_ended(each, time_s) for each in sorted(before - touching)),
         ]
+
+    @property
+    def contacts(self) -> tuple[str, ...]:
+        """The links that touch in the last state, as a status of the plant has them."""
+        return tuple(sorted(each.subject for each in self.touching))
 
     def _begun(self, links: LinkPair, time_s: float) -> Event:
         then = "push each other" if self._pushing else "the simulation goes on through the contact"

@@ -16,6 +16,9 @@ _MAX_SENSOR_ERROR = 1e6
 _MAX_INITIAL_VALUE = 1e9
 """Largest quantity of an initial state, and longest time, SI."""
 
+_CONTACT_PERIOD = 0.1
+"""Longest simulated time between two looks at contacts, s."""
+
 
 def period_ns(tick_rate: float) -> int:
     """Return the duration of a tick, ns; stamps are whole multiples of it."""
@@ -334,6 +337,11 @@ class PlantConfig(WatchdogConfig, RobotConfig):
     def clearance_ticks(self) -> int:
         """Ticks from one clearance to the next in lockstep; 0: none."""
         return self.ticks_of(self.clearance_period)
+
+    @property
+    def contact_ticks(self) -> int:
+        """Ticks from one look at contacts to the next; 0: never."""
+        return self.ticks_of(min(self.clearance_period, _CONTACT_PERIOD))
 
     def ticks_of(self, period: float) -> int:
         """Return the ticks of a period in s, at least one; 0: the period is 0."""

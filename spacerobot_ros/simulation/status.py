@@ -74,6 +74,9 @@ class PlantStatus:
     payload
         The body that the robot holds, as the text of a :class:`.Payload`; empty: none. With it the
         robot has another mass, inertia and momentum.
+    contacts
+        The links that touch, obstacles and the target among them; the end-effector may touch the
+        target.
     timeouts
         Number of times that the joints were brought to rest because no command came in time.
     last_command_s
@@ -99,6 +102,7 @@ class PlantStatus:
     timeouts: int = 0
     last_command_s: float | None = None
     payload: str = ""
+    contacts: tuple[str, ...] = ()
     actuation: str = ""
     tick_rate_hz: float = 0.0
     time_mode: str = ""
@@ -139,6 +143,7 @@ _FORMAT = KeyValueFormat(
     KeyValueField("faults", list_format("; "), always=True),
     KeyValueField("disturbances", list_format("; ")),
     KeyValueField("payload"),
+    KeyValueField("contacts", list_format("; ")),
     KeyValueField("actuation"),
     KeyValueField("tick_rate_hz", number_format(".15g")),
     KeyValueField("time_mode"),
@@ -170,6 +175,8 @@ class PlantMonitor:
             time_mode=config.time_mode,
         )
         """Status of the last update."""
+        self.contacts: tuple[str, ...] = ()
+        """The links that touch, set by the owner."""
         self.failure = "", ""
         """Reason and message of the error that stopped the plant, set by the owner."""
 
@@ -207,6 +214,7 @@ class PlantMonitor:
             faults=tuple(str(fault) for fault in self._plant.active),
             disturbances=tuple(str(each) for each in self._plant.disturbances),
             payload=self._payload(),
+            contacts=self.contacts,
             actuation=self._config.actuation,
             tick_rate_hz=self._config.tick_rate,
             time_mode=self._config.time_mode,

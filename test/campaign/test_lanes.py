@@ -23,6 +23,7 @@ from spacerobot_ros.control.laws.transposed_jacobian import TransposedJacobianLa
 from spacerobot_ros.control.state import Actuation, Reference
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.planning import Goal
+from spacerobot_ros.resources import share_directory
 
 DISPERSED: dict[str, Any] = {
     "mass.*": {"norm": {"loc": 1.0, "scale": 0.03}},
@@ -288,6 +289,11 @@ def test_the_engine_is_chosen_and_says_why_it_cannot() -> None:
     assert select_engine(near, "auto").name == "flights"
     with pytest.raises(SpaceRobotError, match="lanes measure no distances between links"):
         select_engine(near, "lanes")
+    among = controlled(
+        set={"plant.world": str(share_directory() / "config" / "worlds" / "panel.urdf")}
+    )
+    with pytest.raises(SpaceRobotError, match="it has obstacles, and lanes notice no contacts"):
+        select_engine(among, "lanes")
     # What would be another kind of flight is not flown as the nominal one.
     for name, values in (
         ("plant.actuation", ["velocity", "effort"]),

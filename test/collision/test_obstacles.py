@@ -11,7 +11,6 @@ from support.crossing import RADII, URDF
 
 from spacerobot_ros.collision import BasePoses, CollisionGeometry, ObstaclePair, PathCheck
 from spacerobot_ros.collision.planes import PlaneDistance
-from spacerobot_ros.events import EventKind
 from spacerobot_ros.flight.clearance import FlightClearance
 from spacerobot_ros.model import SpaceRobot, parse_robot
 from spacerobot_ros.model.description import Array
@@ -163,12 +162,6 @@ def test_a_flight_by_an_obstacle_is_measured_and_touches_it(geometry: CollisionG
     near = np.array([each.distance for each in statuses])
     np.testing.assert_allclose(near[touching - 1], truth[touching], atol=1e-6)
     assert statuses[touching[0] - 1].message.startswith("Link 'left' and obstacle 'rock' touch, ")
-    events = found.contacts(1)
-    assert [(each.kind, each.time_s) for each in events] == [
-        (EventKind.CONTACT, time[touching[0]]),
-        (EventKind.CONTACT_ENDED, time[touching[-1] + 1]),
-    ]
-    assert events[1].message == "Link 'left' and obstacle 'rock' no longer touch."
 
 
 def left_middles(shapes: Array, base: BasePoses) -> Array:

@@ -13,6 +13,7 @@ from spacerobot_ros.control.controller import build_controller
 from spacerobot_ros.control.executive import ControlExecutive
 from spacerobot_ros.control.state import ControlState
 from spacerobot_ros.control.status import ControllerState, ControllerStatus
+from spacerobot_ros.events import EventKind
 from spacerobot_ros.flight.flight import Flight
 from spacerobot_ros.flight.lockstep import fly_scenario
 from spacerobot_ros.measures import Outcome
@@ -69,6 +70,16 @@ def test_a_goal_behind_a_panel_is_reached_round_it() -> None:
     # Feedback and pulses take a part of the clearance of the plan, 0.01 m.
     assert distance_from_panel(planned) > 5e-3
     assert distance_from_panel(straight) < 0, "so that the test is sharp"
+    # It ends at the goal, and has touched something.
+    assert straight.outcome is Outcome.FAILED
+    contact = next(each for each in straight.events if each.kind is EventKind.CONTACT)
+    told = (
+        "The goal is not reached without contact, as link 'base_link' and obstacle 'panel' touched "
+        f"at {contact.time_s:.4g} s: "
+    )
+    assert straight.message.startswith(told)
+    assert straight.verdict.sentence.startswith(told)
+    assert "settling" not in straight.verdict.sentence
 
 
 def test_a_goal_without_a_plan_is_refused_and_the_robot_holds() -> None:

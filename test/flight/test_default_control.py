@@ -78,7 +78,7 @@ def flown(
     }
     text = yaml.safe_dump({name: {"ros__parameters": of} for name, of in sections.items()})
     file.write_text(text, "utf-8")
-    return fly_scenario(load_scenario(str(file)), longest=600.0, contacts=False)
+    return fly_scenario(load_scenario(str(file)), longest=600.0)
 
 
 def test_an_end_effector_is_brought_to_the_goal_of_the_caller_by_a_law() -> None:

@@ -446,14 +446,24 @@ class PlantNode(FlightNode):
         if self._reported.update():
             self._publisher.rebuild()
         self._publisher.publish(now, all_topics=self._tick % self._pose_ticks == 0)
-        if self._clearance is not None and self._tick % self._clearance_ticks == 0:
-            self._clearance.publish(now)
+        if self._clearance is not None:
+            self._look_at_contacts(self._clearance, now)
         if self._tf_ticks and self._tick % self._tf_ticks == 0:
             self._transforms.publish(now)
         if self._marker_ticks and self._tick % self._marker_ticks == 0:
             self._markers.publish(now)
         if self._report_ticks and self._tick % self._report_ticks == 0:
             self._publish_report()
+
+    def _look_at_contacts(self, clearance: ClearancePublisher, now: int) -> None:
+        publishes = self._tick % self._clearance_ticks == 0
+        if not (publishes or self._tick % self.config.contact_ticks == 0):
+            return
+        contacts = clearance.look(now, publishes=publishes)
+        if contacts is not None:
+            assert self._monitor is not None
+            self._monitor.contacts = contacts
+            self._publish_changed_status()
 
     def _publish_report(self) -> None:
         self._reported_ns = self._steady.now().nanoseconds

@@ -27,6 +27,7 @@ from spacerobot_ros.model.description import RobotDescription
 from spacerobot_ros.nodes.common.messages import message_class, transform_class
 from spacerobot_ros.nodes.common.node import LATCHED, STREAM, FlightNode
 from spacerobot_ros.simulation.actuators import PlantWithFaults, thrusters_in
+from spacerobot_ros.simulation.capture import capture_in
 from spacerobot_ros.simulation.commands import (
     NO_STAMP,
     CommandSource,
@@ -346,9 +347,12 @@ class ClearancePublisher:
         # Not every plant measures distances.
         from spacerobot_ros.simulation.clearance import ClearanceMonitor
 
-        links, so_far = tuple(plant.robot.link_names), None if before is None else before._monitor
         monitor = ClearanceMonitor.of(
-            described, links, so_far, has_contact_forces=has_contact_forces
+            described,
+            tuple(plant.robot.link_names),
+            None if before is None else before._monitor,
+            capturing=capture_in(plant),
+            has_contact_forces=has_contact_forces,
         )
         if monitor is None:
             return None
@@ -358,20 +362,25 @@ class ClearancePublisher:
         """Measure another plant of the same robot from now on."""
         self._plant = plant
 
-    def publish(self, time_ns: int) -> None:
-        """Publish the present clearance, and events of contacts that have begun or ended."""
+    def look(self, time_ns: int, *, publishes: bool) -> tuple[str, ...] | None:
+        """Report contacts that have begun or ended, and return those there are; None: as before.
+
+        ``publishes``: the present clearance is published, too.
+        """
         plant = self._plant
         status, events = self._monitor.measure(
             plant.link_R, plant.link_r, plant.pose, time_ns / SECOND
         )
-        record = StatusRecord(self._name, status.level, status.message, status.to_values())
-        self._stream.publish(record.encoded())
+        if publishes:
+            record = StatusRecord(self._name, status.level, status.message, status.to_values())
+            self._stream.publish(record.encoded())
         for event in events:
             self._node.report_event(event)
             if event.level:
                 self._node.get_logger().error(event.message)
             else:
                 self._node.get_logger().info(event.message)
+        return self._monitor.contacts if events else None
 
 
 class LinkMarkers:
