@@ -68,6 +68,22 @@ def test_shortest_times_and_least_impulses_are_those_of_closed_forms(rotates: bo
     assert cheapest.spent == pytest.approx(2 * limit * burn, rel=5e-3)
 
 
+def test_a_cube_turns_on_the_way_where_that_lets_more_thrusters_push() -> None:
+    robot = SpaceRobot.from_file(robot_file("jet_cube"))
+    table = thrusters_of_urdf(robot.description)
+    # Along an axis of the body; other thrusters push along a diagonal.
+    along = float(np.maximum(table.wrenches[0], 0.0).sum())
+    straight = 2 * np.sqrt(1.2 * robot.total_mass / along)
+    options = ThrustOptions(time_factor=1.0, clearance=0.0)
+    planner = ThrustPlanner(robot, Propulsion.of_table(table), options)
+    upright = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
+    goal = ThrustGoal(upright + np.eye(7)[0] * 1.2)
+    motion = planner.plan(ThrustStart.at_rest(upright, np.zeros(0)), goal)
+    assert motion.duration < 0.947 * straight
+    turned = Rotation.from_quat(motion.at(motion.duration / 2).base.quaternion)
+    assert turned.magnitude() > 0.2
+
+
 def test_pinocchio_ends_at_the_goal_under_the_wrenches_and_efforts_of_a_plan() -> None:
     planner = servicer()
     start = ThrustStart.at_rest(START, FOLDED)

@@ -1,7 +1,8 @@
 """Random goals of base and joints under thrust, past boxes or not: `make thrust-goals`.
 
-Boxes float on the straight way. Every motion that is planned is looked at by coal at 400 instants,
-and the first one of each robot is flown by Pinocchio under its wrenches and efforts alone.
+Boxes float on the straight way; past two there are half as many goals. Every motion that is planned
+is looked at by coal at 400 instants, and without boxes the first one of each robot is flown by
+Pinocchio under its wrenches and efforts alone.
 """
 
 from __future__ import annotations
@@ -18,7 +19,6 @@ from spacerobot_ros.errors import PlanningError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.thrusters import thrusters_of_urdf
 from spacerobot_ros.model.urdf import parse_world
-from spacerobot_ros.model.world import with_world
 from spacerobot_ros.planning.methods.thrust.propulsion import Propulsion
 from spacerobot_ros.planning.methods.thrust.search import (
     ThrustGoal,
@@ -74,8 +74,7 @@ def measure(name: str, count: int, boxes: int, seed: int) -> str:
             ]
             links = "".join(box(k, at, rng, size) for k, at in enumerate(middle))
             world = parse_world(f'<robot name="world"><link name="w"/>{links}</robot>')
-            robot = SpaceRobot(with_world(free.description, world))
-            planner = ThrustPlanner(robot, propulsion)
+            planner.use_obstacles(world)
         start = ThrustStart.at_rest(begin, folded)
         began = time.process_time()
         try:
@@ -95,7 +94,8 @@ def measure(name: str, count: int, boxes: int, seed: int) -> str:
             ended = flown_by_pinocchio(free, motion, start)
             apart = Rotation.from_quat(goal[3:]).inv() * Rotation.from_quat(ended[3:7])
             error = max(float(np.linalg.norm(ended[:3] - goal[:3])), float(apart.magnitude()))
-    line = f"{name:<16}{planned} of {count}, CPU median {np.median(cpu):.2f} s, most {max(cpu):.2f}"
+    line = f"{name:<16}{boxes} boxes: {planned} of {count}, "
+    line += f"CPU median {np.median(cpu):.2f} s, most {max(cpu):.2f}"
     if nearest:
         return f"{line} s, nearest {1e3 * min(nearest):.2f} mm"
     return f"{line} s, Pinocchio ends {error:.1e} m or rad from the goal"
@@ -105,13 +105,14 @@ def main() -> None:
     """Print a line for every robot."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--goals", type=int, default=20)
-    parser.add_argument("--boxes", type=int, default=0)
+    parser.add_argument("--boxes", type=int, nargs="+", default=[0])
     parser.add_argument("--only", default="")
     parser.add_argument("--seed", type=int, default=1)
     given = parser.parse_args()
     for name in ROBOTS:
-        if given.only in ("", name):
-            print(measure(name, given.goals, given.boxes, given.seed), flush=True)
+        for boxes in given.boxes if given.only in ("", name) else []:
+            goals = given.goals if boxes < 2 else (given.goals + 1) // 2
+            print(measure(name, goals, boxes, given.seed), flush=True)
 
 
 if __name__ == "__main__":

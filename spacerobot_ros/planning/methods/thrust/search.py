@@ -21,7 +21,7 @@ from spacerobot_ros.collision import Approach, BasePoses
 from spacerobot_ros.collision.planes import support_distance
 from spacerobot_ros.errors import PlanningError, Proof, UnreachableError
 from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.model.description import Array, Pose
+from spacerobot_ros.model.description import Array, Pose, RobotDescription
 from spacerobot_ros.model.inverse_kinematics import (
     REACHED_DISTANCE,
     FixedBaseArm,
@@ -38,6 +38,7 @@ from spacerobot_ros.model.rotations import (
     rotvecs_from_quaternions,
 )
 from spacerobot_ros.model.wheels import ReactionWheels
+from spacerobot_ros.model.world import with_world
 from spacerobot_ros.parameters import parameter
 from spacerobot_ros.planning.core.cancellation import NEVER, Cancellation
 from spacerobot_ros.planning.core.clearance import DEFAULT_CLEARANCE, Clearance
@@ -54,7 +55,11 @@ from spacerobot_ros.planning.methods.thrust.solver import (
     ThrustSolver,
     Weights,
 )
-from spacerobot_ros.planning.methods.thrust.transcription import ThrustStages, pair_block
+from spacerobot_ros.planning.methods.thrust.transcription import (
+    EXACT_STEPS,
+    ThrustStages,
+    pair_block,
+)
 
 _REGULARISATION = 1e-3
 """Weight of the squares of levels, which makes solutions unique. 1e-2 costs 1 % of propellant, 1e-4
@@ -202,8 +207,14 @@ class ThrustPlanner:
         wheels = ReactionWheels.of(robot.description)
         self._wheels = np.zeros(robot.n, dtype=bool)
         self._wheels[wheels.index] = True
-        self._solvers: dict[tuple[bool, str, tuple[int, ...]], ThrustSolver] = {}
-        self._rows: dict[int, ConstraintBlock] = {}
+        self._stages: dict[tuple[bool, str], ThrustStages] = {}
+        self._solvers: dict[tuple[bool, str, _Kept], ThrustSolver] = {}
+        self._rows: dict[tuple[int, int], ConstraintBlock] = {}
+
+    def use_obstacles(self, world: RobotDescription | None) -> None:
+        """Plan around other obstacles from now on; None: around none."""
+        described = with_world(self.robot.description, world)
+        self.clearance = Clearance.wanted(described, self.options.clearance, "plan.clearance")
 
     @cached_property
     def _functions(self) -> MotionFunctions:
@@ -221,28 +232,34 @@ class ThrustPlanner:
         """
         boundary, end = self._boundary(start, goal)
         kinds = goal.base is not None, self.link if goal.end_effector is not None else ""
+        self._solvers = {key: each for key, each in self._solvers.items() if not key[2]}
         stop = StopRule(self.options.iterations, cancellation)
         guess = self._guess(boundary, end, np.zeros(3))
         search = _Search(self, boundary, end, kinds, stop)
         return search.run(guess, end)
 
-    def solver(self, kinds: tuple[bool, str], pairs: tuple[int, ...] = ()) -> ThrustSolver:
-        """Return the solver of a kind of goals, with pairs that are kept apart."""
-        key = (*kinds, pairs)
+    def solver(self, kinds: tuple[bool, str], kept: _Kept = ()) -> ThrustSolver:
+        """Return the solver of a kind of goals, with pairs that are kept apart at some instants."""
+        key = (*kinds, kept)
         if key not in self._solvers:
-            stages = ThrustStages.of(self.robot, self.propulsion, *kinds)
-            rows = tuple(map(self._pair_rows, pairs))
-            kept = KeptPairs(rows, _INSTANTS if pairs else 0)
-            self._solvers[key] = ThrustSolver(stages, self.options.intervals, kept)
+            if kinds not in self._stages:
+                self._stages[kinds] = ThrustStages.of(self.robot, self.propulsion, *kinds)
+            numbers, places = tuple(n for n, _ in kept), tuple(at for _, at in kept)
+            pairs = KeptPairs(numbers, tuple(map(self._pair_rows, numbers)), places, _INSTANTS)
+            self._solvers[key] = ThrustSolver(self._stages[kinds], self.options.intervals, pairs)
         return self._solvers[key]
 
     def _pair_rows(self, pair: int) -> ConstraintBlock:
-        if pair not in self._rows:
-            assert self.clearance is not None
+        assert self.clearance is not None
+        geometry = self.clearance.geometry
+        first, second = geometry.pairs[pair].tolist()
+        # Those of a solid are the same for all obstacles.
+        key = first, -1 if geometry.with_obstacles[pair] else second
+        if key not in self._rows:
             center_of_mass = self.robot.function("center_of_mass", compile=False)
-            distance = support_distance(self.clearance.geometry, pair, center_of_mass)
-            self._rows[pair] = pair_block(self.robot.n, distance)
-        return self._rows[pair]
+            distance = support_distance(geometry, pair, center_of_mass)
+            self._rows[key] = pair_block(self.robot.n, distance)
+        return self._rows[key]
 
     def motion(self, knots: ThrustKnots) -> ThrustMotion:
         """Return the motion that the controls of a solution fly."""
@@ -375,21 +392,32 @@ class ThrustPlanner:
         r = knots.r_WC[k] + h * (tau * V[k] + tau**2 / 2 * (V[k + 1] - V[k]))
         return shapes, self.base_poses(shapes, X, r), tau
 
-    def planes(self, room: Mapping[int, float], required: Array, knots: ThrustKnots) -> Array:
-        """Return the planes (P, N K, 8) of pairs along a path, with the room of each, m."""
+    def planes(
+        self, kept: _Kept, room: Mapping[int, float], required: Array, knots: ThrustKnots
+    ) -> Array:
+        """Return the planes (R, 8) of pairs along a path, with the room of each, m."""
         assert self.clearance is not None
         geometry = self.clearance.geometry
         shapes, base, tau = self.along(knots)
-        poses = geometry.poses(shapes, base)
+        R, r = geometry.poses(shapes, base)
         found = []
         at_end = np.arange(len(tau)) >= len(tau) - _INSTANTS
         at_end |= np.arange(len(tau)) < _INSTANTS
-        for pair in sorted(room):
-            _, planes = geometry.planes(pair, poses)
-            wanted = np.where(at_end, required[pair], required[pair] + room[pair])
-            planes[:, 3] += wanted
-            found.append(np.hstack([planes, tau]))
-        return np.array(found)
+        for pair, places in kept:
+            at = list(places)
+            _, planes = geometry.planes(pair, (R[at], r[at]))
+            planes[:, 3] += required[pair] + np.where(at_end[at], 0.0, room[pair])
+            found.append(np.hstack([planes, tau[at]]))
+        return np.vstack(found)
+
+    def places(self, pair: int, required: Array, knots: ThrustKnots) -> set[int]:
+        """Return the instants of a path at which a pair is near, by the size of its first solid."""
+        assert self.clearance is not None
+        geometry = self.clearance.geometry
+        shapes, base, _ = self.along(knots)
+        distances = geometry.distances(pair, geometry.poses(shapes, base))
+        reach = geometry.solids[geometry.pairs[pair][0]].enclosure.bounding_radius
+        return set(np.flatnonzero(distances < required[pair] + reach).tolist())
 
     def approaches(self, motion: ThrustMotion, required: Array) -> list[Approach]:
         """Return the pairs that come too near in a motion, nearest first."""
@@ -434,6 +462,10 @@ class ThrustPlanner:
                 yield guess
 
 
+_Kept = tuple[tuple[int, tuple[int, ...]], ...]
+"""Pairs that are kept apart, and the instants at which they are."""
+
+
 @dataclass(frozen=True)
 class _End:
     """Pose (7,) of the base and joint positions (n,) at which a guess ends."""
@@ -445,6 +477,12 @@ class _End:
 _NEAREST = Weights(0.0, 0.0, 1.0, 1.0, _COST_OF_LACK)
 
 _FREE_TIME = DurationBounds(1e-3, 1e5)
+
+
+def _around(approach: Approach, intervals: int) -> set[int]:
+    """Return the instants before and after an approach in an exactly integrated motion."""
+    place = int(approach.tick / EXACT_STEPS * _INSTANTS) - 1
+    return set(range(max(place, 0), min(place + 2, intervals * _INSTANTS)))
 
 
 def _fixed(path: ThrustKnots) -> DurationBounds:
@@ -468,6 +506,9 @@ class _Search:
         """Whether the duration is given, or follows from the shortest one."""
         self._effort_limit = (1.0 - options.reserve) * planner.robot.effort_limit
         self._room: dict[int, float] = {}
+        """Room of the pairs that are kept apart, m."""
+        self._places: dict[int, set[int]] = {}
+        """Instants at which they are."""
         self._required = self._require_ends(end)
 
     def _require_ends(self, end: _End) -> Array:
@@ -510,10 +551,11 @@ class _Search:
     def _motion(self, path: ThrustKnots, end: _End) -> ThrustMotion:
         """Return the exact and clear motion near a path, in its time if that is given."""
         planner = self.planner
-        self._room = {}
+        self._room, self._places = {}, {}
         if self._is_timed:
             # Roughly, for a look at what is in the way.
-            path = self._solve(path, self._cheap(path, _ROUNDINGS[0]), _fixed(path)) or path
+            weights = self._cheap(path, _ROUNDINGS[0])
+            path = self._solve(path, weights, _fixed(path), rough=True) or path
         near = planner.approaches(planner.motion(path), self._required)
         if not near:
             motion = self._exact(path)
@@ -522,11 +564,11 @@ class _Search:
                 return motion
         path = self._clear(path, end, near)
         for _ in range(_MAX_ROUNDS):
-            motion = self._exact(path, planner.planes(self._room, self._required, path))
+            motion = self._exact(path, self._planes(path))
             approaches = planner.approaches(motion, self._required)
             if not approaches:
                 return motion
-            self._add(approaches)
+            self._add(approaches, path)
         raise PlanningError(self._failure(planner.reason(approaches[0])))
 
     def _time(self, fastest: ThrustKnots) -> float:
@@ -539,9 +581,21 @@ class _Search:
             )
         return options.duration or options.time_factor * fastest.duration
 
-    def _add(self, approaches: Sequence[Approach]) -> None:
-        """Keep more pairs apart, and give those that are kept as much room as they lack."""
+    @property
+    def _kept(self) -> _Kept:
+        return tuple((pair, tuple(sorted(self._places[pair]))) for pair in sorted(self._places))
+
+    def _planes(self, path: ThrustKnots) -> Array:
+        return self.planner.planes(self._kept, self._room, self._required, path)
+
+    def _add(self, approaches: Sequence[Approach], path: ThrustKnots) -> None:
+        """Keep more pairs apart, where they are near along a path, and give those that are kept as
+        much room as they lack.
+        """
         for each in approaches:
+            near = self.planner.places(each.pair, self._required, path)
+            near |= _around(each, len(path.levels))
+            self._places[each.pair] = self._places.get(each.pair, set()) | near
             lack = float(self._required[each.pair]) - each.distance
             before = self._room.get(each.pair)
             self._room[each.pair] = _ROOM if before is None else before + lack + _ROOM
@@ -554,14 +608,18 @@ class _Search:
         defects: Array | None = None,
         planes: Array | None = None,
         center: ThrustKnots | None = None,
+        *,
+        rough: bool = False,
     ) -> ThrustKnots | None:
         self.stop.cancellation.raise_if_requested()
-        solver = self.planner.solver(self.kinds, tuple(sorted(self._room)))
+        solver = self.planner.solver(self.kinds, self._kept)
         limits, args = self.planner.limits, (self.stop, duration, defects, planes)
-        return solver.solve(self.boundary, limits, guess, weights, *args, center=center)
+        return solver.solve(
+            self.boundary, limits, guess, weights, *args, center=center, rough=rough
+        )
 
     def _fastest(self, guess: ThrustKnots) -> ThrustKnots | None:
-        return self._solve(guess, self._fast(guess), _FREE_TIME)
+        return self._solve(guess, self._fast(guess), _FREE_TIME, rough=self._is_timed)
 
     def _fast(self, guess: ThrustKnots) -> Weights:
         """Return the weights of least time, in units of the guess."""
@@ -585,7 +643,9 @@ class _Search:
         planner, knots = self.planner, guess
         if self._is_timed:
             duration = _fixed(guess)
-            roundings = _ROUNDINGS if planner.propulsion.norms else (1.0,)
+            roundings = _ROUNDINGS[1:] if planner.propulsion.norms else (1.0,)
+            if planes is not None:
+                roundings = roundings[:1]
             *others, last = (self._cheap(guess, each) for each in roundings)
         else:
             duration, others = _FREE_TIME, []
@@ -603,7 +663,7 @@ class _Search:
                 best, error = motion, found
             if error < _EXACT_END:
                 break
-            defects = planner.solver(self.kinds, tuple(sorted(self._room))).defects(knots, defects)
+            defects = planner.solver(self.kinds, self._kept).defects(knots, defects)
             if self._is_timed and found < _NEAR_END:
                 # The nearest controls that fly exactly: solutions of least propellant are flat.
                 last, center = _NEAREST, knots
@@ -638,24 +698,24 @@ class _Search:
         for guess in itertools.chain(
             planner.bows(self.boundary, end, self._required, near), [path]
         ):
-            self._room = {}
-            self._add(near)
+            self._room, self._places = {}, {}
             at = guess.stretched(max(time / guess.duration, 1.0))
+            self._add(near, at)
             for _ in range(_MAX_ROUNDS):
-                planes = planner.planes(self._room, self._required, at)
+                planes = self._planes(at)
                 weights = self._cheap(at, _ROUNDINGS[0]) if self._is_timed else self._fast(at)
                 duration = _fixed(at) if self._is_timed else _FREE_TIME
                 solved = self._solve(at, weights, duration, planes=planes)
                 if solved is None:
                     break
                 at = solved
-                if planner.solver(self.kinds, tuple(sorted(self._room))).lack > _LARGEST_LACK:
+                if planner.solver(self.kinds, self._kept).lack > _LARGEST_LACK:
                     continue
                 approaches = planner.approaches(planner.motion(at), self._required)
                 if not approaches:
                     return at
                 last = approaches[0]
-                self._add(approaches)
+                self._add(approaches, at)
         raise PlanningError(self._failure(planner.reason(last)))
 
     def _failure(self, why: str) -> str:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import NamedTuple
 
 import casadi as ca
@@ -32,19 +31,9 @@ from spacerobot_ros.planning.methods.thrust.transcription import (
 
 _TOLERANCE = 1e-6
 
-_WARM = {
-    "ipopt.mu_init": 1e-2,
-    "ipopt.bound_push": 1e-3,
-    "ipopt.bound_frac": 1e-3,
-    "ipopt.tol": 1e-3,
-    "ipopt.dual_inf_tol": 1e-1,
-}
-"""The guess is clear of its planes, or nearly so; planes made anew follow its solution."""
-
 _CONTINUED = {
     "ipopt.mu_init": 1e-5,
-    "ipopt.constr_viol_tol": 1e-9,
-    "ipopt.tol": 1e-8,
+    "ipopt.tol": 1e-5,
     "ipopt.warm_start_init_point": "yes",
     **{
         f"ipopt.warm_start_{of}": 1e-7
@@ -54,7 +43,40 @@ _CONTINUED = {
         )
     },
 }
-"""The guess is a solution with other defects or weights."""
+
+_OPTIONS: Mapping[str, Mapping[str, object]] = {
+    "": {},
+    # A shortest time that another time follows from, or a look at what is in the way.
+    "rough": {"ipopt.tol": 1e-4, "ipopt.constr_viol_tol": 1e-5},
+    # The guess is clear of its planes, or nearly so; planes made anew follow its solution.
+    "clear": {
+        "ipopt.mu_init": 1e-2,
+        "ipopt.bound_push": 1e-3,
+        "ipopt.bound_frac": 1e-3,
+        "ipopt.tol": 1e-3,
+        "ipopt.dual_inf_tol": 1e-1,
+    },
+    # The guess is a solution with other weights, planes or pairs.
+    "continued": _CONTINUED,
+    # The guess is a solution with other defects.
+    "corrected": {
+        **_CONTINUED,
+        "ipopt.mu_init": 1e-9,
+        "ipopt.constr_viol_tol": 1e-9,
+        "ipopt.tol": 1e-8,
+    },
+}
+"""Options of IPOPT by where it begins."""
+
+
+class Multipliers(NamedTuple):
+    """Those of a solution: of its variables, of the rows without pairs, and of each pair's rows by
+    their instants.
+    """
+
+    of_variables: Array
+    of_rows: Array
+    of_pairs: Mapping[int, Mapping[int, float]]
 
 
 @dataclass(frozen=True)
@@ -63,7 +85,7 @@ class ThrustKnots:
 
     ``quaternions`` (N + 1, 4) of R_WB; ``shapes``, ``velocities`` (N + 1, n) of the joints;
     ``L_W`` (N + 1, 3) about the centre of mass, N m s; ``r_WC``, ``v_WC`` (N + 1, 3) of the centre
-    of mass, m; ``accelerations`` (N, n) and ``levels`` (N, m).
+    of mass, m; ``accelerations`` (N, n) and ``levels`` (N, m). A solution has multipliers.
     """
 
     step: float
@@ -75,6 +97,7 @@ class ThrustKnots:
     v_WC: Array
     accelerations: Array
     levels: Array
+    multipliers: Multipliers | None = None
 
     @property
     def duration(self) -> float:
@@ -96,6 +119,7 @@ class ThrustKnots:
             v_WC=self.v_WC / factor,
             accelerations=self.accelerations / factor**2,
             levels=self.levels / factor**2,
+            multipliers=None,
         )
 
 
@@ -143,10 +167,14 @@ class Weights(NamedTuple):
 
 @dataclass(frozen=True)
 class KeptPairs:
-    """Pairs that are kept apart at K instants of every interval, each with its rows."""
+    """Pairs that are kept apart, by number: the distance of each, and the places among all K
+    instants of the N intervals, from 0 to N K - 1, at which it counts.
+    """
 
+    numbers: tuple[int, ...] = ()
     rows: tuple[ConstraintBlock, ...] = ()
-    instants: int = 0
+    places: tuple[tuple[int, ...], ...] = ()
+    instants: int = 1
 
 
 class ThrustSolver:
@@ -167,28 +195,21 @@ class ThrustSolver:
         self.iterations, self.converged = 0, False
         self.lack = 0.0
         """Distance by which pairs are nearer in the last solution than they ought to be, m."""
-        layout, program = thrust_program(stages, intervals, pairs.rows, pairs.instants)
+        layout, program = thrust_program(
+            stages, intervals, pairs.rows, pairs.places, pairs.instants
+        )
         self._layout: ThrustLayout = layout
         self._program = program
         self._monitor = SolverMonitor(program.problem, program.lower, program.upper)
         self._flown = stages.flown.map(intervals)
-        self._last: tuple[ThrustKnots, Mapping[str, ca.DM]] | None = None
+        self._built: dict[str, ca.Function] = {}
 
-    def _build(self, options: Mapping[str, object]) -> ca.Function:
-        options = {"ipopt.tol": _TOLERANCE, **options}
-        return build_solver("thrust", self._program, self._monitor, options)
-
-    @cached_property
-    def _solver(self) -> ca.Function:
-        return self._build({})
-
-    @cached_property
-    def _warm(self) -> ca.Function:
-        return self._build(_WARM)
-
-    @cached_property
-    def _continuing(self) -> ca.Function:
-        return self._build(_CONTINUED)
+    def _ipopt(self, begins: str) -> ca.Function:
+        if begins not in self._built:
+            options = {"ipopt.tol": _TOLERANCE, **_OPTIONS[begins]}
+            program, monitor = self._program, self._monitor
+            self._built[begins] = build_solver("thrust", program, monitor, options)
+        return self._built[begins]
 
     def solve(
         self,
@@ -202,10 +223,11 @@ class ThrustSolver:
         planes: Array | None = None,
         *,
         center: ThrustKnots | None = None,
+        rough: bool = False,
     ) -> ThrustKnots | None:
         """Return the best motion near ``guess``; None if none.
 
-        The solver continues at its own last solution if that is the guess.
+        The solver continues at a guess that is a solution, also one without some of the pairs.
 
         Parameters
         ----------
@@ -216,9 +238,11 @@ class ThrustSolver:
         defects
             (N, 12) those of the intervals; None: zero.
         planes
-            (P, N K, 8) planes of the pairs and their instants; None: there are no pairs.
+            (R, 8) planes of the pairs at their places; None: there are no pairs.
         center
             Controls whose differences are squared; None: zero.
+        rough
+            Whether another solve begins at the solution.
         """
         N, layout, propulsion = self.intervals, self._layout, self.stages.propulsion
         places = layout.knots()
@@ -259,11 +283,11 @@ class ThrustSolver:
             strict=True,
         ):
             x0[place] = value
-        last, self._last = self._last, None
-        solver = self._warm if self.pairs.rows else self._solver
-        begin: Mapping[str, Array | ca.DM] = {"x0": x0}
-        if last is not None and last[0] is guess:
-            solver, begin = self._continuing, last[1]
+        begins, begin = "clear" if self.pairs.rows else "rough" if rough else "", {"x0": x0}
+        if guess.multipliers is not None:
+            begins = "continued" if defects is None else "corrected"
+            begin |= self._known(guess.multipliers)
+        solver = self._ipopt(begins)
         self._monitor.begin(stop)
         lacking = np.zeros((N, DEFECT_SIZE)) if defects is None else defects
         parameters = np.concatenate(
@@ -293,11 +317,32 @@ class ThrustSolver:
             x = self._monitor.best
         X_, s_, v_, L_, r_, V_, a_, u_ = (x[place] for place in places)
         h, self.lack = float(x[0]), float(x[-1]) if layout.has_lack else 0.0
-        knots = ThrustKnots(h, X_, s_ - h * v_ / 2, v_, L_, r_, V_, a_, u_)
+        multipliers = None
         if self.converged:
-            kept = {"x0": result["x"], "lam_x0": result["lam_x"], "lam_g0": result["lam_g"]}
-            self._last = knots, kept
-        return knots
+            multipliers = self._multipliers(
+                *(result[each].full().ravel() for each in ("lam_x", "lam_g"))
+            )
+        return ThrustKnots(h, X_, s_ - h * v_ / 2, v_, L_, r_, V_, a_, u_, multipliers)
+
+    def _multipliers(self, of_variables: Array, of_rows: Array) -> Multipliers:
+        kept, rows = self.pairs, len(of_rows) - sum(map(len, self.pairs.places))
+        of_pairs, first = {}, rows
+        for number, places in zip(kept.numbers, kept.places, strict=True):
+            values = of_rows[first : first + len(places)].tolist()
+            of_pairs[number] = dict(zip(places, values, strict=True))
+            first += len(places)
+        return Multipliers(of_variables, of_rows[:rows], of_pairs)
+
+    def _known(self, known: Multipliers) -> dict[str, Array]:
+        """Return the first multipliers of the solver from those of a solution."""
+        kept, of_variables = self.pairs, np.zeros(self._layout.size)
+        of_variables[: len(known.of_variables)] = known.of_variables[: self._layout.size]
+        of_pairs = [
+            known.of_pairs.get(number, {}).get(place, 0.0)
+            for number, places in zip(kept.numbers, kept.places, strict=True)
+            for place in places
+        ]
+        return {"lam_x0": of_variables, "lam_g0": np.concatenate([known.of_rows, of_pairs])}
 
     def flown(self, knots: ThrustKnots) -> Array:
         """Return the states (N, 13, K) in all intervals, exactly integrated from their knots."""

@@ -30,7 +30,7 @@ import numpy as np
 
 from spacerobot_ros.collision.planes import PLANE_SIZE
 from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.model.compilation import cached_function, source_hash
+from spacerobot_ros.model.compilation import cached_function, compiled, source_hash
 from spacerobot_ros.model.dynamics import solve_positive_definite
 from spacerobot_ros.model.momentum_derivatives import momentum_derivatives
 from spacerobot_ros.model.symbolic_rotations import (
@@ -147,8 +147,8 @@ class ThrustStages:
         derived = cache(lambda: _interval_block(robot, propulsion.size))
         interval = ConstraintBlock(
             cached_function("thrust", key, lambda: derived().values),
-            cached_function("thrust_jac", key, lambda: derived().jacobian),
-            cached_function("thrust_hess", key, lambda: derived().hessian),
+            compiled(cached_function("thrust_jac", key, lambda: derived().jacobian)),
+            compiled(cached_function("thrust_hess", key, lambda: derived().hessian)),
         )
         flown = cached_function("flown", key, lambda: flown_interval(robot))
         return cls(n, propulsion, begins, interval, ends, flown)
@@ -294,20 +294,32 @@ def pair_block(joints: int, distance: ca.Function) -> ConstraintBlock:
         z, np.cumsum([0, *sizes]).tolist()
     )
     plane, tau = p[:PLANE_SIZE], p[PLANE_SIZE]
-    q = state_within_interval(tau, s, h * v, h * v_next)[:n]
-    if distance.size1_in(0) == n:
-        return ConstraintBlock.of("pair", z, p, distance(q, plane) + lack)
-    at = ca.vertcat(q, (1 - tau) * X + tau * X_next)
-    center = r + h * (tau * V + tau**2 / 2 * (V_next - V))
-    d = distance(at, plane) + ca.dot(plane[:3], center) + lack
-    return ConstraintBlock.of("pair", z, p, d)
+    at, offset = state_within_interval(tau, s, h * v, h * v_next)[:n], lack
+    if distance.size1_in(0) > n:
+        at = ca.vertcat(at, (1 - tau) * X + tau * X_next)
+        offset = lack + ca.dot(plane[:3], r + h * (tau * V + tau**2 / 2 * (V_next - V)))
+    # By the chain rule, as the distance depends on few of the variables.
+    y, multiplier = ca.SX.sym("y", at.numel()), ca.SX.sym("lambda")
+    bend, slope = ca.substitute(list(ca.hessian(distance(y, plane), y)), [y], [at])
+    P, weight = ca.jacobian(at, z), ca.SX.sym("weight", at.numel())
+    of_place = ca.substitute(ca.hessian(ca.dot(weight, at) + offset, z)[0], weight, slope)
+    return ConstraintBlock.with_derivatives(
+        "pair",
+        z,
+        p,
+        multiplier,
+        distance(at, plane) + offset,
+        slope.T @ P + ca.jacobian(offset, z),
+        multiplier * (P.T @ bend @ P + of_place),
+    )
 
 
 def thrust_program(
     stages: ThrustStages,
     intervals: int,
     pairs: Sequence[ConstraintBlock] = (),
-    instants: int = 0,
+    places: Sequence[Sequence[int]] = (),
+    instants: int = 1,
 ) -> tuple[ThrustLayout, Program]:
     """Assemble the program from the stages of a problem.
 
@@ -315,7 +327,7 @@ def thrust_program(
     the wrenches (6 m,); the defects (12 N,); typical accelerations (n,); weights of the duration,
     of the propellant, of the squares of accelerations and levels, of the lack, and the level at
     which the cost of a norm is rounded off (6,); centres of the squares (n + m, N); and the planes
-    (8,) of every pair, interval and instant.
+    (8,) of every pair at its ``places``, of the ``instants`` of all intervals.
     """
     n, N, propulsion = stages.joints, intervals, stages.propulsion
     m = propulsion.size
@@ -333,31 +345,31 @@ def thrust_program(
             ("typical", n),
             ("weights", 6),
             ("centers", (n + m) * N),
-            ("planes", len(pairs) * N * instants * 8),
+            ("planes", 8 * sum(map(len, places))),
         )
     }
     zero = np.zeros((N, 1), dtype=np.int64)
     knot = np.hstack([X, s, v, L, r, V])
-    first, dynamics, last = n, stages.interval.rows, stages.end.rows
-    equalities = first + N * dynamics + last
+    begins, dynamics, ends_in = n, stages.interval.rows, stages.end.rows
+    equalities = begins + N * dynamics + ends_in
     defects = ca.reshape(p["defects"], DEFECT_SIZE, N)
     placed = [
         PlacedBlock(
             stages.beginning,
             np.hstack([zero[:1], s[:1], v[:1]]),
-            np.arange(first)[np.newaxis],
+            np.arange(begins)[np.newaxis],
             p["start"],
         ),
         PlacedBlock(
             stages.interval,
             np.hstack([zero, knot[:-1], a, u, knot[1:]]),
-            first + np.arange(N * dynamics).reshape(N, dynamics),
+            begins + np.arange(N * dynamics).reshape(N, dynamics),
             ca.vertcat(defects, ca.repmat(p["wrenches"], 1, N)),
         ),
         PlacedBlock(
             stages.end,
             np.hstack([X[-1:], s[-1:], r[-1:]]),
-            first + N * dynamics + np.arange(last)[np.newaxis],
+            begins + N * dynamics + np.arange(ends_in)[np.newaxis],
             p["goals"],
         ),
     ]
@@ -371,22 +383,21 @@ def thrust_program(
             PlacedBlock(norm, groups, rows + np.arange(count)[:, np.newaxis], ca.MX(0, 1))
         )
         rows += count
-    for number, block in enumerate(pairs):
-        count = N * instants
-        lack = np.full((N, 1), layout.size - 1)
-        variables = np.hstack(
-            [zero, *(each[:-1] for each in (X, s, v, r, V)), *(e[1:] for e in (X, v, r, V)), lack]
-        )
-        planes = p["planes"][8 * count * number : 8 * count * (number + 1)]
+    lack = np.full((N, 1), layout.size - 1)
+    variables = np.hstack(
+        [zero, *(each[:-1] for each in (X, s, v, r, V)), *(e[1:] for e in (X, v, r, V)), lack]
+    )
+    ends = np.cumsum([0, *map(len, places)]).tolist()
+    for block, at, (first, last) in zip(pairs, places, pairwise(ends), strict=True):
         placed.append(
             PlacedBlock(
                 block,
-                np.repeat(variables, instants, axis=0),
-                rows + np.arange(count)[:, np.newaxis],
-                ca.reshape(planes, 8, count),
+                variables[np.array(at) // instants],
+                rows + np.arange(first, last)[:, np.newaxis],
+                ca.reshape(p["planes"][8 * first : 8 * last], 8, last - first),
             )
         )
-        rows += count
+    rows += ends[-1]
     levels = ca.reshape(x[u.ravel().tolist()], m, N)
     centers = ca.reshape(p["centers"], n + m, N)
     change = (ca.reshape(x[a.ravel().tolist()], n, N) - centers[:n, :]) / ca.repmat(
