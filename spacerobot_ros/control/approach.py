@@ -1,7 +1,7 @@
 """The approach to a target: when the end-effector sets out, and the reference that it follows.
 
 The reference is a path relative to the grapple frame, which moves as the target's torque-free
-motion predicts (:mod:`spacerobot_ros.control.target_motion`). From where the end-effector is held
+motion predicts (:mod:`spacerobot_ros.model.target_motion`). From where the end-effector is held
 the path leads to a standoff; there the end-effector moves with the grapple frame for a while, then
 closes in along a straight line of that frame. At contact both have the same pose and velocity.
 
@@ -22,18 +22,18 @@ from spacerobot_ros.collision import BasePoses, CollisionGeometry, LinkPair
 from spacerobot_ros.control.limits import MotionLimits
 from spacerobot_ros.control.reference import quintic_duration
 from spacerobot_ros.control.state import ControlState, PoseReference
-from spacerobot_ros.control.target_motion import (
+from spacerobot_ros.errors import PlanningError
+from spacerobot_ros.model.description import Array, Pose, RobotDescription
+from spacerobot_ros.model.inverse_kinematics import REACHED_DISTANCE, FixedBaseArm
+from spacerobot_ros.model.rotations import matrix_from_quaternion, quaternion_from_matrix
+from spacerobot_ros.model.space_robot import SpaceRobot
+from spacerobot_ros.model.target_motion import (
     FrameMotion,
     PathInWorld,
     RelativeMotionOverTime,
     RelativePath,
     TorqueFreeMotion,
 )
-from spacerobot_ros.errors import PlanningError
-from spacerobot_ros.model.description import Array, Pose, RobotDescription
-from spacerobot_ros.model.inverse_kinematics import REACHED_DISTANCE, FixedBaseArm
-from spacerobot_ros.model.rotations import matrix_from_quaternion, quaternion_from_matrix
-from spacerobot_ros.model.space_robot import SpaceRobot
 from spacerobot_ros.parameters import parameter
 
 _SAMPLE_PERIOD = 0.25  # s, of checks of limits
@@ -92,6 +92,13 @@ class ApproachOptions:
         unit="m",
         minimum=0.0,
         maximum=100.0,
+    )
+    detumble: str = parameter(
+        "after",
+        "when the angular momentum of robot and target is removed: before the capture, by a "
+        "planned approach that leaves none (profile: planned); after it, by the task 'detumble'; "
+        "none: that task is left out",
+        choices=("before", "after", "none"),
     )
     timeout: float = parameter(
         0.5, "age of the target's odometry at which the target is lost", unit="s", minimum=0.0
@@ -239,7 +246,7 @@ def plan_approach(
     standoffs = [factor * np.array(options.standoff) for factor in _STANDOFF_FACTORS]
     ways = [(each, _closing_path(each, options, limits)) for each in standoffs]
     ways.insert(0, ways[0])  # Relative to the grapple frame; the others are short in W.
-    at_rest, failure = FrameMotion.of_reference(held), _RefusalReasons()
+    at_rest, failure = held.motion, _RefusalReasons()
     longest = _LONGEST_PATH + options.standoff_time + ways[-1][1].duration + 2 * _SAMPLE_PERIOD
     samples = round((options.horizon + longest) / _SAMPLE_PERIOD)
     grapple = target.grapple(_SAMPLE_PERIOD * np.arange(samples))

@@ -25,6 +25,7 @@ from spacerobot_ros.control.limits import (
 )
 from spacerobot_ros.control.outputs import OutputDistance, OutputSelection
 from spacerobot_ros.control.planned_reference import (
+    GrappleReference,
     PlanJob,
     PlannedReference,
     ReferencePlanner,
@@ -62,6 +63,7 @@ from spacerobot_ros.model.rotations import (
 )
 from spacerobot_ros.model.space_robot import SpaceRobot
 from spacerobot_ros.planning.core.cancellation import Cancellation
+from spacerobot_ros.planning.methods.thrust.goals import Grapple
 
 _BRAKE_RATE = 2.0
 """Decay rate of joint motion when the base is no longer known, 1/s."""
@@ -205,6 +207,11 @@ class CoordinatedController:
         return start, goal, carries
 
     @property
+    def mass(self) -> float:
+        """Mass of the robot, kg."""
+        return self.law.robot.total_mass
+
+    @property
     def plans(self) -> bool:
         """Whether references of goals are planned."""
         return self._planner is not None
@@ -218,7 +225,7 @@ class CoordinatedController:
         end_effector: PoseReference | None = None,
         joints: Array | None = None,
         lead: float = 0.0,
-    ) -> PlanJob:
+    ) -> PlanJob[PlannedReference]:
         """Return the work on a reference towards new goals, which is not begun yet.
 
         The arguments are those of :meth:`set_goals`. If the reference moves, the plan begins
@@ -239,6 +246,24 @@ class CoordinatedController:
             return planner.plan(start, goal, state, limits, cancellation, carries=carries)
 
         return PlanJob(work, begins)
+
+    def plan_grapple(
+        self, time: float, state: ControlState, grapple: Grapple, lead: float
+    ) -> PlanJob[GrappleReference]:
+        """Return the work on a reference to a target, whose motion is given from ``time`` on. The
+        plan begins ``lead`` s later, where reference and target will be then.
+        """
+        planner = self._planner
+        assert planner is not None
+        if self.coming_to_rest:
+            self.profile, self.coming_to_rest = None, False
+        start, limits = self._present_reference(time + lead, state), self._motion
+        later = replace(grapple, motion=grapple.motion.later(lead))
+
+        def work(cancellation: Cancellation) -> GrappleReference:
+            return planner.plan_grapple(start, state, limits, later, cancellation)
+
+        return PlanJob(work, time + lead)
 
     def begin_planned(self, time: float, profile: PlannedReference) -> None:
         """Follow a planned reference from a time on."""

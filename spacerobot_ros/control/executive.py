@@ -17,7 +17,7 @@ from spacerobot_ros.control.controller import CoordinatedController, Mode
 from spacerobot_ros.control.goal_monitor import Decision, GoalMonitor
 from spacerobot_ros.control.limits import Saturated
 from spacerobot_ros.control.outputs import OutputDistance
-from spacerobot_ros.control.planned_reference import PlanJob, PlannedReference
+from spacerobot_ros.control.planned_reference import PLANNING_TIME, PlanJob, PlannedReference
 from spacerobot_ros.control.servicing import Servicing, Task, TaskProgress, TaskState
 from spacerobot_ros.control.stall_monitor import StallMonitor
 from spacerobot_ros.control.state import Actuation, ControlState, PoseReference, Reference
@@ -69,11 +69,6 @@ class _Next(IntEnum):
 _MEASURED, _TRACKING, _NO_DECISION = Mode.MEASURED, ControllerState.TRACKING, Decision.NONE
 
 
-_PLANNING_TIME = 2.0
-"""Time from which a reference that moves is continued by a plan, s; twice as much if planning takes
-longer."""
-
-
 class _Aims(TypedDict):
     """Poses and joint positions that goals ask for; None: they do not."""
 
@@ -89,7 +84,7 @@ class _Plan:
     pending: dict[str, IdentifiedGoal]
     aims: _Aims
     asked: frozenset[Controlled]
-    job: PlanJob
+    job: PlanJob[PlannedReference]
     lead: float
 
     def is_for(self, pending: Mapping[str, IdentifiedGoal]) -> bool:
@@ -646,7 +641,9 @@ class ControlExecutive:
             self._wait_for_tasks()
         if servicing.task is None:
             return
-        progress = servicing.step(time, state, self.controller)
+        progress = servicing.step(
+            time, state, self.controller, in_background=self.plans_in_background
+        )
         for event in servicing.events():
             self.outputs.append(replace(event, goal_id=self._goal_id))
             self._next_report = time
@@ -778,7 +775,7 @@ class ControlExecutive:
             if carried:
                 self.controller.hold_here(time, state)
             aims, asked = self._aims(state)
-            lead = _PLANNING_TIME if plan is None else plan.lead
+            lead = PLANNING_TIME if plan is None else plan.lead
             plan = self._begin_plan(time, state, aims, asked, lead)
         if not plan.job.done:
             return None
@@ -809,15 +806,8 @@ class ControlExecutive:
         lead: float,
     ) -> _Plan:
         background = self.plans_in_background
-        # The memory of a state may be used again for the next one.
-        memory = np.empty(13 + 2 * len(state.q))
-        state.stack(memory)
-        job = self.controller.plan_goals(
-            time,
-            ControlState.unstack(memory),
-            **aims,
-            lead=lead if background else 0.0,
-        )
+        lead_now = lead if background else 0.0
+        job = self.controller.plan_goals(time, state.copied(), **aims, lead=lead_now)
         # Known before the work begins, so that it can be cancelled.
         self._plan = plan = _Plan(dict(self._pending), aims, asked, job, lead)
         job.start(in_background=background)

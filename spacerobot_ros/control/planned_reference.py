@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from threading import Thread
 from time import perf_counter
-from typing import ClassVar
+from typing import ClassVar, Generic, TypeVar
 
 import numpy as np
 
@@ -24,18 +24,19 @@ from spacerobot_ros.errors import ParameterError, PlanningError
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.rotations import matrix_from_quaternion
 from spacerobot_ros.model.space_robot import SpaceRobot
+from spacerobot_ros.model.target_motion import RelativeMotionOverTime
 from spacerobot_ros.model.thrusters import find_thrusters
 from spacerobot_ros.parameters import parameter
 from spacerobot_ros.planning.core.cancellation import Cancellation, PlanningCancelled
 from spacerobot_ros.planning.execution.worker import MAX_THREAD_END_TIME
+from spacerobot_ros.planning.methods.thrust.goals import Grapple, ThrustGoal, ThrustStart
 from spacerobot_ros.planning.methods.thrust.motion import FrameSample, ThrustMotion
 from spacerobot_ros.planning.methods.thrust.propulsion import Propulsion
-from spacerobot_ros.planning.methods.thrust.search import (
-    ThrustGoal,
-    ThrustOptions,
-    ThrustPlanner,
-    ThrustStart,
-)
+from spacerobot_ros.planning.methods.thrust.search import ThrustOptions, ThrustPlanner
+
+PLANNING_TIME = 2.0
+"""Time from which a reference that moves is continued by a plan, s; twice as much if planning takes
+longer."""
 
 
 @dataclass(frozen=True)
@@ -92,6 +93,53 @@ class PlannedReference(ReferenceProfile):
             return Actuation(np.zeros(6), np.zeros(self.motion.joints))
         sample = self.motion.at(time)
         return Actuation(sample.wrench_B, sample.tau)
+
+
+class GrappleReference(PlannedReference):
+    """A planned motion to a target, and with it from then on.
+
+    Parameters
+    ----------
+    start, limits, motion
+        Those of a planned reference.
+    grapple
+        The target, whose motion begins with the plan.
+    """
+
+    name: ClassVar[str] = "grapple"
+
+    def __init__(
+        self, start: Reference, limits: MotionLimits, motion: ThrustMotion, grapple: Grapple
+    ) -> None:
+        end = motion.at(motion.duration)
+        assert end.end_effector is not None
+        joints = None if start.joints is None else JointReference.at_rest(end.q)
+        goal = Reference(_pose(end.base), _pose(end.end_effector), joints)
+        super().__init__(start, goal, limits, motion)
+        self.grapple = grapple
+        frame = grapple.motion.grapple([motion.duration])
+        base = PoseReference(goal.base.position, goal.base.quaternion) if goal.base else None
+        assert base is not None
+        beside = RelativeMotionOverTime.between(frame, base.motion)
+        still = np.zeros((1, 3))
+        self._base = RelativeMotionOverTime(beside.x, still, still, beside.phi, still, still)
+
+    def relative(self, times: Array) -> RelativeMotionOverTime:
+        """Return the motion of the end-effector relative to the grapple frame at times (K,)."""
+        found = []
+        for time in np.minimum(times, self.duration).tolist():
+            frame, hand = self.grapple.motion.grapple([time]), self.motion.at(time).end_effector
+            assert hand is not None
+            found.append(RelativeMotionOverTime.between(frame, _pose(hand).motion))
+        return RelativeMotionOverTime.stacked(found)
+
+    def at(self, time: float) -> Reference:
+        """Return the reference ``time`` s after its start."""
+        if time < self.duration:
+            return super().at(time)
+        frame = self.grapple.motion.grapple([time])
+        base = PoseReference.of_motion(frame.with_relative_motion(self._base))
+        return Reference(base, PoseReference.of_motion(frame), self.goal.joints)
 
 
 def _pose(frame: FrameSample) -> PoseReference:
@@ -157,18 +205,8 @@ class ReferencePlanner:
         PlanningError
             No motion is found.
         """
-        base, joints = start.base, start.joints if self._outputs.joints else None
-        assert base is not None
         assert goal.base is not None
-        R_BW = matrix_from_quaternion(base.quaternion).T
-        q, qdot = (state.q, state.qdot) if joints is None else (joints.q, joints.qdot)
-        begin = ThrustStart(
-            np.concatenate([base.position, base.quaternion]),
-            R_BW @ base.velocity,
-            R_BW @ base.angular_velocity,
-            q.copy(),
-            qdot.copy() if _moves(base) else np.zeros(len(q)),
-        )
+        begin, q = self._begin(start, state)
         hand, shape = None, None
         if self._outputs.joints and goal.joints is not None:
             shape = goal.joints.q
@@ -180,6 +218,40 @@ class ReferencePlanner:
         motion = self._planner.plan(begin, end, cancellation)
         return PlannedReference(start, goal, limits, motion, carries=carries)
 
+    def plan_grapple(
+        self,
+        start: Reference,
+        state: ControlState,
+        limits: MotionLimits,
+        grapple: Grapple,
+        cancellation: Cancellation,
+    ) -> GrappleReference:
+        """Return the planned reference to a target, whose motion begins with it.
+
+        Raises
+        ------
+        PlanningError
+            No motion is found.
+        """
+        begin, _ = self._begin(start, state)
+        motion = self._planner.plan(begin, ThrustGoal(grapple=grapple), cancellation)
+        return GrappleReference(start, limits, motion, grapple)
+
+    def _begin(self, start: Reference, state: ControlState) -> tuple[ThrustStart, Array]:
+        """Return where a plan from a reference begins, and the shape (n,) there."""
+        base, joints = start.base, start.joints if self._outputs.joints else None
+        assert base is not None
+        R_BW = matrix_from_quaternion(base.quaternion).T
+        q, qdot = (state.q, state.qdot) if joints is None else (joints.q, joints.qdot)
+        begin = ThrustStart(
+            np.concatenate([base.position, base.quaternion]),
+            R_BW @ base.velocity,
+            R_BW @ base.angular_velocity,
+            q.copy(),
+            qdot.copy() if _moves(base) else np.zeros(len(q)),
+        )
+        return begin, q
+
 
 def _moves(pose: PoseReference) -> bool:
     return bool(np.any(pose.velocity) or np.any(pose.angular_velocity))
@@ -189,7 +261,10 @@ def _numbers(pose: PoseReference) -> Array:
     return np.concatenate([pose.position, pose.quaternion])
 
 
-class PlanJob:
+_Planned = TypeVar("_Planned", bound=PlannedReference)
+
+
+class PlanJob(Generic[_Planned]):
     """A plan in the making.
 
     Parameters
@@ -200,14 +275,14 @@ class PlanJob:
         Time at which the plan begins if it is ready by then, s; minus infinity: when it is ready.
     """
 
-    def __init__(self, work: Callable[[Cancellation], PlannedReference], begins: float) -> None:
+    def __init__(self, work: Callable[[Cancellation], _Planned], begins: float) -> None:
         self.begins = begins
         self.done = False
         self.wall_time = 0.0
         """Wall time of the work, s."""
         self._cancellation = Cancellation()
         self._work = work
-        self._result: PlannedReference | None = None
+        self._result: _Planned | None = None
         self._error: BaseException | None = None
         self._thread = Thread(target=self._run, daemon=True)
 
@@ -240,7 +315,7 @@ class PlanJob:
             # A thread inside CasADi would crash a process that ends.
             self._thread.join(MAX_THREAD_END_TIME)
 
-    def result(self) -> PlannedReference:
+    def result(self) -> _Planned:
         """Return the plan.
 
         Raises

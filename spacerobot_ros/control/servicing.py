@@ -17,8 +17,8 @@ from spacerobot_ros.control.approach import ApproachPlan, TargetClearance, plan_
 from spacerobot_ros.control.config import ControllerConfig
 from spacerobot_ros.control.controller import CoordinatedController
 from spacerobot_ros.control.detumbling import Detumbling, shortest_detumbling
-from spacerobot_ros.control.state import ControlState, Reference
-from spacerobot_ros.control.target_motion import TorqueFreeMotion
+from spacerobot_ros.control.planned_reference import PLANNING_TIME, GrappleReference, PlanJob
+from spacerobot_ros.control.state import ControlState, PoseReference, Reference
 from spacerobot_ros.errors import ParameterError, PlanningError, RobotDescriptionError, quantity
 from spacerobot_ros.events import Event, EventKind
 from spacerobot_ros.model.description import Array, RobotDescription
@@ -30,6 +30,8 @@ from spacerobot_ros.model.grasp import (
     TargetBody,
     frame_motion,
 )
+from spacerobot_ros.model.target_motion import RelativeMotionOverTime, TorqueFreeMotion
+from spacerobot_ros.planning.methods.thrust.goals import Grapple
 
 _PREDICTION_TOLERANCE = 0.02
 """Distance (m) and angle (rad) of a target from its predicted motion beyond which the approach is
@@ -117,6 +119,27 @@ class MeasuredTarget:
         self.motion, self.time = BodyMotion.of(pose, twist), time
 
 
+@dataclass(frozen=True)
+class MotionPlan:
+    """A planned motion of base and arm as an approach that has begun."""
+
+    reference: GrappleReference
+    start: float = 0.0
+
+    @property
+    def contact(self) -> float:
+        """When the end-effector has the pose of the grapple frame."""
+        return self.reference.duration
+
+    def relative(self, times: Array) -> RelativeMotionOverTime:
+        """Return the motion relative to the grapple frame at times (K,)."""
+        return self.reference.relative(times)
+
+
+_LATEST_BEGIN = 0.1
+"""How much later than planned a motion may begin, s."""
+
+
 class ApproachTask:
     """One approach: it is planned in its first state, and again where the target leaves its way.
 
@@ -131,16 +154,24 @@ class ApproachTask:
     def __init__(self, target: MeasuredTarget, config: ControllerConfig) -> None:
         self.target, self.config = target, config
         self.events: list[Event] = []
-        self._plan: ApproachPlan | None = None
+        self._plan: ApproachPlan | MotionPlan | None = None
         self._predicted: TorqueFreeMotion | None = None
         self._planned_at = 0.0
         self._began: float | None = None
         self._out_of_reach: RelativeMotion | None = None
         self._remaining = math.inf
         """Time until contact, s."""
+        self._job: PlanJob[GrappleReference] | None = None
+        """The work on a planned approach."""
+        self._lead = PLANNING_TIME
 
     def step(
-        self, time: float, state: ControlState, controller: CoordinatedController
+        self,
+        time: float,
+        state: ControlState,
+        controller: CoordinatedController,
+        *,
+        in_background: bool,
     ) -> TaskProgress:
         """Give the controller the reference of a state."""
         options = self.config.target
@@ -158,15 +189,17 @@ class ApproachTask:
         age = time - target.time
         if age > options.timeout:
             return self._ended(f"the target is lost: its odometry is {age:.3g} s old")
-        if self._plan is not None and self._is_off_prediction(target.motion):
-            self._plan = None
-        if self._plan is None:
-            try:
+        off = self._plan is None or self._is_off_prediction(target.motion)
+        try:
+            if controller.plans:
+                self._plan_motion(time, state, controller, off=off, in_background=in_background)
+            elif off:
                 self._make_plan(time, state, controller, target.body, target.motion)
-            except PlanningError as error:
-                why = str(error).rstrip(".")
-                return self._ended(f"{why[0].lower()}{why[1:]}")
-        assert self._plan is not None
+        except PlanningError as error:
+            why = str(error).rstrip(".")
+            return self._ended(f"{why[0].lower()}{why[1:]}")
+        if self._plan is None:
+            return _ACTIVE
         plan, now = self._plan, time - self._planned_at
         grapple = TorqueFreeMotion(target.body, target.motion).grapple([max(age, 0.0)])
         motion = RobotMotion(
@@ -184,9 +217,15 @@ class ApproachTask:
             )
         if now >= plan.start:
             moving = grapple.with_relative_motion(plan.relative(np.array([now])))
-            controller.follow(Reference(end_effector=moving.reference()))
+            controller.follow(Reference(end_effector=PoseReference.of_motion(moving)))
         self._remaining = plan.contact - now
         return _ACTIVE
+
+    def close(self) -> None:
+        """End the work on a plan."""
+        if self._job is not None:
+            self._job.close()
+            self._job = None
 
     @property
     def message(self) -> str:
@@ -214,7 +253,8 @@ class ApproachTask:
     def _is_off_prediction(self, measured: BodyMotion) -> bool:
         assert self._predicted is not None
         assert self.target.body is not None
-        expected = self._predicted.grapple([self.target.time - self._planned_at]).body_motion()
+        elapsed = max(self.target.time - self._planned_at, 0.0)
+        expected = self._predicted.grapple([elapsed]).body_motion()
         off = RelativeMotion.between(expected, measured.at(self.target.body.grapple))
         return off.distance > _PREDICTION_TOLERANCE or off.angle > _PREDICTION_TOLERANCE
 
@@ -230,6 +270,60 @@ class ApproachTask:
             target.body.grapple,
             least,
         )
+
+    def _plan_motion(
+        self,
+        time: float,
+        state: ControlState,
+        controller: CoordinatedController,
+        *,
+        off: bool,
+        in_background: bool,
+    ) -> None:
+        """Have base and arm planned together, anew where the target is off its prediction, and
+        begin with a plan that is ready; until then the robot goes on with an earlier one.
+        """
+        options, target = self.config.target, self.target
+        if self._job is None and off:
+            assert target.body is not None
+            assert target.motion is not None
+            grapple = Grapple(
+                TorqueFreeMotion(target.body, target.motion).later(max(time - target.time, 0.0)),
+                target.description,
+                options.clearance,
+                options.horizon,
+                options.detumble == "before",
+            )
+            lead = self._lead if in_background else 0.0
+            self._job = controller.plan_grapple(time, state.copied(), grapple, lead)
+            self._job.start(in_background=in_background)
+        job = self._job
+        if job is None or not job.done or time < job.begins:
+            return
+        self._job = None
+        planned = job.result()
+        if time - job.begins > _LATEST_BEGIN and in_background:
+            # Robot and target have gone on.
+            self._lead *= 2
+            return
+        self._predicted, self._planned_at = planned.grapple.motion, job.begins
+        self._plan = MotionPlan(planned)
+        controller.begin_planned(job.begins, planned)
+        contact, grapple = job.begins + planned.duration, planned.grapple
+        left = float(np.linalg.norm(grapple.joined_momentum(controller.mass, planned.motion)))
+        message = (
+            f"Base and end-effector set out at {job.begins:.4g} s and meet the target at "
+            f"{contact:.4g} s; {left:.4g} N m s are planned to be left after the grasp."
+        )
+        about = {
+            "starts_s": f"{job.begins:.9g}",
+            "closes_s": f"{contact:.9g}",
+            "contact_s": f"{contact:.9g}",
+            "detumble": options.detumble,
+            "planned_momentum_Nms": f"{left:.9g}",
+            "planned_cost": f"{planned.motion.spent:.9g}",
+        }
+        self.events.append(Event(EventKind.APPROACH_STARTED, message, about=about))
 
     def _make_plan(
         self,
@@ -285,10 +379,19 @@ class DetumblingTask:
         self._began = self._momentum = self._fastest = 0.0
         self._at_rest_since: float | None = None
 
+    def close(self) -> None:
+        """Nothing goes on beside it."""
+
     def step(
-        self, time: float, state: ControlState, controller: CoordinatedController
+        self,
+        time: float,
+        state: ControlState,
+        controller: CoordinatedController,
+        *,
+        in_background: bool,
     ) -> TaskProgress:
         """Have the controller bring the robot to rest."""
+        del in_background
         options = self.config.detumble
         if self._law is None:
             self._begin(time, state, controller)
@@ -361,7 +464,9 @@ class Servicing:
     """
 
     def __init__(self, config: ControllerConfig) -> None:
-        self.before_goals = Task.parsed(config.tasks)
+        tasks = Task.parsed(config.tasks)
+        without = config.target.detumble == "none"
+        self.before_goals = tuple(t for t in tasks if not (without and t is Task.DETUMBLE))
         self._config = config
         self.target = MeasuredTarget()
         self.payload: Payload | None = None
@@ -393,35 +498,49 @@ class Servicing:
 
     def begin(self, tasks: Sequence[Task]) -> None:
         """Begin with the first task at the next state."""
-        self._remaining_tasks, self._present = list(tasks), None
+        self._drop_present()
+        self._remaining_tasks = list(tasks)
 
     def restart(self) -> None:
         """Begin the present task again."""
+        self._drop_present()
+
+    def _drop_present(self) -> None:
+        if self._present is not None:
+            self._present.close()
         self._present = None
 
     def end(self) -> None:
         """Give up the tasks that are left."""
-        self._remaining_tasks, self._present = [], None
+        self._drop_present()
+        self._remaining_tasks = []
 
     def hold(self, payload: Payload | None) -> None:
         """Take over the body that the robot holds from now on."""
         self.payload = payload
-        self._present = None if self.task is Task.DETUMBLE else self._present
+        if self.task is Task.DETUMBLE:
+            self._drop_present()
 
     def step(
-        self, time: float, state: ControlState, controller: CoordinatedController
+        self,
+        time: float,
+        state: ControlState,
+        controller: CoordinatedController,
+        *,
+        in_background: bool = False,
     ) -> TaskProgress:
-        """Work on the present task; DONE with the last one."""
+        """Work on the present task; DONE with the last one. ``in_background``: a thread plans."""
         while self._remaining_tasks:
             if self.task is not Task.APPROACH or self.payload is None:
                 if self._present is None:
                     self._present = self._build_task(self._remaining_tasks[0])
-                progress = self._present.step(time, state, controller)
+                progress = self._present.step(time, state, controller, in_background=in_background)
                 self._events += self._present.events
                 self._present.events.clear()
                 if progress.state is not TaskState.DONE:
                     return progress
-            self._remaining_tasks, self._present = self._remaining_tasks[1:], None
+            self._drop_present()
+            self._remaining_tasks = self._remaining_tasks[1:]
             controller.follow(Reference())
             controller.hold_here(time, state)
         return _DONE

@@ -18,6 +18,7 @@ from spacerobot_ros.model.rotations import (
     quaternion_multiply,
 )
 from spacerobot_ros.model.space_robot import SpaceRobot
+from spacerobot_ros.model.target_motion import FrameMotion
 
 
 def _zero() -> Array:
@@ -65,6 +66,12 @@ class ControlState:
         parts = self.r_WB, self.quaternion_WB, self.v_WB_B, self.omega_WB_B, self.q, self.qdot
         np.concatenate(parts, out=memory)
 
+    def copied(self) -> ControlState:
+        """Return a copy, as the memory of a state may be used again for the next one."""
+        memory = np.empty(13 + 2 * len(self.q))
+        self.stack(memory)
+        return ControlState.unstack(memory)
+
     @classmethod
     def unstack(cls, memory: Array) -> ControlState:
         """Return a copy of the state in the memory of :meth:`stack`."""
@@ -93,6 +100,20 @@ class PoseReference:
         """Return the reference of a frame B whose velocities are given in B, as odometry is."""
         R_WB = matrix_from_quaternion(quaternion_WB)
         return cls(position, quaternion_WB, R_WB @ v_B, R_WB @ omega_B)
+
+    @classmethod
+    def of_motion(cls, motion: FrameMotion, k: int = 0) -> PoseReference:
+        """Return the motion of a frame at the k-th time as a reference."""
+        numbers = (motion.v, motion.omega, motion.a, motion.alpha)
+        quaternion = quaternion_from_matrix(motion.R[k])
+        return cls(motion.r[k], quaternion, *(each[k] for each in numbers))
+
+    @property
+    def motion(self) -> FrameMotion:
+        """The reference as the motion of a frame at one time."""
+        R = matrix_from_quaternion(self.quaternion)
+        numbers = (self.position, self.velocity, self.angular_velocity, self.acceleration)
+        return FrameMotion(*(x[np.newaxis] for x in (R, *numbers, self.angular_acceleration)))
 
 
 @dataclass(frozen=True)

@@ -20,15 +20,15 @@ from spacerobot_ros.control.approach import (
     ArmReach,
     plan_approach,
 )
-from spacerobot_ros.control.target_motion import (
+from spacerobot_ros.errors import PlanningError
+from spacerobot_ros.model.description import Array, Inertia, Pose
+from spacerobot_ros.model.grasp import BodyMotion, TargetBody
+from spacerobot_ros.model.target_motion import (
     FrameMotion,
     RelativeMotionOverTime,
     RelativePath,
     TorqueFreeMotion,
 )
-from spacerobot_ros.errors import PlanningError
-from spacerobot_ros.model.description import Array, Inertia, Pose
-from spacerobot_ros.model.grasp import BodyMotion, TargetBody
 
 GRAPPLE = np.array([-0.4, 0.1, 0.0])
 BODY = TargetBody(
@@ -267,7 +267,7 @@ def test_rates_and_accelerations_of_a_path_beside_the_target_are_those_of_its_po
 ) -> None:
     target, h = TorqueFreeMotion(TUMBLER, START), 1e-3
     held = PoseReference(np.array([1.0, 0.2, 0.3]), np.array([0.0, 0.6, 0.0, 0.8]))
-    begin = RelativeMotionOverTime.between(target.grapple([2.0]), FrameMotion.of_reference(held))
+    begin = RelativeMotionOverTime.between(target.grapple([2.0]), held.motion)
     path = RelativePath(begin, np.array([-0.3, 0.1, 0.05]), 7.0)
     times = np.array([time, time + h, time + 2 * h])
     motion = target.grapple(2.0 + times).with_relative_motion(path.at(times))
@@ -288,10 +288,10 @@ def test_a_path_begins_in_the_motion_of_the_held_pose_and_ends_with_the_grapple_
         np.array([0.003, -0.002, 0.001]),
         np.array([-0.004, 0.002, 0.003]),
     )
-    begin = RelativeMotionOverTime.between(target.grapple([2.0]), FrameMotion.of_reference(held))
+    begin = RelativeMotionOverTime.between(target.grapple([2.0]), held.motion)
     standoff = np.array([-0.3, 0.1, 0.05])
     path = RelativePath(begin, standoff, 7.0)
-    first = target.grapple([2.0]).with_relative_motion(path.at([0.0]))
+    begun = PoseReference.of_motion(target.grapple([2.0]).with_relative_motion(path.at([0.0])))
     for name in (
         "position",
         "velocity",
@@ -300,9 +300,12 @@ def test_a_path_begins_in_the_motion_of_the_held_pose_and_ends_with_the_grapple_
         "angular_acceleration",
     ):
         np.testing.assert_allclose(
-            getattr(first.reference(), name), getattr(held, name), atol=1e-12, err_msg=name
+            getattr(begun, name),
+            getattr(held, name),
+            atol=1e-12,
+            err_msg=name,
         )
-    assert abs(first.reference().quaternion @ held.quaternion) == pytest.approx(1.0, abs=1e-14)
+    assert abs(begun.quaternion @ held.quaternion) == pytest.approx(1.0, abs=1e-14)
     for end in (7.0, 9.5):
         grapple = target.grapple([2.0 + end])
         last = grapple.with_relative_motion(path.at([end]))

@@ -23,15 +23,15 @@ from spacerobot_ros.control.detumbling import (
     shortest_detumbling,
 )
 from spacerobot_ros.control.limits import decay_rate
-from spacerobot_ros.control.target_motion import (
+from spacerobot_ros.model import SpaceRobot, load_robot, parse_robot
+from spacerobot_ros.model.description import Array, Inertia, Pose
+from spacerobot_ros.model.grasp import Payload
+from spacerobot_ros.model.target_motion import (
     FrameMotion,
     PathInWorld,
     RelativeMotionOverTime,
     RelativePath,
 )
-from spacerobot_ros.model import SpaceRobot, load_robot, parse_robot
-from spacerobot_ros.model.description import Array, Inertia, Pose
-from spacerobot_ros.model.grasp import Payload
 from spacerobot_ros.resources import robot_file
 
 PERIOD = 0.02
@@ -383,7 +383,7 @@ def test_the_number_of_ways_past_a_body_is_limited(monkeypatch: pytest.MonkeyPat
 
 def test_a_path_in_the_world_joins_motion_and_standoff() -> None:
     motion, start, T = target((1.7, -0.5), (0.01, -0.02), 0.2), 2.0, 6.0
-    at_rest = FrameMotion.of_reference(HELD)
+    at_rest = HELD.motion
     begin = motion.grapple([start])
     begin_relative = RelativeMotionOverTime.between(begin, at_rest)
     relative = RelativePath(begin_relative, np.array(OPTIONS.standoff), T)

@@ -16,14 +16,10 @@ from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.thrusters import ThrusterTable, thrusters_of_urdf
 from spacerobot_ros.model.urdf import parse_world
 from spacerobot_ros.model.world import with_world
+from spacerobot_ros.planning.methods.thrust.goals import ThrustGoal, ThrustStart
 from spacerobot_ros.planning.methods.thrust.motion import ThrustMotion
 from spacerobot_ros.planning.methods.thrust.propulsion import Propulsion
-from spacerobot_ros.planning.methods.thrust.search import (
-    ThrustGoal,
-    ThrustOptions,
-    ThrustPlanner,
-    ThrustStart,
-)
+from spacerobot_ros.planning.methods.thrust.search import ThrustOptions, ThrustPlanner
 from spacerobot_ros.resources import robot_file
 
 MASS, INERTIA, FORCE, TORQUE = 16.0, np.array([0.3, 0.35, 0.4]), 0.5, 0.05

@@ -19,13 +19,9 @@ from spacerobot_ros.errors import PlanningError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.thrusters import thrusters_of_urdf
 from spacerobot_ros.model.urdf import parse_world
+from spacerobot_ros.planning.methods.thrust.goals import ThrustGoal, ThrustStart
 from spacerobot_ros.planning.methods.thrust.propulsion import Propulsion
-from spacerobot_ros.planning.methods.thrust.search import (
-    ThrustGoal,
-    ThrustOptions,
-    ThrustPlanner,
-    ThrustStart,
-)
+from spacerobot_ros.planning.methods.thrust.search import ThrustOptions, ThrustPlanner
 from spacerobot_ros.resources import robot_file
 
 ROBOTS = ("jet_cube", "free_flyer", "servicer", "servicer_wheels")

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pinocchio as pin
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
+from spacerobot_ros.collision import BasePoses, CollisionGeometry
 from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.model.description import Array
+from spacerobot_ros.model.description import Array, RobotDescription
+from spacerobot_ros.model.grasp import BodyMotion
+from spacerobot_ros.planning.methods.thrust.goals import ThrustStart
 from spacerobot_ros.planning.methods.thrust.motion import ThrustMotion
-from spacerobot_ros.planning.methods.thrust.search import ThrustStart
 
 
 def beyond(start: Array, displacement: Array, rotvec: Array) -> Array:
@@ -55,3 +59,45 @@ def flown_by_pinocchio(robot: SpaceRobot, motion: ThrustMotion, start: ThrustSta
         ends = k * motion.step + 1e-12, (k + 1) * motion.step - 1e-12
         y = solve_ivp(rate, ends, y, rtol=1e-8, atol=1e-9).y[:, -1]
     return np.asarray(y[: model.nq])
+
+
+def tumbled(target: RobotDescription, motion: BodyMotion, times: Array) -> tuple[Array, Array]:
+    """Return quaternions (K, 4) and positions (K, 3) of a free body's frame, by scipy."""
+    inertia = target.bodies[0].inertia
+    J, com = inertia.about_com, inertia.com
+    start = motion.R_WT @ com
+    v = motion.v + np.cross(motion.omega, start)
+
+    def rate(_: float, y: Array) -> Array:
+        R, omega = y[:9].reshape(3, 3), y[9:]
+        alpha = -np.linalg.solve(J, np.cross(omega, J @ omega))
+        # R hat(omega): omega crosses the rows of R.
+        return np.concatenate([np.cross(R, omega).ravel(), alpha])
+
+    y = np.concatenate([motion.R_WT.ravel(), motion.R_WT.T @ motion.omega])
+    ends = (0.0, float(times[-1]) + 1e-9)
+    found = solve_ivp(rate, ends, y, t_eval=times, rtol=1e-10, atol=1e-12).y.T
+    R = Rotation.from_matrix(found[:, :9].reshape(-1, 3, 3))
+    r = motion.r_WT + start + times[:, np.newaxis] * v
+    return R.as_quat(), r - R.apply(com)
+
+
+def distance_from_target(
+    robot: RobotDescription, target: RobotDescription, motion: ThrustMotion, free: BodyMotion
+) -> float:
+    """Return how near a robot comes to a target by coal, at 400 instants, m: but for the body of
+    its end-effector.
+    """
+    times = np.linspace(0.0, motion.duration, 400)
+    samples = [motion.at(time) for time in times]
+    X, r = tumbled(target, free, times)
+    back = Rotation.from_quat(X).inv()
+    base = BasePoses(
+        back.apply(np.array([each.base.position for each in samples]) - r),
+        (back * Rotation.from_quat([each.base.quaternion for each in samples])).as_quat(),
+    )
+    geometry = CollisionGeometry(replace(robot, world=target), obstacles_alone=True)
+    hand = robot.frames["end_effector"][0]
+    poses = geometry.poses(np.array([each.q for each in samples]), base)
+    others = [k for k, (i, _) in enumerate(geometry.pairs) if geometry.solids[i].body != hand]
+    return min(float(geometry.distances(pair, poses).min()) for pair in others)

@@ -59,12 +59,20 @@ class Clearance:
         Smallest distance of links that no joint connects, and of links and obstacles, m.
     parameter
         Name of its parameter, for messages.
+    obstacles_alone
+        Whether two links of the robot may come as near as they will.
     """
 
     def __init__(
-        self, robot: RobotDescription, distance: float, parameter: str = "planner.clearance"
+        self,
+        robot: RobotDescription,
+        distance: float,
+        parameter: str = "planner.clearance",
+        *,
+        obstacles_alone: bool = False,
     ) -> None:
         self._robot, self._parameter = robot, parameter
+        self._obstacles_alone = obstacles_alone
         self.distance = distance
         self._warned: set[str] = set()
 
@@ -94,7 +102,7 @@ class Clearance:
     @cached_property
     def geometry(self) -> CollisionGeometry:
         """The solids of the robot."""
-        return CollisionGeometry(self._robot)
+        return CollisionGeometry(self._robot, obstacles_alone=self._obstacles_alone)
 
     @property
     def has_obstacles(self) -> bool:

@@ -29,7 +29,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from itertools import pairwise
@@ -40,7 +40,7 @@ import numpy.typing as npt
 
 from spacerobot_ros.collision.planes import PLANE_SIZE, PlaneDistance
 from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.model.compilation import cached_function, source_hash
+from spacerobot_ros.model.compilation import cached_function, compiled, source_hash
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.dynamics import solve_positive_definite
 from spacerobot_ros.model.momentum_derivatives import momentum_derivatives
@@ -101,6 +101,26 @@ class ConstraintBlock:
         multiplier = ca.SX.sym("lambda", g.shape[0])
         hessian = ca.hessian(ca.dot(multiplier, g), z)[0]
         return cls.with_derivatives(name, z, p, multiplier, g, ca.jacobian(g, z), hessian)
+
+    @classmethod
+    def cached(
+        cls,
+        name: str,
+        facts: Sequence[str],
+        derive: Callable[[], ConstraintBlock],
+        *,
+        repeated: bool = False,
+    ) -> ConstraintBlock:
+        """Return a block from the cache, or derive it; ``facts`` are all that it depends on.
+
+        Derivatives of a block that is ``repeated`` in a program are compiled.
+        """
+        key, derived = hash_of(facts), cache(derive)
+        jacobian = cached_function(f"{name}_jac", key, lambda: derived().jacobian)
+        hessian = cached_function(f"{name}_hess", key, lambda: derived().hessian)
+        if repeated:
+            jacobian, hessian = compiled(jacobian), compiled(hessian)
+        return cls(cached_function(name, key, lambda: derived().values), jacobian, hessian)
 
     @classmethod
     def with_derivatives(
@@ -240,17 +260,16 @@ def _cached_interval(
         *(f"{each.instants} {each.function.serialize()}" for each in inequalities),
         f"drifting {drifting}",
     ]
-    key = hashlib.sha256("\n".join(facts).encode()).hexdigest()
-
-    @cache
-    def derived() -> ConstraintBlock:
-        return _interval_block(robot, constraints, inequalities, drifting=drifting)
-
-    return ConstraintBlock(
-        cached_function("interval", key, lambda: derived().values),
-        cached_function("interval_jac", key, lambda: derived().jacobian),
-        cached_function("interval_hess", key, lambda: derived().hessian),
+    return ConstraintBlock.cached(
+        "interval",
+        facts,
+        lambda: _interval_block(robot, constraints, inequalities, drifting=drifting),
     )
+
+
+def hash_of(facts: Sequence[str]) -> str:
+    """Return the key of what is derived from some facts."""
+    return hashlib.sha256("\n".join(facts).encode()).hexdigest()
 
 
 def _interval_block(

@@ -81,6 +81,14 @@ class Propulsion:
         limits = (1.0 - reserve) * np.repeat([force, torque], 3)
         return cls(np.diag(limits), limits, ((0, 1, 2), (3, 4, 5)))
 
+    def largest_force(self) -> float:
+        """Return a bound of the force in any direction, N."""
+        force = self.wrenches[:3]
+        if self.norms:
+            return float(np.abs(force).max())
+        one_way = np.maximum(force.clip(0.0).sum(axis=1), -force.clip(None, 0.0).sum(axis=1))
+        return float(np.linalg.norm(one_way))
+
     def cost_of(self, levels: Array) -> Array:
         """Return what levels (..., m) cost a second (...)."""
         within = [i for group in self.norms for i in group]

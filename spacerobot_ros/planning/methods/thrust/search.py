@@ -11,14 +11,13 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
-from spacerobot_ros.collision import Approach, BasePoses
-from spacerobot_ros.collision.planes import support_distance
+from spacerobot_ros.collision import Approach
 from spacerobot_ros.errors import PlanningError, Proof, UnreachableError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array, Pose, RobotDescription
@@ -32,6 +31,7 @@ from spacerobot_ros.model.rotations import (
     compose_poses,
     matrices_from_quaternions,
     matrix_from_quaternion,
+    quaternion_from_matrix,
     quaternion_multiply,
     quaternions_from_rotvecs,
     relative_pose,
@@ -40,12 +40,19 @@ from spacerobot_ros.model.rotations import (
 from spacerobot_ros.model.wheels import ReactionWheels
 from spacerobot_ros.model.world import with_world
 from spacerobot_ros.parameters import parameter
-from spacerobot_ros.planning.core.cancellation import NEVER, Cancellation
+from spacerobot_ros.planning.core.cancellation import NEVER, Cancellation, PlanningCancelled
 from spacerobot_ros.planning.core.clearance import DEFAULT_CLEARANCE, Clearance
 from spacerobot_ros.planning.core.goal import end_effector_pose
 from spacerobot_ros.planning.methods.optimal.multiple_shooting import DurationBounds, StopRule
 from spacerobot_ros.planning.methods.optimal.problem import MotionLimits, MotionOptions
 from spacerobot_ros.planning.methods.optimal.transcription import ConstraintBlock
+from spacerobot_ros.planning.methods.thrust.bodies import INSTANTS, Bodies, KeptPlaces
+from spacerobot_ros.planning.methods.thrust.goals import (
+    Grapple,
+    ThrustGoal,
+    ThrustStart,
+    shortest_catch,
+)
 from spacerobot_ros.planning.methods.thrust.motion import MotionFunctions, ThrustMotion
 from spacerobot_ros.planning.methods.thrust.propulsion import Propulsion
 from spacerobot_ros.planning.methods.thrust.solver import (
@@ -55,11 +62,7 @@ from spacerobot_ros.planning.methods.thrust.solver import (
     ThrustSolver,
     Weights,
 )
-from spacerobot_ros.planning.methods.thrust.transcription import (
-    EXACT_STEPS,
-    ThrustStages,
-    pair_block,
-)
+from spacerobot_ros.planning.methods.thrust.transcription import EndKind, ThrustStages
 
 _REGULARISATION = 1e-3
 """Weight of the squares of levels, which makes solutions unique. 1e-2 costs 1 % of propellant, 1e-4
@@ -87,9 +90,6 @@ _LARGEST_END_ERROR = 1e-4
 _END_REACH = 0.3
 """Distance of the joints at the end from the shape that inverse kinematics finds, m or rad."""
 
-_INSTANTS = 2
-"""Instants of an interval at which pairs are kept apart."""
-
 _ROOM = 4e-3
 """Distance beyond the clearance at these instants: paths bend between them, m."""
 
@@ -101,6 +101,16 @@ _LARGEST_LACK = 1e-4
 
 _MAX_ROUNDS = 6
 """Times that a path is made clear of pairs by new planes."""
+
+_GRASP_REACHES = (0.6, 0.3, 1.5)
+"""Distances of the joints in a grasp from their shape at the start that are tried, m or rad: the
+base moves, and the arm stays clear of it."""
+
+_SHARES_LEFT = (0.0, 0.25, 0.5)
+"""Shares of the angular momentum after a grasp that may be left."""
+
+_MEETING_PERIOD = 1.0
+"""Between times at which a guess meets a target, s."""
 
 _LARGEST_STRETCH = 4.0
 """Largest factor of the time of a motion whose efforts are too large."""
@@ -143,37 +153,6 @@ class ThrustOptions(MotionOptions):
     )
 
 
-@dataclass(frozen=True)
-class ThrustStart:
-    """Where a motion begins: pose (7,) of the base and its twist ``v_WB_B``, ``omega_WB_B`` (3,),
-    positions and velocities (n,) of the joints.
-    """
-
-    pose: Array
-    v_WB_B: Array
-    omega_WB_B: Array
-    q: Array
-    qdot: Array
-
-    @classmethod
-    def at_rest(cls, pose: Array, q: Array) -> ThrustStart:
-        """Return a start without velocities."""
-        return cls(pose, np.zeros(3), np.zeros(3), q, np.zeros(len(q)))
-
-
-@dataclass(frozen=True)
-class ThrustGoal:
-    """Where a motion ends, at rest.
-
-    ``base`` and ``end_effector`` are poses (7,), position and quaternion in W, or None;
-    ``shape`` are joint positions (n,), NaN for joints that are free, None for all free.
-    """
-
-    base: Array | None = None
-    end_effector: Array | None = None
-    shape: Array | None = None
-
-
 class ThrustPlanner:
     """Plans motions of base and joints of one robot.
 
@@ -207,8 +186,8 @@ class ThrustPlanner:
         wheels = ReactionWheels.of(robot.description)
         self._wheels = np.zeros(robot.n, dtype=bool)
         self._wheels[wheels.index] = True
-        self._stages: dict[tuple[bool, str], ThrustStages] = {}
-        self._solvers: dict[tuple[bool, str, _Kept], ThrustSolver] = {}
+        self._stages: dict[EndKind, ThrustStages] = {}
+        self._solvers: dict[tuple[EndKind, KeptPlaces], ThrustSolver] = {}
         self._rows: dict[tuple[int, int], ConstraintBlock] = {}
 
     def use_obstacles(self, world: RobotDescription | None) -> None:
@@ -230,36 +209,68 @@ class ThrustPlanner:
         PlanningError
             There is none within the limits, or none is found; or it was cancelled.
         """
-        boundary, end = self._boundary(start, goal)
-        kinds = goal.base is not None, self.link if goal.end_effector is not None else ""
-        self._solvers = {key: each for key, each in self._solvers.items() if not key[2]}
+        self._solvers = {key: each for key, each in self._solvers.items() if not key[1]}
         stop = StopRule(self.options.iterations, cancellation)
+        bodies = Bodies(self.robot, self.clearance, self.link, goal.grapple)
+        bodies.begin(start.q, start.pose)
+        if goal.grapple is not None:
+            return self._plan_grapple(start, goal.grapple, bodies, stop)
+        boundary, end = self._boundary(start, goal)
+        kind = EndKind(goal.base is not None, self.link if goal.end_effector is not None else "")
+        if kind.base:
+            bodies.require_end(end.q, end.base)
         guess = self._guess(boundary, end, np.zeros(3))
-        search = _Search(self, boundary, end, kinds, stop)
-        return search.run(guess, end)
+        return _Search(self, boundary, kind, stop, bodies).run(guess)
 
-    def solver(self, kinds: tuple[bool, str], kept: _Kept = ()) -> ThrustSolver:
+    def _plan_grapple(
+        self, start: ThrustStart, grapple: Grapple, bodies: Bodies, stop: StopRule
+    ) -> ThrustMotion:
+        """Return the motion to a target: with no angular momentum left, or as little as there is
+        a motion for.
+        """
+        self._require_catch(start, grapple)
+        failure = PlanningError("")
+        for reach in _GRASP_REACHES:
+            boundary, kind, guess = self._meeting(start, grapple, reach)
+            plain = _Search(self, boundary, kind, stop, bodies, grapple)
+            try:
+                motion = plain.run(guess)
+                break
+            except (PlanningCancelled, UnreachableError):
+                raise
+            except PlanningError as error:
+                failure = error
+        else:
+            raise failure
+        if not grapple.detumbles:
+            return motion
+        left = grapple.joined_momentum(self.robot.total_mass, motion)
+        kind = kind._replace(momentum=True)
+        for share in _SHARES_LEFT:
+            search = _Search(self, boundary, kind, stop, bodies, grapple, share * left)
+            try:
+                return search.run_near(plain)
+            except PlanningCancelled:
+                raise
+            except PlanningError:
+                continue
+        return motion
+
+    def solver(self, kind: EndKind, bodies: Bodies, kept: KeptPlaces = ()) -> ThrustSolver:
         """Return the solver of a kind of goals, with pairs that are kept apart at some instants."""
-        key = (*kinds, kept)
-        if key not in self._solvers:
-            if kinds not in self._stages:
-                self._stages[kinds] = ThrustStages.of(self.robot, self.propulsion, *kinds)
+        if (kind, kept) not in self._solvers:
+            if kind not in self._stages:
+                self._stages[kind] = ThrustStages.of(self.robot, self.propulsion, kind)
+            for pair, _ in kept:
+                if bodies.row_key(pair) not in self._rows:
+                    self._rows[bodies.row_key(pair)] = bodies.rows(pair)
+            rows = tuple(self._rows[bodies.row_key(pair)] for pair, _ in kept)
             numbers, places = tuple(n for n, _ in kept), tuple(at for _, at in kept)
-            pairs = KeptPairs(numbers, tuple(map(self._pair_rows, numbers)), places, _INSTANTS)
-            self._solvers[key] = ThrustSolver(self._stages[kinds], self.options.intervals, pairs)
-        return self._solvers[key]
-
-    def _pair_rows(self, pair: int) -> ConstraintBlock:
-        assert self.clearance is not None
-        geometry = self.clearance.geometry
-        first, second = geometry.pairs[pair].tolist()
-        # Those of a solid are the same for all obstacles.
-        key = first, -1 if geometry.with_obstacles[pair] else second
-        if key not in self._rows:
-            center_of_mass = self.robot.function("center_of_mass", compile=False)
-            distance = support_distance(geometry, pair, center_of_mass)
-            self._rows[key] = pair_block(self.robot.n, distance)
-        return self._rows[key]
+            pairs = KeptPairs(numbers, rows, places, INSTANTS)
+            self._solvers[kind, kept] = ThrustSolver(
+                self._stages[kind], self.options.intervals, pairs
+            )
+        return self._solvers[kind, kept]
 
     def motion(self, knots: ThrustKnots) -> ThrustMotion:
         """Return the motion that the controls of a solution fly."""
@@ -267,12 +278,69 @@ class ThrustPlanner:
 
     # -- both ends ----------------------------------------------------------------------------
 
+    def _state(self, start: ThrustStart) -> Array:
+        """Return ``[X; L; r; V]`` (13,) of a start."""
+        robot, X = self.robot, start.pose[3:]
+        p_W, L_W, _ = robot.momentum(X, start.q, start.v_WB_B, start.omega_WB_B, start.qdot)
+        r_WC = start.pose[:3] + matrix_from_quaternion(X) @ robot.center_of_mass(start.q)
+        return np.concatenate([X, L_W, r_WC, p_W / robot.total_mass])
+
+    def _meeting(
+        self, start: ThrustStart, grapple: Grapple, reach: float
+    ) -> tuple[ThrustBoundary, EndKind, ThrustKnots]:
+        """Return both ends of a motion to a target, and a guess: to where the arm, in its shape,
+        has the grapple frame at the earliest time at which the thrust takes it there. ``reach`` is
+        how far joints may be from that shape then, m or rad.
+        """
+        final_velocity = np.where(self._wheels, start.qdot, np.nan)
+        boundary = ThrustBoundary(
+            self._state(start),
+            start.q,
+            start.qdot,
+            np.zeros(0),
+            np.where(
+                self._wheels,
+                [[-np.inf], [np.inf]],
+                start.q + np.array([[-reach], [reach]]),
+            ),
+            final_velocity,
+            None,
+        )
+        kind = EndKind(base=False, link=self.link, target=True)
+        for time in np.arange(_MEETING_PERIOD, grapple.horizon, _MEETING_PERIOD).tolist():
+            guess = self._guess(boundary, self.meeting_end(start.q, grapple, time), np.zeros(3))
+            if guess.duration <= time:
+                break
+        return boundary, kind, guess.stretched(time / guess.duration)
+
+    def meeting_end(self, q: Array, grapple: Grapple, time: float) -> _End:
+        """Return the base at which the hand, by an arm of shape (n,), has the grapple frame."""
+        still = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
+        hand = end_effector_pose(self.robot, self.link, still[:3], still[3:], q)
+        frame = grapple.motion.grapple([time])
+        there = np.concatenate([frame.r[0], quaternion_from_matrix(frame.R[0])])
+        return _End(compose_poses(there, relative_pose(np.concatenate(hand), still)), q)
+
+    def _require_catch(self, start: ThrustStart, grapple: Grapple) -> None:
+        robot, target = self.robot, grapple.motion
+        state = self._state(start)
+        away = target.center_of_mass(0.0) - state[7:10]
+        distance = float(np.linalg.norm(away))
+        leaving = float((target.velocity - state[10:]) @ away) / max(distance, 1e-9)
+        force = self.propulsion.largest_force()
+        near = distance - _reach(robot.description, self.link) - target.arm_length
+        least = shortest_catch(near, leaving, force / robot.total_mass)
+        if least > grapple.horizon:
+            raise UnreachableError(
+                f"The target is {distance:.3g} m away and leaves at {leaving:.3g} m/s: with a "
+                f"force of {force:.3g} N the robot meets it after {least:.4g} s at the earliest, "
+                f"and 'target.horizon' is {grapple.horizon:g} s.",
+                Proof.LIMITS,
+            )
+
     def _boundary(self, start: ThrustStart, goal: ThrustGoal) -> tuple[ThrustBoundary, _End]:
         robot, n = self.robot, self.robot.n
         r_WB, X = start.pose[:3], start.pose[3:]
-        p_W, L_W, _ = robot.momentum(X, start.q, start.v_WB_B, start.omega_WB_B, start.qdot)
-        r_WC = r_WB + matrix_from_quaternion(X) @ robot.center_of_mass(start.q)
-        state = np.concatenate([X, L_W, r_WC, p_W / robot.total_mass])
         shape = np.full(n, np.nan) if goal.shape is None else goal.shape.copy()
         shape[self._wheels] = np.nan
         base, q = goal.base, np.where(np.isfinite(shape), shape, start.q)
@@ -295,7 +363,7 @@ class ThrustPlanner:
         goals = [each for each in (goal.base, goal.end_effector) if each is not None]
         return (
             ThrustBoundary(
-                state,
+                self._state(start),
                 start.q,
                 start.qdot,
                 np.concatenate(goals) if goals else np.zeros(0),
@@ -373,87 +441,28 @@ class ThrustPlanner:
 
     # -- bodies -------------------------------------------------------------------------------
 
-    def base_poses(self, shapes: Array, X: Array, r_WC: Array) -> BasePoses:
-        """Return the poses of the base from those of the centre of mass (K, ...)."""
-        c = self.robot.function("center_of_mass")(shapes.T).full().T
-        return BasePoses(r_WC - np.einsum("kij,kj->ki", matrices_from_quaternions(X), c), X)
-
-    def along(self, knots: ThrustKnots) -> tuple[Array, BasePoses, Array]:
-        """Return shapes, poses of the base and times from 0 to 1 in their intervals (N K,) at the
-        instants at which pairs are kept apart.
-        """
-        N, h, K = len(knots.levels), knots.step, _INSTANTS
-        tau = np.tile(np.arange(1, K + 1) / K, N)[:, np.newaxis]
-        k = np.repeat(np.arange(N), K)
-        q, v, V = knots.shapes, knots.velocities, knots.v_WC
-        shapes = q[k] + h * (tau * v[k] + tau**2 / 2 * (v[k + 1] - v[k]))
-        X = (1 - tau) * knots.quaternions[k] + tau * knots.quaternions[k + 1]
-        X /= np.linalg.norm(X, axis=1, keepdims=True)
-        r = knots.r_WC[k] + h * (tau * V[k] + tau**2 / 2 * (V[k + 1] - V[k]))
-        return shapes, self.base_poses(shapes, X, r), tau
-
-    def planes(
-        self, kept: _Kept, room: Mapping[int, float], required: Array, knots: ThrustKnots
-    ) -> Array:
-        """Return the planes (R, 8) of pairs along a path, with the room of each, m."""
-        assert self.clearance is not None
-        geometry = self.clearance.geometry
-        shapes, base, tau = self.along(knots)
-        R, r = geometry.poses(shapes, base)
-        found = []
-        at_end = np.arange(len(tau)) >= len(tau) - _INSTANTS
-        at_end |= np.arange(len(tau)) < _INSTANTS
-        for pair, places in kept:
-            at = list(places)
-            _, planes = geometry.planes(pair, (R[at], r[at]))
-            planes[:, 3] += required[pair] + np.where(at_end[at], 0.0, room[pair])
-            found.append(np.hstack([planes, tau[at]]))
-        return np.vstack(found)
-
-    def places(self, pair: int, required: Array, knots: ThrustKnots) -> set[int]:
-        """Return the instants of a path at which a pair is near, by the size of its first solid."""
-        assert self.clearance is not None
-        geometry = self.clearance.geometry
-        shapes, base, _ = self.along(knots)
-        distances = geometry.distances(pair, geometry.poses(shapes, base))
-        reach = geometry.solids[geometry.pairs[pair][0]].enclosure.bounding_radius
-        return set(np.flatnonzero(distances < required[pair] + reach).tolist())
-
-    def approaches(self, motion: ThrustMotion, required: Array) -> list[Approach]:
-        """Return the pairs that come too near in a motion, nearest first."""
-        if self.clearance is None:
-            return []
-        shapes, base = motion.path()
-        return self.clearance.approaches(
-            shapes, required, base if self.clearance.has_obstacles else None
-        )
-
-    def reason(self, approach: Approach) -> str:
-        """Return a clause about a motion that is not clear."""
-        assert self.clearance is not None
-        return f"no clear motion was found: {self.clearance.clause(approach, None)}"
-
     def bows(
-        self, boundary: ThrustBoundary, end: _End, required: Array, near: Sequence[Approach]
+        self, boundary: ThrustBoundary, path: ThrustKnots, bodies: Bodies, near: Sequence[Approach]
     ) -> Iterator[ThrustKnots]:
-        """Yield the straight guess and those beside it that are clear, the straightest first."""
-        assert self.clearance is not None
-        geometry, r0 = self.clearance.geometry, boundary.state[7:10]
+        """Yield straight guesses and those beside them that are clear, in the time of a path, the
+        straightest first.
+        """
+        r0 = boundary.state[7:10]
+        base = bodies.base_poses(path.shapes[-1:], path.quaternions[-1:], path.r_WC[-1:])
+        end = _End(np.concatenate([base.position[0], base.quaternion[0]]), path.shapes[-1])
         along = end.base[:3] - r0
         length = max(float(np.linalg.norm(along)), 1e-9)
         frame = np.linalg.svd(along[np.newaxis] / length)[2]
         angles = 2 * math.pi * np.arange(_BOW_DIRECTIONS) / _BOW_DIRECTIONS
         sides = np.outer(np.cos(angles), frame[1]) + np.outer(np.sin(angles), frame[2])
-        in_way = any(each.place_on_obstacle is not None for each in near)
-        pairs = {each.pair for each in near} | {*np.flatnonzero(geometry.with_obstacles).tolist()}
-        for height in _BOW_SHARES if in_way else _BOW_SHARES[:1]:
+        pairs = {each.pair for each in near} | {*bodies.obstacles()}
+        for height in _BOW_SHARES if bodies.is_in_the_way(near) else _BOW_SHARES[:1]:
             found = []
             for side in sides if height else sides[:1]:
                 guess = self._guess(boundary, end, height * max(length / 2, 0.5) * side)
-                shapes, base, _ = self.along(guess)
-                poses = geometry.poses(shapes, base)
+                guess = guess.stretched(max(path.duration / guess.duration, 1.0))
                 lack = [
-                    float((geometry.distances(pair, poses) - required[pair]).min())
+                    float((bodies.distances(pair, guess) - bodies.required[pair]).min())
                     for pair in pairs
                 ]
                 found.append((min(lack), guess))
@@ -462,8 +471,14 @@ class ThrustPlanner:
                 yield guess
 
 
-_Kept = tuple[tuple[int, tuple[int, ...]], ...]
-"""Pairs that are kept apart, and the instants at which they are."""
+def _reach(robot: RobotDescription, link: str) -> float:
+    """Return the distance that a link is from the base at most, but for joints that slide, m."""
+    body, pose = robot.frames[link]
+    far = float(np.linalg.norm(pose.r))
+    while body > 0:
+        far += float(np.linalg.norm(robot.bodies[body].origin.r))
+        body = robot.bodies[body].parent
+    return far
 
 
 @dataclass(frozen=True)
@@ -479,16 +494,6 @@ _NEAREST = Weights(0.0, 0.0, 1.0, 1.0, _COST_OF_LACK)
 _FREE_TIME = DurationBounds(1e-3, 1e5)
 
 
-def _around(approach: Approach, intervals: int) -> set[int]:
-    """Return the instants before and after an approach in an exactly integrated motion."""
-    place = int(approach.tick / EXACT_STEPS * _INSTANTS) - 1
-    return set(range(max(place, 0), min(place + 2, intervals * _INSTANTS)))
-
-
-def _fixed(path: ThrustKnots) -> DurationBounds:
-    return DurationBounds(path.duration, path.duration)
-
-
 class _Search:
     """One search of a planner."""
 
@@ -496,35 +501,33 @@ class _Search:
         self,
         planner: ThrustPlanner,
         boundary: ThrustBoundary,
-        end: _End,
-        kinds: tuple[bool, str],
+        kind: EndKind,
         stop: StopRule,
+        bodies: Bodies,
+        grapple: Grapple | None = None,
+        left: Array | None = None,
     ) -> None:
-        self.planner, self.boundary, self.kinds, self.stop = planner, boundary, kinds, stop
+        self.planner, self.boundary, self.kind, self.stop = planner, boundary, kind, stop
+        self.bodies, self.grapple = bodies, grapple
         options = planner.options
         self._is_timed = options.duration > 0 or options.time_factor > 1
         """Whether the duration is given, or follows from the shortest one."""
+        self._meets_any_time = grapple is not None and options.duration == 0
+        self._earliest = self._latest = 0.0
+        """When a target is met, s."""
         self._effort_limit = (1.0 - options.reserve) * planner.robot.effort_limit
         self._room: dict[int, float] = {}
         """Room of the pairs that are kept apart, m."""
         self._places: dict[int, set[int]] = {}
         """Instants at which they are."""
-        self._required = self._require_ends(end)
+        self._nearest: Approach | None = None
+        """The nearest pair of the last path that was not clear."""
+        self.path: ThrustKnots
+        """The knots of the last exact motion."""
+        self._left = np.zeros(3) if left is None else left
+        """Angular momentum of robot and target in the end, N m s."""
 
-    def _require_ends(self, end: _End) -> Array:
-        clearance, boundary = self.planner.clearance, self.boundary
-        if clearance is None:
-            return np.zeros(0)
-        q, X, r = boundary.shape[np.newaxis], boundary.state[np.newaxis, :4], boundary.state[7:10]
-        base = self.planner.base_poses(q, X, r[np.newaxis])
-        required = clearance.required(boundary.shape, base if clearance.has_obstacles else None)
-        if self.kinds[0]:
-            goal, q = boundary.goals[np.newaxis, :7], end.q
-            base = BasePoses(goal[:, :3], goal[:, 3:])
-            clearance.require_shape(q, required, base if clearance.has_obstacles else None)
-        return required
-
-    def run(self, guess: ThrustKnots, end: _End) -> ThrustMotion:
+    def run(self, guess: ThrustKnots) -> ThrustMotion:
         """Return the motion.
 
         Raises
@@ -535,41 +538,75 @@ class _Search:
         fastest = self._fastest(guess)
         if fastest is None:
             raise PlanningError(self._failure("no motion to the goal was found"))
-        time = self._time(fastest)
+        time, self._earliest = self._time(fastest), fastest.duration
         for _ in range(_MAX_ROUNDS):
-            motion = self._motion(fastest.stretched(time / fastest.duration), end)
+            motion = self._motion(fastest, time)
             share = motion.effort_share(self._effort_limit)
             if share <= 1.0:
                 return motion
             # Efforts of a motion at rest are about as the square of its speed.
-            time = motion.duration * min(1.01 * math.sqrt(share), _LARGEST_STRETCH)
+            self._earliest = motion.duration * min(1.01 * math.sqrt(share), _LARGEST_STRETCH)
+            time = max(self._earliest, time) if self._meets_any_time else self._earliest
             self._is_timed = True
         raise PlanningError(
             self._failure(f"its joints need {share:.3g} times the efforts that a plan may use")
         )
 
-    def _motion(self, path: ThrustKnots, end: _End) -> ThrustMotion:
-        """Return the exact and clear motion near a path, in its time if that is given."""
-        planner = self.planner
-        self._room, self._places = {}, {}
+    def run_near(self, other: _Search) -> ThrustMotion:
+        """Return the motion near that of another search, in its time."""
+        self._room, self._places = dict(other._room), dict(other._places)
+        self._is_timed, path = True, replace(other.path, multipliers=None)
+        self._earliest = self._latest = path.duration
+        planes = self._planes(path)
+        path = self._solve(path, _NEAREST, self._span(path), planes=planes, center=path) or path
+        for _ in range(_MAX_ROUNDS):
+            cleared = self._cleared(path)
+            if cleared is None:
+                break
+            motion = self._exact(cleared, self._planes(cleared))
+            near = self.bodies.approaches(motion)
+            share = motion.effort_share(self._effort_limit)
+            if not near and share <= 1.0:
+                return motion
+            if share > 1.0:
+                break
+            self._add(near, cleared)
+        raise PlanningError(self._failure("no motion near the other one was found"))
+
+    def _motion(self, fastest: ThrustKnots, time: float) -> ThrustMotion:
+        """Return the exact and clear motion near the fastest one, in a time if that is given; to a
+        target, by that time.
+        """
+        planner, bodies = self.planner, self.bodies
+        self._room, self._places, self._latest = {}, {}, time
+        at = max(self._earliest, fastest.duration) if self._meets_any_time else time
+        path = fastest.stretched(at / fastest.duration)
         if self._is_timed:
             # Roughly, for a look at what is in the way.
             weights = self._cheap(path, _ROUNDINGS[0])
-            path = self._solve(path, weights, _fixed(path), rough=True) or path
-        near = planner.approaches(planner.motion(path), self._required)
+            path = self._solve(path, weights, self._span(path), rough=True) or path
+        near = bodies.approaches(planner.motion(path))
         if not near:
             motion = self._exact(path)
-            near = planner.approaches(motion, self._required)
+            near = bodies.approaches(motion)
             if not near:
                 return motion
-        path = self._clear(path, end, near)
+        path = self._clear(path, near)
         for _ in range(_MAX_ROUNDS):
             motion = self._exact(path, self._planes(path))
-            approaches = planner.approaches(motion, self._required)
+            approaches = bodies.approaches(motion)
             if not approaches:
                 return motion
             self._add(approaches, path)
-        raise PlanningError(self._failure(planner.reason(approaches[0])))
+        raise PlanningError(self._failure(bodies.reason(approaches[0])))
+
+    def _span(self, path: ThrustKnots) -> DurationBounds:
+        """Return the bounds of the duration of a motion near a timed path: a target is met at any
+        time by the latest one, if nothing is in the way.
+        """
+        if self._meets_any_time and not self._room:
+            return DurationBounds(self._earliest, self._latest)
+        return DurationBounds(path.duration, path.duration)
 
     def _time(self, fastest: ThrustKnots) -> float:
         options = self.planner.options
@@ -582,21 +619,20 @@ class _Search:
         return options.duration or options.time_factor * fastest.duration
 
     @property
-    def _kept(self) -> _Kept:
+    def _kept(self) -> KeptPlaces:
         return tuple((pair, tuple(sorted(self._places[pair]))) for pair in sorted(self._places))
 
-    def _planes(self, path: ThrustKnots) -> Array:
-        return self.planner.planes(self._kept, self._room, self._required, path)
+    def _planes(self, path: ThrustKnots) -> Array | None:
+        return self.bodies.planes(self._kept, self._room, path) if self._room else None
 
     def _add(self, approaches: Sequence[Approach], path: ThrustKnots) -> None:
         """Keep more pairs apart, where they are near along a path, and give those that are kept as
         much room as they lack.
         """
         for each in approaches:
-            near = self.planner.places(each.pair, self._required, path)
-            near |= _around(each, len(path.levels))
+            near = self.bodies.places(each, path)
             self._places[each.pair] = self._places.get(each.pair, set()) | near
-            lack = float(self._required[each.pair]) - each.distance
+            lack = float(self.bodies.required[each.pair]) - each.distance
             before = self._room.get(each.pair)
             self._room[each.pair] = _ROOM if before is None else before + lack + _ROOM
 
@@ -612,11 +648,19 @@ class _Search:
         rough: bool = False,
     ) -> ThrustKnots | None:
         self.stop.cancellation.raise_if_requested()
-        solver = self.planner.solver(self.kinds, self._kept)
+        boundary = self.boundary
+        if self.grapple is not None:
+            numbers = self.grapple.motion.numbers(guess.duration)
+            goals = np.concatenate([[len(guess.levels)], numbers, self._left])
+            boundary = replace(boundary, goals=goals)
         limits, args = self.planner.limits, (self.stop, duration, defects, planes)
-        return solver.solve(
-            self.boundary, limits, guess, weights, *args, center=center, rough=rough
+        return self._solver.solve(
+            boundary, limits, guess, weights, *args, center=center, rough=rough
         )
+
+    @property
+    def _solver(self) -> ThrustSolver:
+        return self.planner.solver(self.kind, self.bodies, self._kept)
 
     def _fastest(self, guess: ThrustKnots) -> ThrustKnots | None:
         return self._solve(guess, self._fast(guess), _FREE_TIME, rough=self._is_timed)
@@ -642,7 +686,7 @@ class _Search:
         """
         planner, knots = self.planner, guess
         if self._is_timed:
-            duration = _fixed(guess)
+            duration = self._span(guess)
             roundings = _ROUNDINGS[1:] if planner.propulsion.norms else (1.0,)
             if planes is not None:
                 roundings = roundings[:1]
@@ -660,11 +704,12 @@ class _Search:
             knots, motion = solved, planner.motion(solved)
             found = self._end_error(motion)
             if found < error:
-                best, error = motion, found
+                best, error, self.path = motion, found, knots
             if error < _EXACT_END:
                 break
-            defects = planner.solver(self.kinds, self._kept).defects(knots, defects)
+            defects = self._solver.defects(knots, defects)
             if self._is_timed and found < _NEAR_END:
+                duration = DurationBounds(knots.duration, knots.duration)
                 # The nearest controls that fly exactly: solutions of least propellant are flat.
                 last, center = _NEAREST, knots
         if best is None:
@@ -682,41 +727,55 @@ class _Search:
     def _end_error(self, motion: ThrustMotion) -> float:
         """Return the largest error of the poses at the end, m or rad."""
         last = motion.at(motion.duration)
-        frames = [last.base] if self.kinds[0] else []
-        if self.kinds[1] and last.end_effector is not None:
-            frames.append(last.end_effector)
         errors = [0.0]
-        for frame, goal in zip(frames, self.boundary.goals.reshape(-1, 7), strict=True):
-            errors.append(float(np.linalg.norm(frame.position - goal[:3])))
-            errors.append(float(np.linalg.norm(attitude_error(frame.quaternion, goal[3:]))))
+        if self.grapple is not None:
+            hand = last.end_effector
+            assert hand is not None
+            frame = self.grapple.motion.grapple([motion.duration])
+            goal = [frame.r[0], quaternion_from_matrix(frame.R[0])]
+            errors += [float(np.abs(hand.velocity - frame.v[0]).max())]
+            errors += [float(np.abs(hand.angular_velocity - frame.omega[0]).max())]
+            pairs = [(hand, np.concatenate(goal))]
+        else:
+            frames = [last.base] if self.kind.base else []
+            if self.kind.link and last.end_effector is not None:
+                frames.append(last.end_effector)
+            pairs = list(zip(frames, self.boundary.goals.reshape(-1, 7), strict=True))
+        for at, pose in pairs:
+            errors.append(float(np.linalg.norm(at.position - pose[:3])))
+            errors.append(float(np.linalg.norm(attitude_error(at.quaternion, pose[3:]))))
         return max(errors)
 
-    def _clear(self, path: ThrustKnots, end: _End, near: Sequence[Approach]) -> ThrustKnots:
+    def _clear(self, path: ThrustKnots, near: Sequence[Approach]) -> ThrustKnots:
         """Return a path that is clear of the pairs that came near, and of all others."""
-        planner, time = self.planner, path.duration
-        last = near[0]
-        for guess in itertools.chain(
-            planner.bows(self.boundary, end, self._required, near), [path]
-        ):
+        planner, bodies = self.planner, self.bodies
+        for guess in itertools.chain(planner.bows(self.boundary, path, bodies, near), [path]):
             self._room, self._places = {}, {}
-            at = guess.stretched(max(time / guess.duration, 1.0))
-            self._add(near, at)
-            for _ in range(_MAX_ROUNDS):
-                planes = self._planes(at)
-                weights = self._cheap(at, _ROUNDINGS[0]) if self._is_timed else self._fast(at)
-                duration = _fixed(at) if self._is_timed else _FREE_TIME
-                solved = self._solve(at, weights, duration, planes=planes)
-                if solved is None:
-                    break
-                at = solved
-                if planner.solver(self.kinds, self._kept).lack > _LARGEST_LACK:
-                    continue
-                approaches = planner.approaches(planner.motion(at), self._required)
-                if not approaches:
-                    return at
-                last = approaches[0]
-                self._add(approaches, at)
-        raise PlanningError(self._failure(planner.reason(last)))
+            self._add(near, guess)
+            cleared = self._cleared(guess)
+            if cleared is not None:
+                return cleared
+        raise PlanningError(self._failure(bodies.reason(self._nearest or near[0])))
+
+    def _cleared(self, at: ThrustKnots) -> ThrustKnots | None:
+        """Return a path near one that keeps pairs apart, and all others that come too near."""
+        bodies = self.bodies
+        for _ in range(_MAX_ROUNDS):
+            planes = self._planes(at)
+            weights = self._cheap(at, _ROUNDINGS[0]) if self._is_timed else self._fast(at)
+            duration = self._span(at) if self._is_timed else _FREE_TIME
+            solved = self._solve(at, weights, duration, planes=planes)
+            if solved is None:
+                return None
+            at = solved
+            if self._solver.lack > _LARGEST_LACK:
+                continue
+            approaches = bodies.approaches(self.planner.motion(at))
+            if not approaches:
+                return at
+            self._nearest = approaches[0]
+            self._add(approaches, at)
+        return None
 
     def _failure(self, why: str) -> str:
         return f"The goal of robot '{self.planner.robot.description.name}' is not reached: {why}."

@@ -132,12 +132,13 @@ class ThrustBoundary:
     state, shape, velocity
         ``[X; L; r; V]`` (13,), positions and velocities (n,) of the joints at the start.
     goals
-        (7 k,) poses of the base, of the end-effector, or of both at the end: position, quaternion.
+        Numbers of what is given at the end (:class:`.EndKind`).
     final_shapes
         (2, n) least and largest joint positions at the end; infinite for joints that are free.
     final_velocity, final_momentum
-        (n,) velocities of the joints and angular momentum (3,) at the end, where the centre of mass
-        rests: zero, but for wheels that go on spinning.
+        (n,) velocities of the joints, NaN for those that are free, and angular momentum (3,) at the
+        end, where the centre of mass rests: zero, but for wheels that go on spinning. None: the
+        momenta are free, too.
     """
 
     state: Array
@@ -146,7 +147,7 @@ class ThrustBoundary:
     goals: Array
     final_shapes: Array
     final_velocity: Array
-    final_momentum: Array
+    final_momentum: Array | None
 
 
 class Weights(NamedTuple):
@@ -259,9 +260,11 @@ class ThrustSolver:
         for place, value in zip((X, L, r, V), start, strict=True):
             least[place[0]] = most[place[0]] = value
         least[v[0]] = most[v[0]] = boundary.velocity
-        least[V[N]] = most[V[N]] = 0.0
-        least[L[N]] = most[L[N]] = boundary.final_momentum
-        least[v[N]] = most[v[N]] = boundary.final_velocity
+        if boundary.final_momentum is not None:
+            least[V[N]] = most[V[N]] = 0.0
+            least[L[N]] = most[L[N]] = boundary.final_momentum
+        given = np.isfinite(boundary.final_velocity)
+        least[v[N, given]] = most[v[N, given]] = boundary.final_velocity[given]
         if layout.has_lack:
             least[-1] = 0.0
         least[s[N]] = np.maximum(limits.lower, boundary.final_shapes[0])

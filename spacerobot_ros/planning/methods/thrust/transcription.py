@@ -19,18 +19,17 @@ and not their discretisation (deferred correction).
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache
 from itertools import pairwise
+from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
 
 from spacerobot_ros.collision.planes import PLANE_SIZE
 from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.model.compilation import cached_function, compiled, source_hash
+from spacerobot_ros.model.compilation import cached_function, source_hash
 from spacerobot_ros.model.dynamics import solve_positive_definite
 from spacerobot_ros.model.momentum_derivatives import momentum_derivatives
 from spacerobot_ros.model.symbolic_rotations import (
@@ -40,6 +39,7 @@ from spacerobot_ros.model.symbolic_rotations import (
     quaternion_rate,
     relative_vector,
 )
+from spacerobot_ros.model.target_motion import TARGET_SIZE, TargetExpression
 from spacerobot_ros.planning.methods.optimal import transcription as shooting
 from spacerobot_ros.planning.methods.optimal.transcription import (
     GAUSS,
@@ -49,6 +49,7 @@ from spacerobot_ros.planning.methods.optimal.transcription import (
     PlacedBlock,
     Program,
     assembled,
+    hash_of,
     momentum_in_base,
     rotation_with_derivatives,
     state_within_interval,
@@ -112,63 +113,95 @@ class ThrustStages:
     flown: ca.Function
 
     @classmethod
-    def of(
-        cls, robot: SpaceRobot, propulsion: Propulsion, base: bool = True, link: str = ""
-    ) -> ThrustStages:
+    def of(cls, robot: SpaceRobot, propulsion: Propulsion, kind: EndKind) -> ThrustStages:
         """Derive the functions of a robot's problem, or read them from the cache.
 
         The wrenches are parameters: thrusters that break have the same functions.
-
-        Parameters
-        ----------
-        robot, propulsion
-            The model, and what pushes its base.
-        base, link
-            Whether the pose of the base is given at the end, and the link whose pose is; empty:
-            none. Their poses (7,) are the parameters of the end.
         """
         n = robot.n
         h, s, v = ca.SX.sym("h"), ca.SX.sym("s", n), ca.SX.sym("v", n)
         start = ca.SX.sym("start", n)
         begins = ConstraintBlock.of("beginning", ca.vertcat(h, s, v), start, s - h * v / 2 - start)
-        ends = _end_block(robot, base, link)
-        key = hashlib.sha256(
-            "\n".join(
-                [
-                    source_hash(
-                        *(__name__, shooting.__name__, momentum_derivatives.__module__),
-                        *(solve_positive_definite.__module__, quaternion_multiply.__module__),
-                    ),
-                    robot.equations_key,
-                    f"levels {propulsion.size}",
-                ]
-            ).encode()
-        ).hexdigest()
-        derived = cache(lambda: _interval_block(robot, propulsion.size))
-        interval = ConstraintBlock(
-            cached_function("thrust", key, lambda: derived().values),
-            compiled(cached_function("thrust_jac", key, lambda: derived().jacobian)),
-            compiled(cached_function("thrust_hess", key, lambda: derived().hessian)),
+        facts = [
+            source_hash(
+                *(__name__, shooting.__name__, momentum_derivatives.__module__),
+                *(solve_positive_definite.__module__, quaternion_multiply.__module__),
+                TargetExpression.__module__,
+            ),
+            robot.equations_key,
+            f"levels {propulsion.size}",
+        ]
+        return cls(
+            n,
+            propulsion,
+            begins,
+            ConstraintBlock.cached(
+                "thrust",
+                facts,
+                lambda: _interval_block(robot, propulsion.size),
+                repeated=True,
+            ),
+            ConstraintBlock.cached(
+                "thrust_end", [*facts, str(kind)], lambda: _end_block(robot, kind)
+            ),
+            cached_function("flown", hash_of(facts), lambda: flown_interval(robot)),
         )
-        flown = cached_function("flown", key, lambda: flown_interval(robot))
-        return cls(n, propulsion, begins, interval, ends, flown)
 
 
-def _end_block(robot: SpaceRobot, base: bool, link: str) -> ConstraintBlock:
+class EndKind(NamedTuple):
+    """What is given at the end: the pose of the base, that of a link (empty: none), or that the
+    link has the pose and the velocities of a target's grapple frame; then the angular momentum of
+    robot and target together may be given, too.
+    """
+
+    base: bool
+    link: str
+    target: bool = False
+    momentum: bool = False
+
+    @property
+    def size(self) -> int:
+        """Number of parameters: poses (7 each), or the intervals, the numbers of the target
+        (:meth:`.TorqueFreeMotion.numbers`), and the angular momentum (3).
+        """
+        return 4 + TARGET_SIZE if self.target else 7 * (self.base + bool(self.link))
+
+
+def _end_block(robot: SpaceRobot, kind: EndKind) -> ConstraintBlock:
+    """Return the rows of the last knot, of ``[h; X; s; v; L; r; V]``."""
     n = robot.n
-    X, s, r = ca.SX.sym("X", 4), ca.SX.sym("s", n), ca.SX.sym("r", 3)
-    goals = ca.SX.sym("goals", 7 * (base + bool(link)))
-    R, center = matrix_from_quaternion(X), robot.function("center_of_mass", compile=False)(s)
+    z, goals = ca.SX.sym("z", 1 + 4 + 2 * n + 9), ca.SX.sym("goals", kind.size)
+    h, X, s, v, L, r, V = ca.vertsplit(z, np.cumsum([0, 1, 4, n, n, 3, 3, 3]).tolist())
+    R, center_of_mass = matrix_from_quaternion(X), robot.function("center_of_mass", compile=False)
     reached = [ca.SX(0, 1)]
-    if base:
-        reached += [r - R @ center - goals[:3], relative_vector(goals[3:7], X)]
-    if link:
+    if kind.target:
+        q = s - h * v / 2
+        goal = TargetExpression.at(goals[1:-3], goals[0] * h)
+        R_all, r_all = robot.function("link_poses", compile=False)(q)
+        i = robot.link_names.index(kind.link)
+        J = robot.function(f"jacobian:{kind.link}", compile=False)(q)
+        e = r_all[:, i] - center_of_mass(q)
+        omega = R.T @ goal.omega - J[3:6, 6:] @ v
+        D, D_q = robot.function("locked_inertia", compile=False)(q)
+        reached += [
+            r + R @ e - goal.r,
+            half_angle_vector(R @ R_all[:, 3 * i : 3 * i + 3] @ goal.R.T),
+            V + R @ (J[:3, 3:6] @ omega + J[:3, 6:] @ v) - goal.v,
+            L - R @ (D @ omega + D_q @ v),
+        ]
+        if kind.momentum:
+            reduced = robot.total_mass * goal.mass / (robot.total_mass + goal.mass)
+            orbiting = reduced * ca.cross(goal.center - r, goal.center_velocity - V)
+            reached.append(L + goal.L + orbiting - goals[-3:])
+    elif kind.base:
+        reached += [r - R @ center_of_mass(s) - goals[:3], relative_vector(goals[3:7], X)]
+    if kind.link and not kind.target:
         R_all, r_all = robot.function("link_poses", compile=False)(s)
-        i, goal = robot.link_names.index(link), goals[-7:]
+        i, pose = robot.link_names.index(kind.link), goals[-7:]
         R_E = R @ R_all[:, 3 * i : 3 * i + 3]
-        turned = R_E @ matrix_from_quaternion(goal[3:]).T
-        reached += [r + R @ (r_all[:, i] - center) - goal[:3], half_angle_vector(turned)]
-    return ConstraintBlock.of("end", ca.vertcat(X, s, r), goals, ca.vertcat(*reached))
+        turned = R_E @ matrix_from_quaternion(pose[3:]).T
+        reached += [r + R @ (r_all[:, i] - center_of_mass(s)) - pose[:3], half_angle_vector(turned)]
+    return ConstraintBlock.of("thrust_end", z, goals, ca.vertcat(*reached))
 
 
 def _interval_block(robot: SpaceRobot, levels: int) -> ConstraintBlock:
@@ -323,8 +356,8 @@ def thrust_program(
 ) -> tuple[ThrustLayout, Program]:
     """Assemble the program from the stages of a problem.
 
-    Its parameters are the start of the shape (n,) and the goals (7 each), position and quaternion;
-    the wrenches (6 m,); the defects (12 N,); typical accelerations (n,); weights of the duration,
+    Its parameters are the start of the shape (n,), those of the end (:attr:`EndKind.size`), the
+    wrenches (6 m,); the defects (12 N,); typical accelerations (n,); weights of the duration,
     of the propellant, of the squares of accelerations and levels, of the lack, and the level at
     which the cost of a norm is rounded off (6,); centres of the squares (n + m, N); and the planes
     (8,) of every pair at its ``places``, of the ``instants`` of all intervals.
@@ -368,7 +401,7 @@ def thrust_program(
         ),
         PlacedBlock(
             stages.end,
-            np.hstack([X[-1:], s[-1:], r[-1:]]),
+            np.hstack([zero[:1], knot[-1:]]),
             begins + N * dynamics + np.arange(ends_in)[np.newaxis],
             p["goals"],
         ),

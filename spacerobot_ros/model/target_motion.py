@@ -12,12 +12,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
+from typing import NamedTuple
 
+import casadi as ca
 import numpy as np
 import numpy.typing as npt
 
-from spacerobot_ros.control.state import PoseReference
 from spacerobot_ros.model.description import Array
+from spacerobot_ros.model.dynamics import solve_positive_definite
 from spacerobot_ros.model.grasp import BodyMotion, TargetBody
 from spacerobot_ros.model.rotations import (
     cross,
@@ -28,6 +30,7 @@ from spacerobot_ros.model.rotations import (
     quaternions_from_rotvecs,
     rotvec_from_quaternion,
 )
+from spacerobot_ros.model.symbolic_rotations import matrix_from_quaternion, quaternion_rate
 
 _STEP_ANGLE = 0.05  # rad, of the target in one step
 _LONGEST_STEP = 1.0  # s, of Runge-Kutta
@@ -54,27 +57,6 @@ class FrameMotion:
     omega: Array
     a: Array
     alpha: Array
-
-    @classmethod
-    def of_reference(cls, pose: PoseReference) -> FrameMotion:
-        """Return a reference as the motion at one time."""
-        numbers = (pose.velocity, pose.angular_velocity, pose.acceleration)
-        return cls(
-            matrices_from_quaternions(pose.quaternion[np.newaxis]),
-            pose.position[np.newaxis],
-            *(each[np.newaxis] for each in (*numbers, pose.angular_acceleration)),
-        )
-
-    def reference(self, k: int = 0) -> PoseReference:
-        """Return the motion at the k-th time as a reference."""
-        return PoseReference(
-            self.r[k],
-            quaternion_from_matrix(self.R[k]),
-            self.v[k],
-            self.omega[k],
-            self.a[k],
-            self.alpha[k],
-        )
 
     def between_samples(self, first: int, last: int, every: int = 1) -> FrameMotion:
         """Return the motion at times from the first up to the last, which is not included."""
@@ -125,6 +107,12 @@ class RelativeMotionOverTime:
     phi: Array
     phidot: Array
     phiddot: Array
+
+    @classmethod
+    def stacked(cls, motions: Sequence[RelativeMotionOverTime]) -> RelativeMotionOverTime:
+        """Return motions one after the other."""
+        names = [each.name for each in fields(cls)]
+        return cls(*(np.concatenate([getattr(each, name) for each in motions]) for name in names))
 
     @property
     def rotation(self) -> tuple[Array, Array]:
@@ -279,6 +267,52 @@ class TorqueFreeMotion:
         self._step = min(_LONGEST_STEP, _STEP_ANGLE / fastest if fastest > 0 else _LONGEST_STEP)
         self._nodes = [quaternion_from_matrix(R)]
 
+    def numbers(self, time: float) -> Array:
+        """Return all numbers of the motion from a time on, as :class:`TargetExpression` takes
+        them.
+        """
+        inertia, grapple = self._body.inertia, self._body.grapple
+        at = self._quaternions(np.array([time]))[0]
+        r = self._r + time * self._v
+        about = inertia.about_com[np.triu_indices(3)]
+        arm, turn = grapple.r - inertia.com, quaternion_from_matrix(grapple.R)
+        return np.concatenate([[time], at, self._L, r, self._v, [inertia.mass], about, arm, turn])
+
+    @property
+    def velocity(self) -> Array:
+        """Velocity (3,) of the centre of mass in W, m/s."""
+        return self._v
+
+    @property
+    def arm_length(self) -> float:
+        """Distance of the grapple frame from the centre of mass, m."""
+        return float(np.linalg.norm(self._body.grapple.r - self._body.inertia.com))
+
+    def center_of_mass(self, time: float) -> Array:
+        """Return the centre of mass (3,) in W, m."""
+        return np.asarray(self._r + time * self._v)
+
+    @property
+    def grapple_in_target(self) -> Array:
+        """Pose (7,) of the grapple frame in the frame of the root link."""
+        grapple = self._body.grapple
+        return np.concatenate([grapple.r, quaternion_from_matrix(grapple.R)])
+
+    def body_poses(self, times: npt.ArrayLike) -> tuple[Array, Array]:
+        """Return quaternions (K, 4) and positions (K, 3), m, of the root link's frame in W."""
+        t = np.asarray(times, dtype=float)
+        X = self._quaternions(t)
+        arm = matrices_from_quaternions(X) @ self._body.inertia.com
+        return X, self._r + t[:, np.newaxis] * self._v - arm
+
+    def later(self, elapsed: float) -> TorqueFreeMotion:
+        """Return the same motion from a later time on."""
+        X, r = self.body_poses([elapsed])
+        R = matrices_from_quaternions(X)
+        omega = R[0] @ self._rates(R)[0]
+        v = self._v - cross(omega, R[0] @ self._body.inertia.com)
+        return TorqueFreeMotion(self._body, BodyMotion(R[0], r[0], v, omega))
+
     def grapple(self, times: npt.ArrayLike) -> FrameMotion:
         """Return the motion of the grapple frame at times (K,), s since the measured state."""
         t = np.asarray(times, dtype=float)
@@ -325,6 +359,66 @@ class TorqueFreeMotion:
         unit = q / np.linalg.norm(q, axis=1, keepdims=True)
         omega_T = self._rates(matrices_from_quaternions(unit))
         return quaternion_multiply(q, np.hstack([omega_T / 2, np.zeros((len(q), 1))]))
+
+
+TARGET_SIZE = 28
+"""Numbers of a motion (:meth:`TorqueFreeMotion.numbers`)."""
+
+_EXPRESSION_STEPS = 4
+"""Steps of Runge-Kutta in an expression."""
+
+
+class TargetExpression(NamedTuple):
+    """A target at a time, in W: its grapple frame's attitude (3, 3), position, velocity and
+    angular velocity (3,); its mass; its centre of mass, that one's velocity, and the angular
+    momentum about it (3,).
+    """
+
+    R: ca.SX
+    r: ca.SX
+    v: ca.SX
+    omega: ca.SX
+    mass: ca.SX
+    center: ca.SX
+    center_velocity: ca.SX
+    L: ca.SX
+
+    @classmethod
+    def at(cls, numbers: ca.SX, time: ca.SX) -> TargetExpression:
+        """Return the target at a time near that of its numbers (:meth:`TorqueFreeMotion.numbers`),
+        by Euler's equations.
+        """
+        began, X, L, r, v, mass, about, arm, turn = ca.vertsplit(
+            numbers, np.cumsum([0, 1, 4, 3, 3, 3, 1, 6, 3, 4]).tolist()
+        )
+        J = ca.SX(3, 3)
+        for k, (i, j) in enumerate(zip(*np.triu_indices(3), strict=True)):
+            J[i, j] = J[j, i] = about[k]
+
+        def rate(X: ca.SX) -> ca.SX:
+            R = matrix_from_quaternion(X / ca.norm_2(X))
+            return quaternion_rate(X, solve_positive_definite(J, R.T @ L))
+
+        elapsed = time - began
+        h = elapsed / _EXPRESSION_STEPS
+        for _ in range(_EXPRESSION_STEPS):
+            first = rate(X)
+            second = rate(X + h / 2 * first)
+            third = rate(X + h / 2 * second)
+            X = X + h / 6 * (first + 2 * second + 2 * third + rate(X + h * third))
+        R = matrix_from_quaternion(X / ca.norm_2(X))
+        omega, center = R @ solve_positive_definite(J, R.T @ L), r + elapsed * v
+        to_grapple = R @ arm
+        return cls(
+            R @ matrix_from_quaternion(turn),
+            center + to_grapple,
+            v + ca.cross(omega, to_grapple),
+            omega,
+            mass,
+            center,
+            v,
+            L,
+        )
 
 
 def _rotate_vectors(R: Array, vectors: Array) -> Array:

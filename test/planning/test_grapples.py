@@ -1,0 +1,161 @@
+"""Meetings with a target that tumbles: its motion by scipy, momenta by Pinocchio, coal."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from scipy.spatial.transform import Rotation
+from support.sentences import assert_one_sentence
+from support.thrust_flights import distance_from_target, tumbled
+
+from spacerobot_ros import fly
+from spacerobot_ros.errors import PlanningError
+from spacerobot_ros.model import SpaceRobot, load_robot
+from spacerobot_ros.model.grasp import BodyMotion, TargetBody
+from spacerobot_ros.model.target_motion import TorqueFreeMotion
+from spacerobot_ros.model.thrusters import thrusters_of_urdf
+from spacerobot_ros.model.urdf import parse_robot
+from spacerobot_ros.planning.methods.thrust.goals import Grapple, ThrustGoal, ThrustStart
+from spacerobot_ros.planning.methods.thrust.propulsion import Propulsion
+from spacerobot_ros.planning.methods.thrust.search import ThrustOptions, ThrustPlanner
+from spacerobot_ros.resources import robot_file, share_directory
+
+INERTIA = '<inertia ixx="{}" iyy="{}" izz="{}" ixy="0" ixz="0" iyz="0"/></inertial>'
+BOOMED = f"""<robot name="boomed"><link name="base_link"><inertial><mass value="16"/>
+{INERTIA.format(0.3, 0.35, 0.4)}<collision><geometry><box size="0.4 0.3 0.2"/></geometry>
+</collision></link><link name="boom"><inertial><origin xyz="0.2 0 0"/><mass value="1"/>
+{INERTIA.format(0.001, 0.02, 0.02)}<collision><origin xyz="0.2 0 0"/><geometry>
+<box size="0.4 0.05 0.05"/></geometry></collision></link><joint name="hinge" type="revolute">
+<parent link="base_link"/><child link="boom"/><origin xyz="0.25 0 0"/><axis xyz="0 0 1"/>
+<limit lower="-1" upper="1" velocity="0.2" effort="5"/></joint><link name="end_effector"/>
+<joint name="tip" type="fixed"><parent link="boom"/><child link="end_effector"/>
+<origin xyz="0.4 0 0"/></joint></robot>"""
+SLAB = f"""<robot name="slab"><link name="slab"><inertial><origin xyz="0.02 0.01 -0.03"/>
+<mass value="30"/>{INERTIA.format(2.0, 1.4, 1.1)}<collision><geometry><box size="0.6 1.0 0.8"/>
+</geometry></collision></link><link name="grapple"/><joint name="mount" type="fixed">
+<parent link="slab"/><child link="grapple"/><origin xyz="-0.32 0.1 0"/></joint></robot>"""
+HERE = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
+
+
+def boomed(**options: float) -> ThrustPlanner:
+    robot = SpaceRobot.from_urdf(BOOMED)
+    propulsion = Propulsion.within(0.8, 0.1)
+    return ThrustPlanner(robot, propulsion, ThrustOptions(**options), "end_effector")
+
+
+def slab(place: tuple[float, ...], v: tuple[float, ...] = (0.0, 0.0, 0.0)) -> BodyMotion:
+    """Return the slab, whose fixture is on the far side at first, as it turns about two axes."""
+    R = Rotation.from_rotvec([0.0, 0.2, 2.6]).as_matrix()
+    return BodyMotion(R, np.array(place), np.array(v), R @ np.array([0.03, 0.0, 0.04]))
+
+
+def meeting(free: BodyMotion, clearance: float = 0.02) -> Grapple:
+    target = parse_robot(SLAB)
+    return Grapple(TorqueFreeMotion(TargetBody.of(target, "grapple"), free), target, clearance)
+
+
+def test_a_fixture_is_met_with_its_pose_and_velocities_round_the_target() -> None:
+    planner, free = boomed(), slab((2.5, 0.2, -0.1), (0.004, -0.003, 0.0))
+    start, target = ThrustStart.at_rest(HERE, np.zeros(1)), parse_robot(SLAB)
+    motion = planner.plan(start, ThrustGoal(grapple=meeting(free)))
+    T, dt = motion.duration, 1e-3
+    X, r = tumbled(target, free, np.array([0.0, T - dt, T, T + dt]))
+    R, hand = Rotation.from_quat(X), motion.at(T).end_effector
+    assert hand is not None
+    fixture = r + R.apply([-0.32, 0.1, 0.0])
+    assert hand.position == pytest.approx(fixture[2], abs=1e-4)
+    assert (R[2].inv() * Rotation.from_quat(hand.quaternion)).magnitude() < 1e-4
+    assert hand.velocity == pytest.approx((fixture[3] - fixture[1]) / (2 * dt), abs=1e-4)
+    turned = (R[3] * R[1].inv()).as_rotvec() / (2 * dt)
+    assert hand.angular_velocity == pytest.approx(turned, abs=1e-4)
+    robot = planner.robot.description
+    assert distance_from_target(robot, target, motion, free) > 0.0199
+    careless = planner.plan(start, ThrustGoal(grapple=meeting(free, 0.0)))
+    assert distance_from_target(robot, target, careless, free) < 0
+
+
+@cache
+def servicer() -> ThrustPlanner:
+    robot = SpaceRobot.from_file(robot_file("servicer"))
+    propulsion = Propulsion.of_table(thrusters_of_urdf(robot.description), 0.2)
+    return ThrustPlanner(robot, propulsion, ThrustOptions(), "end_effector")
+
+
+def test_a_grasp_leaves_no_angular_momentum_if_that_is_asked_for() -> None:
+    planner = servicer()
+    target = load_robot(share_directory() / "config" / "targets" / "satellite.urdf")
+    body = TargetBody.of(target, "grapple")
+    R = Rotation.from_quat([-0.04, -0.62, 0.59, 0.51]).as_matrix()
+    omega = R @ np.deg2rad([0.0, 2.0, -2.0])
+    free = BodyMotion(R, np.array([3.9, 0.4, 0.6]), np.array([-0.001, -0.002, 0.001]), omega)
+    grapple = Grapple(TorqueFreeMotion(body, free))
+    start = ThrustStart.at_rest(HERE, np.array([0.0, -1.2, 2.0, 0.0, 0.8, 0.0]))
+    totals, durations = [], []
+    for detumbles in (False, True):
+        asked = ThrustGoal(grapple=replace(grapple, detumbles=detumbles))
+        motion = planner.plan(start, asked)
+        model = pin.buildModelFromXML(planner.robot.description.urdf, pin.JointModelFreeFlyer())
+        data, last = model.createData(), motion.at(motion.duration)
+        q, v = pin.neutral(model), np.zeros(model.nv)
+        base = Rotation.from_quat(last.base.quaternion)
+        q[:7] = [*last.base.position, *last.base.quaternion]
+        v[:3] = base.inv().apply(last.base.velocity)
+        v[3:6] = base.inv().apply(last.base.angular_velocity)
+        for name, position, rate in zip(planner.robot.joint_names, last.q, last.qdot, strict=True):
+            joint = model.joints[model.getJointId(name)]
+            turns = [position] if joint.nq == 1 else [np.cos(position), np.sin(position)]
+            q[joint.idx_q : joint.idx_q + joint.nq], v[joint.idx_v] = turns, rate
+        h = pin.computeCentroidalMomentum(model, data, q, v)
+        X, r = tumbled(target, free, np.array([0.0, motion.duration]))
+        inertia, m = body.inertia, data.mass[0]
+        spin = R @ inertia.about_com @ R.T @ omega
+        of_target = free.v + np.cross(omega, R @ inertia.com)
+        apart = r[1] + Rotation.from_quat(X[1]).apply(inertia.com) - data.com[0]
+        reduced = m * inertia.mass / (m + inertia.mass)
+        orbit = reduced * np.cross(apart, of_target - h.linear / m)
+        totals.append(np.linalg.norm(h.angular + spin + orbit) / np.linalg.norm(spin))
+        durations.append(motion.duration)
+        planned = grapple.joined_momentum(planner.robot.total_mass, motion)
+        assert planned == pytest.approx(h.angular + spin + orbit, abs=1e-3)
+    assert totals[0] > 1
+    assert totals[1] < 0.01
+    assert durations[1] < 1.2 * durations[0]
+
+
+def test_meetings_that_cannot_be_are_refused_in_a_sentence() -> None:
+    start = ThrustStart.at_rest(HERE, np.zeros(1))
+
+    def refusal(free: BodyMotion, **options: float) -> str:
+        with pytest.raises(PlanningError) as refused:
+            boomed(**options).plan(start, ThrustGoal(grapple=meeting(free)))
+        return str(refused.value)
+
+    # From rest to 6 m/s takes 17 kg 128 s by 0.8 N.
+    leaving = refusal(slab((2.5, 0.0, 0.0), (6.0, 0.0, 0.0)))
+    assert_one_sentence(leaving, "leaves at 6 m/s", "0.8 N", "target.horizon", "120 s")
+    touching = refusal(slab((0.4, 0.0, 0.0)))
+    assert_one_sentence(touching, "touches 'slab' of the target at the start")
+    short = refusal(slab((2.5, 0.2, -0.1)), duration=3.0)
+    assert_one_sentence(short, "s at least", "plan.duration is 3 s")
+
+
+@pytest.mark.slow
+def test_the_plant_has_what_a_planned_grasp_leaves() -> None:
+    flight = fly(
+        "servicing",
+        parameters={
+            "coordinated_control.profile": "planned",
+            "coordinated_control.plan.thrusters": "urdf",
+            "coordinated_control.target.detumble": "before",
+            "coordinated_control.time_limit": 0.1,
+        },
+    )
+    (began,) = (each for each in flight.events if each.kind.value == "approach_started")
+    assert float(began.about["planned_momentum_Nms"]) < 0.01
+    assert flight.capture["captured"]
+    # The satellite alone has 2.7 N m s.
+    assert np.linalg.norm(flight.capture["angular_momentum_Nms"]) < 1.0
