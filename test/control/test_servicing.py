@@ -267,6 +267,42 @@ def test_a_target_that_strays_is_approached_anew_and_one_that_leaves_is_given_up
     assert_one_sentence(loop.status.message, "given up: the target is out of reach")
 
 
+def test_base_and_arm_are_planned_to_a_target_and_anew_if_it_strays() -> None:
+    # The robot of the test stays where it is.
+    any_error = {"error_margin.position": 0.0, "error_margin.attitude": 0.0}
+    planned = {"profile": "planned", "max_force": 4.0, "plan.clearance": 0.0}
+    loop = Meeting(**planned, **any_error, **{"target.detumble": "none"})
+    loop.executive.plan_at_once()
+    loop.aim(base=goal_at(AIM, "5"))
+    loop.answer(3)
+    assert loop.kinds() == ["goal_accepted", "approach_started"]
+    assert_one_sentence(loop.events[-1].message, "Base and end-effector set out at", "left after")
+    about = loop.events[-1].about
+    assert about["detumble"] == "none"
+    # The block of 10 kg does not turn: what is left is that of the robot beside it.
+    assert float(about["planned_momentum_Nms"]) > 0.1
+    controller, loop.drift = loop.executive.controller, np.array([0.0, 0.01, 0.0])
+    loop.answer()
+    loop.block[0] += 0.019
+    loop.answer()
+    assert loop.kinds().count("approach_started") == 1
+    loop.block[0] += 0.002
+    loop.answer()
+    assert loop.kinds().count("approach_started") == 2
+    loop.skip_to(loop.contact + 0.05)
+    hand = controller.followed_end_effector
+    assert hand is not None
+    assert hand.position == pytest.approx(loop.block + [-0.3, 0.0, 0.0], abs=1e-4)
+    assert hand.velocity == pytest.approx(loop.drift, abs=1e-4)
+    # Base and shape go on with the target.
+    base = controller.reference_at(loop.tick * PERIOD, controller.law.state).base
+    assert base is not None
+    assert base.velocity == pytest.approx(loop.drift, abs=1e-4)
+    loop.capture()
+    loop.answer()
+    assert loop.status.task == "", "nothing is detumbled"
+
+
 def test_detumbling_that_lasts_too_long_is_given_up() -> None:
     loop = Meeting(tasks="detumble", time_limit=0.05)
     loop.rates = np.array([0.3, 0.2])
