@@ -323,8 +323,8 @@ _TOPIC_TABLE = (
         "obstacles",
         _STRING_TYPE,
         _PUBLISHED_BY_USER,
-        "URDF of all fixed obstacles, which replaces the earlier ones, for the planner, the plant "
-        "and viewers; empty: none",
+        "URDF of all fixed obstacles, which replaces the earlier ones, for the planner, a "
+        "controller that plans, the plant and viewers; empty: none",
         latched=True,
     ),
     Topic(

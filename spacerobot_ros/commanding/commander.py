@@ -32,12 +32,13 @@ from spacerobot_ros.commanding.plant_state import (
     StateSynchroniser,
 )
 from spacerobot_ros.control.config import ControllerConfig
-from spacerobot_ros.errors import CommandError, PlanningError, RobotDescriptionError
+from spacerobot_ros.errors import CommandError, PlanningError, RobotDescriptionError, printable
 from spacerobot_ros.events import Event
 from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.model.description import Array
+from spacerobot_ros.model.description import Array, RobotDescription
 from spacerobot_ros.model.grasp import Payload
 from spacerobot_ros.model.shared_parameters import DEFAULT_POSITION_TOLERANCE
+from spacerobot_ros.model.world import links_with_shapes, obstacles_from_topic
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.core.goal import Tolerance
 from spacerobot_ros.planning.execution.config import PlannerConfig
@@ -278,6 +279,10 @@ class Commander(ABC):
         """The robot as it is described, without a body that it holds."""
         self._payload = ""
         self._held: Payload | None = None
+        self._obstacles: str | None = None
+        """The text on the topic obstacles; None: the robot has its own."""
+        self._world: RobotDescription | None = None
+        """The obstacles of this text."""
         """The body that the robot holds, as far as its text is one."""
         self._goal_file = GoalFile(config.resume_file, goal_keys)
         self._goal_ids = GoalIds()
@@ -757,6 +762,25 @@ class Commander(ABC):
                 self.robot = self._with_payload(self._described)
                 self._change_masses(self.robot)
 
+    def receive_obstacles(self, text: str) -> None:
+        """Plan around the obstacles of a URDF text instead of those so far; empty: around none.
+
+        A text that is refused is logged, and the obstacles so far stay.
+        """
+        if text == self._obstacles:
+            return
+        try:
+            self._world = obstacles_from_topic(text)
+        except RobotDescriptionError as refusal:
+            kept = "The obstacles so far stay."
+            self._log_fault("obstacles", printable(f"obstacles: {refusal} {kept}"))
+            return
+        self._obstacles = text
+        links = [] if self._world is None else links_with_shapes(self._world)
+        listed = f": {', '.join(links)}" if links else ""
+        self.host.log("info", printable(f"Plans avoid {len(links)} obstacle(s){listed}."))
+        self._use_obstacles()
+
     def _with_payload(self, robot: SpaceRobot) -> SpaceRobot:
         self._held = None
         try:
@@ -784,6 +808,10 @@ class Commander(ABC):
             self._abort_waiting(f"Aborted by the plant: {stopped.reason}")
 
     # -- differences --------------------------------------------------------------------------
+
+    @abstractmethod
+    def _use_obstacles(self) -> None:
+        """Have the executive plan around other obstacles."""
 
     @abstractmethod
     def _make_status(self, state: str, message: str, goal_id: str) -> Status:

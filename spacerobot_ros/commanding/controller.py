@@ -20,7 +20,7 @@ from spacerobot_ros.commanding.goal_follower import Status
 from spacerobot_ros.commanding.plant_state import Pairing, Stamped
 from spacerobot_ros.control import ControlState, NotFiniteError, PoseReference, Reference
 from spacerobot_ros.control.config import ControllerConfig
-from spacerobot_ros.control.controller import build_controller
+from spacerobot_ros.control.controller import CoordinatedController, build_controller
 from spacerobot_ros.control.executive import GOAL_KEYS, ControlExecutive
 from spacerobot_ros.control.reference import HeldVelocityReference
 from spacerobot_ros.control.servicing import Task
@@ -245,8 +245,7 @@ class ControllerCommander(Commander):
             executive.evaluate(now, executive.command(now, measured, q, rates))
 
     def _build_executive(self, robot: SpaceRobot, decoder: StateDecoder) -> None:
-        controller = build_controller(robot, self.config)
-        self.executive = ControlExecutive(controller, self.config)
+        self.executive = ControlExecutive(self._built_controller(robot), self.config)
         self.executive.servicing.hold(self._held)
         if self._target is not None:
             self.use_target(self._target)
@@ -255,8 +254,17 @@ class ControllerCommander(Commander):
 
     def _change_masses(self, robot: SpaceRobot) -> None:
         assert self.executive is not None
+        self.executive.use_controller(self._built_controller(robot), self._held)
+
+    def _built_controller(self, robot: SpaceRobot) -> CoordinatedController:
         controller = build_controller(robot, self.config)
-        self.executive.use_controller(controller, self._held)
+        if controller.planner is not None and self._obstacles is not None:
+            controller.planner.use_obstacles(self._world)
+        return controller
+
+    def _use_obstacles(self) -> None:
+        if self.executive is not None:
+            self.executive.use_obstacles(self._world)
 
     def _change_rate(self, robot: SpaceRobot) -> None:
         if self.executive is not None:

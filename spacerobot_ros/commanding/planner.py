@@ -15,20 +15,11 @@ from spacerobot_ros.commanding.commander import (
 )
 from spacerobot_ros.commanding.plant_state import Pairing
 from spacerobot_ros.commanding.trajectory_output import TrajectoryEnd, TrajectoryOutput
-from spacerobot_ros.errors import (
-    CommandError,
-    PlanningError,
-    RobotDescriptionError,
-    printable,
-)
+from spacerobot_ros.errors import CommandError, PlanningError
 from spacerobot_ros.events import Event, EventKind
 from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.model.description import Array, RobotDescription
-from spacerobot_ros.model.world import (
-    links_with_shapes,
-    obstacles_from_topic,
-    with_world,
-)
+from spacerobot_ros.model.description import Array
+from spacerobot_ros.model.world import with_world
 from spacerobot_ros.planning.core.method import GaitMethod
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.execution.executive import Executive, Transition
@@ -105,10 +96,6 @@ class PlannerCommander(Commander):
         self._last_goal: IdentifiedGoal | None = None
         self._status: PlannerStatus | None = None
         self._disturbances: tuple[str, ...] = ()
-        self._obstacles: str | None = None
-        """The text on the topic obstacles; None: the robot has its own."""
-        self._world: RobotDescription | None = None
-        """The obstacles of this text."""
         self.trajectories: TrajectoryOutput | None = None
         """Where schedules are sent to, for ``output: trajectory``."""
 
@@ -142,23 +129,7 @@ class PlannerCommander(Commander):
         if self.executive is not None:
             self.executive.schedule_ended(end.message, final=end.final)
 
-    def receive_obstacles(self, text: str) -> None:
-        """Plan around the obstacles of a URDF text instead of those so far; empty: around none.
-
-        A text that is refused is logged, and the obstacles so far stay.
-        """
-        if text == self._obstacles:
-            return
-        try:
-            self._world = obstacles_from_topic(text)
-        except RobotDescriptionError as refusal:
-            kept = "The obstacles so far stay."
-            self._log_fault("obstacles", printable(f"obstacles: {refusal} {kept}"))
-            return
-        self._obstacles = text
-        links = [] if self._world is None else links_with_shapes(self._world)
-        listed = f": {', '.join(links)}" if links else ""
-        self.host.log("info", printable(f"Plans avoid {len(links)} obstacle(s){listed}."))
+    def _use_obstacles(self) -> None:
         executive, robot = self.executive, self.robot
         if executive is not None and robot is not None:
             method = self._method if robot is self._described else None

@@ -25,6 +25,7 @@ from spacerobot_ros.control.limits import (
 )
 from spacerobot_ros.control.outputs import OutputDistance, OutputSelection
 from spacerobot_ros.control.planned_reference import (
+    GoalMotion,
     GrappleReference,
     PlanJob,
     PlannedReference,
@@ -125,7 +126,7 @@ class CoordinatedController:
         planner: ReferencePlanner | None = None,
     ) -> None:
         self.wheels = wheels
-        self._planner = planner
+        self.planner = planner
         self.law, selection = law, law.outputs.selection
         self._kinds, self._distances = selection.error_kinds, selection.distances
         self._limits, self.joint_rate_limits = limits, rates
@@ -179,20 +180,23 @@ class CoordinatedController:
         base carries it, so that the arm keeps its shape. The integral of the errors begins again.
         The reference has the profile that is not planned.
         """
-        if self.coming_to_rest:
-            self.profile, self.coming_to_rest = None, False
-        start, goal, carries = self._motion_to(time, state, base, end_effector, joints)
+        start, goal, _, carries = self.motion_to(
+            time, state, base=base, end_effector=end_effector, joints=joints
+        )
         self._begin_motion(time, state, start, goal, carries=carries)
 
-    def _motion_to(
+    def motion_to(
         self,
         time: float,
         state: ControlState,
-        base: PoseReference | None,
-        end_effector: PoseReference | None,
-        joints: Array | None,
-    ) -> tuple[Reference, Reference, bool]:
-        """Return the reference at a time, the goal, and whether the base carries the hand."""
+        *,
+        base: PoseReference | None = None,
+        end_effector: PoseReference | None = None,
+        joints: Array | None = None,
+    ) -> GoalMotion:
+        """Return the motion from the reference at a time to the goals of :meth:`set_goals`."""
+        if self.coming_to_rest:
+            self.profile, self.coming_to_rest = None, False
         start = self._present_reference(time, state)
         goal = start if self.profile is None else self.profile.goal
         carries = end_effector is None and (self.profile is None or self.profile.carries)
@@ -204,48 +208,7 @@ class CoordinatedController:
             goal = replace(goal, end_effector=end_effector)
         if joints is not None:
             goal = replace(goal, joints=JointReference.at_rest(joints))
-        return start, goal, carries
-
-    @property
-    def mass(self) -> float:
-        """Mass of the robot, kg."""
-        return self.law.robot.total_mass
-
-    @property
-    def plans(self) -> bool:
-        """Whether references of goals are planned."""
-        return self._planner is not None
-
-    def plan_goals(
-        self,
-        time: float,
-        state: ControlState,
-        *,
-        base: PoseReference | None = None,
-        end_effector: PoseReference | None = None,
-        joints: Array | None = None,
-        lead: float = 0.0,
-    ) -> PlanJob[PlannedReference]:
-        """Return the work on a reference towards new goals, which is not begun yet.
-
-        The arguments are those of :meth:`set_goals`. If the reference moves, the plan begins
-        ``lead`` s later, where the reference will be then.
-        """
-        planner = self._planner
-        assert planner is not None
-        if self.coming_to_rest:
-            self.profile, self.coming_to_rest = None, False
-        moving = self.profile is not None and not self.reference_at_rest(time)
-        begins = time + lead if moving else -math.inf
-        start, goal, carries = self._motion_to(
-            begins if moving else time, state, base, end_effector, joints
-        )
-        limits = self._motion
-
-        def work(cancellation: Cancellation) -> PlannedReference:
-            return planner.plan(start, goal, state, limits, cancellation, carries=carries)
-
-        return PlanJob(work, begins)
+        return GoalMotion(start, goal, self._motion, carries)
 
     def plan_grapple(
         self, time: float, state: ControlState, grapple: Grapple, lead: float
@@ -253,7 +216,7 @@ class CoordinatedController:
         """Return the work on a reference to a target, whose motion is given from ``time`` on. The
         plan begins ``lead`` s later, where reference and target will be then.
         """
-        planner = self._planner
+        planner = self.planner
         assert planner is not None
         if self.coming_to_rest:
             self.profile, self.coming_to_rest = None, False
@@ -511,6 +474,16 @@ class CoordinatedController:
     def time_since_measurement(self) -> float:
         """Time since the base was measured last, s."""
         return self._estimator.elapsed if self._estimator is not None else 0.0
+
+    def reference_moves(self, time: float) -> bool:
+        """Whether a reference has not come to rest yet at ``time`` (s)."""
+        return self.profile is not None and not self.reference_at_rest(time)
+
+    def time_until_blocked(self, time: float) -> float:
+        """Return how long the planned reference stays clear of obstacles from ``time`` on, s."""
+        if self.planner is None or not isinstance(self.profile, PlannedReference):
+            return math.inf
+        return self.planner.time_until_blocked(self.profile, time - self._began)
 
     def reference_at_rest(self, time: float) -> bool:
         """Whether the reference has reached its goal at ``time`` (s)."""

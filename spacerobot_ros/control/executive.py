@@ -5,26 +5,26 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from enum import IntEnum
 from types import MappingProxyType
-from typing import TypedDict
 
 import numpy as np
 
 from spacerobot_ros.control.config import ControllerConfig
 from spacerobot_ros.control.controller import CoordinatedController, Mode
 from spacerobot_ros.control.goal_monitor import Decision, GoalMonitor
+from spacerobot_ros.control.goal_planning import Aims, GoalPlanning, PlannedGoals
 from spacerobot_ros.control.limits import Saturated
 from spacerobot_ros.control.outputs import OutputDistance
-from spacerobot_ros.control.planned_reference import PLANNING_TIME, PlanJob, PlannedReference
+from spacerobot_ros.control.planned_reference import PLANNING_TIME
 from spacerobot_ros.control.servicing import Servicing, Task, TaskProgress, TaskState
 from spacerobot_ros.control.stall_monitor import StallMonitor
 from spacerobot_ros.control.state import Actuation, ControlState, PoseReference, Reference
 from spacerobot_ros.control.status import CommandReport, ControllerState, ControllerStatus
 from spacerobot_ros.errors import CommandError, ParameterError, PlanningError
 from spacerobot_ros.events import Event, EventKind
-from spacerobot_ros.model.description import Array
+from spacerobot_ros.model.description import Array, RobotDescription
 from spacerobot_ros.model.grasp import Payload
 from spacerobot_ros.planning.core.goal import (
     POSE,
@@ -69,30 +69,6 @@ class _Next(IntEnum):
 _MEASURED, _TRACKING, _NO_DECISION = Mode.MEASURED, ControllerState.TRACKING, Decision.NONE
 
 
-class _Aims(TypedDict):
-    """Poses and joint positions that goals ask for; None: they do not."""
-
-    base: PoseReference | None
-    end_effector: PoseReference | None
-    joints: Array | None
-
-
-@dataclass(frozen=True)
-class _Plan:
-    """A reference in the making for pending goals, ``lead`` s ahead if the robot moves."""
-
-    pending: dict[str, IdentifiedGoal]
-    aims: _Aims
-    asked: frozenset[Controlled]
-    job: PlanJob[PlannedReference]
-    lead: float
-
-    def is_for(self, pending: Mapping[str, IdentifiedGoal]) -> bool:
-        """Whether these goals wait for it."""
-        same = (goal is pending.get(part) for part, goal in self.pending.items())
-        return len(pending) == len(self.pending) and all(same)
-
-
 class ControlExecutive:
     """Gives a :class:`CoordinatedController` its goals, and reports their outcome.
 
@@ -135,19 +111,13 @@ class ControlExecutive:
         self.servicing = Servicing(config)
         """The tasks before goals, with the target; the owner tells it the body that is held."""
         self._longest_gap = _longest_gap(config)
-        self.plans_in_background = config.plan_in_background
-        """Whether references are planned in a thread."""
-        self._plan: _Plan | None = None
-        self.plan_time = 0.0
-        """Wall time for which references have been planned, s."""
+        self._planning = GoalPlanning(in_background=config.plan_in_background)
         self.reset()
 
     def reset(self) -> None:
         """Drop goals and measurements, without a status: the next state is the first."""
         self.controller.reset()
-        if self._plan is not None:
-            self._plan.job.close()
-            self._plan = None
+        self._planning.close()
         self._time: float | None = None
         """Time of the last state, s."""
         self._next = _Next.GO_ON
@@ -186,13 +156,16 @@ class ControlExecutive:
 
     def cancel_plan(self) -> None:
         """Cancel the reference in the making; any thread may call this."""
-        plan = self._plan
-        if plan is not None:
-            plan.job.cancel()
+        self._planning.cancel()
 
     def plan_at_once(self) -> None:
         """Make later plans while states wait for them: the plant is in lockstep."""
-        self.plans_in_background = False
+        self._planning.in_background = False
+
+    @property
+    def plan_time(self) -> float:
+        """Wall time for which references have been planned, s."""
+        return self._planning.time
 
     def configure(self, config: ControllerConfig) -> None:
         """Use other tolerances, times and gains from the next state on."""
@@ -237,7 +210,7 @@ class ControlExecutive:
     def progress(self, goal_id: str) -> tuple[str, float | None]:
         """Return the work that is done for a goal, and the predicted time until its end, s."""
         task, ends = self.servicing.task, self.controller.reference_ends
-        if self._plan is not None and goal_id in self.waiting_goals:
+        if self._planning.active and goal_id in self.waiting_goals:
             return "planning", None
         if task is not None:
             return task.value, None
@@ -387,6 +360,26 @@ class ControlExecutive:
         """Hold the pose of the next measured state, not an earlier one."""
         self._plan_next(_Next.HOLD)
 
+    def use_obstacles(self, world: RobotDescription | None) -> None:
+        """Plan around other obstacles from now on; None: around none.
+
+        A plan that is being made is made again. If the rest of the present motion comes too near,
+        the remaining one is planned anew: in motion if there is time, else from the pose in which
+        the robot is held.
+        """
+        planner = self.controller.planner
+        if planner is None:
+            return
+        planner.use_obstacles(world)
+        self._planning.drop()
+        if self._goal_state is not _TRACKING or self._time is None or self.servicing.task:
+            return
+        left = self.controller.time_until_blocked(self._time)
+        if left < 2 * PLANNING_TIME:
+            self._plan_next(_Next.BEGIN_ANEW)
+        elif left < math.inf:
+            self._pending = {**self._goals, **self._pending}
+
     def reference_ended(self, remaining: Reference) -> None:
         """Go on with the references that remain: to a goal again, else hold the measured pose."""
         self.controller.follow(remaining)
@@ -433,13 +426,8 @@ class ControlExecutive:
             self.servicing.end()
             self.controller.follow(Reference())
         self._pending.clear()
-        self._drop_plan()
+        self._planning.drop()
         self._abort_message = message
-
-    def _drop_plan(self) -> None:
-        if self._plan is not None:
-            self._plan.job.cancel()
-            self._plan = None
 
     def _report_abort(self) -> None:
         self._goal_state = self._reported_state = ControllerState.ABORTED
@@ -487,7 +475,7 @@ class ControlExecutive:
             reaction, self._next = self._next, _Next.GO_ON
             if reaction >= _Next.HOLD or self.plant_blocked:
                 self._hold_pose(time, measured, aborted=reaction is _Next.ABORT)
-            elif reaction is _Next.BEGIN_ANEW and self.controller.plans:
+            elif reaction is _Next.BEGIN_ANEW and self.controller.planner is not None:
                 self.controller.hold_here(time, measured)
                 self._pending = {**self._goals, **self._pending}
             elif reaction is _Next.BEGIN_ANEW:
@@ -642,7 +630,7 @@ class ControlExecutive:
         if servicing.task is None:
             return
         progress = servicing.step(
-            time, state, self.controller, in_background=self.plans_in_background
+            time, state, self.controller, in_background=self._planning.in_background
         )
         for event in servicing.events():
             self.outputs.append(replace(event, goal_id=self._goal_id))
@@ -711,13 +699,14 @@ class ControlExecutive:
 
     def _begin_goals(self, time: float, state: ControlState, *, carried: bool = False) -> None:
         """Start towards the pending goals, after tasks from the measured pose."""
-        if self.controller.plans:
+        planned = None
+        if self.controller.planner is not None:
             planned = self._planned(time, state, carried=carried)
             if planned is None:
                 return
-            poses, asked, profile, began = planned
+            poses, asked = planned.aims, planned.asked
         else:
-            (poses, asked), profile, began = self._aims(state), None, time
+            poses, asked = self._aims(state)
         pursued = self._goals if self._goal_state is ControllerState.TRACKING else {}
         again = self._goal_id == self._latest_id() and bool(pursued)
         self._goal_id = self._latest_id()
@@ -728,8 +717,8 @@ class ControlExecutive:
         if BASE_GOAL_KEY in self._pending or BASE_GOAL_KEY not in pursued:
             self._asked = asked
         self._pending.clear()
-        if profile is not None:
-            self.controller.begin_planned(began, profile)
+        if planned is not None:
+            self.controller.begin_planned(planned.begins, planned.profile)
         else:
             if carried:
                 # Tasks have left the earlier reference behind.
@@ -741,7 +730,7 @@ class ControlExecutive:
         self._begin_tracking(time)
         self.outputs.append(PursuedGoals(self._goals_to_save()))
 
-    def _aims(self, state: ControlState) -> tuple[_Aims, frozenset[Controlled]]:
+    def _aims(self, state: ControlState) -> tuple[Aims, frozenset[Controlled]]:
         """Return the poses and the shape of the pending goals, and the parts of the base's pose
         that they ask for.
         """
@@ -754,64 +743,32 @@ class ControlExecutive:
         shapes = [g.joint_positions for g in goals.values() if g.joint_positions is not None]
         if self.controller.wheels is not None:
             shapes = [shape[self.controller.wheels.wheels.other] for shape in shapes]
-        aims = _Aims(
+        aims = Aims(
             base=poses.get(BASE_GOAL_KEY),
             end_effector=poses.get(END_EFFECTOR),
             joints=shapes[0] if shapes else None,
         )
         return aims, asked
 
-    def _planned(
-        self, time: float, state: ControlState, *, carried: bool
-    ) -> tuple[_Aims, frozenset[Controlled], PlannedReference, float] | None:
-        """Return what the pending goals aim at, their planned reference, and when it begins.
+    def _planned(self, time: float, state: ControlState, *, carried: bool) -> PlannedGoals | None:
+        """Return the planned reference of the pending goals.
 
         None: it is in the making, or the goals have been refused.
         """
-        plan = self._plan
-        if plan is None or not plan.is_for(self._pending):
-            if plan is not None:
-                plan.job.cancel()
-            if carried:
-                self.controller.hold_here(time, state)
-            aims, asked = self._aims(state)
-            lead = PLANNING_TIME if plan is None else plan.lead
-            plan = self._begin_plan(time, state, aims, asked, lead)
-        if not plan.job.done:
-            return None
-        self.plan_time += plan.job.wall_time
+        if carried and not self._planning.active:
+            self.controller.hold_here(time, state)
+        pending, aims = self._pending, lambda: self._aims(state)
         try:
-            profile = plan.job.result()
+            return self._planning.planned(time, state, self.controller, pending, aims)
         except PlanningError as error:
-            goal_id, self._plan = self._latest_id(), None
-            self._pending.clear()
-            self.refuse(str(error), goal_id)
+            goal_id = self._latest_id()
+            if all(goal is self._goals.get(part) for part, goal in pending.items()):
+                self._give_up(f"Aborted: {error}")
+                self._hold_pose(time, state, aborted=True)
+            else:
+                self._pending.clear()
+                self.refuse(str(error), goal_id)
             return None
-        begins = plan.job.begins
-        if begins < time and begins > -math.inf and self.plans_in_background:
-            # The reference has gone on: a plan from where it will be in twice the time.
-            self._begin_plan(time, state, plan.aims, plan.asked, 2 * plan.lead)
-            return None
-        if begins > time and self.plans_in_background:
-            return None
-        self._plan = None
-        return plan.aims, plan.asked, profile, max(begins, time)
-
-    def _begin_plan(
-        self,
-        time: float,
-        state: ControlState,
-        aims: _Aims,
-        asked: frozenset[Controlled],
-        lead: float,
-    ) -> _Plan:
-        background = self.plans_in_background
-        lead_now = lead if background else 0.0
-        job = self.controller.plan_goals(time, state.copied(), **aims, lead=lead_now)
-        # Known before the work begins, so that it can be cancelled.
-        self._plan = plan = _Plan(dict(self._pending), aims, asked, job, lead)
-        job.start(in_background=background)
-        return plan
 
     def _take_tolerance(self, tolerance: Tolerance | None) -> None:
         self._goal_tolerance, self._goal_config = tolerance, self._config_with(tolerance)
@@ -885,7 +842,7 @@ class ControlExecutive:
                 away = self.controller.distance_from_reference()
                 if self._guided:
                     return f"Following references; {away} from them."
-                if self._plan is not None:
+                if self._planning.active:
                     return f"Planning a motion to the goal; holding, {away} from the reference."
                 return f"Waiting for a goal; holding, {away} from the reference."
             case ControllerState.TRACKING if self.servicing.task is not None:

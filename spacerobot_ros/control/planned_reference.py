@@ -1,12 +1,13 @@
-"""References that a plan under thrust gives, and the work of planning beside the control loop."""
+"""References that a plan under thrust gives."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from threading import Thread
 from time import perf_counter
-from typing import ClassVar, Generic, TypeVar
+from typing import ClassVar, Generic, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -21,7 +22,7 @@ from spacerobot_ros.control.state import (
     Reference,
 )
 from spacerobot_ros.errors import ParameterError, PlanningError
-from spacerobot_ros.model.description import Array
+from spacerobot_ros.model.description import Array, RobotDescription
 from spacerobot_ros.model.rotations import matrix_from_quaternion
 from spacerobot_ros.model.space_robot import SpaceRobot
 from spacerobot_ros.model.target_motion import RelativeMotionOverTime
@@ -146,6 +147,17 @@ def _pose(frame: FrameSample) -> PoseReference:
     return PoseReference(*frame)
 
 
+class GoalMotion(NamedTuple):
+    """From which reference to which one a motion leads, at rest, within limits; ``carries``: the
+    arm keeps its shape.
+    """
+
+    start: Reference
+    goal: Reference
+    limits: MotionLimits
+    carries: bool
+
+
 class ReferencePlanner:
     """Plans the references of one controller.
 
@@ -185,26 +197,39 @@ class ReferencePlanner:
                 "profile to quintic."
             )
         self._planner = ThrustPlanner(robot, propulsion, options, outputs.end_effector_link)
+        self._clearance = self._planner.clearance
+
+    def use_obstacles(self, world: RobotDescription | None) -> None:
+        """Plan around other obstacles from the next plan on; None: around none."""
+        self._clearance = self._planner.clearance_among(world)
+
+    def time_until_blocked(self, profile: PlannedReference, time: float) -> float:
+        """Return how long a reference stays clear of the obstacles, s, from a time after its start
+        on; infinite: to its end.
+        """
+        clearance, motion = self._clearance, profile.motion
+        if clearance is None or not clearance.has_obstacles or time >= motion.duration:
+            return math.inf
+        shapes, base = motion.path()
+        period = motion.duration / (len(shapes) - 1)
+        rest = slice(max(int(time / period), 0), None)
+        required = np.full(len(clearance.geometry.pairs), clearance.distance)
+        near = clearance.approaches(shapes[rest], required, base.rows(rest))
+        ticks = [each.tick for each in near if each.place_on_obstacle is not None]
+        return min(ticks, default=math.inf) * period
 
     def plan(
-        self,
-        start: Reference,
-        goal: Reference,
-        state: ControlState,
-        limits: MotionLimits,
-        cancellation: Cancellation,
-        *,
-        carries: bool,
+        self, motion: GoalMotion, state: ControlState, cancellation: Cancellation
     ) -> PlannedReference:
-        """Return the planned reference from one reference to another, at rest.
-
-        ``state`` has the joints where no reference does. With ``carries`` the arm keeps its shape.
+        """Return the planned reference of a motion; ``state`` has the joints where no reference
+        does.
 
         Raises
         ------
         PlanningError
             No motion is found.
         """
+        start, goal, limits, carries = motion
         assert goal.base is not None
         begin, q = self._begin(start, state)
         hand, shape = None, None
@@ -215,8 +240,8 @@ class ReferencePlanner:
         if shape is None and goal.end_effector is not None:
             hand = _numbers(goal.end_effector)
         end = ThrustGoal(_numbers(goal.base), hand, shape)
-        motion = self._planner.plan(begin, end, cancellation)
-        return PlannedReference(start, goal, limits, motion, carries=carries)
+        found = self._planner.plan(begin, end, cancellation)
+        return PlannedReference(start, goal, limits, found, carries=carries)
 
     def plan_grapple(
         self,
@@ -239,6 +264,7 @@ class ReferencePlanner:
 
     def _begin(self, start: Reference, state: ControlState) -> tuple[ThrustStart, Array]:
         """Return where a plan from a reference begins, and the shape (n,) there."""
+        self._planner.clearance = self._clearance
         base, joints = start.base, start.joints if self._outputs.joints else None
         assert base is not None
         R_BW = matrix_from_quaternion(base.quaternion).T
@@ -284,16 +310,21 @@ class PlanJob(Generic[_Planned]):
         self._work = work
         self._result: _Planned | None = None
         self._error: BaseException | None = None
+        self._after: PlanJob[_Planned] | None = None
         self._thread = Thread(target=self._run, daemon=True)
 
-    def start(self, *, in_background: bool) -> None:
-        """Do the work, in a thread or at once."""
+    def start(self, *, in_background: bool, after: PlanJob[_Planned] | None = None) -> None:
+        """Do the work, in a thread, once that of another job has ended, or at once."""
+        self._after = after
         if in_background:
             self._thread.start()
         else:
             self._run()
 
     def _run(self) -> None:
+        after, self._after = self._after, None
+        if after is not None and after._thread.is_alive():
+            after._thread.join()
         began = perf_counter()
         try:
             self._result = self._work(self._cancellation)

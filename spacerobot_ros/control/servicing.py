@@ -191,7 +191,7 @@ class ApproachTask:
             return self._ended(f"the target is lost: its odometry is {age:.3g} s old")
         off = self._plan is None or self._is_off_prediction(target.motion)
         try:
-            if controller.plans:
+            if controller.planner is not None:
                 self._plan_motion(time, state, controller, off=off, in_background=in_background)
             elif off:
                 self._make_plan(time, state, controller, target.body, target.motion)
@@ -310,7 +310,9 @@ class ApproachTask:
         self._plan = MotionPlan(planned)
         controller.begin_planned(job.begins, planned)
         contact, grapple = job.begins + planned.duration, planned.grapple
-        left = float(np.linalg.norm(grapple.joined_momentum(controller.mass, planned.motion)))
+        left = float(
+            np.linalg.norm(grapple.joined_momentum(controller.law.robot.total_mass, planned.motion))
+        )
         message = (
             f"Base and end-effector set out at {job.begins:.4g} s and meet the target at "
             f"{contact:.4g} s; {left:.4g} N m s are planned to be left after the grasp."

@@ -21,6 +21,7 @@ from spacerobot_ros.commanding.controller import (
 from spacerobot_ros.commanding.goal_follower import Status
 from spacerobot_ros.control.config import ControllerConfig
 from spacerobot_ros.control.executive import END_EFFECTOR
+from spacerobot_ros.control.planned_reference import PlannedReference
 from spacerobot_ros.control.servicing import Task
 from spacerobot_ros.control.status import ControllerState
 from spacerobot_ros.errors import SpaceRobotError
@@ -84,6 +85,8 @@ class CoordinatedControlNode(CommanderNode):
             String, "target/robot_description", self._on_target_description, LATCHED
         )
         self.create_subscription(Odometry, TARGET_ODOMETRY, self._on_target, STREAM, raw=True)
+        if self.config.profile == PlannedReference.name:
+            self.listen_to_obstacles()
         self.subscribe_to_goals("goal_pose")
         self.subscribe_to_goals("end_effector/goal_pose", END_EFFECTOR)
         if self.config.watchdog_timeout:

@@ -12,7 +12,6 @@ from geometry_msgs.msg import PoseStamped, TwistStamped
 from nav_msgs.msg import Path
 from rclpy.publisher import Publisher
 from sensor_msgs.msg import JointState
-from std_msgs.msg import String
 from trajectory_msgs.msg import JointTrajectory
 from visualization_msgs.msg import MarkerArray
 
@@ -102,7 +101,7 @@ class PlannerNode(CommanderNode):
             self._take_twists(name)
             self._take_paths(name)
         self.create_subscription(JointState, "goal_joint_states", self._on_goal_shape, STREAM)
-        self.create_subscription(String, "obstacles", self._on_obstacles, LATCHED)
+        self.listen_to_obstacles()
         self.offer("~/statistics", lambda: self.statistics.to_json())
 
     def start_message(self) -> str:
@@ -160,9 +159,6 @@ class PlannerNode(CommanderNode):
             commander.receive_twist(link, message.header.frame_id, linear, angular)
 
         self.create_subscription(TwistStamped, twist_topic(link), on_twist, STREAM)
-
-    def _on_obstacles(self, message: String) -> None:
-        self.commander.receive_obstacles(message.data)
 
     def _take_paths(self, link: str) -> None:
         def on_path(message: Path) -> None:

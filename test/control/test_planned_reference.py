@@ -11,13 +11,15 @@ from scipy.spatial.transform import Rotation
 
 from spacerobot_ros.control.controller import build_controller
 from spacerobot_ros.control.executive import ControlExecutive
-from spacerobot_ros.control.state import ControlState
+from spacerobot_ros.control.state import ControlState, PoseReference
 from spacerobot_ros.control.status import ControllerState, ControllerStatus
 from spacerobot_ros.events import EventKind
 from spacerobot_ros.flight.flight import Flight
 from spacerobot_ros.flight.lockstep import fly_scenario
 from spacerobot_ros.measures import Outcome
 from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.model.description import RobotDescription
+from spacerobot_ros.model.urdf import parse_world
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.execution.goal_file import IdentifiedGoal
 from spacerobot_ros.resources import robot_file
@@ -32,6 +34,8 @@ STRAIGHT: dict[str, Any] = {
 }
 BEHIND = Goal.from_rotvec([1.6, 1.3, 0.2], [0.3, -0.4, 1.2])
 """Behind the panel of 1.8 x 0.02 x 0.8 m round (1.5, 0.7, 0) m."""
+
+PLACE = np.array([0.3, -0.2, 0.1])
 
 
 def docked(goal: Goal | None = None, **controller: Any) -> Flight:
@@ -97,49 +101,98 @@ def test_a_goal_without_a_plan_is_refused_and_the_robot_holds() -> None:
         assert np.linalg.norm(flight.pose[-1, :3]) < 1e-6
 
 
-def test_states_are_answered_while_a_thread_plans() -> None:
-    """``plan_in_background``: the robot holds its pose, and later goes on to its last goal."""
-    scenario = load_scenario("free_flyer")
-    config = replace(scenario.controller, plan_in_background=True, tick_rate=50.0)
-    robot = SpaceRobot.from_file(robot_file("jet_cube"))
-    executive = ControlExecutive(build_controller(robot, config), config)
-    place, upright = np.array([0.3, -0.2, 0.1]), np.array([0.0, 0.0, 0.0, 1.0])
-    none, time = np.zeros(0), 0.0
+class Follower:
+    """A cube that follows its reference exactly, answered by an executive."""
 
-    def answer() -> None:
-        """Answer the state of a robot that follows its reference exactly."""
-        nonlocal time
-        profile = executive.controller.profile
-        pose = None if profile is None else executive.controller.reference_at(time, state).base
-        if pose is None:
-            measured = state
-        else:
+    def __init__(self, **config: Any) -> None:
+        scenario = load_scenario("free_flyer")
+        self.config = replace(scenario.controller, tick_rate=50.0, **config)
+        robot = SpaceRobot.from_file(robot_file("jet_cube"))
+        self.executive = ControlExecutive(build_controller(robot, self.config), self.config)
+        self.time, self.places = 0.0, list[np.ndarray]()
+        self.state = ControlState.at_rest(PLACE, np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(0))
+
+    def reference(self) -> PoseReference:
+        base = self.executive.controller.reference_at(self.time, self.state).base
+        assert base is not None
+        return base
+
+    def answer(self) -> None:
+        measured, none = self.state, np.zeros(0)
+        if self.executive.controller.profile is not None:
+            pose = self.reference()
             R_BW = Rotation.from_quat(pose.quaternion).inv()
             twist = R_BW.apply(pose.velocity), R_BW.apply(pose.angular_velocity)
             measured = ControlState(pose.position, pose.quaternion, *twist, none, none)
-        executive.evaluate(time, executive.command(time, measured, none, none))
-        time += 0.02
+        self.places.append(measured.r_WB.copy())
+        result = self.executive.command(self.time, measured, none, none)
+        self.executive.evaluate(self.time, result)
+        self.time += 0.02
 
-    state = ControlState.at_rest(place, upright, none)
-    answer()
-    executive.submit("base", IdentifiedGoal(Goal.from_rotvec([0.9, 0.1, 0.3], [0.2, 0.1, 0.4])))
+    def fly(self, until: float = np.inf) -> ControllerState:
+        """Answer states until the goal is decided, or a time; return the controller's state."""
+        while self.executive.state is ControllerState.TRACKING and self.time < until:
+            self.answer()
+        return self.executive.state
+
+
+def test_states_are_answered_while_a_thread_plans() -> None:
+    """``plan_in_background``: the robot holds its pose, and later goes on to its last goal."""
+    rig = Follower(plan_in_background=True)
+    rig.answer()
+    executive, first = rig.executive, Goal.from_rotvec([0.9, 0.1, 0.3], [0.2, 0.1, 0.4])
+    executive.submit("base", IdentifiedGoal(first))
     held, second = 0, Goal.from_rotvec([0.5, -0.9, 0.4], [-0.3, 0.2, 0.1])
     while executive.state is not ControllerState.TRACKING:
         held += 1
         if held == 3:
             # Another goal while a plan for the first one is made.
             executive.submit("base", IdentifiedGoal(second))
-        still = executive.controller.reference_at(time, state).base
-        assert still is not None
-        np.testing.assert_allclose(still.position, place, atol=1e-12)
-        answer()
+        np.testing.assert_allclose(rig.reference().position, PLACE, atol=1e-12)
+        rig.answer()
     assert held > 5, "the test is sharp: planning takes longer than a state"
     ends = executive.controller.reference_ends
     assert ends is not None
-    while executive.state is ControllerState.TRACKING:
-        answer()
-    assert executive.state is ControllerState.REACHED
-    assert time < ends + 5.0
-    ended = executive.controller.reference_at(time, state).base
-    assert ended is not None
-    np.testing.assert_allclose(ended.position, second.position, atol=1e-9)
+    assert rig.fly() is ControllerState.REACHED
+    assert rig.time < ends + 5.0
+    np.testing.assert_allclose(rig.reference().position, second.position, atol=1e-9)
+
+
+def test_motions_are_planned_anew_around_obstacles_that_come_in_flight() -> None:
+    goal = Goal.from_rotvec([1.3, 0.2, 0.1], [0.0, 0.0, 0.0])
+    middle = (PLACE + goal.position) / 2
+    for place, state in (
+        (middle, ControllerState.REACHED),
+        (goal.position, ControllerState.ABORTED),
+    ):
+        rig = Follower()
+        rig.answer()
+        rig.executive.submit("base", IdentifiedGoal(goal))
+        rig.answer()
+        began = rig.time
+        rig.fly(until=began + 6.0)
+        # Something beside the way changes nothing.
+        profile = rig.executive.controller.profile
+        rig.executive.use_obstacles(ball(np.array([0.0, 3.0, 0.0])))
+        rig.answer()
+        assert rig.executive.controller.profile is profile
+        rig.executive.use_obstacles(ball(place))
+        assert rig.fly() is state
+        statuses = [each for each in rig.executive.outputs if isinstance(each, ControllerStatus)]
+        # The cube of 0.3 m contains a ball of 0.15 m.
+        nearest = np.linalg.norm(np.array(rig.places) - place, axis=1).min()
+        assert nearest > 0.15 + 0.1 + 0.01
+        assert nearest < 1.0
+        if state is ControllerState.ABORTED:
+            told = statuses[-1].message
+            assert told.startswith("Aborted: ")
+            assert "'ball'" in told
+
+
+def ball(place: np.ndarray) -> RobotDescription:
+    return parse_world(
+        '<robot name="w"><link name="w"/><link name="ball"><collision><geometry><sphere '
+        'radius="0.1"/></geometry></collision></link><joint name="j" type="fixed"><parent '
+        f'link="w"/><child link="ball"/><origin xyz="{place[0]} {place[1]} {place[2]}"/></joint>'
+        "</robot>"
+    )

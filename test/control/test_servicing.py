@@ -292,7 +292,7 @@ def test_base_and_arm_are_planned_to_a_target_and_anew_if_it_strays() -> None:
     loop.skip_to(loop.contact + 0.05)
     hand = controller.followed_end_effector
     assert hand is not None
-    assert hand.position == pytest.approx(loop.block + [-0.3, 0.0, 0.0], abs=1e-4)
+    assert hand.position == pytest.approx(loop.block - np.array([0.3, 0.0, 0.0]), abs=1e-4)
     assert hand.velocity == pytest.approx(loop.drift, abs=1e-4)
     # Base and shape go on with the target.
     base = controller.reference_at(loop.tick * PERIOD, controller.law.state).base

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -41,7 +42,7 @@ SLAB = f"""<robot name="slab"><link name="slab"><inertial><origin xyz="0.02 0.01
 HERE = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
 
 
-def boomed(**options: float) -> ThrustPlanner:
+def boomed(**options: Any) -> ThrustPlanner:
     robot = SpaceRobot.from_urdf(BOOMED)
     propulsion = Propulsion.within(0.8, 0.1)
     return ThrustPlanner(robot, propulsion, ThrustOptions(**options), "end_effector")

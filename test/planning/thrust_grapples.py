@@ -122,6 +122,7 @@ def flown(rate: float, draws: int, seed: int, profile: str, detumble: str) -> st
         capture = flight.capture
         print(f"{number}: {flight.message} {capture.get('time_s')}", flush=True)
         if capture["captured"]:
+            assert flight.propellant is not None
             captured += 1
             propellant.append(flight.propellant)
             left.append(float(np.linalg.norm(capture["angular_momentum_Nms"])))

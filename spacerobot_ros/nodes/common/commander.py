@@ -126,6 +126,15 @@ class CommanderNode(FlightNode):
             PoseStamped, topic, lambda message: self._on_goal(key, message), STREAM
         )
 
+    def listen_to_obstacles(self) -> None:
+        """Have plans avoid the obstacles of the topic."""
+        self.create_subscription(
+            String,
+            "obstacles",
+            lambda message: self.commander.receive_obstacles(message.data),
+            LATCHED,
+        )
+
     @abstractmethod
     def use(self, robot: SpaceRobot) -> None:
         """Use this robot from now on."""

@@ -190,10 +190,10 @@ class ThrustPlanner:
         self._solvers: dict[tuple[EndKind, KeptPlaces], ThrustSolver] = {}
         self._rows: dict[tuple[int, int], ConstraintBlock] = {}
 
-    def use_obstacles(self, world: RobotDescription | None) -> None:
-        """Plan around other obstacles from now on; None: around none."""
+    def clearance_among(self, world: RobotDescription | None) -> Clearance | None:
+        """Return the :attr:`clearance` among other obstacles; None: among none."""
         described = with_world(self.robot.description, world)
-        self.clearance = Clearance.wanted(described, self.options.clearance, "plan.clearance")
+        return Clearance.wanted(described, self.options.clearance, "plan.clearance")
 
     @cached_property
     def _functions(self) -> MotionFunctions:

@@ -1,0 +1,160 @@
+"""The plan of a reference in the making, beside the control loop."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import TypedDict
+
+from spacerobot_ros.control.controller import CoordinatedController
+from spacerobot_ros.control.planned_reference import PLANNING_TIME, PlanJob, PlannedReference
+from spacerobot_ros.control.state import ControlState, PoseReference
+from spacerobot_ros.errors import PlanningError
+from spacerobot_ros.model.description import Array
+from spacerobot_ros.planning.core.cancellation import Cancellation
+from spacerobot_ros.planning.core.goal import Controlled
+from spacerobot_ros.planning.execution.goal_file import IdentifiedGoal
+
+
+class Aims(TypedDict):
+    """Poses and joint positions that goals ask for; None: they do not."""
+
+    base: PoseReference | None
+    end_effector: PoseReference | None
+    joints: Array | None
+
+
+@dataclass(frozen=True)
+class PlannedGoals:
+    """What goals aim at, the parts of the base's pose that they ask for, their planned reference,
+    and the time at which it begins, s.
+    """
+
+    aims: Aims
+    asked: frozenset[Controlled]
+    profile: PlannedReference
+    begins: float
+
+
+@dataclass(frozen=True)
+class _Plan:
+    """A reference in the making for pending goals."""
+
+    pending: Mapping[str, IdentifiedGoal]
+    aims: Aims
+    asked: frozenset[Controlled]
+    job: PlanJob[PlannedReference]
+
+    def is_for(self, pending: Mapping[str, IdentifiedGoal]) -> bool:
+        """Whether these goals wait for it."""
+        same = (goal is pending.get(part) for part, goal in self.pending.items())
+        return len(pending) == len(self.pending) and all(same)
+
+
+class GoalPlanning:
+    """Plans references for pending goals, one at a time.
+
+    Parameters
+    ----------
+    in_background
+        Whether a thread plans, while states are answered.
+    """
+
+    def __init__(self, *, in_background: bool) -> None:
+        self.in_background = in_background
+        self.time = 0.0
+        """Wall time for which references have been planned, s."""
+        self._plan: _Plan | None = None
+        self._job: PlanJob[PlannedReference] | None = None
+        """The last work, which may not have ended although it is cancelled."""
+        self._lead = PLANNING_TIME
+
+    @property
+    def active(self) -> bool:
+        """Whether a reference is in the making."""
+        return self._plan is not None
+
+    def planned(
+        self,
+        time: float,
+        state: ControlState,
+        controller: CoordinatedController,
+        pending: Mapping[str, IdentifiedGoal],
+        aims: Callable[[], tuple[Aims, frozenset[Controlled]]],
+    ) -> PlannedGoals | None:
+        """Return the planned reference for pending goals; None: it is in the making.
+
+        ``aims`` returns what they aim at, and what they ask for.
+
+        Raises
+        ------
+        PlanningError
+            No motion is found.
+        """
+        plan = self._plan
+        if plan is None or not plan.is_for(pending):
+            self.cancel()
+            if plan is None:
+                self._lead = PLANNING_TIME
+            plan = self._begin(time, state, controller, pending, *aims())
+        if not plan.job.done:
+            return None
+        self.time += plan.job.wall_time
+        try:
+            profile = plan.job.result()
+        except PlanningError:
+            self._plan = None
+            raise
+        begins = plan.job.begins
+        if self.in_background and -math.inf < begins < time:
+            # The reference has gone on: a plan from where it will be in twice the time.
+            self._lead *= 2
+            self._begin(time, state, controller, pending, plan.aims, plan.asked)
+            return None
+        if self.in_background and begins > time:
+            return None
+        self._plan = None
+        return PlannedGoals(plan.aims, plan.asked, profile, max(begins, time))
+
+    def _begin(
+        self,
+        time: float,
+        state: ControlState,
+        controller: CoordinatedController,
+        pending: Mapping[str, IdentifiedGoal],
+        aims: Aims,
+        asked: frozenset[Controlled],
+    ) -> _Plan:
+        planner = controller.planner
+        assert planner is not None
+        seen, begins = state.copied(), -math.inf
+        if controller.reference_moves(time):
+            begins = time + (self._lead if self.in_background else 0.0)
+        motion = controller.motion_to(max(begins, time), seen, **aims)
+
+        def work(cancellation: Cancellation) -> PlannedReference:
+            return planner.plan(motion, seen, cancellation)
+
+        last, self._job = self._job, PlanJob(work, begins)
+        # Known before the work begins, so that it can be cancelled.
+        self._plan = plan = _Plan(dict(pending), aims, asked, self._job)
+        self._job.start(in_background=self.in_background, after=last)
+        return plan
+
+    def cancel(self) -> None:
+        """End the work; any thread may call this."""
+        plan = self._plan
+        if plan is not None:
+            plan.job.cancel()
+
+    def drop(self) -> None:
+        """End the work, without a result."""
+        self.cancel()
+        self._plan = None
+
+    def close(self) -> None:
+        """End the work, and wait until its thread has ended."""
+        self._plan = None
+        if self._job is not None:
+            self._job.close()
