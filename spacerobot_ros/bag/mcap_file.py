@@ -1,7 +1,7 @@
 """The file of a bag: MCAP with the metadata of rosbag2.
 
 ``mcap.writer.Writer`` makes the records. Here is what it leaves to its caller: a file that is
-locked, never written over, whole after any kill, and complete even on a full disk.
+locked, never written over, and whole up to its last record after any kill or on a full disk.
 """
 
 from __future__ import annotations
@@ -16,22 +16,11 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from enum import Enum
-from io import BytesIO
 from pathlib import Path
 from typing import IO, Any, cast
 
 import yaml
-from mcap.data_stream import RecordBuilder
-from mcap.records import (
-    AttachmentIndex,
-    ChunkIndex,
-    Footer,
-    MetadataIndex,
-    Statistics,
-    SummaryOffset,
-)
-from mcap.stream_reader import StreamReader
-from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
+from mcap.writer import CompressionType, Writer
 from rosbags.interfaces import Qos, QosTime
 
 from spacerobot_ros.bag.mcap_reading import require_regular
@@ -269,7 +258,7 @@ class McapFile:
     fails is undone, so that the file of a process that dies is whole but for the record that it was
     appending. While it is open it is locked: no second one can be opened on the same path. A call
     that adds something raises RecordingError where the disk refuses it; the file is then as it was,
-    and takes nothing more but its summary.
+    and has to be closed.
 
     The folders of ``path`` are made; ``compression``, ``chunk_size`` and ``overwrite`` are those of
     :class:`~spacerobot_ros.bag.BagWriter`, ``profile`` is that of the MCAP header. RecordingError
@@ -294,7 +283,6 @@ class McapFile:
         self.bytes_waiting = 0
         """Size of the messages in the chunk in progress, bytes."""
         self._counts_in_file: Counter[int] = Counter()
-        self._refused = self._finished = False
         self._tail = _Tail()
         self._library = Writer(
             cast("IO[bytes]", self._tail),
@@ -382,26 +370,14 @@ class McapFile:
 
     def finish(self, topics: Sequence[RecordedTopic] | None = None) -> None:
         """Complete the file and close it, with rosbag2's record of its topics if they are given."""
-        if self._finished:
-            return
-        self._finished = True
         try:
-            if not self._refused:
-                self.flush()
-                if topics is not None:
-                    self.add_rosbag2_metadata(topics)
+            self.flush()
+            if topics is not None:
+                self.add_rosbag2_metadata(topics)
+            self._library.finish()
+            self._commit()
         finally:
-            # It is worth trying after a failure: a summary is smaller than a chunk.
-            try:
-                if self._refused:
-                    self._library.flush()
-                    self._tail.data.clear()
-                self._library.finish()
-                if self._refused:
-                    self._tail.data = self._without_what_was_refused(self._tail.data)
-                self._commit()
-            finally:
-                self.close()
+            self.close()
 
     def close(self) -> None:
         """Close the file; does not raise."""
@@ -428,38 +404,9 @@ class McapFile:
             with suppress(OSError):
                 self._raw.truncate(self.size)
                 self._raw.seek(self.size, os.SEEK_SET)
-            self._refused = True
             self.message_counts = self._counts_in_file
             raise RecordingError(
                 f"Cannot write the bag {self.path}: {error.strerror or error}; "
                 f"the {self.message_counts.total()} messages before that are safe in it."
             ) from error
         self._tail.start += len(data)
-
-    def _without_what_was_refused(self, end: bytes | bytearray) -> bytearray:
-        """Return the end of a file, from DataEnd on, without the indexes of what is not in it."""
-        size = self.size
-        data_end, *found = StreamReader(BytesIO(end), skip_magic=True).records
-        kept = [
-            record
-            for record in found
-            if not isinstance(record, Footer | SummaryOffset)
-            and not (isinstance(record, ChunkIndex) and record.chunk_start_offset >= size)
-            and not (isinstance(record, AttachmentIndex | MetadataIndex) and record.offset >= size)
-        ]
-        kinds = Counter(map(type, kept))
-        chunks = [record for record in kept if isinstance(record, ChunkIndex)]
-        (statistics,) = (record for record in kept if isinstance(record, Statistics))
-        statistics.message_count = self.message_counts.total()
-        statistics.channel_message_counts = dict(self.message_counts)
-        statistics.chunk_count = len(chunks)
-        statistics.attachment_count = kinds[AttachmentIndex]
-        statistics.metadata_count = kinds[MetadataIndex]
-        statistics.message_start_time = min((c.message_start_time for c in chunks), default=0)
-        statistics.message_end_time = max((c.message_end_time for c in chunks), default=0)
-        builder = RecordBuilder()
-        data_end.write(builder)
-        start = size + builder.count
-        for record in (*kept, Footer(start, summary_offset_start=0, summary_crc=0)):
-            record.write(builder)
-        return bytearray(builder.end() + MCAP0_MAGIC)

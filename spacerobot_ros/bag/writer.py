@@ -223,20 +223,21 @@ class BagWriter(AbstractContextManager["BagWriter"]):
     def close(self) -> None:
         """Write pending messages and the summary, and close the file; a second call does nothing.
 
+        After a failure the file is closed as it is: `spacerobot salvage` completes it.
+
         Raises
         ------
         RecordingError
-            Writing failed, and no earlier call has reported it.
+            Writing fails now.
         """
         if self._closed:
             return
         self._closed = True
-        refusal, self._refusal = self._refusal, self._refusal or f"The bag {self.path} is closed."
-        try:
+        refused, self._refusal = self._refusal, self._refusal or f"The bag {self.path} is closed."
+        if refused:
+            self._file.close()
+        else:
             self._file.finish(self._recorded_topics())
-        except RecordingError:
-            if refusal is None:
-                raise
 
     def __exit__(self, *_: object) -> None:
         self.close()

@@ -6,26 +6,40 @@ import json
 import os
 import signal
 import subprocess
+import sys
 import time
 from collections import defaultdict
 from collections.abc import Iterator
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+import rclpy
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
+from nav_msgs.msg import Odometry
+from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
+from scipy.spatial.transform import Rotation
 from support.warm_python import WarmProcess, WarmPython
 
 from spacerobot_ros.bag import iterate_raw, read_bag
-from spacerobot_ros.errors import ParameterError
+from spacerobot_ros.cli.options import write_json
+from spacerobot_ros.errors import ParameterError, RecordingError, SpaceRobotError
 from spacerobot_ros.flight.verification import verify_bag
 from spacerobot_ros.measures import Outcome
+from spacerobot_ros.nodes.common.process import free_domain
 from spacerobot_ros.planning import Goal
-from spacerobot_ros.scenario import load_scenario
+from spacerobot_ros.planning.core.progress import report_progress
+from spacerobot_ros.planning.execution.executive import Executive
+from spacerobot_ros.scenario import Scenario, load_scenario
 from spacerobot_ros.session.live import ros, send_goal
 from spacerobot_ros.session.processes import MultiProcessStack, checked_namespace
-from spacerobot_ros.session.run import run_scenario
+from spacerobot_ros.session.run import RunResult, run_scenario
+from spacerobot_ros.testing import Stack
 
 ROOT = Path(__file__).parents[2]
 COMMAND = ("-m", "spacerobot_ros.cli.main")
@@ -281,3 +295,340 @@ def test_every_run_is_the_same(name: str, tmp_path: Path) -> None:
             count = min(len(other[topic]), len(first[topic]))
             assert count >= max(len(other[topic]), len(first[topic])) - 1, topic
             assert other[topic][: count - 1] == first[topic][: count - 1], topic
+
+
+SHORT = {
+    "method": "lie_bracket",
+    "lie_bracket.t1": 5.0,
+    "lie_bracket.cycle_period": 1.0,
+    "lie_bracket.cycles": 0,
+}
+
+
+def short(**settings: Any) -> Scenario:
+    """Return a flight of about ten seconds that moves and turns the base."""
+    scenario = load_scenario("sliding_masses").with_overrides("planner", {**SHORT, **settings})
+    return replace(scenario, goal=Goal.from_rotvec([0.02, -0.01, 0.01], [0.02, 0.01, -0.015]))
+
+
+def papers_own() -> Scenario:
+    """Return the published flight of 4900 s."""
+    return load_scenario("sliding_masses").with_overrides("planner", {"method": "lie_bracket"})
+
+
+@pytest.fixture
+def result(tmp_path: Path) -> RunResult:
+    return run_scenario(short(attitude_tolerance=1e-4), tmp_path / "run.mcap")
+
+
+def test_a_run_records_the_topics_that_are_chosen(tmp_path: Path) -> None:
+    topics = {"/odom", "/joint_states", "/momentum", "/robot_description"}
+    chosen = short().with_overrides("recorder", {"topics": " ".join(sorted(topics))})
+    result = run_scenario(chosen, tmp_path / "run.mcap")
+    assert result.succeeded
+    assert set(read_bag(tmp_path / "run.mcap").topics) == topics
+
+
+def test_summary_is_what_the_bag_says(result: RunResult, tmp_path: Path) -> None:
+    """The summary against the bag decoded by another library."""
+    write_json(tmp_path / "sub" / "run.json", result.summary)
+    summary = json.loads((tmp_path / "sub" / "run.json").read_text())
+    with AnyReader([Path(summary["bag"])]) as reader:
+        last: dict[str, Any] = {}
+        count = 0
+        for connection, _, raw in reader.messages():
+            count += 1
+            last[connection.topic] = reader.deserialize(raw, connection.msgtype)
+    pose = last["/odom"].pose.pose
+    position = np.array([pose.position.x, pose.position.y, pose.position.z])
+    attitude = Rotation.from_quat(
+        [pose.orientation.x, pose.orientation.y, pose.orientation.z, pose.orientation.w]
+    )
+    goal = Rotation.from_quat(summary["goal"][3:])
+    assert summary["succeeded"] is True
+    assert summary["scenario"] == "sliding_masses"
+    assert summary["method"] == "lie_bracket"
+    assert summary["messages_recorded"] == count
+    assert summary["final_position_m"] == position.tolist()
+    np.testing.assert_allclose(
+        summary["final_attitude_rotvec_rad"], attitude.as_rotvec(), atol=1e-14
+    )
+    assert summary["final_joint_positions"] == last["/joint_states"].position.tolist()
+    distance = np.linalg.norm(position - summary["goal"][:3])
+    assert summary["position_error_m"] == pytest.approx(distance, abs=1e-15)
+    angle = (attitude.inv() * goal).magnitude()
+    assert summary["attitude_error_rad"] == pytest.approx(angle, abs=1e-12)
+    assert summary["attitude_error_rad"] <= 1e-4
+    assert summary["ticks"] == round(summary["sim_time_s"] * 20)
+    assert summary["sim_time_s"] == pytest.approx(summary["manoeuvre_time_s"])
+    assert {"plan_time_s", "wall_time_s", "ticks_per_s", "real_time_factor"} <= set(summary)
+
+
+def test_momentum_against_the_momentum_in_motion(result: RunResult) -> None:
+    """At most 1e-12 of what the moving parts carry, which the base's own part measures."""
+    odom = read_bag(result.summary["bag"])["/odom"]
+    v, omega = (
+        np.column_stack([odom.field(f"twist.twist.{part}.{x}") for x in "xyz"])
+        for part in ("linear", "angular")
+    )
+    base_linear = 10.0 * np.linalg.norm(v, axis=1).max()
+    base_angular = np.linalg.norm(omega * [1.0, 1.5, 1.5], axis=1).max()
+    assert base_linear > 0.01
+    assert base_angular > 1e-4
+    assert result.summary["linear_momentum_drift"] <= 1e-12 * base_linear
+    assert result.summary["angular_momentum_drift"] <= 1e-12 * base_angular
+
+
+@pytest.mark.slow
+def test_every_message_opens_with_other_libraries(result: RunResult) -> None:
+    """rosbags and mcap-ros2-support decode the same messages, every one of them."""
+    path = Path(result.summary["bag"])
+    with path.open("rb") as stream:
+        reader = make_reader(stream, decoder_factories=[DecoderFactory()])
+        summary = reader.get_summary()
+        assert summary is not None
+        assert summary.statistics is not None
+        by_mcap = [(c.topic, m.log_time, d) for _, c, m, d in reader.iter_decoded_messages()]
+        assert summary.statistics.message_count == len(by_mcap)
+    with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as bag:
+        by_rosbags = [
+            (c.topic, time, bag.deserialize(raw, c.msgtype)) for c, time, raw in bag.messages()
+        ]
+    assert len(by_mcap) == len(by_rosbags) == result.summary["messages_recorded"]
+    topics = {"/clock", "/odom", "/base_pose", "/joint_states", "/momentum", "/joint_commands"}
+    topics |= {"/goal_pose", "/gait_schedule", "/planned_path", "/planner/status", "/markers"}
+    topics |= {"/plant/status", "/events", "/tf"}
+    assert {topic for topic, _, _ in by_mcap} == topics | {"/diagnostics", "/robot_description"}
+
+    def positions(entries: list[tuple[str, int, Any]]) -> list[float]:
+        return [d.pose.pose.position.x for topic, _, d in entries if topic == "/odom"]
+
+    assert positions(by_mcap) == positions(by_rosbags)
+
+
+def test_nothing_is_lost_or_recorded_twice(result: RunResult) -> None:
+    bag = read_bag(result.summary["bag"])
+    ticks = result.summary["ticks"]
+    # The scenario asks for base_pose once a second, that is every 20 ticks.
+    assert len(bag.times("/base_pose")) == ticks // 20 + 1
+    for topic in ("/clock", "/odom", "/joint_states", "/momentum"):
+        times = bag.times(topic)
+        assert len(times) == ticks + 1, topic
+        np.testing.assert_allclose(times, np.arange(ticks + 1) * 0.05, atol=1e-9)
+    np.testing.assert_allclose(bag["/odom"].stamp, bag.times("/odom"), atol=1e-9)
+
+
+def test_bag_says_how_it_was_made(result: RunResult) -> None:
+    bag = read_bag(result.summary["bag"])
+    assert bag.metadata["scenario"]["name"] == "sliding_masses"
+    assert json.loads(bag.metadata["parameters/plant"]["tick_rate"]) == 20.0
+    assert json.loads(bag.metadata["parameters/planner"]["lie_bracket.t1"]) == 5.0
+    assert "version" in bag.metadata["spacerobot"]
+    assert b'<robot name="sliding_masses">' in bag.attachments["robot_description.urdf"]
+
+
+def test_two_runs_are_the_same_to_the_last_message(tmp_path: Path) -> None:
+    from rclpy.serialization import deserialize_message
+
+    bags = [tmp_path / f"{i}.mcap" for i in range(2)]
+    for bag in bags:
+        run_scenario(short(), bag)
+    first, second = (list(iterate_raw(bag)) for bag in bags)
+    assert len(first) == len(second) > 500
+    for a, b in zip(first, second, strict=True):
+        assert a[:4] == b[:4]
+        if a[4] != b[4]:  # Padding is not initialised; what is in it must be equal.
+            kind = message_class(a[1])
+            assert deserialize_message(a[4], kind) == deserialize_message(b[4], kind)
+
+
+def message_class(type_name: str) -> Any:
+    import importlib
+
+    package, _, name = type_name.split("/")
+    return getattr(importlib.import_module(f"{package}.msg"), name)
+
+
+def test_unreachable_goal_is_summed_up_too(tmp_path: Path) -> None:
+    scenario = replace(short(), goal=Goal.from_rotvec([9.0, 0.0, 0.0], [0.0, 0.0, 0.0]))
+    result = run_scenario(scenario, tmp_path / "run.mcap")
+    assert not result.succeeded
+    assert result.summary["state"] == "refused"
+    assert "beyond stroke" in result.message
+    assert "slider_1" in result.message
+
+
+def test_interrupted_run_leaves_a_complete_bag(tmp_path: Path) -> None:
+    """The signal comes from the run's own progress, so it hits in mid-flight for certain."""
+    looks = []
+
+    def progress(now: float, end: float) -> None:
+        looks.append(now)
+        if now > 0 and len(looks) < 50:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    result = run_scenario(papers_own(), tmp_path / "run.mcap", progress)
+    assert result.summary["state"] == "interrupted"
+    assert not result.succeeded
+    assert 0 < result.summary["sim_time_s"] < 4900
+    assert read_bag(tmp_path / "run.mcap").message_count("/odom") == result.summary["ticks"] + 1
+
+
+def test_a_plan_that_is_being_made_is_interrupted(tmp_path: Path) -> None:
+    """The signal comes from the search's own progress."""
+    scenario = load_scenario("sliding_masses").with_overrides("planner", {"optimal.cache": 0})
+    with report_progress(lambda progress: os.kill(os.getpid(), signal.SIGINT), lambda line: None):
+        result = run_scenario(scenario, tmp_path / "run.mcap")
+    assert result.summary["state"] == "interrupted"
+    assert result.message == "Interrupted after 0 s of simulated time."
+    assert read_bag(tmp_path / "run.mcap").message_count("/odom") == 1
+
+
+def test_a_run_takes_the_next_name_if_its_recorder_is_to(tmp_path: Path) -> None:
+    bag = tmp_path / "run.mcap"
+    bag.write_bytes(b"earlier")
+    with pytest.raises(RecordingError, match="exists"):
+        run_scenario(short(), bag)
+    following = short().with_overrides("recorder", {"when_exists": "next"})
+    assert run_scenario(following, bag, longest=1.0).summary["bag"] == str(tmp_path / "run-1.mcap")
+    assert bag.read_bytes() == b"earlier"
+
+
+@pytest.mark.parametrize(
+    ("node", "setting", "sentence"),
+    [
+        ("plant", {"tick_rate": -1.0}, r"Node 'plant': Parameter 'tick_rate' is -1"),
+        ("plant", {"robot": "nothing"}, r"Parameter 'robot' is 'nothing'"),
+        ("planner", {"method": "magic"}, r"Node 'planner': Parameter 'method' is 'magic'"),
+        ("planner", {"spin": 1}, r"Node 'planner' has no parameter 'spin'"),
+        ("plant", {"target.sensors.rate": 1e-322}, "must be 0 or from 1e-100 to 1e[+]100"),
+        ("plant", {"sensors.position_bias": [0, 1e-200, 0]}, "must be 0 or from 1e-100"),
+        ("planner", {"optimal.max_base_rate": 1e-320}, "must be 0 or from 1e-100"),
+        ("plant", {"world": "a\0b"}, "a text without NUL characters"),
+    ],
+)
+def test_bad_parameters_are_named(
+    tmp_path: Path, node: str, setting: dict[str, Any], sentence: str
+) -> None:
+    with pytest.raises(ParameterError, match=sentence):
+        run_scenario(short().with_overrides(node, setting), tmp_path / "run.mcap")
+
+
+@pytest.mark.slow
+def test_the_published_manoeuvre(tmp_path: Path) -> None:
+    """4900 s: the end state that was recomputed at high accuracy from the printed controls."""
+    result = run_scenario(papers_own(), tmp_path / "run.mcap")
+    summary = result.summary
+    attitude = np.array(summary["final_attitude_rotvec_rad"])
+    position = np.array(summary["final_position_m"])
+    assert np.abs(attitude - [0.55055, -0.14255, 0.09554]).max() <= 0.002
+    assert np.abs(position - [0.30135, -0.25412, 0.08435]).max() <= 0.002
+    zf = [-2.378408, 1.687252, -1.377082]
+    np.testing.assert_allclose(summary["final_joint_positions"], zf, atol=1e-4)
+    np.testing.assert_allclose(summary["gait"]["c"], [-0.047568, 0.033745, -0.027542], atol=1e-6)
+    np.testing.assert_allclose(summary["gait"]["alpha"], [-0.84377, -61.0928, -18.8194], atol=1e-4)
+    assert summary["sim_time_s"] == pytest.approx(4900.0)
+    assert summary["ticks"] == 98_000
+    assert summary["momentum_drift"] <= 1e-12
+    assert result.succeeded
+
+
+@pytest.mark.parametrize("error", [RuntimeError("the gait is no number"), MemoryError()])
+def test_a_run_whose_commander_fails_ends_with_the_reason_and_a_whole_bag(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: Exception
+) -> None:
+    """The bag has the states and commands until then."""
+    update, states = Executive.update, iter(range(1000))
+
+    def failing(self: Executive, measured: Any) -> Any:
+        if next(states) == 40:
+            raise error
+        return update(self, measured)
+
+    monkeypatch.setattr(Executive, "update", failing)
+    with pytest.raises(SpaceRobotError, match=rf"has failed at 2 s: {type(error).__name__}"):
+        run_scenario(short(), tmp_path / "run.mcap")
+    bag = read_bag(tmp_path / "run.mcap")
+    with AnyReader([bag.path]) as reader:
+        counts = {c.topic: c.msgcount for c in reader.connections}
+    assert counts["/joint_states"] == 41
+    assert counts["/joint_commands"] == 40
+    assert (tmp_path / "run.mcap").read_bytes().endswith(b"\x89MCAP0\r\n")
+
+
+# -- stacks of nodes in one executor -----------------------------------------------------------
+
+
+QUICK = {"planner": {"method": "optimal"}}
+
+
+class Recorder(rclpy.node.Node):
+    """Keeps the positions of the base."""
+
+    def __init__(self, context: rclpy.Context) -> None:
+        super().__init__("positions", context=context)
+        self.found: list[float] = []
+        self.create_subscription(
+            Odometry, "odom", lambda odom: self.found.append(odom.pose.pose.position.x), 100
+        )
+
+
+def test_a_goal_is_reached_and_another_one_refused() -> None:
+    with Stack("sliding_masses", ["plant", "planner", Recorder], QUICK) as stack:
+        arrival = stack.fly_to(x=0.05)
+        assert arrival.reached
+        assert "The goal is reached" in arrival.message
+        assert stack.nodes["positions"].found[-1] == pytest.approx(0.05, abs=0.02)
+        refused = stack.fly_to(Goal.from_rotvec([9.0, 0.0, 0.0], [0.0, 0.0, 0.0]))
+        assert (refused.reached, refused.outcome) == (False, Outcome.REFUSED)
+
+
+def test_a_stack_flies_the_same_states_every_time() -> None:
+    flown = []
+    for _ in range(2):
+        with Stack("sliding_masses", ["plant", "planner", Recorder], QUICK) as stack:
+            stack.fly_to(x=0.03, rotvec=(0.0, 0.01, 0.0))
+            flown.append(stack.nodes["positions"].found)
+    count = min(map(len, flown))
+    assert count > 50
+    np.testing.assert_array_equal(flown[0][:count], flown[1][:count])
+
+
+def test_a_controller_flies_without_a_planner() -> None:
+    with Stack("planar_manipulator", ["plant", "coordinated_control"]) as stack:
+        assert stack.fly_to(x=0.1, y=0.1).reached
+
+
+def test_what_does_not_happen_in_time_is_an_error() -> None:
+    with (
+        Stack("sliding_masses", ["plant", "planner"], timeout=0.5) as stack,
+        pytest.raises(SpaceRobotError, match=r"more than 0\.5 s"),
+    ):
+        stack.spin_until(lambda: False)
+
+
+def test_two_stacks_have_domains_of_their_own() -> None:
+    with Stack("sliding_masses") as one, Stack("sliding_masses") as other:
+        assert one.domain != other.domain
+        assert one.fly_to(x=0.01).reached
+        assert other.fly_to(x=0.02).reached
+
+
+def test_a_refused_robot_leaves_no_node() -> None:
+    with pytest.raises(ParameterError, match="no_such"):
+        Stack("no_such")
+    with pytest.raises(SpaceRobotError, match="tick_rate"):
+        Stack("sliding_masses", parameters={"plant": {"tick_rate": -1.0}})
+    with free_domain() as domain:
+        assert 1 <= domain <= 101
+
+
+@pytest.mark.slow
+def test_the_example_passes(tmp_path: Path) -> None:
+    words = ["-m", "pytest", "-q", str(ROOT / "examples" / "test_nodes_in_one_executor.py")]
+    done = subprocess.run(
+        [sys.executable, *words, "-p", "no:cacheprovider", "--rootdir", str(tmp_path)],
+        env={**os.environ, "PYTHONPATH": str(ROOT)}, cwd=tmp_path,
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout

@@ -8,7 +8,9 @@ from pathlib import Path
 from typing import Any
 
 import casadi as ca
+import mujoco
 import numpy as np
+import numpy.typing as npt
 import pytest
 from scipy.integrate import simpson
 from support.effort_flights import (
@@ -19,8 +21,7 @@ from support.effort_flights import (
     with_effort_limit,
     without_stops,
 )
-from support.mujoco_flight import MujocoFlight
-from support.oracles import Array, Motion, PinocchioOracle, assert_agrees
+from support.oracles import Array, Motion, MujocoOracle, PinocchioOracle, assert_agrees
 from support.random_robots import random_chain_urdf
 from support.slow import some_fast
 from support.wheels import HULL, WHEELS, text, wheeled_robot
@@ -38,6 +39,50 @@ from spacerobot_ros.simulation.actuators import build_plant
 from spacerobot_ros.simulation.commands import CommandValidator
 from spacerobot_ros.simulation.config import PlantConfig
 from spacerobot_ros.simulation.effort_plant import DEFAULT_INTEGRATION_STEP
+
+
+class MujocoFlight(MujocoOracle):
+    """A robot with motors at its joints and thrusters at the origin of its base link.
+
+    The thrusters are six motors on a site of the base, along and about its axes. They turn with
+    it within a step, unlike ``xfrc_applied`` and ``qfrc_applied``, which are held in the world.
+    """
+
+    def describe(self, urdf: str) -> mujoco.MjSpec:
+        spec = super().describe(urdf)
+        spec.worldbody.first_body().add_site(name="thrusters")
+        for gear in np.eye(6):
+            motor = spec.add_actuator(trntype=mujoco.mjtTrn.mjTRN_SITE, target="thrusters")
+            motor.gear = gear
+        for name in self.joint_names:
+            spec.add_actuator(trntype=mujoco.mjtTrn.mjTRN_JOINT, target=name)
+        return spec
+
+    def start(
+        self, pose: Array, twist: Array, q: npt.ArrayLike, qdot: Array, step: float = 1e-3
+    ) -> None:
+        """Set the state as a plant publishes it, and the step in s of Runge-Kutta 4."""
+        self.model.opt.integrator = mujoco.mjtIntegrator.mjINT_RK4
+        self.model.opt.timestep = step
+        self.set_configuration(np.asarray(q), pose[3:], pose[:3])
+        self.move(self.base_velocities(twist) + self.joint_velocities(qdot))
+
+    def fly(self, effort: npt.ArrayLike, wrench_B: npt.ArrayLike, steps: int) -> None:
+        """Take steps under joint efforts (n,) and force over torque (6,), base components."""
+        self.data.ctrl[:6] = wrench_B
+        self.data.ctrl[6:] = effort
+        mujoco.mj_step(self.model, self.data, nstep=steps)
+
+    @property
+    def pose(self) -> Array:
+        """(7,) position and quaternion (x, y, z, w) of the base link."""
+        return np.append(self.data.qpos[:3], np.roll(self.data.qpos[3:7], -1))
+
+    @property
+    def joints(self) -> tuple[Array, Array]:
+        """Positions and velocities of the joints."""
+        return np.array(self.data.qpos[self._q]), self.selection[3:] @ self.data.qvel
+
 
 SERVICER = (Path(__file__).parents[2] / "urdf" / "servicer.urdf").read_text(encoding="utf-8")
 TICK = 0.01
