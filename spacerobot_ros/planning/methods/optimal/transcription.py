@@ -57,6 +57,9 @@ GAUSS = (0.5 - math.sqrt(3) / 6, 0.5 + math.sqrt(3) / 6)
 _DIRECTION_SIZE = 3
 """Size of the kept direction, the first parameter of an interval."""
 
+_LEAST_MULTIPLIER = 3e-2
+"""Multiplier below which a distance bends nothing: durations or efforts, of about one, per m."""
+
 Indices = npt.NDArray[np.int64]
 
 
@@ -402,7 +405,7 @@ def _distance_block(n: int, pairs: Sequence[PlaneDistance], instants: int) -> Co
     planes = ca.MX.sym("planes", PLANE_SIZE, len(pairs) * instants)
     multipliers = ca.MX.sym("lambda", len(pairs) * instants)
     values, jacobian, hessian = [], [], ca.MX(z.numel(), z.numel())
-    size = n + 4 if turning else n
+    size, curved = n + 4 if turning else n, [_curved_where_it_counts(rows) for rows in pairs]
     for number, by_row in enumerate(ca.vertsplit(multipliers, len(pairs)), 1):
         tau = number / instants
         # The point is s + h (b v + c v+).
@@ -410,18 +413,19 @@ def _distance_block(n: int, pairs: Sequence[PlaneDistance], instants: int) -> Co
         along = b * v + c * v_next
         point = s + h * along
         turned = ca.vertcat(point, (1 - tau) * X + tau * X_next)
-        slopes, curvature = [], ca.MX(size, size)
+        slopes, slope, curvature = [], ca.MX(1, size), ca.MX(size, size)
         for row, (rows, multiplier) in enumerate(zip(pairs, ca.vertsplit(by_row), strict=True)):
             plane = planes[:, (number - 1) * len(pairs) + row]
             at = turned if rows.is_of_obstacle else point, plane
-            J, H = rows.jacobian(*at), rows.hessian(*at, multiplier)
+            J, (weighted, H) = rows.jacobian(*at), curved[row](*at, multiplier)
             if turning and not rows.is_of_obstacle:
-                J, H = ca.horzcat(J, ca.MX(1, 4)), ca.diagcat(H, ca.MX(4, 4))
+                J, weighted = (ca.horzcat(each, ca.MX(1, 4)) for each in (J, weighted))
+                H = ca.diagcat(H, ca.MX(4, 4))
             values.append(rows.values(*at) + lack)
             slopes.append(J)
+            slope += weighted
             curvature += H
-        J = ca.vertcat(*slopes)
-        slope = (J[:, :n].T @ by_row).T
+        J, slope = ca.vertcat(*slopes), slope[:, :n]
         bend = ca.horzcat(ca.MX(1, 5 + n), b * slope, ca.MX(1, 4), c * slope)
         # How [point; turn] moves with z: by a column, and by multiples of units.
         weights = (b * h, c * h)
@@ -437,6 +441,20 @@ def _distance_block(n: int, pairs: Sequence[PlaneDistance], instants: int) -> Co
         ca.Function("distances_jac", z_p, [ca.vertcat(*values), J]),
         ca.Function("distances_hess", [*z_p, multipliers], [hessian]),
     )
+
+
+def _curved_where_it_counts(rows: PlaneDistance) -> ca.Function:
+    """Return ``(y, plane, lambda) -> lambda J, H``: of multipliers next to nothing, zeros without
+    an evaluation. They are those of most rows, and Hessians took half of the time of clear paths.
+    """
+    arguments = [ca.MX.sym(f"a{i}", rows.hessian.size1_in(i)) for i in range(3)]
+    y, plane, multiplier = arguments
+    derivatives = [multiplier * rows.jacobian(y, plane), rows.hessian(*arguments)]
+    nothing = [ca.MX.zeros(each.sparsity()) for each in derivatives]
+    of = [ca.Function("curved", arguments, results) for results in (derivatives, nothing)]
+    counts = ca.fabs(multiplier) > _LEAST_MULTIPLIER
+    chosen = ca.Function.if_else("chosen", *of)(counts, *arguments)
+    return ca.Function("curved", arguments, chosen)
 
 
 def _point_derivative_columns(
