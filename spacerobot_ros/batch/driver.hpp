@@ -5,6 +5,9 @@
 // sizes, enumerations, struct Job, and the rows of the arguments and results of CasADi's functions.
 // FLIGHT and REPORT step a tick; REPORT also gives the results of reports. MOMENTUMLESS is FLIGHT for
 // flights without angular momentum. CONTROL gives a controller's command and decision for a state.
+// HOLDING_STEP and SHAPE_EQUATIONS are those of robots whose joints have stops.
+
+#include <set>
 
 static bool any(V flags) {
   for (int lane = 0; lane < LANES; ++lane)
@@ -22,16 +25,20 @@ static V *work_memory() {
 
 typedef int Function(const V **, V **, long long *, V *, int);
 
+static void run(Function *function, const V **in, V **out) {
+  static thread_local long long integers[INTEGER_SIZE];
+  function(in, out, integers, work_memory(), 0);
+}
+
 // Evaluate a function on the rows of a group.
 template <int ARGUMENTS, int RESULTS>
 static void call(Function *function, V *group, const long long (&arguments)[ARGUMENTS],
                  const long long (&results)[RESULTS]) {
   const V *in[ARGUMENT_POINTERS];
   V *out[RESULT_POINTERS];
-  static thread_local long long integers[INTEGER_SIZE];
   for (int i = 0; i < ARGUMENTS; ++i) in[i] = group + arguments[i];
   for (int i = 0; i < RESULTS; ++i) out[i] = group + results[i];
-  function(in, out, integers, work_memory(), 0);
+  run(function, in, out);
 }
 
 #ifdef MOMENTUMLESS
@@ -205,9 +212,9 @@ static void commit(const Job &job, long long g) {
       V &peak = group[span.to + k];
       assign_where(alive, peak, fmax(peak, fabs(group[span.from + k])));
     }
-#ifdef WRENCH_ROW
+#ifdef STOP_ROW
   for (int part = 0; part < 2; ++part) {
-    const V *w = group + WRENCH_ROW + 3 * part;
+    const V *w = group + REALISED_ROW + JOINTS + 3 * part;
     const V size = sqrt(w[0] * w[0] + w[1] * w[1] + w[2] * w[2]);
     V &peak = group[row::peak_wrench + part];
     assign_where(alive, peak, fmax(peak, size));
@@ -223,13 +230,44 @@ static void commit(const Job &job, long long g) {
     assign_where(alive, highest, fmax(highest, group[row::state + k]));
   }
   job.at[g] += 1;
-  job.pending[g] = pending::NOTHING;
   record(job, g, job.at[g]);
 #ifdef CONTROL
   watch_momenta(group, alive);
   if (job.ends) end_where(job, g, group, group[row::decision]);
 #endif
 }
+
+#ifdef STOP_ROW
+#ifdef HOLDING_STEP
+#include "stops.hpp"
+#endif
+
+// Repeat the tick of the lanes where a joint touches a stop. Those that cannot continue fail.
+static void apply_stops(const Job &job, long long g, V *group, bool report) {
+  V lanes = group[STOP_ROW] != V(0.0) && group[row::alive];
+  if (!any(lanes)) return;
+#ifdef HOLDING_STEP
+  Stops stops{group, job.period / SUBSTEPS};
+  const V failed = stops.advance(job.period, lanes);
+#else
+  const V failed = lanes;
+#endif
+  assign_where(failed, group[row::failure], failed);
+  assign_where(failed, group[row::failed_at], V(double(job.at[g])));
+  group[row::alive] = group[row::alive] && !failed;
+#ifdef HOLDING_STEP
+  lanes = lanes && !failed;
+  // A tick of no duration gives the results at the state after the stops.
+  for (int k = 0; k < STATE; ++k) assign_where(lanes, group[row::state + k], stops.x[k]);
+  assign_where(lanes, group[row::h], V(0.0));
+  evaluate(group, report);
+  assign_where(lanes, group[row::h], V(job.period));
+  for (int lane = 0; lane < LANES; ++lane)
+    for (int j = 0; lanes.x[lane] != 0.0 && j < JOINTS; ++j)
+      group[row::limits + JOINTS + j].x[lane] += in(stops.stopped[lane], j);
+#endif
+}
+#endif
 
 // Evaluate the report of every group at its state, and record it if the start is an instant.
 extern "C" void start_flights(const Job *job) {
@@ -245,33 +283,29 @@ extern "C" void start_flights(const Job *job) {
   }
 }
 
-// Fly all groups until a tick, or until lanes need Python for a step of the tick; return the number
-// of groups that wait for that.
+// Fly all groups until a tick, or until lanes need Python for a command; return the number of groups
+// that wait for that.
 extern "C" long long fly_until(const Job *job, long long until) {
   long long waiting = 0;
   for (long long g = 0; g < job->groups; ++g) {
     V *group = job->memory + g * ROWS;
-    if (job->pending[g] == pending::COMMIT) commit(*job, g);
     while (job->at[g] < until && any(group[row::alive])) {
       const long long tick = job->at[g];
 #ifdef CONTROL
-      if (job->pending[g] != pending::TICK && control(*job, g, tick, group)) {
-        job->pending[g] = pending::TICK;
+      const bool report = true;
+      if (!job->pending[g] && control(*job, g, tick, group)) {
+        job->pending[g] = 1;
         ++waiting;
         break;
       }
-      job->pending[g] = pending::NOTHING;
-      evaluate(group, true);
+      job->pending[g] = 0;
 #else
+      const bool report = instant_of(*job, tick + 1) >= 0;
       command(*job, g, tick, group);
-      evaluate(group, instant_of(*job, tick + 1) >= 0);
 #endif
+      evaluate(group, report);
 #ifdef STOP_ROW
-      if (any((group[STOP_ROW] != V(0.0)) && group[row::alive])) {
-        job->pending[g] = pending::COMMIT;
-        ++waiting;
-        break;
-      }
+      apply_stops(*job, g, group, report);
 #endif
       commit(*job, g);
     }

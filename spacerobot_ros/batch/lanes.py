@@ -1,13 +1,11 @@
 """Flights on vector registers: blocks of groups of SIMD lanes, one flight in each lane.
 
 A block's memory is one array (groups, rows, lanes); a row is one number of each flight of a group.
-``driver.hpp`` loops over the ticks and hands back steps that lanes cannot do: if a joint touches a
-stop, the scalar plant steps that flight for that tick, and the flight continues in its lane.
+``driver.hpp`` loops over the ticks and hands back commands that lanes cannot compute.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import astuple, replace
 
 import numpy as np
@@ -22,8 +20,8 @@ from spacerobot_ros.batch.flights import (
     HeldCommands,
     SensorErrors,
 )
-from spacerobot_ros.batch.native import CompiledTick, Job, Pending, Program
-from spacerobot_ros.batch.scalar import fly_one_by_one, plant_of, pose_of_link
+from spacerobot_ros.batch.native import CompiledTick, Job, Program
+from spacerobot_ros.batch.scalar import fly_one_by_one
 from spacerobot_ros.control.goal_monitor import Decision, GoalMonitor
 from spacerobot_ros.control.reference import ReferenceProfile
 from spacerobot_ros.control.state import ControlState
@@ -32,7 +30,7 @@ from spacerobot_ros.files import warn_once
 from spacerobot_ros.model.compilation import NoLibraryError
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.model_functions import ModelFunctions
-from spacerobot_ros.simulation.effort_plant import EffortPlant
+from spacerobot_ros.simulation.effort_plant import FAILURES
 from spacerobot_ros.times import SECOND
 
 _BLOCK_BYTES = 32 * 2**20
@@ -141,8 +139,6 @@ class LaneBlock:
         self._memory[:, self._rows["decided_state"]] = np.nan
         self._memory[:, self._rows["end_state"]] = np.nan
         self._noise = SensorNoise(flights, self._rows_of_lanes)
-        self._stopped: dict[int, EffortPlant] = {}
-        """Scalar plants of flights that have touched a stop, by their lane in the block."""
         self._ended: dict[int, int] = {}
         """Ticks at which flights failed, by their lane in the block."""
         self._profiles: dict[int, ReferenceProfile] = {}
@@ -290,7 +286,8 @@ class LaneBlock:
             if not begin:
                 self._begin_control(failures)
             while library.fly_until(job, end):
-                self._step_outside_lanes(result, failures)
+                self._command_outside_lanes(result, failures)
+            self._note_failures(failures)
         if self._tick.controller is not None:
             library.end_flights(job)
         self._write_results(result)
@@ -331,8 +328,6 @@ class LaneBlock:
             self._tick.library.start_flights(job)
         job.memory, job.reports, job.groups = memory.ctypes.data, reports.ctypes.data, groups
         self._write_rows("h", np.full((len(lanes), 1), self._flights.control_period), lanes)
-        for lane in lanes.tolist():
-            self._stopped.pop(lane, None)
         return reports[lanes // self._lanes, 0, :, lanes % self._lanes]
 
     def end_lanes(self, lanes: Counts) -> None:
@@ -353,7 +348,8 @@ class LaneBlock:
         self._write_rows("command", commands)
         self._at[:], self._instants[0] = 0, ticks
         while self._tick.library.fly_until(self._job, ticks):
-            self._step_outside_lanes(result, failures)
+            self._command_outside_lanes(result, failures)
+        self._note_failures(failures)
         reports = np.moveaxis(self._reports[:, 0], 2, 1)
         return reports.reshape(-1, self._reports.shape[2])[:count]
 
@@ -385,31 +381,29 @@ class LaneBlock:
         self._write_rows("profile", numbers)
         self._write_rows("bounds", most)
 
-    def _step_outside_lanes(self, result: BatchResult, failures: dict[int, str]) -> None:
-        """Do the step that lanes wait for: a command, or a tick of the plant."""
-        rows, alive = self._rows, self._rows.first_row("alive")
-        steps: dict[Pending, tuple[int, Callable[[int, int, int, BatchResult], None]]] = {
-            Pending.COMMIT: (
-                rows.first_row("limited", 1 + self._flights.robot.n),
-                self._step_lane,
-            )
-        }
-        if self._tick.controller is not None:
-            steps[Pending.TICK] = rows.first_row("exact"), self._command_lane
+    def _note_failures(self, failures: dict[int, str]) -> None:
+        """Give the flights that the driver has ended their messages."""
+        reasons, ticks = self._read_rows("failure")[:, 0], self._read_rows("failed_at")[:, 0]
+        for index in np.flatnonzero(reasons).tolist():
+            self._end_flight(index, int(ticks[index]), FAILURES[int(reasons[index]) - 1], failures)
+        self._memory[:, self._rows["failure"]] = 0.0
+
+    def _command_outside_lanes(self, result: BatchResult, failures: dict[int, str]) -> None:
+        """Compute the commands that lanes wait for."""
+        exact, alive = self._rows.first_row("exact"), self._rows.first_row("alive")
         for group in np.flatnonzero(self._pending):
-            waiting, step = steps[Pending(self._pending[group])]
-            lanes = (self._memory[group, waiting] != 0.0) & (self._memory[group, alive] != 0.0)
+            lanes = (self._memory[group, exact] != 0.0) & (self._memory[group, alive] != 0.0)
             for lane in np.flatnonzero(lanes):
                 index = int(group * self._lanes + lane)
                 try:
-                    step(int(group), int(lane), index, result)
+                    self._command_lane(int(group), int(lane), index)
                 except SpaceRobotError as error:
                     self._end_flight(index, int(self._at[group]), str(error), failures)
                 else:
                     if index < len(self._flown):
                         result.fallback_ticks[self._flown[index]] += 1
 
-    def _command_lane(self, group: int, lane: int, index: int, result: BatchResult) -> None:
+    def _command_lane(self, group: int, lane: int, index: int) -> None:
         controller, row = self._tick.controller, int(self._rows_of_lanes[index])
         assert controller is not None
         state = ControlState.unstack(self._memory[group, self._rows["measured"], lane])
@@ -417,26 +411,6 @@ class LaneBlock:
         realised = controller.exact_command(row, self._profiles[index], tick, state).realised
         command = np.concatenate([realised.tau, realised.wrench_B])
         self._memory[group, self._rows["command"], lane] = command
-
-    def _step_lane(self, group: int, lane: int, index: int, result: BatchResult) -> None:
-        """Step the scalar plant, in which a joint touches its stop."""
-        row, n = int(self._rows_of_lanes[index]), self._flights.robot.n
-        if index not in self._stopped:
-            plant = plant_of(self._flights, row)
-            assert isinstance(plant, EffortPlant)
-            self._stopped[index] = plant
-        plant = self._stopped[index]
-        memory = {name: self._memory[group, at, lane] for name, at in self._rows.slices.items()}
-        plant.place(memory["state"])
-        before = plant.stroke_limited.copy()
-        plant.step(memory["command"][:n], memory["command"][n:])
-        memory["next_state"][:] = plant.state
-        memory["pose"][:], memory["twist"][:] = plant.pose, plant.twist
-        memory["momentum"][:], memory["limited"][1 + n] = plant.momentum, 0.0
-        if self._tick.reported_link:
-            memory["link_pose"][:] = pose_of_link(plant, self._tick.reported_link)
-        if index < len(self._flown):
-            result.limited_ticks["stroke"][row] += plant.stroke_limited - before
 
     def _write_results(self, result: BatchResult) -> None:
         count, n, rows = len(self._flown), self._flights.robot.n, self._flown
@@ -453,8 +427,7 @@ class LaneBlock:
         limits = self._read_rows("limits")[:count].astype(np.int64)
         first = "effort" if self._flights.actuation == "effort" else "rate"
         result.limited_ticks[first][rows] = limits[:, :n]
-        if first == "rate":
-            result.limited_ticks["stroke"][rows] = limits[:, n:]
+        result.limited_ticks["stroke"][rows] = limits[:, n:]
         if self._tick.controller is not None:
             self._write_decisions(result, rows)
         self._noise.measure(result, rows)

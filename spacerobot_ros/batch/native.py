@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import casadi as ca
+import numpy as np
 
 from spacerobot_ros.batch.controlling import CONTROL_INPUTS, CONTROL_OUTPUTS, BatchController
 from spacerobot_ros.batch.flights import ControlledGoals, Flights
@@ -28,9 +29,11 @@ from spacerobot_ros.model.compilation import (
     compilation_settings,
     load_library,
 )
+from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.model_functions import Composition, ModelFunctions
 from spacerobot_ros.parameters import values_of
 from spacerobot_ros.simulation import effort_plant, velocity_plant
+from spacerobot_ros.simulation.effort_plant import JointStops
 
 _SOURCE_FOLDER = Path(__file__).resolve().parent
 
@@ -96,21 +99,11 @@ class Program(IntEnum):
     GIVEN = 3
 
 
-class Pending(IntEnum):
-    """Step of a tick that a group of lanes waits for."""
-
-    NOTHING = 0
-    COMMIT = 1
-    """To commit a tick, after the scalar plant has stepped some lanes."""
-    TICK = 2
-    """To step, after the controller has computed the commands of some lanes."""
-
-
 _JOB_MEMBERS = (
     ("V *", "memory", "(groups, ROWS)"),
     ("long long", "groups", ""),
     ("long long *", "at", "(groups,) the next tick"),
-    ("unsigned char *", "pending", "(groups,) Pending"),
+    ("unsigned char *", "pending", "(groups,) whether lanes wait for commands"),
     ("double", "period", "s"),
     ("long long", "period_ns", ""),
     ("long long", "program", "Program"),
@@ -182,8 +175,6 @@ class CompiledTick:
         Memory of a group.
     report_width
         Numbers of a report.
-    reported_link
-        Link whose pose in B is reported after the rest; empty: none.
     controller
         Source of the commands; None: tables.
     """
@@ -192,7 +183,6 @@ class CompiledTick:
     vector_unit: VectorUnit
     memory_layout: RowLayout
     report_width: int
-    reported_link: str = ""
     controller: BatchController | None = None
 
     @classmethod
@@ -260,6 +250,10 @@ class CompiledTick:
             functions["MOMENTUMLESS"] = _momentumless_function(flights, model)
             arguments["MOMENTUMLESS"] = arguments["FLIGHT"]
             results["MOMENTUMLESS"] = results["FLIGHT"]
+        has_stops = effort and np.isfinite([robot.lower, robot.upper]).any()
+        if has_stops:
+            for name in ("holding_step", "shape_equations"):
+                functions[name.upper()] = model.function(name, compile=False)
         controller = None
         if isinstance(flights.program, ControlledGoals):
             controller = BatchController.of(flights)
@@ -271,7 +265,7 @@ class CompiledTick:
         rows = RowLayout(
             {
                 **{"alive": 1, "measured": n, "joint_bias": n, "joint_noise": 1},
-                **{"limits": n if effort else 2 * n, "peak_rate": n, "peak_effort": n},
+                **{"limits": 2 * n, "peak_rate": n, "peak_effort": n, "failure": 1, "failed_at": 1},
                 **{"peak_wrench": 2, "impulse": 2, "lowest": n, "highest": n},
                 **{"decision": 1, "decided": 1, "decided_state": 2 * n + 13},
                 **{"ended": 1, "end_state": 2 * n + 20},
@@ -301,21 +295,25 @@ class CompiledTick:
             width += rows.row_count(name)
         spans = {
             "COPIES": [rows.copy_range(*each) for each in copies.items()],
-            "SUMS": [(limited, rows.first_row("limits"), rows.row_count("limits"))],
+            "SUMS": [(limited, rows.first_row("limits"), n if effort else 2 * n)],
             "PEAKS": peaks,
             "REPORTED": report,
         }
         constants = {"ROWS": rows.total_rows, "JOINTS": n, "COMMANDS": sizes["command"]}
         constants |= {"REPORT_ROWS": width}
         if effort:
-            # Lanes whose joint touches a stop are stepped by the scalar plant.
-            constants["STOP_ROW"] = limited + n
-            constants["WRENCH_ROW"] = rows.first_row("realised", n)
+            constants |= {"STOP_ROW": limited + n, "REALISED_ROW": efforts}
+            constants |= {"SUBSTEPS": flights.substeps, "BISECTIONS": effort_plant.BISECTIONS}
+            constants["MAX_ARRIVALS_PER_STEP"] = effort_plant.MAX_ARRIVALS_PER_STEP
         if controller is not None:
             constants["EXPECTED_ROW"] = state + 2 * n + 4
-        declarations, unit = _shared_declarations(rows, constants, arrays, spans), vector_unit()
+        limits = JointStops.limits(robot) if has_stops else {}
+        declarations, unit = (
+            _shared_declarations(rows, constants, arrays, spans, limits),
+            vector_unit(),
+        )
         library = _load_library(functions, declarations, unit)
-        return cls(library, unit, rows, width, link, controller)
+        return cls(library, unit, rows, width, controller)
 
 
 @dataclass(frozen=True)
@@ -378,7 +376,8 @@ def _load_library(
 
     ``functions`` are CasADi's by their names in the driver: ``FLIGHT`` and ``REPORT``, the tick
     without and with the results of reports; ``MOMENTUMLESS``, the former of robots without angular
-    momentum; ``CONTROL``, the command for a state.
+    momentum; ``CONTROL``, the command for a state; ``HOLDING_STEP`` and ``SHAPE_EQUATIONS``, for
+    joints on their stops.
     """
     library = _compile_library(functions, declarations, unit)
     names = ["start_flights", "fly_until"]
@@ -401,7 +400,7 @@ def _compile_library(
         _CASADI_SELECTION.sub(r"where(\1,\2)", _vector_source(given)),
         *(f"#define {name} {function.name()}" for name, function in functions.items()),
         declarations,
-        _read_source("driver.hpp"),
+        _read_source("driver.hpp").replace('#include "stops.hpp"\n', _read_source("stops.hpp")),
     ]
     # Vectors as arguments between functions of this file: no other is called with them.
     flags = ("-O2", "-std=c++17", "-fno-math-errno", "-Wno-psabi", *_SCHEDULING, *unit.flags)
@@ -430,12 +429,13 @@ def _shared_declarations(
     constants: Mapping[str, int],
     arrays: Mapping[str, Iterable[int]],
     spans: Mapping[str, Iterable[tuple[int, int, int]]],
+    numbers: Mapping[str, Array],
 ) -> str:
     lines = [f"#define {name} {value}" for name, value in constants.items()]
     lines.append("namespace row {")
     lines += [f"constexpr long long {name} = {at.start};" for name, at in rows.slices.items()]
     lines.append("}")
-    for enum in (Program, Pending, Decision):
+    for enum in (Program, Decision):
         members = ", ".join(f"{each.name} = {each.value}" for each in enum)
         lines.append(f"namespace {enum.__name__.lower()} {{ enum {{ {members} }}; }}")
     lines.append("struct Span { long long from, to, count; };  // rows")
@@ -443,6 +443,10 @@ def _shared_declarations(
     lines += [
         f"static const Span {name}[] = {{{', '.join(map(_cpp_list, each))}}};"
         for name, each in spans.items()
+    ]
+    lines += [
+        f"static const double {name}[] = {{{', '.join(map(_cpp_number, each.tolist()))}}};"
+        for name, each in numbers.items()
     ]
     lines += [
         "struct Job {",
@@ -473,6 +477,10 @@ def _define_sizes(functions: Sequence[ca.Function], unit: VectorUnit, libmvec: s
 
 def _cpp_list(numbers: Iterable[int]) -> str:
     return "{" + ", ".join(map(str, numbers)) + "}"
+
+
+def _cpp_number(value: float) -> str:
+    return repr(value).replace("inf", "INFINITY")
 
 
 def _read_source(name: str) -> str:

@@ -40,19 +40,21 @@ from spacerobot_ros.model.model_functions import Composition
 from spacerobot_ros.simulation.loads import LoadedTick, PlantLoads
 from spacerobot_ros.simulation.plant import Flags, InitialState
 
-_BISECTIONS = 40
+BISECTIONS = 40
 """Bisections of the time of arrival: the error is 1e-12 of an integration step."""
 
 _STOP_TOLERANCE = 1e-12
 """Distance beyond a limit at which a joint counts as outside: relative, below one in m or rad."""
 
 
-_TOO_FAST = (
-    "the commands drive the robot too fast for the integration step. Reduce the commands, or "
-    "parameter 'integration_step'."
+FAILURES = tuple(
+    f"{what}: the commands drive the robot too fast for the integration step. Reduce the commands, "
+    "or parameter 'integration_step'."
+    for what in ("The motion is no longer finite", "Joints hit their stops without end")
 )
+"""Reasons why :class:`JointStops` cannot advance a state."""
 
-_MAX_ARRIVALS_PER_STEP = 2
+MAX_ARRIVALS_PER_STEP = 2
 """Largest number of arrivals at stops per joint and integration step, on average over a tick: the
 joints of a robot that commands drive around knock each other off their stops ever more often."""
 
@@ -72,13 +74,21 @@ class JointStops:
 
     def __init__(self, robot: SpaceRobot, integration_step: float, *, loaded: bool = False) -> None:
         self._integration_step = integration_step
-        self._lower, self._upper = robot.lower, robot.upper
-        self._below = robot.lower - _STOP_TOLERANCE * np.maximum(1.0, np.abs(robot.lower))
-        self._above = robot.upper + _STOP_TOLERANCE * np.maximum(1.0, np.abs(robot.upper))
+        self._lower, self._upper, self._below, self._above = self.limits(robot).values()
         self._q, _, self._qdot, *_ = state_slices(robot.n)
         prefix = "loaded_" if loaded else ""
         self._step = robot.buffered(f"{prefix}holding_step")
         self._equations = robot.buffered(f"{prefix}shape_equations")
+
+    @staticmethod
+    def limits(robot: SpaceRobot) -> dict[str, Array]:
+        """Return the limits (n,) of the joints, and those beyond which they count as outside."""
+        return {
+            "LOWER": robot.lower,
+            "UPPER": robot.upper,
+            "BELOW": robot.lower - _STOP_TOLERANCE * np.maximum(1.0, np.abs(robot.lower)),
+            "ABOVE": robot.upper + _STOP_TOLERANCE * np.maximum(1.0, np.abs(robot.upper)),
+        }
 
     def advance(
         self, state: Array, command: Array, duration: float, locked: Flags | None = None
@@ -95,7 +105,7 @@ class JointStops:
         """
         x, left = state.copy(), duration
         steps = duration / self._integration_step
-        arrivals_left = _MAX_ARRIVALS_PER_STEP * self._lower.size * math.ceil(steps)
+        arrivals_left = MAX_ARRIVALS_PER_STEP * self._lower.size * math.ceil(steps)
         none = np.zeros(self._lower.size, dtype=np.bool_)
         locked = none if locked is None else locked
         held, stopped = self._bring_to_rest(x, command, none, locked)
@@ -106,7 +116,7 @@ class JointStops:
             if self._is_outside_limits(after):
                 arrivals_left -= 1
                 if arrivals_left < 0:
-                    raise SpaceRobotError(f"Joints hit their stops without end: {_TOO_FAST}")
+                    raise SpaceRobotError(FAILURES[1])
                 step = self._time_to_stop(x, command, fixed, step)
                 after = self._integrate_step(x, command, fixed, step)
                 after[self._q] = np.clip(after[self._q], self._lower, self._upper)
@@ -151,7 +161,7 @@ class JointStops:
     def _integrate_step(self, x: Array, command: Array, held: Flags, step: float) -> Array:
         after = self._step(x, command, np.where(held, 0.0, 1.0), step)[0]
         if not np.all(np.isfinite(after)):
-            raise SpaceRobotError(f"The motion is no longer finite: {_TOO_FAST}")
+            raise SpaceRobotError(FAILURES[0])
         return after
 
     def _is_outside_limits(self, x: Array) -> bool:
@@ -161,7 +171,7 @@ class JointStops:
     def _time_to_stop(self, x: Array, command: Array, held: Flags, step: float) -> float:
         """Return the time within a step (s) at which the first joint leaves its limits."""
         early, late = 0.0, step
-        for _ in range(_BISECTIONS):
+        for _ in range(BISECTIONS):
             middle = (early + late) / 2
             if self._is_outside_limits(self._integrate_step(x, command, held, middle)):
                 late = middle

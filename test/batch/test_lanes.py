@@ -183,9 +183,7 @@ def test_effort_flights_in_lanes_are_those_of_the_plant(robots: dict[str, SpaceR
     assert_equal_flights(here, there)
     assert there.limited_ticks["effort"].any(axis=1).sum() > 10
     assert 0 < there.limited_ticks["stroke"].any(axis=1).sum() < 19
-    # Ticks at a stop, and no others, are the scalar plant's.
-    assert (here.fallback_ticks > 0).sum() == there.limited_ticks["stroke"].any(axis=1).sum()
-    assert here.fallback_ticks.sum() < 0.5 * 45 * 19
+    assert not here.fallback_ticks.any()
 
 
 @needs_compiler
