@@ -26,6 +26,11 @@ from spacerobot_ros.errors import CommandError, ParameterError, PlanningError
 from spacerobot_ros.events import Event, EventKind
 from spacerobot_ros.model.description import Array, RobotDescription
 from spacerobot_ros.model.grasp import Payload
+from spacerobot_ros.model.rotations import (
+    attitude_error,
+    matrix_from_quaternion,
+    quaternion_from_matrix,
+)
 from spacerobot_ros.planning.core.goal import (
     POSE,
     Controlled,
@@ -33,6 +38,7 @@ from spacerobot_ros.planning.core.goal import (
     PoseError,
     Tolerance,
     missed_parts,
+    missed_turn,
     reached_message,
 )
 from spacerobot_ros.planning.execution.goal_file import (
@@ -133,6 +139,7 @@ class ControlExecutive:
         self._goal_id = ""
         """Id of the latest of them, which statuses have."""
         self._asked: frozenset[Controlled] = frozenset()
+        self._asked_of_hand: frozenset[Controlled] = frozenset()
         """Parts of the pose of the base that the present goals ask for."""
         self._monitor, self._stall = GoalMonitor(), StallMonitor()
         self._was_measured = False
@@ -230,7 +237,13 @@ class ControlExecutive:
         """
         if key == END_EFFECTOR:
             self._require_output(key)
-        parts = self._parts_of(goal) if goal.goal.end_effectors else {key: goal}
+        if goal.goal.end_effectors:
+            parts = self._parts_of(goal)
+        elif key == END_EFFECTOR:
+            # A pose on the topic of the end-effector is met by the axes that are controlled.
+            parts = {key: replace(goal, goal=replace(goal.goal, asked=_PLACE))}
+        else:
+            parts = {key: goal}
         for part, each in parts.items():
             self._require_controlled(part, each)
         for part, each in parts.items():
@@ -264,8 +277,10 @@ class ControlExecutive:
                     f"The goal of '{each.link}' is a position only, and the law '{law.name}' "
                     "controls its attitude: add an orientation."
                 )
-            quaternion = _NO_ROTATION if each.quaternion is None else each.quaternion
-            pose = Goal(each.position, quaternion, goal.joint_positions)
+            asked, quaternion = POSE, each.quaternion
+            if quaternion is None:
+                asked, quaternion = _PLACE, _NO_ROTATION
+            pose = Goal(each.position, quaternion, goal.joint_positions, asked=asked)
             parts[END_EFFECTOR] = replace(identified, goal=pose)
         return parts
 
@@ -548,15 +563,23 @@ class ControlExecutive:
             self._end_goals(kind, self._goal_state, message)
             self._report_decision(kind, message, self._goal_state)
 
-    def _missed_parts(self) -> dict[Controlled, str]:
-        """Return the :func:`missed_parts` of the base in the state of the last command."""
-        law, goal, config = self.controller.law, self.controller.goal.base, self._goal_config
-        if goal is None or not self._asked:
-            return {}
-        state, aimed = law.state, Goal(goal.position, goal.quaternion, asked=self._asked)
-        error = PoseError.between(state.r_WB, state.quaternion_WB, aimed)
+    def _missed_parts(self) -> dict[str, str]:
+        """Return the :func:`missed_parts` in the state of the last command."""
+        law, goal, config = self.controller.law, self.controller.goal, self._goal_config
+        state, outputs = law.state, law.outputs.selection
         tolerance = Tolerance(config.position_tolerance, config.attitude_tolerance)
-        return missed_parts(aimed, error, controlled_parts(law.outputs.selection.base), tolerance)
+        missed: dict[str, str] = {}
+        if goal.base is not None and self._asked:
+            aimed = Goal(goal.base.position, goal.base.quaternion, asked=self._asked)
+            error = PoseError.between(state.r_WB, state.quaternion_WB, aimed)
+            missed |= missed_parts(aimed, error, controlled_parts(outputs.base), tolerance)
+        turned = "attitude" in self._asked_of_hand - controlled_parts(outputs.end_effector)
+        if goal.end_effector is not None and turned:
+            R_BE, _ = law.robot.link_pose(outputs.end_effector_link, state.q)
+            R_WE = matrix_from_quaternion(state.quaternion_WB) @ R_BE
+            turn = attitude_error(quaternion_from_matrix(R_WE), goal.end_effector.quaternion)
+            missed |= missed_turn(float(np.linalg.norm(turn)), tolerance)
+        return missed
 
     def _end_goals(self, kind: EventKind, state: ControllerState, message: str) -> None:
         """Report the end of all goals but the latest, whose status continues."""
@@ -716,6 +739,8 @@ class ControlExecutive:
         self._take_tolerance(next(reversed(self._pending.values())).tolerance)
         if BASE_GOAL_KEY in self._pending or BASE_GOAL_KEY not in pursued:
             self._asked = asked
+        if END_EFFECTOR in self._pending:
+            self._asked_of_hand = self._pending[END_EFFECTOR].goal.asked
         self._pending.clear()
         if planned is not None:
             self.controller.begin_planned(planned.begins, planned.profile)
@@ -869,7 +894,7 @@ class ControlExecutive:
                 raise ValueError("a refusal has a message of its own")
 
 
-_NOTHING_MISSED: Mapping[Controlled, str] = MappingProxyType({})
+_NOTHING_MISSED: Mapping[str, str] = MappingProxyType({})
 
 
 def decided_message(
@@ -877,7 +902,7 @@ def decided_message(
     distance: OutputDistance,
     config: ControllerConfig,
     cause: str = "",
-    missed: Mapping[Controlled, str] = _NOTHING_MISSED,
+    missed: Mapping[str, str] = _NOTHING_MISSED,
     touched: str = "",
 ) -> str:
     """Return the message about a goal that is reached or failed, at a distance from the goal.
@@ -903,6 +928,9 @@ def decided_message(
 
 
 _NO_ROTATION = np.array([0.0, 0.0, 0.0, 1.0])
+
+_PLACE: frozenset[Controlled] = frozenset({"position"})
+"""What a goal of an end-effector asks for that leaves its attitude open."""
 
 _MAX_STATE_GAP, _MAX_STATE_GAP_PERIODS = 1.0, 10
 """Longest gap between two states, s, and in control periods; longer gaps are jumps of time."""

@@ -45,6 +45,7 @@ from spacerobot_ros.planning.core.goal import (
     Controlled,
     Tolerance,
     missed_parts,
+    missed_turn,
     reached_message,
     uncontrolled_parts,
 )
@@ -591,6 +592,8 @@ class FlightData:
             )
             return Verdict("Reached by the measured pose", sentence)
         parts = missed_parts(self.goal, error, frozenset(controls), tolerance)
+        if not self.turns_end_effector:
+            parts |= missed_turn(error.largest_end_effector_angle, tolerance)
         if self.outcome is Outcome.REACHED_PARTLY and parts and not missed:
             return Verdict(word, reached_message(errors, parts))
         fact = "The goal is reached" if reached else "The goal is not reached in time"

@@ -93,15 +93,17 @@ class FixedBaseArm:
         return q, distance
 
     def search_shape(self, q: Array, goal: Pose) -> tuple[Array, float, float]:
-        """Return the shape (n,) nearest to a pose within all joint limits; all axes count.
+        """Return the shape (n,) nearest to a pose within all joint limits.
 
-        Also returned are the distance and the angle that remain, m and rad. The search starts at
+        Also returned are the distance and the angle that remain in the axes that count, m and rad.
+        The search starts at
         ``q`` and at random shapes; for equal arguments the result is the same.
         """
         # Imported here because scipy.optimize loads slowly.
         from scipy.optimize import least_squares
 
-        weights = np.repeat([1.0, _RADIAN_LENGTH], 3)
+        weights = np.repeat([1.0, _RADIAN_LENGTH], 3)[self._rows]
+        turns = np.array(self._rows) >= 3
 
         def error(shape: Array) -> Array:
             return weights * self.error(shape, goal)[0]
@@ -125,8 +127,8 @@ class FixedBaseArm:
                 best, least = found.x, found.fun
             if np.linalg.norm(least) < _SEARCH_TOLERANCE:
                 break
-        angle = float(np.linalg.norm(least[3:])) / _RADIAN_LENGTH
-        return best, float(np.linalg.norm(least[:3])), angle
+        angle = float(np.linalg.norm(least[turns])) / _RADIAN_LENGTH
+        return best, float(np.linalg.norm(least[~turns])), angle
 
 
 def is_reached(distance: float, angle: float) -> bool:

@@ -27,10 +27,11 @@ from typing import IO
 
 import numpy as np
 
+from spacerobot_ros.control.outputs import default_selection
 from spacerobot_ros.errors import GoalError, SpaceRobotError, quantity
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import DEFAULT_END_EFFECTOR, Array, Pose, RobotDescription
-from spacerobot_ros.model.inverse_kinematics import FixedBaseArm, is_reached
+from spacerobot_ros.model.inverse_kinematics import AXES, FixedBaseArm, is_reached
 from spacerobot_ros.model.rotations import matrix_from_quaternion
 from spacerobot_ros.model.shared_parameters import (
     DEFAULT_POSITION_TOLERANCE,
@@ -114,6 +115,8 @@ class GoalQuestion:
     tool, link
         Goal of a link, for a controller, which plans nothing: the check is then whether the arm can
         reach it. None: a planner flies.
+    axes
+        Axes of the link that the controller controls; other errors do not count.
     """
 
     urdf: str
@@ -122,6 +125,7 @@ class GoalQuestion:
     goal: Goal
     tool: Goal | None = None
     link: str = ""
+    axes: tuple[str, ...] = AXES
 
 
 def make_question(
@@ -155,7 +159,9 @@ def make_question(
         link = robot.end_effector(json.loads(known.get("end_effector_frame", '""')))
         if link not in robot.frames:
             return "The end-effector is not a link of the robot."
-        return GoalQuestion(robot.urdf, {}, RobotState(*pose, q), goal, tool, link)
+        axes = json.loads(known.get("end_effector_outputs", '""')).split()
+        axes = axes or default_selection(robot, link).end_effector or AXES
+        return GoalQuestion(robot.urdf, {}, RobotState(*pose, q), goal, tool, link, tuple(axes))
     if "planner" in state.absent:
         return "The planner is offline."
     if state.planner.state is PlannerState.PLANNING:
@@ -425,7 +431,7 @@ def _check_arm(question: GoalQuestion, tool: Goal) -> GoalCheck:
     base, end = (
         Pose(matrix_from_quaternion(g.quaternion), g.position) for g in (question.goal, tool)
     )
-    arm = FixedBaseArm(SpaceRobot(parse_robot(question.urdf)), question.link, base)
+    arm = FixedBaseArm(SpaceRobot(parse_robot(question.urdf)), question.link, base, question.axes)
     shape, distance, angle = arm.search_shape(question.state.q, end)
     if is_reached(distance, angle):
         message = "The end-effector can reach its goal there."

@@ -24,6 +24,7 @@ from spacerobot_ros.measures import Outcome, flown_time
 from spacerobot_ros.model.thrusters import find_thrusters
 from spacerobot_ros.model.urdf import parse_robot
 from spacerobot_ros.planning import Goal
+from spacerobot_ros.planning.core.goal import EndEffectorGoal
 from spacerobot_ros.planning.execution.status import (
     PlannerState,
     PlannerStatus,
@@ -247,6 +248,27 @@ def test_status_events_and_summary_of_a_goal_that_is_reached_partly_agree(
         ((_, message),) = open_flight_bag(path).messages("goal_pose")
         at = message.pose.position
         assert [math.isnan(each) for each in (at.x, at.y, at.z)] == unasked
+
+
+def test_an_attitude_of_a_hand_that_was_asked_for_and_is_not_controlled_is_not_reached(
+    tmp_path: Path,
+) -> None:
+    """Two joints place the hand, and its attitude follows from them."""
+    scenario, place = load_scenario("coordinated_control"), [1.5, 1.5, 0.0]
+    yaw, bag = 0.0, tmp_path / "run.mcap"
+    for turn, state in ((None, "reached"), (0.0, "reached"), (0.7, "reached_partly")):
+        half = (yaw + (turn or 0.0)) / 2
+        turned = np.array([0.0, 0.0, math.sin(half), math.cos(half)])
+        quaternion = None if turn is None else turned
+        aim = EndEffectorGoal("end_effector", np.array(place), quaternion)
+        result = run_scenario(scenario.with_end_effectors([aim]), bag)
+        assert (result.summary["state"], result.succeeded) == (state, state == "reached")
+        missed = "its end-effector's attitude, which is 0.7 rad off" in result.message
+        assert missed is (state == "reached_partly")
+        flight = read_run(bag)
+        assert flight.outcome.value == state
+        *_, z, w = flight.signal("end_effector_pose").values[-1]
+        yaw, bag = 2 * math.atan2(z, w), tmp_path / f"{turn}.mcap"
 
 
 def test_a_part_that_was_asked_for_and_is_not_controlled_is_not_reached(tmp_path: Path) -> None:

@@ -23,6 +23,7 @@ from spacerobot_ros.planning.core.goal import EndEffectorGoal, Tolerance
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus
 from spacerobot_ros.resources import robot_file
+from spacerobot_ros.scenario import load_scenario
 from spacerobot_ros.viewer.reachability import (
     GoalCheck,
     GoalChecker,
@@ -283,6 +284,26 @@ def test_the_arm_of_a_controlled_robot_reaches_its_goal_or_not() -> None:
     answer = Planner().answer(replace(near, tool=far), Cancellation())
     assert answer.verdict == Verdict.REFUSED
     assert "m and" in answer.message
+
+
+def test_an_attitude_that_the_law_leaves_free_refuses_no_goal() -> None:
+    """The scenario's own goals: of the hand of two joints, the law controls the place alone."""
+    scenario = load_scenario("coordinated_control")
+    robot, tool = load_robot(robot_file("planar_manipulator")), scenario.end_effector_goal
+    assert tool is not None
+    measured = replace(MEASURED, q=np.array([-1.0, 1.05]))
+    state, goals = StackState(measured), {"base": scenario.goal, "end_effector": tool}
+    verdicts = {}
+    for outputs in ("", "x y", "x y rz"):
+        texts = {"end_effector_outputs": json.dumps(outputs)}
+        asked = make_question(state, goals, robot, {"controller": texts})
+        assert isinstance(asked, GoalQuestion)
+        verdicts[outputs] = Planner().answer(asked, Cancellation()).verdict
+    assert verdicts == {
+        "": Verdict.REACHABLE,
+        "x y": Verdict.REACHABLE,
+        "x y rz": Verdict.REFUSED,
+    }
 
 
 def _unit(quaternion: Array) -> Array:

@@ -575,7 +575,7 @@ def uncontrolled_parts(goal: Goal, controls: frozenset[Controlled]) -> tuple[Con
 
 def missed_parts(
     goal: Goal, error: PoseError, controls: frozenset[Controlled], tolerance: Tolerance
-) -> dict[Controlled, str]:
+) -> dict[str, str]:
     """Return the parts of the base that were asked for, are out of tolerance and not controlled,
     each with its error and unit.
     """
@@ -590,7 +590,12 @@ def missed_parts(
     }
 
 
-def reached_message(remaining: str, missed: Mapping[Controlled, str]) -> str:
+def missed_turn(angle: float, tolerance: Tolerance) -> dict[str, str]:
+    """Return, as :func:`missed_parts`, that the attitude of an end-effector (rad) is missed."""
+    return {"end-effector's attitude": f"{angle:.3g} rad"} if angle > tolerance.attitude else {}
+
+
+def reached_message(remaining: str, missed: Mapping[str, str]) -> str:
     """Return the message about a reached goal; ``missed`` are its :func:`missed_parts`."""
     parts = " and ".join(f"its {part}, which is {error} off" for part, error in missed.items())
     but = f" but for {parts} and not controlled" if parts else ""
