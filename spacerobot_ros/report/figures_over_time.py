@@ -700,45 +700,6 @@ _SENSOR_ROUNDING = 1e-12
 """Sensor errors up to this one are rounding errors, m or rad."""
 
 
-def errors_figure(flight: FlightReport) -> ReportFigure | str | None:
-    """Goal minus pose of base and end-effector, in the components under control; of a planner the
-    distance and the angle of the base.
-    """
-    base = Signal(flight.position.time, np.hstack([flight.position.values, flight.quaternion]))
-    if not flight.outputs and not flight.tool_goals:
-        return _base_errors_figure(flight, pose_errors(base, flight.targets))
-    groups = []
-    for part, pose, targets in (
-        ("base", base, flight.targets),
-        ("end_effector", flight.tool, flight.tool_targets),
-    ):
-        errors = pose_errors(pose, targets)
-        chosen = flight.controls(part)
-        name = part.replace("_", "-")
-        for unit, quantity, members in (
-            ("m", "position", (0, 1, 2)),
-            ("rad", "attitude", (3, 4, 5)),
-        ):
-            axes = [i for i in members if i in chosen]
-            if len(errors) and axes:
-                signal = Signal(errors.time, errors.values[:, axes])
-                names = ["xyz"[i % 3] for i in axes]
-                colours = [PALETTE[i % 3] for i in axes]
-                groups.append(TraceGroup(signal, names, f"{name} {quantity} error", unit, colours))
-    if not groups:
-        return None
-    caption = (
-        "Goal minus pose, in the world frame, for the components under control; attitude as the "
-        "remaining rotation vector"
-    )
-    limits: tuple[tuple[Literal["position", "attitude"], str], ...]
-    limits = (("position", "m"), ("attitude", "rad"))
-    known = [(flight.tolerance(part), unit) for part, unit in limits]
-    if within := ", ".join(f"{value:.3g} {unit}" for value, unit in known if value is not None):
-        caption += f"; tolerance of distance and angle: {within}"
-    return time_figure(flight, "errors", "Output errors", caption, groups)
-
-
 _MAX_DECADES = 8
 
 _ERROR_PARTS: tuple[tuple[Literal["position", "attitude"], str, str], ...] = (
@@ -748,23 +709,32 @@ _ERROR_PARTS: tuple[tuple[Literal["position", "attitude"], str, str], ...] = (
 """Parts of a goal, the norms of their errors and the units of those."""
 
 
-def _base_errors_figure(flight: FlightReport, errors: Signal) -> ReportFigure | str | None:
-    """Distance and angle of the base, as far as the method controls it, from errors (N, 6)."""
+def errors_figure(flight: FlightReport) -> ReportFigure | str | None:
+    """Distance and angle of the base, and of a controller's end-effector, from their goals, in the
+    components under control.
+    """
+    base = Signal(flight.position.time, np.hstack([flight.position.values, flight.quaternion]))
     groups = []
-    for k, (part, *_) in enumerate(_ERROR_PARTS):
-        if len(errors) and part not in flight.not_controlled:
-            norms = np.linalg.norm(errors.values[:, 3 * k : 3 * k + 3], axis=1)
-            signal = Signal(errors.time, norms[:, np.newaxis])
-            groups.append(_error_group(flight, signal, part, "base", colour(0)))
+    for number, (part, pose, targets) in enumerate(
+        (("base", base, flight.targets), ("end_effector", flight.tool, flight.tool_targets))
+    ):
+        errors, of = pose_errors(pose, targets), part.replace("_", "-")
+        free = flight.not_controlled if part == "base" else ()
+        for k, (half, *_) in enumerate(_ERROR_PARTS):
+            chosen = [i for i in flight.controls(part) if i // 3 == k]
+            if len(errors) and chosen and half not in free:
+                norms = np.linalg.norm(errors.values[:, chosen], axis=1)
+                signal = Signal(errors.time, norms[:, np.newaxis])
+                groups.append(_error_group(flight, signal, half, of, colour(number)))
     if not groups:
         return None
     caption = (
-        "Distance and angle of the base from its goal, on logarithmic axes; smaller values lie on "
-        "the lower edge; dotted, the tolerance"
+        "Distance and angle from the goal, in the components under control, on logarithmic axes; "
+        "smaller values lie on the lower edge; dotted, the tolerance"
     )
     if left_out := [part for part, *_ in _ERROR_PARTS if part in flight.not_controlled]:
-        caption += f"; the {' and '.join(left_out)} is not controlled"
-    return time_figure(flight, "errors", "Errors of the base", caption, groups)
+        caption += f"; the {' and '.join(left_out)} of the base is not controlled"
+    return time_figure(flight, "errors", "Errors", caption, groups)
 
 
 def _error_group(

@@ -641,34 +641,6 @@ class RecentItems(Generic[T]):
         return self._items[max(bisect_right(self._times, time_s) - 1, 0)]
 
 
-class History:
-    """Numbers over the last minutes of simulated time, one row per drawing.
-
-    Parameters
-    ----------
-    width
-        Numbers in a row.
-    span_s, most
-        As of :class:`RecentItems`.
-    """
-
-    def __init__(self, width: int, span_s: float = 300.0, most: int = 600) -> None:
-        self._rows: RecentItems[Array] = RecentItems(span_s, most)
-        self._width = width
-
-    def add(self, time_s: float, values: Sequence[float] | Array) -> None:
-        """Add a row; rows of this time or later are dropped first (time may run back)."""
-        self._rows.add(time_s, np.concatenate([[time_s], np.asarray(values, float)]))
-
-    def arrays(self) -> tuple[Array, ...]:
-        """Return time (k,) and each number (k,); one row of zeros if there is none yet."""
-        if not self._rows.items:
-            # A plot without numbers has no scale.
-            return tuple(np.zeros(1) for _ in range(self._width + 1))
-        table = np.array(self._rows.items)
-        return tuple(np.ascontiguousarray(column) for column in table.T)
-
-
 class Trail:
     """The flown path of the base, as points at least a step apart.
 

@@ -23,7 +23,7 @@ from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.core.goal import Tolerance
 from spacerobot_ros.simulation.faults import FAULT_KINDS, FaultTargets
 from spacerobot_ros.viewer import content, scene
-from spacerobot_ros.viewer.content import History, RecentItems, Trail
+from spacerobot_ros.viewer.content import RecentItems, Trail
 from spacerobot_ros.viewer.goal_editor import Defer, GoalEditor
 from spacerobot_ros.viewer.server import ViewerConfig
 from spacerobot_ros.viewer.state import (
@@ -348,7 +348,7 @@ class Plots:
         """Start over with another robot."""
         self._first = None
         for plot in (self._momentum, self._budget):
-            plot.history = History(len(plot.names))
+            plot.clear()
         self._budget.handle.visible = False
         self._show_parts({})
         if self._shape is not None:
@@ -368,18 +368,18 @@ class Plots:
         self._show_parts(errors)
         for part, error in errors.items():
             numbers = 1e3 * np.array(error.numbers)
-            self._errors[part, len(numbers)].history.add(time_s, numbers)
+            self._errors[part, len(numbers)].add(time_s, numbers)
         if state.momenta is not None:
             if self._first is None:
                 self._first = state.momenta.actual
             drift = content.momentum_drift(state.momenta, self._first)
-            self._momentum.history.add(time_s, 1e6 * np.array(drift))
+            self._momentum.add(time_s, 1e6 * np.array(drift))
         budget = content.momentum_budget(state)
         if budget:
             self._budget.handle.visible = True
-            self._budget.history.add(time_s, list(budget.values()))
+            self._budget.add(time_s, list(budget.values()))
         if self._shape is not None:
-            self._shape.history.add(time_s, measured.q)
+            self._shape.add(time_s, measured.q)
 
     def show_budget(self, state: StackState) -> None:
         """Show the present momentum budget of a robot with wheels."""
@@ -401,7 +401,7 @@ class Plots:
                 self._errors[part, count] = plot
         for key, plot in self._errors.items():
             if plot.handle.visible and key not in shown:
-                plot.history = History(len(plot.names))
+                plot.clear()
             plot.handle.visible = key in shown
         self._no_errors.visible = not errors
 
@@ -439,7 +439,8 @@ class _Plot:
         limited: bool = False,
     ) -> None:
         self._limited = limited
-        self.names, self.history = names, History(len(names))
+        self.names = names
+        self.clear()
         scales = units or ("y",) * len(names)
         series: list[Any] = [{"label": "t (s)"}]
         for i, name in enumerate(names):
@@ -481,12 +482,19 @@ class _Plot:
         if (scales := self._logarithmic if enabled else self._linear) != self.handle.scales:
             self.handle.scales = scales
 
+    def clear(self) -> None:
+        self._rows: RecentItems[Array] = RecentItems(most=600)
+
+    def add(self, time_s: float, values: Sequence[float] | Array) -> None:
+        self._rows.add(time_s, np.append(time_s, values))
+
     def draw(self, time_s: float | None, limits: Sequence[float] = ()) -> None:
         self.handle.data = self._data(time_s, limits)
 
     def _data(self, time_s: float | None, limits: Sequence[float]) -> tuple[Array, ...]:
         """Return times, curves, their limits, and an upright line at a time, s."""
-        rows = np.stack(self.history.arrays(), axis=1)
+        # A plot without numbers has no scale.
+        rows = np.array(self._rows.items or [np.zeros(1 + len(self.names))])
         rows[:, 1:] = np.maximum(rows[:, 1:], self._least)
         line = np.full(len(rows), -1.0)  # Below the axis.
         if time_s is not None:
@@ -687,7 +695,7 @@ class Page:
 
         @self._server.on_client_connect
         async def _(client: Any) -> None:
-            defer(lambda: self._place_first_camera(client.camera))
+            defer(lambda: self._aim_camera(client.camera))
 
         self._style = gui.add_button("Dark or light", color="gray")
         themes: dict[int, bool] = {}
@@ -944,11 +952,6 @@ class Page:
     def _aim_cameras(self) -> None:
         for client in self._server.get_clients().values():
             self._aim_camera(client.camera)
-
-    def _place_first_camera(self, camera: Any) -> None:
-        """Turn the camera of a phone that has opened the page to the robot."""
-        if getattr(camera, "aspect", 1.0) < _PORTRAIT and self._last is not None:
-            self._aim_camera(camera)
 
     def _move_cameras(self, way: Array) -> None:
         """Move the cameras of all browsers by ``way`` (3,), m."""

@@ -34,7 +34,7 @@ from spacerobot_ros.simulation.clearance import ClearanceStatus
 from spacerobot_ros.simulation.faults import FaultTargets
 from spacerobot_ros.simulation.status import PlantState, PlantStatus
 from spacerobot_ros.viewer import content
-from spacerobot_ros.viewer.content import History, Trail
+from spacerobot_ros.viewer.content import RecentItems, Trail
 from spacerobot_ros.viewer.goal_editor import move_along, rpy_from_quaternion
 from spacerobot_ros.viewer.reachability import GoalCheck, Verdict
 from spacerobot_ros.viewer.state import Measured, Momenta, Notice, StackState
@@ -386,20 +386,19 @@ def test_faults_are_written_for_the_plant() -> None:
 
 
 def test_history_keeps_the_last_minutes_and_forgets_a_time_that_comes_again() -> None:
-    history = History(1, span_s=100.0, most=50)
-    assert [column.tolist() for column in history.arrays()] == [[0.0], [0.0]]
+    recent: RecentItems[float] = RecentItems(span_s=100.0, most=50)
+    assert recent.span is None
     for k in range(1000):
-        history.add(0.5 * k, [float(k)])
-    time, values = history.arrays()
-    assert len(time) <= 50
-    assert time[-1] == 499.5
-    assert time[0] >= 399.5
-    np.testing.assert_array_equal(values, 2 * time)
-    assert np.all(np.diff(time) > 0)
-    history.add(450.0, [-1.0])
-    time, values = history.arrays()
-    assert (time[-1], values[-1]) == (450.0, -1.0)
-    assert np.all(np.diff(time) > 0)
+        recent.add(0.5 * k, 0.5 * k)
+    assert len(recent.items) <= 50
+    assert recent.items[-1] == 499.5
+    assert recent.span == (recent.items[0], 499.5)
+    assert recent.items[0] >= 399.5
+    assert np.all(np.diff(recent.items) > 0)
+    recent.add(450.0, -1.0)
+    assert recent.span == (recent.items[0], 450.0)
+    assert recent.items[-1] == -1.0
+    assert np.all(np.diff(recent.items[:-1]) > 0)
 
 
 def test_a_trail_is_as_long_as_the_flight_with_as_many_points_as_are_drawn() -> None:
