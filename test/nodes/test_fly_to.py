@@ -1,6 +1,6 @@
 """The actions of planner and controller through rclpy: sent, followed, cancelled, preempted.
 
-``test_real_actions.py`` builds the packages of interfaces and runs these tests with them.
+``test_layouts.py`` builds the packages of interfaces and runs these tests with them.
 """
 
 from __future__ import annotations

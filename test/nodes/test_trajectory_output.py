@@ -1,6 +1,6 @@
 """Schedules that a trajectory server of the robot flies: with lag, violations and aborts.
 
-``test_real_actions.py`` builds control_msgs and runs these tests with it.
+``test_layouts.py`` builds control_msgs and runs these tests with it.
 """
 
 from __future__ import annotations
