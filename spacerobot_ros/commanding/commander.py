@@ -191,7 +191,7 @@ class StateDecoder(Protocol):
         """Return positions and rates (n,) of a joint reference, or raise CommandError."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class StateArrays:
     """A state as arrays: joints, and where it is measured the base; all messages in one."""
 
