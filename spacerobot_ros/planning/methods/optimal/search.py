@@ -152,16 +152,17 @@ _MAX_CLEARING_ITERATIONS = 80
 """Steps of the solver between paths that planes are made for at most: what takes more diverges."""
 
 _MAX_CLEARING_ROUNDS, _MAX_SHORTENING_ROUNDS = 15, 10
-"""Paths on the way to a clear one, and from there to a fast one, at most: most take a few."""
+"""Paths on the way to a clear one, and from there to a fast one, at most: most take a few, but a
+servicer's plan is not found in seven."""
 
 _MIN_LARGEST_LACK, _LACK_PER_DEPTH = 0.1, 2.0
 """Distance by which links on the way to a clear path may be nearer than they ought to be, m: at
 least, and as a multiple of the depth of their contact."""
 
-_MAX_WORK_PER_ITERATION, _WORK_FACTOR_WITHOUT_PATH = 2.2e5, 1.25
+_MAX_WORK_PER_ITERATION, _WORK_FACTOR_WITHOUT_PATH = 1.25e5, 2.0
 """Largest work on clear paths, in nonzeros of Jacobians over all steps of the solver, for each step
 that ``optimal.iterations`` allows from one guess, and its factor where there is no clear path yet:
-some 20 s of an idle core (0.3 us a nonzero, for six to fourteen joints on both grids)."""
+some 20 s of an idle core (0.5 us a nonzero). With 1e5 a servicer's plan took 9 % longer."""
 
 _MIN_SHORTENING_ROUNDS = 3
 """Paths on the way to a fast one that are tried even so."""
@@ -712,37 +713,36 @@ class ManoeuvreSearch:
         self, state: _SearchState, kept: KeptDistances, found: list[Manoeuvre]
     ) -> list[Manoeuvre]:
         """Return manoeuvres that keep clear: those that were found, if the fastest one does; else
-        others near to them, or near to other paths; none if none is found.
+        one near to them, or near to other paths; none if none is found.
         """
-        problem = state.problem
         in_order = sorted(found, key=lambda one: one.duration)
         if not kept.approaches(in_order[0].held.positions, in_order[0].held.quaternions):
             return found
         state.best, state.is_clearing = math.inf, True
-        freed: list[Manoeuvre] = []
-        for each in in_order:
-            if freed and each.duration >= min(one.duration for one in freed):
-                break
-            if not kept.approaches(each.held.positions, each.held.quaternions):
-                freed.append(each)
-                continue
-            with state.attempt():
-                freed.append(self._make_clear(state, kept.anew(), each.solution))
-        # A robot that drifts finds others sooner after it has coasted.
-        if freed or (problem.boundary.drifts and problem.motion is None):
-            return freed
+        known = [each.solution for each in in_order]
         clear: list[tuple[KeptDistances, Trajectory]] = []
-        others = self._other_paths(state, [each.solution for each in found], clear)
+        paths = itertools.chain(known, self._other_paths(state, known, clear))
         if not self._has_coarse_paths(state):
-            for path in itertools.islice(others, _MAX_FULL_GRID_STARTS):
+            for path in itertools.islice(paths, len(known) + _MAX_FULL_GRID_STARTS):
                 with state.attempt():
                     return [self._clear_finely(state, kept.anew(), path)]
             return []
-        for path in others:
-            with state.attempt():
-                clear.append(self._clear_coarsely(state, kept.anew(), path))
-            if len(clear) == _CLEAR_ANSWERS:
-                break
+        for number, path in enumerate(paths, 1):
+            if all(path.duration < each.duration for _, each in clear):
+                with state.attempt():
+                    clear.append(self._clear_coarsely(state, kept.anew(), path))
+            if number == len(known) or len(clear) == _CLEAR_ANSWERS:
+                if freed := self._finely_cleared(state, clear):
+                    return freed
+                clear.clear()
+        return self._finely_cleared(state, clear)
+
+    def _finely_cleared(
+        self, state: _SearchState, clear: list[tuple[KeptDistances, Trajectory]]
+    ) -> list[Manoeuvre]:
+        """Return a manoeuvre near to the fastest of clear paths on the coarse grid, or to the next;
+        none if none is found.
+        """
         for apart, path in sorted(clear, key=lambda each: each[1].duration):
             with state.attempt():
                 return [self._clear_finely(state, apart, path)]
@@ -755,6 +755,9 @@ class ManoeuvreSearch:
         guesses that led to known ones, while nothing is ``found``.
         """
         problem = state.problem
+        if problem.boundary.drifts and problem.motion is None:
+            # A robot that drifts finds others sooner after it has coasted.
+            return
         costs = [problem.cost(each) for each in known]
         solver = self._solver(problem, state.coarse)
         brakes = problem.motion is not None and not problem.boundary.drifts
@@ -784,13 +787,6 @@ class ManoeuvreSearch:
         # A motion that is timed is too far off on it: joints run on in long intervals.
         return problem.hastens and state.coarse != state.full and not problem.is_timed
 
-    def _make_clear(self, state: _SearchState, kept: KeptDistances, path: Trajectory) -> Manoeuvre:
-        """Return a manoeuvre near to a path that keeps clear; UnusableCandidateError if none was
-        found."""
-        if self._has_coarse_paths(state):
-            kept, path = self._clear_coarsely(state, kept, path)
-        return self._clear_finely(state, kept, path)
-
     def _clear_coarsely(
         self, state: _SearchState, kept: KeptDistances, path: Trajectory
     ) -> tuple[KeptDistances, Trajectory]:
@@ -800,7 +796,7 @@ class ManoeuvreSearch:
         apart = _Apart(kept, state.coarse)
         slow, _ = self._clear(state, apart, path, _CLEARING_TIME_FACTOR * path.duration)
         fast, _ = self._shorten(state, apart, slow, None)
-        return kept, fast.stretched(_RESAMPLED_TIME_FACTOR)
+        return kept, fast
 
     def _clear_finely(
         self, state: _SearchState, kept: KeptDistances, path: Trajectory
@@ -812,16 +808,22 @@ class ManoeuvreSearch:
         hold = partial(self._make_held_commands, state, kept=kept)
         apart = _Apart(kept, state.full, hold)
         shortest = self._shortest_duration(problem)
-        duration = path.duration if kept.pairs else _CLEARING_TIME_FACTOR * path.duration
-        if options.duration > 0:
+        duration, made = _CLEARING_TIME_FACTOR * path.duration, None
+        if kept.pairs:
+            # A path that is clear on the coarse grid mostly is on the full one, as fast.
+            path = path.stretched(_RESAMPLED_TIME_FACTOR)
+            duration = path.duration
+            path, made = self._shorten(state, apart, path, None)
+        elif options.duration > 0:
             duration = self._given_duration(options)
         elif problem.gentle:
             path = self._slow_to_effort_limits(path, problem.boundary)
             duration = max(_GENTLE_DURATION_FACTOR * path.duration, shortest)
-        path, made = self._clear(state, apart, path, duration)
-        if problem.hastens:
-            path, made = self._shorten(state, apart, path, made)
-        elif problem.gentle:
+        if made is None:
+            path, made = self._clear(state, apart, path, duration)
+            if problem.hastens:
+                path, made = self._shorten(state, apart, path, made)
+        if problem.gentle:
             fast = path.at_full_speed(problem.limits, shortest)
             made = hold(self._slow_to_effort_limits(fast, problem.boundary))
             if near := kept.approaches(made.held.positions, made.held.quaternions):
@@ -882,6 +884,9 @@ class ManoeuvreSearch:
                 if all(each.pair in apart.kept.pairs for each in near):
                     reach /= _REACH_DIVISOR
                 apart.kept.add(near)
+                if made is None and apart.hold is not None:
+                    # It is no path that is clear by its held commands, either.
+                    break
                 continue
             gain = 1 - faster.duration / path.duration
             if gain > 0:
