@@ -244,6 +244,9 @@ def _capture_line(summary: dict[str, Any]) -> list[str]:
         return []
     capture = summary["capture"]
     done = f"at {capture['time_s']:.6g} s" if capture["captured"] else "the target is not captured"
+    if capture["captured"] and "planned_momentum_Nms" in capture:
+        left = math.hypot(*capture["angular_momentum_Nms"])
+        done += f", {left:.3g} N m s left ({capture['planned_momentum_Nms']:.3g} planned)"
     return [f"capture     {done}"]
 
 

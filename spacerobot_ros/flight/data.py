@@ -250,11 +250,18 @@ class FlightData:
     def capture(self) -> dict[str, Any]:
         """The first capture of the target, by the keys of ``spacerobot run --json``.
 
-        Without a capture, ``captured`` is false; empty if there is no target.
+        Without a capture, ``captured`` is false; empty if there is no target. After a planned
+        approach, ``detumble`` and ``planned_momentum_Nms`` are what was asked for and planned, and
+        ``angular_momentum_Nms`` is left.
         """
+        planned: dict[str, Any] = {}
         for event in self.events:
+            about = event.about
+            if event.kind is EventKind.APPROACH_STARTED and "planned_momentum_Nms" in about:
+                left = float(about["planned_momentum_Nms"])
+                planned = {"detumble": about["detumble"], "planned_momentum_Nms": left}
             if event.kind is EventKind.CAPTURED:
-                return {"time_s": event.time_s, **capture_values(event.about)}
+                return {"time_s": event.time_s, **capture_values(about), **planned}
         return {} if self.target is None else {"captured": False}
 
     @cached_property

@@ -130,7 +130,7 @@ def test_a_grasp_leaves_no_angular_momentum_if_that_is_asked_for() -> None:
 def test_meetings_that_cannot_be_are_refused_in_a_sentence() -> None:
     start = ThrustStart.at_rest(HERE, np.zeros(1))
 
-    def refusal(free: BodyMotion, **options: float) -> str:
+    def refusal(free: BodyMotion, **options: Any) -> str:
         with pytest.raises(PlanningError) as refused:
             boomed(**options).plan(start, ThrustGoal(grapple=meeting(free)))
         return str(refused.value)

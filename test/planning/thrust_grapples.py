@@ -41,7 +41,7 @@ def tumbling(rate: float, rng: np.random.Generator) -> BodyMotion:
     return BodyMotion(R, way, 0.002 * rng.normal(size=3), omega)
 
 
-def planned(rate: float, count: int, seed: int, *, detumbles: bool) -> str:
+def planned(rate: float, count: int, seed: int, *, detumbles: bool, bare: bool) -> str:
     """Return a line about plans to targets of a rate."""
     robot = SpaceRobot.from_file(robot_file("servicer"))
     target = load_robot(TARGET)
@@ -79,9 +79,9 @@ def planned(rate: float, count: int, seed: int, *, detumbles: bool) -> str:
         missed.append(
             np.linalg.norm(r[1] + Rotation.from_quat(X[1]).apply(body.grapple.r) - hand[0])
         )
-        if not detumbles:
-            bare = planner.plan(start, ThrustGoal(grapple=replace(grapple, clearance=0.0)))
-            touching += distance_from_target(robot.description, target, bare, free) <= 0
+        if bare:
+            careless = planner.plan(start, ThrustGoal(grapple=replace(grapple, clearance=0.0)))
+            touching += distance_from_target(robot.description, target, careless, free) <= 0
         print(f"{number}: {cpu[-1]:.2f} s of CPU, {motion.duration:.1f} s", flush=True)
     line = (
         f"{rate:g} deg/s: {len(nearest)} of {count}, CPU median {np.median(cpu):.2f} s, most "
@@ -89,7 +89,7 @@ def planned(rate: float, count: int, seed: int, *, detumbles: bool) -> str:
     )
     if detumbles:
         return f"{line}, left {max(left):.2%} of the target's, {max(longer):.3f} of the time"
-    return f"{line}, {touching} touch it without rows"
+    return f"{line}, {touching} touch it without rows" if bare else line
 
 
 def flown(rate: float, draws: int, seed: int, profile: str, detumble: str) -> str:
@@ -124,7 +124,7 @@ def flown(rate: float, draws: int, seed: int, profile: str, detumble: str) -> st
         if capture["captured"]:
             assert flight.propellant is not None
             captured += 1
-            propellant.append(flight.propellant)
+            propellant.append(flight.propellant or 0.0)
             left.append(float(np.linalg.norm(capture["angular_momentum_Nms"])))
             took.append(capture["time_s"])
     return (
@@ -141,6 +141,7 @@ def main() -> None:
     parser.add_argument("--only", default="")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--detumbles", action="store_true")
+    parser.add_argument("--bare", action="store_true")
     parser.add_argument("--flown", action="store_true")
     given = parser.parse_args()
     for rate in (1.0, 3.0, 6.0):
@@ -154,7 +155,8 @@ def main() -> None:
             ):
                 print(flown(rate, given.goals, given.seed, profile, detumble), flush=True)
         else:
-            print(planned(rate, given.goals, given.seed, detumbles=given.detumbles), flush=True)
+            asked = {"detumbles": given.detumbles, "bare": given.bare}
+            print(planned(rate, given.goals, given.seed, **asked), flush=True)
 
 
 if __name__ == "__main__":

@@ -623,7 +623,7 @@ class PlacedBlock:
     """A block placed at every interval or end of the program.
 
     ``variables`` and ``rows`` (count, ...) are the places of its variables in x and of its rows in
-    g (-1: left out), ``parameters`` the part of p that it takes: a column for all places, or one
+    g, ``parameters`` the part of p that it takes: a column for all places, or one
     for each.
     """
 
@@ -631,6 +631,20 @@ class PlacedBlock:
     variables: Indices
     rows: Indices
     parameters: ca.MX
+
+    @classmethod
+    def after(
+        cls,
+        placed: Sequence[PlacedBlock],
+        block: ConstraintBlock,
+        variables: Indices,
+        parameters: ca.MX,
+    ) -> PlacedBlock:
+        """Place a block whose rows come after those of others."""
+        count = len(variables)
+        rows = sum(each.rows.size for each in placed)
+        of_block = rows + np.arange(count * block.rows).reshape(count, block.rows)
+        return cls(block, variables, of_block, parameters)
 
     def called(self, function: ca.Function, x: ca.MX, *more: ca.MX) -> list[ca.MX]:
         """Return the results at all places, each place's nonzeros after the other's."""
@@ -644,10 +658,8 @@ class PlacedBlock:
         return [ca.vec(result.nz[:]) for result in results]
 
     def multipliers(self, lam_g: ca.MX) -> ca.MX:
-        """Return the multipliers of its rows, one place's after the other's; of none, zero."""
-        padded = ca.vertcat(lam_g, 0)
-        rows = np.where(self.rows < 0, lam_g.numel(), self.rows)
-        return ca.reshape(padded[rows.ravel().tolist()], -1, len(rows))
+        """Return the multipliers of its rows, a column for each place."""
+        return ca.reshape(lam_g[self.rows.ravel().tolist()], -1, len(self.rows))
 
 
 def program(stages: Stages, intervals: int) -> Program:
@@ -656,7 +668,6 @@ def program(stages: Stages, intervals: int) -> Program:
     layout = Layout.of(stages, N)
     X, s, v, a = layout.knots()
     x = ca.MX.sym("x", layout.size)
-    kept = 0 if stages.distances is None else stages.distances.rows
     goals = int(stages.end.values.size1_in(1)) - 7
     sizes = {"start": n, "turn": 4, "direction": 3, "center": 3, "end_effectors": goals}
     drift = int(stages.interval.values.numel_in(1)) - _DIRECTION_SIZE
@@ -665,46 +676,55 @@ def program(stages: Stages, intervals: int) -> Program:
         sizes["distances"] = N * int(stages.distances.values.numel_in(1))
     p = {name: ca.MX.sym(name, size) for name, size in sizes.items()}
     zero = np.zeros((N, 1), dtype=np.int64)
-
-    first = stages.beginning.rows
-    dynamics = stages.interval.rows - stages.path_row_count
-    of_intervals = first + np.arange(N * dynamics).reshape(N, dynamics)
-    of_end = first + N * dynamics + np.arange(stages.end.rows)[np.newaxis]
-    equalities = first + N * dynamics + stages.end.rows
-    of_path = equalities + np.arange(N * stages.path_row_count).reshape(N, stages.path_row_count)
-    placed = [
-        PlacedBlock(
-            stages.beginning,
+    placed, equalities = place_stages(
+        (stages.beginning, stages.interval, stages.end),
+        (
             np.hstack([zero[:1], s[:1], v[:1]]),
-            np.arange(first)[np.newaxis],
-            p["start"],
-        ),
-        PlacedBlock(
-            stages.interval,
             np.hstack([zero, X[:-1], s[:-1], v[:-1], a, X[1:], s[1:], v[1:]]),
-            np.hstack([of_intervals, of_path]),
-            ca.vertcat(p["direction"], p["angular_momentum"]),
-        ),
-        PlacedBlock(
-            stages.end,
             np.hstack([X[-1:], s[-1:]]),
-            of_end,
+        ),
+        (
+            p["start"],
+            ca.vertcat(p["direction"], p["angular_momentum"]),
             ca.vertcat(p["turn"], p["center"], p["end_effectors"]),
         ),
-    ]
-    rows = equalities + N * (stages.path_row_count + kept)
+        stages.path_row_count,
+    )
     if stages.distances is not None:
-        of_distances = equalities + N * stages.path_row_count + np.arange(N * kept).reshape(N, kept)
         lack = np.full((N, 1), layout.size - 1)
         variables = np.hstack([zero, X[:-1], s[:-1], v[:-1], X[1:], v[1:], lack])
         of_places = ca.reshape(p["distances"], -1, N)
-        placed.append(PlacedBlock(stages.distances, variables, of_distances, of_places))
+        placed.append(PlacedBlock.after(placed, stages.distances, variables, of_places))
     change = ca.reshape(x[a.ravel().tolist()], n, N) / ca.repmat(p["typical"], 1, N)
     f = p["weights"][0] * N * x[0] + p["weights"][1] * ca.sumsqr(change) / N
     if layout.has_lack:
         f += p["weights"][2] * x[-1]
+    return assembled(x, ca.vertcat(*p.values()), f, placed, equalities)
 
-    return assembled(x, ca.vertcat(*p.values()), f, placed, rows, equalities)
+
+def place_stages(
+    blocks: tuple[ConstraintBlock, ConstraintBlock, ConstraintBlock],
+    variables: tuple[Indices, Indices, Indices],
+    parameters: tuple[ca.MX, ca.MX, ca.MX],
+    path_row_count: int = 0,
+) -> tuple[list[PlacedBlock], int]:
+    """Place the blocks of the first knot, of all intervals and of the last knot.
+
+    The last ``path_row_count`` rows of an interval are inequalities, which come after all
+    equalities; their number is returned, too.
+    """
+    beginning, interval, end = blocks
+    N, first, dynamics = len(variables[1]), beginning.rows, interval.rows - path_row_count
+    of_intervals = first + np.arange(N * dynamics).reshape(N, dynamics)
+    equalities = first + N * dynamics + end.rows
+    of_path = equalities + np.arange(N * path_row_count).reshape(N, path_row_count)
+    rows = (
+        np.arange(first)[np.newaxis],
+        np.hstack([of_intervals, of_path]),
+        first + N * dynamics + np.arange(end.rows)[np.newaxis],
+    )
+    each = zip(blocks, variables, rows, parameters, strict=True)
+    return [PlacedBlock(*parts) for parts in each], equalities
 
 
 def assembled(
@@ -712,12 +732,12 @@ def assembled(
     parameters: ca.MX,
     f: ca.MX,
     placed: Sequence[PlacedBlock],
-    rows: int,
     equalities: int,
 ) -> Program:
     """Return the program of an objective f and of blocks, whose rows after the equalities are
     ``>= 0``.
     """
+    rows = sum(each.rows.size for each in placed)
     g = _gather_rows(rows, [(each.rows, each.called(each.block.values, x)[0]) for each in placed])
     values, jacobian = _jacobian(placed, x, rows)
     lam_f, lam_g = ca.MX.sym("lam_f"), ca.MX.sym("lam_g", rows)

@@ -51,6 +51,7 @@ from spacerobot_ros.planning.methods.optimal.transcription import (
     assembled,
     hash_of,
     momentum_in_base,
+    place_stages,
     rotation_with_derivatives,
     state_within_interval,
 )
@@ -383,54 +384,29 @@ def thrust_program(
     }
     zero = np.zeros((N, 1), dtype=np.int64)
     knot = np.hstack([X, s, v, L, r, V])
-    begins, dynamics, ends_in = n, stages.interval.rows, stages.end.rows
-    equalities = begins + N * dynamics + ends_in
     defects = ca.reshape(p["defects"], DEFECT_SIZE, N)
-    placed = [
-        PlacedBlock(
-            stages.beginning,
+    placed, equalities = place_stages(
+        (stages.beginning, stages.interval, stages.end),
+        (
             np.hstack([zero[:1], s[:1], v[:1]]),
-            np.arange(begins)[np.newaxis],
-            p["start"],
-        ),
-        PlacedBlock(
-            stages.interval,
             np.hstack([zero, knot[:-1], a, u, knot[1:]]),
-            begins + np.arange(N * dynamics).reshape(N, dynamics),
-            ca.vertcat(defects, ca.repmat(p["wrenches"], 1, N)),
-        ),
-        PlacedBlock(
-            stages.end,
             np.hstack([zero[:1], knot[-1:]]),
-            begins + N * dynamics + np.arange(ends_in)[np.newaxis],
-            p["goals"],
         ),
-    ]
-    rows = equalities
+        (p["start"], ca.vertcat(defects, ca.repmat(p["wrenches"], 1, N)), p["goals"]),
+    )
     if propulsion.norms:
         group = ca.SX.sym("u", 3)
         norm = ConstraintBlock.of("norm", group, ca.SX(0, 1), 1 - ca.sumsqr(group))
         groups = np.vstack([u[:, list(each)] for each in propulsion.norms])
-        count = len(groups)
-        placed.append(
-            PlacedBlock(norm, groups, rows + np.arange(count)[:, np.newaxis], ca.MX(0, 1))
-        )
-        rows += count
+        placed.append(PlacedBlock.after(placed, norm, groups, ca.MX(0, 1)))
     lack = np.full((N, 1), layout.size - 1)
     variables = np.hstack(
         [zero, *(each[:-1] for each in (X, s, v, r, V)), *(e[1:] for e in (X, v, r, V)), lack]
     )
     ends = np.cumsum([0, *map(len, places)]).tolist()
     for block, at, (first, last) in zip(pairs, places, pairwise(ends), strict=True):
-        placed.append(
-            PlacedBlock(
-                block,
-                variables[np.array(at) // instants],
-                rows + np.arange(first, last)[:, np.newaxis],
-                ca.reshape(p["planes"][8 * first : 8 * last], 8, last - first),
-            )
-        )
-    rows += ends[-1]
+        planes = ca.reshape(p["planes"][8 * first : 8 * last], 8, last - first)
+        placed.append(PlacedBlock.after(placed, block, variables[np.array(at) // instants], planes))
     levels = ca.reshape(x[u.ravel().tolist()], m, N)
     centers = ca.reshape(p["centers"], n + m, N)
     change = (ca.reshape(x[a.ravel().tolist()], n, N) - centers[:n, :]) / ca.repmat(
@@ -442,7 +418,7 @@ def thrust_program(
     f += (w[2] * ca.sumsqr(change) + w[3] * ca.sumsqr(levels - centers[n:, :])) / N
     if pairs:
         f += w[4] * x[-1]
-    return layout, assembled(x, ca.vertcat(*p.values()), f, placed, rows, equalities)
+    return layout, assembled(x, ca.vertcat(*p.values()), f, placed, equalities)
 
 
 def _spent(propulsion: Propulsion, levels: ca.MX, rounding: ca.MX) -> ca.MX:
