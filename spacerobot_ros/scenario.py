@@ -181,7 +181,9 @@ class Scenario:
         values = self._parameters_as_written(node)
         for name, value in values.items():
             if name not in known and not is_of_every_node(name):
-                raise ParameterError(f"Node '{node}' has no parameter '{name}'.")
+                raise ParameterError(
+                    f"Node '{node}' has no parameter '{name}'.{suggestion(name, known)}"
+                )
             if isinstance(value, str) and name in known:
                 is_number = isinstance(known[name].default, (int, float))
                 values[name] = number_in(value) if is_number else value

@@ -455,7 +455,8 @@ def test_what_a_scenario_needs_is_said(tmp_path: Path) -> None:
     assert str(refused.value) == "The scenario 'own' names no robot; see plant.robot."
     with pytest.raises(ParameterError) as refused:
         found.with_overrides("plant", {"tick_rat": 1}).config("plant")
-    assert str(refused.value) == "Node 'plant' has no parameter 'tick_rat'."
+    misspelt = "Node 'plant' has no parameter 'tick_rat'. Did you mean 'tick_rate'?"
+    assert str(refused.value) == misspelt
     with pytest.raises(ParameterError) as refused:
         found.with_overrides("plant", {"tick_rate": -1}).config("plant")
     assert str(refused.value).startswith("Node 'plant': Parameter 'tick_rate' is -1")

@@ -133,6 +133,8 @@ def _files_of_folder(folder: Path) -> list[Path]:
     # Files of other formats are refused one by one, with what to do.
     found = (sorted(folder.glob(f"*{suffix}")) for suffix in (".mcap", ".mcap.zst*", ".db3"))
     files = next(filter(None, found), [])
+    if not files:
+        raise RecordingError(f"The folder {folder} holds no bag: name an MCAP file.")
     if len(files) != 1:
         raise RecordingError(
             f"The folder {folder} holds {len(files)} MCAP files: name one of them."

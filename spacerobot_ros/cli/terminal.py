@@ -133,9 +133,10 @@ class Display:
             self._work, self._course = "planning", f": {progress.message}"
 
     def fly(self, now: float, end: float) -> None:
-        """Show simulated time against the end of the schedule, s; 0: there is none yet."""
-        if end > 0.0:
-            self._work, self._course = "flying", f": {now:.1f} of {end:.1f} s"
+        """Show simulated time against the end of the schedule, s; 0: it is not known."""
+        if end > 0.0 or now > 0.0:
+            of_end = f" of {end:.1f}" if end > 0.0 else ""
+            self._work, self._course = "flying", f": {now:.1f}{of_end} s"
 
     def show_line(self, message: str) -> None:
         """Print a line that stays, if standard error is a terminal."""

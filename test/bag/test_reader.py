@@ -376,6 +376,8 @@ def test_bags_of_the_mcap_library(tmp_path: Path, options: dict[str, Any]) -> No
 
 def test_a_folder_with_one_bag(good: Path, tmp_path: Path) -> None:
     (tmp_path / "rosbag2").mkdir()
+    with pytest.raises(RecordingError, match="rosbag2 holds no bag: name an MCAP file"):
+        read_bag(tmp_path / "rosbag2")
     (tmp_path / "rosbag2" / "rosbag2_0.mcap").write_bytes(good.read_bytes())
     (tmp_path / "rosbag2" / "metadata.yaml").touch()
     assert read_bag(tmp_path / "rosbag2").message_count() == 100
