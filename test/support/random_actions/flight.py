@@ -25,11 +25,8 @@ from support.ros_harness import Harness
 
 from spacerobot_ros.nodes import CoordinatedControlNode, PlannerNode, PlantNode
 
-_WALL_LIMIT = 20.0
-"""Wall s without a state after which time is taken to stand: far beyond any plan."""
-
-_PLANNING_WALL = 60.0
-"""Wall s that plans may take on a busy machine."""
+_WALL_LIMIT = 60.0
+"""Wall s without a state after which time is taken to stand: plans take less on a busy machine."""
 
 _IDLE_SPINS = 25
 
@@ -437,7 +434,7 @@ class RandomFlight:
             goal_id = self._send(moved(tip, step, turn), tip=True)
         end = self._seen.now_ns + round(setup.patience * SECOND)
         # A plan that is made in the background takes its time on the wall, however fast the flight.
-        soonest = monotonic() + _PLANNING_WALL * self._real_time
+        soonest = monotonic() + _WALL_LIMIT * self._real_time
         self._spin_until(
             lambda: goal_id in book.decided or (self._seen.now_ns > end and monotonic() > soonest),
             f"goal {goal_id} is decided",
