@@ -192,6 +192,11 @@ def recipes() -> dict[str, list[str]]:
     return {row[0].strip(" *"): re.findall(r"`([^`]+)`", row[1]) for row in rows}
 
 
+def test_every_folder_with_modules_is_installed() -> None:
+    folders = {each.parent for each in (ROOT / "spacerobot_ros").rglob("*.py")}
+    assert [str(each) for each in folders if not (each / "__init__.py").exists()] == []
+
+
 def test_one_version_everywhere() -> None:
     citation = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
     assert citation["version"] == spacerobot_ros.__version__
