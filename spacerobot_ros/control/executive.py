@@ -540,7 +540,9 @@ class ControlExecutive:
         self._next_report = time + self._config.status_period
         self._reported_state, self._limited = state, result.limited
         self._command_report = _command_report(self.controller, result)
-        self._publish(state, self._message(state), self._goal_id)
+        # Whoever has sent a goal learns that it is being planned.
+        planned = state is ControllerState.HOLDING and self._planning.active
+        self._publish(state, self._message(state), self._latest_id() if planned else self._goal_id)
 
     def _decide(self, time: float) -> None:
         """Report the decision about the goal, if this state brings it."""
@@ -874,7 +876,8 @@ class ControlExecutive:
                 return self.servicing.message
             case ControllerState.TRACKING:
                 away = self.controller.distance_from_reference()
-                return f"Flying to the goal; {away} from the reference."
+                later = "; planning a motion to a later goal" if self._planning.active else ""
+                return f"Flying to the goal; {away} from the reference{later}."
             case ControllerState.STALLED:
                 away = self.controller.distance_from_reference()
                 return f"Stalled {away} from the reference: {self._stall.cause}."

@@ -141,15 +141,19 @@ def test_states_are_answered_while_a_thread_plans() -> None:
     rig = Follower(plan_in_background=True)
     rig.answer()
     executive, first = rig.executive, Goal.from_rotvec([0.9, 0.1, 0.3], [0.2, 0.1, 0.4])
-    executive.submit("base", IdentifiedGoal(first))
+    executive.submit("base", IdentifiedGoal(first, "first"))
     held, second = 0, Goal.from_rotvec([0.5, -0.9, 0.4], [-0.3, 0.2, 0.1])
     while executive.state is not ControllerState.TRACKING:
         held += 1
         if held == 3:
             # Another goal while a plan for the first one is made.
-            executive.submit("base", IdentifiedGoal(second))
+            executive.submit("base", IdentifiedGoal(second, "second"))
         np.testing.assert_allclose(rig.reference().position, PLACE, atol=1e-12)
         rig.answer()
+    statuses = [each for each in executive.outputs if isinstance(each, ControllerStatus)]
+    planned = {each.goal_id for each in statuses if "Planning a motion" in each.message}
+    assert planned <= {"first", "second"}
+    assert planned, "whoever has sent a goal learns that it is being planned"
     assert held > 5, "the test is sharp: planning takes longer than a state"
     ends = executive.controller.reference_ends
     assert ends is not None
