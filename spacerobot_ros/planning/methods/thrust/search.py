@@ -767,14 +767,18 @@ class _Search:
             solved = self._solve(at, weights, duration, planes=planes)
             if solved is None:
                 return None
-            at = solved
             if self._solver.lack > _LARGEST_LACK:
+                at = solved
                 continue
-            approaches = bodies.approaches(self.planner.motion(at))
+            approaches = bodies.approaches(self.planner.motion(solved))
             if not approaches:
-                return at
+                return solved
             self._nearest = approaches[0]
-            self._add(approaches, at)
+            fell_in = any(e.distance < 0 and e.pair not in self._room for e in approaches)
+            self._add(approaches, solved)
+            if not fell_in:
+                # Else planes of these pairs are made along a path that is clear of them.
+                at = solved
         return None
 
     def _failure(self, why: str) -> str:
