@@ -66,6 +66,10 @@ from spacerobot_ros.model.space_robot import SpaceRobot
 from spacerobot_ros.planning.core.cancellation import Cancellation
 from spacerobot_ros.planning.methods.thrust.goals import Grapple
 
+_FREE_AXIS_MARGIN = 5.0
+"""Tolerances by which a goal may differ from the pose in an axis that the law leaves as it is: noise
+takes a measured pose out of the plane of a planar robot."""
+
 _BRAKE_RATE = 2.0
 """Decay rate of joint motion when the base is no longer known, 1/s."""
 
@@ -250,7 +254,7 @@ class CoordinatedController:
         Raises
         ------
         PlanningError
-            A goal is farther from the pose than the tolerance of the configuration; the message
+            A goal is farther from the pose than some tolerances of the configuration; the message
             names the axes.
         """
         selection, labels = self.law.outputs.selection, ", ".join(self.law.outputs.labels)
@@ -268,7 +272,7 @@ class CoordinatedController:
             ):
                 left = [i for i in range(3) if axes[i] not in controlled]
                 off = float(np.linalg.norm(error[left]))
-                if 0 < len(left) < 3 and off > tolerance:
+                if 0 < len(left) < 3 and off > _FREE_AXIS_MARGIN * tolerance:
                     raise PlanningError(
                         f"The goal {part} of the {name.replace('_', '-')} is {off:.4g} {unit} from "
                         f"the present one in {' and '.join(axes[i] for i in left)} of the world, "

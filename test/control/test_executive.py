@@ -56,7 +56,7 @@ from spacerobot_ros.simulation import EffortPlant, InitialState
 @pytest.mark.parametrize(
     ("key", "position", "rotvec", "named"),
     [
-        ("base", [0.1, 0.05, 0.011], [0.0, 0.0, 0.1], "position of the base is 0.011 m .* in z "),
+        ("base", [0.1, 0.05, 0.051], [0.0, 0.0, 0.1], "position of the base is 0.051 m .* in z "),
         ("base", AIM, [0.3, 0.4, 0.0], "attitude of the base is 0.5 rad .* in rx and ry "),
         ("end_effector", TIP - [0, 0, 3], [0.3, 0, 0], "position of the end-effector is 3 m .* z "),
     ],
@@ -77,8 +77,8 @@ def test_a_goal_out_of_the_plane_is_refused_and_the_earlier_one_goes_on(
     assert_one_sentence(refused[0].message, "transposed_jacobian", "base.rz")
     assert re.search(named, refused[0].message)
     assert (loop.state, loop.status.goal_id) == ("tracking", "first")
-    # Within the tolerances it is accepted.
-    goal = Goal(np.array([0.5, 0.25, 0.009]), Rotation.from_rotvec([0.01, 0.015, 0.0]).as_quat())
+    # Noise takes a measured pose as far out of the plane as this.
+    goal = Goal(np.array([0.5, 0.25, 0.045]), Rotation.from_rotvec([0.05, 0.075, 0.0]).as_quat())
     loop.aim(base=IdentifiedGoal(goal, "third"))
     loop.answer()
     assert (loop.state, loop.status.goal_id) == ("tracking", "third")
