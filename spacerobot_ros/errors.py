@@ -31,7 +31,7 @@ def sentence_case(text: str) -> str:
 
 
 def quantity(value: float, unit: str) -> str:
-    """Return a number for people: three digits, and of a rounding error that it is one.
+    """Return a number for people: three digits; a rounding error is shown as a bound.
 
     m and rad, also in m/s and rad/s, have prefixes: ``1.38 mm``, ``< 1 µrad``.
     """

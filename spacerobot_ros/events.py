@@ -152,7 +152,9 @@ class KeyValueFormat:
         try:
             yield
         except (KeyError, ValueError) as error:
-            raise SpaceRobotError(f"The values are no {self._subject}: {error}.") from error
+            raise SpaceRobotError(
+                f"No {self._subject} can be read from the values: {error}."
+            ) from error
 
 
 class EventKind(str, Enum):

@@ -292,7 +292,7 @@ class Cache:
 
 
 def warn_first_time(logger: logging.Logger, folder: Path, name: str, message: str) -> None:
-    """Log a warning that is given once an installation; afterwards it is logged for debugging.
+    """Log a warning that is given once per installation; afterwards it is logged for debugging.
 
     Parameters
     ----------

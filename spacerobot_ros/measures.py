@@ -37,7 +37,7 @@ class Outcome(str, Enum):
 
 @dataclass(frozen=True)
 class CaptureMeasures:
-    """The measures of a flight to a target; NaN if there is none, or what did not take place.
+    """The measures of a flight to a target; NaN if there is none, or for events that did not occur.
 
     Attributes
     ----------

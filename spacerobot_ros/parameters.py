@@ -130,7 +130,7 @@ class Parameter:
         return self._check_lines(value) if self.texts else self._check_numbers(value)
 
     def excludes(self, text: str) -> bool:
-        """Whether a text is none of the choices, where there are any."""
+        """Whether a text is none of the choices, if there are any."""
         return bool(self.choices) and text not in self.choices
 
     def _check_number(self, value: Any, whole: bool) -> int | float:

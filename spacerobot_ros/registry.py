@@ -65,7 +65,7 @@ class Registry(dict[str, type[T]]):
         self._own = frozenset([*self, *reserved])
 
     def register(self, entry: type[T]) -> type[T]:
-        """Add a class, instead of an earlier one of its name and file; usable as a decorator.
+        """Add a class in place of an earlier one with its name and file; usable as a decorator.
 
         Raises
         ------
@@ -201,7 +201,7 @@ def _module_of(file: Path) -> ModuleType:
         return sys.modules[name]
     spec = importlib.util.spec_from_file_location(name, file)
     if spec is None or spec.loader is None:
-        raise ParameterError(f"The plugin '{file}' is no Python file: its name must end in .py.")
+        raise ParameterError(f"The plugin '{file}' is not a Python file: its name must end in .py.")
     module = sys.modules[name] = importlib.util.module_from_spec(spec)
     try:
         spec.loader.exec_module(module)
@@ -224,6 +224,6 @@ def _require_base(entry: Any, module: ModuleType) -> None:
     derived = any(each.__module__.partition(".")[0] == package for each in entry.__mro__)
     if isinstance(getattr(entry, "name", None), str) and works and not derived:
         raise ParameterError(
-            f"The class '{entry.__name__}' of the plugin '{module.__file__}' is no control law and "
-            "no gait method: derive it from NumpyLaw, ControlLaw or GaitMethod."
+            f"The class '{entry.__name__}' of the plugin '{module.__file__}' is neither a control "
+            "law nor a gait method: derive it from NumpyLaw, ControlLaw or GaitMethod."
         )

@@ -290,7 +290,7 @@ class Scenario:
         }
 
     def require_shape_of(self, robot: SpaceRobot) -> None:
-        """Refuse a goal whose joint positions are of another robot.
+        """Refuse a goal whose joint positions belong to another robot.
 
         Raises
         ------

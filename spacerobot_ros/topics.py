@@ -469,7 +469,7 @@ TOPICS_NOT_RECORDED = ("/rosout", "/parameter_events", "/transition_event", "/he
 
 
 def goal_topic(end_effector: str) -> str:
-    """Return the topic of the goals of an end-effector: its name, in letters that topics have."""
+    """Return the topic of the goals of an end-effector: its name, in letters of topics."""
     return _name_in_topics(end_effector) + "/goal_pose"
 
 
@@ -484,7 +484,7 @@ def path_topic(end_effector: str) -> str:
 
 
 def pose_topic(end_effector: str) -> Topic:
-    """Return the entry of the poses of an end-effector, by its name in letters that topics have."""
+    """Return the entry of the poses of an end-effector, by its name in letters of topics."""
     name = _name_in_topics(end_effector)
     state = StateField("pose", f"pose_of_{name}", _POSE_MEMBERS)
     return replace(TOPICS["end_effector/pose"], name=f"{name}/pose", state=(state,))

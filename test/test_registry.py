@@ -213,7 +213,7 @@ _COMPUTE = "    def compute(self, state, reference):\n        {}\n"
         ),
         (
             _LAW.format("Pd", "object") + _COMPUTE.format("return 1"),
-            "The class 'Pd' of the plugin .* is no control law and no gait method: derive it from",
+            "The class 'Pd' of the plugin .* is neither a control law nor a gait method: derive",
         ),
     ],
 )

@@ -224,14 +224,14 @@ def _require_magic_bytes(path: Path, file: BinaryIO) -> None:
     file.seek(max(length - size, 0))
     if length < 2 * size or file.read(size) != MCAP0_MAGIC:
         raise RecordingError(
-            f"The bag {path} was cut short, its writer having been killed or its disk full: "
+            f"The bag {path} was cut short, because its writer was killed or its disk was full: "
             f"'spacerobot salvage {shlex.quote(str(path))}' makes a complete bag of its content."
         )
     file.seek(0)
 
 
 def file_size(file: BinaryIO) -> int:
-    """Return the size of an open file in bytes, leaving its read position."""
+    """Return the size of an open file in bytes, without moving its read position."""
     place = file.tell()
     size = file.seek(0, os.SEEK_END)
     file.seek(place)
@@ -298,7 +298,7 @@ def read_record(file: BinaryIO, place: int, kind: type[RecordT]) -> RecordT:
 
 
 class ChunkUnpacker:
-    """Unpacks the chunks of a file of a size, up to a limit of their inflated sizes together."""
+    """Unpacks the chunks of a file, up to a limit on the sum of their inflated sizes."""
 
     def __init__(self, compressed: int) -> None:
         limit_mb = _DEFAULT_LIMIT_MB
@@ -320,7 +320,7 @@ class ChunkUnpacker:
         self._inflated_size += size
 
     def unpack(self, chunk: Chunk, place: int) -> bytes:
-        """Return the records of the chunk at ``place``, of the size and checksum that it claims."""
+        """Return the records of the chunk at ``place``; they have the claimed size and checksum."""
         size = chunk.uncompressed_size
         self.count(size, place)
         if chunk.compression not in _DECOMPRESSORS:

@@ -120,7 +120,7 @@ class SubscriberWait:
 
 
 def renamed_topics(remap: str, topics: Collection[str]) -> dict[str, str]:
-    """Return the new name of each topic that ``remap`` (``old:=new``, by spaces) renames.
+    """Return the new name of each topic that ``remap`` (``old:=new``, separated by spaces) renames.
 
     Raises
     ------
@@ -186,8 +186,8 @@ class Playback:
             raise RecordingError(f"The bag {bag.path} has no messages to replay.")
         if len(topics or bag.topics) > _MAX_REPLAYED_TOPICS:
             raise RecordingError(
-                f"The bag {bag.path} has {len(bag.topics)} topics, and {_MAX_REPLAYED_TOPICS} can "
-                "be replayed at once: name those that are wanted."
+                f"The bag {bag.path} has {len(bag.topics)} topics, and only "
+                f"{_MAX_REPLAYED_TOPICS} can be replayed at once: name the ones to replay."
             )
         self._bag = bag
         self._loop = loop
@@ -261,7 +261,7 @@ class Playback:
         return self._take_next_message()
 
     def seek(self, bag_ns: int, clock_ns: int) -> list[ReplayMessage]:
-        """Jump to ``bag_ns`` in the bag, or to its nearer end; a pause lasts.
+        """Jump to ``bag_ns`` in the bag, or to its nearer end; a pause continues.
 
         Returns the messages that a subscriber would have by then: of each topic the last one, if
         it is latched or no older than a second. In a pause at the beginning these are the first

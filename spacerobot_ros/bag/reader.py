@@ -96,7 +96,7 @@ def salvaged_copy(path: Path) -> Path:
 
 
 def bag_files(path: Path) -> list[Path]:
-    """Return the files of a bag in order: of a folder, of a recording that was split, or one.
+    """Return the files of a bag in order: all of a folder or a split recording, or one file.
 
     Of several files, salvaged copies take the place of those that were cut.
 
@@ -242,18 +242,18 @@ class Bag(Mapping[str, TopicSeries]):
     def _recorded_name(self, topic: str) -> str:
         """Return the recorded name of a topic, which may be given without its leading slash."""
         if not isinstance(topic, str):
-            raise TypeError(f"A topic is named by a text, such as 'odom', and not by {topic!r}.")
+            raise TypeError(f"The name of a topic is a text, such as 'odom', and not {topic!r}.")
         other = topic[1:] if topic.startswith("/") else f"/{topic}"
         return other if topic not in self.topics and other in self.topics else topic
 
     @cached_property
     def metadata(self) -> dict[str, dict[str, str]]:
-        """Keys and values of every metadata record by its name; of equal names the last counts."""
+        """Keys and values of every metadata record by its name; the last of equal names counts."""
         return {each.name: each.metadata for each in self._records(Metadata)}
 
     @cached_property
     def attachments(self) -> dict[str, bytes]:
-        """Content of every attachment by its name; of equal names the last counts."""
+        """Content of every attachment by its name; the last of equal names counts."""
         return {each.name: each.data for each in self._records(Attachment)}
 
     def _records(self, kind: type[RecordT]) -> Iterator[RecordT]:

@@ -253,7 +253,7 @@ class LastState:
 
 
 def last_state(path: str | os.PathLike[str], namespace: str = "") -> LastState:
-    """Read the last state of which pose, joints and momenta were recorded.
+    """Read the last state whose pose, joints and momenta were recorded.
 
     A bag that was cut off is read as far as possible. ``namespace`` is the plant's.
 

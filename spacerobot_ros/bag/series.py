@@ -261,8 +261,8 @@ class TopicSeries:
         size = sum(map(len, self.data))
         if size > self._max_decoded_bytes:
             raise RecordingError(
-                f"The messages on {self.topic} have {size} bytes, and "
-                f"{self._max_decoded_bytes:.0f} bytes is the limit for a bag of this size."
+                f"The messages on {self.topic} have {size} bytes; the limit "
+                f"for a bag of this size is {self._max_decoded_bytes:.0f} bytes."
             )
 
     def _decode_message(self, data: bytes) -> Any:
@@ -273,7 +273,7 @@ class TopicSeries:
 
     def _damage_error(self, error: Exception) -> RecordingError:
         reason = str(error) or type(error).__name__
-        return RecordingError(f"A message on {self.topic} is no {self.type_name}: {reason}.")
+        return RecordingError(f"A message on {self.topic} is not a {self.type_name}: {reason}.")
 
     def _resolve_path(self, path: str) -> tuple[np.dtype[Any] | None, bool, bool, str | None]:
         """Resolve a field's path: type of its numbers if any, whether it is an array, whether it is

@@ -228,7 +228,7 @@ def number_field(path: str, values: NDArray[Any]) -> Field:
 
 
 def with_euler_angles(table: TopicTable) -> TopicTable:
-    """Return a table in which each attitude is given by turns about the fixed axes x, y, z as well.
+    """Return a table that also gives each attitude as turns about the fixed axes x, y, z.
 
     The fields ``roll``, ``pitch`` and ``yaw`` (rad) stand where ``orientation`` does:
     ``pose.pose.yaw`` beside ``pose.pose.orientation.z``.

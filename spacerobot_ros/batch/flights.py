@@ -90,7 +90,7 @@ class InitialStates:
 
     @classmethod
     def repeated(cls, robot: SpaceRobot, initial: InitialState, count: int) -> InitialStates:
-        """Return ``count`` equal rows, of which the caller may change columns.
+        """Return ``count`` equal rows, whose columns the caller may change.
 
         Raises
         ------
@@ -203,7 +203,7 @@ class SensorErrors:
 
     @property
     def is_active(self) -> npt.NDArray[np.bool_]:
-        """(N,) whether measurements differ from the truth: only then noise is drawn."""
+        """(N,) whether measurements differ from the truth: noise is drawn only then."""
         return np.asarray(
             self.noise.any(axis=1) | self.pose_bias.any(axis=1) | self.joint_bias.any(axis=1)
         )
@@ -369,12 +369,12 @@ class Flights:
                 if self.robot.description.wheel_names:
                     raise ParameterError(
                         f"Robot '{self.robot.description.name}' has reaction wheels, which the "
-                        "controller of lanes does not turn: fly it by engine 'flights'."
+                        "controller of lanes does not turn: fly it with engine 'flights'."
                     )
                 if self.actuation != "effort":
                     raise ParameterError("A controller needs effort actuation.")
                 if round(config.control_period * SECOND) != round(self.control_period * SECOND):
-                    raise ParameterError("The controller has another rate than the plant.")
+                    raise ParameterError("The controller and the plant have different rates.")
                 if gains and len(gains) != count:
                     raise ParameterError(f"There are gains of {len(gains)} flights, not {count}.")
 

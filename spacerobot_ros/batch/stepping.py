@@ -33,7 +33,7 @@ LINK_POSE_SIZE = 12
 
 
 class SteppedFlights:
-    """N flights of one robot, advanced together by ticks under commands that are given.
+    """N flights of one robot, advanced together by ticks under given commands.
 
     After :meth:`reset` and :meth:`step`, the attributes have the states of the flights:
 

@@ -135,7 +135,7 @@ class Campaign:
 
     @property
     def own_metrics(self) -> list[str]:
-        """Those of the named metrics that are of users."""
+        """The named metrics that users have defined."""
         return [name for name in self.named_metrics if name in OWN_METRICS]
 
     @property
@@ -217,7 +217,7 @@ def parse_campaign(
         rows, drawn = len(columns[0].distribution.choices), [*columns, *drawn]
     flights = _read_whole_number(section, "flights", rows or 100, 1, _MAX_FLIGHTS)
     if rows is not None and flights > rows:
-        raise ParameterError(f"'flights' is {flights}, but the table has {rows}, one a row.")
+        raise ParameterError(f"'flights' is {flights}, but the table has rows for only {rows}.")
     sampler = str(section.get("sampler", "random"))
     engine = str(section.get("engine", "auto"))
     _require_known("sampler", sampler, SAMPLERS)

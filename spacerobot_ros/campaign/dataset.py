@@ -43,7 +43,7 @@ _FLUSH_PERIOD, _FLUSH_ROWS = 5.0, 2000
 
 @lru_cache(maxsize=1)
 def versions_json() -> str:
-    """Return the versions of what flies, with the hash of this package's code."""
+    """Return the versions of the flying software, with the hash of this package's code."""
     return json.dumps(
         {
             "spacerobot_ros": __version__,
@@ -239,7 +239,7 @@ class Dataset:
         return found
 
     def add(self, rows: Iterable[Row]) -> None:
-        """Add rows; they are written after some seconds, or with :meth:`flush`."""
+        """Add rows; they are written after a few seconds, or with :meth:`flush`."""
         self._rows += rows
         late = time.monotonic() - self._written > _FLUSH_PERIOD
         if self._rows and (late or len(self._rows) >= _FLUSH_ROWS):

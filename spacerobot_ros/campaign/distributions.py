@@ -95,7 +95,7 @@ class Dispersion:
 
 
 def read_real_number(key: str, value: Any, least: float = -math.inf) -> float:
-    """Return a finite number of at least ``least``; ParameterError if it is none."""
+    """Return a finite number of at least ``least``; else raise ParameterError."""
     try:
         number = math.nan if isinstance(value, bool) else float(value)
     except (TypeError, ValueError):
@@ -107,7 +107,7 @@ def read_real_number(key: str, value: Any, least: float = -math.inf) -> float:
 
 
 def read_distributions(section: Mapping[str, Any], scenario: Scenario) -> Iterator[Dispersion]:
-    """Yield what is under ``disperse``.
+    """Yield the dispersions under ``disperse``.
 
     Raises
     ------
@@ -139,7 +139,7 @@ def _read_correlated(
     if not isinstance(given, dict) or set(given) - {"mean", "cov"} or "cov" not in given:
         raise ParameterError(f"'{names}': {_CORRELATED} must have 'cov' and may have 'mean'.")
     if any(target.is_text for target in targets):
-        raise ParameterError(f"'{names}' has a text: {_CORRELATED} is of numbers.")
+        raise ParameterError(f"'{names}' has a text: {_CORRELATED} takes numbers only.")
     count = len(targets)
     try:
         mean = np.array(given.get("mean", np.zeros(count)), dtype=float)
@@ -202,7 +202,7 @@ def read_table(text: str, scenario: Scenario) -> list[Dispersion]:
     for name, column in zip(names, zip(*rows, strict=True), strict=True):
         targets = targets_of(name.strip(), scenario)
         if len(targets) > 1:
-            raise ParameterError(f"'{name}' in the table is of {len(targets)} values: name one.")
+            raise ParameterError(f"'{name}' in the table names {len(targets)} values: name one.")
         values = tuple(_read_choice(targets[0], each.strip(), _TABLE) for each in column)
         for text in set(values) if targets[0].is_text else ():
             _require_node_accepts(targets[0], text, scenario)

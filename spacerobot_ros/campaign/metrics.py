@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 class FlightMetric(ABC):
-    """A metric of your own, computed of each flight of a campaign that names it.
+    """A metric of your own, computed for each flight of a campaign that names it.
 
     A class that is derived from it becomes known as the control laws do: by ``--plugin``, by an
     entry point ``spacerobot_ros.metrics``, or by :meth:`.Registry.register` of ``OWN_METRICS``.
@@ -32,7 +32,7 @@ class FlightMetric(ABC):
 
     @abstractmethod
     def evaluate(self, flight: Flight) -> float:
-        """Return the number of a flight; NaN if it has none."""
+        """Return the value for a flight; NaN if it has none."""
 
 
 OWN_METRICS: Registry[FlightMetric] = Registry(
@@ -47,7 +47,7 @@ def metric_of(name: str) -> Metric | type[FlightMetric]:
 
 
 def own_metrics_of(flight: Flight, names: Iterable[str]) -> dict[str, float]:
-    """Return metrics of users, of a flight.
+    """Return the metrics of users for a flight.
 
     Raises
     ------

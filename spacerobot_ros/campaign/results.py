@@ -53,7 +53,7 @@ _NOT_CONTROLLED = re.compile(r"[(; ]([a-z]+(?: and [a-z]+)*) not controlled\)")
 
 
 class Columns(Mapping[str, Any]):
-    """The columns of a dataset by name, in the order of the flights, read where they are needed.
+    """The columns of a dataset by name, in the order of the flights, read when they are needed.
 
     Numbers are arrays (N,), in which missing ones are NaN; texts are lists, in which missing ones
     are None.
@@ -267,7 +267,7 @@ class Results:
         return sorted(found, key=lambda each: -each.strength)
 
     def drawn_by_influence(self, found: Sequence[Influence]) -> list[str]:
-        """Return the names of what was drawn: texts, then numbers by their influence on passing."""
+        """Return the names of drawn values: texts, then numbers by their influence on passing."""
         causes = [each.cause for each in found if each.metric == PASSING]
         return [*(name for name in self.campaign.names if name not in self.drawn_numbers), *causes]
 

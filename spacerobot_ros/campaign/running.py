@@ -249,8 +249,8 @@ def rerun_flight(folder: Path, number: int, bag: Path) -> Rerun:
     note = ""
     if campaign.scenario.plant.thrusters and flight.inertial is not None:
         note = (
-            "Its masses are drawn: the plant of the campaign and that of this flight differ in "
-            "rounding, which thrusters that are on or off multiply."
+            "Its masses are drawn: the plants of the campaign and of this flight differ in "
+            "rounding, which on/off thrusters amplify."
         )
     return Rerun(row, deviation, at, outcome, bag, note)
 

@@ -79,7 +79,7 @@ class Bin:
 
 
 def success_by_bins(drawn: npt.NDArray[Any], passed: Flags) -> list[Bin]:
-    """Return the shares of flights that passed, (N,), in bins of what was drawn, (N,).
+    """Return the shares of flights that passed, (N,), in bins of the drawn values (N,).
 
     A text, or one of few numbers, has a bin of its own; many numbers are in bins of about equally
     many flights.

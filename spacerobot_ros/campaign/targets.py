@@ -309,8 +309,8 @@ def targets_of(name: str, scenario: Scenario) -> list[DispersionTarget]:
 def _parameter_target(name: str, node: str, rest: str, scenario: Scenario) -> DispersionTarget:
     if node not in ("plant", *scenario.commanders):
         raise ParameterError(
-            f"'{name}' is of a node that does not fly: the scenario '{scenario.name}' flies with "
-            f"{' and '.join(scenario.commanders)}."
+            f"'{name}' belongs to a node that does not fly: the scenario '{scenario.name}' flies "
+            f"with {' and '.join(scenario.commanders)}."
         )
     match = _INDEXED_NAME_PATTERN.fullmatch(rest)
     bare, index = (match[1], match[2]) if match else (rest, "")

@@ -197,7 +197,7 @@ class LocalWorkers:
         return worker
 
     def ended(self, tasks: list[_LocalWorker]) -> list[_LocalWorker]:
-        """Return the tasks that have ended; after a while also an empty list."""
+        """Return the tasks that have ended; an empty list if none ends for a while."""
         ready = wait([worker.connection for worker in tasks], timeout=_POLL_PERIOD)
         return [worker for worker in tasks if worker.connection in ready]
 
@@ -282,7 +282,7 @@ class DaskWorkers:
         return self._client.submit(fly_task, *arguments, pure=False, retries=0)
 
     def ended(self, tasks: list[Any]) -> list[Any]:
-        """Return the tasks that have ended; after a while also an empty list."""
+        """Return the tasks that have ended; an empty list if none ends for a while."""
         import distributed
 
         try:
@@ -353,7 +353,7 @@ Workers = LocalWorkers | DaskWorkers
 
 @contextmanager
 def open_workers(cluster: Cluster, flights: int) -> Iterator[Workers]:
-    """Yield the workers of a cluster, at most as many processes as there are flights.
+    """Yield the workers of a cluster, with at most as many processes as flights.
 
     Raises
     ------

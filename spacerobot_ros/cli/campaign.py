@@ -140,7 +140,7 @@ def rerun(folder: Path, number: int, bag: Path | None) -> None:
         click.echo(line)
     exit_if_terminated()
     if not result.agrees:
-        fail("The flight is another one than that in the dataset.")
+        fail("The flight differs from the one in the dataset.")
 
 
 def _fly_campaign(

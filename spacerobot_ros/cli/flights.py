@@ -60,7 +60,7 @@ if TYPE_CHECKING:
     flag_value=1.0,
     type=NumberRange(min=0.0, min_open=True),
     metavar="[FACTOR]",
-    help="Fly by the nodes on the wall clock, FACTOR times as fast (1 without a number).",
+    help="Fly with the nodes on the wall clock, FACTOR times as fast (1 without a number).",
 )
 @click.option(
     "--longest",
@@ -74,7 +74,7 @@ if TYPE_CHECKING:
     "--processes",
     "nodes",
     is_flag=True,
-    help="Fly by the ROS 2 nodes, one process each.",
+    help="Fly with the ROS 2 nodes, one process each.",
 )
 @view_option
 def run_command(
@@ -289,7 +289,7 @@ def _published_lines(scenario: Scenario, summary: dict[str, Any]) -> list[str]:
     is_flag=True,
     hidden=True,
     expose_value=False,
-    help="Accepted as of `run`: the nodes always have processes of their own.",
+    help="Accepted as in `run`: the nodes always have processes of their own.",
 )
 @click.option(
     "--restarts",
@@ -381,7 +381,7 @@ def goal_command(
         raise click.UsageError("The attitude is given twice, in radians and in degrees.")
     if hands and turned and not pose:
         raise click.UsageError(
-            "Beside end-effectors an attitude of the base is sent with its position X Y Z."
+            "With goals of end-effectors, give the attitude of the base with its position X Y Z."
         )
     from spacerobot_ros.planning import Goal
 

@@ -62,7 +62,7 @@ class DefaultGroup(click.Group):
     default = ""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        """Insert the name of the default command if the first argument is no command."""
+        """Insert the name of the default command if the first argument is not a command."""
         if args and args[0] not in (*self.commands, *ctx.help_option_names):
             args = [self.default, *args]
         return super().parse_args(ctx, args)
@@ -298,13 +298,13 @@ def _read_path(file: Path) -> list[list[float]]:
     if not found or len({len(row) for row in found}) > 1:
         raise click.BadParameter(
             f"The path {file} has lines of {sorted({len(row) for row in found})} numbers; give "
-            "each 3, a position, or each 7, a position and a quaternion."
+            "all of them 3 (a position), or all of them 7 (a position and a quaternion)."
         )
     return found
 
 
 def complete_scenario(_: click.Context, __: click.Parameter, incomplete: str) -> list[str]:
-    """Return the scenarios and robots whose names begin so, for shells."""
+    """Return the scenarios and robots that complete a name, for shells."""
     from spacerobot_ros.resources import resource_names
     from spacerobot_ros.scenario import scenario_names
 
@@ -465,7 +465,7 @@ def picture_option(help: str) -> Any:
 
 
 def beside(bag: Path, ending: str) -> Path:
-    """Return a path beside a bag (a file or a folder): its name without suffix, and an ending."""
+    """Return a path beside a bag (a file or a folder): its name without suffix, plus an ending."""
     # The path ``.`` has no name before it is resolved.
     named = bag if bag.name not in ("", "..") else bag.resolve()
     return named.with_name(f"{named.name if bag.is_dir() else named.stem}{ending}")

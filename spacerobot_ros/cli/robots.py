@@ -346,7 +346,7 @@ def _distance_lines(found: Analysis) -> list[str]:
     lines += [f"not counted: {pair} ({why})" for pair, why in geometry.ignored_pairs.items()]
     lines += geometry.notes
     if not geometry.exact and distances:
-        lines.append("Distances are bounds, since the package coal is not installed.")
+        lines.append("Distances are bounds, because the package coal is not installed.")
     return [f"{'distances' if not i else '':<13}{line}" for i, line in enumerate(lines)]
 
 

@@ -84,7 +84,7 @@ class DistanceFunction(Protocol):
 
 
 def distance_function(solids: Sequence[Solid]) -> DistanceFunction:
-    """Return exact distances, or bounds where the package coal is not installed."""
+    """Return exact distances, or bounds if the package coal is not installed."""
     coal = _coal()
     return EnclosureDistances(solids) if coal is None else ExactDistances(solids, coal)
 
@@ -99,8 +99,8 @@ def _coal() -> Any:
             _LOG,
             cache_directory(),
             "warned_of_coal",
-            "Distances between links are those of spheres, capsules and boxes around them, since "
-            "the package coal is not installed: `pip install '.[collision]'` in the clone.",
+            "Distances between links are those of spheres, capsules and boxes around them, "
+            "because the package coal is not installed: `pip install '.[collision]'` in the clone.",
         )
         return None
     return coal

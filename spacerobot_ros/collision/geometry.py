@@ -50,7 +50,7 @@ _COAXIAL_TOLERANCE = 1e-9
 """Largest distance (m) and tilt (rad) from the axis of a joint of a body of revolution about it."""
 
 _UNKNOWN_BASE_DISTANCE = 1e9
-"""Distance of obstacles where the pose of the base is not known, m: they are not looked at."""
+"""Distance of obstacles where the pose of the base is not known, m: they are ignored."""
 
 
 class LinkPair(NamedTuple):
@@ -196,7 +196,7 @@ class CollisionGeometry:
 
     @cached_property
     def distance_function(self) -> DistanceFunction:
-        """The distances of two solids, exact where the package coal is installed."""
+        """The distances of two solids, exact if the package coal is installed."""
         # Where bounding balls never come near, the library of distances need not be imported.
         return distance_function(self.solids)
 
@@ -267,7 +267,7 @@ class CollisionGeometry:
         return np.asarray(apart - self._radii[first] - self._radii[second])
 
     def distances(self, pair: int, poses: Poses) -> Array:
-        """Return the distances (N,) of a pair, m; negative where it is in contact: the depths."""
+        """Return the distances (N,) of a pair, m; negative in contact: the depths."""
         R, r = poses
         i, j = self.pairs[pair]
         a, b = self._link_of[i], self._link_of[j]

@@ -103,7 +103,7 @@ class CommanderHost(Protocol):
 
 
 class GoalExecutive(Protocol):
-    """What executives have in common: goals, and what a plant does to them."""
+    """The common interface of executives: goals, and the effects of the plant on them."""
 
     outputs: deque[Any]
     """Statuses, events and the like to publish, in order; the commander removes them."""
@@ -161,7 +161,7 @@ class GoalExecutive(Protocol):
         """React to a plant that obeys again."""
 
     def plant_reset(self) -> None:
-        """Begin the present goal again: the robot is in another state than before."""
+        """Begin the present goal again, because the state of the robot has changed."""
 
 
 class StateDecoder(Protocol):
@@ -193,7 +193,7 @@ class StateDecoder(Protocol):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StateArrays:
-    """A state as arrays: joints, and where it is measured the base; all messages in one."""
+    """A state as arrays: the joints, and the base if it is measured; all messages in one."""
 
     stamp_ns: int
     q: Array
@@ -340,7 +340,7 @@ class Commander(ABC):
         if given and abs(rate - given) > _EQUAL_RATES * given:
             self.host.log(
                 "warning",
-                f"Parameter 'tick_rate' is {given:g} Hz, and the plant has {rate:g} Hz: "
+                f"Parameter 'tick_rate' is {given:g} Hz, but the plant has {rate:g} Hz: "
                 f"commands follow the plant. Set it to {rate:g}, or leave it out.",
             )
         if self.robot is not None:
@@ -600,8 +600,8 @@ class Commander(ABC):
         if self.states.put_odom(stamp_ns, odom):
             self._log_fault(
                 "contradiction",
-                "odom: two messages of one time differ; more than one node publishes it, and such "
-                "poses are not used.",
+                "odom: two messages with one stamp differ; more than one node publishes it, and "
+                "such poses are ignored.",
             )
         if self._awaits_odom():
             self.answer()
@@ -643,7 +643,7 @@ class Commander(ABC):
 
     @property
     def missing(self) -> str:
-        """What is waited for before states are answered, as a clause; empty: nothing."""
+        """Clause that names what states wait for before they are answered; empty: nothing."""
         if self.robot is None:
             return "a robot on 'robot_description'"
         topics = {"joint_states": self.states.joints, "odom": self.states.odom}
@@ -793,7 +793,7 @@ class Commander(ABC):
             return robot
 
     def on_plant_silent(self, message: str) -> None:
-        """Give up the goals: nothing comes from the plant any more."""
+        """Give up the goals, because nothing comes from the plant any longer."""
         self._give_up_goals(PlantStopped(message))
 
     def _give_up_goals(self, stopped: PlantStopped) -> None:

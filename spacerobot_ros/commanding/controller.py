@@ -123,7 +123,7 @@ class ControllerCommander(Commander):
                 "There is no target to approach: none is on 'target/robot_description'."
             )
         executive.request(task)
-        return f"The task '{task.value}' begins; controller/status tells its course."
+        return f"The task '{task.value}' begins; controller/status reports its progress."
 
     def _active_executive(self) -> ControlExecutive:
         if self.executive is None or not self.active:
@@ -152,7 +152,7 @@ class ControllerCommander(Commander):
         self._waited.pop(topic, None)
         if topic in self._silent:
             self._silent.discard(topic)
-            self.host.log("info", f"'{topic}' is not silent any more: it is followed again.")
+            self.host.log("info", f"'{topic}' is no longer silent: it is followed again.")
         self.answer()
 
     def take_odom(self, stamp_ns: int, odom: Any) -> None:
@@ -166,7 +166,7 @@ class ControllerCommander(Commander):
         super().take_odom(stamp_ns, odom)
 
     def take_accepted_jump(self) -> str:
-        """Take a set-aside state once its time is accepted, and look at what states wait for."""
+        """Take a set-aside state once its time is accepted, and check what states wait for."""
         warning = super().take_accepted_jump()
         if self.active:
             self._watch_waiting_state()
@@ -224,7 +224,7 @@ class ControllerCommander(Commander):
         super().take_joints(stamp_ns, joints)
 
     def rehearse(self) -> None:
-        """Fly a goal and a loss of the pose for nobody, so that no function is compiled in flight.
+        """Rehearse a goal and a loss of the pose, so that no function is compiled in flight.
 
         A controller that compiles keeps the plant waiting longer than its ``command_timeout``.
         """
@@ -278,7 +278,7 @@ class ControllerCommander(Commander):
         if self.plant.status.actuation != "velocity":
             return ""
         return (
-            "The plant takes velocities, and this controller sends efforts and a wrench: start the "
+            "The plant takes velocities, but this controller sends efforts and a wrench: start the "
             "plant with actuation:=effort."
         )
 

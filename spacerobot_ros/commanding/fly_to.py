@@ -65,7 +65,7 @@ class FlyTo:
         return cls(goal, tolerance, time_limit)
 
     def tolerance_or(self, default: Tolerance) -> Tolerance:
-        """Return its tolerances, where those that it leaves open are of a default."""
+        """Return its tolerances; those that it leaves open come from a default."""
         mine = self.tolerance
         return Tolerance(
             mine.position or default.position,
@@ -76,7 +76,7 @@ class FlyTo:
 
 @dataclass(frozen=True)
 class GoalErrors:
-    """Distance of a state from a goal; NaN for what the goal leaves open or nothing measures.
+    """Distance of a state from a goal; NaN for parts left open or not measured.
 
     Attributes
     ----------
@@ -244,7 +244,7 @@ class FlyToGoals:
         self._accepted.append(goal_id)
 
     def leave(self, goal_id: str) -> None:
-        """Follow a goal by topic no more: another commander pursues it."""
+        """Stop following a goal by topic, because another commander pursues it."""
         self._served.pop(goal_id, None)
 
     def request_abort(self, goal_id: str, why: str = "on request") -> None:
@@ -300,7 +300,7 @@ class FlyToGoals:
             self._end(status.goal_id, status)
 
     def end_dropped_goals(self, pursued: Collection[str], why: str = "") -> None:
-        """End the goals that are pursued no more, and which no status has decided.
+        """End the goals that are no longer pursued and that no status has decided.
 
         Parameters
         ----------
@@ -310,7 +310,7 @@ class FlyToGoals:
             The reason for goals that no later goal replaces.
         """
         for goal_id in [each for each in self._served if each not in pursued]:
-            message = why or "The goal is not pursued any more."
+            message = why or "The goal is no longer pursued."
             if not why and self._accepted[-1:] != [goal_id]:
                 message = f"Aborted: replaced by goal {self._accepted[-1]}."
             self._end(goal_id, self._report_aborted(goal_id, message))

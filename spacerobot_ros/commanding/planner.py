@@ -163,7 +163,7 @@ class PlannerCommander(Commander):
         if self.config.output != "commands" or self.plant.status.actuation != "effort":
             return ""
         return (
-            "The plant takes efforts, and this planner sends velocities: start the plant with "
+            "The plant takes efforts, but this planner sends velocities: start the plant with "
             "actuation:=velocity, or the planner with output:=reference beside a "
             "coordinated_control."
         )
@@ -194,7 +194,7 @@ class PlannerCommander(Commander):
         super()._accept_goal(BASE_GOAL_KEY, goal)
 
     def receive_twist(self, link: str, frame: str, linear: Array, angular: Array) -> None:
-        """Let a link follow a twist until twists stop; a log line says why it does not.
+        """Let a link follow a twist until twists stop; a log line gives the reason if it does not.
 
         Parameters
         ----------

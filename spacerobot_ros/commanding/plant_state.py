@@ -270,7 +270,7 @@ class StateSynchroniser:
 
     @property
     def missing(self) -> tuple[str, ...]:
-        """Topics for whose messages a state waits that has everything else."""
+        """Topics whose messages an otherwise complete state waits for."""
         if not (self._required and self._joints_fresh):
             return ()
         stamp = self._joints_ns
@@ -351,7 +351,7 @@ class PlantChange(Enum):
 
 
 class PlantListener:
-    """Follows plant/status: whether the plant obeys, and its resets; none need be published."""
+    """Follows plant/status: whether the plant obeys, and its resets; the topic is optional."""
 
     def __init__(self) -> None:
         self.status = PlantStatus(PlantState.RUNNING)
@@ -399,7 +399,7 @@ class PlantListener:
         if not heard:
             return changes
         if status.rearms > before.rearms and not was_blocked:
-            changes.append(PlantStopped("Commands pass again after a fault was latched."))
+            changes.append(PlantStopped("Commands are accepted again after a latched fault."))
         if status.timeouts > before.timeouts or (
             status.reason == "timeout" and before.reason != "timeout"
         ):

@@ -130,12 +130,12 @@ class ApproachPlan:
 
     @property
     def closing_time(self) -> float:
-        """When the end-effector leaves the standoff."""
+        """Time at which the end-effector leaves the standoff, s."""
         return self.start + self.path_to_standoff.duration + self.standoff_time
 
     @property
     def contact(self) -> float:
-        """When the end-effector has the pose of the grapple frame."""
+        """Time at which the end-effector has the pose of the grapple frame, s."""
         return self.closing_time + self.path_to_contact.duration
 
     def relative(self, times: Array) -> RelativeMotionOverTime:

@@ -149,8 +149,7 @@ class ActuatorLimits:
                 )
         if not np.all(self.effort >= 0):
             raise ParameterError(
-                f"The effort limits of the joints are {self.effort.tolist()}; "
-                "none must be negative."
+                f"The effort limits of the joints are {self.effort.tolist()}; none may be negative."
             )
 
     def apply(self, commanded: Actuation) -> Saturated:

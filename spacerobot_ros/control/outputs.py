@@ -119,7 +119,7 @@ class OutputSelection:
 
 @dataclass(frozen=True)
 class OutputDistance:
-    """How far the outputs are from a reference; NaN for kinds that are not controlled.
+    """Distances of the outputs from a reference; NaN for kinds that are not controlled.
 
     ``position`` (m) and ``attitude`` (rad): distance and angle in the controlled axes, the larger
     of base and end-effector; ``joints``: the largest error of a joint, m or rad.

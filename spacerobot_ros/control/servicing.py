@@ -77,7 +77,7 @@ class TaskState(Enum):
 
 @dataclass(frozen=True)
 class TaskProgress:
-    """The state of a task, with a sentence where it is refused or has failed."""
+    """The state of a task, with a sentence if it is refused or has failed."""
 
     state: TaskState
     message: str = ""
@@ -141,7 +141,7 @@ _LATEST_BEGIN = 0.1
 
 
 class ApproachTask:
-    """One approach: it is planned in its first state, and again where the target leaves its way.
+    """One approach: it is planned in its first state, and again if the target leaves its path.
 
     Parameters
     ----------
@@ -423,7 +423,7 @@ class DetumblingTask:
 
     @property
     def message(self) -> str:
-        """Sentence on the motion that is left."""
+        """Sentence about the remaining motion."""
         return f"Detumbling: base and joints turn at {quantity(self._fastest, 'rad/s')}."
 
     def _begin(self, time: float, state: ControlState, controller: CoordinatedController) -> None:
@@ -434,7 +434,7 @@ class DetumblingTask:
         controller.come_to_rest(self._law.command)
         bound = shortest_detumbling(self._momentum, self._law.torque)
         message = (
-            f"The robot is brought to rest: {self._momentum:.4g} N m s take {bound:.4g} s at least."
+            f"The robot is brought to rest: {self._momentum:.4g} N m s take at least {bound:.4g} s."
         )
         self.events.append(Event(EventKind.DETUMBLE_STARTED, message))
 

@@ -59,8 +59,9 @@ def steady_errors(
     unheld = np.linalg.norm(per_error @ pull + balanced)
     if unheld > _MAX_ROUNDING_SHARE * np.linalg.norm(balanced):
         raise ParameterError(
-            f"The wrench on link '{link}' moves what the outputs of the law '{law.name}' do not "
-            f"hold: there is no steady state. The outputs are {', '.join(law.outputs.labels)}."
+            f"The wrench on link '{link}' causes a motion that the outputs of the law "
+            f"'{law.name}' do not hold: there is no steady state. "
+            f"The outputs are {', '.join(law.outputs.labels)}."
         )
     errors = law.errors_under(state, pull)
     return np.where(law.integral_gains > 0.0, 0.0, errors)

@@ -52,7 +52,7 @@ Counts = npt.NDArray[np.int64]
 
 @dataclass(frozen=True)
 class EpisodeConfig:
-    """What episodes are about: the keyword arguments of the environments.
+    """The configuration of episodes: the keyword arguments of the environments.
 
     Attributes
     ----------
@@ -132,7 +132,7 @@ class EpisodeConfig:
                 )
         if not isinstance(self.hold, int | np.integer) or self.hold < 1:
             raise ParameterError(
-                f"Argument 'hold' is {self.hold!r}; it is a whole number of ticks, one at least."
+                f"Argument 'hold' is {self.hold!r}; it must be a whole number of ticks above 0."
             )
         for name in ("time_limit", "tolerance", "spread", "max_force", "max_torque"):
             value = getattr(self, name)
@@ -141,7 +141,9 @@ class EpisodeConfig:
                 and np.isfinite(value)
                 and value >= 0.0
             ):
-                raise ParameterError(f"Argument '{name}' is {value!r}; it must be finite, from 0.")
+                raise ParameterError(
+                    f"Argument '{name}' is {value!r}; it must be finite, at least 0."
+                )
         if not isinstance(self.reward, Mapping | None):
             raise ParameterError(
                 f"Argument 'reward' is {self.reward!r}; it must be a dictionary of weights."
@@ -150,7 +152,7 @@ class EpisodeConfig:
             raise ParameterError("Argument 'time_limit' is 0; episodes take longer, in s.")
         if self.link and not self.kind.has_link:
             raise ParameterError(
-                f"Argument 'link' is '{self.link}', and in task '{self.task}' no link reaches: "
+                f"Argument 'link' is '{self.link}', but in task '{self.task}' no link reaches: "
                 "leave it out, or take spacerobot/Reach-v0."
             )
         if self.scenario and self.campaign:
@@ -219,7 +221,7 @@ class EpisodeStarts:
         """Starts of the draws by their numbers; texts are the reasons of refusals."""
 
     def draw(self, rng: np.random.Generator, flights: SteppedFlights) -> _Start:
-        """Return a start of one of the flights; of a campaign, one of its draws at random.
+        """Return the start of an episode: the scenario's, or that of a random draw of the campaign.
 
         Raises
         ------
@@ -238,7 +240,7 @@ class EpisodeStarts:
                 return start
         raise ParameterError(
             f"{_MAX_REFUSED_DRAWS} draws of the campaign in succession are refused, the last "
-            f"because: {start} Disperse within what the robot can have."
+            f"one because: {start} Disperse within the possible values of the robot."
         )
 
     def _drawn(self, campaign: Campaign, number: int, flights: SteppedFlights) -> _Start | str:

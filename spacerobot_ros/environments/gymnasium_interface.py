@@ -62,7 +62,7 @@ def _seeds_of(seed: Any, count: int) -> list[int | None]:
             f"The seed is {seed!r}: give a whole number, or a list of {count} of them or None."
         ) from None
     if len(seeds) != count:
-        raise ValueError(f"There are {len(seeds)} seeds of {count} environments.")
+        raise ValueError(f"There are {len(seeds)} seeds for {count} environments.")
     if any(each is not None and each < 0 for each in seeds):
         raise Error(f"The seed is {seed!r}: seeds are whole numbers from 0.")
     return seeds
@@ -202,7 +202,7 @@ class SpaceRobotVectorEnv(VectorEnv, EzPickle):
         seed: int | Sequence[int | None] | None = None,
         options: dict[str, Any] | None = None,
     ) -> tuple[Any, dict[str, Any]]:
-        """Begin all episodes, or those of ``options["reset_mask"]`` (num_envs,) alone.
+        """Begin all episodes, or those of ``options["reset_mask"]`` (num_envs,) only.
 
         Options ``goal`` and ``start``, one for all or one for each robot, replace what is drawn.
         """

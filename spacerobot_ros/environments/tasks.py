@@ -351,7 +351,7 @@ class Reach(Task):
         return np.eye(3) if len(found) == 3 else found
 
     def random_goal(self, start: RobotStates, spread: float, rng: np.random.Generator) -> Array:
-        """Return a position within ``spread`` m of where the link starts, where it can go."""
+        """Return a position within ``spread`` m of the link's start, in its free directions."""
         ways, way = self.directions, rng.normal(size=3)
         if len(ways) < 3:
             R = matrices_from_quaternions(start.pose[:1, 3:])[0]

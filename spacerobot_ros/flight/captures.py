@@ -80,7 +80,7 @@ class States:
 
     @classmethod
     def of(cls, flight: Flight, robot: RobotDescription, prefix: str = "") -> States:
-        """Return the states of a flight; none where its joints are not those of the robot.
+        """Return the states of a flight; none if its joints are not those of the robot.
 
         With the prefix ``measured_`` they are those that the sensors measured.
         """
@@ -224,9 +224,9 @@ def payload_estimates(flight: Flight, most: int = 600) -> tuple[PayloadEstimate,
     loaded = any(event.kind is EventKind.DISTURBANCE for event in flight.events)
     if loaded or plant.disturbances or Surroundings.of(plant.orbit, plant.table).has_loads:
         raise SpaceRobotError(
-            "The held body is not estimated: loads from outside (disturbances, an orbit or a "
-            "table) acted on the robot, and their impulse is not known to it; estimate it from a "
-            "flight without them."
+            "The held body is not estimated: external loads (disturbances, an orbit or a table) "
+            "acted on the robot, and their impulse is unknown; estimate it from a flight without "
+            "them."
         )
     prefix = "measured_" if len(flight.signal("measured_pose")) else ""
     states, alone = States.of(flight, robot, prefix), SpaceRobot(robot)

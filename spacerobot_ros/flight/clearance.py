@@ -49,7 +49,7 @@ class FlightClearance:
         pose: tuple[Array, Array],
         mesh_of: Callable[[Shape], TriangleMesh] = shape_mesh,
     ) -> FlightClearance | None:
-        """Return the clearance of a flight; None without states, or where no pair of links counts.
+        """Return the clearance of a flight; None without states, or if no pair of links counts.
 
         Parameters
         ----------
@@ -78,7 +78,7 @@ class FlightClearance:
 
     @cached_property
     def nearest(self) -> Approach:
-        """The nearest approach of two links, between the states too."""
+        """The nearest approach of two links, also between the states."""
         found = PathCheck(self.geometry).nearest(self.shapes, self.base)
         assert found is not None
         return found

@@ -174,7 +174,7 @@ class FlightData:
     # -- arrays -------------------------------------------------------------------------------
 
     def signal(self, name: str) -> Signal:
-        """Return a quantity over time; without samples where the flight does not have it."""
+        """Return a quantity over time; without samples if the flight does not have it."""
         found = self.series.get(name)
         if found is not None:
             return found
@@ -415,7 +415,7 @@ class FlightData:
 
     @property
     def has_thrust(self) -> bool:
-        """Whether forces or torques were commanded of thrusters."""
+        """Whether forces or torques of thrusters were commanded."""
         wrench = self.commands.get("base_wrench")
         return wrench is not None and bool(wrench.values.any())
 

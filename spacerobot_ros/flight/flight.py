@@ -117,7 +117,7 @@ class Flight(FlightData):
     # -- views and files ----------------------------------------------------------------------
 
     def to_pandas(self, *, euler: bool = False) -> pd.DataFrame:
-        """Return a table with a row a state, indexed by time (s).
+        """Return a table with a row for each state, indexed by time (s).
 
         Columns and their units, ``attrs["units"]``, are those of the tables of bags: of ``odom``
         and ``joint_states`` as there, with the true state, of other topics with the topic before

@@ -70,7 +70,7 @@ _TICKS_PER_CLOCK_READ = 64
 
 @dataclass(frozen=True)
 class Robots:
-    """The models of a flight: that of the plant, and those that its commanders believe in."""
+    """The models of a flight: that of the plant, and those that its commanders assume."""
 
     plant: SpaceRobot
     planner: SpaceRobot

@@ -347,7 +347,7 @@ def open_flight_bag(path: str | os.PathLike[str], namespace: str | None = None) 
 
 
 def namespaces(bag: Bag) -> list[str]:
-    """Return the namespaces of robots that a bag has an ``odom`` in, in alphabetical order."""
+    """Return the namespaces in which a bag has an ``odom`` of a robot, in alphabetical order."""
     found = {
         topic.rpartition("/")[0]
         for topic, kind in bag.topics.items()

@@ -112,7 +112,7 @@ def save_flight(
 def open_bag(
     scenario: Scenario, path: str | os.PathLike[str], *, overwrite: bool = False
 ) -> BagWriter:
-    """Return a new bag, with the compression and the largest file of the scenario's recorder.
+    """Return a new bag, with the compression and the file size limit of the scenario's recorder.
 
     Raises
     ------
@@ -438,7 +438,7 @@ _UNITS = {"propellant": "kg"}
 
 
 def table_of_flight(flight: FlightData, *, euler: bool = False) -> TopicTable:
-    """Return a row a state: the true state by the columns of ``odom`` and ``joint_states``.
+    """Return a row for each state: the true state by the columns of ``odom`` and ``joint_states``.
 
     The columns of other topics have the topic before them, as ``momentum.data[linear_x]``. Where
     sensors err, ``measured`` stands before those of the measured state.

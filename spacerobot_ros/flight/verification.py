@@ -262,8 +262,8 @@ def _recorded_robot(bag: Bag) -> RecordedRobot:
         names = ", ".join(each.namespace for each in found)
         plants = f"{len(found)} plants ({names})" if found else "no plant"
         raise RecordingError(
-            f"The bag {bag.path} holds the states of {plants}: to verify it takes one that "
-            "published odom and joint_states."
+            f"The bag {bag.path} holds the states of {plants}: a verification needs one "
+            "that published odom and joint_states."
         )
     return found[0]
 
@@ -289,8 +289,8 @@ def _plant_config(recorded: RecordedRobot) -> PlantConfig:
         ) from error
     if config.time_mode != "lockstep":
         raise RecordingError(
-            f"The bag {bag.path} was flown in real time, and does not record which command "
-            "the plant held in which tick: only flights in lockstep can be verified."
+            f"The bag {bag.path} was flown in real time, and does not record the command "
+            "that the plant held in each tick: only flights in lockstep can be verified."
         )
     return config
 
@@ -383,7 +383,7 @@ def _missing_states(
     if len(lacking) > lost:
         time = min(lacking) * flight.config.period_ns / SECOND
         return (
-            f"it holds commands for {len(lacking)} states that are not in it, the first of "
+            f"it holds commands for {len(lacking)} states that are not in it, the first at "
             f"{time:.9g} s."
         )
     return ""

@@ -127,7 +127,7 @@ def _with_dependencies(name: _InterfaceName, seen: set[str]) -> str:
 
 @cache
 def type_hash(type_name: str) -> str:
-    """Return the hash by which ROS 2 tells apart versions of a message type.
+    """Return the hash by which ROS 2 distinguishes versions of a message type.
 
     It is ``RIHS01_`` and 64 hexadecimal digits; empty if the package was installed without the
     description of its types (``share/<package>/msg/<Type>.json``). Raises as

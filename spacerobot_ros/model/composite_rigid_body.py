@@ -156,7 +156,7 @@ class Composites:
 
     @property
     def D_qq(self) -> ca.SX:
-        """Inertia matrix (n, n) of the joint rates where base and centre rest (eq. 16b)."""
+        """Inertia matrix (n, n) of the joint rates while base and centre rest (eq. 16b)."""
         m = self.kin.moving_body_count
         D_qq = ca.SX(m, m)
         for j in range(1, m + 1):

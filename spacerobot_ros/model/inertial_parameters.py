@@ -178,8 +178,8 @@ class InertialParameters:
             row, body_index = np.argwhere(impossible)[0]
             moments = ", ".join(f"{each[row, body_index]:.4g}" for each in (low, middle, high))
             raise RobotDescriptionError(
-                f"The inertia of '{names[int(body_index)]}' is that of no body: its principal "
-                f"moments are {moments} kg m^2."
+                f"The inertia of '{names[int(body_index)]}' is not that of a rigid body: its "
+                f"principal moments are {moments} kg m^2."
             )
 
     def apply_to_description(self, robot: RobotDescription) -> RobotDescription:

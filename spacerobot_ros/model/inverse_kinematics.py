@@ -75,7 +75,7 @@ class FixedBaseArm:
         return error[self._rows], J_W[self._rows]
 
     def nearest_shape(self, q: Array, goal: Pose) -> tuple[Array, float]:
-        """Return the shape (n,) nearest to a pose that is found from ``q`` on.
+        """Return the shape (n,) nearest to a pose that a search from ``q`` finds.
 
         Also returned is the largest error that remains, m or rad. The search is damped least
         squares, with steps that are short enough to stay on one branch of solutions.

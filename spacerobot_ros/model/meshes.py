@@ -191,7 +191,7 @@ def read_mesh(path: str | Path) -> TriangleMesh:
     suffix = path.suffix.lower()
     if suffix not in (".stl", ".obj", *_TRIMESH_SUFFIXES):
         raise MeshError(
-            f"The mesh {path} is of no kind that can be read (STL, OBJ, COLLADA, glTF, PLY): "
+            f"The mesh {path} is not of a kind that can be read (STL, OBJ, COLLADA, glTF, PLY): "
             "convert it to STL."
         )
     try:

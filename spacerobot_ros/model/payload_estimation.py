@@ -92,7 +92,7 @@ class PayloadEstimate:
 
     @property
     def payload(self) -> Payload | None:
-        """The body; None where a parameter is not determined."""
+        """The body; None if a parameter is not determined."""
         if self.undetermined:
             return None
         mass, h, about = _mass_moment_inertia(self.parameters)

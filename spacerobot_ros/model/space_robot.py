@@ -100,7 +100,7 @@ class SpaceRobot:
         return SpaceRobot(description, self._build)
 
     def derived(self, description: RobotDescription) -> SpaceRobot:
-        """Return the robot of a description that was made of this one's, such as its gyrostat.
+        """Return the robot of a description that was made from this one's, such as its gyrostat.
 
         If this robot shares its compiled functions with robots that differ only in mass
         properties, so does that one.
@@ -419,8 +419,8 @@ class SpaceRobot:
         else:
             joint = self.description.movable_joints[int(moved.argmax())]
             mend = (
-                f"its joint '{joint.name}' can move without any mass moving, as the bodies on one "
-                f"side of it have no inertia about its axis. Give '{joint.child}' and "
+                f"its joint '{joint.name}' can move without any mass moving, because the bodies on "
+                f"one side of it have no inertia about its axis. Give '{joint.child}' and "
                 f"'{joint.parent}' {box}, or make the joint fixed."
             )
         raise RobotDescriptionError(

@@ -227,7 +227,7 @@ def thruster_table(entries: Sequence[Mapping[str, Any]], robot: RobotDescription
         unknown = sorted(set(entry) - _THRUSTER_KEYS)
         if unknown:
             raise ParameterError(
-                f"The {where} has '{unknown[0]}'; known are {', '.join(sorted(_THRUSTER_KEYS))}."
+                f"The {where} has '{unknown[0]}'; known keys: {', '.join(sorted(_THRUSTER_KEYS))}."
             )
         mount = _pose_of_link(str(entry.get("link", robot.base_link)), robot, where)
         frame = Pose(

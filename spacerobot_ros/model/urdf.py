@@ -397,7 +397,7 @@ def describe_inertia_flaw(about: Array) -> str:
         return "has a negative principal moment; check its signs."
     if high > (1 + TRIANGLE_SLACK) * (low + middle) + 1e-12:
         return (
-            f"is that of no body: its principal moments are {low:.4g}, {middle:.4g} and "
+            f"is not that of a rigid body: its principal moments are {low:.4g}, {middle:.4g} and "
             f"{high:.4g} kg m^2, and none can be larger than the sum of the other two. Check units "
             "and digits of <inertia>."
         )

@@ -16,7 +16,7 @@ from spacerobot_ros.model.urdf import parse_world, require_found_meshes
 
 
 def with_world(robot: RobotDescription, world: RobotDescription | None) -> RobotDescription:
-    """Return a robot among obstacles (:func:`.load_world`), instead of those around it so far.
+    """Return a robot among obstacles (:func:`.load_world`), instead of its present ones.
 
     Without a world there are none around it.
     """
@@ -32,7 +32,7 @@ def with_world(robot: RobotDescription, world: RobotDescription | None) -> Robot
 
 
 def obstacles_from_topic(text: str) -> RobotDescription | None:
-    """Return the obstacles of a text on the topic ``obstacles``; None, where it is empty.
+    """Return the obstacles of a text on the topic ``obstacles``; None if it is empty.
 
     The text is plain URDF: nothing in it is expanded.
 
@@ -47,7 +47,7 @@ def obstacles_from_topic(text: str) -> RobotDescription | None:
     world = parse_world(text)
     if world.world is not None:
         raise RobotDescriptionError(
-            "Obstacles are not among others: leave the element <world> out of their URDF."
+            "Obstacles have no obstacles of their own: leave the element <world> out of their URDF."
         )
     require_found_meshes(world)
     return world

@@ -160,7 +160,7 @@ class CoordinatedControlNode(CommanderNode):
         self._joint_commands.publish(self._joint_message.serialised(stamp))
 
     def publish_status(self, status: Status) -> None:
-        """Publish a status of the goal, and log it where something is wrong."""
+        """Publish a status of the goal, and log it if something is wrong."""
         super().publish_status(status)
         decision = status.state, status.goal_id
         lasts, self._published = self._published == decision, decision

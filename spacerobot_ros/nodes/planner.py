@@ -122,7 +122,7 @@ class PlannerNode(CommanderNode):
             self._announcement.join(MAX_THREAD_END_TIME)
 
     def destroy_node(self) -> None:
-        """Destroy the node with its clients of trajectories, in whatever state it is."""
+        """Destroy the node with its clients of trajectories, in any state."""
         self._await_announcement()
         if self._trajectories is not None:
             self._trajectories.destroy()

@@ -154,7 +154,7 @@ class RecorderNode(FlightNode):
         asked = Path(config.bag).name
         if asked and not writer.path.name.startswith((f"{Path(asked).stem}_", asked)):
             self.get_logger().warning(
-                f"The bag {config.bag} is there already: this flight goes into {writer.path}."
+                f"The bag {config.bag} already exists: this flight goes into {writer.path}."
             )
         if config.diagnostics_period:
             self.create_timer(config.diagnostics_period, self._publish_state, clock=steady)
@@ -611,7 +611,7 @@ def _read_descriptions(path: str) -> list[tuple[str, dict[str, str]]]:
 
 
 def main() -> None:
-    """Record until SIGINT or SIGTERM; the exit code is 1 where the recording has failed."""
+    """Record until SIGINT or SIGTERM; the exit code is 1 if the recording has failed."""
     made: list[RecorderNode] = []
 
     def make() -> RecorderNode:

@@ -131,7 +131,10 @@ class ReplayNode(FlightNode):
     def start_message(self) -> str:
         """Return a log message with bag, number of topics and rate."""
         config = self.config
-        return f"Replays {len(self._outputs)} topic(s) of {config.bag} at {config.rate:g} times."
+        return (
+            f"Replays {len(self._outputs)} topic(s) of {config.bag} at {config.rate:g} times the "
+            "recorded speed."
+        )
 
     def deactivate(self) -> None:
         """Pause; the replay continues from the same message when it is activated again."""
@@ -149,7 +152,7 @@ class ReplayNode(FlightNode):
             meshes.close()
 
     def destroy_node(self) -> None:
-        """Close the bag and remove the files of its meshes, whatever state the node is in."""
+        """Close the bag and remove the files of its meshes, in any state of the node."""
         self.cleanup()
         super().destroy_node()
 

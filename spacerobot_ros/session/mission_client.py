@@ -162,7 +162,7 @@ class MissionClient:
         return bool(deciders & readers)
 
     def send(self, goal: Goal, end_effector: Goal | None = None) -> None:
-        """Publish goal poses of the base and of end-effectors, where there are any.
+        """Publish goal poses of the base and of end-effectors, if there are any.
 
         All have the same stamp, which is no other goal's: the status names them by it. A planner
         keeps the joint positions that a goal is to end in for the goals after it: so each goal is

@@ -133,8 +133,8 @@ def _missing_effort_remark(joint: Joint) -> str:
     if joint.limits.effort != 0:
         return ""
     return (
-        f"The joint '{joint.name}' has the effort limit 0: driven by velocities it moves, driven "
-        'by efforts it cannot. Give <limit effort="..."/> in N or N m.'
+        f"The joint '{joint.name}' has the effort limit 0: it moves under velocity commands, but "
+        'not under effort commands. Give <limit effort="..."/> in N or N m.'
     )
 
 

@@ -242,7 +242,7 @@ class CaptureReport:
         }
 
     def event(self, time_s: float) -> Event:
-        """Return the event of the capture; a warning where a joint impulse is beyond its limit."""
+        """Return the event of the capture; a warning if a joint impulse is beyond its limit."""
         impact, limit = self.impact, self.joint_impulse_limit
         force, moment = np.linalg.norm(impact.impulse[:3]), np.linalg.norm(impact.impulse[3:])
         message = (
@@ -453,7 +453,7 @@ class CapturePlant(WrappedPlant):
         self._continue(robot, motion, momenta)
 
     def step(self, *commands: Any) -> bool:
-        """Advance a tick under the commands of the robot; first capture the target where that is
+        """Advance a tick under the commands of the robot; first capture the target if that is
         automatic and possible. Returns whether a joint was limited.
         """
         if self._config.mode == "automatic" and self.payload is None:

@@ -324,7 +324,7 @@ class PlantConfig(WatchdogConfig, RobotConfig):
         return replace(self, actuation=actuation or ("effort" if needs_efforts else "velocity"))
 
     def prefix_for(self, robot: RobotDescription) -> str:
-        """Return what goes before the names of a robot's frames, none of which is the world's."""
+        """Return the prefix of the names of a robot's frames, so that none is the world's."""
         taken = self.world_frame in robot.frames
         return self.frame_prefix or ("robot/" if taken else "")
 

@@ -362,8 +362,8 @@ def _link_indices(robot: SpaceRobot, names: Sequence[str]) -> list[int]:
             )
     if len({pose_topic(name).name for name in names}) < len(names):
         raise ParameterError(
-            "Parameter 'end_effectors' names links with one topic NAME/pose: "
-            f"{', '.join(names)}; name each once."
+            "Parameter 'end_effectors' names links that share a topic NAME/pose: "
+            f"{', '.join(names)}; name only one of them."
         )
     return [links.index(name) for name in names]
 

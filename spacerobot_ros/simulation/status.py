@@ -290,7 +290,7 @@ def _events_between(before: PlantStatus, now: PlantStatus) -> list[Event]:
     for fault in ended:
         add(EventKind.FAULT_ENDED, f"A fault has ended: {with_seconds(fault)}.", fault=fault)
     if ended and not now.faults:
-        add(EventKind.FAULTS_CLEARED, "No fault is active any more.")
+        add(EventKind.FAULTS_CLEARED, "No fault is active any longer.")
     for each in now.disturbances:
         if each not in before.disturbances:
             message = f"A disturbance begins: {with_seconds(each)}."

@@ -95,7 +95,7 @@ def test_a_bag_is_a_mapping_of_topics_with_and_without_the_slash(bag: Bag) -> No
     assert bag.get("event") is None
     assert bag.get("event", 7) == 7
     for no_name in (7, None, ["events"]):
-        with pytest.raises(TypeError, match="A topic is named by a text"):
+        with pytest.raises(TypeError, match="The name of a topic is a text"):
             bag.to_pandas(no_name) if no_name else bag[no_name]  # type: ignore[index,call-overload]
     with pytest.raises(RecordingError, match="no topic event: it has"):
         bag["event"]

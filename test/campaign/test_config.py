@@ -71,7 +71,7 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     ({"table": 3}, "'table' must be the name of a CSV file, or its lines"),
     ({"table": "mass\n"}, "needs a line of names, and a line for each flight"),
     ({"table": "mass\n1,2\n"}, "row 1 of the table has 2 values for 1 names"),
-    ({"table": "mass.*\n1\n"}, r"'mass.\*' in the table is of 4 values: name one"),
+    ({"table": "mass.*\n1\n"}, r"'mass.\*' in the table names 4 values: name one"),
     ({"table": "mass\nx\n"}, "'mass: table' is 'x'; it must be a finite number"),
     ({"table": "mass\n1\n", "disperse": {"mass.mass_1": NORM}}, "set the same numbers"),
     ({"table": "planner.method\noptima\n"}, "must be one of lie_bracket"),
@@ -336,7 +336,7 @@ def test_the_rows_of_a_table_are_its_flights(tmp_path: Path) -> None:
         {"mass.mass_1": 0.75, "planner.method": "auto", "goal.position.x": -0.002},
     ]
     assert second[0] != second[1]
-    with pytest.raises(ParameterError, match="'flights' is 3, but the table has 2, one a row"):
+    with pytest.raises(ParameterError, match="'flights' is 3, but the table has rows for only 2"):
         load_campaign(file, 3)
 
 

@@ -433,7 +433,7 @@ def test_a_path_that_is_no_text_is_refused(option: str) -> None:
         ),
         (
             ["goal", "--goal-rotvec", *"001", "--end-effector-position", *"123"],
-            "Beside end-effectors an attitude of the base is sent with its position X Y Z.",
+            "With goals of end-effectors, give the attitude of the base with its position X Y Z.",
         ),
         (["goal", "1", "2"], "A goal is X Y Z, or X Y Z QX QY QZ QW."),
         (["goal"], "A goal is X Y Z, or X Y Z QX QY QZ QW."),

@@ -250,7 +250,7 @@ def test_without_coal_distances_are_bounds(
         monkeypatch.undo()
         distances_module._coal.cache_clear()
     assert [each.message for each in caplog.records if "coal" in each.message] == [
-        "Distances between links are those of spheres, capsules and boxes around them, since the "
+        "Distances between links are those of spheres, capsules and boxes around them, because the "
         "package coal is not installed: `pip install '.[collision]'` in the clone."
     ]
     assert exact.exact

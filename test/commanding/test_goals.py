@@ -252,7 +252,7 @@ def test_a_goal_that_was_refused_has_replaced_none() -> None:
     rig.goals.accepted("later")
     rig.goals.update(status("refused", "later"))
     rig.goals.end_dropped_goals(())
-    assert first.end_of == ("aborted", "The goal is not pursued any more.")
+    assert first.end_of == ("aborted", "The goal is no longer pursued.")
 
 
 # -- aborts -----------------------------------------------------------------------------------

@@ -137,8 +137,9 @@ def test_wrenches_that_nothing_holds_are_refused(name: str, wrench: list[float])
     with pytest.raises(ParameterError) as refused:
         steady_errors(law, planar_start(), "link_2", wrench)
     assert str(refused.value) == (
-        f"The wrench on link 'link_2' moves what the outputs of the law '{name}' do not hold: "
-        f"there is no steady state. The outputs are {', '.join(law.outputs.labels)}."
+        "The wrench on link 'link_2' causes a motion that the outputs of the law "
+        f"'{name}' do not hold: there is no steady state. "
+        f"The outputs are {', '.join(law.outputs.labels)}."
     )
 
 

@@ -255,7 +255,7 @@ def test_defaults_are_what_a_thruster_does_not_say(tmp_path: Path) -> None:
         ({"link": "wing"}, "The link of thruster 'a' is 'wing', but there is no such link."),
         ({"link": "arm"}, "on link 'arm', which joints move"),
         ({"name": ""}, "The name of a thruster is missing."),
-        ({"colour": "red"}, "The thruster 'a' has 'colour'; known are"),
+        ({"colour": "red"}, "The thruster 'a' has 'colour'; known keys"),
     ],
 )
 def test_refusals_name_the_thruster(change: dict[str, Any], sentence: str, tmp_path: Path) -> None:

@@ -321,14 +321,14 @@ def test_goals_of_a_scenario() -> None:
     [
         ({"ticks": 3}, "There is no argument 'ticks' of environments; there are task, scenario, "),
         ({"goals": "far"}, "Argument 'goals' is 'far'; it may be random, scenario"),
-        ({"hold": 0}, "Argument 'hold' is 0; it is a whole number of ticks"),
-        ({"hold": 1.5}, "Argument 'hold' is 1.5; it is a whole number of ticks"),
-        ({"time_limit": 0}, "Argument 'time_limit' is 0; episodes take longer"),
-        ({"time_limit": "x"}, "Argument 'time_limit' is 'x'; it must be finite, from 0"),
+        ({"hold": 0}, "Argument 'hold' is 0; it must be a whole number of ticks"),
+        ({"hold": 1.5}, "Argument 'hold' is 1.5; it must be a whole number of ticks"),
+        ({"time_limit": 0}, "Argument 'time_limit' is 0; it must be a positive time"),
+        ({"time_limit": "x"}, "Argument 'time_limit' is 'x'; it must be finite, at least 0"),
         ({"scenario": 3}, "Argument 'scenario' is 3; it must be a text"),
-        ({"link": "segment_2"}, "Argument 'link' is 'segment_2', and in task 'reorient' no link"),
+        ({"link": "segment_2"}, "Argument 'link' is 'segment_2', but in task 'reorient' no link"),
         ({"reward": {"time": np.nan}}, "The weight 'time' of the reward is nan: give a finite"),
-        ({"spread": -1.0}, "Argument 'spread' is -1.0; it must be finite, from 0"),
+        ({"spread": -1.0}, "Argument 'spread' is -1.0; it must be finite, at least 0"),
         ({"time_limit": np.inf}, "Argument 'time_limit' is inf; it must be finite"),
         ({"scenario": "a", "campaign": "b"}, "both given: a campaign names its scenario"),
         ({"reward": {"speed": 1}}, "There is no weight 'speed' of the reward; there are progress"),
@@ -397,7 +397,7 @@ def test_bad_actions_goals_and_masks_are_refused() -> None:
     for mask in (np.zeros(2, dtype=bool), np.ones(3, dtype=bool), np.ones(2)):
         with pytest.raises(ValueError, match="must be 2 booleans, at least one true"):
             vector.reset(options={"reset_mask": mask})
-    with pytest.raises(ValueError, match="There are 3 seeds of 2 environments"):
+    with pytest.raises(ValueError, match="There are 3 seeds for 2 environments"):
         vector.reset(seed=[1, 2, 3])
     for seed in (1.5, "x", [1, "x"], [1.5, 2]):
         with pytest.raises(Error, match="give a whole number, or a list of 2 of them or None"):

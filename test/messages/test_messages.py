@@ -248,7 +248,7 @@ def test_pairs_have_the_order_of_the_fields_and_leave_defaults_out() -> None:
     ("pairs", "named"), [({"words": "a"}, "'number'"), ({"number": "3", "n.x": "1.5"}, "1.5")]
 )
 def test_pairs_that_are_missing_or_unreadable_are_named(pairs: dict[str, str], named: str) -> None:
-    with pytest.raises(SpaceRobotError, match=f"^The values are no sample: .*{named}"):
+    with pytest.raises(SpaceRobotError, match=f"^No sample can be read from the values: .*{named}"):
         FORMAT.from_values(Sample, pairs)
 
 

@@ -110,7 +110,7 @@ def test_a_planar_robot_is_described_by_its_links_and_by_its_largest_curvature()
     assert words.startswith("3 links in a plane: loops of joints 'pin_1' and 'pin_2' turn")
     shapes = np.stack(np.meshgrid(*2 * [np.linspace(-np.pi, np.pi, 181)]), axis=-1)
     top = np.abs(phase_density(shapes)).max()
-    assert float(words.split(" rad a unit")[0].rsplit(" ", 1)[1]) == pytest.approx(top, rel=5e-3)
+    assert float(words.split(" rad per unit")[0].rsplit(" ", 1)[1]) == pytest.approx(top, rel=5e-3)
     assert abs(phase_density(found.shape)) == pytest.approx(top, rel=1e-3)
     assert str(np.round(found.shape, 3).tolist()) in words
 

@@ -313,7 +313,7 @@ def test_a_shape_that_a_stuck_joint_is_not_in_is_refused() -> None:
     wanted[2] += 0.1
     goal = Goal(np.zeros(3), Rotation.from_rotvec([0.01, 0.0, 0.0]).as_quat(), wanted)
     with pytest.raises(
-        PlanningError, match=r"stuck at 2 rad; the goal wants .*'elbow_pitch' at 2\.1"
+        PlanningError, match=r"stuck at 2 rad; the goal requires .*'elbow_pitch' at 2\.1"
     ):
         gait(SERVICER, SHAPE, "elbow_pitch").plan(state, goal)
 

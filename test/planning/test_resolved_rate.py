@@ -263,14 +263,14 @@ def test_a_joint_at_its_limit_ends_the_line() -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"rotvec": (0.1, 0.0, 0.0)}, "the goal is for the base: optimal plans for it"),
+        ({"rotvec": (0.1, 0.0, 0.0)}, "the goal is for the base: use optimal for it"),
         (
             {"end_effector_position": (1.5, 0.4, 0.3), "position": (0, 0, 0)},
-            "asks for the pose of the base, too: optimal plans for both",
+            "also asks for the pose of the base: use optimal for both",
         ),
         (
             {"end_effector_position": (1.5, 0.4, 0.3), "joint_positions": (0, 0, 0.5)},
-            "asks for joint positions, too",
+            "also asks for joint positions",
         ),
         (
             {"end_effector_pose": (1.5, 0.4, 0.3, 0, 0, 0, 1)},

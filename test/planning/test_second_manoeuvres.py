@@ -174,8 +174,8 @@ def test_a_second_stuck_joint_is_planned_without_beside_the_first() -> None:
     assert not commands[:, [0, 2]].any()
     assert commands[:, 1].any()
     assert [n.split(":")[1] for n in loop.notices if n.startswith("Stuck")] == [
-        " slider_1. The remaining motion is planned without.",
-        " slider_1, slider_3. The remaining motion is planned without.",
+        " slider_1. The remaining motion is planned without stuck joints.",
+        " slider_1, slider_3. The remaining motion is planned without stuck joints.",
     ]
     # The next goal is planned for with all joints again.
     loop.plant.hold(np.zeros(3, dtype=np.bool_))

@@ -473,7 +473,7 @@ def test_named_links_are_where_pinocchio_sees_them_in_the_measured_state() -> No
     assert names(state)[:3] == [f"{name}/pose" for name in named]
     with pytest.raises(ParameterError, match="'end_effectors' names 'claw'"):
         reported(ARM, end_effectors=("link_1", "claw"))
-    with pytest.raises(ParameterError, match="name each once"):
+    with pytest.raises(ParameterError, match="name only one of them"):
         reported(ARM, end_effectors=("link_1", "link_1"))
 
 

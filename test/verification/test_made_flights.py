@@ -374,7 +374,7 @@ def test_a_bag_whose_states_were_removed_is_not_verified(tmp_path: Path, kept: i
     result = verify_bag(bag)
     assert result.difference is None
     assert result.ticks == kept - 1
-    first = f"the first of {kept * TICK:g} s."
+    first = f"the first at {kept * TICK:g} s."
     assert result.missing == f"it holds commands for {10 - kept} states that are not in it, {first}"
 
 

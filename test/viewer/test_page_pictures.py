@@ -218,7 +218,7 @@ def test_a_controlled_flight_that_is_looked_back_at_aborted_and_stopped(
         page.wait_for_text("'/plant' is latched: stopped on request; rearm it first.")
         page.press("Rearm")
         page.wait_for_text(
-            "Commands pass again", "Plant running", without="until the plant is rearmed"
+            "Commands are accepted again", "Plant running", without="until the plant is rearmed"
         )
 
 

@@ -347,7 +347,7 @@ class ControlLaw(ABC):
 
     @property
     def follows_accelerations(self) -> bool:
-        """Whether commands contain what the accelerations of the reference take, by the masses."""
+        """Whether commands include the efforts of the reference's accelerations, by the masses."""
         return self.gain_units != FORCE_GAINS or self._weighs
 
     def automatic_effort(self, symbols: Mapping[str, ca.SX]) -> ca.SX:

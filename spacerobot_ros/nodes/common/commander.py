@@ -83,7 +83,7 @@ class CommanderNode(FlightNode):
 
     @abstractmethod
     def make_commander(self) -> Commander:
-        """Return a commander with the present parameters, of which this node is the host."""
+        """Return a commander with the present parameters; this node is its host."""
 
     def listen(self, status_topic: str) -> None:
         """Subscribe to the topics of every commander, and use the robot of the parameters.
@@ -318,8 +318,8 @@ class CommanderNode(FlightNode):
         if self._has_foreign_statuses():
             self._doubted = True
             self.get_logger().warning(
-                "plant/status: more nodes publish it than odom; no status counts until only the "
-                "plant does.",
+                "plant/status: more nodes publish it than odom; it is ignored until only the "
+                "plant publishes it.",
                 throttle_duration_sec=_STATUS_LOG_PERIOD,
             )
             return
@@ -388,7 +388,7 @@ class CommanderNode(FlightNode):
     def _resubscribe_best_effort(self) -> None:
         """Subscribe to the state with best-effort QoS, as sensor drivers publish it."""
         self.get_logger().info(
-            f"A publisher of '{self._unheard}' offers best effort: the state is subscribed so."
+            f"A publisher of '{self._unheard}' offers best effort: it is subscribed that way."
         )
         self._unheard, self._best_effort = "", True
         for topic in ("odom", "joint_states"):

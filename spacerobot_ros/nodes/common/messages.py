@@ -260,7 +260,7 @@ def transform_class() -> Any | None:
 
 
 class KnownFrames:
-    """The frames that a node knows: those of its robot's state, and those of /tf where it is there.
+    """The frames that a node knows: those of its robot's state, and those of /tf if available.
 
     Messages of /tf are kept as they are received, and read when a frame is asked for.
 
@@ -289,7 +289,7 @@ class KnownFrames:
             node.create_subscription(self._kind, topic, kept.append, qos, raw=True)
 
     def pose(self, frame: str, world: str, own: dict[str, tuple[str, Array]]) -> Array | None:
-        """Return the pose (7,) of a frame in the world, by the latest that is known of it.
+        """Return the pose (7,) of a frame in the world, as it was last known.
 
         ``own`` has parent and pose in it by frame, and overrides /tf. None: the frames are not
         connected.

@@ -164,7 +164,7 @@ class FlightNode(LifecycleNode):
 
     @property
     def simulated_time_s(self) -> float | None:
-        """Simulated time, s; None where the node does not know it."""
+        """Simulated time, s; None if the node does not know it."""
         return None
 
     # -- callbacks ----------------------------------------------------------------------------

@@ -158,7 +158,7 @@ def _given_value(node: Node, name: str) -> Any:
 
 
 def unknown_parameters(node: Node) -> str:
-    """Return a sentence about values that were given for parameters which a node does not have.
+    """Return a sentence about values that were given for parameters that a node does not have.
 
     Each is named with the nearest name that exists; empty: all are known.
     """

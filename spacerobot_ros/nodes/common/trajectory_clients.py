@@ -54,7 +54,7 @@ class TrajectoryClients:
         self._clients: dict[str, ActionClient] = {}
 
     def connect(self, name: str, on_end: Callable[[TrajectoryEnd], None]) -> TrajectoryOutput:
-        """Return an output to the server of an action, which tells ends as `on_end`."""
+        """Return an output to the server of an action, which reports ends to `on_end`."""
         if name not in self._clients:
             self._clients[name] = ActionClient(self._node, self._kind, name)
         connection = _Connection(self._kind, self._clients[name])

@@ -251,7 +251,7 @@ class PlantNode(FlightNode):
             # Time stands still meanwhile: this command, and the wrench beside it, answer its state.
             self._real_time.start(self._steady.now().nanoseconds, self._tick)
         self._monitor.observe(self._commands, self.plant, config)
-        self.get_logger().info(f"Commands carry {_CARRIED[actuation]}: the plant takes these.")
+        self.get_logger().info(f"Commands carry {_CARRIED[actuation]}, which the plant takes.")
         self._publish_changed_status()
 
     def _plant_now(self, robot: SpaceRobot, config: PlantConfig) -> PlantWithFaults:

@@ -339,7 +339,7 @@ class ClearancePublisher:
         *,
         has_contact_forces: bool = False,
     ) -> ClearancePublisher | None:
-        """Return the publisher of a plant among obstacles; None where no links could touch.
+        """Return the publisher of a plant among obstacles; None if no links could touch.
 
         ``before`` is the publisher among the obstacles so far, whose topic continues;
         ``has_contact_forces`` is that of :class:`.ClearanceMonitor`.

@@ -80,7 +80,7 @@ class Clearance:
     def wanted(
         cls, robot: RobotDescription, distance: float, parameter: str = "planner.clearance"
     ) -> Clearance | None:
-        """Return the clearance of a robot that is asked for; None: none, by a distance of zero.
+        """Return the requested clearance of a robot; None for a distance of zero.
 
         Among obstacles, a distance of zero stands for 0.01 m.
 
@@ -106,7 +106,7 @@ class Clearance:
 
     @property
     def has_obstacles(self) -> bool:
-        """Whether the motion of the base counts, too, as there are obstacles."""
+        """Whether the motion of the base also counts, because there are obstacles."""
         return bool(self.geometry.with_obstacles.any())
 
     @cached_property
@@ -175,8 +175,8 @@ class Clearance:
                 and not pairs <= robot.disabled_collisions
             ):
                 raise UnreadMeshError(
-                    f"Link '{each.link}' cannot be kept clear of others: {each.reason} Or have an "
-                    f"SRDF disable its pairs (planner.srdf), or set {self._parameter} to 0."
+                    f"Link '{each.link}' cannot be kept clear of others: {each.reason} Or disable "
+                    f"its pairs by an SRDF (planner.srdf), or set {self._parameter} to 0."
                 )
             warn_once(each.note)
 
@@ -185,7 +185,7 @@ class Clearance:
             self._warned.add(links.subject)
             remedy = ""
             if not isinstance(links, ObstaclePair):
-                remedy = " If they only look so, have an SRDF disable the pair (planner.srdf)."
+                remedy = " If they only appear to be, disable the pair by an SRDF (planner.srdf)."
             _LOG.warning(
                 "%s are in contact at the start: their contact is ignored.%s",
                 sentence_case(links.subject),
@@ -246,7 +246,7 @@ class Clearance:
         return self._check.approaches(positions, required, base)
 
     def clause(self, approach: Approach, control_period: float | None) -> str:
-        """Return a clause about a path that comes too near; no control period: of no times."""
+        """Return a clause about a path that comes too near; without a control period no times."""
         when = ""
         if control_period is not None:
             when = f" after {approach.tick * control_period:.4g} s,"

@@ -141,7 +141,7 @@ class JointEfforts:
 
 
 def given_effort_limits(robot: SpaceRobot) -> Array | None:
-    """Return the effort limits (n,) of the URDF; None where it gives none.
+    """Return the effort limits (n,) of the URDF; None if it gives none.
 
     A limit of zero stands for one that is not known: nothing moves under it.
     """

@@ -183,7 +183,7 @@ class GaitMethod(ABC):
 
     @cached_property
     def _joint_efforts(self) -> JointEfforts | None:
-        """The efforts of held commands; None where the URDF does not limit efforts."""
+        """The efforts of held commands; None if the URDF does not limit efforts."""
         limit = given_effort_limits(self.robot)
         return None if limit is None else JointEfforts(self.robot, limit, self.control_period)
 
@@ -382,8 +382,8 @@ class GaitMethod(ABC):
         if max(p, L) > _REST_MOMENTUM * self.robot.total_mass:
             raise PlanningError(
                 "The robot drifts: its total momentum is not zero "
-                f"({p:.3g} kg m/s, {L:.3g} kg m^2/s), and {self.name} plans for zero momentum; "
-                "joint motions cannot remove it; optimal plans for robots that drift."
+                f"({p:.3g} kg m/s, {L:.3g} kg m^2/s), and {self.name} plans for zero momentum, "
+                "which joint motions cannot establish; optimal plans for robots that drift."
             )
         wheels = ReactionWheels.of(self.robot.description)
         if state.qdot is not None and wheels.are_spinning(state.qdot):
@@ -393,7 +393,7 @@ class GaitMethod(ABC):
             )
 
     def significant(self, momentum: Array) -> Array:
-        """Return a total momentum (3,), kg m/s or kg m^2/s; zero where it counts as zero."""
+        """Return a total momentum (3,), kg m/s or kg m^2/s; zero if it counts as zero."""
         if np.linalg.norm(momentum) > _REST_MOMENTUM * self.robot.total_mass:
             return momentum
         return np.zeros(3)

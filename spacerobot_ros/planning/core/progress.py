@@ -20,8 +20,8 @@ _PACKAGE = "spacerobot_ros"
 
 
 class SearchPhase(Enum):
-    """What a search does: it searches for solutions, refines them, and makes them clear, and clear
-    ones short.
+    """Phase of a search: it searches for solutions, refines them, makes them clear, and shortens
+    clear ones.
     """
 
     SEARCHING = "searching"

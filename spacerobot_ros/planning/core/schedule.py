@@ -149,7 +149,7 @@ def straight_motion(
         joint = robot.description.movable_joints[slowest]
         raise PlanningError(
             f"A motion of {len(legs)} straight legs would take {total:.4g} s, more than longest = "
-            f"{longest:.6g} s; the slowest joint is '{joint.name}', which does "
+            f"{longest:.6g} s; the slowest joint is '{joint.name}', whose limit is "
             f"{robot.velocity_limit[slowest]:.3g} {joint.unit}/s."
         )
     pieces = [start[np.newaxis]]

@@ -373,7 +373,7 @@ class Executive:
     def plant_stopped(
         self, why: str, commanded_until_ns: int | None = None, rests_since_ns: int = 0
     ) -> bool:
-        """Give up every goal at once: the plant does not obey commands any more.
+        """Give up every goal at once, because the plant no longer obeys commands.
 
         If it rests because commands did not come, a goal continues for which nothing was commanded
         until then, and one whose plan has taken so long that no state was answered. A goal that was
@@ -437,8 +437,7 @@ class Executive:
         """Do nothing: the next goal begins from the measured state anyway."""
 
     def plant_reset(self) -> None:
-        """Plan again for the present goal, if any: the robot is in another state than
-        before."""
+        """Plan again for the present goal, if any, because the state of the robot has changed."""
         self._plan_again("The plant was reset: the motion is planned again.")
 
     def use_robot(
@@ -733,7 +732,7 @@ class Executive:
         left = active.ends_at - self._stamp_ns / 1e9
         active = replace(active, identified=identified, corrections=0, manoeuvre_time=left)
         self._accept_goal(active)
-        message = "The schedule that is executed leads to this goal, too."
+        message = "The present schedule also leads to this goal."
         self._add_status(PlannerState.EXECUTING, message, identified, active)
 
     def _check_path(self, active: ActiveGoal, measured: MeasuredState) -> None:
@@ -1074,7 +1073,7 @@ class Executive:
         self._average.restart()
         self._change_phase(Event.JOINTS_STUCK, self._phase_at_rest())
         names = ", ".join(self._robot.joint_names[i] for i in tracker.stuck)
-        message = f"Stuck: {names}. The remaining motion is planned without."
+        message = f"Stuck: {names}. The remaining motion is planned without stuck joints."
         self._add_notice(Severity.WARNING, message)
         self._add_event(EventKind.STUCK_JOINT, message, active.identified, 1, joints=names)
 

@@ -87,7 +87,7 @@ class StateAverage:
         self._poses, self._rates, self._shapes = [], [], []
 
     def forget(self) -> None:
-        """Forget the states and the momenta: the robot is in another state than before."""
+        """Forget the states and the momenta, because the state of the robot has changed."""
         self.restart()
         self._momenta = None
 

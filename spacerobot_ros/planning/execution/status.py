@@ -46,7 +46,7 @@ class PlannerState(str, Enum):
 
     @property
     def decided(self) -> bool:
-        """Whether the goal of the status is decided: it is not pursued any more."""
+        """Whether the goal of the status is decided: it is no longer pursued."""
         return self in (
             *(PlannerState.REACHED, PlannerState.REACHED_PARTLY, PlannerState.FAILED),
             *(PlannerState.REFUSED, PlannerState.ABORTED),
@@ -236,7 +236,7 @@ class PlannerStatistics:
 
 
 def goal_values(goal: Goal) -> tuple[float, ...]:
-    """Return position and quaternion (7,) of a goal for a status; () where the base is free."""
+    """Return position and quaternion (7,) of a goal for a status; () if the base is free."""
     return (*goal.position.tolist(), *goal.quaternion.tolist()) if goal.base else ()
 
 

@@ -223,7 +223,7 @@ class Teleoperation:
             self._following.twist = None
 
     def end(self) -> None:
-        """Follow no twist any more."""
+        """Stop following twists."""
         self._following = None
 
     def _follower_of(self, link: str) -> TwistFollower:
@@ -242,7 +242,7 @@ class Teleoperation:
             following.pose, following.pose_ns = base.pose, measured.stamp_ns
 
     def step(self, measured: MeasuredState, before: Array, *, goal_waits: bool) -> TwistStep:
-        """Return the answer to a state: braking where the twist is old, or while a goal waits.
+        """Return the answer to a state: braking if the twist is old or a goal waits.
 
         ``before`` (n,) are the rates that were commanded last.
         """

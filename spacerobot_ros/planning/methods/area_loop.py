@@ -120,7 +120,7 @@ class AreaLoopGait(GaitMethod):
 
     @override
     def setup(self) -> None:
-        """Compute what robot and options decide; see :meth:`GaitMethod.setup`."""
+        """Compute what depends on robot and options only; see :meth:`GaitMethod.setup`."""
         robot, chosen = self.robot, self.options
         self._nominal = NominalShapeChooser(
             robot,
@@ -135,7 +135,7 @@ class AreaLoopGait(GaitMethod):
     @classmethod
     @override
     def require_suitable(cls, robot: SpaceRobot) -> None:
-        """Refuse robots whose bases loops of three joints cannot turn about three axes."""
+        """Refuse robots whose base cannot be turned about three axes by loops of three joints."""
         if robot.n < 3:
             raise PlanningError(
                 f"area_loop needs three joints (paper 2); robot '{robot.description.name}' has "
@@ -312,7 +312,7 @@ class AreaLoopGait(GaitMethod):
         cycles = flown + self._count_cycles_left(missing, share, enough)
         most = self.options.most_cycles
         if cycles > most:
-            why = f" In a loop twice as large {too_near}." if too_near else ""
+            why = f" In a loop twice as large, {too_near}." if too_near else ""
             raise PlanningError(
                 f"The goal takes about {cycles:.4g} cycles, more than most_cycles = {most}; "
                 f"{flown} are flown.{why}"
@@ -345,7 +345,7 @@ class AreaLoopGait(GaitMethod):
             if not found:
                 return share, too_near
             share, too_near = share / 2, found
-        raise PlanningError(f"Even in the smallest of {_MAX_SHRINKS} loops {too_near}.")
+        raise PlanningError(f"Even in the smallest of {_MAX_SHRINKS} loops, {too_near}.")
 
     def _count_cycles_left(self, missing: float, share: float, enough: float) -> float:
         """Return the number of cycles left for a missing turn (rad), to first order."""

@@ -115,8 +115,8 @@ def _require_turn_about(robot: SpaceRobot, axis: Array) -> None:
         raise PlanningError(
             f"Robot '{robot.description.name}' is not planar: joint "
             f"'{robot.joint_names[worst[1]]}' also turns the base about other axes than its own, "
-            f"by up to {tilts[worst]:.2g} rad a rad; mass centres outside of one plane or products "
-            "of inertia do that."
+            f"by up to {tilts[worst]:.2g} rad per rad; the causes are mass centres outside of one "
+            "plane, or products of inertia."
         )
 
 
@@ -137,7 +137,7 @@ def check_planar_chain(robot: SpaceRobot) -> Controllability:
     largest, pair, shape = max(tops, key=lambda top: top[0])
     message = (
         f"{robot.n + 1} links in a plane: loops of joints '{pair[0]}' and '{pair[1]}' turn the "
-        f"base by up to {largest:.3g} rad a unit of area, round {np.round(shape, 3).tolist()} "
+        f"base by up to {largest:.3g} rad per unit of area, round {np.round(shape, 3).tolist()} "
         "(paper 3)."
     )
     if largest <= ZERO_TURN_PER_AREA:

@@ -91,7 +91,7 @@ class LieBracketGait(GaitMethod):
 
     @override
     def setup(self) -> None:
-        """Compute what robot and options decide; see :meth:`GaitMethod.setup`."""
+        """Compute what depends on robot and options only; see :meth:`GaitMethod.setup`."""
         robot = self.robot
         # A cycle is a whole number of ticks, so all cycles have the same commands and rotation.
         self.ticks_a_cycle = max(
@@ -309,7 +309,7 @@ class LieBracketGait(GaitMethod):
         while True:
             if n * self.ticks_a_cycle * self.control_period > longest:
                 if too_near:
-                    raise PlanningError(f"In loops of the sliders {too_near}.")
+                    raise PlanningError(f"In loops of the sliders, {too_near}.")
                 raise PlanningError(
                     f"The turn would take more than {longest:.6g} s within the strokes and "
                     f"rates of the sliders at the final shape {np.round(z_f, 4).tolist()}; "

@@ -55,7 +55,7 @@ class PosePath:
 
     @classmethod
     def from_poses(cls, positions: Array, quaternions: Array) -> PosePath:
-        """Return the path through poses, of which equal ones in succession count as one."""
+        """Return the path through poses; equal ones in succession count as one."""
         path = cls(positions, quaternions)
         kept = np.append(True, path.lengths > _SAME_POSE)
         return path if kept.all() else cls(positions[kept], quaternions[kept])

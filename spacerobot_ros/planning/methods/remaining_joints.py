@@ -181,7 +181,7 @@ class RemainingJointsGait(GaitMethod):
         worst = int(np.argmax(far))
         if far[worst] > tolerance:
             raise UnreachableError(
-                f"the goal wants joint '{self.robot.joint_names[worst]}' at {shape[worst]:.4g}.",
+                f"the goal requires joint '{self.robot.joint_names[worst]}' at {shape[worst]:.4g}.",
                 Proof.LIMITS,
             )
 

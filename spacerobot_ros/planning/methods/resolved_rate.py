@@ -333,7 +333,7 @@ class JointPath:
         return bool(self.path_fractions[-1] == 1.0)
 
     def truncated(self, last: int) -> JointPath:
-        """Return the path up to and with one of its places."""
+        """Return the path up to and including one of its places."""
         parts = {each.name: getattr(self, each.name)[: last + 1] for each in fields(self)}
         return JointPath(**parts)
 
@@ -432,7 +432,7 @@ def _fastest_speeds(slopes: Array, bends: Array, limits: MotionLimits, interval:
         method="highs",
     )
     if found.x is None:
-        raise PlanningError("No motion along the line keeps the limits of the joints was found.")
+        raise PlanningError("No motion along the line within the limits of the joints was found.")
     return np.maximum(np.asarray(found.x, dtype=float), 0.0) * unit
 
 
@@ -526,7 +526,7 @@ class ResolvedRateGait(GaitMethod):
 
     @override
     def setup(self) -> None:
-        """Compute what robot and options decide; see :meth:`GaitMethod.setup`."""
+        """Compute what depends on robot and options only; see :meth:`GaitMethod.setup`."""
         self._limits = MotionLimits.of(self.robot, self.options, self.name)
         if len(self.options.waypoints) % 3:
             raise ParameterError(
@@ -701,13 +701,13 @@ class ResolvedRateGait(GaitMethod):
         if not goal.end_effectors:
             raise PlanningError(
                 f"{self.name} moves end-effectors along straight lines, and the goal is for the "
-                "base: optimal plans for it."
+                "base: use optimal for it."
             )
         if goal.base or goal.joint_positions is not None:
             part = "the pose of the base" if goal.base else "joint positions"
             raise PlanningError(
                 f"{self.name} has its joints follow the line of the end-effector, and the goal "
-                f"asks for {part}, too: optimal plans for both."
+                f"also asks for {part}: use optimal for both."
             )
 
     def _link_paths(

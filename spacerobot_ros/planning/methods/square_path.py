@@ -110,7 +110,7 @@ class SquarePathGait(GaitMethod):
 
     @override
     def setup(self) -> None:
-        """Compute what robot and options decide; see :meth:`GaitMethod.setup`."""
+        """Compute what depends on robot and options only; see :meth:`GaitMethod.setup`."""
         robot, chosen = self.robot, self.options
         t1, t2, t3, t4 = chosen.t1, chosen.t2, chosen.t3, chosen.t4
         instants = (0.0, t1, t2, t3, t4)
@@ -324,8 +324,8 @@ class SquareSearch:
                     return loop
                 obstacle = obstacle or too_near
         raise PlanningError(
-            f"On square loops within the joint limits links come too near to each other, up to "
-            f"most_loops = {self._most_loops} of them: {obstacle}."
+            f"On square loops within the joint limits, links come too near to each other with up "
+            f"to most_loops = {self._most_loops} loops: {obstacle}."
         )
 
     def _squares(
