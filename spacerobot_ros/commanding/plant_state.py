@@ -345,7 +345,7 @@ class PlantChange(Enum):
     """Changes other than a stop that a plant reports."""
 
     OBEYS = "obeys"
-    """Commands pass again."""
+    """Commands are accepted again."""
     RESET = "reset"
     """The robot is back in its initial state."""
 

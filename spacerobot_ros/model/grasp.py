@@ -59,7 +59,7 @@ class Payload:
         Raises
         ------
         RobotDescriptionError
-            The robot has no such link, or the inertia is that of no body.
+            The robot has no such link, or the inertia is not that of a rigid body.
         """
         frames = robot.description.frames
         if self.link not in frames:

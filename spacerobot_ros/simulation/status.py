@@ -279,7 +279,7 @@ def _events_between(before: PlantStatus, now: PlantStatus) -> list[Event]:
     if now.resets != before.resets:
         add(EventKind.RESET, "The robot is back in its initial state.")
     if now.rearms != before.rearms:
-        add(EventKind.REARMED, "Commands pass again.")
+        add(EventKind.REARMED, "Commands are accepted again.")
     if now.latched_fault and now.latched_fault != before.latched_fault:
         message = f"A fault is latched: {now.latched_fault}."
         add(EventKind.LATCHED, message, 2, reason=now.reason)

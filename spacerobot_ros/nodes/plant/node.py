@@ -612,7 +612,7 @@ class PlantNode(FlightNode):
         assert self._monitor is not None
         self._monitor.rearms += 1
         self._publish_changed_status()
-        return f"Commands pass again after: {fault}."
+        return f"Commands are accepted again after: {fault}."
 
     def _grasp(self, act: Callable[[CapturePlant], CaptureReport | ReleaseReport]) -> str:
         """Capture or release the target; it takes effect in the next tick."""
