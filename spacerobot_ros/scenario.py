@@ -759,7 +759,7 @@ def read_sections(path: Path) -> dict[str, dict[str, Any]]:
 def different_parameters(scenarios: Sequence[Scenario]) -> list[tuple[str, ...]]:
     """Return each parameter that is not the same in all scenarios, with its unit, and its values.
 
-    Values are texts; ``–`` where a scenario does not give the parameter, which has its default
+    Values are texts; ``–`` if a scenario does not give the parameter, which has its default
     then. Texts of robots are omitted.
     """
     given = [{(n, p): v for n in CONFIGS for p, v in s.parameters(n).items()} for s in scenarios]
@@ -801,7 +801,7 @@ def _sections(content: Mapping[Any, Any], path: Path) -> dict[str, dict[str, Any
 
 
 def _read_content(path: Path) -> dict[Any, Any]:
-    """Return the content of a parameter file; empty where the file is no mapping."""
+    """Return the content of a parameter file; empty if the file is not a mapping."""
     try:
         content = load_yaml(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:

@@ -235,7 +235,7 @@ class PathCheck:
         return best
 
     def _nearest(self, path: _Path, pair: int, limit: float) -> Approach | None:
-        """Return the nearest approach of a pair; None where it does not come nearer than limit."""
+        """Return the nearest approach of a pair; None if it does not come nearer than limit."""
         geometry, motion, bounds = self.geometry, path.largest_motions, path.distance_bounds
 
         def distances(ticks: Array) -> Array:

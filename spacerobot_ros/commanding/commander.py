@@ -466,7 +466,7 @@ class Commander(ABC):
         return answer
 
     def _require_free(self) -> None:
-        """Raise PlanningError where no goal is taken now."""
+        """Raise PlanningError if no goal is accepted now."""
         if not self.active:
             raise PlanningError(f"The goal is refused: this node is {self.activity.value}.")
         if self._actuation_refusal:
@@ -528,7 +528,7 @@ class Commander(ABC):
         self._fly_to.end_dropped_goals(self._active_goal_ids())
 
     def _abort_fly_to(self) -> None:
-        """Give up all goals where the client of one, or its time limit, asks for it."""
+        """Give up all goals if the client of one, or its time limit, asks for it."""
         waiting = {goal.goal_id for goal in self._waiting_goals.values()}
         if self.executive is not None:
             waiting |= self.executive.waiting_goals

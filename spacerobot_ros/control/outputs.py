@@ -318,7 +318,7 @@ class OutputVector:
         require_finite("reference", memory)
 
     def without_force(self, Q: ca.SX) -> ca.SX:
-        """Return generalised forces (N,) without their force on the centre of mass, where no
+        """Return generalised forces (N,) without their force on the centre of mass, if no
         actuator makes one.
         """
         return Q if self.thrust else ca.vertcat(ca.SX.zeros(3), Q[3:])

@@ -376,7 +376,7 @@ class FlightData:
         return scenario.controller.law
 
     def tolerance(self, part: Literal["position", "attitude", "joint"]) -> float | None:
-        """Return the largest error of a part of a reached goal, m or rad; None where a bag has no
+        """Return the largest error of a part of a reached goal, m or rad; None if a bag has no
         parameters of the commander.
         """
         scenario, name = self.scenario, f"{part}_tolerance"

@@ -572,7 +572,7 @@ def recorded_target(robot: RecordedRobot) -> str:
 
 
 def _parse_json(text: str) -> Any:
-    """Return a value that was written as JSON; None where it cannot be read."""
+    """Return a value that was written as JSON; None if it cannot be read."""
     try:
         return json.loads(text)
     except (ValueError, RecursionError):

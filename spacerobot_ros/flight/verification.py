@@ -646,7 +646,7 @@ class _Comparison:
         )
 
     def _command_remark(self, tick: int) -> str:
-        """Return a clause on why the commands of a tick had no effect; empty where they had."""
+        """Return a clause on why the commands of a tick had no effect; empty if they had one."""
         done, before = self._resimulation, tick - 1
         if tick > done.end:
             return f" (its plant had stopped: {done.stopped.rstrip('.')})"

@@ -21,7 +21,7 @@ DEFAULT_TICK_RATE = 20.0
 _MIN_RATE = 0.001  # Hz
 
 DEFAULT_POSITION_TOLERANCE = 1e-3
-"""Automatic position tolerance where no robot is known, m."""
+"""Automatic position tolerance if no robot is known, m."""
 
 _TOLERANCE_SHARE = 1e-3
 """Automatic position tolerance as a share of the size of a robot."""

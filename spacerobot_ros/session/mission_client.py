@@ -42,7 +42,7 @@ class MissionClient:
     Parameters
     ----------
     decider
-        The commander that decides: the planner where there is one.
+        The commander that decides: the planner if there is one.
     world_frame
         Frame of the goals.
     now

@@ -447,7 +447,7 @@ class CapturePlant(WrappedPlant):
     def _resume_dynamics(
         self, robot: SpaceRobot, motion: RobotMotion, momenta: Array, body: BodyMotion
     ) -> None:
-        """Integrate the robot, and the target where it is free, from these motions on."""
+        """Integrate the robot, and the target if it is free, from these motions on."""
         if self.payload is None:
             self.target.release(body)
         self._continue(robot, motion, momenta)

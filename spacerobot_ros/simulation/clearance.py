@@ -43,7 +43,7 @@ class ClearanceStatus:
     Attributes
     ----------
     distance
-        m; negative where the links touch: the depth of the contact.
+        m; negative if the links touch: the depth of the contact.
     links
         The two links.
     time_s

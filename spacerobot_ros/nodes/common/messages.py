@@ -99,7 +99,7 @@ def shape_message(goal: Goal, joint_names: Sequence[str]) -> JointState:
 def pose_array(position: Any, orientation: Any) -> Array | None:
     """Return the pose (7,) of a point or vector and a quaternion message, which is scaled to 1.
 
-    None where a number is not finite, or the quaternion zero.
+    None if a number is not finite, or the quaternion zero.
     """
     p, o = position, orientation
     pose = np.array([p.x, p.y, p.z, o.x, o.y, o.z, o.w])

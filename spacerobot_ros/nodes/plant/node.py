@@ -72,7 +72,7 @@ _LONGEST_MARKER_PERIOD, _LONGEST_FRAME_PERIOD, _LONGEST_CLEARANCE_PERIOD = 0.5, 
 """Longest wall time between two publications in real time, s: of markers, of /tf, of clearances."""
 
 _CARRIED = {"velocity": "velocities", "effort": "efforts", "auto": "velocities or efforts"}
-"""What commands carry, by the parameter ``actuation``."""
+"""Quantities that commands carry, by the parameter ``actuation``."""
 
 
 class PlantNode(FlightNode):

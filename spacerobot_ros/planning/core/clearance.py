@@ -31,7 +31,7 @@ from spacerobot_ros.model.description import Array, RobotDescription
 _LOG = logging.getLogger(__name__)
 
 DEFAULT_CLEARANCE = 0.01
-"""Smallest distance between two links of a plan, m; 0: contacts are not looked at."""
+"""Smallest distance between two links of a plan, m; 0: contacts are ignored."""
 
 _CLEARANCE_OF_OBSTACLES = 0.01
 """Smallest distance among obstacles if none is asked for, m."""

@@ -212,7 +212,7 @@ class ActiveGoal:
     required: frozenset[Controlled] = frozenset()
     """Parts of the goal that plans without the stuck joints must control."""
     not_flown_reason: str = ""
-    """Clause that tells why no schedule is flown any more; empty: schedules are flown."""
+    """Clause that says why no schedule is flown any longer; empty: schedules are flown."""
 
 
 class Executive:

@@ -785,7 +785,7 @@ class ResolvedRateGait(GaitMethod):
 
     def _find_obstacle(self, lines: _LinkPaths, path: JointPath) -> tuple[int, str] | None:
         """Return the last place of a path before the limits of the joints are left, or before a
-        singularity is near, with the reason; None where the way is free.
+        singularity is near, with the reason; None if the way is free.
         """
         robot = self.robot
         beyond = np.maximum(robot.lower - path.shapes, path.shapes - robot.upper)
