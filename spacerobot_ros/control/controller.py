@@ -67,8 +67,8 @@ from spacerobot_ros.planning.core.cancellation import Cancellation
 from spacerobot_ros.planning.methods.thrust.goals import Grapple
 
 _FREE_AXIS_MARGIN = 5.0
-"""Tolerances by which a goal may differ from the pose in an axis that the law leaves as it is: noise
-takes a measured pose out of the plane of a planar robot."""
+"""Tolerances by which a goal may differ from the pose in an axis that the law leaves as it is:
+noise takes a measured pose out of the plane of a planar robot."""
 
 _BRAKE_RATE = 2.0
 """Decay rate of joint motion when the base is no longer known, 1/s."""

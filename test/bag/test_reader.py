@@ -462,9 +462,9 @@ def test_a_message_that_is_damaged(tmp_path: Path) -> None:
         for data in (b"", b"\0\1\0\0", b"\0\1\0\0\xff\xff\xff\xff", string("good")):
             writer.write(channel, data, 1, 1)
     series = read_bag(tmp_path / "a.mcap")["/a"]
-    with pytest.raises(RecordingError, match=r"A message on /a is no std_msgs/msg/String"):
+    with pytest.raises(RecordingError, match=r"A message on /a is not a std_msgs/msg/String"):
         series.field("data")
-    with pytest.raises(RecordingError, match=r"A message on /a is no std_msgs/msg/String"):
+    with pytest.raises(RecordingError, match=r"A message on /a is not a std_msgs/msg/String"):
         next(series.messages())
 
 

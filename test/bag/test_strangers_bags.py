@@ -405,7 +405,7 @@ def make_device(path: Path) -> None:
         (make_pipe, "it is a pipe"),
         (make_socket, "it is a socket"),
         (make_device, "it is a device"),
-        (make_folder, "it is a folder|holds 0 MCAP files"),
+        (make_folder, "it is a folder|holds no bag"),
     ],
 )
 def test_what_is_no_file_is_neither_read_nor_written(

@@ -395,7 +395,7 @@ def test_what_the_law_cannot_give_in_one_step_is_given_by_the_controller() -> No
 
 def test_a_controller_at_another_rate_is_refused() -> None:
     flights = controlled("planar_manipulator", SHAPE, ticks=5)
-    with pytest.raises(ParameterError, match="another rate"):
+    with pytest.raises(ParameterError, match="different rates"):
         dataclasses.replace(flights, control_period=0.02)
 
 

@@ -536,7 +536,7 @@ def test_a_status_survives_its_values(
 
 @pytest.mark.parametrize("values", [{}, {"state": "flying"}, {"state": "holding", "law": "a"}])
 def test_other_values_are_no_status_of_a_controller(values: dict[str, str]) -> None:
-    with pytest.raises(SpaceRobotError, match="no status of a controller"):
+    with pytest.raises(SpaceRobotError, match="No status of a controller"):
         ControllerStatus.from_values(values)
 
 

@@ -128,7 +128,7 @@ def test_a_target_is_approached_captured_brought_to_rest_and_carried() -> None:
     assert (loop.state, loop.status.task) == ("tracking", "detumble")
     assert_one_sentence(loop.status.message, "Detumbling", "50 mrad/s")
     assert loop.kinds()[2:] == ["detumble_started"]
-    assert_one_sentence(loop.events[-1].message, "N m s take", "s at least")
+    assert_one_sentence(loop.events[-1].message, "N m s take at least")
     assert loop.executive.controller.coming_to_rest
     loop.answer(5)
     loop.rates = np.array([0.001, -0.002])

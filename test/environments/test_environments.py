@@ -323,7 +323,7 @@ def test_goals_of_a_scenario() -> None:
         ({"goals": "far"}, "Argument 'goals' is 'far'; it may be random, scenario"),
         ({"hold": 0}, "Argument 'hold' is 0; it must be a whole number of ticks"),
         ({"hold": 1.5}, "Argument 'hold' is 1.5; it must be a whole number of ticks"),
-        ({"time_limit": 0}, "Argument 'time_limit' is 0; it must be a positive time"),
+        ({"time_limit": 0}, "Argument 'time_limit' is 0; episodes take longer, in s"),
         ({"time_limit": "x"}, "Argument 'time_limit' is 'x'; it must be finite, at least 0"),
         ({"scenario": 3}, "Argument 'scenario' is 3; it must be a text"),
         ({"link": "segment_2"}, "Argument 'link' is 'segment_2', but in task 'reorient' no link"),

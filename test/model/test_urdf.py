@@ -550,13 +550,13 @@ def test_a_payload_is_welded_to_its_body() -> None:
         ({"inertias": np.diag([1.0, 1.0, 2.02])}, None),
         (
             {"inertias": np.diag([1.0, 1.0, 2.03])},
-            "The inertia of 'body_0' is that of no body: its principal moments are 1, 1, 2.03 "
-            "kg m^2.",
+            "The inertia of 'body_0' is not that of a rigid body: its principal moments "
+            "are 1, 1, 2.03 kg m^2.",
         ),
         (
             {"inertias": np.diag([-1e-9, 1.0, 1.0])},
-            "The inertia of 'body_0' is that of no body: its principal moments are -1e-09, 1, 1 "
-            "kg m^2.",
+            "The inertia of 'body_0' is not that of a rigid body: its principal moments "
+            "are -1e-09, 1, 1 kg m^2.",
         ),
     ],
 )

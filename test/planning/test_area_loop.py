@@ -580,7 +580,7 @@ def test_cycles_are_counted_with_the_loop_that_is_flown(roomy_arm: SpaceRobot) -
     cycles = float(str(shrunk.notes["expected_cycles"]))
     assert str(refusal.value) == (
         f"The goal takes about {cycles:.4g} cycles, more than most_cycles = {most}; 0 are flown. "
-        "In a loop twice as large links 'a' and 'b' come within 0.004 m."
+        "In a loop twice as large, links 'a' and 'b' come within 0.004 m."
     )
 
 

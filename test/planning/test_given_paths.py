@@ -292,7 +292,7 @@ def test_one_end_effector_follows_a_path_and_the_base_is_free() -> None:
         plan(
             "three_joint_arm", end_effector_path=paths, end_effector_position={"link_3": [1, 1, 1]}
         )
-    with pytest.raises(PlanningError, match="asks for the pose of the base, too"):
+    with pytest.raises(PlanningError, match="also asks for the pose of the base"):
         plan("three_joint_arm", end_effector_path=paths, position=[0, 0, 0])
     with pytest.raises(GoalError, match="has 2 goals; it can have one"):
         plan("three_joint_arm", end_effector_path=paths, end_effector_position={HAND: [1, 1, 1]})

@@ -110,7 +110,7 @@ def test_a_status_has_the_keys_that_belong_to_it() -> None:
 
 @pytest.mark.parametrize("values", [{}, {"state": "asleep"}, {"state": "idle", "goal": "a b"}])
 def test_what_is_no_status_is_refused(values: dict[str, str]) -> None:
-    with pytest.raises(SpaceRobotError, match="no status of a planner"):
+    with pytest.raises(SpaceRobotError, match="No status of a planner"):
         PlannerStatus.from_values(values)
 
 

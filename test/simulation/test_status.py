@@ -158,7 +158,7 @@ def test_a_status_survives_its_message(state: PlantState) -> None:
 
 @pytest.mark.parametrize("values", [{}, {"state": "asleep"}, {"state": "paused", "resets": "x"}])
 def test_what_is_no_status_is_refused(values: dict[str, str]) -> None:
-    with pytest.raises(SpaceRobotError, match="are no status of a plant"):
+    with pytest.raises(SpaceRobotError, match="No status of a plant"):
         PlantStatus.from_values(values)
 
 
@@ -170,7 +170,7 @@ def test_an_event_survives_its_message() -> None:
     assert float(values["wall_time"]) == 1e9
     assert Event.from_values(values, "It is reached.") == event
     assert Event(EventKind.NODE_SILENT, "").to_values(None) == {"event": "node_silent"}
-    with pytest.raises(SpaceRobotError, match="no event"):
+    with pytest.raises(SpaceRobotError, match="No event"):
         Event.from_values({"event": "lunch"})
 
 

@@ -378,7 +378,7 @@ def test_a_clearance_is_read_again_from_its_message() -> None:
     assert type(again.links) is ObstaclePair
     for flaw in ({"distance": "near"}, {"first": None}):
         values = {k: v for k, v in (status.to_values() | flaw).items() if v is not None}
-        with pytest.raises(SpaceRobotError, match="are no clearance"):
+        with pytest.raises(SpaceRobotError, match="No clearance can be read"):
             ClearanceStatus.from_values(values)
 
 

@@ -774,10 +774,10 @@ class _Search:
             if not approaches:
                 return solved
             self._nearest = approaches[0]
-            fell_in = any(e.distance < 0 and e.pair not in self._room for e in approaches)
+            fell_in = [e.pair for e in approaches if e.distance < 0 and e.pair not in self._room]
             self._add(approaches, solved)
-            if not fell_in:
-                # Else planes of these pairs are made along a path that is clear of them.
+            if not fell_in or min(bodies.distances(pair, at).min() for pair in fell_in) <= 0:
+                # Else planes of these pairs are made along the path before, which is clear of them.
                 at = solved
         return None
 
