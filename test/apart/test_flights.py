@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import re
 import subprocess
@@ -25,12 +26,15 @@ FREE_FLYER = """<robot name="cube">
 """
 """A spacecraft without joints."""
 
+ANYWHERE = [math.nan] * 3
+"""A position that is not asked for."""
+
 PLANNED: dict[str, Place] = {
     "sliding_masses": ([0.05, 0.0, 0.0], [0.0, 0.0, 0.0]),
-    "three_joint_arm": ([0.0, 0.0, 0.0], [0.02, 0.01, 0.05]),
-    "planar_chain": ([0.0, 0.0, 0.0], [0.0, 0.0, 0.3]),
-    "surveyor": ([0.0, 0.0, 0.0], [0.0, 0.0, 0.1]),
-    "seven_joint_arm": ([0.0, 0.0, 0.0], [0.05, 0.0, 0.05]),
+    "three_joint_arm": (ANYWHERE, [0.02, 0.01, 0.05]),
+    "planar_chain": (ANYWHERE, [0.0, 0.0, 0.3]),
+    "surveyor": (ANYWHERE, [0.0, 0.0, 0.1]),
+    "seven_joint_arm": (ANYWHERE, [0.05, 0.0, 0.05]),
 }
 CONTROLLED: dict[str, Place] = {
     "planar_manipulator": ([0.2, 0.1, 0.0], [0.0, 0.0, 0.2]),
@@ -171,7 +175,7 @@ COMMAND_TIMEOUT = 0.5
 def turned(k: int) -> Place:
     """Return a place that is none of the others, and far from the one before."""
     sign = 1.0 if k % 2 else -1.0
-    return ([0.0, 0.0, 0.0], [0.03 * sign + 0.001 * k, 0.0, 0.04 * sign])
+    return (ANYWHERE, [0.03 * sign + 0.001 * k, 0.0, 0.04 * sign])
 
 
 def slid(k: int) -> Place:

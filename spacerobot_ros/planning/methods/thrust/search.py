@@ -84,7 +84,7 @@ _EXACT_END, _MAX_CORRECTIONS = 1e-5, 10
 _NEAR_END = 1e-2
 """Error at the end from which on the nearest exact motion will do, m and rad."""
 
-_LARGEST_END_ERROR = 1e-4
+_LARGEST_END_ERROR = 1e-3
 """Error at the end beyond which a motion is no solution, m and rad."""
 
 _END_REACH = 0.3
