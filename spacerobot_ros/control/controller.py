@@ -53,6 +53,7 @@ from spacerobot_ros.errors import (
     SpaceRobotError,
     describe_exception,
 )
+from spacerobot_ros.files import warn_once
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.grasp import Payload
 from spacerobot_ros.model.inverse_kinematics import AXES
@@ -145,6 +146,8 @@ class CoordinatedController:
         self._commanded_at = -math.inf
         """Time of the last command, s."""
         self._estimator: DeadReckoning | None = None
+        self.gains_checked = False
+        """Whether the gains were compared with the control period: at the next state, if not."""
         self._brake: tuple[ComputedTorqueLaw, Reference] | None = None
         self.coming_to_rest = False
         """Whether the robot is being brought to rest, at any pose."""
@@ -168,6 +171,7 @@ class CoordinatedController:
     def set_gains(self, gains: Gains) -> None:
         """Change the gains from the next command on."""
         self.law.set_gains(gains)
+        self.gains_checked = False
 
     def set_goals(
         self,
@@ -413,6 +417,10 @@ class CoordinatedController:
             self.law.time = time
             with self._failures_of_law(time):
                 commanded = self.law.command(state, self._reference_at(time))
+            if not self.gains_checked:
+                self.gains_checked = True
+                if warning := self.law.sampling_warning():
+                    warn_once(warning)
             if isinstance(self.profile, PlannedReference) and not self.law.follows_accelerations:
                 planned = self.profile.actuation(time - self._began)
                 commanded = Actuation(*(a + b for a, b in zip(commanded, planned, strict=True)))

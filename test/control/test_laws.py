@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -36,6 +37,7 @@ from control.servicer_motion import (
 )
 from scipy.linalg import block_diag, expm
 from scipy.spatial.transform import Rotation
+from support.sentences import assert_one_sentence
 
 from spacerobot_ros import fly as fly_robot
 from spacerobot_ros.control import (
@@ -52,7 +54,10 @@ from spacerobot_ros.control import (
 from spacerobot_ros.control.config import ControllerConfig
 from spacerobot_ros.control.controller import build_controller
 from spacerobot_ros.errors import ParameterError
+from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.parameters import configured, declared, parameter
+from spacerobot_ros.resources import robot_file
+from spacerobot_ros.scenario import load_scenario, scenario_names
 
 
 @pytest.mark.parametrize("name", INVERTIBLE)
@@ -525,3 +530,74 @@ def test_far_from_singularities_the_command_takes_one_evaluation(
     assert not law.status.singular
     with pytest.raises(AssertionError, match="singular values"):
         law.command(stretched(0.01), GOAL)
+
+
+def _command_once(robot: SpaceRobot, config: ControllerConfig, shape: Sequence[float]) -> None:
+    """Command a robot at rest in a shape, 0 for joints beyond the given ones."""
+    controller = build_controller(robot, config)
+    positions = dict.fromkeys(robot.joint_names, 0.0) | dict(
+        zip(robot.joint_names, shape, strict=False)
+    )
+    q = np.array([positions[name] for name in controller.law.robot.joint_names])
+    state = ControlState.at_rest(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), q)
+    controller.command(0.0, state, state.q, state.qdot)
+
+
+@pytest.mark.parametrize("name", scenario_names())
+def test_no_scenario_has_gains_that_are_too_high_for_its_period(
+    name: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    scenario = load_scenario(name)
+    robot = SpaceRobot.from_file(robot_file(scenario.plant.robot))
+    _command_once(
+        robot, scenario.config("coordinated_control"), scenario.plant.initial_joint_positions
+    )
+    assert not caplog.records
+
+
+@pytest.mark.parametrize("share", [0.9, 1.1])
+@pytest.mark.parametrize("law", LAWS)
+def test_gains_that_are_too_high_for_the_period_are_warned_of(
+    law: str, share: float, caplog: pytest.LogCaptureFixture
+) -> None:
+    """``kd`` times the period against the inertia decides, if commands come a period late."""
+    period, hull, wheel = 0.02, 0.01, 0.02
+    # The joint meets both bodies in series; the other laws command accelerations.
+    inertia = hull * wheel / (hull + wheel) if law == "transposed_jacobian" else 1.0
+    # A sentence is said once: those of the laws differ.
+    kd = (share + 0.001 * len(law)) * inertia / period
+    base = "" if law == "computed_torque" else "rz"
+    outputs = {"base_outputs": base, "joint_outputs": "turn"}
+    gains = {"gains.joints.kp": 0.01 * kd, "gains.joints.kd": kd}
+    values = {"law": law, "tick_rate": 1 / period, **outputs, **gains}
+    robot = SpaceRobot.from_urdf(_turner(hull, wheel))
+    _command_once(robot, configured(ControllerConfig, values), [])
+    rates = [1.0, 1.0]
+    for _ in range(200):
+        # The joint's rate under commands that answer the state before.
+        rates.append(rates[-1] - period * kd / inertia * rates[-2])
+    assert (abs(rates[-1]) > 1.0) is (share > 1.0)
+    if share < 1.0:
+        assert not caplog.records
+    else:
+        (record,) = caplog.records
+        assert_one_sentence(
+            record.getMessage(), f"kd = {kd:g}", "'joint.turn'", "0.02 s", "tick_rate"
+        )
+        if law == "transposed_jacobian":
+            assert "inertia (or mass) of 0.007" in record.getMessage()
+
+
+def _turner(hull: float, wheel: float) -> str:
+    def link(name: str, inertia: float) -> str:
+        diagonal = " ".join(f'{axis}="{inertia}"' for axis in ("ixx", "iyy", "izz"))
+        return (
+            f'<link name="{name}"><inertial><mass value="1"/>'
+            f'<inertia {diagonal} ixy="0" ixz="0" iyz="0"/></inertial></link>'
+        )
+
+    return (
+        f'<robot name="turner">{link("hull", hull)}{link("wheel", wheel)}'
+        '<joint name="turn" type="continuous"><parent link="hull"/><child link="wheel"/>'
+        '<axis xyz="0 0 1"/><limit velocity="600" effort="0.2"/></joint></robot>'
+    )

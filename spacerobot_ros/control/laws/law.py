@@ -41,6 +41,9 @@ late, and 2 if they do not."""
 _CRITICAL_STIFFNESS = 1 / 4
 """Automatic Kp of accelerations over the square of Kd: critical damping."""
 
+_LARGEST_GROWTH = 1.001
+"""Largest growth of errors in a control period that counts as none."""
+
 _SINGULAR_DAMPING = 0.02
 """Share that is added to the mobility of each output, so that automatic gains stay bounded at
 singularities."""
@@ -509,16 +512,51 @@ class ControlLaw(ABC):
 
     def slowest_decay(self) -> float:
         """Return the rate (1/s) at which the slowest error decays, near the last state at rest."""
-        Kp, Kd = self.gain_matrices
-        if self.gain_units != ACCELERATION_GAINS and not self._weighs:
-            J, q = self._out["J_z"], self.state.q
-            H = self.robot.inertia_matrix(q)[3:, 3:]
-            mobility = J[:, :3] @ J[:, :3].T / self.robot.total_mass
-            mobility += J[:, 3:] @ np.linalg.solve(H, J[:, 3:].T)
-            Kp, Kd = mobility @ Kp, mobility @ Kd
+        Kp, Kd, _ = self._acceleration_gains()
         m = self.outputs.m
         motion = np.block([[np.zeros((m, m)), np.eye(m)], [-Kp, -Kd]])
         return float(-np.linalg.eigvals(motion).real.max())
+
+    def sampling_warning(self) -> str:
+        """Return the warning that errors grow, near the last state at rest, if commands are held
+        for a control period and come a period late; empty: they decay.
+        """
+        Kp, Kd, mobility = self._acceleration_gains()
+        m, h = self.outputs.m, self.control_period
+        one, zero = np.eye(m), np.zeros((m, m))
+        # Errors, their rates, and the accelerations by the command before.
+        sampled = np.block([[one, h * one, h**2 / 2 * one], [zero, one, h * one], [-Kp, -Kd, zero]])
+        growth, modes = np.linalg.eig(sampled)
+        fastest = int(np.abs(growth).argmax())
+        if np.abs(growth[fastest]) <= _LARGEST_GROWTH:
+            return ""
+        i = int(np.abs(modes[:m, fastest]).argmax())
+        kp, kd = (gains[i] for gains in self.gain_diagonals)
+        inertia = f", on an inertia (or mass) of {1 / mobility[i, i]:.1g}"
+        return (
+            f"The gains kp = {kp:g} and kd = {kd:g} of output '{self.outputs.labels[i]}'"
+            f"{inertia if self.gain_units == FORCE_GAINS else ''} are too high for a control "
+            f"period of {h:g} s: the sampled loop is unstable or nearly so. Lower them, set them "
+            "to 0 (automatic), or raise tick_rate."
+        )
+
+    def _acceleration_gains(self) -> tuple[Array, Array, Array]:
+        """Return the accelerations (m, m) of the outputs by error and by error rate, and their
+        mobility (m, m), near the last state at rest.
+        """
+        Kp, Kd = self.gain_matrices
+        J, q = self._out["J_z"], self.state.q
+        H = self.robot.inertia_matrix(q)[3:, 3:]
+        mobility = J[:, :3] @ J[:, :3].T / self.robot.total_mass
+        mobility += J[:, 3:] @ np.linalg.solve(H, J[:, 3:].T)
+        if self.gain_units != ACCELERATION_GAINS:
+            # Automatic gains are those of accelerations already.
+            given = [self._in[name] > 0 for name in ("kp", "kd")]
+            Kp, Kd = (
+                mobility @ np.where(is_given, K, 0.0) + np.where(is_given, 0.0, K)
+                for is_given, K in zip(given, (Kp, Kd), strict=True)
+            )
+        return Kp, Kd, mobility
 
     @property
     def singular_error_share(self) -> float:

@@ -153,6 +153,7 @@ def _run_node(factory: Callable[[], FlightNode], arguments: list[str] | None) ->
         return 2
     stop = rclpy.task.Future()
     node = None
+    warnings = logging.Handler(logging.WARNING)
     try:
         try:
             node = factory()
@@ -160,6 +161,9 @@ def _run_node(factory: Callable[[], FlightNode], arguments: list[str] | None) ->
             print(f"{error}", file=sys.stderr, flush=True)
             return 2
         node.on_end = stop.set_result
+        log = node.get_logger()
+        warnings.emit = lambda record: log.warning(record.getMessage())  # type: ignore[method-assign]
+        logging.getLogger("spacerobot_ros").addHandler(warnings)
         # Existing objects are excluded from garbage collection, which would take tens of ms in
         # flight.
         gc.collect()
@@ -180,6 +184,7 @@ def _run_node(factory: Callable[[], FlightNode], arguments: list[str] | None) ->
             _await_delivery(node)
         return stop.result() or 0
     finally:
+        logging.getLogger("spacerobot_ros").removeHandler(warnings)
         if node is not None:
             node.destroy_node()
         rclpy.try_shutdown()

@@ -81,6 +81,10 @@ def report_progress(
     """
     handler, logger = _ProgressHandler(show, announce), logging.getLogger(_PACKAGE)
     before = logger.level
+    # Python prints warnings only as long as no handler takes records.
+    unhandled = None if logger.hasHandlers() else logging.lastResort
+    if unhandled is not None:
+        logger.addHandler(unhandled)
     logger.addHandler(handler)
     # Other handlers keep their own levels, so their output does not change.
     logger.setLevel(logging.INFO if before == logging.NOTSET else min(before, logging.INFO))
@@ -89,6 +93,8 @@ def report_progress(
     finally:
         logger.setLevel(before)
         logger.removeHandler(handler)
+        if unhandled is not None:
+            logger.removeHandler(unhandled)
 
 
 class _ProgressHandler(logging.Handler):
