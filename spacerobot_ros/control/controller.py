@@ -71,6 +71,9 @@ _FREE_AXIS_MARGIN = 5.0
 """Tolerances by which a goal may differ from the pose in an axis that the law leaves as it is:
 noise takes a measured pose out of the plane of a planar robot."""
 
+_LONGEST_MOTION = 1e9
+"""Longest duration of a reference, s: that of the longest flights."""
+
 _BRAKE_RATE = 2.0
 """Decay rate of joint motion when the base is no longer known, 1/s."""
 
@@ -284,12 +287,40 @@ class CoordinatedController:
                         f"{labels}."
                     )
 
+    def require_bounded_duration(
+        self,
+        state: ControlState,
+        *,
+        base: PoseReference | None = None,
+        end_effector: PoseReference | None = None,
+    ) -> None:
+        """Refuse goals to which the reference would take longer than any flight.
+
+        Raises
+        ------
+        PlanningError
+            It would; the message says how long it takes.
+        """
+        here = Reference.present(
+            self.law.robot, state, self.law.outputs.selection.end_effector_link
+        )
+        motion = self._motion_within_limits(state)
+        duration = self._profile_type(here, Reference(base, end_effector), motion).duration
+        if duration > _LONGEST_MOTION:
+            raise PlanningError(
+                f"The reference to the goal would take {duration:.3g} s, and the longest is "
+                f"{_LONGEST_MOTION:g} s: choose a nearer goal, or raise motion.speed, "
+                "motion.acceleration or the limits of the thrusters."
+            )
+
+    def _motion_within_limits(self, state: ControlState) -> MotionLimits:
+        motion = self._motion.within_thruster_limits(self._limits, self.law.robot, state.q)
+        return motion if self.wheels is None else self.wheels.limits_with_wheels(motion, state.q)
+
     def _begin_motion(
         self, time: float, state: ControlState, start: Reference, goal: Reference, *, carries: bool
     ) -> None:
-        motion = self._motion.within_thruster_limits(self._limits, self.law.robot, state.q)
-        if self.wheels is not None:
-            motion = self.wheels.limits_with_wheels(motion, state.q)
+        motion = self._motion_within_limits(state)
         self.profile = self._profile_type(start, goal, motion, carries=carries)
         self._began = time
         with self._failures_of_law(time):

@@ -641,7 +641,7 @@ class ControlExecutive:
         """Go on with the tasks before the pending goals, and start towards the goals after them."""
         servicing = self.servicing
         if self._pending:
-            self._refuse_uncontrolled(state)
+            self._refuse_goals_by_state(state)
         if self._requested is not None:
             self._begin_tasks(time, self._requested)
             self._requested = None
@@ -672,14 +672,15 @@ class ControlExecutive:
             case TaskState.REFUSED | TaskState.FAILED:
                 self._end_tasks(time, state, progress)
 
-    def _refuse_uncontrolled(self, state: ControlState) -> None:
-        """Refuse pending goals that the law leaves unmet in a single axis, by a measured state."""
+    def _refuse_goals_by_state(self, state: ControlState) -> None:
+        """Refuse pending goals that the law leaves unmet in an axis, or that are out of reach."""
         for key, pending in list(self._pending.items()):
             goal = pending.goal.kept_at(state.r_WB, state.quaternion_WB)
             pose = PoseReference(goal.position, goal.quaternion)
             config = self._config_with(pending.tolerance)
             try:
                 self.controller.require_controlled_axes(state, config, **{key: pose})
+                self.controller.require_bounded_duration(state, **{key: pose})
             except PlanningError as error:
                 self._pending = {
                     part: each
