@@ -51,7 +51,8 @@ class StallMonitor:
     error shrinks from one time to the next by less than 2 %, and by less than before:
 
     * after the reference has come to rest, and while an error is beyond its tolerance;
-    * on its way, if the robot lags behind it by more than half of the way.
+    * on its way, if the robot lags behind it by more than half of the way, beyond its tolerance,
+      and the error has not begun to shrink.
 
     It is no longer stalled when the errors shrink again.
     """
@@ -70,7 +71,8 @@ class StallMonitor:
         """Whether the reference was at rest since the present time began."""
         self._largest: list[float] = []
         """Largest shares in the present time and in those before, the latest first."""
-        self._lag = 0.0
+        self._share = self._lag = 0.0
+        """Largest share, and lag behind the reference, in the last state."""
         self._samples = self._limited = 0
 
     def observe(
@@ -92,8 +94,8 @@ class StallMonitor:
             self._begin(time, controller, config)
         self._next_sample = time + self._window / _SAMPLES
         errors = controller.errors()
-        self._largest[0] = max(self._largest[0], _largest_share(errors, config))
-        self._lag = max(self._lag, _lag(errors, controller, config))
+        self._share, self._lag = _largest_share(errors, config), _lag(errors, controller, config)
+        self._largest[0] = max(self._largest[0], self._share)
         self._samples += 1
         self._limited += result.limited
         if time >= self._ends:
@@ -109,7 +111,6 @@ class StallMonitor:
         self._ends = time + self._window
         self._at_rest = controller.reference_at_rest(time)
         self._largest = [0.0, *self._largest[:2]]
-        self._lag = 0.0
         self._samples = self._limited = 0
 
     @property
@@ -125,6 +126,8 @@ class StallMonitor:
         earlier = self._largest[2] - before if len(self._largest) > 2 else 0.0
         if now <= 1.0 or progress >= _LEAST_PROGRESS * before:
             self.cause = ""
+        elif not self._at_rest and self._share < (1 - _LEAST_PROGRESS) * now:
+            self.cause = ""  # The errors grew on the way, and shrink again.
         # Robots with little thrust begin slowly, and make more and more way.
         elif progress > max(earlier, 0.0) and not self.cause:
             pass
@@ -186,4 +189,4 @@ def _lag(
         (errors.attitude, ways.attitude, config.attitude_tolerance),
         (errors.joints, ways.joints, config.joint_tolerance),
     )
-    return max((error / way for error, way, tolerance in pairs if way > tolerance), default=0.0)
+    return max((e / way for e, way, tolerance in pairs if min(e, way) > tolerance), default=0.0)

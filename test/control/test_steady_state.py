@@ -551,6 +551,43 @@ def test_a_robot_that_is_behind_and_follows_is_not_stalled_on_the_way() -> None:
         assert loop.state == "tracking"
 
 
+def test_a_part_within_its_tolerance_lags_behind_no_reference() -> None:
+    """The robot follows 2 m some seconds late, and need not turn by half of 0.015 rad yet."""
+    loop = ExecutiveLoop(profile="quintic", attitude_tolerance=0.014)
+    loop.answer()
+    turned = np.array([0.0, 0.0, np.sin(0.0075), np.cos(0.0075)])
+    far = Goal(np.array([2.0, 0.0, 0.0]), turned)
+    loop.aim(base=IdentifiedGoal(far, "far"))
+    loop.answer()
+    controller = loop.executive.controller
+    assert controller.reference_ends is not None
+    while loop.tick * PERIOD < 0.8 * controller.reference_ends:
+        late = controller.profile.at(loop.tick * PERIOD - 2.0).base if controller.profile else None
+        assert late is not None
+        loop.place = late.position
+        loop.answer()
+        assert loop.state == "tracking", loop.status.message
+
+
+@pytest.mark.parametrize("decay", [0.02, 0.2])
+def test_errors_that_have_begun_to_shrink_on_the_way_are_no_stall(decay: float) -> None:
+    """A knock throws the robot back by 65 % of its way at 23 s; then it catches up."""
+    loop = ExecutiveLoop(profile="quintic")
+    loop.answer()
+    move(loop, np.array([2.0, 0.0, 0.0]), "far")
+    loop.answer()
+    controller = loop.executive.controller
+    assert controller.profile is not None
+    for time in np.arange(0.0, controller.profile.duration, PERIOD):
+        base = controller.profile.at(time).base
+        assert base is not None
+        after = time - 23.0
+        error = 1.3 * np.exp(-(after**2) if after < 0.0 else -decay * after)
+        loop.place = base.position - [error, 0.0, 0.0]
+        loop.answer()
+        assert loop.state == "tracking", (time, loop.status.message)
+
+
 def test_before_a_first_measurement_a_controller_waits() -> None:
     loop = ExecutiveLoop()
     loop.answer(measured=False)

@@ -467,6 +467,24 @@ def test_references_lack_what_they_do_not_give() -> None:
     assert (decoder.q.tolist(), decoder.qdot.tolist()) == ([1, 2], [0.5, 0.25])
 
 
+def test_what_a_measured_state_says_beyond_the_robot_is_counted_with_its_reason() -> None:
+    decoder = MessageDecoder(["arm", "finger"], ["finger2"])
+    raw = state(["camera_pan", "finger2", "finger", "arm"], velocity=[9.0, 9.0, np.nan, 0.5])
+    decoder.decode_joints(raw)
+    assert (decoder.q.tolist(), decoder.qdot.tolist()) == ([4, 3], [0.5, 0.0])
+    assert decoder.ignored == {
+        "joint 'camera_pan' is unknown": 1,
+        "joint 'finger2' follows another": 1,
+        "velocities are not finite": 1,
+    }
+    # Drivers of two machines send a message each.
+    assert decoder.joined(state(["arm"], velocity=[0.25])) is None
+    whole = decoder.joined(state(["finger"], velocity=[0.125]))
+    assert whole is not None
+    decoder.decode_joints(whole)
+    assert (decoder.q.tolist(), decoder.qdot.tolist()) == ([1, 1], [0.25, 0.125])
+
+
 @pytest.mark.parametrize("count", [10_000, 10_001])
 def test_a_list_of_texts_has_ten_thousand_at_most(count: int) -> None:
     reader = JointReader(["a"], ["position"])
