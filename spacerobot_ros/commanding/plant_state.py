@@ -395,6 +395,9 @@ class PlantListener:
             if not was_blocked or status.latched_fault != before.latched_fault:
                 fault = status.latched_fault
                 changes.append(PlantStopped(f"{fault}." if fault else status.message))
+            # A plant that obeys nothing may still be reset, at once and to another pose.
+            if heard and status.resets > before.resets:
+                changes.append(PlantChange.RESET)
             return changes
         if not heard:
             return changes

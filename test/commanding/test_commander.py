@@ -371,19 +371,22 @@ def test_goals_on_file_are_resumed_and_deleted_when_they_are_aborted(
 # -- the plant and its robot ------------------------------------------------------------------
 
 
-def test_a_plant_that_is_reset_shows_another_pose_of_one_time(controller: Rig) -> None:
-    controller.state(1)
-    running = PlantStatus(PlantState.RUNNING, "A command is in force.")
-    controller.commander.receive_plant_status(running)
-    controller.commander.receive_plant_status(
-        PlantStatus(PlantState.RUNNING, "A command is in force.", resets=1)
-    )
-    controller.state(1)
-    assert controller.host.commands == [1, 1]
-    assert not any("differ" in line for _, line in controller.host.lines)
-    controller.odom(1)
-    controller.odom(1)
-    assert any("differ" in line for _, line in controller.host.lines)
+@pytest.mark.parametrize("kind", ["planner", "controller"])
+@pytest.mark.parametrize("latched", [False, True])
+def test_a_plant_that_is_reset_shows_another_pose_of_one_time(
+    kind: str, *, latched: bool, request: pytest.FixtureRequest
+) -> None:
+    rig: Rig = request.getfixturevalue(kind)
+    before = LATCHED if latched else PlantStatus(PlantState.RUNNING, "A command is in force.")
+    rig.state(1)
+    rig.commander.receive_plant_status(before)
+    rig.commander.receive_plant_status(replace(before, resets=1))
+    rig.state(1)
+    assert rig.host.commands == [1, 1]
+    assert not any("differ" in line for _, line in rig.host.lines)
+    rig.odom(1)
+    rig.odom(1)
+    assert any("differ" in line for _, line in rig.host.lines)
 
 
 # -- a robot that captures a target -----------------------------------------------------------

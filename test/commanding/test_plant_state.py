@@ -491,3 +491,8 @@ def test_a_reset_is_reported_once() -> None:
     one = listener(RUNNING)
     assert one.update(replace(RUNNING, resets=1)) == [PlantChange.RESET]
     assert one.update(replace(RUNNING, resets=1, time_s=9.0)) == []
+    # A plant that obeys nothing is reset as well.
+    assert PlantChange.RESET not in one.update(replace(LATCHED, resets=1))
+    assert one.update(replace(LATCHED, resets=2)) == [PlantChange.RESET]
+    assert one.update(replace(AGAIN, resets=2)) == [PlantChange.OBEYS]
+    assert listener().update(replace(LATCHED, resets=3)) == [PlantStopped("a fuse is blown.")]
