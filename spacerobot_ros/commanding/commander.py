@@ -53,6 +53,11 @@ from spacerobot_ros.planning.execution.status import ScheduleStart
 from spacerobot_ros.simulation.status import PlantState, PlantStatus
 from spacerobot_ros.times import SECOND
 
+_LONGEST_REPETITION = 1.0
+"""Longest simulated time between two poses that contradict others, by two publishers, s."""
+
+_NEVER_NS = -(10**20)
+
 _REPORT_PERIOD = 1.0  # wall s, between warnings about ignored states
 
 _LONGEST_SILENCE, _SILENT_PERIODS = 1.0, 5
@@ -273,6 +278,8 @@ class Commander(ABC):
         self.robot: SpaceRobot | None = None
         self.stamps = StampFilter(clock)
         self.states = StateSynchroniser(pose_required=pose_required)
+        self._contradicted_ns = _NEVER_NS
+        """Stamp of the last pose that contradicted another one, ns."""
         self.plant = PlantListener()
         self._decoder: StateDecoder | None = None
         self._described: SpaceRobot | None = None
@@ -598,11 +605,15 @@ class Commander(ABC):
     def take_odom(self, stamp_ns: int, odom: Any) -> None:
         """Take an odom of the present time, and answer its state if complete."""
         if self.states.put_odom(stamp_ns, odom):
-            self._log_fault(
-                "contradiction",
-                "odom: two messages with one stamp differ; more than one node publishes it, and "
-                "such poses are ignored.",
-            )
+            # One alone is a plant that was reset or restarted, whose status comes later.
+            since = (stamp_ns - self._contradicted_ns) / SECOND
+            if 0.0 < since <= max(_LONGEST_REPETITION, 2 * self.config.control_period):
+                self._log_fault(
+                    "contradiction",
+                    "odom: two messages with one stamp differ; more than one node publishes it, "
+                    "and such poses are ignored.",
+                )
+            self._contradicted_ns = stamp_ns
         if self._awaits_odom():
             self.answer()
 
@@ -743,6 +754,7 @@ class Commander(ABC):
                 continue
             if change is PlantChange.RESET:
                 self.states.forget_pose()
+                self._contradicted_ns = _NEVER_NS
                 if self.executive is not None:
                     self.executive.plant_reset()
             elif self.executive is not None:
