@@ -386,6 +386,16 @@ def started(*words: str | bytes, **variables: str) -> subprocess.CompletedProces
     )
 
 
+def test_warnings_during_a_flight_are_printed_once(tmp_path: Path) -> None:
+    """The moments of inertia of the cube, 0.24 to 0.26 kg m^2, bear 13 N m s/rad at 50 Hz."""
+    gains = "coordinated_control.gains.base_attitude"
+    late = ("--set", "coordinated_control.time_limit=0.2", "--bag", str(tmp_path / "a.mcap"))
+    ended = started("run", "free_flyer", "--set", f"{gains}.kp=9", "--set", f"{gains}.kd=90", *late)
+    assert ended.returncode == 1, ended.stderr
+    (line,) = (each for each in ended.stderr.splitlines() if "sampled loop is unstable" in each)
+    assert_one_sentence(line, "kd = 90", "'base.r", "0.02 s", "tick_rate")
+
+
 @pytest.mark.parametrize(
     ("words", "domain"),
     [
