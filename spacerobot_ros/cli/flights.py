@@ -245,8 +245,7 @@ def _capture_line(summary: dict[str, Any]) -> list[str]:
     capture = summary["capture"]
     done = f"at {capture['time_s']:.6g} s" if capture["captured"] else "the target is not captured"
     if capture["captured"] and "planned_momentum_Nms" in capture:
-        left = math.hypot(*capture["angular_momentum_Nms"])
-        done += f", {left:.3g} N m s left ({capture['planned_momentum_Nms']:.3g} planned)"
+        done += f", planned to leave {capture['planned_momentum_Nms']:.3g} N m s"
     return [f"capture     {done}"]
 
 

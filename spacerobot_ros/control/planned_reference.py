@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from bisect import bisect_left
 from collections.abc import Callable
 from dataclasses import dataclass
 from threading import Thread
@@ -212,11 +213,17 @@ class ReferencePlanner:
             return math.inf
         shapes, base = motion.path()
         period = motion.duration / (len(shapes) - 1)
-        rest = slice(max(int(time / period), 0), None)
+        first = max(int(time / period), 0)
         required = np.full(len(clearance.geometry.pairs), clearance.distance)
-        near = clearance.approaches(shapes[rest], required, base.rows(rest))
-        ticks = [each.tick for each in near if each.place_on_obstacle is not None]
-        return min(ticks, default=math.inf) * period
+
+        def is_blocked_by(last: int) -> bool:
+            part = slice(first, last + 1)
+            near = clearance.approaches(shapes[part], required, base.rows(part))
+            return any(each.place_on_obstacle is not None for each in near)
+
+        rows = range(first, len(shapes))
+        blocked = bisect_left(rows, True, key=is_blocked_by)
+        return blocked * period if blocked < len(rows) else math.inf
 
     def plan(
         self, motion: GoalMotion, state: ControlState, cancellation: Cancellation

@@ -480,7 +480,10 @@ def _require_flyable(scenario: Scenario) -> None:
         )
 
 
-_NO_ERROR_TEXT = "it wrote no error."
+_NO_ERROR_TEXT = (
+    "it wrote no error. If another stack is up in this ROS domain, its nodes answer instead: set "
+    "ROS_DOMAIN_ID to another number."
+)
 
 _LOG_PREFIX = re.compile(r"^\[(DEBUG|INFO|WARN|ERROR|FATAL)\] \[[\d.]+\] \[[^\]]*\]: ")
 """Level, time and name before a message in the log of a node."""

@@ -163,7 +163,7 @@ def test_end_effector_and_propellant_have_lines_where_there_are_some(
                 **{"captured": True, "time_s": 1.25, "planned_momentum_Nms": 0.5},
                 "angular_momentum_Nms": [2.0, -1.0, 2.0],
             },
-            "capture     at 1.25 s, 3 N m s left (0.5 planned)",
+            "capture     at 1.25 s, planned to leave 0.5 N m s",
         ),
         ({"captured": False}, "capture     the target is not captured"),
     ],

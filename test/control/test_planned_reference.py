@@ -8,6 +8,7 @@ from typing import Any
 import coal
 import numpy as np
 from scipy.spatial.transform import Rotation
+from support.sentences import assert_one_sentence
 
 from spacerobot_ros.control.controller import build_controller
 from spacerobot_ros.control.executive import ControlExecutive
@@ -200,3 +201,37 @@ def ball(place: np.ndarray) -> RobotDescription:
         f'link="w"/><child link="ball"/><origin xyz="{place[0]} {place[1]} {place[2]}"/></joint>'
         "</robot>"
     )
+
+
+def test_a_motion_is_blocked_when_it_first_comes_too_near() -> None:
+    """To a ball in the middle of its way, through which it flies half a metre deep."""
+    rig = Follower()
+    rig.answer()
+    aim = PLACE + np.array([1.6, 0.3, -0.2])
+    rig.executive.submit("base", IdentifiedGoal(Goal.from_rotvec(aim, [0.2, 0.1, 0.4])))
+    rig.answer()
+    controller, began = rig.executive.controller, rig.time
+    profile, planner = controller.profile, controller.planner
+    assert profile is not None
+    assert planner is not None
+    half = profile.at(profile.duration / 2).base
+    assert half is not None
+    planner.use_obstacles(ball(half.position))
+    times = np.linspace(0.0, profile.duration, 2000)
+    bases = [profile.at(time).base for time in times.tolist()]
+    away = [np.linalg.norm(each.position - half.position) for each in bases if each is not None]
+    # The cube of 0.3 m is between the balls in it and around it; the clearance is 0.01 m.
+    earliest, latest = (times[np.argmax(np.array(away) < r + 0.11)] for r in (0.26, 0.15))
+    assert latest - earliest < 0.1 * profile.duration
+    assert earliest - 0.1 < controller.time_until_blocked(began) < latest + 0.1
+
+
+def test_a_start_within_an_obstacle_is_refused() -> None:
+    rig = Follower()
+    rig.answer()
+    rig.executive.use_obstacles(ball(PLACE + np.array([0.2, 0.0, 0.0])))
+    rig.executive.submit("base", IdentifiedGoal(Goal.from_rotvec([0.9, 0.1, 0.3], [0.2, 0, 0])))
+    rig.answer()
+    statuses = [each for each in rig.executive.outputs if isinstance(each, ControllerStatus)]
+    refused = [each.message for each in statuses if each.state is ControllerState.REFUSED]
+    assert_one_sentence(refused[-1], "obstacle 'ball' touch at the start")

@@ -130,14 +130,14 @@ class Clearance:
         """Return the distances (P,) that all pairs keep from a start (n,) on, m.
 
         A pair that is nearer than the clearance at the start does not come nearer than there.
-        Links that are in contact at the start are not looked at (minus infinity), with a warning.
+        Links that touch each other at the start are not looked at (minus infinity), with a warning.
         ``base`` is the pose of the base there; None: obstacles do not count.
 
         Raises
         ------
         PlanningError
-            Links are much nearer at the start than the clearance, or the mesh of a ``<collision>``
-            cannot be read; the message names them.
+            Links are much nearer at the start than the clearance, a link touches an obstacle, or
+            the mesh of a ``<collision>`` cannot be read; the message names them.
         """
         geometry = self.geometry
         self._require_declared_meshes()
@@ -148,8 +148,14 @@ class Clearance:
         for pair in np.flatnonzero(geometry.lower_bounds(poses)[0] <= self.distance).tolist():
             distance = float(geometry.distances(pair, poses)[0])
             if distance <= 0:
+                links = geometry.links_of(pair)
+                if isinstance(links, ObstaclePair):
+                    raise PlanningError(
+                        f"{sentence_case(links.subject)} touch at the start: move the robot away "
+                        f"first, or set {self._parameter} to 0."
+                    )
                 required[pair] = -np.inf
-                self._warn_of_contact(geometry.links_of(pair))
+                self._warn_of_contact(links)
             elif distance < _MIN_START_SHARE * self.distance:
                 links = geometry.links_of(pair)
                 remedy = "" if isinstance(links, ObstaclePair) else _SRDF_REMEDY
