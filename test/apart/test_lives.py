@@ -174,8 +174,8 @@ def publish_nothing(apart: NodesApart, node: str) -> None:
         apart.harness.matched(publisher)
 
 
-SOON = 2.0
-"""s from the first state within which it is said."""
+SOON = 4.0
+"""s from the first state within which it is said; on an idle machine 1 s."""
 
 AFTERWARDS = 6.0
 """s in which it is not said again: messages that repeat do so every five."""
