@@ -10,6 +10,9 @@ from spacerobot_ros.model.thrusters import find_thrusters
 from spacerobot_ros.model.wheels import ReactionWheels
 from spacerobot_ros.simulation.status import PlantState
 
+_ROUNDING = 1e-12
+"""Rates and steps that are none: what is left of a rate that is braked to zero."""
+
 
 class RestCheck:
     """Nothing moves under a latch, nor after it before another goal, nor without a goal at all."""
@@ -47,12 +50,12 @@ class RestCheck:
         period = self._setup.period_ns
         free = self._situation.acting(now.time_ns, period, "actuator_noise", "actuator_bias")
         for name, rate in zip(self._names, now.qdot, strict=True):
-            if rate != 0.0 and name not in free:
+            if abs(rate) > _ROUNDING and name not in free:
                 return f"joint {name} moves at {rate:.3g} {why}"
         if before is None or now.time_ns != before.time_ns + period:
             return None
         for name, step in zip(self._names, now.q - before.q, strict=True):
-            if step != 0.0 and name not in free:
+            if abs(step) > _ROUNDING and name not in free:
                 return f"joint {name} goes on by {step:.3g} {why}"
         return None
 
