@@ -508,7 +508,7 @@ def test_starts_are_given() -> None:
     [
         ("faults/weak_motors", {}),
         ("faults/noisy_sensors", {}),
-        pytest.param("servicer_thrusters", {}, marks=pytest.mark.slow),
+        pytest.param("servicer_thrusters", {"time_limit": 0.1}, marks=pytest.mark.slow),
     ],
 )
 def test_scenarios_with_faults_noise_or_thrusters_in_vectors_are_as_many_single_ones(
