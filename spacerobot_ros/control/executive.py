@@ -640,7 +640,7 @@ class ControlExecutive:
     def _follow_goals(self, time: float, state: ControlState) -> None:
         """Go on with the tasks before the pending goals, and start towards the goals after them."""
         servicing = self.servicing
-        if self._pending:
+        if self._pending and not self._planning.is_for(self._pending):
             self._refuse_goals_by_state(state)
         if self._requested is not None:
             self._begin_tasks(time, self._requested)

@@ -75,6 +75,10 @@ class GoalPlanning:
         """Whether a reference is in the making."""
         return self._plan is not None
 
+    def is_for(self, pending: Mapping[str, IdentifiedGoal]) -> bool:
+        """Whether a reference for these goals is in the making."""
+        return self._plan is not None and self._plan.is_for(pending)
+
     def planned(
         self,
         time: float,
@@ -93,7 +97,7 @@ class GoalPlanning:
             No motion is found.
         """
         plan = self._plan
-        if plan is None or not plan.is_for(pending):
+        if plan is None or not self.is_for(pending):
             self.cancel()
             if plan is None:
                 self._lead = PLANNING_TIME
