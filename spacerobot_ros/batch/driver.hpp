@@ -7,8 +7,6 @@
 // flights without angular momentum. CONTROL gives a controller's command and decision for a state.
 // HOLDING_STEP and SHAPE_EQUATIONS are those of robots whose joints have stops.
 
-#include <set>
-
 static bool any(V flags) {
   for (int lane = 0; lane < LANES; ++lane)
     if (flags.x[lane] != 0.0) return true;
@@ -17,28 +15,30 @@ static bool any(V flags) {
 
 INLINE void assign_where(V flag, V &to, V value) { to.x = flag.x != 0.0 ? value.x : to.x; }
 
-static V *work_memory() {
-  static thread_local V *memory = nullptr;
-  if (!memory) memory = (V *)aligned_alloc(64, ((WORK_SIZE * sizeof(V)) / 64 + 1) * 64);
-  return memory;
-}
-
 typedef int Function(const V **, V **, long long *, V *, int);
 
-static void run(Function *function, const V **in, V **out) {
+template <Function *function>
+static void run(const V **in, V **out) {
+#ifdef __CUDACC_RTC__
+  long long integers[INTEGER_SIZE];
+  V work[WORK_SIZE];
+#else
   static thread_local long long integers[INTEGER_SIZE];
-  function(in, out, integers, work_memory(), 0);
+  static thread_local V *work = nullptr;
+  if (!work) work = (V *)aligned_alloc(64, ((WORK_SIZE * sizeof(V)) / 64 + 1) * 64);
+#endif
+  function(in, out, integers, work, 0);
 }
 
 // Evaluate a function on the rows of a group.
-template <int ARGUMENTS, int RESULTS>
-static void call(Function *function, V *group, const long long (&arguments)[ARGUMENTS],
+template <Function *function, int ARGUMENTS, int RESULTS>
+static void call(V *group, const long long (&arguments)[ARGUMENTS],
                  const long long (&results)[RESULTS]) {
   const V *in[ARGUMENT_POINTERS];
   V *out[RESULT_POINTERS];
   for (int i = 0; i < ARGUMENTS; ++i) in[i] = group + arguments[i];
   for (int i = 0; i < RESULTS; ++i) out[i] = group + results[i];
-  run(function, in, out);
+  run<function>(in, out);
 }
 
 #ifdef MOMENTUMLESS
@@ -51,13 +51,13 @@ static bool is_momentumless(const V *group) {
 
 static void evaluate(V *group, bool report) {
   if (report)
-    call(REPORT, group, REPORT_ARGUMENTS, REPORT_RESULTS);
+    call<REPORT>(group, REPORT_ARGUMENTS, REPORT_RESULTS);
 #ifdef MOMENTUMLESS
   else if (is_momentumless(group))
-    call(MOMENTUMLESS, group, MOMENTUMLESS_ARGUMENTS, MOMENTUMLESS_RESULTS);
+    call<MOMENTUMLESS>(group, MOMENTUMLESS_ARGUMENTS, MOMENTUMLESS_RESULTS);
 #endif
   else
-    call(FLIGHT, group, FLIGHT_ARGUMENTS, FLIGHT_RESULTS);
+    call<FLIGHT>(group, FLIGHT_ARGUMENTS, FLIGHT_RESULTS);
 }
 
 static long long instant_of(const Job &job, long long tick) {
@@ -66,21 +66,21 @@ static long long instant_of(const Job &job, long long tick) {
   return -1;
 }
 
-// Copy the report of a group's state in the lanes where a flag is not zero.
-static void copy_report(const V *group, V *to, V chosen) {
-  const Bits mask = chosen.x != 0.0;
-  for (const Span &span : REPORTED)
-    for (long long k = 0; k < span.count; ++k) {
-      Numbers &there = to[span.to + k].x;
-      there = mask ? group[span.from + k].x : there;
-    }
+// Return the place of an entry in a table that has `size` entries for each group.
+static long long place(const Job &job, long long g, long long size, long long entry) {
+#ifdef THREADS
+  return entry * job.groups + g;  // Threads that run together read numbers side by side.
+#else
+  return g * size + entry;
+#endif
 }
 
-static void record(const Job &job, long long g, long long tick) {
-  const long long instant = instant_of(job, tick);
-  if (instant >= 0)
-    copy_report(job.memory + g * ROWS,
-                job.reports + (g * job.instant_count + instant) * REPORT_ROWS, V(1.0));
+static void record(const Job &job, long long g, long long tick, const V *group) {
+  const long long instant = instant_of(job, tick), size = job.instant_count * REPORT_ROWS;
+  if (instant < 0) return;
+  for (const Span &span : REPORTED)
+    for (long long k = 0; k < span.count; ++k)
+      job.reports[place(job, g, size, instant * REPORT_ROWS + span.to + k)] = group[span.from + k];
 }
 
 // Return one number of each lane.
@@ -91,14 +91,15 @@ static V lanes_of(const double *each) {
 }
 
 static V normal(const Job &job, long long g, long long tick, long long column) {
-  return lanes_of(
-      job.normals +
-      ((g * job.normals_ticks + tick - job.normals_from) * job.normals_width + column) * LANES);
+  const long long entry = (tick - job.normals_from) * job.normals_width + column;
+  return lanes_of(job.normals +
+                  LANES * place(job, g, job.normals_ticks * job.normals_width, entry));
 }
 
 static V entry(const Job &job, long long g, long long tick, long long column) {
-  if (!job.each_table) return V(job.table[tick * COMMANDS + column]);
-  return lanes_of(job.table + ((g * job.table_ticks + tick) * COMMANDS + column) * LANES);
+  const long long entry = tick * COMMANDS + column;
+  if (!job.each_table) return V(job.table[entry]);
+  return lanes_of(job.table + LANES * place(job, g, job.table_ticks * COMMANDS, entry));
 }
 
 #ifndef CONTROL
@@ -143,7 +144,7 @@ static bool control(const Job &job, long long g, long long tick, V *group) {
   for (long long k = 0; job.noisy && k < job.normals_width; ++k)
     group[row::normals + k] = normal(job, g, tick, k);
   group[row::time] = V(double(tick * job.period_ns) / 1e9);
-  call(CONTROL, group, CONTROL_ARGUMENTS, CONTROL_RESULTS);
+  call<CONTROL>(group, CONTROL_ARGUMENTS, CONTROL_RESULTS);
   V &decision = group[row::decision];
   const V undecided = decision == V(double(decision::NONE));
   const V now = undecided && group[row::verdict] && group[row::alive];
@@ -156,14 +157,11 @@ static bool control(const Job &job, long long g, long long tick, V *group) {
   return any(group[row::exact] && group[row::alive]);
 }
 
-// Measure the first state of every group, from which references begin.
-extern "C" void measure_starts(const Job *job) {
-  for (long long g = 0; g < job->groups; ++g) {
-    V *group = job->memory + g * ROWS;
-    control(*job, g, 0, group);
-    group[row::decision] = V(double(decision::NONE));
-    group[row::decided] = V(-1.0);
-  }
+// Measure the first state of a group, from which references begin.
+static void measure_start(const Job &job, long long g, V *group) {
+  control(job, g, 0, group);
+  group[row::decision] = V(double(decision::NONE));
+  group[row::decided] = V(-1.0);
 }
 
 // End flights of a group after the tick that is committed.
@@ -171,14 +169,11 @@ static void end_where(const Job &job, long long g, V *group, V ending) {
   V &alive = group[row::alive];
   ending = ending && alive;
   if (!any(ending)) return;
-  copy_report(group, group + row::end_state, ending);
+  for (const Span &span : REPORTED)
+    for (long long k = 0; k < span.count; ++k)
+      assign_where(ending, group[row::end_state + span.to + k], group[span.from + k]);
   assign_where(ending, group[row::ended], V(double(job.at[g])));
   alive = alive && !ending;
-}
-
-extern "C" void end_flights(const Job *job) {
-  for (long long g = 0; g < job->groups; ++g)
-    end_where(*job, g, job->memory + g * ROWS, V(1.0));
 }
 
 // Return the part of the momenta (6) of a group that thrust does not explain.
@@ -201,8 +196,7 @@ static void watch_momenta(V *group, V alive) {
 }
 #endif
 
-static void commit(const Job &job, long long g) {
-  V *group = job.memory + g * ROWS;
+static void commit(const Job &job, long long g, V *group) {
   const V alive = group[row::alive];
   for (const Span &span : SUMS)
     for (long long k = 0; k < span.count; ++k)
@@ -230,7 +224,7 @@ static void commit(const Job &job, long long g) {
     assign_where(alive, highest, fmax(highest, group[row::state + k]));
   }
   job.at[g] += 1;
-  record(job, g, job.at[g]);
+  record(job, g, job.at[g], group);
 #ifdef CONTROL
   watch_momenta(group, alive);
   if (job.ends) end_where(job, g, group, group[row::decision]);
@@ -269,46 +263,88 @@ static void apply_stops(const Job &job, long long g, V *group, bool report) {
 }
 #endif
 
-// Evaluate the report of every group at its state, and record it if the start is an instant.
-extern "C" void start_flights(const Job *job) {
-  for (long long g = 0; g < job->groups; ++g) {
-    V *group = job->memory + g * ROWS;
-    evaluate(group, true);
-    record(*job, g, 0);
-    for (long long k = 0; k < JOINTS; ++k)
-      group[row::lowest + k] = group[row::highest + k] = group[row::state + k];
+// Evaluate the report of a group at its state, and record it if the start is an instant. Groups in
+// which all ticks have a duration are under way.
+static void start(const Job &job, long long g, V *group) {
+  if (!any(group[row::h] == V(0.0))) return;
+  evaluate(group, true);
+  record(job, g, 0, group);
+  for (long long k = 0; k < JOINTS; ++k)
+    group[row::lowest + k] = group[row::highest + k] = group[row::state + k];
 #ifdef CONTROL
-    unexplained(group, group + row::first_momenta);
+  unexplained(group, group + row::first_momenta);
 #endif
+}
+
+// Fly a group until a tick, or until lanes need Python for a command: the group is then pending.
+static void fly(const Job &job, long long g, V *group, long long until) {
+  while (job.at[g] < until && any(group[row::alive])) {
+    const long long tick = job.at[g];
+#ifdef CONTROL
+    const bool report = true;
+    if (!job.pending[g] && control(job, g, tick, group)) {
+      job.pending[g] = 1;
+      return;
+    }
+    job.pending[g] = 0;
+#else
+    const bool report = instant_of(job, tick + 1) >= 0;
+    command(job, g, tick, group);
+#endif
+    evaluate(group, report);
+#ifdef STOP_ROW
+    apply_stops(job, g, group, report);
+#endif
+    commit(job, g, group);
   }
 }
 
-// Fly all groups until a tick, or until lanes need Python for a command; return the number of groups
-// that wait for that.
-extern "C" long long fly_until(const Job *job, long long until) {
-  long long waiting = 0;
-  for (long long g = 0; g < job->groups; ++g) {
-    V *group = job->memory + g * ROWS;
-    while (job->at[g] < until && any(group[row::alive])) {
-      const long long tick = job->at[g];
-#ifdef CONTROL
-      const bool report = true;
-      if (!job->pending[g] && control(*job, g, tick, group)) {
-        job->pending[g] = 1;
-        ++waiting;
-        break;
-      }
-      job->pending[g] = 0;
-#else
-      const bool report = instant_of(*job, tick + 1) >= 0;
-      command(*job, g, tick, group);
-#endif
-      evaluate(group, report);
-#ifdef STOP_ROW
-      apply_stops(*job, g, group, report);
-#endif
-      commit(*job, g);
-    }
-  }
-  return waiting;
+#ifdef THREADS
+// Work on a flight in memory of its thread.
+template <class Work>
+static void one_flight(const Job &job, long long g, Work work) {
+  V group[ROWS];
+  for (int k = 0; k < ROWS; ++k) group[k] = job.memory[place(job, g, ROWS, k)];
+  work(g, group);
+  for (int k = 0; k < ROWS; ++k) job.memory[place(job, g, ROWS, k)] = group[k];
 }
+#endif
+
+template <class Work>
+static void each_group(const Job &job, Work work) {
+#ifdef __CUDACC_RTC__
+  const long long g = blockIdx.x * (long long)blockDim.x + threadIdx.x;
+  if (g < job.groups) one_flight(job, g, work);
+#else
+  for (long long g = 0; g < job.groups; ++g)
+#ifdef THREADS
+    one_flight(job, g, work);
+#else
+    work(g, job.memory + g * ROWS);
+#endif
+#endif
+}
+
+#ifdef __CUDACC_RTC__
+#define ENTRY_POINT extern "C" __global__ void
+#else
+#define ENTRY_POINT extern "C" void
+#endif
+
+ENTRY_POINT start_flights(const Job *job) {
+  each_group(*job, [=](long long g, V *group) { start(*job, g, group); });
+}
+
+ENTRY_POINT fly_until(const Job *job, long long until) {
+  each_group(*job, [=](long long g, V *group) { fly(*job, g, group, until); });
+}
+
+#ifdef CONTROL
+ENTRY_POINT measure_starts(const Job *job) {
+  each_group(*job, [=](long long g, V *group) { measure_start(*job, g, group); });
+}
+
+ENTRY_POINT end_flights(const Job *job) {
+  each_group(*job, [=](long long g, V *group) { end_where(*job, g, group, V(1.0)); });
+}
+#endif

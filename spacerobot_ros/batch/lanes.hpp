@@ -1,36 +1,63 @@
 // A number in each lane of a vector register, under the name that CasADi's generated C has for a
-// number. LANES is given by the compiler's command line, LIBMVEC where the C library has vector
-// functions of this width.
+// number. LIBMVEC is defined if the C library has vector functions of this width. One lane is plain
+// C++, which CUDA compiles too; NUMBER is the type of its number.
 
+#ifdef __CUDACC_RTC__
+#define INFINITY (10.0 * 1e308)
+#else
 #include <math.h>
 #include <stdlib.h>
+#endif
 
-#include <algorithm>
+#if LANES == 1
+typedef bool Bits;
 
+struct Numbers {
+  NUMBER number;
+  Numbers() = default;
+  constexpr Numbers(NUMBER number) : number(number) {}
+  constexpr operator NUMBER() const { return number; }
+  NUMBER &operator[](int) { return number; }
+  NUMBER operator[](int) const { return number; }
+};
+#else
 typedef double Numbers __attribute__((vector_size(8 * LANES)));
 typedef long long Bits __attribute__((vector_size(8 * LANES)));
+#endif
 
 struct V {
   Numbers x;
   V() = default;
+#if LANES == 1
+  constexpr V(double each) : x(NUMBER(each)) {}
+#else
   V(double each) : x(each - Numbers{}) {}
-  V(Numbers given) : x(given) {}
+#endif
+  explicit V(Numbers given) : x(given) {}
 };
 
+#ifdef __CUDACC_RTC__
+#define INLINE static __forceinline__
+#else
 #define INLINE static inline __attribute__((always_inline))
+#endif
 
+#if LANES == 1
+INLINE V flag(Bits is_true) { return V(is_true ? 1.0 : 0.0); }
+#else
 INLINE V flag(Bits true_where) {
   return V((Numbers)(true_where & (Bits)(1.0 - Numbers{})));
 }
+#endif
 INLINE V operator+(V a, V b) { return V(a.x + b.x); }
 INLINE V operator-(V a, V b) { return V(a.x - b.x); }
 INLINE V operator*(V a, V b) { return V(a.x * b.x); }
 INLINE V operator/(V a, V b) { return V(a.x / b.x); }
 INLINE V operator-(V a) { return V(-a.x); }
-INLINE V &operator+=(V &a, V b) { a.x += b.x; return a; }
-INLINE V &operator-=(V &a, V b) { a.x -= b.x; return a; }
-INLINE V &operator*=(V &a, V b) { a.x *= b.x; return a; }
-INLINE V &operator/=(V &a, V b) { a.x /= b.x; return a; }
+INLINE V &operator+=(V &a, V b) { return a = a + b; }
+INLINE V &operator-=(V &a, V b) { return a = a - b; }
+INLINE V &operator*=(V &a, V b) { return a = a * b; }
+INLINE V &operator/=(V &a, V b) { return a = a / b; }
 INLINE V operator<(V a, V b) { return flag(a.x < b.x); }
 INLINE V operator>(V a, V b) { return flag(a.x > b.x); }
 INLINE V operator<=(V a, V b) { return flag(a.x <= b.x); }
@@ -43,25 +70,31 @@ INLINE V operator||(V a, V b) { return flag((a.x != 0.0) | (b.x != 0.0)); }
 // NaN is ignored, as by the functions of the C library.
 INLINE V fmin(V a, V b) { return V((a.x < b.x) | (b.x != b.x) ? a.x : b.x); }
 INLINE V fmax(V a, V b) { return V((a.x > b.x) | (b.x != b.x) ? a.x : b.x); }
+
+#define LANE_BY_LANE(NAME) \
+  INLINE V NAME(V a) { \
+    V r; \
+    for (int i = 0; i < LANES; ++i) r.x[i] = NAME((NUMBER)a.x[i]); \
+    return r; \
+  }
+#define LANE_BY_LANE_OF_TWO(NAME) \
+  INLINE V NAME(V a, V b) { \
+    V r; \
+    for (int i = 0; i < LANES; ++i) r.x[i] = NAME((NUMBER)a.x[i], (NUMBER)b.x[i]); \
+    return r; \
+  }
+
+#if LANES == 1
+LANE_BY_LANE(fabs)
+INLINE V where(V condition, V value) { return condition.x != 0.0 ? value : V(0.0); }
+#else
 INLINE V fabs(V a) {
   return V((Numbers)((Bits)a.x & (Bits){} + 0x7fffffffffffffffLL));
 }
 INLINE V where(V condition, V value) {
   return V((Numbers)((Bits)(condition.x != 0.0) & (Bits)value.x));
 }
-
-#define LANE_BY_LANE(NAME) \
-  INLINE V NAME(V a) { \
-    V r; \
-    for (int i = 0; i < LANES; ++i) r.x[i] = NAME((double)a.x[i]); \
-    return r; \
-  }
-#define LANE_BY_LANE_OF_TWO(NAME) \
-  INLINE V NAME(V a, V b) { \
-    V r; \
-    for (int i = 0; i < LANES; ++i) r.x[i] = NAME((double)a.x[i], (double)b.x[i]); \
-    return r; \
-  }
+#endif
 
 #ifdef LIBMVEC
 extern "C" Numbers VECTOR_SIN(Numbers);

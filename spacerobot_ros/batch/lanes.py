@@ -1,12 +1,14 @@
-"""Flights on vector registers: blocks of groups of SIMD lanes, one flight in each lane.
+"""Blocks of flights: in the lanes of vector registers, or each in a thread of a device.
 
 A block's memory is one array (groups, rows, lanes); a row is one number of each flight of a group.
-``driver.hpp`` loops over the ticks and hands back commands that lanes cannot compute.
+Threads are all in one group. ``driver.hpp`` loops over the ticks and hands back commands that lanes
+cannot compute.
 """
 
 from __future__ import annotations
 
 from dataclasses import astuple, replace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -22,6 +24,7 @@ from spacerobot_ros.batch.flights import (
 )
 from spacerobot_ros.batch.native import CompiledTick, Job, Program
 from spacerobot_ros.batch.scalar import fly_one_by_one
+from spacerobot_ros.batch.targets import Target, vector_unit
 from spacerobot_ros.control.goal_monitor import Decision, GoalMonitor
 from spacerobot_ros.control.reference import ReferenceProfile
 from spacerobot_ros.control.state import ControlState
@@ -32,9 +35,6 @@ from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.model_functions import ModelFunctions
 from spacerobot_ros.simulation.effort_plant import FAILURES
 from spacerobot_ros.times import SECOND
-
-_BLOCK_BYTES = 32 * 2**20
-"""Memory of a block of flights, including noise and commands."""
 
 _MAX_BLOCK_GROUPS = 64
 """Largest number of lane groups in a block: more gain nothing."""
@@ -51,24 +51,24 @@ _PROGRAMS = {
 Flags = npt.NDArray[np.bool_]
 
 
-def fly_lanes(flights: Flights) -> BatchResult:
-    """Fly many flights at once, one in each SIMD lane.
+def fly_lanes(flights: Flights, target: Target | None = None) -> BatchResult:
+    """Fly many flights at once, one in each SIMD lane, or each in a thread of a device.
 
     Every flight equals that of the plant with the same numbers to rounding (1e-12 over the flights
     of the benchmark). Without a C++ compiler the plant flies them one by one;
     :attr:`BatchResult.engine` tells which of the two flew them.
     """
     try:
-        return _fly_all_in_lanes(flights)
+        return _fly_all_in_lanes(flights, target or vector_unit())
     except NoLibraryError as reason:
         warn_once(f"Flights are flown one by one, not in lanes: {reason}.")
         return fly_one_by_one(flights)
 
 
-def _fly_all_in_lanes(flights: Flights) -> BatchResult:
-    """Fly on vector registers; NoLibraryError if the tick cannot be compiled for them here."""
+def _fly_all_in_lanes(flights: Flights, target: Target) -> BatchResult:
+    """Fly on a target; NoLibraryError if the tick cannot be compiled for it here."""
     model, p = symbolic_model_of(flights)
-    tick = CompiledTick.of(flights, model)
+    tick = CompiledTick.of(flights, model, target)
     fit = starts_accepted_by_plant(flights)
     # The scalar plant gives the message about each irregular start.
     result = fly_one_by_one(flights, np.flatnonzero(~fit).tolist())
@@ -78,8 +78,7 @@ def _fly_all_in_lanes(flights: Flights) -> BatchResult:
     for first in range(0, len(rows), size):
         block = LaneBlock(flights, tick, model, p, rows[first : first + size])
         block.fly(result, failures)
-    engine = f"{tick.vector_unit.lanes} lanes ({tick.vector_unit.name})"
-    return replace(result, engine=engine, failures=failures)
+    return replace(result, engine=target.engine, failures=failures)
 
 
 def symbolic_model_of(flights: Flights) -> tuple[ModelFunctions, Array]:
@@ -114,9 +113,11 @@ def _block_size(flights: Flights, tick: CompiledTick) -> int:
         case ControlledGoals():
             tables = []
     each += sum(2 * table[0].nbytes for table in tables if table.ndim == 3)
-    lanes = tick.vector_unit.lanes
-    groups = max(1, min(_MAX_BLOCK_GROUPS, _BLOCK_BYTES // (each * lanes)))
-    return int(groups * lanes)
+    fitting = tick.target.block_bytes // each
+    if tick.target.threads:
+        return max(1, int(fitting))
+    lanes = tick.target.lanes
+    return max(1, min(_MAX_BLOCK_GROUPS, int(fitting) // lanes)) * lanes
 
 
 class LaneBlock:
@@ -129,12 +130,13 @@ class LaneBlock:
         self, flights: Flights, tick: CompiledTick, model: ModelFunctions, p: Array, rows: Counts
     ) -> None:
         self._flights, self._tick, self._flown = flights, tick, rows
-        self._lanes, self._rows = tick.vector_unit.lanes, tick.memory_layout
+        self._target, self._rows = tick.target, tick.memory_layout
+        self._lanes = len(rows) if tick.target.threads else tick.target.lanes
         self._groups = -(-len(rows) // self._lanes)
         count = self._groups * self._lanes
         self._surplus = count - len(rows)
         self._rows_of_lanes = np.concatenate([rows, np.repeat(rows[-1:], self._surplus)])
-        self._memory = _aligned_array((self._groups, self._rows.total_rows, self._lanes))
+        self._memory = self._target.zeros((self._groups, self._rows.total_rows, self._lanes))
         self._memory[:, self._rows["alive"]] = 1.0
         self._memory[:, self._rows["decided_state"]] = np.nan
         self._memory[:, self._rows["end_state"]] = np.nan
@@ -145,27 +147,32 @@ class LaneBlock:
         """Reference profiles of flights with a controller, by their lane in the block."""
         self._write_starts(model, p[self._rows_of_lanes])
         self._write_errors_and_gains()
-        self._at = np.zeros(self._groups, np.int64)
-        self._pending = np.zeros(self._groups, np.uint8)
-        width = tick.report_width
-        self._reports = _aligned_array(
-            (self._groups, len(flights.report_ticks), width, self._lanes)
+        self._loops = count if self._target.threads else self._groups
+        """Number of flights or groups whose ticks are counted, each for itself."""
+        arrays = self._target.arrays
+        self._at = arrays.zeros(self._loops, np.int64)
+        self._pending = arrays.zeros(self._loops, np.uint8)
+        self._reports = self._target.zeros(
+            (self._groups, len(flights.report_ticks), tick.report_width, self._lanes)
         )
         self._job, self._referenced = self._prepare_job()
 
-    def _write_rows(self, name: str, values: Array, lanes: Counts | None = None) -> None:
+    def _write_rows(self, name: str, values: Any, lanes: Counts | None = None) -> None:
         """Write rows of a name: (flights of the block, size), or those of some lanes alone."""
+        arrays = self._target.arrays
+        values = arrays.asarray(values)
         if lanes is None:
             part = values.reshape(self._groups, self._lanes, -1)
-            self._memory[:, self._rows[name]] = np.swapaxes(part, 1, 2)
+            self._memory[:, self._rows[name]] = arrays.swapaxes(part, 1, 2)
             return
         group, lane = np.divmod(lanes[:, np.newaxis], self._lanes)
         rows = np.arange(self._rows.total_rows)[self._rows[name]]
-        self._memory[group, rows, lane] = values
+        at = (arrays.asarray(each) for each in (group, rows, lane))
+        self._memory[tuple(at)] = values
 
     def _read_rows(self, name: str) -> Array:
         """Return rows (flights of the block, size) of a name."""
-        part = np.swapaxes(self._memory[:, self._rows[name]], 1, 2)
+        part = np.swapaxes(self._target.to_numpy(self._memory[:, self._rows[name]]), 1, 2)
         return part.reshape(len(self._rows_of_lanes), -1)
 
     def _write_starts(self, model: ModelFunctions, p: Array, lanes: Counts | None = None) -> None:
@@ -197,7 +204,7 @@ class LaneBlock:
             self._write_rows("joint_noise", self._flights.sensors.noise[at, 4:5])
         if self._tick.controller is not None:
             initial = astuple(GoalMonitor())[1:]
-            self._memory[:, self._rows["monitor"]] = np.reshape(initial, (1, -1, 1))
+            self._write_rows("monitor", np.tile(initial, (len(at), 1)))
             self._memory[:, self._rows["decided"]] = -1.0
             self._write_rows("gains", self._tick.controller.gains_argument(at.tolist()))
             if self._flights.sensors is not None:
@@ -205,12 +212,13 @@ class LaneBlock:
                 self._write_rows("bias", np.hstack([errors.pose_bias[at], errors.joint_bias[at]]))
                 self._write_rows("sigma", errors.noise[at])
 
-    def _prepare_job(self) -> tuple[Job, list[npt.NDArray[np.generic]]]:
+    def _prepare_job(self) -> tuple[Job, list[Any]]:
         """Return the driver's job, and the arrays that it points to."""
-        flights, program, table = self._flights, self._flights.program, self._command_table()
-        self._instants = np.array(flights.report_ticks, dtype=np.int64)
+        flights, program = self._flights, self._flights.program
+        table = self._target.arrays.asarray(self._command_table())
+        self._instants = self._target.arrays.asarray(np.array(flights.report_ticks, dtype=np.int64))
         each_table = table.ndim == 4
-        arrays: dict[str, npt.NDArray[np.generic]] = {
+        arrays = {
             "memory": self._memory,
             "at": self._at,
             "pending": self._pending,
@@ -219,7 +227,7 @@ class LaneBlock:
             "reports": self._reports,
         }
         job = Job(
-            groups=self._groups,
+            groups=self._loops,
             period=flights.control_period,
             period_ns=round(flights.control_period * SECOND),
             program=_PROGRAMS[type(program)],
@@ -228,7 +236,7 @@ class LaneBlock:
             noisy=self._noise.is_fed_back,
             instant_count=len(flights.report_ticks),
             ends=isinstance(program, ControlledGoals) and program.ends_when_decided,
-            **{name: array.ctypes.data for name, array in arrays.items()},
+            **{name: self._target.address(array) for name, array in arrays.items()},
         )
         if isinstance(program, FollowedSchedule):
             job.gain = min(program.shape_gain, 1.0 / flights.control_period)
@@ -272,8 +280,8 @@ class LaneBlock:
         # A tick of no duration under no command reports the start.
         library.start_flights(job)
         self._write_rows("h", np.full(len(self._rows_of_lanes), flights.control_period))
-        alive = self._memory[:, self._rows.first_row("alive")]
         for begin in range(0, flights.ticks, _CHUNK_TICKS):
+            alive = self._target.to_numpy(self._memory[:, self._rows.first_row("alive")])
             if not alive.any():
                 break
             end = min(begin + _CHUNK_TICKS, flights.ticks)
@@ -281,13 +289,12 @@ class LaneBlock:
             last = end + (end == flights.ticks)
             normals = self._noise.draw_noise(begin, last, alive)
             if normals is not None:
-                job.normals = normals.ctypes.data
+                on_target = self._target.arrays.asarray(normals)
+                job.normals = self._target.address(on_target)
                 job.normals_from, job.normals_ticks, job.normals_width = begin, *normals.shape[1:3]
             if not begin:
                 self._begin_control(failures)
-            while library.fly_until(job, end):
-                self._command_outside_lanes(result, failures)
-            self._note_failures(failures)
+            self._fly_until(end, result, failures)
         if self._tick.controller is not None:
             library.end_flights(job)
         self._write_results(result)
@@ -317,18 +324,15 @@ class LaneBlock:
         self._write_rows("command", np.zeros((len(lanes), width)), lanes)
         if self._flights.actuation == "velocity":
             self._write_rows("before", np.zeros((len(lanes), self._flights.robot.n)), lanes)
-        # A tick of no duration reports the start; other lanes of a group are not changed by it.
+        # A tick of no duration reports the start; groups that have none are left alone.
         self._write_rows("h", np.zeros((len(lanes), 1)), lanes)
         self._write_rows("alive", np.ones((len(lanes), 1)), lanes)
-        job, memory, reports = self._job, self._memory, self._reports
         self._instants[0] = 0
-        groups, job.groups = job.groups, 1
-        for group in np.unique(lanes // self._lanes):
-            job.memory, job.reports = memory[group].ctypes.data, reports[group].ctypes.data
-            self._tick.library.start_flights(job)
-        job.memory, job.reports, job.groups = memory.ctypes.data, reports.ctypes.data, groups
+        self._tick.library.start_flights(self._job)
         self._write_rows("h", np.full((len(lanes), 1), self._flights.control_period), lanes)
-        return reports[lanes // self._lanes, 0, :, lanes % self._lanes]
+        at = self._target.arrays.asarray(lanes)
+        reports = self._reports[at // self._lanes, 0, :, at % self._lanes]
+        return self._target.to_numpy(reports)
 
     def end_lanes(self, lanes: Counts) -> None:
         """End the flights of some lanes; a group whose lanes are all idle costs nothing."""
@@ -347,15 +351,19 @@ class LaneBlock:
             commands = np.concatenate([commands, np.repeat(commands[-1:], self._surplus, axis=0)])
         self._write_rows("command", commands)
         self._at[:], self._instants[0] = 0, ticks
-        while self._tick.library.fly_until(self._job, ticks):
-            self._command_outside_lanes(result, failures)
-        self._note_failures(failures)
-        reports = np.moveaxis(self._reports[:, 0], 2, 1)
+        self._fly_until(ticks, result, failures)
+        reports = np.moveaxis(self._target.to_numpy(self._reports[:, 0]), 2, 1)
         return reports.reshape(-1, self._reports.shape[2])[:count]
 
+    def _fly_until(self, tick: int, result: BatchResult, failures: dict[int, str]) -> None:
+        self._tick.library.fly_until(self._job, tick)
+        while self._pending.any():
+            self._command_outside_lanes(result, failures)
+            self._tick.library.fly_until(self._job, tick)
+        self._note_failures(failures)
+
     def _end_flight(self, index: int, tick: int, message: str, failures: dict[int, str]) -> None:
-        group, lane = divmod(index, self._lanes)
-        self._memory[group, self._rows["alive"], lane] = 0.0
+        self.end_lanes(np.array([index]))
         if index < len(self._flown):
             failures[int(self._flown[index])] = message
             self._ended[index] = tick
@@ -383,6 +391,8 @@ class LaneBlock:
 
     def _note_failures(self, failures: dict[int, str]) -> None:
         """Give the flights that the driver has ended their messages."""
+        if not self._memory[:, self._rows["failure"]].any():
+            return
         reasons, ticks = self._read_rows("failure")[:, 0], self._read_rows("failed_at")[:, 0]
         for index in np.flatnonzero(reasons).tolist():
             self._end_flight(index, int(ticks[index]), FAILURES[int(reasons[index]) - 1], failures)
@@ -390,31 +400,31 @@ class LaneBlock:
 
     def _command_outside_lanes(self, result: BatchResult, failures: dict[int, str]) -> None:
         """Compute the commands that lanes wait for."""
-        exact, alive = self._rows.first_row("exact"), self._rows.first_row("alive")
-        for group in np.flatnonzero(self._pending):
-            lanes = (self._memory[group, exact] != 0.0) & (self._memory[group, alive] != 0.0)
-            for lane in np.flatnonzero(lanes):
-                index = int(group * self._lanes + lane)
-                try:
-                    self._command_lane(int(group), int(lane), index)
-                except SpaceRobotError as error:
-                    self._end_flight(index, int(self._at[group]), str(error), failures)
-                else:
-                    if index < len(self._flown):
-                        result.fallback_ticks[self._flown[index]] += 1
+        to_numpy, each = self._target.to_numpy, len(self._rows_of_lanes) // self._loops
+        waiting = np.repeat(to_numpy(self._pending) != 0, each)
+        waiting &= (self._read_rows("exact") * self._read_rows("alive"))[:, 0] != 0.0
+        ticks, states = np.repeat(to_numpy(self._at), each), self._read_rows("measured")
+        for index in np.flatnonzero(waiting).tolist():
+            try:
+                command = self._exact_command(index, int(ticks[index]), states[index])
+            except SpaceRobotError as error:
+                self._end_flight(index, int(ticks[index]), str(error), failures)
+                continue
+            self._write_rows("command", command, np.array([index]))
+            if index < len(self._flown):
+                result.fallback_ticks[self._flown[index]] += 1
 
-    def _command_lane(self, group: int, lane: int, index: int) -> None:
+    def _exact_command(self, index: int, tick: int, measured: Array) -> Array:
         controller, row = self._tick.controller, int(self._rows_of_lanes[index])
         assert controller is not None
-        state = ControlState.unstack(self._memory[group, self._rows["measured"], lane])
-        tick = int(self._at[group])
+        state = ControlState.unstack(measured)
         realised = controller.exact_command(row, self._profiles[index], tick, state).realised
-        command = np.concatenate([realised.tau, realised.wrench_B])
-        self._memory[group, self._rows["command"], lane] = command
+        return np.concatenate([realised.tau, realised.wrench_B])
 
     def _write_results(self, result: BatchResult) -> None:
         count, n, rows = len(self._flown), self._flights.robot.n, self._flown
-        reports = np.moveaxis(self._reports, 3, 1).reshape(-1, *self._reports.shape[1:3])
+        reports = np.moveaxis(self._target.to_numpy(self._reports), 3, 1)
+        reports = reports.reshape(-1, *self._reports.shape[1:3])
         for index, tick in self._ended.items():
             if index < count:
                 reports[index, np.array(self._flights.report_ticks) > tick] = np.nan
@@ -458,13 +468,6 @@ def _pad_table(table: Array, ticks: int, dimensions: int, count: int) -> Array:
     rest = np.zeros((*table.shape[:-2], ticks - table.shape[-2], table.shape[-1]))
     whole = np.concatenate([table, rest], axis=-2)
     return np.broadcast_to(whole, (count, *whole.shape)) if dimensions > whole.ndim else whole
-
-
-def _aligned_array(shape: tuple[int, ...], value: float = 0.0) -> Array:
-    count = int(np.prod(shape))
-    memory = np.full(count + 8, value)
-    offset = (-memory.ctypes.data % 64) // 8
-    return memory[offset : offset + count].reshape(shape)
 
 
 class SensorNoise:

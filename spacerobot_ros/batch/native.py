@@ -9,13 +9,9 @@ generated as C++: the rows of a group's memory (:class:`RowLayout`), the enumera
 from __future__ import annotations
 
 import ctypes
-import re
-from collections.abc import Iterable, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from enum import IntEnum
-from functools import lru_cache
-from pathlib import Path
 from typing import Any
 
 import casadi as ca
@@ -23,71 +19,14 @@ import numpy as np
 
 from spacerobot_ros.batch.controlling import CONTROL_INPUTS, CONTROL_OUTPUTS, BatchController
 from spacerobot_ros.batch.flights import ControlledGoals, Flights
+from spacerobot_ros.batch.targets import Target
 from spacerobot_ros.control.goal_monitor import Decision
-from spacerobot_ros.model.compilation import (
-    NoLibraryError,
-    compilation_settings,
-    load_library,
-)
+from spacerobot_ros.model.compilation import compilation_settings
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.model_functions import Composition, ModelFunctions
 from spacerobot_ros.parameters import values_of
 from spacerobot_ros.simulation import effort_plant, velocity_plant
 from spacerobot_ros.simulation.effort_plant import JointStops
-
-_SOURCE_FOLDER = Path(__file__).resolve().parent
-
-_SCHEDULING = ("-fschedule-insns", "-fsched-pressure")
-"""Options of GCC, ignored by Clang: it orders long sums of products such that they do not wait for
-each other, which takes a fifth of the time of flights and changes no number."""
-
-_CASADI_SELECTION = re.compile(r"\((\w+|\(\*\w+\+\+\))\?(\w+(?:\[i\])?):0\)")
-"""CasADi's texts for a number, alone or in a loop, that is zero unless a condition holds."""
-
-
-@dataclass(frozen=True)
-class VectorUnit:
-    """Vector registers of a processor.
-
-    Attributes
-    ----------
-    name
-        For people.
-    lanes
-        Numbers of 64 bits in a register.
-    flags
-        Options of the compiler.
-    libmvec
-        Letter of its functions in the vector library of the C library; empty: none.
-    """
-
-    name: str
-    lanes: int
-    flags: tuple[str, ...]
-    libmvec: str
-
-
-VECTOR_UNITS: dict[str, VectorUnit] = {
-    "avx512f": VectorUnit("AVX-512", 8, ("-mavx512f", "-mprefer-vector-width=512"), "e"),
-    "avx2": VectorUnit("AVX2", 4, ("-mavx2",), "d"),
-    "sse2": VectorUnit("SSE2", 2, ("-msse2",), "b"),
-}
-"""Vector registers by the name of the processor's flag, the widest first."""
-
-_PORTABLE_UNIT = VectorUnit("two at a time", 2, (), "")
-"""The vector unit of other processors, whose registers the compiler chooses."""
-
-
-@lru_cache(maxsize=1)
-def vector_unit() -> VectorUnit:
-    """Return the widest registers that this processor and its kernel support."""
-    try:
-        text = Path("/proc/cpuinfo").read_text("utf-8", errors="replace")
-    except OSError:
-        return _PORTABLE_UNIT
-    flags = re.search(r"^flags\s*:(.*)$", text, re.MULTILINE)
-    features = flags[1].split() if flags else []
-    return next((unit for name, unit in VECTOR_UNITS.items() if name in features), _PORTABLE_UNIT)
 
 
 class Program(IntEnum):
@@ -133,6 +72,9 @@ class Job(ctypes.Structure):
     _fields_ = [(name, _MEMBER_TYPES.get(kind, ctypes.c_void_p)) for kind, name, _ in _JOB_MEMBERS]
 
 
+_JOB = ctypes.POINTER(Job)
+
+
 class RowLayout:
     """The rows of a group's memory by name; a row is one number of each flight in the group."""
 
@@ -169,8 +111,8 @@ class CompiledTick:
     ----------
     library
         The functions of ``driver.hpp``, which take a :class:`Job`.
-    vector_unit
-        Vector registers that they use.
+    target
+        What they run on.
     memory_layout
         Memory of a group.
     report_width
@@ -180,13 +122,15 @@ class CompiledTick:
     """
 
     library: Any
-    vector_unit: VectorUnit
+    target: Target
     memory_layout: RowLayout
     report_width: int
     controller: BatchController | None = None
 
     @classmethod
-    def of(cls, flights: Flights, model: ModelFunctions, link: str = "") -> CompiledTick:
+    def of(
+        cls, flights: Flights, model: ModelFunctions, target: Target, link: str = ""
+    ) -> CompiledTick:
         """Compile the tick of flights, or return it from an earlier compilation.
 
         With ``link``, reports end with the pose in B of that link: the rotation by columns (9) and
@@ -200,7 +144,7 @@ class CompiledTick:
             The law cannot drive the selected outputs, or cannot be flown in lanes.
         """
         key: tuple[Any, ...] = (cls, flights.actuation, flights.substeps)
-        key = (*key, link, vector_unit(), compilation_settings())
+        key = (*key, link, target, compilation_settings())
         program = flights.program
         if isinstance(program, ControlledGoals):
             # The function has all parameters as constants, except the gains of each flight.
@@ -209,7 +153,7 @@ class CompiledTick:
             believed = program.robot or flights.robot
             key = (*key, believed, repr(parameters), repr(program.config.motion))
         if key not in model.derived:
-            model.derived[key] = cls._compile(flights, model, link)
+            model.derived[key] = cls._compile(flights, model, target, link)
         compiled: CompiledTick = model.derived[key]
         if compiled.controller is not None and isinstance(program, ControlledGoals):
             controller = BatchController(program, compiled.controller.controller)
@@ -217,7 +161,9 @@ class CompiledTick:
         return compiled
 
     @classmethod
-    def _compile(cls, flights: Flights, model: ModelFunctions, link: str) -> CompiledTick:
+    def _compile(
+        cls, flights: Flights, model: ModelFunctions, target: Target, link: str
+    ) -> CompiledTick:
         effort, robot = flights.actuation == "effort", flights.robot
         names, n = _TICK_VARIABLES[flights.actuation], robot.n
         make = (effort_plant if effort else velocity_plant).tick_function
@@ -308,12 +254,15 @@ class CompiledTick:
         if controller is not None:
             constants["EXPECTED_ROW"] = state + 2 * n + 4
         limits = JointStops.limits(robot) if has_stops else {}
-        declarations, unit = (
-            _shared_declarations(rows, constants, arrays, spans, limits),
-            vector_unit(),
-        )
-        library = _load_library(functions, declarations, unit)
-        return cls(library, unit, rows, width, controller)
+        declarations = _shared_declarations(rows, constants, arrays, spans, limits)
+        entries: dict[str, list[Any]] = {
+            "start_flights": [_JOB],
+            "fly_until": [_JOB, ctypes.c_longlong],
+        }
+        if controller is not None:
+            entries |= {"measure_starts": [_JOB], "end_flights": [_JOB]}
+        library = target.compile(functions, declarations, entries)
+        return cls(library, target, rows, width, controller)
 
 
 @dataclass(frozen=True)
@@ -369,61 +318,6 @@ def _momentumless_function(flights: Flights, model: ModelFunctions) -> ca.Functi
     return ca.Function("velocity_momentumless", inputs, chosen)
 
 
-def _load_library(
-    functions: Mapping[str, ca.Function], declarations: str, unit: VectorUnit
-) -> ctypes.CDLL:
-    """Return the library of ``driver.hpp``, with the C library's vector functions if it has them.
-
-    ``functions`` are CasADi's by their names in the driver: ``FLIGHT`` and ``REPORT``, the tick
-    without and with the results of reports; ``MOMENTUMLESS``, the former of robots without angular
-    momentum; ``CONTROL``, the command for a state; ``HOLDING_STEP`` and ``SHAPE_EQUATIONS``, for
-    joints on their stops.
-    """
-    library = _compile_library(functions, declarations, unit)
-    names = ["start_flights", "fly_until"]
-    names += ["measure_starts", "end_flights"] if "CONTROL" in functions else []
-    for name in names:
-        function = getattr(library, name)
-        function.argtypes, function.restype = [ctypes.POINTER(Job)], None
-    fly_until = library.fly_until
-    fly_until.argtypes = [*fly_until.argtypes, ctypes.c_longlong]
-    fly_until.restype = ctypes.c_longlong
-    return library
-
-
-def _compile_library(
-    functions: Mapping[str, ca.Function], declarations: str, unit: VectorUnit
-) -> ctypes.CDLL:
-    given = list(functions.values())
-    parts = [
-        _read_source("lanes.hpp"),
-        _CASADI_SELECTION.sub(r"where(\1,\2)", _vector_source(given)),
-        *(f"#define {name} {function.name()}" for name, function in functions.items()),
-        declarations,
-        _read_source("driver.hpp").replace('#include "stops.hpp"\n', _read_source("stops.hpp")),
-    ]
-    # Vectors as arguments between functions of this file: no other is called with them.
-    flags = ("-O2", "-std=c++17", "-fno-math-errno", "-Wno-psabi", *_SCHEDULING, *unit.flags)
-    name = f"lanes_{given[0].name()}"
-    if unit.libmvec:
-        source = "\n".join([_define_sizes(given, unit, unit.libmvec), *parts])
-        with suppress(NoLibraryError):
-            return load_library(
-                name, source, ctypes.CDLL, flags=flags, libraries=("-lmvec",), language="cpp"
-            )
-    source = "\n".join([_define_sizes(given, unit, ""), *parts])
-    return load_library(name, source, ctypes.CDLL, flags=flags, language="cpp")
-
-
-def _vector_source(functions: Sequence[ca.Function]) -> str:
-    """Return C++ of functions in which every number has the type ``V``."""
-    options = {"with_header": False, "cpp": True, "casadi_real": "V"}
-    generator = ca.CodeGenerator(functions[0].name(), options)
-    for function in functions:
-        generator.add(function)
-    return str(generator.dump())
-
-
 def _shared_declarations(
     rows: RowLayout,
     constants: Mapping[str, int],
@@ -456,32 +350,9 @@ def _shared_declarations(
     return "\n".join(lines)
 
 
-def _define_sizes(functions: Sequence[ca.Function], unit: VectorUnit, libmvec: str) -> str:
-    numbers = {
-        "LANES": unit.lanes,
-        "WORK_SIZE": max(function.sz_w() for function in functions) + 1,
-        "ARGUMENT_POINTERS": max(function.sz_arg() for function in functions) + 1,
-        "RESULT_POINTERS": max(function.sz_res() for function in functions) + 1,
-        "INTEGER_SIZE": max(function.sz_iw() for function in functions) + 1,
-    }
-    lines = [f"#define {name} {value}" for name, value in numbers.items()]
-    if libmvec:
-        # The names of the x86-64 vector ABI: kind of registers, lanes, one vector argument.
-        lines += ["#define LIBMVEC"]
-        lines += [
-            f"#define VECTOR_{name.upper()} _ZGV{libmvec}N{unit.lanes}v_{name}"
-            for name in ("sin", "cos")
-        ]
-    return "\n".join(lines)
-
-
 def _cpp_list(numbers: Iterable[int]) -> str:
     return "{" + ", ".join(map(str, numbers)) + "}"
 
 
 def _cpp_number(value: float) -> str:
     return repr(value).replace("inf", "INFINITY")
-
-
-def _read_source(name: str) -> str:
-    return (_SOURCE_FOLDER / name).read_text("utf-8")

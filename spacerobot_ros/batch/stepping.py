@@ -18,6 +18,7 @@ from spacerobot_ros.batch.flights import BatchResult, Counts, Flights, HeldComma
 from spacerobot_ros.batch.lanes import LaneBlock, starts_accepted_by_plant, symbolic_model_of
 from spacerobot_ros.batch.native import CompiledTick
 from spacerobot_ros.batch.scalar import plant_of, pose_of_link
+from spacerobot_ros.batch.targets import Target, vector_unit
 from spacerobot_ros.errors import CommandError, ParameterError, SpaceRobotError
 from spacerobot_ros.files import warn_once
 from spacerobot_ros.model import SpaceRobot
@@ -69,6 +70,8 @@ class SteppedFlights:
     plants
         Configurations of plants with thrusters, faults or external loads, which lanes do not have,
         for each flight; a reset makes a plant of the one that is then in the list. Empty: none.
+    target
+        What lanes run on; None: the widest registers of this processor.
 
     Raises
     ------
@@ -98,6 +101,7 @@ class SteppedFlights:
         link: str = "",
         in_lanes: bool = True,
         plants: Sequence[PlantConfig] = (),
+        target: Target | None = None,
     ) -> None:
         if link and link not in robot.link_names:
             raise ParameterError(
@@ -126,7 +130,7 @@ class SteppedFlights:
         self._require_regular(self._flights)
         scalar = plants or not in_lanes
         self._engine = (
-            _PlantEngine(self._flights, link, plants) if scalar else self._choose_engine()
+            _PlantEngine(self._flights, link, plants) if scalar else self._choose_engine(target)
         )
         width = 2 * robot.n + 20 + (LINK_POSE_SIZE if link else 0)
         self._reports = np.zeros((count, width))
@@ -255,9 +259,9 @@ class SteppedFlights:
         for row in np.flatnonzero(~starts_accepted_by_plant(flights)).tolist():
             plant_of(flights, row)
 
-    def _choose_engine(self) -> _Engine:
+    def _choose_engine(self, target: Target | None) -> _Engine:
         try:
-            return _LaneEngine(self._flights, self._link)
+            return _LaneEngine(self._flights, self._link, target or vector_unit())
         except NoLibraryError as reason:
             warn_once(f"Flights are flown one by one, not in lanes: {reason}.")
             return _PlantEngine(self._flights, self._link, ())
@@ -292,16 +296,16 @@ class _Engine(Protocol):
 class _LaneEngine:
     """Flights in SIMD lanes, all in one block; NoLibraryError if no tick can be compiled here."""
 
-    def __init__(self, flights: Flights, link: str) -> None:
-        self._flights, self._link = flights, link
+    def __init__(self, flights: Flights, link: str, target: Target) -> None:
+        self._flights, self._link, self._target = flights, link, target
         self._result = BatchResult.empty(flights)
         self._block = self._new_block()
 
     def _new_block(self) -> LaneBlock:
         flights = self._flights
         self._model, p = symbolic_model_of(flights)
-        tick = CompiledTick.of(flights, self._model, self._link)
-        self.name = f"{tick.vector_unit.lanes} lanes ({tick.vector_unit.name})"
+        tick = CompiledTick.of(flights, self._model, self._target, self._link)
+        self.name = self._target.engine
         block = LaneBlock(flights, tick, self._model, p, np.arange(len(flights)))
         block.begin_stepping()
         return block

@@ -49,8 +49,8 @@ static void stop_joints(const Matrix &compliance, const Rates &rates, Set joints
 // least-index pivoting from a guess).
 static Set joints_stopped(const Matrix &compliance, const Rates &rates, const Rates &inward,
                           Set joints) {
-  // A repeated set of joints differs from the other by rounding only: both are right.
-  for (std::set<Set> tried; tried.insert(joints).second;) {
+  // Sets that repeat differ from each other by rounding only: any of them is right.
+  for (int tries = 0; tries < 1000; ++tries) {
     Rates after, impulses;
     stop_joints(compliance, rates, joints, after, impulses);
     int wrong = 0;
@@ -71,7 +71,7 @@ struct Stops {
   void equations(V *K, V *Q) {
     const V *arguments[ARGUMENT_POINTERS] = {x, group + REALISED_ROW, group + row::p};
     V *results[RESULT_POINTERS] = {K, Q};
-    run(SHAPE_EQUATIONS, arguments, results);
+    run<SHAPE_EQUATIONS>(arguments, results);
   }
 
   void integrate(V h) {
@@ -80,7 +80,7 @@ struct Stops {
       for (int lane = 0; lane < LANES; ++lane) free[j].x[lane] = !in(held[lane], j);
     const V *arguments[ARGUMENT_POINTERS] = {x, group + REALISED_ROW, free, &h, group + row::p};
     V *results[RESULT_POINTERS] = {after};
-    run(HOLDING_STEP, arguments, results);
+    run<HOLDING_STEP>(arguments, results);
   }
 
   V is_outside() const {
@@ -118,7 +118,7 @@ struct Stops {
         const Set touched = joints_stopped(compliance, rates, inward, 0);
         stopped[lane] |= touched;
         Rates before;
-        std::copy(rates, rates + JOINTS, before);
+        for (int j = 0; j < JOINTS; ++j) before[j] = rates[j];
         stop_joints(compliance, before, touched, rates, impulses);
       }
       for (int i = 0; i < JOINTS; ++i) {
@@ -135,7 +135,7 @@ struct Stops {
   // Fly some lanes for a tick; return those that failed, by 1 and the number of the reason.
   V advance(double duration, V lanes) {
     V left(duration), arrivals(MAX_ARRIVALS_PER_STEP * JOINTS * ceil(duration / step)), failed(0.0);
-    std::copy(group + row::state, group + row::state + STATE, x);
+    for (int k = 0; k < STATE; ++k) x[k] = group[row::state + k];
     bring_to_rest(lanes);
     for (; any(lanes = lanes && left > V(1e-12 * duration)); bring_to_rest(lanes)) {
       V h = where(lanes, fmin(V(step), left)), finite(1.0);

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from support.targets import needs_compiler, on_targets, target_named
 
 from spacerobot_ros.batch import (
     BatchResult,
@@ -21,9 +22,9 @@ from spacerobot_ros.batch import (
     fly_one_by_one,
 )
 from spacerobot_ros.batch.flights import NOISES
+from spacerobot_ros.batch.targets import Target
 from spacerobot_ros.errors import CommandError, ParameterError, RobotDescriptionError
 from spacerobot_ros.model import InertialParameters, SpaceRobot, load_robot
-from spacerobot_ros.model.compilation import cxx_compiler
 from spacerobot_ros.model.description import Inertia
 from spacerobot_ros.resources import robot_file, share_directory
 from spacerobot_ros.simulation import InitialState
@@ -309,8 +310,6 @@ def test_flights_that_do_not_go_together_are_refused(described_sliders: SpaceRob
             Flights(described_sliders, *arguments)
 
 
-needs_compiler = pytest.mark.skipif(cxx_compiler() is None, reason="there is no C++ compiler")
-
 STATES = "pose", "twist", "q", "qdot", "momentum"
 
 
@@ -376,6 +375,7 @@ def fly_with_resets(
     in_lanes: bool,
     link: str,
     shifted: bool = False,
+    target: Target | None = None,
 ) -> tuple[SteppedFlights, int]:
     """Fly beside plants with resets, other masses and joint stops; return ticks on a stop.
 
@@ -383,7 +383,9 @@ def fly_with_resets(
     """
     count, n, rng = 5, robot.n, np.random.default_rng(3)
     starts, masses = drawn_starts(robot, count, rng), drawn_masses(robot, count, rng)
-    flights = SteppedFlights(robot, actuation, period, starts, masses, link=link, in_lanes=in_lanes)
+    flights = SteppedFlights(
+        *(robot, actuation, period, starts, masses), link=link, in_lanes=in_lanes, target=target
+    )
     reference = OnePlant(flights, actuation, link)
     reference.plants = [reference.make(starts, masses, row) for row in range(count)]
     scale = np.concatenate(
@@ -427,13 +429,16 @@ def fly_with_resets(
     return flights, at_stops
 
 
-@needs_compiler
+@on_targets("registers", "threads")
 @pytest.mark.parametrize(("actuation", "period"), [("velocity", 0.05), ("effort", 0.01)])
 def test_stepped_lanes_are_plants_with_resets_and_other_masses(
-    sliders: SpaceRobot, actuation: str, period: float
+    sliders: SpaceRobot, target_name: str, actuation: str, period: float
 ) -> None:
-    flights, at_stops = fly_with_resets(sliders, actuation, period, 30, in_lanes=True, link="")
-    assert "lanes" in flights.engine
+    target = target_named(target_name)
+    flights, at_stops = fly_with_resets(
+        *(sliders, actuation, period, 30), in_lanes=True, link="", target=target
+    )
+    assert flights.engine == target.engine
     assert at_stops > 3
 
 

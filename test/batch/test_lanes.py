@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from support.slow import some_fast
+from support.targets import needs_compiler, on_targets, target_named
 
 from spacerobot_ros.batch import (
     BatchResult,
@@ -22,7 +23,7 @@ from spacerobot_ros.batch import (
     SensorErrors,
     fly_lanes,
     fly_one_by_one,
-    native,
+    targets,
 )
 from spacerobot_ros.batch.controlling import BatchController
 from spacerobot_ros.control.config import ControllerConfig
@@ -42,8 +43,6 @@ from spacerobot_ros.model.description import Array
 from spacerobot_ros.resources import share_directory
 from spacerobot_ros.simulation import InitialState
 from spacerobot_ros.simulation.config import SensorConfig
-
-needs_compiler = pytest.mark.skipif(cxx_compiler() is None, reason="there is no C++ compiler")
 
 NUMBERS = (
     *("pose", "twist", "q", "qdot", "momentum", "measured_pose", "measured_q"),
@@ -133,16 +132,17 @@ def effort_flights(robot: SpaceRobot, count: int) -> Flights:
     )
 
 
-@needs_compiler
+@on_targets("registers")
 @pytest.mark.parametrize(
     ("each", "deadband"), some_fast([(False, 0.0), (True, 0.003)], (True, 0.003))
 )
 def test_velocity_flights_in_lanes_are_those_of_the_plant(
-    robots: dict[str, SpaceRobot], each: bool, deadband: float
+    robots: dict[str, SpaceRobot], target_name: str, each: bool, deadband: float
 ) -> None:
     flights = velocity_flights(robots["sliding_masses"], 19, each=each, deadband=deadband)
-    here, there = fly_lanes(flights), fly_one_by_one(flights)
-    assert "lanes" in here.engine
+    target = target_named(target_name)
+    here, there = fly_lanes(flights, target), fly_one_by_one(flights)
+    assert here.engine == target.engine
     assert_equal_flights(here, there)
     assert there.limited_ticks["rate"].any(axis=1).sum() > 10
     assert there.limited_ticks["stroke"].any(axis=1).sum() > 10
@@ -175,35 +175,38 @@ def test_flights_without_momentum_are_those_of_the_plant_and_of_neighbours_of_mo
     assert (mixed.pose[::2, -1] != here.pose[::2, -1]).any(axis=1).all()
 
 
-@pytest.mark.slow
-@needs_compiler
-def test_effort_flights_in_lanes_are_those_of_the_plant(robots: dict[str, SpaceRobot]) -> None:
+@on_targets()
+def test_effort_flights_in_lanes_are_those_of_the_plant(
+    robots: dict[str, SpaceRobot], target_name: str
+) -> None:
     flights = effort_flights(robots["sliding_masses"], 19)
-    here, there = fly_lanes(flights), fly_one_by_one(flights)
+    here, there = fly_lanes(flights, target_named(target_name)), fly_one_by_one(flights)
     assert_equal_flights(here, there)
     assert there.limited_ticks["effort"].any(axis=1).sum() > 10
     assert 0 < there.limited_ticks["stroke"].any(axis=1).sum() < 19
     assert not here.fallback_ticks.any()
 
 
-@needs_compiler
+@on_targets("registers")
 def test_a_flight_that_fails_says_why_and_leaves_its_neighbours_alone(
-    robots: dict[str, SpaceRobot],
+    robots: dict[str, SpaceRobot], target_name: str
 ) -> None:
+    target = target_named(target_name)
     flights = effort_flights(robots["sliding_masses"], 9)
     momenta, q = flights.initial_states.momenta.copy(), flights.initial_states.q.copy()
     momenta[4] = 1e80
     q[7, 0] = 50.0
     starts = dataclasses.replace(flights.initial_states, momenta=momenta, q=q)
     broken = dataclasses.replace(flights, initial_states=starts)
-    here, there = fly_lanes(broken), fly_one_by_one(broken)
+    here, there = fly_lanes(broken, target), fly_one_by_one(broken)
     assert here.failures == there.failures
     assert sorted(here.failures) == [4, 7]
     assert "no longer finite" in here.failures[4]
     assert "outside its limits" in here.failures[7]
     assert np.isnan(here.pose[4, -1]).all()
     others = [i for i in range(9) if i not in (4, 7)]
-    np.testing.assert_array_equal(here.pose[others], fly_lanes(flights).pose[others])
+    alone = fly_lanes(flights, target)
+    np.testing.assert_array_equal(here.pose[others], alone.pose[others])
 
 
 def test_without_a_compiler_the_plant_flies_them(
@@ -225,12 +228,12 @@ def test_the_widest_registers_that_there_are_are_chosen(monkeypatch: pytest.Monk
         ("asimd", "two at a time"),
         (None, "two at a time"),
     ):
-        native.vector_unit.cache_clear()
+        targets.vector_unit.cache_clear()
         text = f"model name : avx512f\nflags\t\t: {flags}\n" if flags else "no processor\n"
         monkeypatch.setattr(Path, "read_text", lambda *_, text=text, **__: text)
-        assert native.vector_unit().name == name
+        assert targets.vector_unit().name == name
     monkeypatch.undo()
-    native.vector_unit.cache_clear()
+    targets.vector_unit.cache_clear()
 
 
 @needs_compiler
@@ -326,8 +329,9 @@ def assert_same(here: BatchResult, there: BatchResult) -> None:
     assert here.failures == there.failures == {}
 
 
-@needs_compiler
-def test_control_in_lanes_is_that_of_the_controller() -> None:
+@on_targets("registers", "threads")
+def test_control_in_lanes_is_that_of_the_controller(target_name: str) -> None:
+    target = target_named(target_name)
     flights = controlled(
         *("planar_manipulator", SHAPE),
         ticks=220,
@@ -339,8 +343,8 @@ def test_control_in_lanes_is_that_of_the_controller() -> None:
         max_force=10.0,
         motion=MotionLimits(1.0, 1.0, 1.0, 1.0),
     )
-    here, there = fly_lanes(flights), fly_one_by_one(flights)
-    assert "lanes" in here.engine
+    here, there = fly_lanes(flights, target), fly_one_by_one(flights)
+    assert here.engine == target.engine
     assert_same(here, there)
     assert not here.fallback_ticks.any()
     # Goals are reached at times of their own, and the force was at its limit.
@@ -372,8 +376,8 @@ def test_automatic_gains_in_lanes_are_those_of_the_controller() -> None:
     assert np.abs(there.q[2:, -1] - fly_one_by_one(given).q[2:, -1]).max() > 1e-6
 
 
-@needs_compiler
-def test_what_the_law_cannot_give_in_one_step_is_given_by_the_controller() -> None:
+@on_targets("registers")
+def test_what_the_law_cannot_give_in_one_step_is_given_by_the_controller(target_name: str) -> None:
     """Through a singularity, and with joints that are held within a small rate."""
     planar = share_directory() / "urdf" / "planar_manipulator.urdf"
     cases: tuple[dict[str, Any], ...] = (
@@ -388,7 +392,7 @@ def test_what_the_law_cannot_give_in_one_step_is_given_by_the_controller() -> No
         tip = SpaceRobot.from_file(planar).link_pose("end_effector", shape)[1]
         held = np.array([*tip, *BASE[3:]])
         flights = controlled("planar_manipulator", shape, ticks=120, end_effector=held, **case)
-        here, there = fly_lanes(flights), fly_one_by_one(flights)
+        here, there = fly_lanes(flights, target_named(target_name)), fly_one_by_one(flights)
         assert_same(here, there)
         assert 0 < here.fallback_ticks.sum() <= 9 * 120
 
