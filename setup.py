@@ -126,6 +126,8 @@ setup(
         "data": DATA,
         "rl": RL,
         "sb3": [*RL, "stable-baselines3"],
+        # Flights on a GPU; ctk brings NVRTC, which compiles them.
+        "cuda": ["cupy-cuda12x[ctk]"],
         "docs": [*DOCS, *DATA],  # The notebook makes tables.
         "test": [
             *CAMPAIGN,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import time
 from pathlib import Path
 from typing import Any
 
@@ -21,11 +22,13 @@ from spacerobot_ros.batch import (
     HeldCommands,
     InitialStates,
     SensorErrors,
+    SteppedFlights,
     fly_lanes,
     fly_one_by_one,
     targets,
 )
 from spacerobot_ros.batch.controlling import BatchController
+from spacerobot_ros.batch.targets import CudaDevice
 from spacerobot_ros.control.config import ControllerConfig
 from spacerobot_ros.control.goal_monitor import GoalMonitor
 from spacerobot_ros.control.laws.law import GainPair, Gains
@@ -40,7 +43,7 @@ from spacerobot_ros.model import (
 )
 from spacerobot_ros.model.compilation import cxx_compiler
 from spacerobot_ros.model.description import Array
-from spacerobot_ros.resources import share_directory
+from spacerobot_ros.resources import robot_file, share_directory
 from spacerobot_ros.simulation import InitialState
 from spacerobot_ros.simulation.config import SensorConfig
 
@@ -487,3 +490,38 @@ def test_the_function_of_lanes_is_the_controller_and_its_monitor(
     assert decisions[4:29] == [Decision.NONE] * 20 + [Decision.REACHED] * 5
     assert decisions[-1] is Decision.LOST
     assert memory[1:].max() >= 3
+
+
+@pytest.mark.slow
+@pytest.mark.gpu
+@pytest.mark.parametrize(
+    ("name", "actuation", "period", "ticks"),
+    [("servicer", "effort", 0.001, 200), ("three_joint_arm", "velocity", 0.001, 4000)],
+)
+def test_a_device_flies_faster_than_registers_to_the_same_states(
+    name: str, actuation: str, period: float, ticks: int, capsys: pytest.CaptureFixture[str]
+) -> None:
+    device, robot = target_named("device"), SpaceRobot(load_robot(robot_file(name)))
+    assert isinstance(device, CudaDevice)
+    rng, count = np.random.default_rng(6), 131_072
+    starts = InitialStates.repeated(robot, InitialState(), count)
+    limits = robot.velocity_limit if actuation == "velocity" else 0.02 * robot.effort_limit
+    commands = 0.05 * limits * rng.uniform(-1.0, 1.0, (count, robot.n))
+    if actuation == "effort":
+        commands = np.hstack([commands, np.zeros((count, 6))])
+    last, rates = {}, {}
+    for target in (targets.vector_unit(), device, CudaDevice.of(single=True)):
+        number = count if target.threads else 512
+        flights = SteppedFlights(robot, actuation, period, starts[np.arange(number)], target=target)
+        flights.step(commands[:number])  # The first call loads what it needs.
+        began = time.perf_counter()
+        flights.step(commands[:number], ticks)
+        rates[target.name] = number * ticks / (time.perf_counter() - began)
+        last[target.name] = flights.pose[:512].copy()
+    with capsys.disabled():
+        print(f"\n{name}, {actuation}:", *(f"{k}: {v:.3g} ticks/s" for k, v in rates.items()))
+    registers, double, single = last.values()
+    np.testing.assert_allclose(double, registers, rtol=0.0, atol=1e-12)
+    np.testing.assert_allclose(single, registers, rtol=0.0, atol=1e-4)
+    slow, *fast = rates.values()
+    assert min(fast) > slow
