@@ -237,13 +237,12 @@ class ControlExecutive:
         """
         if key == END_EFFECTOR:
             self._require_output(key)
-        if goal.goal.end_effectors:
-            parts = self._parts_of(goal)
-        elif key == END_EFFECTOR:
+        unnamed = all(each.link == "" for each in goal.goal.end_effectors)
+        parts = self._parts_of(goal) if goal.goal.end_effectors else {key: goal}
+        if key == END_EFFECTOR and unnamed:
             # A pose on the topic of the end-effector is met by the axes that are controlled.
-            parts = {key: replace(goal, goal=replace(goal.goal, asked=_PLACE))}
-        else:
-            parts = {key: goal}
+            hand = parts[key]
+            parts[key] = replace(hand, goal=replace(hand.goal, asked=_PLACE))
         for part, each in parts.items():
             self._require_controlled(part, each)
         for part, each in parts.items():

@@ -46,6 +46,7 @@ from spacerobot_ros.events import EventKind
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.parameters import configured
 from spacerobot_ros.planning import Goal
+from spacerobot_ros.planning.core.goal import EndEffectorGoal
 from spacerobot_ros.planning.execution.goal_file import IdentifiedGoal
 from spacerobot_ros.resources import robot_file
 from spacerobot_ros.simulation import EffortPlant, InitialState
@@ -231,6 +232,19 @@ def test_a_goal_is_reached_when_it_is_held_for_the_settling_time() -> None:
     loop.place = np.zeros(3)
     loop.answer(5)
     assert loop.state == "reached", "it was reached, wherever the robot is pushed to later"
+
+
+@pytest.mark.parametrize(("link", "state"), [("", "reached"), ("end_effector", "reached_partly")])
+def test_an_attitude_that_follows_from_the_joints_counts_for_a_hand_that_is_named(
+    link: str, state: str
+) -> None:
+    """A pose on the topic of the end-effector, which names none, has an attitude in any case."""
+    loop = ExecutiveLoop(settle_time=0.0)
+    turned = Rotation.from_rotvec([0.0, 0.0, 0.7]).as_quat()
+    goal = Goal.of_end_effectors([EndEffectorGoal(link, TIP, turned)])
+    loop.aim(end_effector=IdentifiedGoal(goal, "7"))
+    loop.answer(4)
+    assert loop.state == state
 
 
 def test_the_settling_time_of_a_goal_begins_with_the_goal() -> None:
