@@ -26,12 +26,11 @@ from support.expected import (
     plans,
 )
 from support.figure_prints import (
-    MADE_PARTS,
+    MADE_FLIGHTS,
     PARTS,
     PICTURES,
     analysis_prints,
     made_part,
-    made_parts,
     report_part,
 )
 from support.page_prints import CAMPAIGNS
@@ -77,12 +76,6 @@ def known_to(kept: Any, found: Any) -> Any:
     return {key: known_to(kept[key], value) for key, value in found.items() if key in kept}
 
 
-def _slow_in_print(part: str, *values: str) -> Any:
-    """Return a case; figures for print, which have the same lines as those of reports, are slow."""
-    marks = (pytest.mark.slow,) if part.endswith(", paper") else ()
-    return pytest.param(*values, marks=marks, id="-".join(values))
-
-
 @pytest.mark.parametrize(
     ("file", "prints"),
     [(COMMAND_TABLE, command_prints), (TOPIC_TABLE, topic_prints)],
@@ -109,7 +102,7 @@ def test_the_way_to_a_manoeuvre_stays_as_it_is(name: str) -> None:
     assert not problems, "\n".join([*problems[:40], WRITE])
 
 
-@pytest.mark.parametrize("part", [_slow_in_print(part, part) for part in PARTS])
+@pytest.mark.parametrize("part", PARTS)
 @pytest.mark.parametrize("name", _some_quick(BAGS, "servicer_thrusters", "sliding_masses"))
 def test_reports_stay_as_they_are(name: str, part: str) -> None:
     kept = json.loads(REPORTS.read_text("utf-8"))[name].get(part)
@@ -117,10 +110,8 @@ def test_reports_stay_as_they_are(name: str, part: str) -> None:
     assert not problems, "\n".join([*problems[:40], WRITE])
 
 
-@pytest.mark.parametrize(
-    ("name", "part"),
-    [_slow_in_print(part, name, part) for name in MADE_PARTS for part in made_parts(name)],
-)
+@pytest.mark.parametrize("part", PARTS)
+@pytest.mark.parametrize("name", MADE_FLIGHTS)
 def test_reports_of_made_up_flights_stay_as_they_are(name: str, part: str) -> None:
     kept = json.loads(MADE_REPORTS.read_text("utf-8"))[name].get(part)
     problems = differences(made_part(name, part), kept)

@@ -14,7 +14,13 @@ from typing import Any
 
 import numpy as np
 from support.command_prints import command_prints, topic_prints
-from support.figure_prints import MADE_PARTS, PICTURES, analysis_prints, made_prints, report_prints
+from support.figure_prints import (
+    MADE_FLIGHTS,
+    PICTURES,
+    analysis_prints,
+    made_prints,
+    report_prints,
+)
 from support.page_prints import CAMPAIGNS
 from support.planar_trees import random_tree
 from support.search_prints import SEARCHES
@@ -299,7 +305,7 @@ def main() -> None:
         (PLANS, plans()),
         (REPORTS, reports),
         (CAMPAIGN_PAGES, pages),
-        (MADE_REPORTS, {name: made_prints(name) for name in MADE_PARTS}),
+        (MADE_REPORTS, {name: made_prints(name) for name in MADE_FLIGHTS}),
         (SEARCH, {name: print_of() for name, print_of in SEARCHES.items()}),
         (VIEWER, {name: viewer_prints(name) for name in SITUATIONS}),
     ):

@@ -70,8 +70,6 @@ from spacerobot_ros.report.writing import FIGURES, _overview_figure
 from spacerobot_ros.resources import robot_file
 
 ROOT = Path(__file__).resolve().parents[2]
-NARROW = 88.0 / 25.4
-"""Width of a figure in a column of a paper, inches."""
 
 
 @cache
@@ -79,8 +77,8 @@ def _flight(name: str) -> FlightReport:
     return read_report(ROOT / "bags" / f"{name}.mcap", None)
 
 
-def _figure(flight: FlightReport, figure: str, style: str) -> dict[str, str] | None:
-    with drawing(WIDTH if style == "report" else NARROW, style):
+def _figure(flight: FlightReport, figure: str) -> dict[str, str] | None:
+    with drawing(WIDTH, "report"):
         drawn = FIGURES[figure](flight)
         if not isinstance(drawn, ReportFigure):
             return None
@@ -123,22 +121,12 @@ PARTS: dict[str, Callable[[FlightReport], Any]] = {
         map(_command, getattr(view_of_flight(flight), "commands", ["none"]))
     ),
     "overview": lambda flight: prints_of(_overview_figure(flight)),
-    **{
-        f"figure {figure}, {style}": partial(_figure, figure=figure, style=style)
-        for style in ("report", "paper")
-        for figure in FIGURES
-    },
+    **{f"figure {figure}, report": partial(_figure, figure=figure) for figure in FIGURES},
 }
 """The parts of a report by name; None where a bag has nothing for one."""
 
 
-MADE_PARTS: dict[str, tuple[str, ...]] = {
-    "cycles": ("robot", "pose", "velocities", "loops", "momentum", "path"),
-    "controlled": ("joints",),
-    "planar": ("robot", "loops", "path"),
-    "bare": (),
-}
-"""Made-up flights, and their figures in the style of papers; those of reports are all drawn."""
+MADE_FLIGHTS = ("cycles", "controlled", "planar", "bare")
 
 
 class _RecordingCanvas:
@@ -163,15 +151,8 @@ class _RecordingCanvas:
 
 def made_prints(name: str) -> dict[str, Any]:
     """Return the parts of the report of a made-up flight that has them."""
-    found = {part: made_part(name, part) for part in made_parts(name)}
+    found = {part: made_part(name, part) for part in PARTS}
     return {part: content for part, content in found.items() if content is not None}
-
-
-def made_parts(name: str) -> list[str]:
-    """Return the names of the parts that are drawn of a made-up flight."""
-    style = "figure {}, paper"
-    left_out = {style.format(figure) for figure in FIGURES if figure not in MADE_PARTS[name]}
-    return [part for part in PARTS if part not in left_out]
 
 
 def made_part(name: str, part: str) -> Any:
