@@ -111,6 +111,8 @@ class Case:
     beside
         Further parameters, without which it would have no effect; the flight that it is compared
         with has them too.
+    changes
+        Empty: the robot flies in another way, which quantities follow in their own.
     """
 
     parameter: str
@@ -208,7 +210,7 @@ def main() -> None:
     """Write the quantities that change into the table anew."""
     wanted, entries = sys.argv[1:], table()
     for case in cases():
-        if not wanted or any(word in case.parameter for word in wanted):
+        if case.changes and (not wanted or any(word in case.parameter for word in wanted)):
             entries[case.parameter]["changes"] = list(case.found())
             print(case.parameter, *entries[case.parameter]["changes"], flush=True)
     head = "".join(
@@ -513,6 +515,7 @@ def _marked(case: Case) -> object:
 
 @pytest.mark.parametrize("case", [_marked(case) for case in cases()])
 def test_a_parameter_changes_these_quantities_and_no_others(case: Case) -> None:
-    assert case.changes, "it changes nothing"
-    assert "refused" not in case.changes
-    assert case.found() == case.changes
+    found = case.found()
+    assert found, "it changes nothing"
+    assert "refused" not in found
+    assert not case.changes or found == case.changes
