@@ -410,7 +410,7 @@ def test_runs_stand_side_by_side(folder: Path, flown: Page, tmp_path: Path) -> N
     assert ticks == [f"{len(cyclic_shapes()) - 1} ticks", "2 ticks"]
     assert rows[1][head.index("Method")] == "–"
     # The second bag does not give the method, which is not the default in the first.
-    parameters = [["planner.position_tolerance", "0.02", "0.03"]]
+    parameters = [["planner.position_tolerance (m)", "0.02", "0.03"]]
     parameters += [["planner.method", "lie_bracket", "–"]]
     assert page.tables["different"][1:] == parameters
     ((name, here, there),) = page.tables["goals"][1:]

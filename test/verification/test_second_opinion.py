@@ -230,7 +230,7 @@ QUICK_BAGS = ("sliding_masses", "arm_attitude", "planar_chain", "coordinated_con
 """Bags of which all tests are quick."""
 
 MIN_TICKS = {"reach": 30, "two_hands": 25, "strut": 50, "capture": 150, "gravity_gradient": 200}
-MIN_TICKS |= {"free_flyer": 250}
+MIN_TICKS |= {"free_flyer": 200, "wheels": 250}
 """Flights of these are short, or have few ticks a second."""
 
 
