@@ -27,7 +27,7 @@ ROOT = Path(__file__).parents[2]
 PATIENCE = 60.0
 MULTIARRAY = ("numpy._core.multiarray", "numpy.core.multiarray")
 """In the midst of the imports, by its names since numpy 2 and before."""
-SOON = 2.0
+SOON = 20.0
 PLANS = ("plan", "sliding_masses", "--random", "100000")
 
 
@@ -82,7 +82,7 @@ def test_a_command_that_still_imports_ends_with_one_line(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("run", range(12))
+@pytest.mark.parametrize("run", range(3))
 def test_plans_are_ended_at_any_moment(tmp_path: Path, run: int) -> None:
     """While modules are imported, models are compiled, and gaits are searched for."""
     chance = random.Random(run)

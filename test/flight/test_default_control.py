@@ -154,8 +154,7 @@ def turns_of_sign(values: np.ndarray[Any, Any]) -> int:
 
 @pytest.mark.parametrize(
     "rate",
-    [5.0, pytest.param(10.0, marks=pytest.mark.slow), 20.0]
-    + [pytest.param(rate, marks=pytest.mark.slow) for rate in (50.0, 200.0)],
+    [5.0, 20.0, pytest.param(200.0, marks=pytest.mark.slow)],
 )
 @pytest.mark.parametrize("robot", SHAPES)
 def test_goals_are_reached_by_default(tmp_path: Path, robot: str, rate: float) -> None:

@@ -105,7 +105,6 @@ Array = npt.NDArray[np.float64]
 
 PERIOD = 0.1
 WHOLE = np.eye(3)
-FEW_AND_MANY = [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(1, 20))]
 LINK = (
     '<link name="{0}"><inertial><origin xyz="{1}"/><mass value="{2}"/>'
     '<inertia ixx="{3}" iyy="{3}" izz="{3}" ixy="0" ixz="0" iyz="0"/></inertial></link>'
@@ -136,7 +135,7 @@ def bound_of(robot: SpaceRobot, boundary: BoundaryConditions, **limits: Any) -> 
 # -- motion of the base by each joint ---------------------------------------------------------
 
 
-@pytest.mark.parametrize("seed", FEW_AND_MANY)
+@pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("kind", ["tree", "chain", "planar", "sliders"])
 def test_no_joint_moves_the_base_beyond_its_bound(kind: str, seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -262,7 +261,7 @@ def test_a_joint_takes_the_time_of_its_fastest_motion(way: float, acceleration: 
     )
 
 
-@pytest.mark.parametrize("seed", FEW_AND_MANY)
+@pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("kind", ["tree", "chain", "planar", "sliders"])
 def test_no_motion_is_faster_than_the_bound(kind: str, seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -332,13 +331,12 @@ def test_ends_in_motion_and_a_drift_shorten_the_bound() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("name", list(CASES))
-def test_no_plan_is_faster_than_the_bound(name: str, seed: int) -> None:
+def test_no_plan_is_faster_than_the_bound(name: str) -> None:
     case, robot = CASES[name], SpaceRobot.from_file(robot_file(name))
     options = OptimalOptions(**case.options, cache=0, starts=6, answers=1, intervals=30)
     method = OptimalGait(robot, PERIOD, options=options)
-    (request,) = requests(robot, case, 1, seed)
+    (request,) = requests(robot, case, 1, seed=1)
     schedule = method.plan(request)
     # Within a time that is a little shorter than the bound, the goal is refused with that bound.
     bound = bound_by_refusal(method, request)

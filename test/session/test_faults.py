@@ -156,11 +156,11 @@ def test_a_node_that_is_killed_has_no_cause_in_its_log_but_one_that_crashes_has(
     assert end_message("plant", 1, log).endswith("code 1: Node '/coordinated_control' is silent")
 
 
-KILLS = 20
+KILLS = 4
 ROOT = Path(__file__).parents[2]
 START_PATIENCE = 60.0
-SOON = 2.0
-"""Wall s after which no process is left."""
+SOON = 20.0
+"""Wall s after which no process is left; on an idle machine 1.2 s."""
 
 MARK = "SPACEROBOT_TEST_MARK"
 FLIGHT = (
