@@ -54,8 +54,8 @@ test: $(STAMP)/test ## check style and types, run the tests
 	    wait $$types; types=$$?; cat $(STAMP)/mypy.txt; exit $$((tests | types))
 
 .PHONY: test-slow
-test-slow: $(STAMP)/test ## run the slow tests: long flights, builds with pip and colcon
-	$(BIN)/python3 -m pytest -m slow
+test-slow: $(STAMP)/test ## run the slow tests: long flights and plans, nodes in real time, pages of the documentation
+	$(BIN)/python3 -m pytest -m "slow and not study" -n 3 --dist loadfile --durations=20
 
 # With TESTED and VENV given here, the rules below make another environment.
 .PHONY: test-oldest

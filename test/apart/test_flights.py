@@ -55,6 +55,7 @@ FURTHER: dict[str, Place] = dict.fromkeys(
 CONTROLLED |= FURTHER
 TOPIC_FLIGHTS = [*FLIGHTS, *(("coordinated_control", robot) for robot in FURTHER)]
 QUICK = [("planner", "sliding_masses"), ("coordinated_control", "planar_manipulator")]
+SLOW = [("planner", "surveyor"), ("coordinated_control", "servicer")]
 
 
 def robot_given(name: str, folder: Path) -> str:
@@ -92,7 +93,7 @@ def check_record(apart: NodesApart, python: WarmPython) -> None:
     apart.wait(lambda: apart.probe.count("odom") > heard + 10, "the bag's states have come again")
 
 
-@pytest.mark.parametrize(("node", "robot"), some_fast(TOPIC_FLIGHTS, *QUICK))
+@pytest.mark.parametrize(("node", "robot"), some_fast(TOPIC_FLIGHTS, *QUICK, slow=SLOW))
 def test_a_goal_on_the_topic_is_reached(
     apart: NodesApart, warm_python: WarmPython, node: str, robot: str
 ) -> None:
@@ -106,7 +107,7 @@ def test_a_goal_on_the_topic_is_reached(
     check_record(apart, warm_python)
 
 
-@pytest.mark.slow
+@pytest.mark.study
 @pytest.mark.parametrize(("node", "robot"), FLIGHTS)
 def test_a_goal_of_an_action_is_reached(
     apart: NodesApart, warm_python: WarmPython, node: str, robot: str
@@ -215,7 +216,7 @@ def test_a_second_goal_in_motion_is_flown(apart: NodesApart) -> None:
     assert [line for line in apart.complaints if "replaced" not in line] == []
 
 
-@pytest.mark.slow
+@pytest.mark.study
 @pytest.mark.parametrize("robot", ["sliding_masses", "seven_joint_arm"])
 def test_twenty_second_goals_in_motion_are_flown(apart: NodesApart, robot: str) -> None:
     """Ten for a robot whose plans are quick, and ten for one whose plans take seconds."""
@@ -241,7 +242,12 @@ RATES = [(node, rate) for node in SLIDE_AND_TURN for rate in (5.0, 10.0, 50.0, 2
 
 
 @pytest.mark.parametrize(
-    ("node", "rate"), some_fast(RATES, ("planner", 10.0), ("coordinated_control", 50.0))
+    ("node", "rate"),
+    some_fast(
+        RATES,
+        *(("planner", 10.0), ("coordinated_control", 50.0)),
+        slow=[("planner", 200.0), ("coordinated_control", 5.0)],
+    ),
 )
 def test_a_plant_of_any_rate_is_followed(apart: NodesApart, node: str, rate: float) -> None:
     robot, place = SLIDE_AND_TURN[node]

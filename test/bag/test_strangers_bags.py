@@ -332,7 +332,7 @@ def test_hostile_bags_do_no_harm(tmp_path: Path) -> None:
     assert all(o["code"] == 2 for o in found)
 
 
-@pytest.mark.slow
+@pytest.mark.study
 @pytest.mark.parametrize("operations", ["read,resume,play,salvage", "verify", "report", "replay"])
 def test_nothing_that_is_done_with_hostile_bags_does_harm(
     tmp_path: Path, own_domain: None, operations: str

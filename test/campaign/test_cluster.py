@@ -149,6 +149,7 @@ def test_a_worker_that_has_no_package_is_refused(tmp_path: Path) -> None:
                 assert re.fullmatch(f"drawn .*\n{expected}", run.log.read_text())
 
 
+@pytest.mark.study
 def test_workers_and_campaigns_that_are_killed(tmp_path: Path) -> None:
     file = tmp_path / "many.yaml"
     file.write_text(yaml.safe_dump({"campaign": section(**GIVEN)}))

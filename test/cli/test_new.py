@@ -415,7 +415,7 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-@pytest.mark.slow
+@pytest.mark.study
 @pytest.mark.parametrize("name", ROBOTS)
 @pytest.mark.usefixtures("own_domain")
 def test_a_robot_of_others_is_at_a_goal_in_two_commands(name: str, folder: Path) -> None:

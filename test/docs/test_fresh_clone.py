@@ -19,7 +19,7 @@ STAYS = "spacerobot up "
 """Words of a command that goes on until Ctrl-C: the commands after it talk to it."""
 
 pytestmark = [
-    pytest.mark.slow,
+    pytest.mark.study,
     pytest.mark.skipif(not (ROOT / ".git").exists(), reason="not a clone of the repository"),
 ]
 

@@ -33,7 +33,7 @@ LONGEST = 120.0
 STATUSES = ("planner/status", "controller/status", "plant/status")
 
 pytestmark = [
-    pytest.mark.slow,
+    pytest.mark.study,
     pytest.mark.skipif(shutil.which("ros2") is None, reason="the command ros2 is not installed"),
 ]
 

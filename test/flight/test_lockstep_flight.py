@@ -70,7 +70,9 @@ def assert_same(flight: Flight, other: Flight, tolerance: float = 0.0) -> None:
         np.testing.assert_allclose(mine.values[:count], sent.values, rtol=tolerance, atol=tolerance)
     assert flight.outcome is other.outcome
     assert flight.corrections == other.corrections
-    assert flight.manoeuvre_time == pytest.approx(other.manoeuvre_time, rel=1e-8)
+    # Statuses have no stamp: a recorder beside the nodes may have heard the next tick before one.
+    tick = flight.time[1] - flight.time[0]
+    assert flight.manoeuvre_time == pytest.approx(other.manoeuvre_time, abs=1.01 * tick)
 
 
 @pytest.mark.parametrize("bag", BAGS)
@@ -79,11 +81,6 @@ def test_reference_bags_are_flown_again_without_ros(bag: Path) -> None:
     flight, recorded = fly_scenario(recorded_scenario(read_bag(bag))), read_run(bag)
     assert len(recorded.time) > 25
     assert_same(flight, recorded, 1e-9)
-
-
-@pytest.fixture
-def own_domain(ros_domain: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("ROS_DOMAIN_ID", str(ros_domain))
 
 
 BROKEN = ["plant.tick_rate=50", "coordinated_control.tick_rate=50"]
@@ -97,15 +94,15 @@ BY_ROS = [
     pytest.param(
         "faults/broken_thrusters", [*BROKEN, *NOISY], Outcome.FAILED, marks=pytest.mark.slow
     ),
-    pytest.param("faults/stuck_elbow", [], Outcome.REACHED, marks=pytest.mark.slow),
+    pytest.param("faults/stuck_elbow", [], Outcome.REACHED, marks=pytest.mark.study),
     pytest.param("faults/late_poses", [], Outcome.REACHED, marks=pytest.mark.slow),
-    pytest.param("faults/weak_motors", [], Outcome.REACHED, marks=pytest.mark.slow),
-    pytest.param("faults/wrong_masses", [], Outcome.REACHED, marks=pytest.mark.slow),
-    pytest.param("faults/noisy_sensors", [], Outcome.REACHED, marks=pytest.mark.slow),
+    pytest.param("faults/weak_motors", [], Outcome.REACHED, marks=pytest.mark.study),
+    pytest.param("faults/wrong_masses", [], Outcome.REACHED, marks=pytest.mark.study),
+    pytest.param("faults/noisy_sensors", [], Outcome.REACHED, marks=pytest.mark.study),
     pytest.param("planar_chain", [], Outcome.REACHED, marks=pytest.mark.slow),
-    pytest.param("servicer", [], Outcome.REACHED, marks=pytest.mark.slow),
+    pytest.param("servicer", [], Outcome.REACHED, marks=pytest.mark.study),
     pytest.param("servicer_thrusters", [], Outcome.REACHED, marks=pytest.mark.slow),
-    pytest.param("gravity_gradient", [], Outcome.REACHED, marks=pytest.mark.slow),
+    pytest.param("gravity_gradient", [], Outcome.REACHED, marks=pytest.mark.study),
     pytest.param("sliding_masses", PUSHED, Outcome.FAILED, marks=pytest.mark.slow),
 ]
 

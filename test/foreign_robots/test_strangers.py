@@ -326,7 +326,7 @@ WRITTEN = {
 }
 
 
-@pytest.mark.slow
+@pytest.mark.study
 @pytest.mark.parametrize("kind", ["attitude", "position", "shape"])
 @pytest.mark.parametrize("name", WRITTEN)
 def test_a_robot_is_planned_for_in_time_and_ends_where_its_plan_says(

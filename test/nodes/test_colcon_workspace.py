@@ -103,7 +103,7 @@ def is_up_or_ended(process: subprocess.Popen[bytes], client: Client) -> bool:
     return process.poll() is not None or client.service_is_ready()
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_the_built_package_is_found_and_its_nodes_fly(
     workspace: Workspace, harness: Harness
 ) -> None:
@@ -142,7 +142,7 @@ def test_the_built_package_is_found_and_its_nodes_fly(
     assert b"package://spacerobot_ros/meshes/surveyor/bus.stl" in urdf
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_the_built_command_flies_and_its_bag_verifies(workspace: Workspace) -> None:
     # The script asks for the Python that colcon runs with, which here has nothing but colcon.
     command = f"python3 {workspace.prefix / 'lib' / 'spacerobot_ros' / 'spacerobot'}"

@@ -122,7 +122,7 @@ FLY_TO = action_class("spacerobot_msgs", "FlyTo")
 NAVIGATE = action_class("nav2_msgs", "NavigateToPose")
 
 pytestmark = [
-    pytest.mark.slow,
+    pytest.mark.study,
     pytest.mark.skipif(FLY_TO is None or NAVIGATE is None, reason="the packages are not built"),
 ]
 

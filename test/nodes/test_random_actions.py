@@ -54,7 +54,7 @@ def test_actions_that_once_found_a_defect_find_none(
     assert not flight.figures.violations, flight.figures.violations[0]
 
 
-@pytest.mark.slow
+@pytest.mark.study
 @MODES
 @pytest.mark.parametrize("setup", list(SETUPS))
 def test_many_random_actions_leave_every_state_as_specified(

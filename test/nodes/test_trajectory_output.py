@@ -19,7 +19,7 @@ from spacerobot_ros.nodes.common.fly_to import action_class
 FOLLOW = action_class("control_msgs", "FollowJointTrajectory")
 
 pytestmark = [
-    pytest.mark.slow,
+    pytest.mark.study,
     pytest.mark.skipif(FOLLOW is None, reason="the package is not built"),
 ]
 

@@ -206,12 +206,12 @@ def test_foxglove_commands_what_the_nodes_offer(foxglove: dict[str, Any]) -> Non
 ROOT = Path(__file__).resolve().parents[2]
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_actions_are_served_by_both_kinds_of_interface() -> None:
     _run("test_fly_to.py", SPACEROBOT_MSGS, NAV2_MSGS)
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_schedules_are_flown_by_a_trajectory_server() -> None:
     _run("test_trajectory_output.py", CONTROL_MSGS)
 
@@ -220,7 +220,7 @@ def _run(tests: str, *packages: InterfacePackage) -> None:
     """Run tests of nodes with packages that are built."""
     environment = {**os.environ, **with_interfaces(*packages)}
     run = subprocess.run(
-        [sys.executable, "-m", "pytest", "-q", "-s", "-p", "no:cacheprovider", "-rs", "-m", "slow",
+        [sys.executable, "-m", "pytest", "-q", "-s", "-p", "no:cacheprovider", "-rs", "-m", "study",
          f"test/nodes/{tests}"],
         cwd=ROOT, env=environment, capture_output=True, text=True, check=False,
     )  # fmt: skip
@@ -233,7 +233,7 @@ def _run(tests: str, *packages: InterfacePackage) -> None:
 # -- the real /tf ------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_frames_on_the_real_topic_are_those_of_odom_and_pinocchio() -> None:
     environment = {**os.environ, **with_interfaces(TF2_MSGS)}
     run = subprocess.run(

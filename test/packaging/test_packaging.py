@@ -123,7 +123,7 @@ def test_a_node_has_a_script_that_runs_its_module() -> None:
         assert f'sys.exit(run_module("{module_of(node)}"))\n' in script.read_text()
 
 
-@pytest.mark.slow
+@pytest.mark.study
 @pytest.mark.parametrize("setuptools", SETUPTOOLS)
 def test_pip_installs_nodes_that_run_outside_an_active_environment(
     project: Path, tmp_path: Path, setuptools: str
@@ -149,7 +149,7 @@ def colcon(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return colcon_program(tmp_path_factory.mktemp("colcon"))
 
 
-@pytest.mark.slow
+@pytest.mark.study
 @pytest.mark.parametrize("options", [[], ["--symlink-install"]], ids=["copies", "symlinks"])
 def test_colcon_builds_a_package_in_which_ros2_run_finds_the_nodes(
     project: Path, tmp_path: Path, colcon: Path, options: list[str]
@@ -457,7 +457,7 @@ repositories:
     }
 
 
-@pytest.mark.slow
+@pytest.mark.study
 @pytest.mark.skipif(not CHECKOUT, reason="SPACEROBOT_ROSDISTRO names no checkout of rosdistro")
 def test_the_list_is_that_of_rosdistro() -> None:
     found = resolved(keys_of(*MANIFESTS), Path(CHECKOUT))

@@ -411,7 +411,7 @@ def cases(name: str, drift: float, count: int) -> Iterator[Case]:
         yield Case(robot, state, rotvec, schedule.duration, cpu)
 
 
-@pytest.mark.slow
+@pytest.mark.study
 @pytest.mark.parametrize("drift", LEAST_PLANNED)
 def test_robots_that_drift_are_planned_for(drift: float) -> None:
     planned, count = 0, 0

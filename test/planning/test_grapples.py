@@ -145,7 +145,10 @@ def test_meetings_that_cannot_be_are_refused_in_a_sentence() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("detumble", "least", "most"), [("after", 10.0, 20.0), ("before", 0, 1.0)])
+@pytest.mark.parametrize(
+    ("detumble", "least", "most"),
+    [("after", 10.0, 20.0), pytest.param("before", 0, 1.0, marks=pytest.mark.study)],
+)
 def test_the_plant_has_what_a_planned_grasp_leaves(
     detumble: str, least: float, most: float
 ) -> None:

@@ -208,7 +208,7 @@ def rows_of_all() -> list[Row]:
     return []
 
 
-@pytest.mark.slow
+@pytest.mark.study
 @pytest.mark.parametrize("name", ROBOTS)
 def test_plans_to_random_goals_keep_clear(
     name: str, tmp_path: Path, rows_of_all: list[Row]
@@ -231,7 +231,7 @@ def test_plans_to_random_goals_keep_clear(
             assert each.same
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_clearance_costs_little_over_all_robots(rows_of_all: list[Row]) -> None:
     found = summary_of(rows_of_all)
     print(f"all robots: {found}", flush=True)
@@ -274,7 +274,7 @@ FLOWN_ROBOTS = {
 """Shape at the start, rad, and methods by robot."""
 
 
-@pytest.mark.slow
+@pytest.mark.study
 @pytest.mark.parametrize(
     ("name", "method"),
     [(name, each) for name, (_, given) in FLOWN_ROBOTS.items() for each in given],
@@ -343,7 +343,7 @@ def goal_of(robot: SpaceRobot, start: Array, number: int, rng: np.random.Generat
     return Goal.checked(robot.center_of_mass(start) - there, turn)
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_plans_are_as_short_as_those_of_long_searches() -> None:
     """At least 97 % of the durations are within 2 % of those by a search from sixty guesses."""
     ratios: list[float] = []
@@ -416,7 +416,7 @@ def planned(name: str, count: int) -> Iterator[GaitSchedule]:
         yield schedule
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_flown_times_are_those_of_the_solutions() -> None:
     """Rounded up to a tick; beyond that, at most 3 % in 95 % of the cases and never three ticks."""
     longer, beyond, ticks = [], [], []
@@ -562,7 +562,7 @@ def rock_on_the_way(
     return rock if nearest >= 2 * CLEARANCE else None
 
 
-@pytest.mark.slow
+@pytest.mark.study
 @pytest.mark.parametrize("name", MOVING_ROBOTS)
 def test_plans_in_motion_keep_clear(name: str, tmp_path: Path) -> None:
     robot = SpaceRobot.from_file(robot_file(name))

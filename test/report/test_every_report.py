@@ -17,7 +17,7 @@ from spacerobot_ros.scenario import load_scenario, scenario_names
 from spacerobot_ros.session.run import run_scenario
 
 pytestmark = [
-    pytest.mark.slow,
+    pytest.mark.study,
     pytest.mark.skipif(chromium() is None, reason="no Chromium to look at the page with"),
 ]
 

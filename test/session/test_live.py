@@ -12,7 +12,6 @@ from collections import defaultdict
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import replace
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -138,7 +137,7 @@ def test_a_planner_that_dies_is_started_again_within_the_limit(
         assert robot.wait(PATIENCE) == 2
 
 
-@pytest.mark.slow
+@pytest.mark.study  # In real time, which a busy machine does not keep.
 def test_a_robot_that_is_up_reports_changes_and_not_each_number(spacerobot: Command) -> None:
     settings = ("--rate", "5", "--set", "coordinated_control.time_limit=8")
     with spacerobot.start("up", "coordinated_control", *settings) as robot:
@@ -149,9 +148,7 @@ def test_a_robot_that_is_up_reports_changes_and_not_each_number(spacerobot: Comm
         assert missed.returncode == 1, missed.stdout + missed.stderr
         robot.send_signal(signal.SIGINT)
         later = [line.split(";")[0].split(":")[0].strip() for line in lines]
-    assert (later[0], later[-1]) == ("Flying to the goal", "The goal is not reached in time")
-    # A busy machine does not keep real time, and the controller waits for states.
-    assert all(one != next_one for one, next_one in pairwise(later))
+    assert later == ["Flying to the goal", "The goal is not reached in time"]
 
 
 @pytest.mark.slow

@@ -16,7 +16,7 @@ from spacerobot_ros.cli.main import main
 from spacerobot_ros.report import write_report
 
 pytestmark = [
-    pytest.mark.slow,
+    pytest.mark.study,
     pytest.mark.skipif(chromium() is None, reason="no Chromium to open pages with"),
     pytest.mark.skipif(not AXE.exists(), reason="no axe-core: make accessibility"),
 ]

@@ -27,7 +27,7 @@ from spacerobot_ros.viewer.page import CAMERA, view_beside_panel
 from spacerobot_ros.viewer.scene import reach_of
 
 pytestmark = [
-    pytest.mark.slow,
+    pytest.mark.study,
     pytest.mark.skipif(chromium() is None, reason="no Chromium to open the page with"),
 ]
 

@@ -18,7 +18,7 @@ from support.up import PATIENCE, Up
 from support.viewer_page import Page
 
 pytestmark = [
-    pytest.mark.slow,
+    pytest.mark.study,
     pytest.mark.skipif(chromium() is None, reason="no Chromium to open the page with"),
 ]
 

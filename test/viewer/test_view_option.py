@@ -111,7 +111,7 @@ def ended(process: subprocess.Popen[str], domain: int) -> float:
     return time.monotonic() - began
 
 
-@pytest.mark.slow
+@pytest.mark.study
 @pytest.mark.skipif(chromium() is None, reason="no Chromium to open the page with")
 def test_a_recording_is_moved_in_time(ros_domain: int, tmp_path: Path) -> None:
     bag = ROOT / "bags" / "planar_chain.mcap"
@@ -139,7 +139,7 @@ def test_a_recording_is_moved_in_time(ros_domain: int, tmp_path: Path) -> None:
         assert ended(process, ros_domain) < 4.0
 
 
-@pytest.mark.slow
+@pytest.mark.study
 @pytest.mark.skipif(chromium() is None, reason="no Chromium to open the page with")
 def test_the_momentum_budget_of_a_recording_is_seen(ros_domain: int, tmp_path: Path) -> None:
     bag = ROOT / "bags" / "wheels.mcap"
@@ -155,7 +155,7 @@ def test_the_momentum_budget_of_a_recording_is_seen(ros_domain: int, tmp_path: P
         assert ended(process, ros_domain) < 4.0
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_a_stack_and_its_viewer_end_together(ros_domain: int, tmp_path: Path) -> None:
     words = ("up", "sliding_masses", "--processes", "--rate", "4")
     with viewed(ros_domain, tmp_path, *words) as (process, _):
@@ -163,7 +163,7 @@ def test_a_stack_and_its_viewer_end_together(ros_domain: int, tmp_path: Path) ->
         assert ended(process, ros_domain) < 6.0
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_a_command_that_is_killed_leaves_no_viewer(ros_domain: int, tmp_path: Path) -> None:
     with viewed(ros_domain, tmp_path, "up", "sliding_masses") as (process, _):
         process.kill()
