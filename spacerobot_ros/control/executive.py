@@ -366,9 +366,9 @@ class ControlExecutive:
         not reached.
         """
         met = [each for each in contacts if each not in self._contacts]
-        if met and not self._touched and self._goal_state is _TRACKING:
-            self._touched = f"{met[0]} touched at {time:.4g} s"
         self._contacts = contacts
+        if not self._touched and self._goal_state is _TRACKING:
+            self._touched = _touch(met, time)
 
     def on_plant_obeying(self) -> None:
         """Hold the pose of the next measured state, not an earlier one."""
@@ -691,7 +691,7 @@ class ControlExecutive:
 
     def _begin_tasks(self, time: float, tasks: tuple[Task, ...]) -> None:
         self.servicing.begin(tasks)
-        self._touched = ""
+        self._touched = _touch(self._contacts, time)
         self._begin_tracking(time)
         self._wait_for_tasks()
 
@@ -753,7 +753,7 @@ class ControlExecutive:
             self.controller.set_goals(time, state, **poses)
         if not (carried or again):
             self._report_acceptance()
-            self._touched = ""
+            self._touched = _touch(self._contacts, time)
         self._begin_tracking(time)
         self.outputs.append(PursuedGoals(self._goals_to_save()))
 
@@ -895,6 +895,11 @@ class ControlExecutive:
                 return "The base is not measured any more: thrusters off, joints brought to rest."
             case ControllerState.REFUSED:
                 raise ValueError("a refusal has a message of its own")
+
+
+def _touch(contacts: Sequence[str], time: float) -> str:
+    """Return a clause on the first of some contacts at a time, s; empty: there is none."""
+    return f"{contacts[0]} touched at {time:.4g} s" if contacts else ""
 
 
 _NOTHING_MISSED: Mapping[str, str] = MappingProxyType({})

@@ -574,8 +574,8 @@ class FlightData:
         if missed:
             word += ", but the target is not captured"
         succeeded = self.outcome is Outcome.REACHED and not missed
-        error, tolerance = self._last_error, self._tolerances
-        if error is None or tolerance is None or self.goal is None:
+        error, tolerance, goal = self._last_error, self._tolerances, self.goal
+        if error is None or tolerance is None:
             sentence = self.message
             if left_out and "not controlled" not in sentence:
                 sentence += f" Not controlled: {' and '.join(left_out)}."
@@ -587,7 +587,7 @@ class FlightData:
             controls -= {"position", "attitude"}
         if not error.end_effectors:
             controls -= {"end_effectors"}
-        errors = describe_remaining_error(error, controls, tolerance, self.goal)
+        errors = describe_remaining_error(error, controls, tolerance, goal)
         within = tolerance.admits(error, controls)
         touched = self.message.startswith("The goal is not reached without contact")
         if late and within and not touched:
@@ -598,7 +598,8 @@ class FlightData:
                 f"The measured pose is within tolerance of the goal; the true one is {errors}."
             )
             return Verdict("Reached by the measured pose", sentence)
-        parts = missed_parts(self.goal, error, frozenset(controls), tolerance)
+        controlled = frozenset(controls)
+        parts = {} if goal is None else missed_parts(goal, error, controlled, tolerance)
         if not self.turns_end_effector:
             parts |= missed_turn(error.largest_end_effector_angle, tolerance)
         if self.outcome is Outcome.REACHED_PARTLY and parts and not missed:

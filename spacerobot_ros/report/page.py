@@ -144,7 +144,7 @@ def _runs_html(flight: FlightReport, beside: Sequence[FlightReport]) -> list[str
 def _numbers_html(flight: FlightReport) -> list[str]:
     result, joints = result_table(flight), joint_table(flight)
     parts = ["<h2>Numbers of the run</h2>"]
-    if flight.goal is None:
+    if flight.goal is None and not flight.tool_goals:
         parts.append('<p class="missing">The bag holds no goal pose.</p>')
     if result.rows:
         parts.append(table("numbers", (), result.rows))

@@ -87,6 +87,17 @@ def test_a_goal_behind_a_panel_is_reached_round_it() -> None:
     assert "settling" not in straight.verdict.sentence
 
 
+def test_a_robot_that_touches_a_panel_from_the_start_fails_on_its_way() -> None:
+    at_panel = {"initial_position": [1.5, 0.6, 0.0]}
+    scenario = load_scenario("free_flyer").with_overrides("coordinated_control", STRAIGHT)
+    goal = Goal.checked([1.5, 0.2, 0.0], [0.0, 0.0, 0.0, 1.0])
+    flight = fly_scenario(scenario.with_overrides("plant", at_panel).with_other_goal(goal))
+    assert np.linalg.norm(flight.pose[-1, :3] - goal.position) < 5e-3
+    assert flight.outcome is Outcome.FAILED
+    touched = "link 'base_link' and obstacle 'panel' touched at 0 s"
+    assert touched in flight.message
+
+
 def test_a_goal_without_a_plan_is_refused_and_the_robot_holds() -> None:
     inside = Goal.from_rotvec([1.5, 0.75, 0.1], [0.0, 0.0, 0.4])
     for goal, settings, words in (

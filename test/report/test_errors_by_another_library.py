@@ -297,6 +297,20 @@ def test_errors_of_recorded_flights(name: str, position_counts: bool) -> None:
         assert f" and {error:.3g} at the joints from the goal" in flight.verdict.sentence
 
 
+def test_a_goal_of_the_end_effector_alone_is_judged_by_its_error(tmp_path: Path) -> None:
+    bag, goal = tmp_path / "far.mcap", np.array([9.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
+    short = {"coordinated_control.time_limit": 40.0}
+    flight = fly("servicer", end_effector_pose=goal, parameters=short)
+    flight.save(bag)
+    read = read_flight(open_flight_bag(bag))
+    assert read.verdict == flight.verdict
+    hand = read.signal("end_effector_pose").values[-1]
+    distance = float(np.linalg.norm(goal[:3] - hand[:3]))
+    angle = float((Rotation.from_quat(goal[3:]) * Rotation.from_quat(hand[3:]).inv()).magnitude())
+    numbers = [shown(read.verdict.sentence, f"# {unit}") for unit in ("m and", "rad from the goal")]
+    assert numbers == pytest.approx([distance, angle], rel=6e-3)
+
+
 def test_a_goal_that_only_the_measured_pose_reaches_is_not_called_reached(tmp_path: Path) -> None:
     """The position is measured 0.1 m off; its tolerance is 0.001 m."""
     flight, bag = fly("faults/biased_pose"), tmp_path / "biased.mcap"
