@@ -108,7 +108,8 @@ def run_command(
         raise click.UsageError("--view needs --realtime: a flight in lockstep is over soon.")
     usual = bag or Path("out") / f"{chosen.name}.mcap"
     taken, path = os.path.lexists(usual), bag or free_name(usual)
-    with viewer_if_requested(view, chosen.parameters("viewer")), display(chosen.name) as shown:
+    page = viewer_if_requested(view, chosen.parameters("viewer"), settings=settings)
+    with page, display(chosen.name) as shown:
         by_nodes = nodes or realtime is not None
         result = run_scenario(chosen, path, shown.fly, nodes=by_nodes, longest=longest)
     path = Path(result.summary["bag"])
@@ -328,7 +329,7 @@ def up_command(
 
         shown["scenario_goals"] = goals_to_text(chosen.goal, chosen.end_effector_goal)
     parameters = {**shown, **chosen.parameters("viewer")}
-    with viewer_if_requested(view, parameters, namespace) as viewer:
+    with viewer_if_requested(view, parameters, namespace, settings) as viewer:
         if viewer is not None:
             viewer.restart_within(restarts)
         recorded = run_until_stopped(

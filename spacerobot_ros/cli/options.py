@@ -438,9 +438,15 @@ LAWS = "spacerobot_ros.control.laws.registry:LAWS"
 
 @contextmanager
 def viewer_if_requested(
-    view: bool, parameters: Mapping[str, Any], namespace: str = ""
+    view: bool, parameters: Mapping[str, Any], namespace: str = "", settings: Sequence[str] = ()
 ) -> Iterator[Viewer | None]:
-    """Run the viewer beside a command if ``view``; its address is written to standard error."""
+    """Run the viewer beside a command if ``view``; its address is written to standard error.
+
+    Without it ``settings``, those of ``--set``, are not to name parameters of the viewer.
+    """
+    for text in () if view else settings:
+        if text.startswith("viewer."):
+            raise click.UsageError(f"'{text}' is a setting of the web page: add --view.")
     if not view:
         yield None
         return

@@ -848,8 +848,9 @@ class ControlExecutive:
         task = self.servicing.task
         name = "" if task is None else task.value
         ends = self.controller.reference_ends
-        settled = 0.0
-        if state is ControllerState.TRACKING and task is None and ends is not None:
+        settled = 0.0  # Also while another motion is planned, whose end is not known.
+        flies = state is ControllerState.TRACKING and task is None and not self._planning.active
+        if flies and ends is not None:
             settled = ends + self._config.settle_time
         report = self._command_report
         self.outputs.append(ControllerStatus(state, message, about, report, name, settled))
@@ -876,7 +877,10 @@ class ControlExecutive:
                 return self.servicing.message
             case ControllerState.TRACKING:
                 away = self.controller.distance_from_reference()
-                later = "; planning a motion to a later goal" if self._planning.active else ""
+                later = "; planning a motion to a later goal"
+                if self._latest_id() == self._goal_id:
+                    later = "; planning another motion to it"
+                later *= self._planning.active
                 return f"Flying to the goal; {away} from the reference{later}."
             case ControllerState.STALLED:
                 away = self.controller.distance_from_reference()

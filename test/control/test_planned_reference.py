@@ -205,6 +205,32 @@ def test_motions_are_planned_anew_around_obstacles_that_come_in_flight() -> None
             assert "'ball'" in told
 
 
+def test_a_status_in_flight_says_for_what_another_motion_is_planned() -> None:
+    rig = Follower(plan_in_background=True, status_period=0.02)
+    rig.answer()
+    goal, other = (Goal.from_rotvec(x, [0.0] * 3) for x in ([1.3, 0.2, 0.1], [0.5, -0.9, 0.4]))
+    rig.executive.submit("base", IdentifiedGoal(goal, "first"))
+    while rig.executive.state is not ControllerState.TRACKING:
+        rig.answer()
+    between = ball((PLACE + goal.position) / 2)
+    for event, words in (
+        ("", "the reference."),
+        ("obstacle", "planning another motion to it."),
+        ("goal", "planning a motion to a later goal."),
+    ):
+        if event == "obstacle":
+            rig.executive.use_obstacles(between)
+        elif event == "goal":
+            rig.executive.submit("base", IdentifiedGoal(other, "other"))
+        for _ in range(3):
+            rig.answer()
+        status = rig.executive.outputs[-1]
+        assert isinstance(status, ControllerStatus)
+        assert status.message.endswith(words)
+        assert (status.ends_at_s > 0.0) == (not event)
+    rig.executive.reset()
+
+
 def ball(place: np.ndarray) -> RobotDescription:
     return parse_world(
         '<robot name="w"><link name="w"/><link name="ball"><collision><geometry><sphere '

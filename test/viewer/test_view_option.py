@@ -31,6 +31,15 @@ def test_a_lockstep_flight_is_over_before_it_is_seen() -> None:
     assert "--view needs --realtime" in refused.output
 
 
+def test_settings_of_a_page_that_is_not_served_are_refused() -> None:
+    from click.testing import CliRunner
+
+    for command in (["up", "planar_chain"], ["run", "planar_chain", "--realtime"]):
+        refused = CliRunner().invoke(main, [*command, "--set", "viewer.host=0.0.0.0"])
+        assert refused.exit_code == 2
+        assert "'viewer.host=0.0.0.0' is a setting of the web page: add --view." in refused.output
+
+
 def test_the_viewer_gives_way_to_what_flies_within_its_session_and_among_sessions() -> None:
     with subprocess.Popen(["sleep", "60"], start_new_session=True) as process:
         try:

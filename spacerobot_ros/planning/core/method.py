@@ -97,6 +97,12 @@ class EmptyOptions:
 BEYOND_EFFORT_LIMITS = "beyond_effort_limits"
 """Name of the note about joints that take more than their effort limits."""
 
+NO_JOINTS = (
+    "Robot '{}' has no joints that could move its base. If it has thrusters, "
+    "coordinated_control flies it; with `profile: planned` it plans the motion."
+)
+"""Refusal of a robot by methods, with its name."""
+
 
 class GaitMethod(ABC):
     """An algorithm that turns a goal pose into a gait.

@@ -21,7 +21,7 @@ from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.integration import DEFAULT_INTEGRATION_STEP
 from spacerobot_ros.planning.core.cancellation import NEVER, Cancellation, PlanningCancelled
 from spacerobot_ros.planning.core.goal import POSE, Controlled, PoseError
-from spacerobot_ros.planning.core.method import GaitMethod, PlanRequest
+from spacerobot_ros.planning.core.method import NO_JOINTS, GaitMethod, PlanRequest
 from spacerobot_ros.planning.core.schedule import GaitSchedule
 
 
@@ -81,6 +81,8 @@ class AutoGait(GaitMethod):
             No method plans; the messages of all of them say why. It is an `UnreachableError` where
             one of them proves it, and else a `NotFoundError` where one of them searched.
         """
+        if not self.robot.n:
+            raise PlanningError(NO_JOINTS.format(self.robot.description.name))
         refusals = dict(self._unsuitable)
         names = self._comparable_methods(refusals)
         if request.goal.end_effectors:

@@ -33,7 +33,7 @@ from spacerobot_ros.planning.core.controllability import (
     tilted_goal_error,
 )
 from spacerobot_ros.planning.core.goal import POSITION_SLACK, Controlled, RobotState
-from spacerobot_ros.planning.core.method import PlanRequest
+from spacerobot_ros.planning.core.method import NO_JOINTS, PlanRequest
 from spacerobot_ros.planning.methods.optimal.motion_bounds import CenterReach
 from spacerobot_ros.planning.methods.optimal.problem import (
     BoundaryConditions,
@@ -123,7 +123,7 @@ class GoalSpecification:
         """
         name = robot.description.name
         if robot.n == 0:
-            raise PlanningError(f"Robot '{name}' has no joints that could move its base.")
+            raise PlanningError(NO_JOINTS.format(name))
         if self.attitude and self.base_rotations.turns_base and not len(self.base_rotations.axes):
             raise PlanningError(
                 f"The attitude of robot '{name}' is uncontrollable: its joints rotate its base "
