@@ -45,6 +45,17 @@ def quantity(value: float, unit: str) -> str:
     return f"{factor * value:.3g} {prefix if size else ''}{unit}"
 
 
+def numbers(values: Iterable[float], digits: int = 5) -> str:
+    """Return numbers as text, with ``digits`` decimals; a rounded zero has no sign."""
+    return ", ".join(f"{round(float(x), digits) + 0.0:.{digits}f}" for x in values)
+
+
+def shortened(name: str, length: int = 21) -> str:
+    """Return a name, its middle left out if it is too long for a label."""
+    half = (length - 1) // 2
+    return name if len(name) <= length else f"{name[:half]}…{name[-half:]}"
+
+
 class SpaceRobotError(Exception):
     """Base of all errors of this package; the message is one sentence for the user.
 

@@ -24,7 +24,6 @@ from spacerobot_ros.cli.options import (
     end_effector_options,
     goal_options,
     json_option,
-    numbers,
     registered_option,
     report_option,
     settings_option,
@@ -34,7 +33,7 @@ from spacerobot_ros.cli.options import (
     write_json,
 )
 from spacerobot_ros.cli.terminal import display, exit_if_terminated, fail
-from spacerobot_ros.errors import quantity
+from spacerobot_ros.errors import numbers, quantity
 from spacerobot_ros.termination import termination
 
 if TYPE_CHECKING:

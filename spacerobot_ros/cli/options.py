@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stdout
 from dataclasses import dataclass, field
 from functools import cached_property, wraps
@@ -485,8 +485,3 @@ def write_json(path: Path, content: Any, indent: int | None = 2) -> None:
         click.echo(text, file=output, nl=False)
     else:
         write_output(path, text)
-
-
-def numbers(values: Iterable[float], digits: int = 5) -> str:
-    """Return numbers as text, with ``digits`` decimals; a rounded zero has no sign."""
-    return ", ".join(f"{round(x, digits) + 0.0:.{digits}f}" for x in values)

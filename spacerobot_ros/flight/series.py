@@ -44,6 +44,10 @@ class Signal:
         first, last = np.searchsorted(self.time, [start - 1e-9, end + 1e-9])
         return Signal(self.time[first:last], self.values[first:last])
 
+    def norms(self, columns: Sequence[int]) -> Signal:
+        """Return the norms (N, 1) of some columns."""
+        return Signal(self.time, np.linalg.norm(self.values[:, columns], axis=1, keepdims=True))
+
     def relative_to_first(self) -> Signal:
         """Return the changes since the first sample."""
         return Signal(self.time, self.values - self.values[:1])

@@ -585,11 +585,6 @@ def fit_legend(legend: Legend, room: float) -> None:
         text.set_fontsize(share * float(text.get_fontsize()))
 
 
-def short(name: str) -> str:
-    """Return a name, its middle left out if it is too long for a label."""
-    return name if len(name) <= 22 else f"{name[:10]}…{name[-11:]}"
-
-
 def scaled(unit: str, largest: float) -> tuple[float, str]:
     """Return factor and unit that suit values of at most ``largest``."""
     if unit not in ("m", "rad") or largest == 0.0 or largest >= 0.05:

@@ -14,7 +14,7 @@ from typing import Literal
 import numpy as np
 from matplotlib.axes import Axes
 
-from spacerobot_ros.errors import RobotDescriptionError, sentence_case
+from spacerobot_ros.errors import RobotDescriptionError, sentence_case, shortened
 from spacerobot_ros.flight.captures import BUDGET_PARTS
 from spacerobot_ros.flight.series import Signal
 from spacerobot_ros.measures import momentum_change
@@ -47,7 +47,6 @@ from spacerobot_ros.report.figures import (
     set_range,
     set_time,
     sheet,
-    short,
 )
 from spacerobot_ros.report.flight import FlightReport, joint_unit, pose_errors
 from spacerobot_ros.report.signals import Cycles, Indices, envelope
@@ -76,14 +75,18 @@ EVENTS_CAPTION = (
 )
 
 
-def draw_whole_flight(
-    axes: Axes, flight: FlightReport, group: TraceGroup, share: float = 1.0
+def draw_group(
+    axes: Axes, group: TraceGroup, end: float, share: float = 1.0, later: Sequence[float] = ()
 ) -> bool:
-    """Draw traces over the whole flight; return whether any is drawn as a band."""
+    """Draw traces from zero to an end, s, and marks of ``later`` schedules at their starts, s.
+
+    Return whether any trace is drawn as a band.
+    """
+    set_time(axes, 0.0, max([end, *(float(each.time[-1]) for each in group.signals)]))
     if group.rows:
-        return _draw_rows(axes, flight, group, share)
+        return _draw_rows(axes, group, share)
     if group.decades:
-        _draw_decades(axes, flight, group)
+        _draw_decades(axes, group)
         return False
     colours = group.colours
     values = np.concatenate([group.values, [g[3] for g in group.goals]])
@@ -111,25 +114,19 @@ def draw_whole_flight(
         axes.hlines(value, start, end, color=colours[index], ls=(0, DASHES), lw=1.2, zorder=3)
     if group.goals:
         keys.append(legend_entry(SECONDARY_COLOUR, "goal", DASHES))
-    later = [time for time, _ in flight.executing[1:]]
     if len(later) > _MAX_MARKED_SCHEDULES or group.beside:
-        later = []
+        later = ()
     for time in later:
         axes.axvline(time, color=LINE_COLOUR, lw=1.0, zorder=1.5)
     if later:
         keys.append(legend_entry(LINE_COLOUR, "new schedule"))
     legend_above(axes, keys)
-    set_time(axes, 0.0, _end(flight, group))
     axes.set_ylabel(f"{group.label} ({group.unit})")
     _label_trace_ends(axes, group.signal, group)
     return dense
 
 
-def _end(flight: FlightReport, group: TraceGroup) -> float:
-    return max([flight.end, *(float(each.time[-1]) for each in group.signals)])
-
-
-def _draw_decades(axes: Axes, flight: FlightReport, group: TraceGroup) -> None:
+def _draw_decades(axes: Axes, group: TraceGroup) -> None:
     """Draw positive traces on a logarithmic axis; smaller values lie on its lower edge."""
     floor, top = log_range(group.values, group.decades)
     axes.set_yscale("log")
@@ -157,7 +154,6 @@ def _draw_decades(axes: Axes, flight: FlightReport, group: TraceGroup) -> None:
     legend_above(axes, keys)
     axes.minorticks_off()
     axes.yaxis.set_major_formatter(lambda value, _: power_of_ten(value))
-    set_time(axes, 0.0, _end(flight, group))
     if several:
         axes.set_title("" if narrow() else group.label)
     axes.set_ylabel(group.unit if several else f"{group.label} ({group.unit})")
@@ -197,11 +193,11 @@ def time_figure(
         named = enumerate(flights)
         keys = [legend_entry(SECONDARY_COLOUR, text, flight_dashes(k)) for k, text in named]
         figure.legend(handles=keys, loc="upper center", borderaxespad=0.1, handlelength=3.0)
-    share = min(1.0, 4 / len(groups))
+    share, later = min(1.0, 4 / len(groups)), [time for time, _ in flight.executing[1:]]
     dense = []
     for number, group in enumerate(groups):
         whole, *below_it = panels[number * len(rows) : (number + 1) * len(rows)]
-        dense.append(draw_whole_flight(whole[0], flight, group, share))
+        dense.append(draw_group(whole[0], group, flight.end, share, later))
         if cycles is not None:
             whole[0].set_title("whole flight")
             first, last = (axes for row in below_it for axes in row)
@@ -288,7 +284,7 @@ def _layout(
     return [[1.0], [1.0, 1.0]], [2.0, 1.35] * len(groups)
 
 
-def _draw_rows(axes: Axes, flight: FlightReport, group: TraceGroup, share: float) -> bool:
+def _draw_rows(axes: Axes, group: TraceGroup, share: float) -> bool:
     """Draw each trace as a band in a row of its own, the first on top."""
     columns = max(int(TRACE_TIME_SLICES * share), 20)
     count, signal = len(group.names), group.signal
@@ -309,7 +305,6 @@ def _draw_rows(axes: Axes, flight: FlightReport, group: TraceGroup, share: float
     axes.tick_params(axis="y", length=0, labelsize="small")
     axes.grid(axis="y", visible=False)
     axes.set_title(f"{group.label} ({group.unit})")
-    set_time(axes, 0.0, flight.end)
     return dense
 
 
@@ -426,7 +421,7 @@ def joint_groups(
             part = Signal(signal.time, signal.values[:, chosen])
             colours = [colour(i) for i in chosen]
             groups.append(
-                TraceGroup(part, list(map(short, names)), label, unit, colours, limits=limits)
+                TraceGroup(part, list(map(shortened, names)), label, unit, colours, limits=limits)
             )
     return groups
 
@@ -589,7 +584,7 @@ def thrusters_figure(flight: FlightReport) -> ReportFigure | str | None:
     duty = Signal(whole.time, whole.values[:, used])
     tints = [colour(k) for k in range(len(used))]
     label, unit = "thrusters", "share of each tick that they are on"
-    groups = [TraceGroup(duty, [short(names[k]) for k in used], label, unit, tints, rows=True)]
+    groups = [TraceGroup(duty, [shortened(names[k]) for k in used], label, unit, tints, rows=True)]
     impulse, propellant = flight.impulse, flight.series.get("propellant")
     groups.append(TraceGroup(impulse, ["impulse"], "impulse given", "N s", [PALETTE[0]]))
     caption = "Share of each tick that each thruster was on; below, the impulse of all of them"
@@ -723,8 +718,7 @@ def errors_figure(flight: FlightReport) -> ReportFigure | str | None:
         for k, (half, *_) in enumerate(_ERROR_PARTS):
             chosen = [i for i in flight.controls(part) if i // 3 == k]
             if len(errors) and chosen and half not in free:
-                norms = np.linalg.norm(errors.values[:, chosen], axis=1)
-                signal = Signal(errors.time, norms[:, np.newaxis])
+                signal = errors.norms(chosen)
                 groups.append(_error_group(flight, signal, half, of, colour(number)))
     if not groups:
         return None
@@ -765,10 +759,9 @@ def link_errors_figure(flight: FlightReport) -> ReportFigure | str | None:
         return flight.hidden_links_text or None if flight.link_goals else None
     groups: list[TraceGroup] = []
     for number, (link, errors) in enumerate(flight.link_errors.items()):
-        for part, quantity, _ in _ERROR_PARTS:
-            signal: Signal = getattr(errors, quantity)
+        for (part, *_), signal in zip(_ERROR_PARTS, errors, strict=True):
             if len(signal):
-                groups.append(_error_group(flight, signal, part, short(link), colour(number)))
+                groups.append(_error_group(flight, signal, part, shortened(link), colour(number)))
     caption = (
         "Distance of each link from the position of its goal, and angle from its attitude where "
         "that counts, on logarithmic axes; smaller values lie on the lower edge; dotted, the "

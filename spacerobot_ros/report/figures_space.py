@@ -10,6 +10,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
+from spacerobot_ros.errors import shortened
 from spacerobot_ros.flight.series import Signal
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.planning import PoseError
@@ -30,7 +31,6 @@ from spacerobot_ros.report.figures import (
     narrow,
     set_range,
     sheet,
-    short,
 )
 from spacerobot_ros.report.figures_over_time import (
     DASHES,
@@ -237,7 +237,7 @@ def path_figure(flight: FlightReport, beside: Sequence[FlightReport] = ()) -> Re
     for number, (link, poses) in enumerate(flight.link_poses.items()):
         tint = _LINK_COLOURS[number % len(_LINK_COLOURS)]
         paths.append((poses.values[:, :3], tint))
-        keys.append(legend_entry(tint, short(link)))
+        keys.append(legend_entry(tint, shortened(link)))
     if flight.planned:
         keys.append(legend_entry(PLANNED_COLOUR, "planned", DASHES))
     everything = np.concatenate(

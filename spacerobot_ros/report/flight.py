@@ -68,22 +68,6 @@ class GoalSpan:
     goal: Goal
 
 
-@dataclass(frozen=True)
-class LinkErrors:
-    """How far a link was from its goals, while it had one.
-
-    Attributes
-    ----------
-    distance
-        Distance from the goal (N, 1), m.
-    angle
-        Angle from the attitude of the goal (M, 1), rad; empty where any attitude will do.
-    """
-
-    distance: Signal
-    angle: Signal
-
-
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
 class FlightReport(Flight):
     """A flight and its bag, times in s since the first state; missing signals are empty.
@@ -331,9 +315,10 @@ class FlightReport(Flight):
         return {} if self.goal is None else {each.link: each for each in self.goal.end_effectors}
 
     @cached_property
-    def link_errors(self) -> dict[str, LinkErrors]:
-        """Errors of the true poses of links with goals, at up to two thousand states; none where
-        the bag lacks the robot's description or its states.
+    def link_errors(self) -> dict[str, tuple[Signal, Signal]]:
+        """Distances (N, 1), m, and angles (M, 1), rad, of the true poses of links from their goals,
+        at up to two thousand states; no angles where any attitude will do, and no links where the
+        bag lacks the robot's description or its states.
         """
         return {link: self._errors_of_link(link) for link in self.link_poses}
 
@@ -349,23 +334,17 @@ class FlightReport(Flight):
         time = self.position.time[rows]
         return {link: Signal(time, poses[link]) for link in links if link in poses}
 
-    def _errors_of_link(self, link: str) -> LinkErrors:
+    def _errors_of_link(self, link: str) -> tuple[Signal, Signal]:
         aims = [
-            (target, aim)
+            (GoalSpan(target.start, target.end, aim.as_goal()), aim.quaternion is not None)
             for target in self._all_targets
             for aim in target.goal.end_effectors
             if aim.link == link
         ]
-        norms = []
-        for columns, counted in (
-            (slice(0, 3), aims),
-            (slice(3, 6), [(target, aim) for target, aim in aims if aim.quaternion is not None]),
-        ):
-            spans = [GoalSpan(target.start, target.end, aim.as_goal()) for target, aim in counted]
-            errors = pose_errors(self.link_poses[link], spans)
-            off = np.linalg.norm(errors.values[:, columns], axis=1)
-            norms.append(Signal(errors.time, off[:, np.newaxis]))
-        return LinkErrors(*norms)
+        poses = self.link_poses[link]
+        distances = pose_errors(poses, [span for span, _ in aims]).norms([0, 1, 2])
+        angles = pose_errors(poses, [span for span, turns in aims if turns]).norms([3, 4, 5])
+        return distances, angles
 
     @property
     def tool_goals(self) -> tuple[SentGoal, ...]:

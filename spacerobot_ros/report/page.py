@@ -219,13 +219,8 @@ def _parameters_html(flight: FlightReport) -> list[str]:
         return []
     parts = ["<h2>Parameters</h2>"]
     for node, values in nodes.items():
-        rows = "".join(
-            f"<tr><td><code>{escape(key)}</code></td><td><code>{escape(value)}</code></td></tr>\n"
-            for key, value in values.items()
-        )
-        parts.append(
-            f"<details><summary>{escape(node)}</summary><table><tbody>\n{rows}</tbody></table></details>"
-        )
+        shown = table(f"parameters-{node}", (), list(values.items()))
+        parts.append(f"<details><summary>{escape(node)}</summary>{shown}</details>")
     return parts
 
 

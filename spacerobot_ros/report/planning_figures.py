@@ -17,6 +17,8 @@ from matplotlib.colors import BoundaryNorm, Normalize, TwoSlopeNorm
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch, Wedge
 
+from spacerobot_ros.errors import shortened
+from spacerobot_ros.flight.series import Signal
 from spacerobot_ros.flight.trials import PlanEvaluation, PlanningProblem
 from spacerobot_ros.model.description import Array, JointKind
 from spacerobot_ros.model.rotations import rotvec_from_quaternion, rotvecs_from_quaternions
@@ -32,16 +34,16 @@ from spacerobot_ros.report.figures import (
     TEXT_COLOUR,
     WIDTH,
     PictureFormat,
+    TraceGroup,
     colour,
     drawing,
     new_figure,
     panel,
     picture_of,
     room_for,
-    set_range,
-    set_time,
     sheet,
 )
+from spacerobot_ros.report.figures_over_time import draw_group
 
 _FINE_GRID, _COARSE_GRID = 61, 37
 """Points a side of a map, of robots with up to three joints and with more."""
@@ -312,51 +314,29 @@ def draw_plan(
 
 
 def _plan_figure(problem: PlanningProblem, trial: PlanEvaluation) -> Figure:
-    robot, goal = problem.robot, problem.goal
-    positions = trial.positions
-    ticks = problem.control_period * np.arange(len(positions), dtype=np.float64)
-    rates = np.diff(positions, axis=0) / problem.control_period
-    path = trial.path
-    turned = rotvecs_from_quaternions(path.quaternion)
-    names = robot.joint_names
-    figure, rows = sheet([[1], [1], [1, 1]], [1.9, 1.9, 1.9], right=room_for(names) + 0.35)
-    joints, speeds, (place, attitude) = rows[0][0], rows[1][0], rows[2]
+    robot, goal, path = problem.robot, problem.goal, trial.path
+    ticks = problem.control_period * np.arange(len(trial.positions), dtype=np.float64)
+    rates = np.diff(trial.positions, axis=0) / problem.control_period
+    names = [shortened(name) for name in robot.joint_names]
+    tints = [colour(k) for k in range(len(names))]
     units = sorted({joint.unit for joint in robot.description.movable_joints})
-    title = f"{trial.method}, {trial.duration:.6g} s: joints ({', '.join(units)})"
-    _draw_panel(joints, title, ticks, positions, names)
+    speeds = ", ".join(f"{unit}/s" for unit in units)
     # Held over a tick: steps.
-    held = np.repeat(rates, 2, axis=0)
-    title = f"held joint velocities ({', '.join(f'{unit}/s' for unit in units)})"
-    _draw_panel(speeds, title, np.repeat(ticks, 2)[1:-1], held, names)
-    for axes, title, values, wanted in (
-        (place, "base position (m) and goal", path.position, goal.position),
-        (
-            attitude,
-            "base attitude, rotation vector (rad), and goal",
-            turned,
-            rotvec_from_quaternion(goal.quaternion),
-        ),
+    held = Signal(np.repeat(ticks, 2)[1:-1], np.repeat(rates, 2, axis=0))
+    groups = [
+        TraceGroup(Signal(ticks, trial.positions), names, "joints", ", ".join(units), tints),
+        TraceGroup(held, names, "held velocities", speeds, tints),
+    ]
+    turned, wanted = rotvecs_from_quaternions(path.quaternion), rotvec_from_quaternion
+    for part, label, unit, values, aim in (
+        ("position", "base position", "m", path.position, goal.position),
+        ("attitude", "rotation vector", "rad", turned, wanted(goal.quaternion)),
     ):
-        _draw_panel(axes, title, path.time, values, _AXIS_NAMES, wanted)
-        axes.set_xlabel("time (s)")
+        goals = [(0.0, float(path.time[-1]), k, x) for k, x in enumerate(aim) if part in goal.base]
+        signal = Signal(path.time, values)
+        groups.append(TraceGroup(signal, _AXIS_NAMES, label, unit, PALETTE[:3], goals))
+    figure, rows = sheet([[1], [1], [1, 1]], [1.9, 1.9, 1.9], right=room_for(names))
+    for axes, group in zip((axes for row in rows for axes in row), groups, strict=True):
+        draw_group(axes, group, 0.0)
+    rows[0][0].set_title(f"{trial.method}, {trial.duration:.6g} s")
     return figure
-
-
-def _draw_panel(
-    axes: Axes,
-    title: str,
-    time: Array,
-    values: Array,
-    names: tuple[str, ...],
-    wanted: Array | None = None,
-) -> None:
-    axes.set_title(title)
-    set_range(axes, values, () if wanted is None else wanted.tolist())
-    end = float(time[-1]) if len(time) else 0.0
-    set_time(axes, 0.0, end)
-    for index, name in enumerate(names):
-        if wanted is not None:
-            axes.axhline(wanted[index], color=colour(index), linewidth=0.8, linestyle=":")
-        axes.plot(time, values[:, index], color=colour(index), label=name)
-    axes.axhline(0.0, color=LINE_COLOUR, linewidth=0.6, zorder=0.5)
-    axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))

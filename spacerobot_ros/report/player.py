@@ -23,7 +23,7 @@ from spacerobot_ros.report.flight import FlightReport
 from spacerobot_ros.report.page_parts import PagePart, package_file
 from spacerobot_ros.report.scene import Body, bodies_of, goal_of_base, is_flat, obstacles_of
 from spacerobot_ros.report.signals import Cycles, Indices, simplified
-from spacerobot_ros.report.solids import EDGE_COLOUR, corner_points, placed_solids
+from spacerobot_ros.report.solids import EDGE_COLOUR, View, corner_points, placed_solids
 
 Command = dict[str, Any]
 
@@ -355,16 +355,9 @@ def _camera_position(points: Array, flat: bool) -> Array:
 
     It is the nearest one in the direction of the view, with a margin.
     """
-    azimuth, elevation = math.radians(-90 if flat else -58), math.radians(89.9 if flat else 24)
-    backwards = np.array(
-        [
-            math.cos(elevation) * math.cos(azimuth),
-            math.cos(elevation) * math.sin(azimuth),
-            math.sin(elevation),
-        ]
-    )
-    right = np.array([-math.sin(azimuth), math.cos(azimuth), 0.0])
-    up = np.cross(backwards, right)
+    # Its up is not to be along its direction.
+    view = View(-90.0, 89.9) if flat else View()
+    backwards, (right, up) = view.viewing_direction, view.paper_axes
     slope = math.tan(math.radians(_FIELD_OF_VIEW / 2))
     sideways = np.maximum(np.abs(points @ up), np.abs(points @ right) / _MIN_ASPECT) / slope
     return _MARGIN * float((points @ backwards + sideways).max()) * backwards

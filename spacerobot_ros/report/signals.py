@@ -11,12 +11,8 @@ import numpy.typing as npt
 
 from spacerobot_ros.flight.series import Signal
 from spacerobot_ros.model.description import Array, RobotDescription
-from spacerobot_ros.model.kinematics import ForwardKinematics, joints_outward
-from spacerobot_ros.model.rotations import (
-    matrices_from_quaternions,
-    quaternion_multiply,
-    rotvecs_from_quaternions,
-)
+from spacerobot_ros.model.kinematics import ForwardKinematics
+from spacerobot_ros.model.rotations import rotvecs_from_quaternions
 
 Indices = npt.NDArray[np.int64]
 
@@ -145,7 +141,7 @@ def continuous(poses: Array) -> Array:
 def link_poses(robot: RobotDescription, base: Array, q: Array) -> dict[str, Array]:
     """Return the poses (K, 7) in the world of all links, the base link first.
 
-    Their quaternions are as continuous as those of the base.
+    Their quaternions are continuous, as those of the base are.
 
     Parameters
     ----------
@@ -154,18 +150,13 @@ def link_poses(robot: RobotDescription, base: Array, q: Array) -> dict[str, Arra
     base, q
         (K, 7) poses of the base in the world, and (K, n) joint positions, m or rad.
     """
+    from scipy.spatial.transform import Rotation
+
     kinematics = ForwardKinematics(robot)
-    transforms = kinematics.transforms_at(q)
-    steps = {child: transforms[:, i] for i, (_, child) in enumerate(kinematics.moving)}
-    fixed = zip(kinematics.fixed, kinematics.fixed_transforms, strict=True)
-    steps |= {child: pose[np.newaxis] for (_, child), pose in fixed}
-    poses = {robot.base_link: base}
-    for joint in joints_outward(robot):
-        outer, step = poses[joint.parent], steps[joint.child]
-        turned = (matrices_from_quaternions(outer[:, 3:]) @ step[:, :3, np.newaxis])[..., 0]
-        attitude = quaternion_multiply(outer[:, 3:], step[:, 3:])
-        poses[joint.child] = np.hstack([outer[:, :3] + turned, attitude])
-    return poses
+    R_WL, r_WL = kinematics.poses_in_world(base, q)
+    attitudes = Rotation.from_matrix(R_WL.reshape(-1, 3, 3)).as_quat().reshape(*r_WL.shape[:2], 4)
+    poses = np.concatenate([r_WL, attitudes], axis=2)
+    return {link: continuous(poses[:, k]) for k, link in enumerate(kinematics.links)}
 
 
 def find_cycles(rates: Signal) -> Cycles | None:

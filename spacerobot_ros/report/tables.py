@@ -9,7 +9,7 @@ from typing import Literal
 
 import numpy as np
 
-from spacerobot_ros.errors import SpaceRobotError, quantity
+from spacerobot_ros.errors import SpaceRobotError, numbers, quantity
 from spacerobot_ros.flight.captures import payload_estimates
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.inertial_parameters import INERTIA_ENTRIES
@@ -106,17 +106,14 @@ def _error_with_tolerance(
 
 
 def runs_table(flights: Sequence[FlightReport]) -> Table:
-    """Return outcome and headline numbers of several flights, a row each."""
+    """Return outcome and headline numbers of several flights, a column each."""
     found = [
         {"Outcome": flight.verdict.word} | {label: value for label, value, _ in headline(flight)}
         for flight in flights
     ]
     labels = list(dict.fromkeys(label for values in found for label in values))
-    rows = [
-        (flight.bag.path.name, *(values.get(label, _NO_VALUE) for label in labels))
-        for flight, values in zip(flights, found, strict=True)
-    ]
-    return Table(("Bag", *labels), rows)
+    rows = [(label, *(values.get(label, _NO_VALUE) for values in found)) for label in labels]
+    return Table(("Bag", *(flight.bag.path.name for flight in flights)), rows)
 
 
 def result_table(flight: FlightReport) -> Table:
@@ -195,7 +192,7 @@ def payload_text(estimate: PayloadEstimate) -> str:
     if not math.isnan(mass):
         parts.append(f"mass {mass:.6g} ± {spread:.1g} kg")
     if not np.isnan(estimate.parameters[:4]).any():
-        center = _format_vector(estimate.parameters[1:4] / mass)
+        center = numbers(estimate.parameters[1:4] / mass)
         parts.append(f"centre of mass ({center}) m in {estimate.link}")
     if (payload := estimate.payload) is not None:
         inertia = payload.inertia.about_com
@@ -216,7 +213,7 @@ def joint_table(flight: FlightReport) -> Table | None:
     for i, name in enumerate(flight.joint_names):
         joint = flight.joint(name)
         unit = joint_unit(flight, name)
-        ends = [_format_number(x) for x in flight.shape.values[[0, -1], i].tolist()]
+        ends = [numbers([x]) for x in flight.shape.values[[0, -1], i].tolist()]
         if i in flight.wheel_columns:
             ends = [_NO_VALUE] * 2  # The angle of a body of revolution means nothing.
         limits = limit = share = peak_text = _NO_VALUE
@@ -265,25 +262,14 @@ def published_table(flight: FlightReport) -> Table | None:
 
 
 def _measured_values(flight: FlightReport, row: Published) -> tuple[list[float], str]:
-    figures: dict[str, Iterable[float]] = {}
-    if len(flight.position):
-        figures["final_position_m"] = flight.position.values[-1]
-        figures["final_attitude_rotvec_rad"] = rotvec_from_quaternion(flight.quaternion[-1])
-    if len(flight.shape):
-        figures["final_joint_positions"] = flight.shape.values[-1]
-    if len(flight.rates):
-        figures["peak_joint_velocities"] = np.abs(flight.rates.values).max(axis=0)
-    if (error := flight.error) is not None:
-        figures["position_error_m"] = [error.distance]
-        figures["attitude_error_rad"] = [error.angle]
-    if (time := flight.time_flown) is not None:
-        figures["manoeuvre_time_s"] = [time]
-    if row.quantity in figures:
-        return [float(x) for x in figures[row.quantity]], "flight"
+    whole = flight.error is not None and len(flight.shape) and len(flight.rates)
+    value = flight.summary().get(row.quantity) if whole else None
+    if isinstance(value, float | list):
+        return np.atleast_1d(value).tolist(), "flight"
     notes = flight.executing[0][1].notes if flight.executing else {}
     value = notes.get(row.quantity, "")
-    numbers: list[float] = [] if isinstance(value, str) else np.atleast_1d(value).tolist()
-    return numbers, "planner" if numbers else ""
+    noted: list[float] = [] if isinstance(value, str) else np.atleast_1d(value).tolist()
+    return noted, "planner" if noted else ""
 
 
 def _count_decimals(x: float) -> int:
@@ -292,21 +278,12 @@ def _count_decimals(x: float) -> int:
 
 
 def _position_text(position: Array) -> str:
-    return f"({_format_vector(position)}) m"
-
-
-def _format_vector(values: Iterable[float]) -> str:
-    return ", ".join(_format_number(x) for x in values)
-
-
-def _format_number(x: float) -> str:
-    """Return a number of m or rad with 5 decimals; -0 becomes 0."""
-    return f"{round(x, 5) + 0.0:.5f}"
+    return f"({numbers(position)}) m"
 
 
 def _format_attitude(rotvec: Iterable[float]) -> str:
     angle = math.degrees(math.hypot(*rotvec))
-    return f"rotation vector ({_format_vector(rotvec)}) rad, {angle:.3f}° in all"
+    return f"rotation vector ({numbers(rotvec)}) rad, {angle:.3f}° in all"
 
 
 def _tolerance_text(flight: FlightReport, part: Literal["position", "attitude"]) -> str:

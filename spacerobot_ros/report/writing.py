@@ -16,10 +16,10 @@ from spacerobot_ros.report.figures import (
     ReportFigure,
     drawing,
     legend_above,
-    new_figure,
     panel,
     picture_of,
     room_for,
+    sheet,
     widen_panels,
 )
 from spacerobot_ros.report.figures_over_time import (
@@ -27,7 +27,7 @@ from spacerobot_ros.report.figures_over_time import (
     attitude_figure,
     attitude_group,
     clearance_figure,
-    draw_whole_flight,
+    draw_group,
     efforts_figure,
     errors_figure,
     figure_of_flights,
@@ -101,8 +101,8 @@ def write_report(
     """Write the report of a bag as one HTML file, which needs nothing besides itself.
 
     Any bag makes a page: parts that it lacks are left out, and the page says so. Bags
-    ``beside`` it, of other methods to the same goal for one, get a row in a table and their paths
-    in the figure of paths. Of several robots in the bag ``namespace`` chooses one.
+    ``beside`` it, of other methods to the same goal for one, get a column in a table and their
+    paths in the figure of paths. Of several robots in the bag ``namespace`` chooses one.
 
     Raises
     ------
@@ -237,18 +237,17 @@ def _overview_figure(flight: FlightReport) -> Figure:
     if not flight.hidden_links_text:
         last = [len(flight.position) - 1]
         robot = placed_solids(bodies_of(flight, last, MAX_MESH_FACES), 0)
-    height, gap, left = 1.25, 0.42, 0.72
-    up = 0.5 + (height + gap) * len(groups) + 0.35
-    figure = new_figure(up)
     right = room_for([name for group in groups for name in group.names])
-    width = WIDTH - left - right - (_ROBOT_PANEL_WIDTH if robot else 0.1)
-    for number, group in enumerate(groups):
-        y = up - 0.35 - (number + 1) * (height + gap)
-        axes = panel(figure, left, y + 0.05, width, height)
-        draw_whole_flight(axes, flight, group, width / WIDTH)
+    beside = _ROBOT_PANEL_WIDTH if robot else 0.1
+    rows = [[1.0]] * len(groups)
+    figure, panels = sheet(rows, [1.25] * len(groups), right=right + beside, top=0.77, gap=0.42)
+    share = 1.0 - (right + beside) / WIDTH
+    for number, (group, (axes,)) in enumerate(zip(groups, panels, strict=True)):
+        draw_group(axes, group, flight.end, share, [time for time, _ in flight.executing[1:]])
         if number < len(groups) - 1:
             axes.set_xlabel("")
             axes.tick_params(labelbottom=False)
+    up = float(figure.get_size_inches()[1])
     if robot:
         size = _ROBOT_PANEL_WIDTH - 0.15
         axes = panel(figure, WIDTH - size - 0.1, 0.2, size, up - 1.0)

@@ -11,7 +11,7 @@ from typing import Generic, TypeVar
 
 import numpy as np
 
-from spacerobot_ros.errors import ParameterError, quantity
+from spacerobot_ros.errors import ParameterError, numbers, quantity, shortened
 from spacerobot_ros.measures import momentum_change
 from spacerobot_ros.model.description import DEFAULT_END_EFFECTOR, Array, RobotDescription
 from spacerobot_ros.model.kinematics import ForwardKinematics
@@ -42,8 +42,6 @@ _WARNING_WHEEL_SHARE, _SATURATED_WHEEL_SHARE = 0.8, 0.98
 
 _NEAR_CONTACT = 0.02
 """Distance between links below which the head of the page shows it, m."""
-
-_MAX_NAME_LENGTH = 21
 
 COLORS: Mapping[Verdict, Color] = {
     Verdict.UNCHECKED: (150, 150, 160),
@@ -228,9 +226,9 @@ def look_back_html(shown: StackState, live: StackState) -> str:
     return padded("".join(lines))
 
 
-def announcement_html(notice: Notice) -> str:
-    """Return a line above the state of the stack."""
-    return padded(_line_html(notice.message, notice.level))
+def line_html(text: str, level: int) -> str:
+    """Return a line in the head of the page."""
+    return padded(_line_html(text, level))
 
 
 def has_stack_ended(state: StackState) -> bool:
@@ -238,12 +236,6 @@ def has_stack_ended(state: StackState) -> bool:
     statuses = {"plant": state.plant, "planner": state.planner, "controller": state.controller}
     known = {key for key, status in statuses.items() if status is not None}
     return bool(known and state.silent) and known <= state.absent
-
-
-def ended_html() -> str:
-    """Return the status of a page whose viewer has ended."""
-    text = "The viewer has ended. This page shows its last state, and steers nothing any more."
-    return padded(_line_html(text, 2))
 
 
 def padded(html: str) -> str:
@@ -299,7 +291,7 @@ def joints_html(robot: RobotDescription, q: Array, qdot: Array, effort: Array) -
             level = 2 if not 0.0 <= share <= 1.0 else 1
         bar = "no limits" if share is None else _bar_html(share, level)
         name = f'<span title="{escape(joint.name)}">{escape(shortened(joint.name))}</span>'
-        cells = [name, f"{_format_decimals(q[i], 3)} {joint.unit}", bar]
+        cells = [name, f"{numbers([q[i]], 3)} {joint.unit}", bar]
         effort_unit = "N" if joint.unit == "m" else "N m"
         cells.append(_value_and_limit(qdot[i], fastest[i], f"{joint.unit}/s"))
         cells.append(_value_and_limit(effort[i], strongest[i], effort_unit))
@@ -313,12 +305,6 @@ def joints_html(robot: RobotDescription, q: Array, qdot: Array, effort: Array) -
     style = "border-spacing:3px 2px;text-align:left;white-space:nowrap;font-size:.85em"
     table = f'<table style="{style}"><tr>{heads}</tr>{"".join(rows)}</table>'
     return padded(f'<div tabindex="0" style="overflow-x:auto">{table}</div>')
-
-
-def shortened(name: str) -> str:
-    """Return a name, its middle left out if it is too long for a label."""
-    half = (_MAX_NAME_LENGTH - 1) // 2
-    return name if len(name) <= _MAX_NAME_LENGTH else f"{name[:half]}…{name[-half:]}"
 
 
 def _share_of_range(value: float, lower: float, upper: float) -> float | None:
@@ -339,13 +325,8 @@ def _bar_html(share: float, level: int) -> str:
 
 
 def _value_and_limit(value: float, limit: float, unit: str) -> str:
-    number = _format_decimals(value, 2)
+    number = numbers([value], 2)
     return f"{number}/{limit:.3g} {unit}" if math.isfinite(limit) else f"{number} {unit}"
-
-
-def _format_decimals(value: float, digits: int) -> str:
-    """Return a number with some decimals; a rounded zero has no sign."""
-    return f"{round(float(value), digits) + 0.0:.{digits}f}"
 
 
 def log_html(notices: Iterable[Notice]) -> str:
@@ -377,7 +358,7 @@ class GoalDistance:
     ) -> str:
         """Return a clause with the numbers, their tolerances, and parts that are not controlled."""
         limits = (0.0, 0.0) if tolerance is None else (tolerance.position, tolerance.attitude)
-        numbers, tolerances = [], []
+        errors, tolerances = [], []
         for part, value, unit, limit in (
             ("position", self.distance, "m", limits[0]),
             ("attitude", self.angle, "rad", limits[1]),
@@ -385,10 +366,10 @@ class GoalDistance:
             if value is None:
                 continue
             free = part in left_out
-            numbers.append(quantity(value, unit) + (" (not controlled)" if free else ""))
+            errors.append(quantity(value, unit) + (" (not controlled)" if free else ""))
             tolerances += [] if free or tolerance is None else [quantity(limit, unit)]
         within = f" (tolerance {', '.join(tolerances)})" if tolerances else ""
-        return f"{' and '.join(numbers)} from its goal{within}"
+        return f"{' and '.join(errors)} from its goal{within}"
 
     @property
     def numbers(self) -> tuple[float, ...]:
@@ -526,15 +507,13 @@ def momentum_html(state: StackState) -> str:
     if not budget or control is None or control.command is None:
         return ""
     command = control.command
-    rows = [
-        (escape(part), f"{_format_decimals(value, 3)} N m s", "") for part, value in budget.items()
-    ]
+    rows = [(escape(part), f"{numbers([value], 3)} N m s", "") for part, value in budget.items()]
     for name, share in command.wheels.items():
         # 0, 1 or 2: how many of the two shares it reaches.
         level = sum(abs(share) >= each for each in (_WARNING_WHEEL_SHARE, _SATURATED_WHEEL_SHARE))
         title = f'<span title="{escape(name)}">{escape(shortened(name))}</span>'
         bar = _bar_html((1.0 + share) / 2, level)
-        rows.append((title, f"{_format_decimals(100 * share, 0)} %", bar))
+        rows.append((title, f"{numbers([100 * share], 0)} %", bar))
     cells = "".join("<tr>" + "".join(f"<td>{cell}</td>" for cell in row) + "</tr>" for row in rows)
     dumping = _line_html("The momentum of the wheels is being dumped.", 1)
     style = "border-spacing:4px 2px;white-space:nowrap;font-size:.9em"
@@ -670,11 +649,6 @@ class Trail:
             self._points, self._times = self._points[::2], self._times[::2]
             self._step *= 2
 
-    @property
-    def points(self) -> Array:
-        """The points (k, 3), m."""
-        return np.array(self._points).reshape(-1, 3)
-
-    def points_until(self, time_s: float) -> Array:
-        """Return the points (k, 3) until a time, m."""
-        return self.points[: bisect_right(self._times, time_s)]
+    def points(self, until: float = math.inf) -> Array:
+        """Return the points (k, 3), m, until a time, s."""
+        return np.array(self._points[: bisect_right(self._times, until)]).reshape(-1, 3)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from spacerobot_ros.errors import GoalError
+from spacerobot_ros.errors import GoalError, shortened
 from spacerobot_ros.model.description import (
     DEFAULT_END_EFFECTOR,
     Array,
@@ -18,16 +18,19 @@ from spacerobot_ros.model.description import (
     RobotDescription,
 )
 from spacerobot_ros.model.kinematics import ForwardKinematics
-from spacerobot_ros.model.rotations import compose_poses, relative_pose
+from spacerobot_ros.model.rotations import (
+    compose_poses,
+    matrix_from_quaternion,
+    relative_pose,
+    rpy_from_matrix,
+)
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.core.goal import EndEffectorGoal
 from spacerobot_ros.planning.execution.goal_file import BASE_GOAL_KEY
-from spacerobot_ros.planning.execution.status import end_effector_values, goal_values
 from spacerobot_ros.viewer.content import (
     COLORS,
     check_html,
     hint_html,
-    shortened,
 )
 from spacerobot_ros.viewer.reachability import GoalCheck, Verdict
 from spacerobot_ros.viewer.scene import RobotDrawing, wxyz, xyzw
@@ -38,6 +41,21 @@ if TYPE_CHECKING:
 
 Defer = Callable[[Callable[[], None]], None]
 """Queues a function for the thread that draws the page."""
+
+
+def react(register: Callable[[Any], Any], defer: Defer, act: Callable[[Any], None]) -> None:
+    """Have a function called with the value of an element in the thread that draws the page.
+
+    ``register`` is the element's ``on_click`` or ``on_update``. Only users count, not the values
+    that the page itself writes.
+    """
+
+    @register
+    async def _(event: Any) -> None:
+        if event.client is not None:
+            value = getattr(event.target, "value", None)
+            defer(lambda: act(value))
+
 
 GOAL_SETTLING_TIME_S = 0.3
 """Wall time without a change after which a goal is checked, s."""
@@ -101,8 +119,8 @@ class GoalEditor:
         self._origin = Origin.ROBOT
         self._in_flight = False
         """Whether the robot flies to the goal that is shown, whose gizmos are hidden then."""
-        self._followed: object = None
-        """Numbers of the goals that were last followed."""
+        self._followed: Mapping[Part, Goal] = {}
+        """The goals that were last followed."""
         self._check = GoalCheck(Verdict.UNCHECKED)
         gui = server.gui
         self._none_taken = gui.add_html(hint_html("A recording takes no goals."), visible=False)
@@ -121,11 +139,7 @@ class GoalEditor:
         )
         self._tool_too.visible = False
         self._final = _FinalShape(gui, edit, self._mark_changed)
-
-        @self._tool_too.on_update
-        async def _(event: Any) -> None:
-            edit(lambda: self.touch(time.monotonic()))
-
+        react(self._tool_too.on_update, edit, lambda _: self.touch(time.monotonic()))
         self._to_robot = gui.add_button("Goal to the robot", color="gray")
         for field in (self._position, self._angles):
             field.on_update(self._on_field)
@@ -149,10 +163,7 @@ class GoalEditor:
 
     def on_reset_goal(self, act: Callable[[], None]) -> None:
         """Call a function when the button that moves the goal to the robot is pressed."""
-
-        @self._to_robot.on_click
-        async def _(event: Any) -> None:
-            self._defer(act)
+        react(self._to_robot.on_click, self._defer, lambda _: act())
 
     def show_robot(self, robot: RobotDescription | None, reach: float) -> None:
         """Start over with another robot, in an empty scene; None: there is none."""
@@ -160,7 +171,7 @@ class GoalEditor:
         self._marks.clear()
         self._poses.clear()
         self._ghost, self._present, self._changed_at = None, None, None
-        self._followed = None
+        self._followed = {}
         self._reach, self._robot = reach, robot
         self._kinematics = None if robot is None else ForwardKinematics(robot)
         self._parts.offer(())
@@ -204,12 +215,13 @@ class GoalEditor:
         now
             Wall time, s.
         """
-        numbers, links = _numbers(goals), _links_of(goals)
-        if not goals or not self.placed or numbers == self._followed:
+        before, links = self._followed, _links_of(goals)
+        same = goals.keys() == before.keys() and all(goals[x].equals(before[x]) for x in goals)
+        if not goals or not self.placed or same:
             return
         if self._origin is Origin.USER or not set(links) <= set(self._parts.links):
             return
-        self._followed = numbers
+        self._followed = dict(goals)
         base, tool = goals.get(BASE_GOAL_KEY), goals.get(DEFAULT_END_EFFECTOR)
         asked = {link: RequestedPart.POSITION if aim.quaternion is None else RequestedPart.POSE
                  for link, aim in links.items()}  # fmt: skip
@@ -304,12 +316,16 @@ class GoalEditor:
             self._in_flight = in_flight
             self._show_parts()
 
-    def show_tool(self, *, there: bool) -> None:
-        """Show or hide the controls of the end-effector."""
-        self._tool_too.visible = there
+    def show_parts(self, *, tool: bool, planned: bool) -> None:
+        """Show or hide the controls of a controller's end-effector, and those that planners take:
+        the choice of end-effectors, and the final joint positions.
+        """
+        self._tool_too.visible = tool
         if _TOOL_GIZMO in self._gizmos:
-            shown = there and self._tool_too.value and not self._in_flight
+            shown = tool and self._tool_too.value and not self._in_flight
             self._gizmos[_TOOL_GIZMO].visible = shown
+        self._parts.show(visible=planned)
+        self._final.show(visible=planned)
 
     def offer_end_effectors(self, links: Iterable[str]) -> None:
         """Offer goals of the links for which the planner takes some."""
@@ -321,14 +337,6 @@ class GoalEditor:
                 self._gizmos[_link_gizmo(link)].visible = False
         self._parts.offer(offered)
         self._on_parts_chosen(BASE_GOAL_KEY)
-
-    def show_end_effectors(self, *, there: bool) -> None:
-        """Show or hide the choice of end-effectors, whose goals planners take."""
-        self._parts.show(visible=there)
-
-    def show_shape(self, *, there: bool) -> None:
-        """Show or hide the final joint positions, which planners take."""
-        self._final.show(visible=there)
 
     def show(self, *, visible: bool) -> None:
         """Show or hide all controls: a replay takes no goals."""
@@ -533,11 +541,7 @@ class _PartMenu:
         )
         self._numbers.visible = False
         self._there = False
-
-        @self._numbers.on_update
-        async def _(event: Any) -> None:
-            if event.client is not None:  # Else the page itself wrote the value.
-                defer(lambda: self._on_change(self.shown))
+        react(self._numbers.on_update, defer, lambda _: self._on_change(self.shown))
 
     @property
     def links(self) -> tuple[str, ...]:
@@ -587,12 +591,7 @@ class _PartMenu:
             else tuple(RequestedPart)
         )
         menu = self._gui.add_dropdown(shortened(part), [each.value for each in choices], hint=part)
-
-        @menu.on_update
-        async def _(event: Any) -> None:
-            if event.client is not None:  # Else the page itself wrote the value.
-                self._edit(lambda: self._on_chosen(part))
-
+        react(menu.on_update, self._edit, lambda _: self._on_chosen(part))
         return menu
 
     def _on_chosen(self, part: Part) -> None:
@@ -638,11 +637,7 @@ class _FinalShape:
         self._folder = gui.add_folder("At the end", visible=False)
         self._fields: list[Any] = []
         self._q: Array = np.zeros(0)
-
-        @self._enabled.on_update
-        async def _(event: Any) -> None:
-            if event.client is not None:  # Else the page itself wrote the value.
-                edit(self._update_folder)
+        react(self._enabled.on_update, edit, lambda _: self._update_folder())
 
     @property
     def positions(self) -> Array | None:
@@ -659,7 +654,7 @@ class _FinalShape:
         with self._folder:
             for joint in joints:
                 field = self._add_joint_field(joint)
-                field.on_update(self._on_field)
+                react(field.on_update, self._edit, lambda _: self._on_change())
                 self._fields.append(field)
         self._update_folder()
 
@@ -699,14 +694,10 @@ class _FinalShape:
         self._folder.visible = shown
         self._on_change()
 
-    async def _on_field(self, event: Any) -> None:
-        if event.client is not None:  # Else the page itself wrote the value.
-            self._edit(self._on_change)
-
 
 def _fields_of(pose: Array) -> tuple[tuple[float, ...], tuple[float, ...]]:
     """Return the position, m, and roll, pitch and yaw, deg, of a pose (7,), as they are shown."""
-    numbers = (pose[:3], np.degrees(rpy_from_quaternion(pose[3:])))
+    numbers = (pose[:3], np.degrees(rpy_from_matrix(matrix_from_quaternion(pose[3:]))))
     position, angles = (
         tuple(np.round(part, digits).tolist())
         for part, digits in zip(numbers, _DECIMALS, strict=True)
@@ -716,18 +707,6 @@ def _fields_of(pose: Array) -> tuple[tuple[float, ...], tuple[float, ...]]:
 
 def _links_of(goals: Mapping[Part, Goal]) -> dict[str, EndEffectorGoal]:
     return {aim.link: aim for goal in goals.values() for aim in goal.end_effectors}
-
-
-def _numbers(goals: Mapping[Part, Goal]) -> dict[Part, object]:
-    """Return the numbers of goals, which can be compared, by part."""
-    return {
-        part: (
-            goal_values(goal),
-            end_effector_values(goal),
-            None if goal.joint_positions is None else goal.joint_positions.tolist(),
-        )
-        for part, goal in goals.items()
-    }
 
 
 def _link_gizmo(link: str) -> str:
@@ -742,17 +721,3 @@ def _gizmo_of(part: Part) -> str:
 def move_along(pose: Array, before: Array, after: Array) -> Array:
     """Return a pose (7,) rigidly moved along with another one, from ``before`` to ``after``."""
     return compose_poses(after, relative_pose(before, pose))
-
-
-def rpy_from_quaternion(quaternion: Array) -> Array:
-    """Return roll, pitch and yaw (3,), the angles about the fixed axes x, y, z, rad.
-
-    Source: `R = Rz(yaw) Ry(pitch) Rx(roll)`, as URDF has it; at a pitch of 90 deg roll is zero.
-    """
-    x, y, z, w = quaternion
-    sine = float(np.clip(2 * (w * y - z * x), -1.0, 1.0))
-    if abs(sine) > 1 - 1e-12:
-        return np.array([0.0, math.copysign(math.pi / 2, sine), 2 * math.atan2(z, w)])
-    roll = math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
-    yaw = math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
-    return np.array([roll, math.asin(sine), yaw])

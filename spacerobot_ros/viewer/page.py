@@ -15,16 +15,17 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from spacerobot_ros.errors import GoalError, ParameterError
+from spacerobot_ros.errors import GoalError, ParameterError, shortened
 from spacerobot_ros.model.description import Array, RobotDescription
 from spacerobot_ros.model.kinematics import ForwardKinematics
 from spacerobot_ros.model.thrusters import ThrusterTable
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.core.goal import Tolerance
+from spacerobot_ros.planning.execution.goal_file import BASE_GOAL_KEY
 from spacerobot_ros.simulation.faults import FAULT_KINDS, FaultTargets
 from spacerobot_ros.viewer import content, scene
 from spacerobot_ros.viewer.content import RecentItems, Trail
-from spacerobot_ros.viewer.goal_editor import Defer, GoalEditor
+from spacerobot_ros.viewer.goal_editor import Defer, GoalEditor, react
 from spacerobot_ros.viewer.server import ViewerConfig
 from spacerobot_ros.viewer.state import (
     Action,
@@ -94,21 +95,10 @@ class ButtonPanel:
             hint="Stop all: joints brake, thrusters are off until Rearm. Reset: back to the start.",
         )
         self._time = gui.add_button_group("Time", ("Pause", "Resume"))
-
-        @self._fly.on_click
-        async def _(event: Any) -> None:
-            defer(fly)
-
-        @self._fly_scenario.on_click
-        async def _(event: Any) -> None:
-            defer(lambda: act(FlyAction(scenario_goals)))
-
+        react(self._fly.on_click, defer, lambda _: fly())
+        react(self._fly_scenario.on_click, defer, lambda _: act(FlyAction(scenario_goals)))
         for group in (self._goal, self._plant, self._time):
-
-            @group.on_click
-            async def _(event: Any) -> None:
-                request = Request(str(event.target.value).split()[0].lower())
-                defer(lambda: act(request))
+            react(group.on_click, defer, lambda label: act(Request(label.split()[0].lower())))
 
     def show(self, *, visible: bool) -> None:
         """Show or hide the buttons."""
@@ -128,11 +118,7 @@ class TimeLine:
         self._slider: Any = None
         self._duration = 0.0
         self._left_alone_until = -math.inf
-
-        @self._buttons.on_click
-        async def _(event: Any) -> None:
-            request = Request(str(event.target.value).lower())
-            defer(lambda: act(request))
+        react(self._buttons.on_click, defer, lambda label: act(Request(label.lower())))
 
     def show(self, state: StackState, now: float) -> None:
         """Show the position of the replay, if there is one."""
@@ -154,16 +140,11 @@ class TimeLine:
             self._slider = self._gui.add_slider(
                 "Time (s)", 0.0, max(math.ceil(duration / step) * step, step), step, 0.0
             )
-
-        @self._slider.on_update
-        async def _(event: Any) -> None:
-            if event.client is not None:
-                seconds = float(event.target.value)
-                self._defer(lambda: self._seek(seconds))
+        react(self._slider.on_update, self._defer, self._seek)
 
     def _seek(self, seconds: float) -> None:
         self._left_alone_until = time.monotonic() + _SLIDER_HOLD_S
-        self._act(SeekAction(seconds))
+        self._act(SeekAction(float(seconds)))
 
 
 class LookBack:
@@ -188,21 +169,18 @@ class LookBack:
             hint="Show the state at an earlier time, of the last five minutes; the robot goes on.",
         )
         self._live = gui.add_button("Back to the present", color="orange", visible=False)
+        react(self._live.on_click, defer, lambda _: self._look(None, 0.0))
 
         @self._slider.on_update
         async def _(event: Any) -> None:
             if event.client is not None:
                 at, end = float(event.target.value), float(event.target.max)
-                self._left_alone_until = time.monotonic() + _SLIDER_HOLD_S
-                defer(lambda: self._look(None if at >= end else at))
+                # At once, so that nothing is written over it meanwhile.
+                self._left_alone_until = until = time.monotonic() + _SLIDER_HOLD_S
+                defer(lambda: self._look(None if at >= end else at, until))
 
-        @self._live.on_click
-        async def _(event: Any) -> None:
-            self._left_alone_until = 0.0
-            defer(lambda: self._look(None))
-
-    def _look(self, time_s: float | None) -> None:
-        self.time_s = time_s
+    def _look(self, time_s: float | None, left_alone_until: float) -> None:
+        self.time_s, self._left_alone_until = time_s, left_alone_until
 
     def show(self, span: tuple[float, float] | None) -> None:
         """Show the slider over a span of simulated time, s; None: there is no past."""
@@ -250,19 +228,9 @@ class FaultPanel:
         self._inject = gui.add_button("Inject", color="orange")
         self._clear = gui.add_button("Clear faults", color="gray")
         self._active = gui.add_html("")
-
-        @self._kind.on_update
-        async def _(event: Any) -> None:
-            if event.client is not None:
-                defer(self._show_kind)
-
-        @self._inject.on_click
-        async def _(event: Any) -> None:
-            defer(self._on_inject)
-
-        @self._clear.on_click
-        async def _(event: Any) -> None:
-            defer(lambda: act(InjectAction("clear")))
+        react(self._kind.on_update, defer, lambda _: self._show_kind())
+        react(self._inject.on_click, defer, lambda _: self._on_inject())
+        react(self._clear.on_click, defer, lambda _: act(InjectAction("clear")))
 
     def offer(self, targets: FaultTargets) -> None:
         """Offer the faults that the targets of a plant can have."""
@@ -395,7 +363,7 @@ class Plots:
         shown = [(part, len(error.numbers)) for part, error in errors.items()]
         for part, count in shown:
             if (part, count) not in self._errors:
-                title, units = f"Error of {content.shortened(part)}", ("mm", "mrad")[:count]
+                title, units = f"Error of {shortened(part)}", ("mm", "mrad")[:count]
                 with self._error_tab:
                     plot = _Plot(self._gui, title, units, 10.0, units, limited=True)
                 self._errors[part, count] = plot
@@ -445,7 +413,7 @@ class _Plot:
         series: list[Any] = [{"label": "t (s)"}]
         for i, name in enumerate(names):
             turn, color = divmod(i, len(_CURVE_COLORS))
-            look = {"label": content.shortened(name), "stroke": _CURVE_COLORS[color], "width": 1.5}
+            look = {"label": shortened(name), "stroke": _CURVE_COLORS[color], "width": 1.5}
             # Colours repeat with dashes, shorter each time.
             dashes = {"dash": (max(12 // turn, 2), 4)} if turn else {}
             series.append(look | dashes | {"scale": scales[i]})
@@ -631,8 +599,6 @@ class Page:
         self._looked_back = False
         self._announced: tuple[Notice, float] | None = None
         """The line in the head, and the wall time until which it is shown, s."""
-        self._planned: tuple[Array | None, Mapping[Part, Array]] = None, {}
-        """The planned motion whose paths of end-effectors are drawn, and those paths."""
         self._build()
 
     def _build(self) -> None:
@@ -688,10 +654,7 @@ class Page:
                 for name, shown, hint in _LAYERS
             }
         for handle in (self._setting, *self._layers.values()):
-
-            @handle.on_update
-            async def _(event: Any) -> None:
-                defer(self._show_layers)
+            react(handle.on_update, defer, lambda _: self._show_layers())
 
         @self._server.on_client_connect
         async def _(client: Any) -> None:
@@ -730,18 +693,16 @@ class Page:
         self._target_drawing = None
         self._drawn_obstacles = []
         reach = 1.0 if robot is None else scene.reach_of(robot)
-        self._reach, self._trail = reach, Trail(0.003 * reach)
-        self._end_effector_trails: dict[Part, Trail] = {}
+        self._reach = reach
+        self._trails: dict[Part, Trail] = {}
+        self._planned: tuple[Array | None, Array | None] = None, None
+        """The planned path and motion that are drawn."""
         self.editor.show_robot(robot, reach)
         self._plots.show_robot(robot)
         if robot is None:
             return
-        self._drawing = scene.RobotDrawing(
-            self._server.scene, _ROBOT_PATH, robot, on_note=lambda text: self.note(Notice(text, 1))
-        )
-        self._drawing.base.visible = False  # Until its first state comes.
-        world = robot.world if self._obstacles is None else self._obstacles[0]
-        self._drawn_obstacles = scene.draw_obstacles(self._server.scene, _OBSTACLES_PATH, world)
+        self._drawing = self._draw_body(_ROBOT_PATH, robot)
+        self._draw_obstacles(robot.world if self._obstacles is None else self._obstacles[0])
         self._show_layers()
         if self._target is not None:
             self.show_target(self._target)
@@ -753,20 +714,25 @@ class Page:
             each.remove()
         self._drawn_obstacles = []
         if self._robot is not None:
-            self._drawn_obstacles = scene.draw_obstacles(self._server.scene, _OBSTACLES_PATH, world)
+            self._draw_obstacles(world)
+
+    def _draw_obstacles(self, world: RobotDescription | None) -> None:
+        self._drawn_obstacles = scene.draw_obstacles(self._server.scene, _OBSTACLES_PATH, world)
+
+    def _draw_body(self, path: str, body: RobotDescription) -> scene.RobotDrawing:
+        """Draw a body, which is hidden until its first state comes."""
+        drawn = scene.RobotDrawing(
+            self._server.scene, path, body, on_note=lambda text: self.note(Notice(text, 1))
+        )
+        drawn.base.visible = False
+        return drawn
 
     def show_target(self, target: RobotDescription) -> None:
         """Draw the body that floats beside the robot, from its first state on."""
         if self._target_drawing is not None:
             self._target_drawing.base.remove()
         self._target = target
-        self._target_drawing = scene.RobotDrawing(
-            self._server.scene,
-            _TARGET_PATH,
-            target,
-            on_note=lambda text: self.note(Notice(text, 1)),
-        )
-        self._target_drawing.base.visible = False
+        self._target_drawing = self._draw_body(_TARGET_PATH, target)
 
     def _show_layers(self) -> None:
         shown = {name: bool(handle.value) for name, handle in self._layers.items()}
@@ -783,7 +749,8 @@ class Page:
 
     def end(self) -> None:
         """Say that the viewer has ended, in browsers that go on showing the page."""
-        self._status.content = content.ended_html()
+        text = "The viewer has ended. This page shows its last state, and steers nothing any more."
+        self._status.content = content.line_html(text, 2)
         self._bar.visible = False
         self._server.flush()
 
@@ -858,10 +825,10 @@ class Page:
             self.editor.follow(state.goals, self._now)
         self.editor.update_robot(measured.pose, measured.q)
         self._plots.add(state, self._goal_errors(state))
-        self._trail.add(measured.time_s, measured.pose[:3])
         assert self._kinematics is not None
-        for part, point in content.end_effector_positions(state, self._kinematics).items():
-            trail = self._end_effector_trails.setdefault(part, Trail(0.003 * self._reach))
+        hands = content.end_effector_positions(state, self._kinematics)
+        for part, point in {BASE_GOAL_KEY: measured.pose[:3], **hands}.items():
+            trail = self._trails.setdefault(part, Trail(0.003 * self._reach))
             trail.add(measured.time_s, point)
         if state.replay is None:
             self._past.add(measured.time_s, state)
@@ -889,17 +856,16 @@ class Page:
             )
 
     def _draw_paths(self, state: StackState, around: scene.Surroundings, until: float) -> None:
-        around.flown.draw(self._trail.points_until(until))
-        path = state.planned_path
-        around.planned.draw(np.zeros((0, 3)) if path is None else path)
-        for part, trail in self._end_effector_trails.items():
-            around.draw_end_effector(part, trail.points_until(until))
+        around.draw_paths("flown", {part: x.points(until) for part, x in self._trails.items()})
         assert self._robot is not None
         assert self._kinematics is not None
-        if self._planned[0] is not state.planned_motion:
+        planned = state.planned_path, state.planned_motion
+        if any(each is not drawn for each, drawn in zip(planned, self._planned, strict=True)):
+            self._planned = planned
             paths = content.planned_positions(state, self._robot, self._kinematics)
-            self._planned = state.planned_motion, paths
-            around.draw_planned_end_effectors(paths)
+            if state.planned_path is not None:
+                paths[BASE_GOAL_KEY] = state.planned_path
+            around.draw_paths("planned", paths)
 
     def _goal_errors(self, state: StackState) -> dict[Part, content.GoalDistance]:
         return {} if self._kinematics is None else content.goal_errors(state, self._kinematics)
@@ -910,7 +876,7 @@ class Page:
         text = content.status_html(shown, errors, self._tolerance, described=described)
         announces = self._announced is not None and self._now < self._announced[1]
         if self._announced is not None and announces and not content.has_stack_ended(state):
-            text = content.announcement_html(self._announced[0]) + text
+            text = content.line_html(self._announced[0].message, self._announced[0].level) + text
         if shown is not state:
             text = content.look_back_html(shown, state) + text
         if text != self._status.content:
@@ -925,10 +891,10 @@ class Page:
         has_tool = content.has_tool(state)
         if has_tool and state.measured is not None and not self.editor.has_tool:
             self.editor.add_tool(state.tool)
-        self.editor.show_tool(there=has_tool and state.replay is None)
-        planned = state.planner is not None and state.replay is None
-        self.editor.show_end_effectors(there=planned)
-        self.editor.show_shape(there=planned)
+        steered = state.replay is None
+        self.editor.show_parts(
+            tool=has_tool and steered, planned=state.planner is not None and steered
+        )
 
     def _draw_joints(self, robot: RobotDescription, state: StackState) -> None:
         last = state.measured

@@ -11,7 +11,6 @@ positions are searched that bring the end-effector to its goal while the base is
 from __future__ import annotations
 
 import json
-import math
 import os
 import pickle
 import subprocess
@@ -42,7 +41,7 @@ from spacerobot_ros.model.urdf import parse_robot
 from spacerobot_ros.parameters import configured, declared
 from spacerobot_ros.planning import Goal, PoseError
 from spacerobot_ros.planning.core.cancellation import Cancellation, PlanningCancelled
-from spacerobot_ros.planning.core.goal import RobotState, Tolerance
+from spacerobot_ros.planning.core.goal import RobotState, Tolerance, missed_parts
 from spacerobot_ros.planning.core.method import PlanRequest
 from spacerobot_ros.planning.core.prediction import coasting_positions
 from spacerobot_ros.planning.core.progress import SearchProgress, report_progress
@@ -410,21 +409,12 @@ def _uncontrolled_text(
 
     ``base`` (7,) is the pose in which the base is to end.
     """
-    controls = schedule.controls
-    error = PoseError.between(base[:3], base[3:], goal)
-    parts = []
-    uncontrolled = goal.base - controls
-    if "position" in uncontrolled and error.distance > tolerance.position:
-        parts.append(("position", quantity(error.distance, "m")))
-    if "attitude" in uncontrolled and error.angle > tolerance.attitude:
-        parts.append(("attitude", f"{math.degrees(error.angle):.3g} deg"))
+    controls, error = schedule.controls, PoseError.between(base[:3], base[3:], goal)
+    missed = missed_parts(goal, error, controls, tolerance)
+    parts = [f"{part}: it ends {off} off" for part, off in missed.items()]
     if "shape" not in controls and goal.joint_positions is not None:
-        parts.append(("final joint positions", ""))
-    return "".join(
-        f" '{schedule.method}' does not control the {part}"
-        + (f": it ends {off} off." if off else ".")
-        for part, off in parts
-    )
+        parts.append("final joint positions")
+    return "".join(f" '{schedule.method}' does not control the {part}." for part in parts)
 
 
 def _check_arm(question: GoalQuestion, tool: Goal) -> GoalCheck:

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from enum import Enum
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -19,6 +19,7 @@ from spacerobot_ros.model.description import Array, RobotDescription
 from spacerobot_ros.model.kinematics import ForwardKinematics, joints_outward
 from spacerobot_ros.model.thrusters import ThrusterTable
 from spacerobot_ros.model.visuals import Visual, meshes_from_files, visuals_of
+from spacerobot_ros.planning.execution.goal_file import BASE_GOAL_KEY
 
 if TYPE_CHECKING:
     import viser
@@ -108,14 +109,14 @@ class RobotDrawing:
                 )
         self._moving = [frames[child] for _, child in kinematics.moving]
         self._frames = {robot.base_link: self.base, **frames}
-        self._names: list[Any] | None = None
         meshes = meshes_from_files(robot, _MAX_MESH_TRIANGLES, on_note)
         self._solids = [
             _draw_solid(scene, f"{paths[visual.link]}/{number}", visual, color)
             for number, visual in enumerate(visuals_of(robot, meshes, _MAX_MESH_TRIANGLES))
         ]
         self._robot, self._paths = robot, paths
-        self._collision_shapes: list[Any] | None = None
+        self._extras: dict[str, list[Any]] = {}
+        """Parts by kind, which are drawn when they are first shown."""
 
     def _node_paths(self, robot: RobotDescription) -> dict[str, str]:
         paths = {robot.base_link: self._path}
@@ -125,18 +126,12 @@ class RobotDrawing:
 
     def show_collision_shapes(self, *, visible: bool) -> None:
         """Show or hide the shapes by which distances between links are measured."""
-        if self._collision_shapes is None:
-            if not visible:
-                return
-            self._collision_shapes = [
-                _draw_solid(
-                    self._scene, f"{self._paths[visual.link]}/collision{number}", visual, _COLLISION
-                )
-                for number, visual in enumerate(collision_visuals(self._robot))
-                if len(visual.mesh.faces)
-            ]
-        for each in self._collision_shapes:
-            each.visible = visible
+        scene, paths = self._scene, self._paths
+        self._show("collision", visible, lambda: [
+            _draw_solid(scene, f"{paths[visual.link]}/collision{number}", visual, _COLLISION)
+            for number, visual in enumerate(collision_visuals(self._robot))
+            if len(visual.mesh.faces)
+        ])  # fmt: skip
 
     def show_frames(self, *, visible: bool) -> None:
         """Show or hide the axes of the frames of all links."""
@@ -148,13 +143,13 @@ class RobotDrawing:
 
     def show_names(self, *, visible: bool) -> None:
         """Show or hide the names of all links, at the origins of their frames."""
-        if self._names is None:
-            if not visible:
-                return
-            self._names = [
-                self._scene.add_label(f"{self._paths[link]}/name", link) for link in self._frames
-            ]
-        for each in self._names:
+        add, paths = self._scene.add_label, self._paths
+        self._show("name", visible, lambda: [add(f"{paths[x]}/name", x) for x in self._frames])
+
+    def _show(self, kind: str, visible: bool, draw: Callable[[], list[Any]]) -> None:
+        if visible and kind not in self._extras:
+            self._extras[kind] = draw()
+        for each in self._extras.get(kind, ()):
             each.visible = visible
 
     def paint(self, color: Color) -> None:
@@ -341,10 +336,8 @@ class Surroundings:
         )
         self._sky = self._add_sky(reach, center)
         self._world = scene.add_frame("/world", axes_length=0.25 * reach, axes_radius=0.006 * reach)
-        self.planned = Lines(scene, "/planned_path", _PLANNED)
-        self.flown = Lines(scene, "/flown_path", _FLOWN)
         self.plume_lines = Lines(scene, f"{robot_path}/plumes", _PLUME)
-        self._end_effectors: dict[tuple[str, str], Lines] = {}
+        self._paths: dict[tuple[str, str], Lines] = {}
         self._paths_shown = True
 
     def _add_sky(self, reach: float, center: Array) -> list[Any]:
@@ -398,26 +391,19 @@ class Surroundings:
     def show_paths(self, *, visible: bool) -> None:
         """Show or hide the planned path and the flown ones."""
         self._paths_shown = visible
-        for each in (self.planned, self.flown, *self._end_effectors.values()):
+        for each in self._paths.values():
             each.show(visible=visible)
 
-    def draw_end_effector(self, name: str, points: Array) -> None:
-        """Draw the flown path (k, 3) of an end-effector, m."""
-        self._draw_path_of("flown", name, _FLOWN_END_EFFECTOR, points)
-
-    def draw_planned_end_effectors(self, paths: Mapping[str, Array]) -> None:
-        """Draw the planned paths (k, 3) of end-effectors, m; those of others are cleared."""
-        for kind, name in tuple(self._end_effectors):
-            if kind == "planned" and name not in paths:
-                self._end_effectors[kind, name].draw(np.zeros((0, 3)))
+    def draw_paths(self, kind: Literal["flown", "planned"], paths: Mapping[str, Array]) -> None:
+        """Draw the paths (k, 3) of base and end-effectors, m; those of others are cleared."""
+        for name in [name for each, name in self._paths if each == kind and name not in paths]:
+            self._paths[kind, name].draw(np.zeros((0, 3)))
         for name, points in paths.items():
-            self._draw_path_of("planned", name, _PLANNED, points)
-
-    def _draw_path_of(self, kind: str, name: str, color: Color, points: Array) -> None:
-        """Draw a path of an end-effector; ``kind``: ``flown`` or ``planned``."""
-        if (kind, name) not in self._end_effectors:
-            number = sum(each == kind for each, _ in self._end_effectors)
-            line = Lines(self._scene, f"/{kind}_path_of_end_effector{number}", color)
-            line.show(visible=self._paths_shown)
-            self._end_effectors[kind, name] = line
-        self._end_effectors[kind, name].draw(points)
+            if (kind, name) not in self._paths:
+                base, color = name == BASE_GOAL_KEY, _PLANNED
+                if kind == "flown":
+                    color = _FLOWN if base else _FLOWN_END_EFFECTOR
+                end = "" if base else f"_of_end_effector{len(self._paths)}"
+                self._paths[kind, name] = Lines(self._scene, f"/{kind}_path{end}", color)
+                self._paths[kind, name].show(visible=self._paths_shown)
+            self._paths[kind, name].draw(points)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import Enum
 
 import numpy as np
@@ -13,8 +13,12 @@ from spacerobot_ros.bag.playback import ReplayStatus
 from spacerobot_ros.control.status import ControllerStatus
 from spacerobot_ros.model.description import DEFAULT_END_EFFECTOR, Array
 from spacerobot_ros.planning import Goal
-from spacerobot_ros.planning.core.goal import EndEffectorGoal
-from spacerobot_ros.planning.execution.goal_file import BASE_GOAL_KEY
+from spacerobot_ros.planning.execution.goal_file import (
+    BASE_GOAL_KEY,
+    IdentifiedGoal,
+    decode_goal,
+    encode_goal,
+)
 from spacerobot_ros.planning.execution.status import PlannerStatus
 from spacerobot_ros.simulation.clearance import ClearanceStatus
 from spacerobot_ros.simulation.status import PlantStatus
@@ -80,29 +84,20 @@ for the end-effector of a controller.
 
 def goals_to_text(goal: Goal, of_controller: Goal | None = None) -> str:
     """Return goals as JSON; ``of_controller`` is the goal of a controller's end-effector."""
-    goals: dict[str, object] = {
-        "base": [*goal.position, *goal.quaternion] if goal.base else None,
-        "end_effectors": {each.link: each.numbers for each in goal.end_effectors},
-        "joints": None if goal.joint_positions is None else goal.joint_positions.tolist(),
+    goals: dict[Part, Goal] = {
+        aim.link: Goal.of_end_effectors([aim], joint_positions=goal.joint_positions)
+        for aim in goal.end_effectors
     }
+    if goal.base:
+        goals[BASE_GOAL_KEY] = replace(goal, end_effectors=())
     if of_controller is not None:
-        goals["end_effector"] = [*of_controller.position, *of_controller.quaternion]
-    return json.dumps(goals)
+        goals[DEFAULT_END_EFFECTOR] = of_controller
+    return json.dumps({part: encode_goal(IdentifiedGoal(each)) for part, each in goals.items()})
 
 
 def goals_from_text(text: str) -> dict[Part, Goal]:
     """Return the goals by part of a text of :func:`goals_to_text`; none of an empty text."""
-    given = json.loads(text or "{}")
-    joints = given.get("joints")
-    goals = {
-        part: Goal.checked(given[part][:3], given[part][3:], joints)
-        for part in (BASE_GOAL_KEY, DEFAULT_END_EFFECTOR)
-        if given.get(part)
-    }
-    for link, numbers in given.get("end_effectors", {}).items():
-        aim = EndEffectorGoal.of_numbers(link, numbers)
-        goals[link] = Goal.of_end_effectors([aim], joint_positions=joints)
-    return goals
+    return {part: decode_goal(entry) for part, entry in json.loads(text or "{}").items()}
 
 
 @dataclass(frozen=True)

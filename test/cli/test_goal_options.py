@@ -33,11 +33,10 @@ from spacerobot_ros.cli.options import (
     GoalOptions,
     beside,
     goal_options,
-    numbers,
     warn_of_large_angles,
 )
 from spacerobot_ros.cli.terminal import sentences
-from spacerobot_ros.errors import GoalError, ParameterError, PlanningError
+from spacerobot_ros.errors import GoalError, ParameterError, PlanningError, numbers
 from spacerobot_ros.measures import Outcome
 from spacerobot_ros.scenario import load_scenario
 from spacerobot_ros.termination import Terminated
@@ -405,7 +404,7 @@ def views(monkeypatch: pytest.MonkeyPatch) -> list[tuple[bool, str]]:
 
     @contextmanager
     def viewer_if_requested(
-        view: bool, parameters: Mapping[str, Any], namespace: str = ""
+        view: bool, parameters: Mapping[str, Any], namespace: str = "", settings: Any = ()
     ) -> Iterator[Any]:
         found.append((view, namespace))
         yield _Viewer() if view else None

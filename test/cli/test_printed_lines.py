@@ -20,9 +20,8 @@ from support.command_line import CliRunner, Result
 
 from spacerobot_ros.bag.salvage import Salvaged
 from spacerobot_ros.cli.main import main
-from spacerobot_ros.cli.options import numbers
 from spacerobot_ros.collision import CollisionGeometry
-from spacerobot_ros.errors import PlanningError
+from spacerobot_ros.errors import PlanningError, numbers
 from spacerobot_ros.flight.second_opinion import EngineComparison
 from spacerobot_ros.flight.trials import PlanEvaluation, PlanningProblem
 from spacerobot_ros.flight.verification import Difference, Verification

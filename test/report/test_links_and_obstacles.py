@@ -89,17 +89,17 @@ def test_errors_of_links_are_those_of_their_true_poses(hands: FlightReport) -> N
         R, r = poses_by_pinocchio(hands, link)
         goal = hands.link_goals[link]
         off = np.linalg.norm(r - goal.position, axis=1)
-        np.testing.assert_array_equal(errors.distance.time, hands.position.time)
-        np.testing.assert_allclose(errors.distance.values[:, 0], off, atol=1e-12)
+        np.testing.assert_array_equal(errors[0].time, hands.position.time)
+        np.testing.assert_allclose(errors[0].values[:, 0], off, atol=1e-12)
         np.testing.assert_allclose(hands.link_poses[link].values[:, :3], r, atol=1e-12)
         if goal.quaternion is None:
-            assert not len(errors.angle)
+            assert not len(errors[1])
             continue
         wanted = Rotation.from_quat(goal.quaternion).as_matrix()
         turned = (Rotation.from_matrix(wanted).inv() * Rotation.from_matrix(R)).magnitude()
-        np.testing.assert_allclose(errors.angle.values[:, 0], turned, atol=1e-8)
-    assert hands.link_errors[LEFT].distance.values[0, 0] > 0.3
-    assert hands.link_errors[LEFT].angle.values[0, 0] > 0.3
+        np.testing.assert_allclose(errors[1].values[:, 0], turned, atol=1e-8)
+    assert hands.link_errors[LEFT][0].values[0, 0] > 0.3
+    assert hands.link_errors[LEFT][1].values[0, 0] > 0.3
 
 
 def test_each_goal_counts_until_the_next(hands: FlightReport) -> None:
@@ -117,11 +117,11 @@ def test_each_goal_counts_until_the_next(hands: FlightReport) -> None:
     assert report.targets == targets[1:], "goals of the base"
     errors, time = report.link_errors, hands.position.time
     early, late = time <= 0.4, time >= 0.7
-    np.testing.assert_allclose(errors[RIGHT].distance.time, time[early])
-    np.testing.assert_allclose(errors[LEFT].distance.time, [*time[early], *time[late]])
+    np.testing.assert_allclose(errors[RIGHT][0].time, time[early])
+    np.testing.assert_allclose(errors[LEFT][0].time, [*time[early], *time[late]])
     _, r = poses_by_pinocchio(hands, LEFT)
     off = [*np.linalg.norm(r[early] - left.position, axis=1), *np.linalg.norm(r[late], axis=1)]
-    np.testing.assert_allclose(errors[LEFT].distance.values[:, 0], off, atol=1e-12)
+    np.testing.assert_allclose(errors[LEFT][0].values[:, 0], off, atol=1e-12)
     unknown = GoalSpan(0.0, 1.0, Goal.of_end_effectors([replace(left, link="nobody")]))
     assert other(hands, _all_targets=[unknown]).link_errors == {}
     assert other(hands, _all_targets=[]).link_errors == {}
@@ -189,7 +189,7 @@ def test_a_logarithmic_axis_ends_at_the_power_of_ten_above_the_largest_value() -
 
 
 def test_charts_have_limits_on_logarithmic_axes_where_these_have_them(hands: FlightReport) -> None:
-    signal = hands.link_errors[LEFT].distance
+    signal = hands.link_errors[LEFT][0]
     group = TraceGroup(
         signal, ["d"], "distance", "m", ["#000000"], limits=[(0, 0.01), (0, 1e-5)], decades=4
     )

@@ -16,7 +16,7 @@ from support.flight_bags import GOAL, TICK, Story, goal_value, still, tell
 
 from spacerobot_ros.bag import read_bag
 from spacerobot_ros.cli.main import main
-from spacerobot_ros.errors import RobotDescriptionError, SpaceRobotError
+from spacerobot_ros.errors import RobotDescriptionError, SpaceRobotError, shortened
 from spacerobot_ros.events import EventKind
 from spacerobot_ros.model.payload_estimation import PayloadEstimate
 from spacerobot_ros.model.urdf import parse_robot
@@ -25,7 +25,7 @@ from spacerobot_ros.report import figures_over_time
 from spacerobot_ros.report import flight as report_flight
 from spacerobot_ros.report import tables as report_tables
 from spacerobot_ros.report.events import _MARKS
-from spacerobot_ros.report.figures import ReportFigure, drawing, short
+from spacerobot_ros.report.figures import ReportFigure, drawing
 from spacerobot_ros.report.figures_over_time import momentum_budget_figure, shape_groups
 from spacerobot_ros.report.figures_space import configurations_figure
 from spacerobot_ros.report.flight import FlightReport, read_report
@@ -358,10 +358,10 @@ def test_reaction_wheels_have_rates_and_no_angles() -> None:
     assert max(abs(x) for each in angles.values() for x in each) > 1000
     groups = shape_groups(report)
     assert [group.unit for group in groups] == ["rad", "rad/s"]
-    assert not set(map(short, wheels)) & set(groups[0].names)
-    assert set(groups[1].names) == set(map(short, wheels))
+    assert not set(map(shortened, wheels)) & set(groups[0].names)
+    assert set(groups[1].names) == set(map(shortened, wheels))
     for k, name in enumerate(groups[1].names):
-        full = next(each for each in wheels if short(each) == name)
+        full = next(each for each in wheels if shortened(each) == name)
         rates = [m.velocity[list(m.name).index(full)] for m in recorded]
         assert np.abs(groups[1].signal.values[:, k]).max() == pytest.approx(np.abs(rates).max())
     # Pictures hold them still: at any angle they look the same.

@@ -76,7 +76,7 @@ def test_a_goal_ends_in_the_joint_positions_that_are_asked_for(server: Any) -> N
     q = np.array([0.05, -0.1, 0.15])
     page.editor.place(POSE, None, q, 0.0)
     assert not page.final._enabled.visible, "no planner is there"
-    page.editor.show_shape(there=True)
+    page.editor.show_parts(tool=False, planned=True)
     assert page.final._enabled.visible
     assert not page.final._folder.visible
     goal = page.editor.goals()["base"]
@@ -106,7 +106,7 @@ def test_a_goal_ends_in_the_joint_positions_that_are_asked_for(server: Any) -> N
     moved = [float(np.linalg.norm(a - b)) for a, b in zip(page.ghost(), at_rest, strict=True)]
     np.testing.assert_allclose(moved, [0.02, 0.02, 0.35], atol=1e-9)
     # Without a planner nobody takes it.
-    page.editor.show_shape(there=False)
+    page.editor.show_parts(tool=False, planned=False)
     assert not page.final._folder.visible
     assert page.editor.goals()["base"].joint_positions is None
 
@@ -149,7 +149,7 @@ def test_the_ghost_is_not_drawn_where_the_robot_is(server: Any) -> None:
 
 def test_fields_of_joints_stay_within_their_limits(server: Any) -> None:
     page = Editor(server, "servicer")
-    page.editor.show_shape(there=True)
+    page.editor.show_parts(tool=False, planned=True)
     page.editor.place(POSE, None, np.full(6, 100.0), 0.0)
     page.set(page.final._enabled, True)
     shape = page.editor.goals()["base"].joint_positions
@@ -174,7 +174,7 @@ def test_a_goal_of_the_end_effector_that_appears_is_checked(server: Any) -> None
     assert set(goals) == {"base"}
     assert page.editor.settled_goals(LATER) is None, "it is checked once"
     page.editor.add_tool(np.array([1.0, 0, 0, 0, 0, 0, 1]))
-    page.editor.show_tool(there=True)
+    page.editor.show_parts(tool=True, planned=False)
     goals = page.editor.settled_goals(LATER)
     assert goals is not None
     assert set(goals) == {"base", "end_effector"}
@@ -210,7 +210,7 @@ def two_hands(server: Any) -> Editor:
     page = Editor(server, "dual_arm")
     page.editor.offer_end_effectors(HANDS)
     page.editor.place(STANDING, None, np.linspace(0.1, 0.7, 14), 0.0)
-    page.editor.show_end_effectors(there=True)
+    page.editor.show_parts(tool=False, planned=True)
     return page
 
 
@@ -350,18 +350,18 @@ def test_hands_are_offered_while_a_planner_is_there(two_hands: Editor) -> None:
     page, parts = two_hands, two_hands.editor._parts
     choose(page, HANDS[0], "position")
     shape = np.full(14, 0.5)
-    page.editor.show_shape(there=True)
+    page.editor.show_parts(tool=False, planned=True)
     page.set(page.final._enabled, True)
     for field, position in zip(page.final._fields, shape, strict=True):
         field._impl.value = position
     asked = page.editor.goals()[HANDS[0]].joint_positions
     assert asked is not None
     np.testing.assert_array_equal(asked, shape)
-    page.editor.show_end_effectors(there=False)
+    page.editor.show_parts(tool=False, planned=False)
     assert not parts._folder.visible
     assert not gizmo(page, HANDS[0]).visible
     assert set(page.editor.goals()) == {"base"}
-    page.editor.show_end_effectors(there=True)
+    page.editor.show_parts(tool=False, planned=True)
     assert set(page.editor.goals()) == {HANDS[0]}, "as it was chosen"
     assert gizmo(page, HANDS[0]).visible
     # A recording takes no goals; after it everything is as before.
@@ -382,7 +382,7 @@ def test_hands_are_offered_while_a_planner_is_there(two_hands: Editor) -> None:
     page.editor.settled_goals(LATER)
     page.editor.offer_end_effectors(())
     assert page.editor.moving, "the goal is another one"
-    page.editor.show_end_effectors(there=True)
+    page.editor.show_parts(tool=False, planned=True)
     assert not parts._folder.visible
     assert not gizmo(page, HANDS[0]).visible
     assert set(page.editor.goals()) == {"base"}
@@ -434,7 +434,7 @@ def test_goals_of_links_that_others_send_are_shown_with_their_parts(server: Any)
     editor.follow(sent, 1.0)
     assert set(editor.goals()) == {"base"}, "the page offers no goals of links yet"
     editor.offer_end_effectors([link])
-    editor.show_end_effectors(there=True)
+    editor.show_parts(tool=False, planned=True)
     editor.follow(sent, 2.0)
     found = editor.goals()
     assert set(found) == {link}

@@ -94,7 +94,7 @@ def test_each_layer_is_shown_and_hidden_alone(server: Server, page: Page) -> Non
     base, world = server.scene.named("/robot"), server.scene.named("/world")
     lines = [
         server.scene.named(name)
-        for name in ("/planned_path", "/flown_path", "/flown_path_of_end_effector0")
+        for name in ("/planned_path", "/flown_path", "/flown_path_of_end_effector1")
     ]
     np.testing.assert_allclose(lines[2].points[0], [[3.0, 2.0, 1.0], [3.5, 2.0, 1.0]])
     assert [each.visible for each in lines] == [True] * 3
@@ -135,12 +135,12 @@ def test_planned_paths_of_end_effectors_are_drawn(server: Server, page: Page) ->
         offset = child[at].origin.R @ offset + child[at].origin.r
         at = child[at].parent
     turned = np.array([1.0 - offset[1], 2.0 + offset[0], 3.0 + offset[2]])
-    found = server.scene.named("/planned_path_of_end_effector0")
+    found = server.scene.named("/planned_path_of_end_effector2")
     np.testing.assert_allclose(found.points[0], [offset, turned], atol=1e-6)
     assert np.linalg.norm(offset) > 0.1
     assert found.visible
     page.update(replace(LATER, planned_motion=None), 2.0)
-    assert not server.scene.named("/planned_path_of_end_effector0").visible
+    assert not server.scene.named("/planned_path_of_end_effector2").visible
 
 
 # -- the past -------------------------------------------------------------------------------------

@@ -124,7 +124,7 @@ class GoalFile:
         if self._path is None:
             return
         kept = {key: goal for key, goal in goals.items() if goal.resumes}
-        entries = {key: _encode_goal(goal) for key, goal in kept.items()}
+        entries = {key: encode_goal(goal) for key, goal in kept.items()}
         self._ids = frozenset(goal.goal_id for goal in kept.values())
         if not entries:
             self.delete()
@@ -181,7 +181,7 @@ class GoalFile:
         try:
             return {
                 key: IdentifiedGoal(
-                    _decode_goal(entry),
+                    decode_goal(entry),
                     # Files of earlier versions have no goal ids.
                     str(entry.get("id", "")),
                 )
@@ -193,7 +193,8 @@ class GoalFile:
             ) from error
 
 
-def _decode_goal(entry: Mapping[str, Any]) -> Goal:
+def decode_goal(entry: Mapping[str, Any]) -> Goal:
+    """Return the goal of an entry of :func:`encode_goal`; `KeyError` or `TypeError`: it is none."""
     goal = Goal.checked(entry["position"], entry["quaternion"], entry["joint_positions"])
     paths = entry.get("paths", {})
     goals = [
@@ -210,7 +211,8 @@ def _decode_goal(entry: Mapping[str, Any]) -> Goal:
     return replace(goal, end_effectors=Goal.of_end_effectors(goals).end_effectors, base=parts)
 
 
-def _encode_goal(identified: IdentifiedGoal) -> dict[str, Any]:
+def encode_goal(identified: IdentifiedGoal) -> dict[str, Any]:
+    """Return a goal as values that JSON has."""
     goal = identified.goal
     shape = goal.joint_positions
     entry: dict[str, Any] = {
