@@ -399,7 +399,7 @@ _TOPIC_TABLE = (
     Topic(
         "planned_path",
         _PATH_TYPE,
-        ("planner",),
+        ("planner", "coordinated_control"),
         "predicted path of the base",
         latched=True,
     ),

@@ -181,7 +181,7 @@ def _summary_lines(summary: dict[str, Any]) -> list[str]:
         f"position    ({numbers(summary['final_position_m'])}) m{beside}",
         f"attitude    ({numbers(summary['final_attitude_rotvec_rad'])}) rad{turned}",
         *_end_effector_line(summary),
-        f"shape       ({numbers(_shape(summary))})",
+        *([f"shape       ({numbers(shape)})"] if (shape := _shape(summary)) else []),
         f"manoeuvre   {summary['manoeuvre_time_s']:.6g} s, "
         f"{summary['corrections']} correction(s), planned in {summary['plan_time_s']:.3f} s",
         f"flight      {summary['ticks']} ticks in {summary['wall_time_s']:.2f} s: "
@@ -235,8 +235,9 @@ def _end_effector_errors(summary: dict[str, Any], distance: float, angle: float 
 
 
 def _propellant_line(summary: dict[str, Any]) -> list[str]:
-    used = summary.get("propellant_kg")
-    return [] if used is None else [f"propellant  {1e3 * used:.1f} g"]
+    used, planned = summary.get("propellant_kg"), summary.get("planned_propellant_kg")
+    beside = "" if planned is None else f" (planned {1e3 * planned:.1f} g)"
+    return [] if used is None else [f"propellant  {1e3 * used:.1f} g{beside}"]
 
 
 def _capture_line(summary: dict[str, Any]) -> list[str]:

@@ -41,6 +41,7 @@ from spacerobot_ros.model.shared_parameters import DEFAULT_POSITION_TOLERANCE
 from spacerobot_ros.model.world import links_with_shapes, obstacles_from_topic
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.core.goal import Tolerance
+from spacerobot_ros.planning.core.schedule import BasePath
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.execution.goal_file import (
     BASE_GOAL_KEY,
@@ -96,6 +97,9 @@ class CommanderHost(Protocol):
 
     def publish_start(self, start: ScheduleStart) -> None:
         """Publish a schedule that begins; only planners have schedules."""
+
+    def publish_path(self, path: BasePath, stamp_ns: int) -> None:
+        """Publish the path of a planned reference that begins; only controllers have them."""
 
     def log(self, level: LogLevel, message: str) -> None:
         """Write a line into the log."""

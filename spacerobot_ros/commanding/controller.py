@@ -22,7 +22,8 @@ from spacerobot_ros.control import ControlState, NotFiniteError, PoseReference, 
 from spacerobot_ros.control.config import ControllerConfig
 from spacerobot_ros.control.controller import CoordinatedController, build_controller
 from spacerobot_ros.control.executive import GOAL_KEYS, ControlExecutive
-from spacerobot_ros.control.reference import HeldVelocityReference
+from spacerobot_ros.control.planned_reference import PlannedReference
+from spacerobot_ros.control.reference import HeldVelocityReference, ReferenceProfile
 from spacerobot_ros.control.servicing import Task
 from spacerobot_ros.control.status import ControllerState, ControllerStatus
 from spacerobot_ros.errors import CommandError, PlanningError
@@ -84,6 +85,7 @@ class ControllerCommander(Commander):
         self._target: RobotDescription | None = None
         self._target_odometry: Stamped | None = None
         """The latest odometry of the target, until it is read."""
+        self._published_plan: ReferenceProfile | None = None
 
     def _make_status(self, state: str, message: str, goal_id: str) -> ControllerStatus:
         return ControllerStatus(ControllerState(state), message, goal_id)
@@ -359,6 +361,7 @@ class ControllerCommander(Commander):
             now = stamp / SECOND
             self._read_target(decoder)
             result = executive.command(now, measured, q, qdot, self._reference(decoder))
+            self._publish_plan(executive.controller.profile, stamp)
             self._forward_outputs()
         except (CommandError, NotFiniteError) as error:
             self._log_fault("state", f"The state is refused: {error}")
@@ -368,6 +371,13 @@ class ControllerCommander(Commander):
             self.host.send_command(stamp)
         executive.evaluate(now, result)
         self._forward_outputs()
+
+    def _publish_plan(self, profile: ReferenceProfile | None, stamp_ns: int) -> None:
+        """Publish the path of a reference that begins, if it is planned."""
+        if profile is not self._published_plan:
+            self._published_plan = profile
+            if isinstance(profile, PlannedReference):
+                self.host.publish_path(profile.path, stamp_ns)
 
     def _measured_state(self, *arrays: Array) -> ControlState:
         """Return the state of a pose (7,), a twist (6,), q and qdot (n,)."""

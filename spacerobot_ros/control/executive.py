@@ -17,7 +17,7 @@ from spacerobot_ros.control.goal_monitor import Decision, GoalMonitor
 from spacerobot_ros.control.goal_planning import Aims, GoalPlanning, PlannedGoals
 from spacerobot_ros.control.limits import Saturated
 from spacerobot_ros.control.outputs import OutputDistance
-from spacerobot_ros.control.planned_reference import PLANNING_TIME
+from spacerobot_ros.control.planned_reference import PLANNING_TIME, PlannedReference
 from spacerobot_ros.control.servicing import Servicing, Task, TaskProgress, TaskState
 from spacerobot_ros.control.stall_monitor import StallMonitor
 from spacerobot_ros.control.state import Actuation, ControlState, PoseReference, Reference
@@ -752,7 +752,7 @@ class ControlExecutive:
                 self.controller.hold_here(time, state)
             self.controller.set_goals(time, state, **poses)
         if not (carried or again):
-            self._report_acceptance()
+            self._report_acceptance(None if planned is None else planned.profile)
             self._touched = _touch(self._contacts, time)
         self._begin_tracking(time)
         self.outputs.append(PursuedGoals(self._goals_to_save()))
@@ -810,9 +810,16 @@ class ControlExecutive:
             joint_tolerance=tolerance.shape,
         )
 
-    def _report_acceptance(self) -> None:
-        message, goal_id = "The goal is accepted.", self._goal_id
-        self.outputs.append(Event(EventKind.GOAL_ACCEPTED, message, goal_id=goal_id))
+    def _report_acceptance(self, plan: PlannedReference | None = None) -> None:
+        message, about = "The goal is accepted.", {}
+        if plan is not None:
+            message += f" The planned motion takes {plan.duration:.3g} s"
+            if (spent := plan.propellant) is not None:
+                message += f" and {1e3 * spent:.3g} g of propellant"
+                about["planned_propellant_kg"] = f"{spent:.6g}"
+            message += "."
+        goal_id = self._goal_id
+        self.outputs.append(Event(EventKind.GOAL_ACCEPTED, message, goal_id=goal_id, about=about))
 
     def _goals_to_save(self) -> dict[str, IdentifiedGoal]:
         goal, selection = self.controller.goal, self.controller.law.outputs.selection

@@ -30,6 +30,7 @@ from spacerobot_ros.model.target_motion import RelativeMotionOverTime
 from spacerobot_ros.model.thrusters import find_thrusters
 from spacerobot_ros.parameters import parameter
 from spacerobot_ros.planning.core.cancellation import Cancellation, PlanningCancelled
+from spacerobot_ros.planning.core.schedule import BasePath
 from spacerobot_ros.planning.execution.worker import MAX_THREAD_END_TIME
 from spacerobot_ros.planning.methods.thrust.goals import Grapple, ThrustGoal, ThrustStart
 from spacerobot_ros.planning.methods.thrust.motion import FrameSample, ThrustMotion
@@ -76,6 +77,17 @@ class PlannedReference(ReferenceProfile):
     ) -> None:
         super().__init__(start, goal, limits, carries=carries)
         self.motion, self.duration = motion, motion.duration
+
+    @property
+    def path(self) -> BasePath:
+        """The planned poses of the base, over the time since the start."""
+        _, base = self.motion.path()
+        return BasePath(np.linspace(0.0, self.duration, len(base.position)), *base)
+
+    @property
+    def propellant(self) -> float | None:
+        """The propellant that the plan takes, kg; None without a table of thrusters."""
+        return None if self.motion.propulsion.norms else self.motion.spent
 
     def at(self, time: float) -> Reference:
         """Return the reference ``time`` s after its start."""

@@ -49,6 +49,7 @@ from spacerobot_ros.planning.core.goal import (
     reached_message,
     uncontrolled_parts,
 )
+from spacerobot_ros.planning.core.schedule import BasePath
 from spacerobot_ros.planning.execution.status import (
     PlannerState,
     PlannerStatus,
@@ -161,6 +162,7 @@ class FlightData:
     goals: tuple[SentGoal, ...] = ()
     end_effector_goals: tuple[SentGoal, ...] = ()
     schedules: tuple[tuple[int, GaitSchedule], ...] = ()
+    paths: tuple[tuple[int, BasePath], ...] = ()
     plant_statuses: tuple[tuple[int, PlantStatus], ...] = ()
     diagnostics: tuple[tuple[int, tuple[StatusRecord, ...]], ...] = ()
     covariances: tuple[tuple[int, Array], ...] = ()
@@ -467,6 +469,13 @@ class FlightData:
         """Propellant used, kg; None without thrusters."""
         used = self.signal("propellant")
         return float(used.values[-1, 0]) if len(used) else None
+
+    @property
+    def planned_propellant(self) -> float | None:
+        """Propellant that the last planned reference takes, kg; None without one of thrusters."""
+        key = "planned_propellant_kg"
+        found = [event.about[key] for event in self.events if key in event.about]
+        return float(found[-1]) if found else None
 
     @cached_property
     def momentum_drift(self) -> Array:

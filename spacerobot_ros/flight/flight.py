@@ -108,6 +108,8 @@ class Flight(FlightData):
             summary["detumbling"] = self.detumbling
         if self.propellant is not None:
             summary["propellant_kg"] = self.propellant
+        if self.planned_propellant is not None:
+            summary["planned_propellant_kg"] = self.planned_propellant
         if self.clearance is not None:
             summary["clearance_m"] = measures.clearance
             summary["clearance_links"] = list(self.clearance.nearest.links)

@@ -47,6 +47,7 @@ from spacerobot_ros.model.shared_parameters import RobotConfig, robot_from_text,
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.core.goal import POSE
 from spacerobot_ros.planning.core.method import GaitMethod
+from spacerobot_ros.planning.core.schedule import BasePath
 from spacerobot_ros.planning.execution.goal_file import BASE_GOAL_KEY, GoalIds
 from spacerobot_ros.planning.execution.status import PlannerStatus, ScheduleStart
 from spacerobot_ros.scenario import Scenario
@@ -196,6 +197,10 @@ class _Host:
 
     def publish_start(self, start: ScheduleStart) -> None:
         self.flight.log.schedules.append((start.stamp_ns, start.schedule))
+        self.publish_path(start.schedule.path, start.stamp_ns)
+
+    def publish_path(self, path: BasePath, stamp_ns: int) -> None:
+        self.flight.log.paths.append((stamp_ns, path))
 
     def log(self, level: str, message: str) -> None:
         pass

@@ -14,6 +14,7 @@ from spacerobot_ros.measures import Outcome
 from spacerobot_ros.messages.statuses import StatusRecord
 from spacerobot_ros.model.description import Array, RobotDescription
 from spacerobot_ros.planning import GaitSchedule
+from spacerobot_ros.planning.core.schedule import BasePath
 from spacerobot_ros.planning.execution.status import PlannerStatus
 from spacerobot_ros.scenario import Scenario
 from spacerobot_ros.simulation.actuators import PlantWithFaults, thrusters_in
@@ -46,6 +47,7 @@ class FlightLog:
         self.events: list[Event] = []
         self.statuses: list[tuple[int, Status]] = []
         self.schedules: list[tuple[int, GaitSchedule]] = []
+        self.paths: list[tuple[int, BasePath]] = []
         self.plant_statuses: list[tuple[int, PlantStatus]] = []
         self.diagnostics: list[tuple[int, tuple[StatusRecord, ...]]] = []
         self.covariances: list[tuple[int, Array]] = []
@@ -150,6 +152,7 @@ class FlightLog:
             goal=scenario.goal.kept_at(*np.split(states["pose"][0], [3])),
             end_effector_goal=scenario.end_effector_goal,
             schedules=tuple(self.schedules),
+            paths=tuple(self.paths),
             plant_statuses=tuple(self.plant_statuses),
             diagnostics=tuple(self.diagnostics),
             covariances=tuple(self.covariances),

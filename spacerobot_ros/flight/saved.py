@@ -383,11 +383,12 @@ def _plan_streams(flight: FlightData) -> Iterator[_Stream]:
     schedules = flight.schedules
     makers: dict[str, Callable[[int, GaitSchedule], bytes]] = {
         "gait_schedule": lambda time, plan: trajectory_message(plan, time, robot.base_link),
-        "planned_path": lambda time, plan: path_message(plan.path, time, world),
         "markers": lambda time, plan: goal_markers(plan.goal, plan.path, robot, world),
     }
     for name, make in makers.items():
         yield _Stream.of(TOPICS[name], [(time, make(time, plan)) for time, plan in schedules])
+    paths = [(time, path_message(path, time, world)) for time, path in flight.paths]
+    yield _Stream.of(TOPICS["planned_path"], paths)
 
 
 def _status_streams(flight: FlightData) -> Iterator[_Stream]:

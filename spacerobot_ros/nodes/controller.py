@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseStamped, WrenchStamped
-from nav_msgs.msg import Odometry
+from nav_msgs.msg import Odometry, Path
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 
@@ -25,6 +25,7 @@ from spacerobot_ros.control.planned_reference import PlannedReference
 from spacerobot_ros.control.servicing import Task
 from spacerobot_ros.control.status import ControllerState
 from spacerobot_ros.errors import SpaceRobotError
+from spacerobot_ros.messages.builders import path_message
 from spacerobot_ros.messages.layout import encode
 from spacerobot_ros.messages.readers import (
     WRENCH,
@@ -40,6 +41,7 @@ from spacerobot_ros.nodes.common.process import run_node
 from spacerobot_ros.nodes.common.watchdog import HEARTBEAT_QOS, HeartbeatState, Role
 from spacerobot_ros.nodes.common.watchdog import TOPIC as HEARTBEAT
 from spacerobot_ros.planning.core.goal import Goal
+from spacerobot_ros.planning.core.schedule import BasePath
 from spacerobot_ros.planning.execution.goal_file import BASE_GOAL_KEY
 from spacerobot_ros.planning.execution.status import ScheduleStart
 from spacerobot_ros.times import first_time_ns, stamp_bytes
@@ -87,6 +89,7 @@ class CoordinatedControlNode(CommanderNode):
         self.create_subscription(Odometry, TARGET_ODOMETRY, self._on_target, STREAM, raw=True)
         if self.config.profile == PlannedReference.name:
             self.listen_to_obstacles()
+            self._path_topic = self.create_publisher(Path, "planned_path", LATCHED)
         self.subscribe_to_goals("goal_pose")
         self.subscribe_to_goals("end_effector/goal_pose", END_EFFECTOR)
         if self.config.watchdog_timeout:
@@ -175,6 +178,10 @@ class CoordinatedControlNode(CommanderNode):
 
     def publish_start(self, start: ScheduleStart) -> None:
         """Ignore schedules, which a controller does not have."""
+
+    def publish_path(self, path: BasePath, stamp_ns: int) -> None:
+        """Publish the path of a planned reference."""
+        self._path_topic.publish(path_message(path, stamp_ns, self.config.world_frame))
 
 
 def main() -> None:

@@ -33,6 +33,7 @@ from spacerobot_ros.nodes.common.node import LATCHED, STREAM, described_robot
 from spacerobot_ros.nodes.common.process import run_node
 from spacerobot_ros.nodes.common.trajectory_clients import TrajectoryClients
 from spacerobot_ros.planning.core.goal import EndEffectorGoal, Goal
+from spacerobot_ros.planning.core.schedule import BasePath
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.execution.goal_file import BASE_GOAL_KEY
 from spacerobot_ros.planning.execution.status import (
@@ -227,6 +228,9 @@ class PlannerNode(CommanderNode):
         # Serialising a long schedule takes longer than a tick, and nothing waits for it.
         self._announcement = Thread(target=self._publish_schedule, args=(start,), daemon=True)
         self._announcement.start()
+
+    def publish_path(self, path: BasePath, stamp_ns: int) -> None:
+        """Ignore paths of references, which a planner does not have."""
 
     def _publish_schedule(self, start: ScheduleStart) -> None:
         schedule, stamp, frame = start.schedule, start.stamp_ns, self.config.world_frame

@@ -283,7 +283,7 @@ def path_figure(flight: FlightReport, beside: Sequence[FlightReport] = ()) -> Re
         + f" in the world frame{', three views to one scale' if len(views) > 1 else ''}: open "
         "circle, start; full circle, end"
         + ("; cross, goal" if goals else "")
-        + ("; dashed, the path of the base that the planner published" if flight.planned else "")
+        + ("; dashed, the planned path of the base" if flight.planned else "")
         + ". Every recorded state is drawn."
     )
     return ReportFigure("path", "Paths", caption, figure)

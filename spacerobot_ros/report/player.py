@@ -18,7 +18,13 @@ from spacerobot_ros.flight.series import Signal
 from spacerobot_ros.model.description import Array, Pose, Shape
 from spacerobot_ros.model.rotations import matrix_from_quaternion
 from spacerobot_ros.model.visuals import Visual, solid_mesh
-from spacerobot_ros.report.figures import BASE_COLOUR, GHOST_COLOUR, HAND_COLOUR, LINE_COLOUR
+from spacerobot_ros.report.figures import (
+    BASE_COLOUR,
+    GHOST_COLOUR,
+    HAND_COLOUR,
+    LINE_COLOUR,
+    PLANNED_COLOUR,
+)
 from spacerobot_ros.report.flight import FlightReport
 from spacerobot_ros.report.page_parts import PagePart, package_file
 from spacerobot_ros.report.scene import Body, bodies_of, goal_of_base, is_flat, obstacles_of
@@ -399,6 +405,7 @@ def _grid_lines(center: Array, radius: float, spacing: float, flat: bool) -> Arr
 
 def _path_commands(flight: FlightReport) -> list[Command]:
     lines = [("path of the base", flight.position.values, BASE_COLOUR)]
+    lines += [(f"plan {k}", path, PLANNED_COLOUR) for k, path in enumerate(flight.planned)]
     if len(flight.tool):
         lines.append(("path of the end-effector", flight.tool.values[:, :3], HAND_COLOUR))
     assert flight.robot is not None
@@ -459,6 +466,7 @@ def _caption_text(flight: FlightReport, frames: KeyFrames, radius: float, ghosts
         text += " and of the end-effectors (pink)"
     elif len(flight.tool) or flight.link_poses:
         text += " and of the end-effector (pink)"
+    text += " and what was planned (orange)" * bool(flight.planned)
     text += "; the green ghost is the goal" if ghosts else ""
     text += "; obstacles have the shapes by which distances are measured" * bool(flight.obstacles)
     text += "; the target moves as target/odom says" * (flight.target is not None)

@@ -71,7 +71,9 @@ def headline(flight: FlightReport) -> list[tuple[str, str, str]]:
         label = "Momentum not explained by thrusters" if flight.has_thrust else "Momentum drift"
         rows.append((label, quantity(linear, "kg m/s"), f"angular {quantity(angular, 'kg m²/s')}"))
     if (propellant := flight.propellant) is not None:
-        rows.append(("Propellant", f"{1e3 * propellant:.3g} g", ""))
+        planned = flight.planned_propellant
+        beside = "" if planned is None else f"planned: {1e3 * planned:.3g} g"
+        rows.append(("Propellant", f"{1e3 * propellant:.3g} g", beside))
     if capture := flight.capture:
         about = flight.capture_measures
         done = f"at {about.time:.4g} s" if capture["captured"] else "no"

@@ -49,6 +49,9 @@ class Host:
     def publish_start(self, start: Any) -> None:
         self.starts.append(start)
 
+    def publish_path(self, path: Any, stamp_ns: int) -> None:
+        self.starts.append(path)
+
     def log(self, level: str, message: str) -> None:
         self.lines.append((level, message))
 

@@ -64,6 +64,14 @@ def test_a_planned_docking_takes_less_propellant_in_the_same_time() -> None:
     assert planned.propellant is not None
     assert straight.propellant is not None
     assert planned.propellant < 0.7 * straight.propellant
+    ((begins_ns, path),) = planned.paths
+    assert begins_ns == 0
+    np.testing.assert_allclose(path.position[0], planned.pose[0, :3], atol=1e-9)
+    np.testing.assert_allclose(path.position[-1], planned.pose[-1, :3], atol=5e-3)
+    assert planned.planned_propellant is not None
+    # Feedback takes the rest.
+    assert 0.7 * planned.propellant < planned.planned_propellant < planned.propellant
+    assert (straight.paths, straight.planned_propellant) == ((), None)
 
 
 def test_a_goal_behind_a_panel_is_reached_round_it() -> None:
