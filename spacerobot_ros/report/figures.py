@@ -13,7 +13,7 @@ from enum import Enum
 from functools import cached_property
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, NamedTuple
 
 import matplotlib as mpl
 import numpy as np
@@ -75,12 +75,17 @@ _FIXED_SETTINGS: Any = {
 }
 
 
-_figure_width = ContextVar("_figure_width", default=WIDTH)
-_degrees = ContextVar("_degrees", default=False)
-_lettered = ContextVar("_lettered", default=False)
-"""Whether figures of several panels have letters: (a), (b)."""
-_font_scale = ContextVar("_font_scale", default=1.0)
-"""Ratio of the font size to 8.5 points."""
+class _Look(NamedTuple):
+    """How figures are drawn; ``scale``: ratio of the font size to 8.5 points."""
+
+    width: float = WIDTH
+    degrees: bool = False
+    lettered: bool = False
+    scale: float = 1.0
+
+
+_PAGE = _Look()
+_look = ContextVar("_look", default=_PAGE)
 
 
 @contextmanager
@@ -120,16 +125,12 @@ def drawing(
             _apply_style(own)
             _require_fonts(own)
         mpl.rcParams.update(_FIXED_SETTINGS)
-        across = _figure_width.set(width)
-        scale = _font_scale.set(float(mpl.rcParams["font.size"]) / _FONT_SIZE)
-        angles, letters = _degrees.set(degrees), _lettered.set(lettered)
+        scale = float(mpl.rcParams["font.size"]) / _FONT_SIZE
+        before = _look.set(_Look(width, degrees, lettered, scale))
         try:
             yield
         finally:
-            _degrees.reset(angles)
-            _lettered.reset(letters)
-            _figure_width.reset(across)
-            _font_scale.reset(scale)
+            _look.reset(before)
 
 
 def _apply_style(path: Path) -> None:
@@ -222,22 +223,22 @@ class _Warnings(logging.Filter):
 
 def width() -> float:
     """Return the width of a figure, inches."""
-    return _figure_width.get()
+    return _look.get().width
 
 
 def narrow() -> bool:
     """Whether a figure is for one column of a paper."""
-    return _figure_width.get() / _font_scale.get() < _NARROW_WIDTH
+    return _look.get().width / _look.get().scale < _NARROW_WIDTH
 
 
 def inches(length: float) -> float:
     """Return a length made for letters of 8.5 points, scaled to the font size, inches."""
-    return length * _font_scale.get()
+    return length * _look.get().scale
 
 
 def angle_unit() -> tuple[float, str]:
     """Return the unit that angles are drawn in, and its number in one rad."""
-    return (180.0 / np.pi, "deg") if _degrees.get() else (1.0, "rad")
+    return (180.0 / np.pi, "deg") if _look.get().degrees else (1.0, "rad")
 
 
 def sheet(
@@ -257,11 +258,11 @@ def sheet(
     there is room for labels ``left`` and ``right`` of the panels, at the ``bottom``, and for titles
     at the ``top``, in the ``gap`` between the rows, and for a ``lane`` below every row.
     """
-    scale = _font_scale.get()
+    scale = _look.get().scale
     if narrow() and left > 0.5:
         # Panels are small, so tick labels have few digits.
         left = max(left, 0.95)
-    if _lettered.get():
+    if _look.get().lettered:
         left = max(left, _LETTER_WIDTH)
     left, right, top = (scale * x for x in (left, right, top))
     bottom, gap = scale * (bottom + lane), scale * (gap + lane)
@@ -299,7 +300,7 @@ _LETTER = "letter"
 
 def _letter_panels(panels: Sequence[Axes], left: float) -> None:
     """Write (a), (b) and so on ``left`` of the top of each panel, inches, if that is wanted."""
-    if not _lettered.get() or len(panels) < 2:
+    if not _look.get().lettered or len(panels) < 2:
         return
     for number, axes in enumerate(panels):
         axes.annotate(
@@ -442,10 +443,7 @@ def draw_traces(
         values = factor * signal.values[:, index]
         in_sight = Signal(signal.time, values[:, np.newaxis] / (_INVISIBLE_ERROR * (high - low)))
         crowded = len(signal) > 2 * columns
-        if crowded and _needs_band(in_sight, columns):
-            kept, off = np.empty(0, np.int64), np.inf
-        else:
-            kept, off = simplified(in_sight, columns)
+        kept, off = simplified(in_sight, columns)
         if off > 1.0 and crowded:
             dense = True
             time, least, most = envelope(signal, index, columns)
@@ -467,14 +465,6 @@ def draw_traces(
     return dense
 
 
-def _needs_band(signal: Signal, columns: int) -> bool:
-    """Whether a signal, in tolerances, is mostly off the line through ``columns`` samples."""
-    nodes = np.linspace(0, len(signal) - 1, columns + 1).astype(int)
-    values = signal.values[:, 0]
-    line = np.interp(signal.time, signal.time[nodes], values[nodes])
-    return bool(np.mean(np.abs(values - line) > 1.0) > 0.5)
-
-
 def largest_over_time(signal: Signal, column: int) -> tuple[Array, Array]:
     """Return times and values of a column; of a dense one the largest in each slice of time."""
     if len(signal) <= 2 * LARGEST_VALUE_SLICES:
@@ -483,8 +473,14 @@ def largest_over_time(signal: Signal, column: int) -> tuple[Array, Array]:
     return time, high
 
 
-def set_range(axes: Axes, values: Array, extra: Sequence[float] = (), least: float = 0.0) -> None:
-    """Set the y axis to the range of values with a margin, and nearby values of ``extra``.
+def set_range(
+    axes: Axes,
+    values: Array,
+    extra: Sequence[float] = (),
+    least: float = 0.0,
+    axis: Literal["x", "y"] = "y",
+) -> None:
+    """Set an axis to the range of values with a margin, and nearby values of ``extra``.
 
     The axis spans at least ``least``, or 0.1 if the values are constant, so that rounding errors
     are not magnified.
@@ -497,8 +493,9 @@ def set_range(axes: Axes, values: Array, extra: Sequence[float] = (), least: flo
     near = [x for x in extra if low - 0.2 * span <= x <= high + 0.2 * span]
     low, high = min([low, *near]), max([high, *near])
     middle, half = (low + high) / 2, max(high - low, least) / 2
-    axes.set_ylim(middle - 1.12 * half, middle + 1.12 * half)
-    axes.yaxis.set_major_locator(MaxNLocator(5, steps=[1, 2, 2.5, 5, 10]))
+    axes.set(**{f"{axis}lim": (middle - 1.12 * half, middle + 1.12 * half)})
+    ticks = MaxNLocator(5 if axis == "y" else 4, steps=[1, 2, 2.5, 5, 10])
+    (axes.yaxis if axis == "y" else axes.xaxis).set_major_locator(ticks)
 
 
 def log_range(values: Array, decades: int) -> tuple[float, float]:
@@ -574,7 +571,7 @@ def legend_above(axes: Axes, keys: Sequence[Line2D]) -> None:
         )
         figure = axes.figure
         assert isinstance(figure, Figure)
-        left = _LETTER_WIDTH * figure.dpi if _lettered.get() else 0.0
+        left = _LETTER_WIDTH * figure.dpi if _look.get().lettered else 0.0
         fit_legend(legend, axes.bbox.x1 - left)
 
 
@@ -649,7 +646,7 @@ class TraceGroup:
         """Return the traces in the unit of angles that is drawn: in degrees instead of rad, if
         that is wanted.
         """
-        if not _degrees.get() or not self.unit.startswith("rad"):
+        if not _look.get().degrees or not self.unit.startswith("rad"):
             return self
         factor, unit = angle_unit()
         return replace(

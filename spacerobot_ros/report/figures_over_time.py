@@ -428,15 +428,10 @@ def joint_groups(
 
 def axis_groups(signal: Signal, parts: Sequence[tuple[str, str]]) -> list[TraceGroup]:
     """Return a group of x, y and z for each label and unit; they are columns side by side."""
+    columns = [signal.values[:, 3 * k : 3 * k + 3] for k in range(len(parts))]
     return [
-        TraceGroup(
-            Signal(signal.time, signal.values[:, 3 * k : 3 * k + 3]),
-            list("xyz"),
-            label,
-            unit,
-            PALETTE[:3],
-        )
-        for k, (label, unit) in enumerate(parts)
+        TraceGroup(Signal(signal.time, values), list("xyz"), label, unit, PALETTE[:3])
+        for values, (label, unit) in zip(columns, parts, strict=True)
     ]
 
 

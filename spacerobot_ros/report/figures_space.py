@@ -8,6 +8,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from spacerobot_ros.errors import shortened
@@ -248,11 +249,8 @@ def path_figure(flight: FlightReport, beside: Sequence[FlightReport] = ()) -> Re
     views = {"from above": (0, 1), "from the front": (0, 2), "from the side": (1, 2)}
     if float(np.ptp(everything[:, 2])) < 1e-9:
         views = {"from above": (0, 1)}
-    if narrow():
-        figure, panels = sheet([[1.0]] * len(views), [2.6] * len(views), gap=0.75)
-    else:
-        figure, panels = sheet([[1.0] * len(views)], [2.35 if len(views) > 1 else 4.2])
-    places = [axes for row in panels for axes in row]
+    count = len(views)
+    figure, places = _square_panels(count, count, 2.6, 2.35 if count > 1 else 4.2)
     for axes, (title, (i, j)) in zip(places, views.items(), strict=True):
         for path, tint in paths:
             dense = len(path) > 2 * TRACE_TIME_SLICES
@@ -296,6 +294,22 @@ def _set_square_limits(axes: Axes, middle: Array, half: float) -> None:
     axes.locator_params(nbins=5)
 
 
+def _square_panels(
+    count: int, across: int, stacked: float, beside: float
+) -> tuple[Figure, list[Axes]]:
+    """Return so many panels: above each other in a narrow figure, else ``across`` in a row; each of
+    a height in inches.
+    """
+    if narrow():
+        figure, panels = sheet([[1.0]] * count, [stacked] * count, gap=0.75)
+    else:
+        figure, panels = sheet([[1.0] * across], [beside])
+    places = [axes for row in panels for axes in row]
+    for axes in places[count:]:
+        axes.set_visible(False)
+    return figure, places[:count]
+
+
 _LOOP_JOINTS = 3
 
 
@@ -319,20 +333,15 @@ def loops_figure(flight: FlightReport) -> ReportFigure | str:
     if cycles is not None:
         part = part.between(*cycles.last(SHOWN_CYCLES))
     one = len(pairs) == 1
-    if narrow():
-        figure, panels = sheet([[1.0]] * len(pairs), [2.0] * len(pairs), gap=0.75)
-    else:
-        figure, panels = sheet([[1.0] * (2 if one else _LOOP_JOINTS)], [3.4 if one else 2.35])
-    places = [axes for row in panels for axes in row]
-    for axes in places[len(pairs) :]:
-        axes.set_visible(False)
-    for axes, (i, j) in zip(places[: len(pairs)], pairs, strict=True):
+    across, high = (2, 3.4) if one else (_LOOP_JOINTS, 2.35)
+    figure, places = _square_panels(len(pairs), across, 2.0, high)
+    for axes, (i, j) in zip(places, pairs, strict=True):
         x, y = part.values[:, i], part.values[:, j]
         axes.plot(x, y, color=colour(0), rasterized=len(part) > 4 * TRACE_TIME_SLICES)
         axes.plot(x[:1], y[:1], "o", color=colour(0), mfc="white", ms=5, zorder=4)
         axes.plot(x[-1:], y[-1:], "o", color=colour(0), ms=2.5, zorder=4)
         set_range(axes, y)
-        _set_x_range(axes, x)
+        set_range(axes, x, axis="x")
         units = [joint_units[k] for k in (i, j)]
         axes.set_xlabel(f"{names[i]} ({units[0]})")
         axes.set_ylabel(f"{names[j]} ({units[1]})")
@@ -357,13 +366,6 @@ def loops_figure(flight: FlightReport) -> ReportFigure | str:
         caption += f" The first three of {len(flight.shape_columns)} joints are shown."
     heading = "Path in shape space" if cycles is None else "Loops in shape space"
     return ReportFigure("loops", heading, caption, figure)
-
-
-def _set_x_range(axes: Axes, values: Array) -> None:
-    low, high = float(values.min()), float(values.max())
-    half = (high - low if high - low > 1e-6 else 0.1) / 2
-    axes.set_xlim((low + high) / 2 - 1.12 * half, (low + high) / 2 + 1.12 * half)
-    axes.locator_params(axis="x", nbins=4)
 
 
 def _signed_area(x: Array, y: Array) -> float:

@@ -28,7 +28,7 @@ from spacerobot_ros.flight.reading import (
     read_flight,
     since,
 )
-from spacerobot_ros.flight.series import SentGoal, Signal, pose_error, reported_goal
+from spacerobot_ros.flight.series import SentGoal, Signal, reported_goal
 from spacerobot_ros.measures import flown_time
 from spacerobot_ros.model.description import DEFAULT_END_EFFECTOR, Array, Joint, Pose, Shape
 from spacerobot_ros.model.meshes import TriangleMesh
@@ -39,7 +39,7 @@ from spacerobot_ros.model.rotations import (
     rotvecs_from_quaternions,
 )
 from spacerobot_ros.model.visuals import Visual, meshes_from_attachments
-from spacerobot_ros.planning import Goal, PoseError
+from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.core.goal import EndEffectorGoal
 from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus, time_to_end
 from spacerobot_ros.planning.methods.registry import METHODS
@@ -362,12 +362,6 @@ class FlightReport(Flight):
         return [GoalSpan(t, end, goal) for (t, goal), end in zip(goals, ends, strict=True)]
 
     @property
-    def tool_error(self) -> PoseError | None:
-        """Error of the last pose of a controller's end-effector to its last goal."""
-        goals = self.tool_goals
-        return pose_error(self.tool, goals[-1].goal) if goals else None
-
-    @property
     def position_counts(self) -> bool:
         """Whether the method controls the position of the base."""
         return "position" not in self.not_controlled
@@ -381,11 +375,6 @@ class FlightReport(Flight):
             return list(range(6))
         axes = ("x", "y", "z", "rx", "ry", "rz")
         return [i for i, axis in enumerate(axes) if f"{part}.{axis}" in self.outputs]
-
-    @property
-    def measured_error(self) -> PoseError | None:
-        """Error of the last measured pose to the goal, where sensors err."""
-        return pose_error(self.signal("measured_pose"), self.base_goal)
 
     def goal_rotvec(self, goal: Goal) -> Array:
         """Attitude of a goal (3,), rad, with the number of turns nearest to the last attitude."""

@@ -11,6 +11,7 @@ import numpy as np
 
 from spacerobot_ros.errors import SpaceRobotError, numbers, quantity
 from spacerobot_ros.flight.captures import payload_estimates
+from spacerobot_ros.flight.series import pose_error
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.inertial_parameters import INERTIA_ENTRIES
 from spacerobot_ros.model.payload_estimation import PayloadEstimate
@@ -38,7 +39,8 @@ class Table:
 def headline(flight: FlightReport) -> list[tuple[str, str, str]]:
     """Return label, value and note of each headline number."""
     rows: list[tuple[str, str, str]] = []
-    error, tool, sensed = flight.error, flight.tool_error, flight.measured_error
+    error, sensed = flight.error, pose_error(flight.signal("measured_pose"), flight.base_goal)
+    tool = flight.end_effector_error if flight.tool_goals else None
     if error is not None:
         measured = "" if sensed is None else f"measured: {quantity(sensed.distance, 'm')}"
         near = quantity(error.distance, "m"), measured
@@ -129,7 +131,7 @@ def result_table(flight: FlightReport) -> Table:
         rows.append(("Final position", _position_text(flight.position.values[-1])))
         attitude = rotvec_from_quaternion(flight.quaternion[-1])
         rows.append(("Final attitude", _format_attitude(attitude)))
-    if flight.tool_error is not None:
+    if flight.tool_goals and len(flight.tool):
         goal = flight.tool_goals[-1].goal
         rows.append(("End-effector goal", _position_text(goal.position)))
         rows.append(("End-effector, final", _position_text(flight.tool.values[-1, :3])))
@@ -230,18 +232,7 @@ def joint_table(flight: FlightReport) -> Table | None:
             if joint is not None and 0 < joint.limits.velocity < math.inf:
                 share = f"{100 * peak / joint.limits.velocity:.1f} %"
         kind = joint.kind.value if joint is not None else _NO_VALUE
-        rows.append(
-            (
-                name,
-                kind,
-                unit,
-                *ends,
-                limits,
-                peak_text,
-                limit,
-                share,
-            )
-        )
+        rows.append((name, kind, unit, *ends, limits, peak_text, limit, share))
     head = ["Joint", "Type", "Unit", "Start", "Final", "Limits", "Peak velocity", "Limit", "Used"]
     return Table(tuple(head), rows, (3, 4, 5, 6, 7, 8))
 

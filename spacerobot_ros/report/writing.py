@@ -10,6 +10,8 @@ from matplotlib.figure import Figure
 
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.files import write_output
+from spacerobot_ros.report import figures_over_time as over_time
+from spacerobot_ros.report import figures_space as space
 from spacerobot_ros.report.figures import (
     WIDTH,
     PictureFormat,
@@ -21,38 +23,6 @@ from spacerobot_ros.report.figures import (
     room_for,
     sheet,
     widen_panels,
-)
-from spacerobot_ros.report.figures_over_time import (
-    NO_POSES_TEXT,
-    attitude_figure,
-    attitude_group,
-    clearance_figure,
-    draw_group,
-    efforts_figure,
-    errors_figure,
-    figure_of_flights,
-    link_errors_figure,
-    momentum_budget_figure,
-    momentum_figure,
-    pose_figure,
-    position_figure,
-    position_group,
-    rates_figure,
-    sensors_figure,
-    shape_figure,
-    shape_groups,
-    thrusters_figure,
-    twist_figure,
-)
-from spacerobot_ros.report.figures_space import (
-    configurations_figure,
-    cycles_figure,
-    draw_goal_and_path,
-    draw_robot,
-    loops_figure,
-    path_figure,
-    view_of,
-    with_near,
 )
 from spacerobot_ros.report.flight import FlightReport, read_report
 from spacerobot_ros.report.page import page
@@ -70,24 +40,24 @@ _ROBOT_PANEL_WIDTH = 3.9
 """Width of the robot in a picture, inches."""
 
 FIGURES: dict[str, Callable[[FlightReport], ReportFigure | str | None]] = {
-    "robot": configurations_figure,
-    "pose": pose_figure,
-    "position": position_figure,
-    "attitude": attitude_figure,
-    "cycles": cycles_figure,
-    "joints": shape_figure,
-    "velocities": rates_figure,
-    "loops": loops_figure,
-    "errors": errors_figure,
-    "link_errors": link_errors_figure,
-    "sensors": sensors_figure,
-    "efforts": efforts_figure,
-    "thrusters": thrusters_figure,
-    "twist": twist_figure,
-    "clearance": clearance_figure,
-    "momentum": momentum_figure,
-    "momentum_budget": momentum_budget_figure,
-    "path": path_figure,
+    "robot": space.configurations_figure,
+    "pose": over_time.pose_figure,
+    "position": over_time.position_figure,
+    "attitude": over_time.attitude_figure,
+    "cycles": space.cycles_figure,
+    "joints": over_time.shape_figure,
+    "velocities": over_time.rates_figure,
+    "loops": space.loops_figure,
+    "errors": over_time.errors_figure,
+    "link_errors": over_time.link_errors_figure,
+    "sensors": over_time.sensors_figure,
+    "efforts": over_time.efforts_figure,
+    "thrusters": over_time.thrusters_figure,
+    "twist": over_time.twist_figure,
+    "clearance": over_time.clearance_figure,
+    "momentum": over_time.momentum_figure,
+    "momentum_budget": over_time.momentum_budget_figure,
+    "path": space.path_figure,
 }
 """The figures of :func:`write_figures`, by name."""
 
@@ -112,7 +82,7 @@ def write_report(
     flight = read_report(bag, namespace)
     others = [read_report(other) for other in beside]
     with drawing():
-        figures = [*(draw(flight) for draw in _REPORT_FIGURES), path_figure(flight, others)]
+        figures = [*(draw(flight) for draw in _REPORT_FIGURES), space.path_figure(flight, others)]
         text = page(flight, player_of(view_of_flight(flight)), figures, others)
     write_output(html, text)
 
@@ -186,9 +156,9 @@ def write_figures(
         for name in only or [name for name in FIGURES if name not in ("position", "attitude")]:
             try:
                 if others and name == "path":
-                    figure: ReportFigure | str | None = path_figure(flight, others)
+                    figure: ReportFigure | str | None = space.path_figure(flight, others)
                 elif others:
-                    figure = figure_of_flights([flight, *others], FIGURES[name])
+                    figure = over_time.figure_of_flights([flight, *others], FIGURES[name])
                 else:
                     figure = FIGURES[name](flight)
                 if isinstance(figure, ReportFigure):
@@ -224,15 +194,15 @@ def write_picture(bag: Path, picture: Path, *, namespace: str | None = None) -> 
     format = PictureFormat.of(picture)
     flight = read_report(bag, namespace)
     if not len(flight.position):
-        raise SpaceRobotError(NO_POSES_TEXT)
+        raise SpaceRobotError(over_time.NO_POSES_TEXT)
     with drawing():
         write_output(picture, picture_of(_overview_figure(flight), format, _PICTURE_PIXELS))
 
 
 def _overview_figure(flight: FlightReport) -> Figure:
-    groups = [position_group(flight), attitude_group(flight)]
+    groups = [over_time.position_group(flight), over_time.attitude_group(flight)]
     if len(flight.shape):
-        groups += shape_groups(flight)[:1]
+        groups += over_time.shape_groups(flight)[:1]
     robot, around = [], placed_solids(obstacles_of(flight), 0)
     if not flight.hidden_links_text:
         last = [len(flight.position) - 1]
@@ -243,7 +213,9 @@ def _overview_figure(flight: FlightReport) -> Figure:
     figure, panels = sheet(rows, [1.25] * len(groups), right=right + beside, top=0.77, gap=0.42)
     share = 1.0 - (right + beside) / WIDTH
     for number, (group, (axes,)) in enumerate(zip(groups, panels, strict=True)):
-        draw_group(axes, group, flight.end, share, [time for time, _ in flight.executing[1:]])
+        over_time.draw_group(
+            axes, group, flight.end, share, [time for time, _ in flight.executing[1:]]
+        )
         if number < len(groups) - 1:
             axes.set_xlabel("")
             axes.tick_params(labelbottom=False)
@@ -251,10 +223,10 @@ def _overview_figure(flight: FlightReport) -> Figure:
     if robot:
         size = _ROBOT_PANEL_WIDTH - 0.15
         axes = panel(figure, WIDTH - size - 0.1, 0.2, size, up - 1.0)
-        view = view_of(flight)
-        points = with_near(corner_points(robot), corner_points(around), view)
-        draw_robot(axes, [*robot, *around], points, view)
-        legend_above(axes, draw_goal_and_path(axes, flight, view))
+        view = space.view_of(flight)
+        points = space.with_near(corner_points(robot), corner_points(around), view)
+        space.draw_robot(axes, [*robot, *around], points, view)
+        legend_above(axes, space.draw_goal_and_path(axes, flight, view))
     title = ": ".join(filter(None, (flight.scenario.name, flight.scenario.description)))
     figure.text(0.1 / WIDTH, 1 - 0.24 / up, title, size=10.5, weight="bold")
     return figure

@@ -297,14 +297,19 @@ def joints_html(robot: RobotDescription, q: Array, qdot: Array, effort: Array) -
         cells.append(_value_and_limit(effort[i], strongest[i], effort_unit))
         # Long names take several lines.
         cells[0] = f'<div style="white-space:normal;overflow-wrap:anywhere">{name}</div>'
-        rows.append("<tr>" + "".join(f"<td>{cell}</td>" for cell in cells) + "</tr>")
-    titles = ("joint", "at", "in range", "rate", "effort")
-    heads = "".join(f"<th>{title}</th>" for title in titles)
+        rows.append(cells)
     if not rows:
         return padded("The robot has no joints.")
-    style = "border-spacing:3px 2px;text-align:left;white-space:nowrap;font-size:.85em"
-    table = f'<table style="{style}"><tr>{heads}</tr>{"".join(rows)}</table>'
+    table = _table_html(rows, ("joint", "at", "in range", "rate", "effort"))
     return padded(f'<div tabindex="0" style="overflow-x:auto">{table}</div>')
+
+
+def _table_html(rows: Iterable[Sequence[str]], head: Sequence[str] = ()) -> str:
+    cells = [[f"<th>{title}</th>" for title in head]] if head else []
+    cells += [[f"<td>{cell}</td>" for cell in row] for row in rows]
+    lines = "".join(f"<tr>{''.join(each)}</tr>" for each in cells)
+    style = "border-spacing:3px 2px;text-align:left;white-space:nowrap;font-size:.85em"
+    return f'<table style="{style}">{lines}</table>'
 
 
 def _share_of_range(value: float, lower: float, upper: float) -> float | None:
@@ -514,13 +519,8 @@ def momentum_html(state: StackState) -> str:
         title = f'<span title="{escape(name)}">{escape(shortened(name))}</span>'
         bar = _bar_html((1.0 + share) / 2, level)
         rows.append((title, f"{numbers([100 * share], 0)} %", bar))
-    cells = "".join("<tr>" + "".join(f"<td>{cell}</td>" for cell in row) + "</tr>" for row in rows)
     dumping = _line_html("The momentum of the wheels is being dumped.", 1)
-    style = "border-spacing:4px 2px;white-space:nowrap;font-size:.9em"
-    return padded(
-        "<b>Angular momentum</b>"
-        f'<table style="{style}">{cells}</table>{dumping if command.dumping else ""}'
-    )
+    return padded(f"<b>Angular momentum</b>{_table_html(rows)}{dumping * command.dumping}")
 
 
 def has_tool(state: StackState) -> bool:

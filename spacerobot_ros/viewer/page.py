@@ -522,6 +522,8 @@ _PRESETS = {
 }
 """Positions of the camera relative to the robot by the names of buttons, in robot lengths."""
 
+_THEME: Any = {"control_width": "large", "show_logo": False, "show_share_button": False}
+
 _LAYERS = (
     ("Paths", True, "Planned path of the base, flown paths of base and end-effectors."),
     ("Frames", False, "Axes of the world and of all links."),
@@ -603,7 +605,7 @@ class Page:
 
     def _build(self) -> None:
         gui, defer = self._server.gui, self._inbox.put
-        gui.configure_theme(**self._theme_options(dark=self._config.dark))
+        gui.configure_theme(dark_mode=self._config.dark, **_THEME)
         # Buttons come first, so that a growing status text does not move them under the mouse.
         self._time_line = TimeLine(gui, defer, self._request)
         goals = goals_from_text(self._config.scenario_goals)
@@ -645,9 +647,7 @@ class Page:
         self._follow: Any = gui.add_checkbox(
             "Follow the robot", initial_value=False, hint="All cameras move with the base."
         )
-        self._setting: Any = gui.add_dropdown(
-            "Setting", tuple(each.value for each in scene.Backdrop)
-        )
+        self._setting: Any = gui.add_dropdown("Setting", scene.BACKDROPS)
         with gui.add_folder("Layers", expand_by_default=False):
             self._layers: dict[str, Any] = {
                 name: gui.add_checkbox(name, initial_value=shown, hint=hint)
@@ -668,16 +668,7 @@ class Page:
             if event.client is not None:
                 dark = not themes.get(event.client.client_id, self._config.dark)
                 themes[event.client.client_id] = dark
-                event.client.gui.configure_theme(**self._theme_options(dark=dark))
-
-    @staticmethod
-    def _theme_options(*, dark: bool) -> dict[str, Any]:
-        return {
-            "dark_mode": dark,
-            "control_width": "large",
-            "show_logo": False,
-            "show_share_button": False,
-        }
+                event.client.gui.configure_theme(dark_mode=dark, **_THEME)
 
     # -- the robot and its goal -----------------------------------------------------------------
 
@@ -745,7 +736,7 @@ class Page:
             self._around.show_paths(visible=shown["Paths"])
             self._around.show_world(visible=shown["Frames"])
             self._around.plume_lines.show(visible=shown["Plumes"])
-            self._around.show_backdrop(scene.Backdrop(self._setting.value))
+            self._around.show_backdrop(str(self._setting.value))
 
     def end(self) -> None:
         """Say that the viewer has ended, in browsers that go on showing the page."""

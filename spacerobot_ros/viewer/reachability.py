@@ -82,8 +82,6 @@ class GoalCheck:
         The verdict.
     message
         Text for the user, with the reason of a refusal.
-    duration_s
-        Duration of the manoeuvre, s; 0 if there is none.
     shape, base
         (n,) joint positions at its end, m or rad, and (7,) pose of the base, as predicted; None if
         there is none.
@@ -93,7 +91,6 @@ class GoalCheck:
 
     verdict: Verdict
     message: str = ""
-    duration_s: float = 0.0
     shape: Array | None = None
     base: Array | None = None
     source: Array | None = None
@@ -364,12 +361,13 @@ class Planner:
             raise
         except SpaceRobotError as error:
             return GoalCheck(Verdict.REFUSED, str(error))
-        duration = schedule.expected_duration
         base = _predicted_end(self._robot, request, schedule)
         left_out = _uncontrolled_text(schedule, base, question.goal, request.tolerance)
-        message = f"Reachable in {duration:.4g} s by '{schedule.method}'.{left_out}"
+        message = (
+            f"Reachable in {schedule.expected_duration:.4g} s by '{schedule.method}'.{left_out}"
+        )
         verdict = Verdict.PARTLY if left_out else Verdict.REACHABLE
-        return GoalCheck(verdict, message, duration, schedule.positions[-1], base)
+        return GoalCheck(verdict, message, schedule.positions[-1], base)
 
     def _build_planner(self, urdf: str, parameters: Mapping[str, str]) -> None:
         self._built = None

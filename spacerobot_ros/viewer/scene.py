@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from enum import Enum
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -175,13 +174,7 @@ class RobotDrawing:
 def draw_obstacles(
     scene: viser.SceneApi, path: str, world: RobotDescription | None
 ) -> list[viser.MeshHandle]:
-    """Draw the shapes of obstacles by which distances are measured; None: there are none.
-
-    Returns
-    -------
-    list[viser.MeshHandle]
-        The meshes.
-    """
+    """Draw and return the shapes of obstacles by which distances are measured; None: none."""
     return [
         _draw_solid(scene, f"{path}/{number}", replace(visual, mesh=visual.mesh.moved(pose)))
         for number, (visual, pose) in enumerate(obstacle_visuals(world))
@@ -295,11 +288,8 @@ def plume_lines(table: ThrusterTable, names: tuple[str, ...], duty: Array, lengt
     return np.array(segments, float).reshape(-1, 2, 3)
 
 
-class Backdrop(Enum):
-    """The surroundings that a robot is shown in."""
-
-    SPACE = "Space"
-    GRID = "Grid"
+BACKDROPS = ("Space", "Grid")
+"""The surroundings that a robot is shown in."""
 
 
 class Surroundings:
@@ -373,16 +363,16 @@ class Surroundings:
         fill = self._scene.add_light_ambient("/skylight", intensity=_SKY_INTENSITY)
         return [stars, sun, light, fill]
 
-    def show_backdrop(self, setting: Backdrop) -> None:
+    def show_backdrop(self, setting: str) -> None:
         """Show the sky, lit by the Sun alone, or the grid."""
-        indoors = setting is Backdrop.GRID
+        indoors = setting == "Grid"
         self._scene.configure_default_lights(enabled=indoors)
         self._scene.configure_environment_map("city" if indoors else None)
         # Space is dark on light pages too.
         self._scene.set_background_image(None if indoors else _SPACE)
-        self._grid.visible = setting is Backdrop.GRID
+        self._grid.visible = indoors
         for each in self._sky:
-            each.visible = setting is Backdrop.SPACE
+            each.visible = not indoors
 
     def show_world(self, *, visible: bool) -> None:
         """Show or hide the axes of the world."""

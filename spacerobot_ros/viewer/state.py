@@ -59,13 +59,10 @@ class Momenta:
     expected
         (6,) the momenta that follow from thrust and other forces from outside; None: they are
         constant.
-    energy
-        Kinetic energy, J.
     """
 
     actual: Array
     expected: Array | None
-    energy: float
 
 
 @dataclass(frozen=True)

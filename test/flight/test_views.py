@@ -351,7 +351,9 @@ def test_a_flight_says_how_it_ended_in_one_line() -> None:
         f"0 correction(s)), {off.distance:.3g} m and {off.angle:.3g} rad from the goal. "
         f"{FLIGHT.verdict.sentence}>"
     )
-    assert repr(made_flight(goal=None)).endswith("0 correction(s)). The goal is reached.>")
+    assert repr(made_flight(goal=None, end_effector_goal=None)).endswith(
+        "0 correction(s)). The goal is reached.>"
+    )
 
 
 def test_errors_over_time_are_those_of_every_pose() -> None:
@@ -360,7 +362,7 @@ def test_errors_over_time_are_those_of_every_pose() -> None:
     np.testing.assert_allclose(FLIGHT.errors, np.column_stack([gaps, turns]), atol=1e-12)
     off = Offset(FLIGHT)
     assert FLIGHT.errors[-1] == pytest.approx([off.distance, off.angle])
-    assert made_flight(goal=None).errors.shape == (0, 2)
+    assert made_flight(goal=None, end_effector_goal=None).errors.shape == (0, 2)
 
 
 class Offset:
@@ -442,7 +444,7 @@ def test_a_controller_controls_its_outputs() -> None:
     assert flown_by("base.rz", "end_effector.x").not_controlled == ("position",)
     assert flown_by("base.z", goal=shaped).not_controlled == ("attitude", "shape")
     assert flown_by("joint.a").not_controlled == ("position", "attitude")
-    assert made_flight(goal=None).not_controlled == ()
+    assert made_flight(goal=None, end_effector_goal=None).not_controlled == ()
     off = Offset(turned := flown_by("base.rz"))
     assert f", {off.distance:.3g} m (not controlled) and {off.angle:.3g} rad from" in repr(turned)
     assert turned.summary()["not_controlled"] == ["position"]

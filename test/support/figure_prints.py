@@ -36,6 +36,7 @@ from support.made_flights import made_flight
 
 from spacerobot_ros.events import Event
 from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.analysis import analyze
 from spacerobot_ros.planning.core.workspaces import Workspaces
 from spacerobot_ros.report import figures_space, planning_figures
@@ -239,7 +240,7 @@ def _plan() -> dict[str, str]:
     robot = SimpleNamespace(
         joint_names=("left", "right", "wrist"), description=SimpleNamespace(movable_joints=units)
     )
-    goal = SimpleNamespace(
+    goal = Goal(
         position=np.array([0.03, -0.05, 0.0]),
         quaternion=Rotation.from_rotvec([0.1, -0.15, 0.3]).as_quat(),
     )

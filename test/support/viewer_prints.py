@@ -70,7 +70,7 @@ def _planned() -> dict[str, Any]:
     flying = StackState(
         measured=seen.measured(4.0, 0.0),
         age_s=0.1,
-        momenta=Momenta(np.arange(6.0) / 100, None, 0.5),
+        momenta=Momenta(np.arange(6.0) / 100, None),
         firing=Firing((table.names[0], table.names[3], "unknown"), np.array([0.5, 0.0, 1.0])),
         plant=PlantStatus(PlantState.RUNNING, "It flies.", faults=("joint_stuck shoulder",)),
         planner=PlannerStatus(
@@ -100,9 +100,9 @@ def _planned() -> dict[str, Any]:
     gui.named("Follow the robot").use(seen.server, True)
     gui.named("Dark or light").use(seen.server)
     later = replace(flying, measured=seen.measured(5.5, 0.125))
-    seen.show(replace(later, momenta=Momenta(np.arange(6.0) / 90, None, 0.5)))
+    seen.show(replace(later, momenta=Momenta(np.arange(6.0) / 90, None)))
     act.editor.show_check(
-        GoalCheck(Verdict.REACHABLE, "In 8 s.", 8.0, np.linspace(0.1, 0.6, len(names)))
+        GoalCheck(Verdict.REACHABLE, "In 8 s.", np.linspace(0.1, 0.6, len(names)))
     )
     seen.show(replace(flying, measured=seen.measured(7.0, 0.25)))
     return seen.shown()
@@ -116,7 +116,7 @@ def _controlled() -> dict[str, Any]:
         measured=seen.measured(2.0, 0.5),
         tool=hand,
         age_s=0.1,
-        momenta=Momenta(np.arange(6.0), np.arange(6.0) + 1e-6, 0.5),
+        momenta=Momenta(np.arange(6.0), np.arange(6.0) + 1e-6),
         controller=ControllerStatus(ControllerState.HOLDING, "Holds <this>."),
         goals={"base": _GOAL, "end_effector": _GOAL},
         absent=frozenset({"controller"}),

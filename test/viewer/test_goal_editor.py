@@ -183,7 +183,7 @@ def test_a_goal_of_the_end_effector_that_appears_is_checked(server: Any) -> None
 def test_a_robot_with_other_joints_comes_after_a_goal_was_checked(server: Any) -> None:
     page = Editor(server, "sliding_masses")
     page.editor.place(POSE, None, np.zeros(3), 0.0)
-    reachable = GoalCheck(Verdict.REACHABLE, "Reachable in 1 s.", 1.0, shape=np.full(3, 0.1))
+    reachable = GoalCheck(Verdict.REACHABLE, "Reachable in 1 s.", shape=np.full(3, 0.1))
     page.editor.show_check(reachable)
     bent = page.ghost()
     # The next plan may end in the same sentence, with another shape.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -58,7 +59,7 @@ def test_an_answer_is_what_the_planner_would_plan() -> None:
         control_period=0.1,
     )  # fmt: skip
     assert answer.verdict == Verdict.REACHABLE
-    assert answer.duration_s == pytest.approx(own.duration)
+    assert f"Reachable in {own.duration:.4g} s" in answer.message
     assert answer.shape is not None
     np.testing.assert_allclose(answer.shape, own.positions[-1], atol=1e-9)
     end = np.concatenate([own.path.position[-1], own.path.quaternion[-1]])
@@ -146,7 +147,7 @@ def test_goals_of_links_are_planned_for_and_the_base_ends_where_the_plan_has_it(
     asked = GoalQuestion(robot.urdf, texts, start, Goal.of_end_effectors([aim]))
     answer = Planner().answer(asked, Cancellation())
     assert answer.verdict == Verdict.REACHABLE, answer
-    assert answer.message == f"Reachable in {answer.duration_s:.4g} s by 'resolved_rate'."
+    assert re.fullmatch(r"Reachable in [\d.]+ s by 'resolved_rate'\.", answer.message)
     assert answer.shape is not None
     assert answer.base is not None
     # By Pinocchio the link is at its goal then, with the base off its place.
@@ -348,7 +349,7 @@ def test_why_no_question_is_asked(state: StackState, known: bool, reason: str) -
 
 
 def test_a_question_has_the_measured_state_and_the_momenta() -> None:
-    momenta = Momenta(np.arange(6.0), np.zeros(6), 2.0)
+    momenta = Momenta(np.arange(6.0), np.zeros(6))
     parameters = {"planner": {"tick_rate": "20.0"}, "controller": {"law": '"step"'}}
     for given, expected in ((momenta, np.arange(6.0)), (None, np.zeros(6))):
         question = make_question(
@@ -366,7 +367,7 @@ def test_a_question_has_the_measured_state_and_the_momenta() -> None:
 
 
 def test_the_question_of_a_controller_is_for_its_end_effector() -> None:
-    state = StackState(MEASURED, momenta=Momenta(np.ones(6), None, 0.0))
+    state = StackState(MEASURED, momenta=Momenta(np.ones(6), None))
     goals = {"base": GOAL, "end_effector": HAND}
     question = make_question(state, goals, SERVICER, {})
     assert isinstance(question, GoalQuestion)

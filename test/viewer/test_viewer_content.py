@@ -308,10 +308,10 @@ def test_what_a_controller_does_not_control_is_said_beside_its_number() -> None:
 
 def test_momenta_are_compared_with_what_they_should_be() -> None:
     actual, first = np.arange(6.0), np.zeros(6)
-    alone = Momenta(actual, None, 0.0)
+    alone = Momenta(actual, None)
     assert content.momentum_drift(alone, actual) == (0.0, 0.0)
     assert content.momentum_drift(alone, first) == pytest.approx((math.sqrt(5), math.sqrt(50)))
-    pushed = Momenta(actual, actual - [0, 0, 2, 0, 3, 0], 0.0)
+    pushed = Momenta(actual, actual - [0, 0, 2, 0, 3, 0])
     assert content.momentum_drift(pushed, first) == pytest.approx((2.0, 3.0))
 
 

@@ -372,9 +372,7 @@ def test_a_robot_that_changes_after_a_check_is_shown(
     page, sliders = stack.page, names_of(load_robot(robot_file("sliding_masses")))
     stack.describe()
     stack.until(lambda: stack.move(0.1, sliders) or page.editor.placed, "a goal")
-    page.editor.show_check(
-        GoalCheck(Verdict.REACHABLE, "Reachable in 1 s.", 1.0, shape=np.zeros(3))
-    )
+    page.editor.show_check(GoalCheck(Verdict.REACHABLE, "Reachable in 1 s.", shape=np.zeros(3)))
     # A plan for the robot of before is not to be answered any more.
     cancelled: list[bool] = []
 

@@ -169,7 +169,7 @@ def test_rounding_is_no_peak_and_numbers_of_a_flight_are_seen(server: Any) -> No
     off = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 2.0])
     for time_s, size in ((0.0, 0.0), (1.0, 2e-16), (2.0, 3e-6)):
         measured = Measured(time_s, np.eye(7)[6], zeros, zeros, zeros)
-        plots.add(StackState(measured, momenta=Momenta(actual + size * off, actual, 0.0)), {})
+        plots.add(StackState(measured, momenta=Momenta(actual + size * off, actual)), {})
     plots.draw()
     handle = plots._momentum.handle
     assert [series["label"] for series in handle.series[1:]] == [

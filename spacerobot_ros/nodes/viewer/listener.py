@@ -306,7 +306,7 @@ class Listener:
             if apart > 3 * self._least_apart_ns + _JITTER_NS:
                 return
         numbers = np.array(momentum.data)
-        self._momenta = Momenta(numbers[:6], self._expected_momenta, float(numbers[6]))
+        self._momenta = Momenta(numbers[:6], self._expected_momenta)
 
     def _take_expected_momenta(self) -> None:
         expected = self._expected.take()
