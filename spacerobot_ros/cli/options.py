@@ -94,6 +94,24 @@ def json_option(help: str) -> Any:
     )
 
 
+def complete_scenario(_: click.Context, __: click.Parameter, incomplete: str) -> list[str]:
+    """Return the scenarios and robots that complete a name, for shells."""
+    from spacerobot_ros.resources import resource_names
+    from spacerobot_ros.scenario import scenario_names
+
+    names = {*scenario_names(), *resource_names("urdf", ".urdf")}
+    return sorted(name for name in names if name.startswith(incomplete))
+
+
+def complete_setting(_: click.Context, __: click.Parameter, incomplete: str) -> list[str]:
+    """Return the parameters of nodes that complete a setting, for shells."""
+    from spacerobot_ros.parameters import declared
+    from spacerobot_ros.scenario import CONFIGS
+
+    names = (f"{node}.{each.name}=" for node, kind in CONFIGS.items() for each in declared(kind))
+    return sorted(name for name in names if name.startswith(incomplete))
+
+
 bag_argument = click.argument("bag", type=PATH)
 bag_option = _path_option("--bag")
 out_option = _path_option("--out", "-o", "--output")  # --output: up to version 0.2.0.
@@ -107,6 +125,7 @@ settings_option = click.option(
     "settings",
     multiple=True,
     metavar="NODE.PARAMETER=VALUE",
+    shell_complete=complete_setting,
     help="Set a parameter of a node. May be repeated.",
 )
 view_option = click.option(
@@ -301,15 +320,6 @@ def _read_path(file: Path) -> list[list[float]]:
             "all of them 3 (a position), or all of them 7 (a position and a quaternion)."
         )
     return found
-
-
-def complete_scenario(_: click.Context, __: click.Parameter, incomplete: str) -> list[str]:
-    """Return the scenarios and robots that complete a name, for shells."""
-    from spacerobot_ros.resources import resource_names
-    from spacerobot_ros.scenario import scenario_names
-
-    names = {*scenario_names(), *resource_names("urdf", ".urdf")}
-    return sorted(name for name in names if name.startswith(incomplete))
 
 
 def goal_options(command: Callable[..., None]) -> Callable[..., None]:

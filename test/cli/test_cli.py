@@ -545,3 +545,6 @@ def test_shells_complete_scenarios_robots_and_commands() -> None:
     assert found == ["servicer", "servicer_thrusters", "servicer_wheels"]
     assert completed(["plan"], "faults/stuck_s") == ["faults/stuck_slider"]
     assert {"replay", "report"} <= set(completed([], "re"))
+    assert completed(["run", "servicer", "--set"], "planner.positi") == [
+        "planner.position_tolerance="
+    ]
