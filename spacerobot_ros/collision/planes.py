@@ -96,21 +96,22 @@ def support_distance(
 ) -> ca.Function:
     """Return ``(y, plane) -> d``, m: how far all of the second solid is in front of a plane.
 
-    The arguments are those of :class:`PlaneDistance`, whose point is not used: the solid is its
-    rounded box, whose extent along the normal is ``sum h_i |n e_i| + radius``. So the distance
-    holds however the solid has turned, and is smaller than that of a shape within the box.
+    The arguments are those of :class:`PlaneDistance`, whose point is not used. For an obstacle the
+    plane is in W, and ``y = [q; X; r]`` (n + 7) has the position of the centre of mass. The solid
+    is its rounded box, whose extent along the normal is ``sum h_i |n e_i| + radius``. So the
+    distance holds however it has turned, and is smaller than that of a shape within the box.
     """
     robot, of_obstacle = geometry.robot, bool(geometry.with_obstacles[pair])
     n = len(robot.joint_names)
-    y, plane = ca.SX.sym("y", n + 4 if of_obstacle else n), ca.SX.sym("plane", PLANE_SIZE)
+    y, plane = ca.SX.sym("y", n + 7 if of_obstacle else n), ca.SX.sym("plane", PLANE_SIZE)
     q, normal = y[:n], plane[:3]
     first, second = (geometry.solids[i] for i in geometry.pairs[pair])
     if of_obstacle:
-        X = y[n:]
+        X, r_C = y[n : n + 4], y[n + 4 :]
         solid = first
         R, r = _pose_of_link(robot, first, _chain_of(robot, first.body), joint_positions(robot, q))
         R_X = symbolic_rotations.matrix_from_quaternion(X / ca.norm_2(X))
-        R, r = R_X @ R, R_X @ (r - center_of_mass(q))
+        R, r = R_X @ R, r_C + R_X @ (r - center_of_mass(q))
     else:
         solid = second
         (R_A, r_A), (R_P, r_P) = _relative_poses(robot, first, second, q)

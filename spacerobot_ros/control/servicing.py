@@ -293,6 +293,7 @@ class ApproachTask:
                 options.clearance,
                 options.horizon,
                 options.detumble == "before",
+                options.standoff,
             )
             lead = self._lead if in_background else 0.0
             self._job = controller.plan_grapple(time, state.copied(), grapple, lead)

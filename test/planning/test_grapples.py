@@ -39,6 +39,7 @@ SLAB = f"""<robot name="slab"><link name="slab"><inertial><origin xyz="0.02 0.01
 <mass value="30"/>{INERTIA.format(2.0, 1.4, 1.1)}<collision><geometry><box size="0.6 1.0 0.8"/>
 </geometry></collision></link><link name="grapple"/><joint name="mount" type="fixed">
 <parent link="slab"/><child link="grapple"/><origin xyz="-0.32 0.1 0"/></joint></robot>"""
+SATELLITE = share_directory() / "config" / "targets" / "satellite.urdf"
 HERE = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
 
 
@@ -86,15 +87,39 @@ def servicer() -> ThrustPlanner:
     return ThrustPlanner(robot, propulsion, ThrustOptions(), "end_effector")
 
 
+FOLDED = np.array([0.0, -1.2, 2.0, 0.0, 0.8, 0.0])
+
+
+def satellite(quaternion: list[float], place: list[float], omega: list[float]) -> BodyMotion:
+    """Return a satellite that turns about axes of its own, deg/s, and drifts by millimetres."""
+    R = Rotation.from_quat(quaternion).as_matrix()
+    v = np.array([-0.001, -0.002, 0.001])
+    return BodyMotion(R, np.array(place), v, R @ np.deg2rad(omega))
+
+
+def test_a_fixture_that_faces_away_is_met_when_it_has_turned() -> None:
+    planner, target = servicer(), load_robot(SATELLITE)
+    free = satellite([0.254, 0.691, -0.641, -0.216], [-2.38, 1.2, 3.88], [-5.93, 0.91, 0.0])
+    motion = TorqueFreeMotion(TargetBody.of(target, "grapple"), free)
+    start = ThrustStart.at_rest(HERE, FOLDED)
+    clear, careless = (
+        planner.plan(start, ThrustGoal(grapple=Grapple(motion, target, distance)))
+        for distance in (0.02, 0.0)
+    )
+    robot = planner.robot.description
+    assert distance_from_target(robot, target, careless, free) < -0.1
+    assert distance_from_target(robot, target, clear, free) > 0.0199
+    assert careless.duration < 16 < clear.duration < 40
+
+
 def test_a_grasp_leaves_no_angular_momentum_if_that_is_asked_for() -> None:
     planner = servicer()
-    target = load_robot(share_directory() / "config" / "targets" / "satellite.urdf")
+    target = load_robot(SATELLITE)
     body = TargetBody.of(target, "grapple")
-    R = Rotation.from_quat([-0.04, -0.62, 0.59, 0.51]).as_matrix()
-    omega = R @ np.deg2rad([0.0, 2.0, -2.0])
-    free = BodyMotion(R, np.array([3.9, 0.4, 0.6]), np.array([-0.001, -0.002, 0.001]), omega)
+    free = satellite([-0.04, -0.62, 0.59, 0.51], [3.9, 0.4, 0.6], [0.0, 2.0, -2.0])
+    R, omega = free.R_WT, free.omega
     grapple = Grapple(TorqueFreeMotion(body, free))
-    start = ThrustStart.at_rest(HERE, np.array([0.0, -1.2, 2.0, 0.0, 0.8, 0.0]))
+    start = ThrustStart.at_rest(HERE, FOLDED)
     totals, durations = [], []
     for detumbles in (False, True):
         asked = ThrustGoal(grapple=replace(grapple, detumbles=detumbles))
@@ -139,7 +164,7 @@ def test_meetings_that_cannot_be_are_refused_in_a_sentence() -> None:
     leaving = refusal(slab((2.5, 0.0, 0.0), (6.0, 0.0, 0.0)))
     assert_one_sentence(leaving, "leaves at 6 m/s", "0.8 N", "target.horizon", "120 s")
     touching = refusal(slab((0.4, 0.0, 0.0)))
-    assert_one_sentence(touching, "touches 'slab' of the target at the start")
+    assert_one_sentence(touching, "obstacle 'slab' touch at the start", "target.clearance")
     short = refusal(slab((2.5, 0.2, -0.1)), duration=3.0)
     assert_one_sentence(short, "s at least", "plan.duration is 3 s")
 

@@ -575,36 +575,37 @@ def turn_function(robot: SpaceRobot, *, drifting: bool = False) -> ca.Function:
 
 @dataclass(frozen=True)
 class Layout:
-    """Indices of the variables of N intervals: the step, then knot after knot ``X, s, v, a``.
+    """Indices of the variables of N intervals: the step, then knot after knot its states and its
+    controls, which the last knot has not.
 
-    The last knot has no acceleration. Where links are kept apart, the last variable is by how much
-    they are nearer than they ought to be, m (``has_lack``).
+    Where pairs are kept apart, the last variable is by how much they are nearer than they ought to
+    be, m (``has_lack``). ``states`` and ``controls`` are the sizes of the parts of a knot.
     """
 
-    joints: int
+    states: tuple[int, ...]
+    controls: tuple[int, ...]
     intervals: int
     has_lack: bool = False
 
     @classmethod
     def of(cls, stages: Stages, intervals: int) -> Layout:
-        """Return the indices of the problem of some stages."""
-        return cls(stages.joints, intervals, stages.distances is not None)
-
-    @property
-    def _knot(self) -> int:
-        return 4 + 3 * self.joints
+        """Return the indices of the problem of some stages, whose knots are ``X, s, v, a``."""
+        n = stages.joints
+        return cls((4, n, n), (n,), intervals, stages.distances is not None)
 
     @property
     def size(self) -> int:
         """Number of variables."""
-        return 1 + self._knot * self.intervals + 4 + 2 * self.joints + self.has_lack
+        of_states = sum(self.states) * (self.intervals + 1)
+        return 1 + of_states + sum(self.controls) * self.intervals + self.has_lack
 
-    def knots(self) -> tuple[Indices, Indices, Indices, Indices]:
-        """Return the places of X (N + 1, 4), s, v (N + 1, n) and a (N, n)."""
-        n, first = self.joints, 1 + self._knot * np.arange(self.intervals + 1)[:, np.newaxis]
-        ends = np.cumsum([0, 4, n, n, n])
-        X, s, v, a = (first + np.arange(i, j) for i, j in pairwise(ends))
-        return X, s, v, a[:-1]
+    def knots(self) -> tuple[Indices, ...]:
+        """Return the places of the states (N + 1, ...), then of the controls (N, ...)."""
+        ends = np.cumsum([0, *self.states, *self.controls])
+        first = 1 + ends[-1] * np.arange(self.intervals + 1)[:, np.newaxis]
+        places = [first + np.arange(i, j) for i, j in pairwise(ends)]
+        count = len(self.states)
+        return (*places[:count], *(each[:-1] for each in places[count:]))
 
 
 @dataclass(frozen=True)

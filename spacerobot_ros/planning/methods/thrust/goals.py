@@ -7,9 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array, RobotDescription
 from spacerobot_ros.model.grasp import combined_momenta
+from spacerobot_ros.model.rotations import compose_poses, relative_pose
 from spacerobot_ros.model.target_motion import TorqueFreeMotion
+from spacerobot_ros.planning.core.goal import end_effector_pose
 from spacerobot_ros.planning.methods.thrust.motion import ThrustMotion
 
 
@@ -48,6 +51,8 @@ class Grapple:
         Time within which it is met, s.
     detumbles
         Whether robot and target together have no angular momentum then, or the least possible.
+    standoff
+        (3,) a position in the grapple frame from which the end-effector would come straight, m.
     """
 
     motion: TorqueFreeMotion
@@ -55,6 +60,7 @@ class Grapple:
     clearance: float = 0.0
     horizon: float = 120.0
     detumbles: bool = False
+    standoff: tuple[float, ...] = (-0.3, 0.0, 0.0)
 
     def joined_momentum(self, mass: float, motion: ThrustMotion) -> Array:
         """Return the angular momentum (3,) of a robot of a mass (kg) and the target about their
@@ -82,6 +88,13 @@ class ThrustGoal:
     end_effector: Array | None = None
     shape: Array | None = None
     grapple: Grapple | None = None
+
+
+def base_for_hand(robot: SpaceRobot, link: str, shape: Array, hand: Array) -> Array:
+    """Return the pose (7,) of the base with which a link, in a shape (n,), has a pose (7,)."""
+    still = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
+    there = np.concatenate(end_effector_pose(robot, link, still[:3], still[3:], shape))
+    return compose_poses(hand, relative_pose(there, still))
 
 
 def shortest_catch(distance: float, leaving: float, acceleration: float) -> float:

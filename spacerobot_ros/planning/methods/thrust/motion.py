@@ -12,11 +12,21 @@ from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.compilation import BufferedFunction
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.dynamics import solve_positive_definite
-from spacerobot_ros.model.rotations import matrices_from_quaternions
-from spacerobot_ros.model.symbolic_rotations import matrix_from_quaternion, quaternion_from_matrix
+from spacerobot_ros.model.rotations import (
+    matrices_from_quaternions,
+    quaternion_multiply,
+    rotvecs_from_quaternions,
+)
+from spacerobot_ros.model.symbolic_rotations import (
+    matrix_from_quaternion,
+    quaternion_from_matrix,
+    quaternion_rate,
+)
 from spacerobot_ros.planning.methods.thrust.propulsion import Propulsion
 from spacerobot_ros.planning.methods.thrust.solver import ThrustKnots
-from spacerobot_ros.planning.methods.thrust.transcription import EXACT_STEPS, flight_step
+
+EXACT_STEPS = 8
+"""Steps of Runge-Kutta in an interval that is integrated exactly."""
 
 
 class FrameSample(NamedTuple):
@@ -60,7 +70,7 @@ class MotionFunctions(NamedTuple):
     @classmethod
     def of(cls, robot: SpaceRobot, link: str = "") -> MotionFunctions:
         """Derive the functions."""
-        step, sample = BufferedFunction(flight_step(robot)), BufferedFunction(_sample(robot, link))
+        step, sample = BufferedFunction(_flight_step(robot)), BufferedFunction(_sample(robot, link))
         return cls(step, sample, robot.function("center_of_mass", compile=False), link)
 
 
@@ -81,14 +91,18 @@ class ThrustMotion:
         self, functions: MotionFunctions, propulsion: Propulsion, knots: ThrustKnots
     ) -> None:
         self.propulsion = propulsion
-        self._functions = functions
+        self._functions, self._knots = functions, knots
         self._q, self._qdot = knots.shapes, knots.velocities
         self._qddot = np.diff(knots.velocities, axis=0) / knots.step
         self._wrenches = knots.levels @ propulsion.wrenches.T
         self.levels = knots.levels
         """Levels (N, m) of the propulsion, each held for :attr:`step` seconds."""
         self.step = knots.step
-        self._grid = self._integrate(knots.states[0])
+        states = [knots.states[:1]]
+        for k in range(len(knots.levels)):
+            states.append(self._through(k, states[-1][-1]))
+        self._grid = np.vstack(states)
+        """States (N EXACT_STEPS + 1, 13) at equal distances in time."""
 
     @property
     def joints(self) -> int:
@@ -105,14 +119,23 @@ class ThrustMotion:
         """What the levels cost: kg of propellant of thrusters in a table, else N s."""
         return self.step * float(np.sum(self.propulsion.cost_of(self.levels)))
 
-    def _integrate(self, state: Array) -> Array:
-        """Return states (N EXACT_STEPS + 1, 13) at equal distances in time."""
-        states = [state]
-        t = self.step / EXACT_STEPS
-        for k in range(len(self.levels)):
-            for number in range(EXACT_STEPS):
-                states.append(self._advanced(states[-1], k, number * t, t))
+    def _through(self, k: int, state: Array) -> Array:
+        """Return the states (EXACT_STEPS, 13) on an interval that begins in one."""
+        t, states = self.step / EXACT_STEPS, []
+        for number in range(EXACT_STEPS):
+            state = self._advanced(state, k, number * t, t)
+            states.append(state)
         return np.array(states)
+
+    def defects(self) -> Array:
+        """Return the defects (N, 12) with which the knots would be an exact flight."""
+        knots, states = self._knots, self._knots.states
+        ends = np.array([self._through(k, x)[-1] for k, x in enumerate(states[:-1])])
+        # Knots obey the program with their own defects: what they miss is the rest.
+        inverse = states[1:, :4] * [-1.0, -1.0, -1.0, 1.0]
+        turn = rotvecs_from_quaternions(quaternion_multiply(inverse, ends[:, :4]))
+        rest = np.hstack([turn, ends[:, 4:] - states[1:, 4:]])
+        return rest if knots.defects is None else knots.defects + rest
 
     def _joints(self, k: int, since: float) -> tuple[Array, Array]:
         q, qdot, qddot = self._q[k], self._qdot[k], self._qddot[k]
@@ -221,3 +244,32 @@ def _sample(robot: SpaceRobot, link: str) -> ca.Function:
         hand = frame(r_all[:, i] - c, R_all[:, 3 * i : 3 * i + 3], J[3:6, 6:] @ qdot)
     outputs = [ca.densify(each) for each in (base, hand, tau)]
     return ca.Function("thrust_sample", [x, q, qdot, qddot, wrench], ca.cse(outputs))
+
+
+def _flight_step(robot: SpaceRobot) -> ca.Function:
+    """Return ``(x, q, qdot, qddot, wrench, t) -> x+``: a step of Runge-Kutta 4 of
+    ``x = [X; L; r; V]`` over t seconds, with joints on a parabola and a wrench held in the base.
+    """
+    n, m = robot.n, robot.total_mass
+    x, wrench, t = ca.SX.sym("x", 13), ca.SX.sym("wrench", 6), ca.SX.sym("t")
+    q, qdot, qddot = (ca.SX.sym(name, n) for name in ("q", "qdot", "qddot"))
+    center_of_mass = robot.function("center_of_mass", compile=False)
+    locked_inertia = robot.function("locked_inertia", compile=False)
+
+    def slope(at: ca.SX, tau: float) -> ca.SX:
+        X, L, _, V = ca.vertsplit(at, [0, 4, 7, 10, 13])
+        elapsed = tau * t
+        q_at, qdot_at = q + elapsed * qdot + elapsed**2 / 2 * qddot, qdot + elapsed * qddot
+        D, D_q = locked_inertia(q_at)
+        R = matrix_from_quaternion(X)
+        omega = solve_positive_definite(D, R.T @ L - D_q @ qdot_at)
+        twisted = R @ (wrench[3:] - ca.cross(center_of_mass(q_at), wrench[:3]))
+        return ca.vertcat(quaternion_rate(X, omega), twisted, V, R @ wrench[:3] / m)
+
+    first = slope(x, 0.0)
+    second = slope(x + t / 2 * first, 0.5)
+    third = slope(x + t / 2 * second, 0.5)
+    fourth = slope(x + t * third, 1.0)
+    reached = x + t / 6 * (first + 2 * second + 2 * third + fourth)
+    reached[:4] /= ca.norm_2(reached[:4])
+    return ca.Function("flight_step", [x, q, qdot, qddot, wrench, t], [ca.cse(reached)])

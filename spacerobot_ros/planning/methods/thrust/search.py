@@ -28,13 +28,11 @@ from spacerobot_ros.model.inverse_kinematics import (
 )
 from spacerobot_ros.model.rotations import (
     attitude_error,
-    compose_poses,
     matrices_from_quaternions,
     matrix_from_quaternion,
     quaternion_from_matrix,
     quaternion_multiply,
     quaternions_from_rotvecs,
-    relative_pose,
     rotvecs_from_quaternions,
 )
 from spacerobot_ros.model.wheels import ReactionWheels
@@ -42,27 +40,31 @@ from spacerobot_ros.model.world import with_world
 from spacerobot_ros.parameters import parameter
 from spacerobot_ros.planning.core.cancellation import NEVER, Cancellation, PlanningCancelled
 from spacerobot_ros.planning.core.clearance import DEFAULT_CLEARANCE, Clearance
-from spacerobot_ros.planning.core.goal import end_effector_pose
+from spacerobot_ros.planning.methods.optimal.end_effectors import reach_of_end_effector
 from spacerobot_ros.planning.methods.optimal.multiple_shooting import DurationBounds, StopRule
 from spacerobot_ros.planning.methods.optimal.problem import MotionLimits, MotionOptions
 from spacerobot_ros.planning.methods.optimal.transcription import ConstraintBlock
-from spacerobot_ros.planning.methods.thrust.bodies import INSTANTS, Bodies, KeptPlaces
+from spacerobot_ros.planning.methods.thrust.bodies import Bodies
 from spacerobot_ros.planning.methods.thrust.goals import (
     Grapple,
     ThrustGoal,
     ThrustStart,
+    base_for_hand,
     shortest_catch,
 )
 from spacerobot_ros.planning.methods.thrust.motion import MotionFunctions, ThrustMotion
 from spacerobot_ros.planning.methods.thrust.propulsion import Propulsion
 from spacerobot_ros.planning.methods.thrust.solver import (
-    KeptPairs,
     ThrustBoundary,
     ThrustKnots,
     ThrustSolver,
     Weights,
 )
-from spacerobot_ros.planning.methods.thrust.transcription import EndKind, ThrustStages
+from spacerobot_ros.planning.methods.thrust.transcription import (
+    EndKind,
+    KeptPlaces,
+    ThrustStages,
+)
 
 _REGULARISATION = 1e-3
 """Weight of the squares of levels, which makes solutions unique. 1e-2 costs 1 % of propellant, 1e-4
@@ -102,9 +104,12 @@ _LARGEST_LACK = 1e-4
 _MAX_ROUNDS = 6
 """Times that a path is made clear of pairs by new planes."""
 
-_GRASP_REACHES = (0.6, 0.3, 1.5)
-"""Distances of the joints in a grasp from their shape at the start that are tried, m or rad: the
-base moves, and the arm stays clear of it."""
+_GRASP_REACH = 0.6
+"""Distance of the joints from their shape at the start on the way to a grasp, m or rad: the base
+moves, and the arm stays clear of it."""
+
+_SHALLOW = 0.1
+"""Depth of a contact on a path from which on it is not tried with planes, m."""
 
 _SHARES_LEFT = (0.0, 0.25, 0.5)
 """Shares of the angular momentum after a grasp that may be left."""
@@ -229,19 +234,18 @@ class ThrustPlanner:
         a motion for.
         """
         self._require_catch(start, grapple)
-        failure = PlanningError("")
-        for reach in _GRASP_REACHES:
-            boundary, kind, guess = self._meeting(start, grapple, reach)
-            plain = _Search(self, boundary, kind, stop, bodies, grapple)
-            try:
-                motion = plain.run(guess)
-                break
-            except (PlanningCancelled, UnreachableError):
-                raise
-            except PlanningError as error:
-                failure = error
-        else:
-            raise failure
+        boundary, kind = self._meeting(start), EndKind(base=False, link=self.link, target=True)
+        times = np.arange(_MEETING_PERIOD, grapple.horizon, _MEETING_PERIOD).tolist()
+        guesses = (self.meeting_guess(boundary, grapple, time) for time in times)
+        guess = next((each for each in guesses if each is not None), None)
+        if guess is None:
+            raise UnreachableError(
+                f"The thrust does not take the robot to the target within {grapple.horizon:g} s: "
+                "raise 'target.horizon'.",
+                Proof.LIMITS,
+            )
+        plain = _Search(self, boundary, kind, stop, bodies, grapple)
+        motion = plain.run(guess)
         if not grapple.detumbles:
             return motion
         left = grapple.joined_momentum(self.robot.total_mass, motion)
@@ -264,12 +268,10 @@ class ThrustPlanner:
             for pair, _ in kept:
                 if bodies.row_key(pair) not in self._rows:
                     self._rows[bodies.row_key(pair)] = bodies.rows(pair)
-            rows = tuple(self._rows[bodies.row_key(pair)] for pair, _ in kept)
-            numbers, places = tuple(n for n, _ in kept), tuple(at for _, at in kept)
-            pairs = KeptPairs(numbers, rows, places, INSTANTS)
-            self._solvers[kind, kept] = ThrustSolver(
-                self._stages[kind], self.options.intervals, pairs
-            )
+            rows = [self._rows[bodies.row_key(pair)] for pair, _ in kept]
+            places = [at for _, at in kept]
+            solver = ThrustSolver(self._stages[kind], self.options.intervals, rows, places)
+            self._solvers[kind, kept] = solver
         return self._solvers[kind, kept]
 
     def motion(self, knots: ThrustKnots) -> ThrustMotion:
@@ -285,41 +287,28 @@ class ThrustPlanner:
         r_WC = start.pose[:3] + matrix_from_quaternion(X) @ robot.center_of_mass(start.q)
         return np.concatenate([X, L_W, r_WC, p_W / robot.total_mass])
 
-    def _meeting(
-        self, start: ThrustStart, grapple: Grapple, reach: float
-    ) -> tuple[ThrustBoundary, EndKind, ThrustKnots]:
-        """Return both ends of a motion to a target, and a guess: to where the arm, in its shape,
-        has the grapple frame at the earliest time at which the thrust takes it there. ``reach`` is
-        how far joints may be from that shape then, m or rad.
-        """
-        final_velocity = np.where(self._wheels, start.qdot, np.nan)
-        boundary = ThrustBoundary(
-            self._state(start),
-            start.q,
-            start.qdot,
-            np.zeros(0),
-            np.where(
-                self._wheels,
-                [[-np.inf], [np.inf]],
-                start.q + np.array([[-reach], [reach]]),
-            ),
-            final_velocity,
-            None,
-        )
-        kind = EndKind(base=False, link=self.link, target=True)
-        for time in np.arange(_MEETING_PERIOD, grapple.horizon, _MEETING_PERIOD).tolist():
-            guess = self._guess(boundary, self.meeting_end(start.q, grapple, time), np.zeros(3))
-            if guess.duration <= time:
-                break
-        return boundary, kind, guess.stretched(time / guess.duration)
+    def _meeting(self, start: ThrustStart) -> ThrustBoundary:
+        """Return both ends of a motion to a target, with joints near their shape at the start."""
+        reach = np.where(self._wheels, np.inf, _GRASP_REACH)
+        near = start.q + np.multiply.outer([-1.0, 1.0], reach)
+        velocity = np.where(self._wheels, start.qdot, np.nan)
+        state, none = self._state(start), np.zeros(0)
+        return ThrustBoundary(state, start.q, start.qdot, none, near, near, velocity, None)
 
-    def meeting_end(self, q: Array, grapple: Grapple, time: float) -> _End:
-        """Return the base at which the hand, by an arm of shape (n,), has the grapple frame."""
-        still = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
-        hand = end_effector_pose(self.robot, self.link, still[:3], still[3:], q)
-        frame = grapple.motion.grapple([time])
+    def meeting_guess(
+        self, boundary: ThrustBoundary, grapple: Grapple, time: float, height: float = 0.0
+    ) -> ThrustKnots | None:
+        """Return a guess that is at a target at a time, in the shape of the start, on a way that
+        bows out to the side of the fixture; None: the thrust does not suffice.
+        """
+        frame, shape = grapple.motion.grapple([time]), boundary.shape
         there = np.concatenate([frame.r[0], quaternion_from_matrix(frame.R[0])])
-        return _End(compose_poses(there, relative_pose(np.concatenate(hand), still)), q)
+        end = _End(base_for_hand(self.robot, self.link, shape, there), shape)
+        outwards = (
+            frame.R[0] @ grapple.standoff / max(float(np.linalg.norm(grapple.standoff)), 1e-9)
+        )
+        guess = self._guess(boundary, end, height * _bow_height(boundary, end) * outwards)
+        return guess.stretched(time / guess.duration) if guess.duration <= time else None
 
     def _require_catch(self, start: ThrustStart, grapple: Grapple) -> None:
         robot, target = self.robot, grapple.motion
@@ -328,7 +317,8 @@ class ThrustPlanner:
         distance = float(np.linalg.norm(away))
         leaving = float((target.velocity - state[10:]) @ away) / max(distance, 1e-9)
         force = self.propulsion.largest_force()
-        near = distance - _reach(robot.description, self.link) - target.arm_length
+        reach = reach_of_end_effector(robot, self.limits.lower, self.limits.upper, self.link)
+        near = distance - reach - target.arm_length
         least = shortest_catch(near, leaving, force / robot.total_mass)
         if least > grapple.horizon:
             raise UnreachableError(
@@ -340,15 +330,12 @@ class ThrustPlanner:
 
     def _boundary(self, start: ThrustStart, goal: ThrustGoal) -> tuple[ThrustBoundary, _End]:
         robot, n = self.robot, self.robot.n
-        r_WB, X = start.pose[:3], start.pose[3:]
         shape = np.full(n, np.nan) if goal.shape is None else goal.shape.copy()
         shape[self._wheels] = np.nan
         base, q = goal.base, np.where(np.isfinite(shape), shape, start.q)
-        if goal.end_effector is not None:
-            hand = np.concatenate(end_effector_pose(robot, self.link, r_WB, X, start.q))
-            if base is None:
-                base = compose_poses(goal.end_effector, relative_pose(hand, start.pose))
-        if base is None:
+        if base is None and goal.end_effector is not None:
+            base = base_for_hand(robot, self.link, start.q, goal.end_effector)
+        elif base is None:
             base = start.pose
         given = np.isfinite(shape)
         shapes = np.where(given, shape, np.array([[-np.inf], [np.inf]]))
@@ -367,6 +354,7 @@ class ThrustPlanner:
                 start.q,
                 start.qdot,
                 np.concatenate(goals) if goals else np.zeros(0),
+                np.array([[-np.inf], [np.inf]]),
                 shapes,
                 final_velocity,
                 matrix_from_quaternion(base[3:]) @ spin,
@@ -451,34 +439,30 @@ class ThrustPlanner:
         base = bodies.base_poses(path.shapes[-1:], path.quaternions[-1:], path.r_WC[-1:])
         end = _End(np.concatenate([base.position[0], base.quaternion[0]]), path.shapes[-1])
         along = end.base[:3] - r0
-        length = max(float(np.linalg.norm(along)), 1e-9)
-        frame = np.linalg.svd(along[np.newaxis] / length)[2]
+        frame = np.linalg.svd(along[np.newaxis])[2]
         angles = 2 * math.pi * np.arange(_BOW_DIRECTIONS) / _BOW_DIRECTIONS
         sides = np.outer(np.cos(angles), frame[1]) + np.outer(np.sin(angles), frame[2])
-        pairs = {each.pair for each in near} | {*bodies.obstacles()}
+        pairs = {each.pair for each in near}
         for height in _BOW_SHARES if bodies.is_in_the_way(near) else _BOW_SHARES[:1]:
             found = []
             for side in sides if height else sides[:1]:
-                guess = self._guess(boundary, end, height * max(length / 2, 0.5) * side)
+                guess = self._guess(boundary, end, height * _bow_height(boundary, end) * side)
                 guess = guess.stretched(max(path.duration / guess.duration, 1.0))
-                lack = [
-                    float((bodies.distances(pair, guess) - bodies.required[pair]).min())
-                    for pair in pairs
-                ]
-                found.append((min(lack), guess))
+                found.append((bodies.room(guess, pairs), guess))
             best, guess = max(found, key=lambda each: each[0])
             if best > 0:
                 yield guess
 
-
-def _reach(robot: RobotDescription, link: str) -> float:
-    """Return the distance that a link is from the base at most, but for joints that slide, m."""
-    body, pose = robot.frames[link]
-    far = float(np.linalg.norm(pose.r))
-    while body > 0:
-        far += float(np.linalg.norm(robot.bodies[body].origin.r))
-        body = robot.bodies[body].parent
-    return far
+    def meetings(
+        self, boundary: ThrustBoundary, grapple: Grapple, bodies: Bodies, times: Array
+    ) -> Iterator[ThrustKnots]:
+        """Yield guesses at a target at times that are clear, of each time the straightest one."""
+        for time in times.tolist():
+            for height in _BOW_SHARES:
+                guess = self.meeting_guess(boundary, grapple, time, height)
+                if guess is not None and bodies.room(guess, range(len(bodies.required))) > 0:
+                    yield guess
+                    break
 
 
 @dataclass(frozen=True)
@@ -487,6 +471,11 @@ class _End:
 
     base: Array
     q: Array
+
+
+def _bow_height(boundary: ThrustBoundary, end: _End) -> float:
+    """Return the least height of a bow away from a straight line that is worth a try, m."""
+    return max(float(np.linalg.norm(end.base[:3] - boundary.state[7:10])) / 2, 0.5)
 
 
 _NEAREST = Weights(0.0, 0.0, 1.0, 1.0, _COST_OF_LACK)
@@ -558,19 +547,12 @@ class _Search:
         self._is_timed, path = True, replace(other.path, multipliers=None)
         self._earliest = self._latest = path.duration
         planes = self._planes(path)
-        path = self._solve(path, _NEAREST, self._span(path), planes=planes, center=path) or path
-        for _ in range(_MAX_ROUNDS):
-            cleared = self._cleared(path)
-            if cleared is None:
-                break
-            motion = self._exact(cleared, self._planes(cleared))
-            near = self.bodies.approaches(motion)
-            share = motion.effort_share(self._effort_limit)
-            if not near and share <= 1.0:
+        path = self._solve(path, _NEAREST, self._span(path), planes, center=path) or path
+        cleared = self._cleared(path)
+        if cleared is not None:
+            motion = self._settled(cleared)
+            if motion.effort_share(self._effort_limit) <= 1.0:
                 return motion
-            if share > 1.0:
-                break
-            self._add(near, cleared)
         raise PlanningError(self._failure("no motion near the other one was found"))
 
     def _motion(self, fastest: ThrustKnots, time: float) -> ThrustMotion:
@@ -591,14 +573,17 @@ class _Search:
             near = bodies.approaches(motion)
             if not near:
                 return motion
-        path = self._clear(path, near)
+        return self._settled(self._clear(path, near))
+
+    def _settled(self, path: ThrustKnots) -> ThrustMotion:
+        """Return the exact motion near a clear path, which is clear, too."""
         for _ in range(_MAX_ROUNDS):
             motion = self._exact(path, self._planes(path))
-            approaches = bodies.approaches(motion)
-            if not approaches:
+            near = self.bodies.approaches(motion)
+            if not near:
                 return motion
-            self._add(approaches, path)
-        raise PlanningError(self._failure(bodies.reason(approaches[0])))
+            self._add(near, path)
+        raise PlanningError(self._failure(self.bodies.reason(near[0])))
 
     def _span(self, path: ThrustKnots) -> DurationBounds:
         """Return the bounds of the duration of a motion near a timed path: a target is met at any
@@ -641,11 +626,11 @@ class _Search:
         guess: ThrustKnots,
         weights: Weights,
         duration: DurationBounds,
-        defects: Array | None = None,
         planes: Array | None = None,
         center: ThrustKnots | None = None,
         *,
         rough: bool = False,
+        corrected: bool = False,
     ) -> ThrustKnots | None:
         self.stop.cancellation.raise_if_requested()
         boundary = self.boundary
@@ -653,9 +638,9 @@ class _Search:
             numbers = self.grapple.motion.numbers(guess.duration)
             goals = np.concatenate([[len(guess.levels)], numbers, self._left])
             boundary = replace(boundary, goals=goals)
-        limits, args = self.planner.limits, (self.stop, duration, defects, planes)
+        limits, args = self.planner.limits, (self.stop, duration, planes, center)
         return self._solver.solve(
-            boundary, limits, guess, weights, *args, center=center, rough=rough
+            boundary, limits, guess, weights, *args, rough=rough, corrected=corrected
         )
 
     @property
@@ -695,19 +680,19 @@ class _Search:
             duration, others = _FREE_TIME, []
             last = self._fast(guess)
         for each in others:
-            knots = self._solve(knots, each, duration, planes=planes) or knots
-        defects, center, best, error = None, None, None, math.inf
-        for _ in range(_MAX_CORRECTIONS):
-            solved = self._solve(knots, last, duration, defects, planes, center)
+            knots = self._solve(knots, each, duration, planes) or knots
+        center, best, error = None, None, math.inf
+        for number in range(_MAX_CORRECTIONS):
+            solved = self._solve(knots, last, duration, planes, center, corrected=number > 0)
             if solved is None:
                 break
-            knots, motion = solved, planner.motion(solved)
+            motion = planner.motion(solved)
             found = self._end_error(motion)
             if found < error:
-                best, error, self.path = motion, found, knots
+                best, error, self.path = motion, found, solved
             if error < _EXACT_END:
                 break
-            defects = self._solver.defects(knots, defects)
+            knots = replace(solved, defects=motion.defects())
             if self._is_timed and found < _NEAR_END:
                 duration = DurationBounds(knots.duration, knots.duration)
                 # The nearest controls that fly exactly: solutions of least propellant are flat.
@@ -748,8 +733,16 @@ class _Search:
 
     def _clear(self, path: ThrustKnots, near: Sequence[Approach]) -> ThrustKnots:
         """Return a path that is clear of the pairs that came near, and of all others."""
-        planner, bodies = self.planner, self.bodies
-        for guess in itertools.chain(planner.bows(self.boundary, path, bodies, near), [path]):
+        planner, bodies, boundary, grapple = self.planner, self.bodies, self.boundary, self.grapple
+        if grapple is None:
+            guesses = itertools.chain(planner.bows(boundary, path, bodies, near), [path])
+        else:
+            latest = grapple.horizon if self._meets_any_time else path.duration + 1e-9
+            times = np.arange(path.duration, latest, _MEETING_PERIOD)
+            shallow = [path] if near[0].distance > -_SHALLOW else []
+            clear = planner.meetings(boundary, grapple, bodies, times)
+            guesses = itertools.chain(shallow, clear)
+        for guess in guesses:
             self._room, self._places = {}, {}
             self._add(near, guess)
             cleared = self._cleared(guess)
@@ -764,13 +757,15 @@ class _Search:
             planes = self._planes(at)
             weights = self._cheap(at, _ROUNDINGS[0]) if self._is_timed else self._fast(at)
             duration = self._span(at) if self._is_timed else _FREE_TIME
-            solved = self._solve(at, weights, duration, planes=planes)
+            solved = self._solve(at, weights, duration, planes)
             if solved is None:
                 return None
             if self._solver.lack > _LARGEST_LACK:
                 at = solved
                 continue
-            approaches = bodies.approaches(self.planner.motion(solved))
+            motion = self.planner.motion(solved)
+            approaches = bodies.approaches(motion)
+            solved = replace(solved, defects=motion.defects())
             if not approaches:
                 return solved
             self._nearest = approaches[0]

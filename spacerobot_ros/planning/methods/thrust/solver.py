@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -10,10 +10,6 @@ import casadi as ca
 import numpy as np
 
 from spacerobot_ros.model.description import Array
-from spacerobot_ros.model.rotations import (
-    quaternion_multiply,
-    rotvecs_from_quaternions,
-)
 from spacerobot_ros.planning.methods.optimal.multiple_shooting import (
     DurationBounds,
     SolverMonitor,
@@ -24,7 +20,6 @@ from spacerobot_ros.planning.methods.optimal.problem import MotionLimits
 from spacerobot_ros.planning.methods.optimal.transcription import ConstraintBlock
 from spacerobot_ros.planning.methods.thrust.transcription import (
     DEFECT_SIZE,
-    ThrustLayout,
     ThrustStages,
     thrust_program,
 )
@@ -69,23 +64,14 @@ _OPTIONS: Mapping[str, Mapping[str, object]] = {
 """Options of IPOPT by where it begins."""
 
 
-class Multipliers(NamedTuple):
-    """Those of a solution: of its variables, of the rows without pairs, and of each pair's rows by
-    their instants.
-    """
-
-    of_variables: Array
-    of_rows: Array
-    of_pairs: Mapping[int, Mapping[int, float]]
-
-
 @dataclass(frozen=True)
 class ThrustKnots:
     """N intervals of ``step`` seconds: states at N + 1 knots, controls of N intervals.
 
     ``quaternions`` (N + 1, 4) of R_WB; ``shapes``, ``velocities`` (N + 1, n) of the joints;
     ``L_W`` (N + 1, 3) about the centre of mass, N m s; ``r_WC``, ``v_WC`` (N + 1, 3) of the centre
-    of mass, m; ``accelerations`` (N, n) and ``levels`` (N, m). A solution has multipliers.
+    of mass, m; ``accelerations`` (N, n) and ``levels`` (N, m). A solution has the multipliers of
+    its variables and of its rows. ``defects`` (N, 12) are those of the intervals; None: zero.
     """
 
     step: float
@@ -97,7 +83,8 @@ class ThrustKnots:
     v_WC: Array
     accelerations: Array
     levels: Array
-    multipliers: Multipliers | None = None
+    multipliers: tuple[Array, Array] | None = None
+    defects: Array | None = None
 
     @property
     def duration(self) -> float:
@@ -120,6 +107,7 @@ class ThrustKnots:
             accelerations=self.accelerations / factor**2,
             levels=self.levels / factor**2,
             multipliers=None,
+            defects=None,
         )
 
 
@@ -133,8 +121,9 @@ class ThrustBoundary:
         ``[X; L; r; V]`` (13,), positions and velocities (n,) of the joints at the start.
     goals
         Numbers of what is given at the end (:class:`.EndKind`).
-    final_shapes
-        (2, n) least and largest joint positions at the end; infinite for joints that are free.
+    shapes, final_shapes
+        (2, n) least and largest joint positions on the way and at the end; infinite for joints that
+        are free.
     final_velocity, final_momentum
         (n,) velocities of the joints, NaN for those that are free, and angular momentum (3,) at the
         end, where the centre of mass rests: zero, but for wheels that go on spinning. None: the
@@ -145,6 +134,7 @@ class ThrustBoundary:
     shape: Array
     velocity: Array
     goals: Array
+    shapes: Array
     final_shapes: Array
     final_velocity: Array
     final_momentum: Array | None
@@ -166,18 +156,6 @@ class Weights(NamedTuple):
     rounding: float = 1.0
 
 
-@dataclass(frozen=True)
-class KeptPairs:
-    """Pairs that are kept apart, by number: the distance of each, and the places among all K
-    instants of the N intervals, from 0 to N K - 1, at which it counts.
-    """
-
-    numbers: tuple[int, ...] = ()
-    rows: tuple[ConstraintBlock, ...] = ()
-    places: tuple[tuple[int, ...], ...] = ()
-    instants: int = 1
-
-
 class ThrustSolver:
     """Solves the problem of one robot for many boundary conditions.
 
@@ -185,24 +163,25 @@ class ThrustSolver:
     ----------
     stages, intervals
         The functions of the problem, and the number of intervals N.
-    pairs
-        The pairs that are kept apart.
+    rows, places
+        The distances of pairs that are kept apart, and where (:data:`KeptPlaces`).
     """
 
     def __init__(
-        self, stages: ThrustStages, intervals: int, pairs: KeptPairs = KeptPairs()
+        self,
+        stages: ThrustStages,
+        intervals: int,
+        rows: Sequence[ConstraintBlock] = (),
+        places: Sequence[Sequence[int]] = (),
     ) -> None:
-        self.stages, self.intervals, self.pairs = stages, intervals, pairs
+        self.stages, self.intervals = stages, intervals
         self.iterations, self.converged = 0, False
         self.lack = 0.0
         """Distance by which pairs are nearer in the last solution than they ought to be, m."""
-        layout, program = thrust_program(
-            stages, intervals, pairs.rows, pairs.places, pairs.instants
-        )
-        self._layout: ThrustLayout = layout
-        self._program = program
+        self._layout, self._program = thrust_program(stages, intervals, rows, places)
+        program = self._program
+        self._rows_of_pairs = sum(map(len, places))
         self._monitor = SolverMonitor(program.problem, program.lower, program.upper)
-        self._flown = stages.flown.map(intervals)
         self._built: dict[str, ca.Function] = {}
 
     def _ipopt(self, begins: str) -> ca.Function:
@@ -220,15 +199,15 @@ class ThrustSolver:
         weights: Weights,
         stop: StopRule,
         duration: DurationBounds,
-        defects: Array | None = None,
         planes: Array | None = None,
-        *,
         center: ThrustKnots | None = None,
+        *,
         rough: bool = False,
+        corrected: bool = False,
     ) -> ThrustKnots | None:
         """Return the best motion near ``guess``; None if none.
 
-        The solver continues at a guess that is a solution, also one without some of the pairs.
+        The solver continues at a guess that is a solution, also one without the pairs.
 
         Parameters
         ----------
@@ -236,14 +215,14 @@ class ThrustSolver:
             The problem, and where the solver begins.
         stop, duration
             Conditions on which it stops early, and bounds of the duration.
-        defects
-            (N, 12) those of the intervals; None: zero.
         planes
             (R, 8) planes of the pairs at their places; None: there are no pairs.
         center
             Controls whose differences are squared; None: zero.
         rough
             Whether another solve begins at the solution.
+        corrected
+            Whether the guess is a solution with other defects.
         """
         N, layout, propulsion = self.intervals, self._layout, self.stages.propulsion
         places = layout.knots()
@@ -252,7 +231,8 @@ class ThrustSolver:
         X, s, v, L, r, V, a, u = places
         least[0], most[0] = duration.shortest / N, duration.longest / N
         least[X], most[X] = -1.1, 1.1
-        least[s], most[s] = limits.lower, limits.upper
+        least[s] = np.maximum(limits.lower, boundary.shapes[0])
+        most[s] = np.minimum(limits.upper, boundary.shapes[1])
         least[v], most[v] = -limits.velocity, limits.velocity
         least[a], most[a] = -limits.acceleration, limits.acceleration
         least[u], most[u] = propulsion.lowest, 1.0
@@ -267,8 +247,8 @@ class ThrustSolver:
         least[v[N, given]] = most[v[N, given]] = boundary.final_velocity[given]
         if layout.has_lack:
             least[-1] = 0.0
-        least[s[N]] = np.maximum(limits.lower, boundary.final_shapes[0])
-        most[s[N]] = np.minimum(limits.upper, boundary.final_shapes[1])
+        least[s[N]] = np.maximum(least[s[N]], boundary.final_shapes[0])
+        most[s[N]] = np.minimum(most[s[N]], boundary.final_shapes[1])
         h = guess.step
         x0[0] = h
         for place, value in zip(
@@ -286,17 +266,18 @@ class ThrustSolver:
             strict=True,
         ):
             x0[place] = value
-        begins, begin = "clear" if self.pairs.rows else "rough" if rough else "", {"x0": x0}
+        begin = {"x0": x0}
+        begins = "clear" if self._rows_of_pairs else "rough" if rough else ""
         if guess.multipliers is not None:
-            begins = "continued" if defects is None else "corrected"
-            begin |= self._known(guess.multipliers)
+            begins = "corrected" if corrected else "continued"
+            begin |= self._known(*guess.multipliers)
         solver = self._ipopt(begins)
         self._monitor.begin(stop)
-        lacking = np.zeros((N, DEFECT_SIZE)) if defects is None else defects
+        defects = np.zeros((N, DEFECT_SIZE)) if guess.defects is None else guess.defects
         parameters = np.concatenate(
             [
                 *(boundary.shape, boundary.goals, propulsion.wrenches.ravel(order="F")),
-                *(lacking.ravel(), limits.acceleration, list(weights)),
+                *(defects.ravel(), limits.acceleration, list(weights)),
                 np.hstack([center.accelerations, center.levels]).ravel()
                 if center is not None
                 else np.zeros(a.size + u.size),
@@ -320,54 +301,18 @@ class ThrustSolver:
             x = self._monitor.best
         X_, s_, v_, L_, r_, V_, a_, u_ = (x[place] for place in places)
         h, self.lack = float(x[0]), float(x[-1]) if layout.has_lack else 0.0
-        multipliers = None
-        if self.converged:
-            multipliers = self._multipliers(
-                *(result[each].full().ravel() for each in ("lam_x", "lam_g"))
-            )
-        return ThrustKnots(h, X_, s_ - h * v_ / 2, v_, L_, r_, V_, a_, u_, multipliers)
+        known = tuple(result[each].full().ravel() for each in ("lam_x", "lam_g"))
+        multipliers = (known[0], known[1]) if self.converged else None
+        shapes = s_ - h * v_ / 2
+        return ThrustKnots(h, X_, shapes, v_, L_, r_, V_, a_, u_, multipliers, guess.defects)
 
-    def _multipliers(self, of_variables: Array, of_rows: Array) -> Multipliers:
-        kept, rows = self.pairs, len(of_rows) - sum(map(len, self.pairs.places))
-        of_pairs, first = {}, rows
-        for number, places in zip(kept.numbers, kept.places, strict=True):
-            values = of_rows[first : first + len(places)].tolist()
-            of_pairs[number] = dict(zip(places, values, strict=True))
-            first += len(places)
-        return Multipliers(of_variables, of_rows[:rows], of_pairs)
-
-    def _known(self, known: Multipliers) -> dict[str, Array]:
-        """Return the first multipliers of the solver from those of a solution."""
-        kept, of_variables = self.pairs, np.zeros(self._layout.size)
-        of_variables[: len(known.of_variables)] = known.of_variables[: self._layout.size]
-        of_pairs = [
-            known.of_pairs.get(number, {}).get(place, 0.0)
-            for number, places in zip(kept.numbers, kept.places, strict=True)
-            for place in places
-        ]
-        return {"lam_x0": of_variables, "lam_g0": np.concatenate([known.of_rows, of_pairs])}
-
-    def flown(self, knots: ThrustKnots) -> Array:
-        """Return the states (N, 13, K) in all intervals, exactly integrated from their knots."""
-        N = self.intervals
-        found = self._flown(
-            knots.states[:-1].T,
-            knots.shapes[:-1].T,
-            knots.velocities[:-1].T,
-            (np.diff(knots.velocities, axis=0) / knots.step).T,
-            self.stages.propulsion.wrenches @ knots.levels.T,
-            np.full((1, N), knots.step),
-        )
-        return np.asarray(found.full().T.reshape(N, -1, 13).transpose(0, 2, 1))
-
-    def defects(self, knots: ThrustKnots, before: Array | None = None) -> Array:
-        """Return the defects (N, 12) with which these knots would be an exact flight.
-
-        ``before`` are those with which they were solved.
+    def _known(self, of_variables: Array, of_rows: Array) -> dict[str, Array]:
+        """Return the first multipliers of the solver from those of a solution: of all rows, if it
+        has the same ones, else of those without pairs.
         """
-        ends, states = self.flown(knots)[:, :, -1], knots.states
-        # Knots obey the program with the defects before: what they miss is the rest.
-        inverse = states[1:, :4] * [-1.0, -1.0, -1.0, 1.0]
-        turn = rotvecs_from_quaternions(quaternion_multiply(inverse, ends[:, :4]))
-        rest = np.hstack([turn, ends[:, 4:] - states[1:, 4:]])
-        return rest if before is None else before + rest
+        x, g = np.zeros(self._layout.size), np.zeros(len(self._program.lower))
+        shared = min(len(x), len(of_variables))
+        x[:shared] = of_variables[:shared]
+        same = len(g) if len(of_rows) == len(g) else len(g) - self._rows_of_pairs
+        g[:same] = of_rows[:same]
+        return {"lam_x0": x, "lam_g0": g}

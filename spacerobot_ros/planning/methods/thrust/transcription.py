@@ -29,14 +29,13 @@ import numpy as np
 
 from spacerobot_ros.collision.planes import PLANE_SIZE
 from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.model.compilation import cached_function, source_hash
+from spacerobot_ros.model.compilation import source_hash
 from spacerobot_ros.model.dynamics import solve_positive_definite
 from spacerobot_ros.model.momentum_derivatives import momentum_derivatives
 from spacerobot_ros.model.symbolic_rotations import (
     half_angle_vector,
     matrix_from_quaternion,
     quaternion_multiply,
-    quaternion_rate,
     relative_vector,
 )
 from spacerobot_ros.model.target_motion import TARGET_SIZE, TargetExpression
@@ -45,11 +44,10 @@ from spacerobot_ros.planning.methods.optimal.transcription import (
     GAUSS,
     AttitudeRows,
     ConstraintBlock,
-    Indices,
+    Layout,
     PlacedBlock,
     Program,
     assembled,
-    hash_of,
     momentum_in_base,
     place_stages,
     rotation_with_derivatives,
@@ -60,34 +58,13 @@ from spacerobot_ros.planning.methods.thrust.propulsion import Propulsion
 DEFECT_SIZE = 12
 """Numbers of an interval's defect: rotation vector, then L, r and V at its end."""
 
+INSTANTS = 2
+"""Instants of an interval at which pairs are kept apart."""
 
-@dataclass(frozen=True)
-class ThrustLayout:
-    """Indices of the variables of N intervals: the step, then knot after knot
-    ``X, s, v, L, r, V, a, u``; the last knot has no controls. With pairs that are kept apart, the
-    last variable is by how much they are nearer than they ought to be, m.
-    """
-
-    joints: int
-    levels: int
-    intervals: int
-    has_lack: bool = False
-
-    @property
-    def _sizes(self) -> list[int]:
-        return [4, self.joints, self.joints, 3, 3, 3, self.joints, self.levels]
-
-    @property
-    def size(self) -> int:
-        """Number of variables."""
-        return 1 + sum(self._sizes) * self.intervals + sum(self._sizes[:6]) + self.has_lack
-
-    def knots(self) -> tuple[Indices, ...]:
-        """Return the places of X, s, v, L, r, V (N + 1, ...), and of a and u (N, ...)."""
-        first = 1 + sum(self._sizes) * np.arange(self.intervals + 1)[:, np.newaxis]
-        ends = np.cumsum([0, *self._sizes])
-        places = [first + np.arange(i, j) for i, j in pairwise(ends)]
-        return (*places[:6], places[6][:-1], places[7][:-1])
+KeptPlaces = tuple[tuple[int, tuple[int, ...]], ...]
+"""Pairs that are kept apart, and the places at which they are among all K instants of the N
+intervals, from 0 to N K - 1.
+"""
 
 
 @dataclass(frozen=True)
@@ -102,8 +79,6 @@ class ThrustStages:
         What pushes the base.
     beginning, interval, end
         Rows of the first knot, of two neighbouring knots, and of the last one.
-    flown
-        The states of an interval, exactly integrated (:func:`flown_interval`).
     """
 
     joints: int
@@ -111,7 +86,6 @@ class ThrustStages:
     beginning: ConstraintBlock
     interval: ConstraintBlock
     end: ConstraintBlock
-    flown: ca.Function
 
     @classmethod
     def of(cls, robot: SpaceRobot, propulsion: Propulsion, kind: EndKind) -> ThrustStages:
@@ -145,7 +119,6 @@ class ThrustStages:
             ConstraintBlock.cached(
                 "thrust_end", [*facts, str(kind)], lambda: _end_block(robot, kind)
             ),
-            cached_function("flown", hash_of(facts), lambda: flown_interval(robot)),
         )
 
 
@@ -174,19 +147,20 @@ def _end_block(robot: SpaceRobot, kind: EndKind) -> ConstraintBlock:
     z, goals = ca.SX.sym("z", 1 + 4 + 2 * n + 9), ca.SX.sym("goals", kind.size)
     h, X, s, v, L, r, V = ca.vertsplit(z, np.cumsum([0, 1, 4, n, n, 3, 3, 3]).tolist())
     R, center_of_mass = matrix_from_quaternion(X), robot.function("center_of_mass", compile=False)
+    q = s - h * v / 2 if kind.target else s
     reached = [ca.SX(0, 1)]
-    if kind.target:
-        q = s - h * v / 2
-        goal = TargetExpression.at(goals[1:-3], goals[0] * h)
+    if kind.link:
         R_all, r_all = robot.function("link_poses", compile=False)(q)
         i = robot.link_names.index(kind.link)
+        e, R_E = r_all[:, i] - center_of_mass(q), R @ R_all[:, 3 * i : 3 * i + 3]
+    if kind.target:
+        goal = TargetExpression.at(goals[1:-3], goals[0] * h)
         J = robot.function(f"jacobian:{kind.link}", compile=False)(q)
-        e = r_all[:, i] - center_of_mass(q)
         omega = R.T @ goal.omega - J[3:6, 6:] @ v
         D, D_q = robot.function("locked_inertia", compile=False)(q)
         reached += [
             r + R @ e - goal.r,
-            half_angle_vector(R @ R_all[:, 3 * i : 3 * i + 3] @ goal.R.T),
+            half_angle_vector(R_E @ goal.R.T),
             V + R @ (J[:3, 3:6] @ omega + J[:3, 6:] @ v) - goal.v,
             L - R @ (D @ omega + D_q @ v),
         ]
@@ -197,11 +171,8 @@ def _end_block(robot: SpaceRobot, kind: EndKind) -> ConstraintBlock:
     elif kind.base:
         reached += [r - R @ center_of_mass(s) - goals[:3], relative_vector(goals[3:7], X)]
     if kind.link and not kind.target:
-        R_all, r_all = robot.function("link_poses", compile=False)(s)
-        i, pose = robot.link_names.index(kind.link), goals[-7:]
-        R_E = R @ R_all[:, 3 * i : 3 * i + 3]
-        turned = R_E @ matrix_from_quaternion(pose[3:]).T
-        reached += [r + R @ (r_all[:, i] - center_of_mass(s)) - pose[:3], half_angle_vector(turned)]
+        turned = R_E @ matrix_from_quaternion(goals[-4:]).T
+        reached += [r + R @ e - goals[-7:-4], half_angle_vector(turned)]
     return ConstraintBlock.of("thrust_end", z, goals, ca.vertcat(*reached))
 
 
@@ -254,66 +225,6 @@ def _interval_block(robot: SpaceRobot, levels: int) -> ConstraintBlock:
     )
 
 
-def rates_function(robot: SpaceRobot) -> ca.Function:
-    """Return ``(X, q, qdot, L, wrench) -> (Xdot, Ldot, F)``: rates of attitude and angular momentum
-    and the force in W.
-    """
-    n = robot.n
-    X, q, qdot = ca.SX.sym("X", 4), ca.SX.sym("q", n), ca.SX.sym("qdot", n)
-    L, wrench = ca.SX.sym("L", 3), ca.SX.sym("wrench", 6)
-    D, D_q = robot.function("locked_inertia", compile=False)(q)
-    R = matrix_from_quaternion(X)
-    omega = solve_positive_definite(D, R.T @ L - D_q @ qdot)
-    c = robot.function("center_of_mass", compile=False)(q)
-    twisted = R @ (wrench[3:] - ca.cross(c, wrench[:3]))
-    rates = [quaternion_rate(X, omega), twisted, R @ wrench[:3]]
-    return ca.Function("rates", [X, q, qdot, L, wrench], rates)
-
-
-EXACT_STEPS = 8
-"""Steps of Runge-Kutta in an interval that is integrated exactly."""
-
-
-def flight_step(robot: SpaceRobot) -> ca.Function:
-    """Return ``(x, q, qdot, qddot, wrench, t) -> x+``: a step of Runge-Kutta 4 of
-    ``x = [X; L; r; V]`` over t seconds, with joints on a parabola and a wrench held in the base.
-    """
-    n, m = robot.n, robot.total_mass
-    rates = rates_function(robot)
-    x, wrench, t = ca.SX.sym("x", 13), ca.SX.sym("wrench", 6), ca.SX.sym("t")
-    q, qdot, qddot = (ca.SX.sym(name, n) for name in ("q", "qdot", "qddot"))
-
-    def slope(at: ca.SX, tau: float) -> ca.SX:
-        X, L, _, V = ca.vertsplit(at, [0, 4, 7, 10, 13])
-        elapsed = tau * t
-        q_at, qdot_at = q + elapsed * qdot + elapsed**2 / 2 * qddot, qdot + elapsed * qddot
-        Xdot, Ldot, F = rates(X, q_at, qdot_at, L, wrench)
-        return ca.vertcat(Xdot, Ldot, V, F / m)
-
-    first = slope(x, 0.0)
-    second = slope(x + t / 2 * first, 0.5)
-    third = slope(x + t / 2 * second, 0.5)
-    fourth = slope(x + t * third, 1.0)
-    reached = x + t / 6 * (first + 2 * second + 2 * third + fourth)
-    X = reached[:4]
-    reached = ca.vertcat(X / ca.norm_2(X), reached[4:])
-    return ca.Function("flight_step", [x, q, qdot, qddot, wrench, t], [ca.cse(reached)])
-
-
-def flown_interval(robot: SpaceRobot) -> ca.Function:
-    """Return ``(x, q, qdot, qddot, wrench, h) -> (13, EXACT_STEPS)``: states on an interval."""
-    n, step = robot.n, flight_step(robot)
-    x, wrench, h = ca.MX.sym("x", 13), ca.MX.sym("wrench", 6), ca.MX.sym("h")
-    q, qdot, qddot = (ca.MX.sym(name, n) for name in ("q", "qdot", "qddot"))
-    at, states, t = x, [], h / EXACT_STEPS
-    for number in range(EXACT_STEPS):
-        begins = number * t
-        q_at = q + begins * qdot + begins**2 / 2 * qddot
-        at = step(at, q_at, qdot + begins * qddot, qddot, wrench, t)
-        states.append(at)
-    return ca.Function("flown", [x, q, qdot, qddot, wrench, h], [ca.horzcat(*states)])
-
-
 def pair_block(joints: int, distance: ca.Function) -> ConstraintBlock:
     """Return the distance of a pair from a plane at an instant of an interval, plus the lack.
 
@@ -328,22 +239,22 @@ def pair_block(joints: int, distance: ca.Function) -> ConstraintBlock:
         z, np.cumsum([0, *sizes]).tolist()
     )
     plane, tau = p[:PLANE_SIZE], p[PLANE_SIZE]
-    at, offset = state_within_interval(tau, s, h * v, h * v_next)[:n], lack
+    at = state_within_interval(tau, s, h * v, h * v_next)[:n]
     if distance.size1_in(0) > n:
-        at = ca.vertcat(at, (1 - tau) * X + tau * X_next)
-        offset = lack + ca.dot(plane[:3], r + h * (tau * V + tau**2 / 2 * (V_next - V)))
+        place = r + h * (tau * V + tau**2 / 2 * (V_next - V))
+        at = ca.vertcat(at, (1 - tau) * X + tau * X_next, place)
     # By the chain rule, as the distance depends on few of the variables.
     y, multiplier = ca.SX.sym("y", at.numel()), ca.SX.sym("lambda")
     bend, slope = ca.substitute(list(ca.hessian(distance(y, plane), y)), [y], [at])
     P, weight = ca.jacobian(at, z), ca.SX.sym("weight", at.numel())
-    of_place = ca.substitute(ca.hessian(ca.dot(weight, at) + offset, z)[0], weight, slope)
+    of_place = ca.substitute(ca.hessian(ca.dot(weight, at), z)[0], weight, slope)
     return ConstraintBlock.with_derivatives(
         "pair",
         z,
         p,
         multiplier,
-        distance(at, plane) + offset,
-        slope.T @ P + ca.jacobian(offset, z),
+        distance(at, plane) + lack,
+        slope.T @ P + ca.jacobian(lack, z),
         multiplier * (P.T @ bend @ P + of_place),
     )
 
@@ -353,19 +264,18 @@ def thrust_program(
     intervals: int,
     pairs: Sequence[ConstraintBlock] = (),
     places: Sequence[Sequence[int]] = (),
-    instants: int = 1,
-) -> tuple[ThrustLayout, Program]:
+) -> tuple[Layout, Program]:
     """Assemble the program from the stages of a problem.
 
     Its parameters are the start of the shape (n,), those of the end (:attr:`EndKind.size`), the
     wrenches (6 m,); the defects (12 N,); typical accelerations (n,); weights of the duration,
     of the propellant, of the squares of accelerations and levels, of the lack, and the level at
     which the cost of a norm is rounded off (6,); centres of the squares (n + m, N); and the planes
-    (8,) of every pair at its ``places``, of the ``instants`` of all intervals.
+    (8,) of every pair at its ``places`` (:data:`KeptPlaces`).
     """
     n, N, propulsion = stages.joints, intervals, stages.propulsion
     m = propulsion.size
-    layout = ThrustLayout(n, m, N, bool(pairs))
+    layout = Layout((4, n, n, 3, 3, 3), (n, m), N, bool(pairs))
     X, s, v, L, r, V, a, u = layout.knots()
     x = ca.MX.sym("x", layout.size)
     goals = int(stages.end.values.size1_in(1))
@@ -406,7 +316,7 @@ def thrust_program(
     ends = np.cumsum([0, *map(len, places)]).tolist()
     for block, at, (first, last) in zip(pairs, places, pairwise(ends), strict=True):
         planes = ca.reshape(p["planes"][8 * first : 8 * last], 8, last - first)
-        placed.append(PlacedBlock.after(placed, block, variables[np.array(at) // instants], planes))
+        placed.append(PlacedBlock.after(placed, block, variables[np.array(at) // INSTANTS], planes))
     levels = ca.reshape(x[u.ravel().tolist()], m, N)
     centers = ca.reshape(p["centers"], n + m, N)
     change = (ca.reshape(x[a.ravel().tolist()], n, N) - centers[:n, :]) / ca.repmat(
