@@ -196,6 +196,13 @@ class ThrustMotion:
         """``[X; L; r; V]`` (13,) at the end."""
         return np.asarray(self._grid[-1])
 
+    @property
+    def last_knot(self) -> Array:
+        """``[h; X; s; v; L; r; V]`` at the end, of which the rows of the end are."""
+        X, momenta = np.split(self.final_state, [4])
+        s = self._q[-1] + self.step * self._qdot[-1] / 2
+        return np.concatenate([[self.step], X, s, self._qdot[-1], momenta])
+
 
 def _sample(robot: SpaceRobot, link: str) -> ca.Function:
     """Return ``(x, q, qdot, qddot, wrench) -> (base, end_effector, tau)``: numbers of frames (19,),

@@ -269,9 +269,9 @@ class ThrustPlanner:
                 if bodies.row_key(pair) not in self._rows:
                     self._rows[bodies.row_key(pair)] = bodies.rows(pair)
             rows = [self._rows[bodies.row_key(pair)] for pair, _ in kept]
-            places = [at for _, at in kept]
-            solver = ThrustSolver(self._stages[kind], self.options.intervals, rows, places)
-            self._solvers[kind, kept] = solver
+            self._solvers[kind, kept] = ThrustSolver(
+                self._stages[kind], self.options.intervals, rows, [at for _, at in kept]
+            )
         return self._solvers[kind, kept]
 
     def motion(self, knots: ThrustKnots) -> ThrustMotion:
@@ -304,10 +304,9 @@ class ThrustPlanner:
         frame, shape = grapple.motion.grapple([time]), boundary.shape
         there = np.concatenate([frame.r[0], quaternion_from_matrix(frame.R[0])])
         end = _End(base_for_hand(self.robot, self.link, shape, there), shape)
-        outwards = (
-            frame.R[0] @ grapple.standoff / max(float(np.linalg.norm(grapple.standoff)), 1e-9)
-        )
-        guess = self._guess(boundary, end, height * _bow_height(boundary, end) * outwards)
+        away = frame.R[0] @ grapple.standoff
+        away *= height * _bow_height(boundary, end) / max(float(np.linalg.norm(away)), 1e-9)
+        guess = self._guess(boundary, end, away)
         return guess.stretched(time / guess.duration) if guess.duration <= time else None
 
     def _require_catch(self, start: ThrustStart, grapple: Grapple) -> None:
@@ -633,11 +632,7 @@ class _Search:
         corrected: bool = False,
     ) -> ThrustKnots | None:
         self.stop.cancellation.raise_if_requested()
-        boundary = self.boundary
-        if self.grapple is not None:
-            numbers = self.grapple.motion.numbers(guess.duration)
-            goals = np.concatenate([[len(guess.levels)], numbers, self._left])
-            boundary = replace(boundary, goals=goals)
+        boundary = replace(self.boundary, goals=self._goals(guess.duration))
         limits, args = self.planner.limits, (self.stop, duration, planes, center)
         return self._solver.solve(
             boundary, limits, guess, weights, *args, rough=rough, corrected=corrected
@@ -709,27 +704,18 @@ class _Search:
             )
         return best
 
+    def _goals(self, duration: float) -> Array:
+        """Return the parameters of the end, for a target of a motion that takes about so long."""
+        if self.grapple is None:
+            return self.boundary.goals
+        numbers = self.grapple.motion.numbers(duration)
+        return np.concatenate([[self.planner.options.intervals], numbers, self._left])
+
     def _end_error(self, motion: ThrustMotion) -> float:
-        """Return the largest error of the poses at the end, m or rad."""
-        last = motion.at(motion.duration)
-        errors = [0.0]
-        if self.grapple is not None:
-            hand = last.end_effector
-            assert hand is not None
-            frame = self.grapple.motion.grapple([motion.duration])
-            goal = [frame.r[0], quaternion_from_matrix(frame.R[0])]
-            errors += [float(np.abs(hand.velocity - frame.v[0]).max())]
-            errors += [float(np.abs(hand.angular_velocity - frame.omega[0]).max())]
-            pairs = [(hand, np.concatenate(goal))]
-        else:
-            frames = [last.base] if self.kind.base else []
-            if self.kind.link and last.end_effector is not None:
-                frames.append(last.end_effector)
-            pairs = list(zip(frames, self.boundary.goals.reshape(-1, 7), strict=True))
-        for at, pose in pairs:
-            errors.append(float(np.linalg.norm(at.position - pose[:3])))
-            errors.append(float(np.linalg.norm(attitude_error(at.quaternion, pose[3:]))))
-        return max(errors)
+        """Return the largest error at the end, m, rad, m/s: but for that of angular momenta."""
+        rows = self._solver.stages.end.values(motion.last_knot, self._goals(motion.duration))
+        of_poses = 9 if self.kind.target else rows.numel()
+        return float(np.abs(rows.full()[:of_poses]).max(initial=0.0))
 
     def _clear(self, path: ThrustKnots, near: Sequence[Approach]) -> ThrustKnots:
         """Return a path that is clear of the pairs that came near, and of all others."""
