@@ -260,9 +260,7 @@ class MultipleShooting:
         accelerations = np.multiply.outer([-1.0, 1.0], np.tile(limits.acceleration, (N, 1)))
         steps = duration.shortest / N, duration.longest / N
         least, most = (
-            _pack_knots(
-                layout, steps[i], attitudes[i], vertices[i], velocities[i], accelerations[i]
-            )
+            pack_knots(layout, steps[i], attitudes[i], vertices[i], velocities[i], accelerations[i])
             for i in (0, 1)
         )
         lack = 0.0 if near is None else near.largest_lack
@@ -313,7 +311,7 @@ class MultipleShooting:
     def _initial_variables(self, guess: Trajectory, lack: float) -> Array:
         h, v = guess.step, guess.velocities
         a = np.diff(v, axis=0) / h
-        x = _pack_knots(self._layout, h, guess.quaternions, guess.shapes + h * v / 2, v, a)
+        x = pack_knots(self._layout, h, guess.quaternions, guess.shapes + h * v / 2, v, a)
         if self._layout.has_lack:
             x[-1] = lack / 2
         return x
@@ -366,8 +364,8 @@ def _pack_parameters(
     )
 
 
-def _pack_knots(layout: Layout, step: float, *knots: Array) -> Array:
-    """Return the variables of a step and of X, s, v and a at their knots."""
+def pack_knots(layout: Layout, step: float, *knots: Array) -> Array:
+    """Return the variables of a step and of the parts of all knots (:meth:`.Layout.knots`)."""
     x = np.zeros(layout.size)
     x[0] = step
     for places, values in zip(layout.knots(), knots, strict=True):

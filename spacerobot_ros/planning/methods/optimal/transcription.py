@@ -214,10 +214,8 @@ class Stages:
             Whether the angular momentum is a parameter; else it is zero.
         """
         n = robot.n
-        X, s, v = ca.SX.sym("X", 4), ca.SX.sym("s", n), ca.SX.sym("v", n)
-        h = ca.SX.sym("h")
-        start, turn, center = ca.SX.sym("start", n), ca.SX.sym("turn", 4), ca.SX.sym("center", 3)
-        begins = ConstraintBlock.of("beginning", ca.vertcat(h, s, v), start, s - h * v / 2 - start)
+        X, s = ca.SX.sym("X", 4), ca.SX.sym("s", n)
+        turn, center = ca.SX.sym("turn", 4), ca.SX.sym("center", 3)
         reached = [ca.DM(axes) @ relative_vector(turn, X)]
         if position:
             center_of_mass = robot.function("center_of_mass", compile=False)
@@ -230,13 +228,20 @@ class Stages:
         interval = _cached_interval(robot, constraints, inequalities, drifting=drifting)
         path = interval.rows - _count_dynamics_rows(n)
         turn = turn_function(robot, drifting=drifting)
-        return cls(n, begins, interval, ends, path, turn)
+        return cls(n, beginning_block(n), interval, ends, path, turn)
 
     def with_distances(self, rows: Sequence[PlaneDistance], instants: int) -> Stages:
         """Return the problem in which pairs of links keep distances, too, at a number of instants
         in each interval.
         """
         return replace(self, distances=_distance_block(self.joints, rows, instants))
+
+
+def beginning_block(joints: int) -> ConstraintBlock:
+    """Return the rows of the first knot, of ``[h; s; v]``: its shape is the start (n,)."""
+    h, s, v = ca.SX.sym("h"), ca.SX.sym("s", joints), ca.SX.sym("v", joints)
+    start = ca.SX.sym("start", joints)
+    return ConstraintBlock.of("beginning", ca.vertcat(h, s, v), start, s - h * v / 2 - start)
 
 
 def _count_dynamics_rows(joints: int) -> int:

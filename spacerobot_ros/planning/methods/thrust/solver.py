@@ -15,6 +15,7 @@ from spacerobot_ros.planning.methods.optimal.multiple_shooting import (
     SolverMonitor,
     StopRule,
     build_solver,
+    pack_knots,
 )
 from spacerobot_ros.planning.methods.optimal.problem import MotionLimits
 from spacerobot_ros.planning.methods.optimal.transcription import ConstraintBlock
@@ -227,7 +228,6 @@ class ThrustSolver:
         N, layout, propulsion = self.intervals, self._layout, self.stages.propulsion
         places = layout.knots()
         least, most = np.full(layout.size, -np.inf), np.full(layout.size, np.inf)
-        x0 = np.zeros(layout.size)
         X, s, v, L, r, V, a, u = places
         least[0], most[0] = duration.shortest / N, duration.longest / N
         least[X], most[X] = -1.1, 1.1
@@ -249,23 +249,13 @@ class ThrustSolver:
             least[-1] = 0.0
         least[s[N]] = np.maximum(least[s[N]], boundary.final_shapes[0])
         most[s[N]] = np.minimum(most[s[N]], boundary.final_shapes[1])
-        h = guess.step
-        x0[0] = h
-        for place, value in zip(
-            places,
-            (
-                guess.quaternions,
-                guess.shapes + h * guess.velocities / 2,
-                guess.velocities,
-                guess.L_W,
-                guess.r_WC,
-                guess.v_WC,
-                guess.accelerations,
-                guess.levels,
-            ),
-            strict=True,
-        ):
-            x0[place] = value
+        x0 = pack_knots(
+            layout,
+            guess.step,
+            *(guess.quaternions, guess.shapes + guess.step * guess.velocities / 2),
+            *(guess.velocities, guess.L_W, guess.r_WC, guess.v_WC),
+            *(guess.accelerations, guess.levels),
+        )
         begin = {"x0": x0}
         begins = "clear" if self._rows_of_pairs else "rough" if rough else ""
         if guess.multipliers is not None:

@@ -48,6 +48,7 @@ from spacerobot_ros.planning.methods.optimal.transcription import (
     PlacedBlock,
     Program,
     assembled,
+    beginning_block,
     momentum_in_base,
     place_stages,
     rotation_with_derivatives,
@@ -93,10 +94,6 @@ class ThrustStages:
 
         The wrenches are parameters: thrusters that break have the same functions.
         """
-        n = robot.n
-        h, s, v = ca.SX.sym("h"), ca.SX.sym("s", n), ca.SX.sym("v", n)
-        start = ca.SX.sym("start", n)
-        begins = ConstraintBlock.of("beginning", ca.vertcat(h, s, v), start, s - h * v / 2 - start)
         facts = [
             source_hash(
                 *(__name__, shooting.__name__, momentum_derivatives.__module__),
@@ -107,9 +104,9 @@ class ThrustStages:
             f"levels {propulsion.size}",
         ]
         return cls(
-            n,
+            robot.n,
             propulsion,
-            begins,
+            beginning_block(robot.n),
             ConstraintBlock.cached(
                 "thrust",
                 facts,
