@@ -235,15 +235,12 @@ class ThrustPlanner:
         """
         self._require_catch(start, grapple)
         boundary, kind = self._meeting(start), EndKind(base=False, link=self.link, target=True)
-        times = np.arange(_MEETING_PERIOD, grapple.horizon, _MEETING_PERIOD).tolist()
-        guesses = (self.meeting_guess(boundary, grapple, time) for time in times)
-        guess = next((each for each in guesses if each is not None), None)
-        if guess is None:
-            raise UnreachableError(
-                f"The thrust does not take the robot to the target within {grapple.horizon:g} s: "
-                "raise 'target.horizon'.",
-                Proof.LIMITS,
-            )
+        latest = max(grapple.horizon, 2 * _MEETING_PERIOD)
+        for time in np.arange(_MEETING_PERIOD, latest, _MEETING_PERIOD).tolist():
+            guess = self._meeting_guess(boundary, grapple, time)
+            if guess.duration <= time:
+                break
+        guess = guess.stretched(time / guess.duration)
         plain = _Search(self, boundary, kind, stop, bodies, grapple)
         motion = plain.run(guess)
         if not grapple.detumbles:
@@ -295,19 +292,18 @@ class ThrustPlanner:
         state, none = self._state(start), np.zeros(0)
         return ThrustBoundary(state, start.q, start.qdot, none, near, near, velocity, None)
 
-    def meeting_guess(
+    def _meeting_guess(
         self, boundary: ThrustBoundary, grapple: Grapple, time: float, height: float = 0.0
-    ) -> ThrustKnots | None:
-        """Return a guess that is at a target at a time, in the shape of the start, on a way that
-        bows out to the side of the fixture; None: the thrust does not suffice.
+    ) -> ThrustKnots:
+        """Return a guess at full thrust to where a target is at a time, in the shape of the start,
+        on a way that bows out to the side of the fixture.
         """
         frame, shape = grapple.motion.grapple([time]), boundary.shape
         there = np.concatenate([frame.r[0], quaternion_from_matrix(frame.R[0])])
         end = _End(base_for_hand(self.robot, self.link, shape, there), shape)
         away = frame.R[0] @ grapple.standoff
         away *= height * _bow_height(boundary, end) / max(float(np.linalg.norm(away)), 1e-9)
-        guess = self._guess(boundary, end, away)
-        return guess.stretched(time / guess.duration) if guess.duration <= time else None
+        return self._guess(boundary, end, away)
 
     def _require_catch(self, start: ThrustStart, grapple: Grapple) -> None:
         robot, target = self.robot, grapple.motion
@@ -458,8 +454,11 @@ class ThrustPlanner:
         """Yield guesses at a target at times that are clear, of each time the straightest one."""
         for time in times.tolist():
             for height in _BOW_SHARES:
-                guess = self.meeting_guess(boundary, grapple, time, height)
-                if guess is not None and bodies.room(guess, range(len(bodies.required))) > 0:
+                guess = self._meeting_guess(boundary, grapple, time, height)
+                if guess.duration > time:
+                    break
+                guess = guess.stretched(time / guess.duration)
+                if bodies.room(guess, range(len(bodies.required))) > 0:
                     yield guess
                     break
 
