@@ -453,7 +453,9 @@ class CoordinatedController:
                 if warning := self.law.sampling_warning():
                     warn_once(warning)
             if isinstance(self.profile, PlannedReference) and not self.law.follows_accelerations:
-                planned = self.profile.actuation(time - self._began)
+                planned = self.profile.actuation(
+                    time - self._began, self._control_period, self.law.joint_damping
+                )
                 commanded = Actuation(*(a + b for a, b in zip(commanded, planned, strict=True)))
             if self.coming_to_rest:
                 commanded = self._to_rest(state)

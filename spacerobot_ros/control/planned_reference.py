@@ -98,15 +98,31 @@ class PlannedReference(ReferenceProfile):
         return Reference(
             None if goal.base is None else _pose(sample.base),
             None if goal.end_effector is None or hand is None else _pose(hand),
-            None if goal.joints is None else JointReference(sample.q, sample.qdot, sample.qddot),
+            JointReference(sample.q, sample.qdot, sample.qddot),
         )
 
-    def actuation(self, time: float) -> Actuation:
-        """Return the wrench and efforts of the plan ``time`` s after its start; none at its end."""
-        if not 0.0 <= time < self.duration:
-            return Actuation(np.zeros(6), np.zeros(self.motion.joints))
-        sample = self.motion.at(time)
-        return Actuation(sample.wrench_B, sample.tau)
+    def actuation(self, time: float, period: float, joint_damping: float = 0.0) -> Actuation:
+        """Return the mean wrench and efforts of the plan over a control period that begins
+        ``time`` s after its start; zero before its start and after its end.
+
+        Samples would not do: efforts jump between intervals, and joints would get other rates.
+
+        Parameters
+        ----------
+        time, period
+            Time since the start, and the time for which the command is held, s.
+        joint_damping
+            Friction that the law adds to the joints and that the efforts overcome, N m s/rad.
+        """
+        ends = min(time + period, self.duration)
+        knot = self.motion.step * (math.floor(time / self.motion.step) + 1)
+        wrench, tau = np.zeros(6), np.zeros(self.motion.joints)
+        for begin, end in ((time, min(knot, ends)), (knot, ends)):
+            if 0.0 <= begin < end:
+                sample, share = self.motion.at((begin + end) / 2), (end - begin) / period
+                wrench += share * sample.wrench_B
+                tau += share * (sample.tau + joint_damping * sample.qdot)
+        return Actuation(wrench, tau)
 
 
 class GrappleReference(PlannedReference):

@@ -48,11 +48,13 @@ from spacerobot_ros.control import (
     GainPair,
     Gains,
     LawOptions,
+    PoseReference,
     Reference,
     TargetNotSetError,
 )
 from spacerobot_ros.control.config import ControllerConfig
 from spacerobot_ros.control.controller import build_controller
+from spacerobot_ros.control.state import JointReference
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.parameters import configured, declared, parameter
@@ -517,6 +519,33 @@ def test_wrist_singularity_of_the_spatial_arm(name: str) -> None:
     assert law.status.singular
     assert law.status.smallest_singular_value < 1e-12
     assert np.abs(np.concatenate([actuation.wrench_B, actuation.tau])).max() < 500.0
+
+
+@pytest.mark.parametrize("wrist", [0.0, 0.02, -0.8])
+def test_a_motion_through_a_singularity_is_followed(wrist: float) -> None:
+    """Its wrench and efforts, for Pinocchio, are the command if the reference has the joints."""
+    rng, robot = np.random.default_rng(5), load("servicer")
+    state = replace(well_conditioned_state(rng), q=np.array([0.2, -1.2, 2.0, 0.3, wrist, -0.4]))
+    wanted = Actuation(rng.uniform(-5.0, 5.0, 6), rng.uniform(-0.1, 0.1, 6))
+    motion, present = OutputMotion(robot, state, wanted), Reference.present(robot, state, "")
+    assert present.base is not None
+    R, r = plant_of(robot, state).frame(END_EFFECTOR)[::-1]
+    velocities, accelerations = np.split(motion.velocity, 4), np.split(motion.acceleration, 4)
+    places = (
+        (present.base.position, present.base.quaternion),
+        (r, Rotation.from_matrix(R).as_quat()),
+    )
+    base, hand = (
+        PoseReference(*place, *velocities[i : i + 2], *accelerations[i : i + 2])
+        for place, i in zip(places, (0, 2), strict=True)
+    )
+    qddot = plant_of(robot, state).acceleration(wanted)[1]
+    joints = JointReference(state.q, state.qdot, qddot)
+    law = law_of("model_based", robot, GAINS)
+    given = law.command(state, Reference(base, hand, joints))
+    assert law.status.singular == (abs(wrist) < 0.1)
+    np.testing.assert_allclose(given.wrench_B, wanted.wrench_B, atol=1e-6)
+    np.testing.assert_allclose(given.tau, wanted.tau, atol=1e-6)
 
 
 def test_far_from_singularities_the_command_takes_one_evaluation(

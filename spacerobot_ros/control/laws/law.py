@@ -353,6 +353,11 @@ class ControlLaw(ABC):
         """Whether commands include the efforts of the reference's accelerations, by the masses."""
         return self.gain_units != FORCE_GAINS or self._weighs
 
+    @property
+    def joint_damping(self) -> float:
+        """Viscous friction by joint efforts in every command, N m s/rad."""
+        return 0.0
+
     def automatic_effort(self, symbols: Mapping[str, ca.SX]) -> ca.SX:
         """Return the efforts (m,) of automatic gains, for a law that commands forces; else zeros.
 

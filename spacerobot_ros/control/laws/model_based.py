@@ -13,7 +13,7 @@ import numpy.typing as npt
 from typing_extensions import override
 
 from spacerobot_ros.control.laws.law import ACCELERATION_GAINS, ControlLaw, LawOptions
-from spacerobot_ros.control.state import Actuation, Reference
+from spacerobot_ros.control.state import Actuation, JointReference, Reference
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.dynamics import solve_positive_definite
 from spacerobot_ros.parameters import nonnegative
@@ -53,7 +53,8 @@ class ModelBasedLaw(ControlLaw):
       ``t`` for ``s``: damping ``d = sqrt(t^2 - s^2)``, which starts from zero at the threshold.
       Accelerations along v stay bounded; other directions are unaffected.
     * Velocity along v that the outputs no longer show, so that their Kd does not act on it, is
-      damped directly, with the largest Kd.
+      damped directly, with the largest Kd. If the reference has joints, motion along v follows
+      them instead, critically damped.
 
     Eq. (28) then holds for the other directions only, and :attr:`status` reports it.
 
@@ -137,14 +138,14 @@ class ModelBasedLaw(ControlLaw):
         if self._out["margin"][0] >= self.singular_value_threshold:
             actuation = self._out["actuation"]
         else:
-            actuation = self._damped_actuation(q)
+            actuation = self._damped_actuation(reference)
         return Actuation(actuation[:6].copy(), actuation[6:].copy())
 
-    def _damped_actuation(self, q: Array) -> Array:
+    def _damped_actuation(self, reference: Reference) -> Array:
         out = self._out
         U, singular_values, V = np.linalg.svd(out["J_z"], full_matrices=False)
         mobility = out["mobility"].copy()
-        H = self.robot.inertia_matrix(q)
+        H = self.robot.inertia_matrix(self._in["state"][13 : 13 + self.robot.n])
         z0dot, largest_kd = out["z0dot"], self._in["kd"].max()
         for u, s, v in zip(U.T, singular_values, V, strict=True):
             damping = self._damping(float(s))
@@ -153,6 +154,24 @@ class ModelBasedLaw(ControlLaw):
                 mobility += damping**2 * (v @ along) * np.outer(u, u)
                 rate = (v @ z0dot) / (v @ along)
                 self._in["singular_damping"][:] -= largest_kd * rate * along
+        if reference.joints is not None:
+            self._in["singular_damping"][:] = self._following(reference.joints)
         self._function.evaluate()
         force = np.linalg.solve(mobility, out["acceleration"])
         return out["other"] + force @ out["J_actuators"]
+
+    def _following(self, joints: JointReference) -> Array:
+        """Return the acceleration (6 + n,) with which joints follow their reference and outputs, as
+        far as the base moves them, theirs, less the damping in the null space.
+
+        Outputs then need forces for the rest of their errors alone: damping leaves forces out that
+        bear the motion along v, too.
+        """
+        out, kd = self._out, self._in["kd"].max()
+        damped = self.options.null_space_damping * out["z0dot"]
+        followed = np.zeros(6 + self.robot.n)
+        q, qdot = self._in["state"][13 : 13 + self.robot.n], out["z0dot"][6:]
+        followed[6:] = joints.qddot + kd * (joints.qdot - qdot) + kd**2 / 4 * (joints.q - q)
+        rest = out["acceleration"] - out["J_z"] @ (damped + followed)
+        followed[:6] = np.linalg.lstsq(out["J_z"][:, :6], rest, rcond=None)[0]
+        return np.asarray(damped + followed)

@@ -48,10 +48,15 @@ class TransposedJacobianLaw(ControlLaw):
     gain_units: ClassVar[tuple[str, str]] = FORCE_GAINS
     Options: ClassVar[Any] = TransposedJacobianOptions
 
+    @property
+    @override
+    def joint_damping(self) -> float:
+        return float(self.options.joint_damping)
+
     @override
     def inputs(self) -> Mapping[str, npt.ArrayLike]:
         """Return arguments of the law's own; see :meth:`ControlLaw.inputs`."""
-        return {"joint_damping": self.options.joint_damping}
+        return {"joint_damping": self.joint_damping}
 
     @override
     def results(self, symbols: dict[str, ca.SX]) -> dict[str, ca.SX]:
