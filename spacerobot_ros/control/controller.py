@@ -612,6 +612,7 @@ class CoordinatedController:
             given.base or own.base,
             given.end_effector or own.end_effector,
             given.joints or own.joints,
+            of_one_motion=own.of_one_motion and given.joints is None,
         )
 
     def _known_state(

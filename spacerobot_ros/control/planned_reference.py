@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from bisect import bisect_left
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from threading import Thread
 from time import perf_counter
 from typing import ClassVar, Generic, NamedTuple, TypeVar
@@ -99,6 +99,7 @@ class PlannedReference(ReferenceProfile):
             None if goal.base is None else _pose(sample.base),
             None if goal.end_effector is None or hand is None else _pose(hand),
             JointReference(sample.q, sample.qdot, sample.qddot),
+            of_one_motion=True,
         )
 
     def actuation(self, time: float, period: float, joint_damping: float = 0.0) -> Actuation:
@@ -274,7 +275,9 @@ class ReferencePlanner:
             shape = q
         if shape is None and goal.end_effector is not None:
             hand = _numbers(goal.end_effector)
-        end = ThrustGoal(_numbers(goal.base), hand, shape)
+        end = ThrustGoal(_numbers(goal.base), hand, shape, keeps_shape=carries)
+        if carries:
+            begin = replace(begin, qdot=np.zeros(len(q)))
         found = self._planner.plan(begin, end, cancellation)
         return PlannedReference(start, goal, limits, found, carries=carries)
 

@@ -132,11 +132,15 @@ class JointReference:
 
 @dataclass(frozen=True)
 class Reference:
-    """Reference of the outputs; None for a group that is not controlled."""
+    """Reference of the outputs; None for a group that is not controlled.
+
+    ``of_one_motion``: the poses are those that the joints move the robot through.
+    """
 
     base: PoseReference | None = None
     end_effector: PoseReference | None = None
     joints: JointReference | None = None
+    of_one_motion: bool = False
 
     @classmethod
     def present(cls, robot: SpaceRobot, state: ControlState, end_effector: str = "") -> Reference:

@@ -523,7 +523,7 @@ def test_wrist_singularity_of_the_spatial_arm(name: str) -> None:
 
 @pytest.mark.parametrize("wrist", [0.0, 0.02, -0.8])
 def test_a_motion_through_a_singularity_is_followed(wrist: float) -> None:
-    """Its wrench and efforts, for Pinocchio, are the command if the reference has the joints."""
+    """Its wrench and efforts, for Pinocchio, are the command if the reference has its joints."""
     rng, robot = np.random.default_rng(5), load("servicer")
     state = replace(well_conditioned_state(rng), q=np.array([0.2, -1.2, 2.0, 0.3, wrist, -0.4]))
     wanted = Actuation(rng.uniform(-5.0, 5.0, 6), rng.uniform(-0.1, 0.1, 6))
@@ -542,7 +542,7 @@ def test_a_motion_through_a_singularity_is_followed(wrist: float) -> None:
     qddot = plant_of(robot, state).acceleration(wanted)[1]
     joints = JointReference(state.q, state.qdot, qddot)
     law = law_of("model_based", robot, GAINS)
-    given = law.command(state, Reference(base, hand, joints))
+    given = law.command(state, Reference(base, hand, joints, of_one_motion=True))
     assert law.status.singular == (abs(wrist) < 0.1)
     np.testing.assert_allclose(given.wrench_B, wanted.wrench_B, atol=1e-6)
     np.testing.assert_allclose(given.tau, wanted.tau, atol=1e-6)

@@ -99,6 +99,15 @@ def test_pinocchio_ends_at_the_goal_under_the_wrenches_and_efforts_of_a_plan() -
     assert 0 < motion.spent < straight * planner.propulsion.cost.sum()
 
 
+def test_an_arm_that_is_to_keep_its_shape_keeps_it_all_the_way() -> None:
+    planner, start = servicer(), ThrustStart.at_rest(START, FOLDED)
+    goal = beyond(START, np.array([1.0, 0.4, -0.2]), np.array([0.1, -0.2, 0.5]))
+    motion = planner.plan(start, ThrustGoal(base=goal, shape=FOLDED, keeps_shape=True))
+    assert np.abs(motion.path()[0] - FOLDED).max() < 1e-9
+    ended = flown_by_pinocchio(planner.robot, motion, start)
+    assert ended[:3] == pytest.approx(goal[:3], abs=1e-3)
+
+
 def test_hand_and_base_reach_their_poses_together() -> None:
     planner = servicer()
     pose = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])

@@ -53,8 +53,8 @@ class ModelBasedLaw(ControlLaw):
       ``t`` for ``s``: damping ``d = sqrt(t^2 - s^2)``, which starts from zero at the threshold.
       Accelerations along v stay bounded; other directions are unaffected.
     * Velocity along v that the outputs no longer show, so that their Kd does not act on it, is
-      damped directly, with the largest Kd. If the reference has joints, motion along v follows
-      them instead, critically damped.
+      damped directly, with the largest Kd. If the reference is of one motion, motion along v
+      follows its joints instead, critically damped.
 
     Eq. (28) then holds for the other directions only, and :attr:`status` reports it.
 
@@ -154,7 +154,7 @@ class ModelBasedLaw(ControlLaw):
                 mobility += damping**2 * (v @ along) * np.outer(u, u)
                 rate = (v @ z0dot) / (v @ along)
                 self._in["singular_damping"][:] -= largest_kd * rate * along
-        if reference.joints is not None:
+        if reference.of_one_motion and reference.joints is not None:
             self._in["singular_damping"][:] = self._following(reference.joints)
         self._function.evaluate()
         force = np.linalg.solve(mobility, out["acceleration"])

@@ -81,12 +81,14 @@ class ThrustGoal:
 
     ``base`` and ``end_effector`` are poses (7,), position and quaternion in W, or None;
     ``shape`` are joint positions (n,), NaN for joints that are free, None for all free;
+    ``keeps_shape``: joints that are not free keep the positions of the start all the way;
     ``grapple`` is a target in place of the others.
     """
 
     base: Array | None = None
     end_effector: Array | None = None
     shape: Array | None = None
+    keeps_shape: bool = False
     grapple: Grapple | None = None
 
 

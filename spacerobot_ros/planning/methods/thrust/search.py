@@ -353,6 +353,7 @@ class ThrustPlanner:
                 shapes,
                 final_velocity,
                 matrix_from_quaternion(base[3:]) @ spin,
+                goal.keeps_shape,
             ),
             _End(base, q),
         )
@@ -499,7 +500,7 @@ class _Search:
         options = planner.options
         self._is_timed = options.duration > 0 or options.time_factor > 1
         """Whether the duration is given, or follows from the shortest one."""
-        self._meets_any_time = grapple is not None and options.duration == 0
+        self._meets_any_time = grapple is not None
         self._earliest = self._latest = 0.0
         """When a target is met, s."""
         self._effort_limit = (1.0 - options.reserve) * planner.robot.effort_limit
@@ -599,7 +600,10 @@ class _Search:
                 f"{options.duration:g} s.",
                 Proof.LIMITS,
             )
-        return options.duration or options.time_factor * fastest.duration
+        time = options.duration or options.time_factor * fastest.duration
+        if self.grapple is not None:
+            time = max(min(time, self.grapple.horizon), fastest.duration)
+        return time
 
     @property
     def _kept(self) -> KeptPlaces:

@@ -129,6 +129,8 @@ class ThrustBoundary:
         (n,) velocities of the joints, NaN for those that are free, and angular momentum (3,) at the
         end, where the centre of mass rests: zero, but for wheels that go on spinning. None: the
         momenta are free, too.
+    keeps_shape
+        Whether the joints that have a position at the end have it all the way.
     """
 
     state: Array
@@ -139,6 +141,7 @@ class ThrustBoundary:
     final_shapes: Array
     final_velocity: Array
     final_momentum: Array | None
+    keeps_shape: bool = False
 
 
 class Weights(NamedTuple):
@@ -249,6 +252,10 @@ class ThrustSolver:
             least[-1] = 0.0
         least[s[N]] = np.maximum(least[s[N]], boundary.final_shapes[0])
         most[s[N]] = np.minimum(most[s[N]], boundary.final_shapes[1])
+        if boundary.keeps_shape:
+            # Both ends are given by other rows.
+            held = np.isfinite(boundary.final_shapes[0])
+            least[s[1 : N - 1, held]] = most[s[1 : N - 1, held]] = boundary.shape[held]
         x0 = pack_knots(
             layout,
             guess.step,
