@@ -118,6 +118,7 @@ NEAR := --goal 0.12 0.05 -0.03 --goal-rotvec 0.02 -0.03 0.06 \
     --set coordinated_control.settle_time=0.5 \
     --set coordinated_control.position_tolerance=0.002 --set coordinated_control.attitude_tolerance=0.01 \
     --set plant.tick_rate=50 --set coordinated_control.tick_rate=50
+STRAIGHT := --set coordinated_control.profile=quintic
 
 .PHONY: bags
 bags: $(STAMP)/demo ## fly the reference bags in bags/ again, where a changed behaviour is wanted
@@ -133,10 +134,9 @@ bags: $(STAMP)/demo ## fly the reference bags in bags/ again, where a changed be
 	    --set coordinated_control.position_tolerance=0.02 \
 	    --set coordinated_control.attitude_tolerance=0.02
 	$(FLY) servicer $(NEAR)
-	$(FLY) servicer_thrusters $(NEAR)
+	$(FLY) servicer_thrusters $(NEAR) $(STRAIGHT)
 	$(FLY) free_flyer --goal 0.8 0.2 0.05 --goal-rotvec 0 0 1 --set plant.tick_rate=10 \
-	    --set coordinated_control.tick_rate=10 --set coordinated_control.profile=quintic \
-	    --set coordinated_control.settle_time=0.5
+	    --set coordinated_control.tick_rate=10 --set coordinated_control.settle_time=0.5 $(STRAIGHT)
 	$(FLY) wheels --set plant.tick_rate=10 --set coordinated_control.tick_rate=10 \
 	    --set coordinated_control.settle_time=1
 	$(FLY) gravity_gradient --set plant.tick_rate=12.5 --set coordinated_control.tick_rate=12.5 \
@@ -146,7 +146,8 @@ bags: $(STAMP)/demo ## fly the reference bags in bags/ again, where a changed be
 	$(FLY) two_hands
 	$(FLY) strut --set plant.world=config/worlds/strut.urdf --set planner.world=config/worlds/strut.urdf
 	$(FLY) capture --set plant.target.robot=config/targets/block.urdf
-	$(FLY) servicing --set plant.target.robot=config/targets/satellite.urdf \
+	$(FLY) servicing $(STRAIGHT) --set coordinated_control.target.horizon=120 \
+	    --set plant.target.robot=config/targets/satellite.urdf \
 	    --set plant.tick_rate=10 --set coordinated_control.tick_rate=10
 
 # What mkdocs prints of its theme's successor is no warning of the build.

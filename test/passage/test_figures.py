@@ -90,7 +90,10 @@ FLIGHTS: dict[str, dict[str, Any]] = {
     },
     "nozzles": {
         "what": "servicer_thrusters",
-        "parameters": {"coordinated_control.time_limit": 3.0},
+        "parameters": {
+            "coordinated_control.time_limit": 3.0,
+            "coordinated_control.profile": "quintic",
+        },
     },
 }
 """Arguments of :func:`spacerobot_ros.fly`: short flights that differ in robot and method."""

@@ -172,7 +172,7 @@ def test_meetings_that_cannot_be_are_refused_in_a_sentence() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("detumble", "least", "most"),
-    [("after", 10.0, 20.0), pytest.param("before", 0, 1.0, marks=pytest.mark.study)],
+    [("after", 1.8, 2.4), pytest.param("before", 0, 0.4, marks=pytest.mark.study)],
 )
 def test_the_plant_has_what_a_planned_grasp_leaves(
     detumble: str, least: float, most: float
@@ -181,7 +181,6 @@ def test_the_plant_has_what_a_planned_grasp_leaves(
     flight = fly(
         "servicing",
         parameters={
-            "coordinated_control.profile": "planned",
             "coordinated_control.target.detumble": detumble,
             "coordinated_control.time_limit": 0.1,
         },

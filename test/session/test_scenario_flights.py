@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import coal
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -156,6 +157,10 @@ def test_both_poses_are_reached_by_pulses(excluded: str, tmp_path: Path) -> None
     used = on_time[-1].sum() * 10.0 / (9.80665 * 290.0)
     assert summary["propellant_kg"] == pytest.approx(used, rel=1e-9)
     assert 0.01 < used < 0.1
+    if not excluded:
+        # The straight profile takes 41 g and 33 s.
+        assert used <= 0.020
+        assert summary["manoeuvre_time_s"] <= 31.0
     np.testing.assert_allclose(thrust, 10.0 * duty, atol=1e-12)
     assert np.mean((duty == 0.0) | (duty > 1.0 - 1e-9)) > 0.97
     for name in excluded.split():
@@ -179,6 +184,34 @@ def test_both_poses_are_reached_by_pulses(excluded: str, tmp_path: Path) -> None
     assert verify_bag(path).difference is None
 
 
+@pytest.mark.slow
+def test_a_crate_in_the_way_is_passed_at_a_distance(tmp_path: Path) -> None:
+    """The bus of 1.2 x 1 x 1 m and its panels, by coal: straight through the crate, or past it."""
+    crate, place = coal.Box(0.3, 0.3, 0.3), coal.Transform3s(np.eye(3), np.array([0.9, -0.8, 0.0]))
+    origin = '<origin xyz="0.9 -0.8 0"/><geometry><box size="0.3 0.3 0.3"/></geometry>'
+    shapes = f"<visual>{origin}</visual><collision>{origin}</collision>"
+    world = tmp_path / "crate.urdf"
+    world.write_text(f'<robot name="w"><link name="crate">{shapes}</link></robot>', "utf-8")
+    bus = [((1.2, 1.0, 1.0), 0.0), ((0.8, 1.6, 0.03), 1.5), ((0.8, 1.6, 0.03), -1.5)]
+
+    def distance(flight: Flight) -> float:
+        distances = []
+        for pose in flight.pose[::10]:
+            R = Rotation.from_quat(pose[3:]).as_matrix()
+            for size, y in bus:
+                at = coal.Transform3s(R, pose[:3] + R @ [0.0, y, 0.0])
+                request, result = coal.DistanceRequest(), coal.DistanceResult()
+                part = coal.Box(*size)
+                distances.append(coal.distance(part, at, crate, place, request, result))
+        return float(min(distances))
+
+    straight = fly("servicer_thrusters", parameters={"coordinated_control.profile": "quintic"})
+    assert distance(straight) < -0.05
+    past = fly("servicer_thrusters", parameters={"coordinated_control.world": str(world)})
+    assert past.succeeded, past.message
+    assert distance(past) > 0.01
+
+
 def test_thrusters_of_a_robot_that_nothing_pushes_are_refused(tmp_path: Path) -> None:
     scenario = load_scenario("servicer_thrusters").with_overrides(
         "plant", {"actuation": "velocity"}
@@ -192,7 +225,8 @@ def test_thrusters_of_a_robot_that_nothing_pushes_are_refused(tmp_path: Path) ->
 
 @pytest.fixture(scope="module")
 def flight() -> Flight:
-    return fly(load_scenario("servicing"))
+    straight = {"profile": "quintic", "target.horizon": 120.0}
+    return fly(load_scenario("servicing").with_overrides("coordinated_control", straight))
 
 
 @pytest.mark.slow
@@ -223,6 +257,15 @@ def test_a_tumbling_satellite_is_captured_brought_to_rest_and_carried(flight: Fl
     turn = rotvec_from_quaternion(flight.pose[-1, 3:])
     np.testing.assert_allclose(flight.pose[-1, :3], [-0.8, 0.3, 0.2], atol=0.002)
     np.testing.assert_allclose(turn, [0.05, -0.04, 0.12], atol=0.002)
+
+
+@pytest.mark.slow
+def test_planned_motions_take_less_propellant_and_no_more_time(flight: Flight) -> None:
+    planned = fly("servicing")
+    assert planned.succeeded, planned.message
+    assert planned.manoeuvre_time <= flight.manoeuvre_time
+    spent, straight = (each.signal("propellant").values[-1, 0] for each in (planned, flight))
+    assert spent < 0.8 * straight
 
 
 @pytest.mark.slow

@@ -232,6 +232,7 @@ SETUPS: dict[str, Setup] = {
         controller=_of(
             "servicer_thrusters",
             "coordinated_control",
+            profile="quintic",
             tick_rate=50.0,
             settle_time=0.2,
             position_tolerance=0.01,
