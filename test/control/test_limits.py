@@ -201,8 +201,8 @@ def test_a_profile_lasts_as_long_as_its_slowest_part() -> None:
 
 
 def _without(given: Reference, parts: dict[str, None]) -> Reference:
-    names = ("base", "end_effector", "joints")
-    return Reference(*(None if name in parts else getattr(given, name) for name in names))
+    kept = {name: part for name, part in vars(given).items() if name not in parts}
+    return Reference(**kept)
 
 
 def test_a_profile_leads_from_start_to_goal_and_its_rates_are_its_slopes() -> None:

@@ -235,13 +235,13 @@ def test_state_and_reference_that_are_refused() -> None:
             vector.pack_reference(replace(reference, joints=joints), r)
     with pytest.raises(ValueError, match="shape"):
         vector.pack_state(random_state(rng, 3), x)
-    for group, named in (
-        ("base", "the base"),
-        ("end_effector", "the end-effector"),
-        ("joints", "the joints"),
+    for without, named in (
+        (replace(reference, base=None), "the base"),
+        (replace(reference, end_effector=None), "the end-effector"),
+        (replace(reference, joints=None), "the joints"),
     ):
         with pytest.raises(TargetNotSetError, match=named):
-            vector.pack_reference(replace(reference, **{group: None}), r)
+            vector.pack_reference(without, r)
 
 
 # -- which outputs a robot gets, and which are refused -------------------------------------------
