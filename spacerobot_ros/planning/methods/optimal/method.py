@@ -12,7 +12,6 @@ import io
 import json
 import math
 import sys
-from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -27,10 +26,7 @@ from spacerobot_ros.files import Cache
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.compilation import cache_directory
 from spacerobot_ros.model.description import Array
-from spacerobot_ros.model.rotations import (
-    matrices_from_quaternions,
-    matrix_from_quaternion,
-)
+from spacerobot_ros.model.rotations import matrices_from_quaternions, matrix_from_quaternion
 from spacerobot_ros.model.wheels import ReactionWheels
 from spacerobot_ros.parameters import values_of
 from spacerobot_ros.planning.core.cancellation import NEVER, Cancellation
@@ -134,14 +130,16 @@ class _PlanResult:
 
 
 @dataclass(frozen=True)
-class _CoastingMotion:
-    """The motion of a base whose joints rest: shapes (N + 1, n), attitudes (N + 1, 4) and positions
-    (N + 1, 3) at ticks.
-    """
+class _BaseMotion:
+    """Shapes (N + 1, n), attitudes (N + 1, 4) and positions (N + 1, 3) of the base, at ticks."""
 
     shapes: Array
     attitudes: Array
     positions: Array
+
+    def state_at(self, state: RobotState, tick: int) -> RobotState:
+        """Return a state with the pose of the base at a tick."""
+        return replace(state, position=self.positions[tick], quaternion=self.attitudes[tick])
 
 
 @dataclass(frozen=True)
@@ -609,7 +607,8 @@ class OptimalGait(GaitMethod):
         with suppress(NotFoundError):
             return self._begin_now(brief, _STARTS_BEFORE_COASTING)
         last = min(longest, _COASTING_TURNS * 2 * math.pi / rate)
-        coast = self._coast(task.request, math.ceil(last / self.control_period))
+        ticks = math.ceil(last / self.control_period)
+        coast = self._motion_along(state, np.tile(state.q, (ticks + 1, 1)))
         step = max(1, round(_COASTING_ANGLE / rate / self.control_period))
         for end in self._goal_passing_ticks(task, coast, step):
             try:
@@ -618,26 +617,24 @@ class OptimalGait(GaitMethod):
                 task.cancellation.raise_if_requested()
         return self._begin_now(_within_time(task, last))
 
-    def _coast(self, request: PlanRequest, ticks: int) -> _CoastingMotion:
-        state, shapes = request.state, np.tile(request.state.q, (ticks + 1, 1))
+    def _motion_along(self, state: RobotState, shapes: Array) -> _BaseMotion:
         attitudes = self._prediction.attitudes(shapes, state.quaternion, state.angular_momentum)
-        times = self.control_period * np.arange(ticks + 1, dtype=np.float64)
-        return _CoastingMotion(
-            shapes, attitudes, self._prediction.positions(state, times, shapes, attitudes)
-        )
+        times = self.control_period * np.arange(len(shapes), dtype=np.float64)
+        positions = self._prediction.positions(state, times, shapes, attitudes)
+        return _BaseMotion(shapes, attitudes, positions)
 
-    def _later(self, task: _Task, coast: _CoastingMotion, ticks: int) -> _Task:
+    def _later(self, task: _Task, coast: _BaseMotion, ticks: int) -> _Task:
         """Return the task of a manoeuvre that begins after some ticks of coasting."""
-        state, quaternion = task.request.state, coast.attitudes[ticks]
-        after = replace(state, position=coast.positions[ticks], quaternion=quaternion)
+        state = task.request.state
+        after = coast.state_at(state, ticks)
         later = replace(task.request, state=after)
         aimed = self._boundary(later, self.goal_shape(later.goal))
-        R_BW = matrix_from_quaternion(quaternion).T
+        R_BW = matrix_from_quaternion(after.quaternion).T
         L_B = R_BW @ matrix_from_quaternion(state.quaternion) @ task.boundary.angular_momentum
         aimed = replace(aimed, state=after, angular_momentum=L_B)
         return replace(task, request=later, boundary=aimed)
 
-    def _goal_passing_ticks(self, task: _Task, coast: _CoastingMotion, step: int) -> list[int]:
+    def _goal_passing_ticks(self, task: _Task, coast: _BaseMotion, step: int) -> list[int]:
         """Return the ticks at which the coasting base passes the goal, the closest pass first."""
         grid = np.arange(0, len(coast.shapes), step)
         turns = np.array([self._later(task, coast, int(k)).boundary.goal_rotation for k in grid])
@@ -647,7 +644,7 @@ class OptimalGait(GaitMethod):
         closest = passes[np.argsort(-near[passes], kind="stable")]
         return [int(tick) for tick in grid[closest][:_MAX_COASTING_ENDS]]
 
-    def _plan_for_coasting_time(self, task: _Task, coast: _CoastingMotion, end: int) -> _PlanResult:
+    def _plan_for_coasting_time(self, task: _Task, coast: _BaseMotion, end: int) -> _PlanResult:
         """Return a manoeuvre that ends about when the coasting base passes the goal, at tick
         ``end``.
 
@@ -718,22 +715,20 @@ class OptimalGait(GaitMethod):
         shares = 1 - np.arange(1, ticks + 1) / ticks
         travel = np.append(0.0, period * np.cumsum(shares))
         braking = state.q + travel[:, np.newaxis] * motion.velocity
-        attitudes = self._prediction.attitudes(braking, state.quaternion, state.angular_momentum)
-        times = period * np.arange(len(braking), dtype=np.float64)
-        positions = self._prediction.positions(state, times, braking, attitudes)
+        along = self._motion_along(state, braking)
         beyond = np.any(braking < limits.lower) or np.any(braking > limits.upper)
         if self._efforts is not None and self._efforts_are_strict:
             beyond |= self._efforts.excess(braking, motion.velocity) > 1 + _LIMIT_ROUNDING
         if beyond or self._too_near(braking, self._base_poses(state, braking)):
             raise refusal
         try:
-            self._constraints.check(braking, attitudes, period)
+            self._constraints.check(braking, along.attitudes, period)
         except UnusableCandidateError:
             raise refusal from None
-        at_rest = replace(state, position=positions[-1], quaternion=attitudes[-1], q=braking[-1])
+        at_rest = replace(along.state_at(state, -1), q=braking[-1])
         request = replace(task.request, state=at_rest, motion=None)
         gait = self._plan_about_center(request, task.cancellation, task.clock)
-        notes: Notes = {**gait.notes, "braking_time": float(times[-1])}
+        notes: Notes = {**gait.notes, "braking_time": ticks * period}
         shapes = np.vstack([braking[:-1], gait.positions])
         after = task.boundary.final_velocity
         return self._build_schedule(state, request.goal, shapes, notes, motion.velocity, after)
@@ -770,7 +765,9 @@ class OptimalGait(GaitMethod):
         """
         attitudes = self._prediction.attitudes(positions, state.quaternion, state.angular_momentum)
         path = self._prediction.path(state, positions, attitudes)
-        L_B = _momenta_in_base(state, attitudes)
+        L_B: Array | None = None
+        if state.angular_momentum.any():
+            L_B = np.asarray(state.angular_momentum @ matrices_from_quaternions(attitudes))
         # Held commands end on the goal by the plant's integration; where it is off, so are they.
         true_end = self._prediction.true_end(positions, attitudes, state.angular_momentum)
         (true_position,) = self._prediction.positions(
@@ -823,31 +820,32 @@ class OptimalGait(GaitMethod):
         return ", ".join(parts) or "nothing"
 
     def _request_key(self, request: PlanRequest) -> str:
-        state, goal, tolerance = request.state, request.goal, request.tolerance
-        shape = goal.joint_positions
-        numbers = {
-            "state": np.concatenate([state.position, state.quaternion, state.q]),
-            "goal": np.concatenate([goal.position, goal.quaternion]),
-            "shape": np.zeros(0) if shape is None else shape,
-            "time": np.array([self.control_period, self.integration_step]),
-            "tolerance": np.array([tolerance.position, tolerance.attitude]),
-            **vars(self._limits),
+        """Return the name of a plan: a hash of the robot's equations and of the request."""
+        robot, goal = self.robot, request.goal
+        digest = hashlib.sha256(robot.equations_key.encode())
+        facts: dict[str, object] = {
+            "format": 4,
+            "versions": [__version__, ca.__version__, np.__version__],
+            "joints": robot.joint_names,
+            "options": values_of(self.options),
+            "time": [self.control_period, self.integration_step],
+            "limits": vars(self._limits),
+            "state": vars(request.state),
+            "goal": [goal.position, goal.quaternion, goal.joint_positions, sorted(goal.base)],
+            "end_effectors": [[each.link, each.values] for each in goal.end_effectors],
+            "tolerance": vars(request.tolerance),
         }
-        for each in goal.end_effectors:
-            numbers[f"end_effector {each.link}"] = np.array(each.values)
-        if goal.end_effectors:
-            parts = [part in goal.base for part in ("position", "attitude")]
-            numbers["base"] = np.array(parts, dtype=float)
-        momenta = np.concatenate([state.linear_momentum, state.angular_momentum])
-        if momenta.any():
-            numbers["momenta"] = momenta
-        if state.qdot is not None and np.any(state.qdot):
-            numbers["velocities"] = state.qdot
         if self._efforts is not None:
-            numbers["effort"] = self._efforts.limit
+            digest.update(robot.function("joint_efforts", compile=False).serialize().encode())
+            facts["efforts"] = self._efforts.limit
         if self.clearance is not None:
-            numbers["clearance"] = self.clearance.facts
-        return plan_key(self.robot, numbers, values_of(self.options))
+            facts["clearance"] = self.clearance.facts
+
+        def listed(value: object) -> object:
+            return value.tolist() if isinstance(value, np.ndarray) else repr(value)
+
+        digest.update(json.dumps(facts, sort_keys=True, default=listed).encode())
+        return digest.hexdigest()
 
 
 def _within_time(task: _Task, seconds: float) -> _Task:
@@ -860,13 +858,6 @@ def _asked_time(chosen: OptimalOptions) -> tuple[str, float]:
     if chosen.duration > 0:
         return "duration", chosen.duration
     return "longest", chosen.longest
-
-
-def _momenta_in_base(state: RobotState, attitudes: Array) -> Array | None:
-    """Return the angular momenta (N + 1, 3) in the base at attitudes (N + 1, 4); None: zero."""
-    if not state.angular_momentum.any():
-        return None
-    return np.asarray(state.angular_momentum @ matrices_from_quaternions(attitudes))
 
 
 @dataclass(frozen=True)
@@ -885,21 +876,3 @@ class _CachedPlan:
     def from_bytes(cls, content: bytes) -> _CachedPlan:
         with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
             return cls(arrays["positions"], json.loads(str(arrays["notes"])))
-
-
-def plan_key(robot: SpaceRobot, numbers: Mapping[str, Array], options: Mapping[str, object]) -> str:
-    """Return the name of a plan: a hash of the robot's equations and of the request."""
-    digest = hashlib.sha256(robot.equations_key.encode())
-    if "effort" in numbers:
-        digest.update(robot.function("joint_efforts", compile=False).serialize().encode())
-    facts = {
-        "format": 3,
-        "versions": [__version__, ca.__version__, np.__version__],
-        "joints": robot.joint_names,
-        "options": options,
-        "numbers": {
-            name: [x.hex() for x in map(float, np.ravel(v))] for name, v in numbers.items()
-        },
-    }
-    digest.update(json.dumps(facts, sort_keys=True, default=repr).encode())
-    return digest.hexdigest()
