@@ -73,21 +73,6 @@ _LARGEST_REACH, _LARGEST_REACH_SHARE = 0.3, 0.15
 _COST_OF_LACK = 300.0
 """Cost of a distance that is lacking, in durations or efforts of the guess per m."""
 
-_CONTINUED_OPTIONS = {
-    # Most take ten to thirty steps; the others are begun anew.
-    "ipopt.max_iter": 40,
-    "ipopt.mu_init": 1e-6,
-    "ipopt.warm_start_init_point": "yes",
-    **{
-        f"ipopt.warm_start_{of}": 1e-9
-        for of in (
-            *("bound_push", "bound_frac", "slack_bound_push", "slack_bound_frac"),
-            "mult_bound_push",
-        )
-    },
-}
-"""With other distances than those of the solution that it begins at, with its multipliers."""
-
 
 @dataclass(frozen=True)
 class StopRule:
@@ -156,17 +141,6 @@ class Neighbourhood:
         return cls(share * np.minimum(_LARGEST_REACH, _LARGEST_REACH_SHARE * width), largest_lack)
 
 
-@dataclass(frozen=True)
-class _Solution:
-    """A solution, whether its duration was given, and the variables and multipliers from which a
-    solver continues.
-    """
-
-    trajectory: Trajectory
-    fixed: bool
-    variables: Mapping[str, ca.DM]
-
-
 class MultipleShooting:
     """Solves the problem of one robot for many boundary conditions.
 
@@ -196,15 +170,10 @@ class MultipleShooting:
         self._has_distances = stages.distances is not None
         self._tolerance = tolerance
         self._solver = self._build_solver(_WARM_OPTIONS if self._has_distances else {})
-        self._last: _Solution | None = None
 
     def _build_solver(self, options: Mapping[str, object]) -> ca.Function:
         options = {**options, "ipopt.tol": self._tolerance}
         return build_solver("manoeuvre", self._program, self._monitor, options)
-
-    @cached_property
-    def _continuing_solver(self) -> ca.Function:
-        return self._build_solver(_CONTINUED_OPTIONS)
 
     @cached_property
     def _refining_solver(self) -> ca.Function:
@@ -222,10 +191,6 @@ class MultipleShooting:
         refining: bool = False,
     ) -> Trajectory | None:
         """Return the fastest trajectory near ``guess``; None if none.
-
-        With distances, the solver continues at its own last solution, where that is the guess:
-        then it takes a few steps. If that fails, it begins there as at any guess: at the same
-        path in more time.
 
         In a fixed time it is the one of least effort: of the least mean square of the
         accelerations, over the joints' speeds.
@@ -268,20 +233,10 @@ class MultipleShooting:
             most[-1] = lack
         self._monitor.begin(stop)
         solver = self._refining_solver if refining and not self._has_distances else self._solver
-        begin: Mapping[str, Array | ca.DM]
-        last = self._last
-        begins_at_last = False
-        # The multipliers of least effort are not those of least time.
-        if last is not None and guess is last.trajectory and duration.fixed == last.fixed:
-            begins_at_last = True
-            solver, begin = self._continuing_solver, last.variables
-        else:
-            slower = self._has_distances and not duration.fixed and not boundary.is_timed
-            first = guess.stretched(_WARM_STRETCH) if slower else guess
-            begin = {"x0": self._initial_variables(first, lack)}
-        self._last = None
+        slower = self._has_distances and not duration.fixed and not boundary.is_timed
+        first = guess.stretched(_WARM_STRETCH) if slower else guess
         result = solver(
-            **begin,
+            x0=self._initial_variables(first, lack),
             lbx=least,
             ubx=most,
             lbg=self._program.lower,
@@ -293,8 +248,6 @@ class MultipleShooting:
         stats = solver.stats()
         self.iterations, self.converged = int(stats["iter_count"]), bool(stats["success"])
         x = result["x"].full().ravel()
-        if not self.converged and begins_at_last:
-            return self.solve(boundary, limits, guess, stop, duration, near)
         if not self.converged:
             # Where the goal drifts away, no time makes up for what each interval violates.
             infeasible = self._drifting and stats["return_status"] == _INFEASIBLE
@@ -303,9 +256,6 @@ class MultipleShooting:
             x = self._monitor.best
         trajectory = self._unpack_trajectory(x)
         self.lack = float(x[-1]) if layout.has_lack else 0.0
-        if self._has_distances and self.converged:
-            begin = {"x0": result["x"], "lam_x0": result["lam_x"], "lam_g0": result["lam_g"]}
-            self._last = _Solution(trajectory, duration.fixed, begin)
         return trajectory
 
     def _initial_variables(self, guess: Trajectory, lack: float) -> Array:
