@@ -39,7 +39,7 @@ _MIN_INSTANTS = 80
 coarse one they would come too near."""
 
 _SHARE_OF_ENDS = 0.1
-"""Share of a path at either end where pairs need not have room."""
+"""Share of a path at an end with a given shape where pairs need not have room."""
 
 
 def instants_of(intervals: int) -> int:
@@ -208,7 +208,9 @@ class KeptDistances:
         )
         found = np.empty((len(shapes), len(self.pairs), PLANE_SIZE))
         place = np.arange(len(shapes)) / len(shapes)
-        at_ends = np.minimum(place, 1 - place) < _SHARE_OF_ENDS
+        if self._boundary.final is not None:
+            place = np.minimum(place, 1 - place)
+        at_ends = place < _SHARE_OF_ENDS
         for number, pair in enumerate(self.pairs):
             distances, found[:, number] = self._library.planes(self._boundary, pair, poses)
             wanted = self._required[pair] + self._room[pair]

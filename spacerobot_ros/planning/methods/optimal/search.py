@@ -159,10 +159,10 @@ _MIN_LARGEST_LACK, _LACK_PER_DEPTH = 0.1, 2.0
 """Distance by which links on the way to a clear path may be nearer than they ought to be, m: at
 least, and as a multiple of the depth of their contact."""
 
-_MAX_WORK_PER_ITERATION, _WORK_FACTOR_WITHOUT_PATH = 1.25e5, 2.0
+_MAX_WORK_PER_ITERATION, _WORK_FACTOR_WITHOUT_PATH = 8e4, 1.5
 """Largest work on clear paths, in nonzeros of Jacobians over all steps of the solver, for each step
 that ``optimal.iterations`` allows from one guess, and its factor where there is no clear path yet:
-some 20 s of an idle core (0.5 us a nonzero). With 1e5 a servicer's plan took 9 % longer."""
+12 and 18 s of an idle core (0.5 us a nonzero). With 1.25e5 two arms took 40 s for the same plan."""
 
 _MIN_SHORTENING_ROUNDS = 3
 """Paths on the way to a fast one that are tried even so."""
@@ -180,10 +180,14 @@ _REACH_DIVISOR, _REACH_FACTOR, _MIN_REACH_SHARE = 3.0, 2.0, 0.02
 """Divisor of the reach where a faster path is not clear, its factor where it is, and the share of
 the largest reach at which paths are not made faster any more."""
 
+_REACH_FROM_GUESS = 4.0
+"""Factor of the largest reach from a guess, which is far from the goal."""
+
 _MAX_CLEAR_STARTS, _MAX_CLEAR_STARTS_IN_MOTION, _CLEAR_ANSWERS = 16, 1, 2
-"""Guesses near which, or near whose solutions, manoeuvres that keep clear are looked for at most
-(in motion, unless the base drifts, the rest of the motion is the one: from rest, after braking,
-others are found sooner), and the number of clear paths on a coarse grid that ends the search."""
+"""Guesses near whose solutions manoeuvres that keep clear are looked for at most (in motion, unless
+the base drifts, the rest of the motion is the one: from rest, after braking, others are found
+sooner), and the number of clear paths on a coarse grid that ends the search. With 8 guesses a plan
+of a quadruped took 40 % longer."""
 
 _REPORT_PERIOD = 1.0
 """Wall time after which a solver reports that it is still busy, s."""
@@ -389,6 +393,10 @@ class _SearchState:
             self.rejection = str(reason)
             self.report(self.rejection)
         self.cancellation.raise_if_requested()
+
+
+def _touch(near: Sequence[Approach]) -> bool:
+    return any(each.distance < 0 for each in near)
 
 
 class _Apart(NamedTuple):
@@ -721,16 +729,17 @@ class ManoeuvreSearch:
         state.best, state.is_clearing = math.inf, True
         known = [each.solution for each in in_order]
         clear: list[tuple[KeptDistances, Trajectory]] = []
-        paths = itertools.chain(known, self._other_paths(state, known, clear))
+        of_known = ((each, 1.0) for each in known)
+        paths = itertools.chain(of_known, self._other_paths(state, kept, known, clear))
         if not self._has_coarse_paths(state):
-            for path in itertools.islice(paths, len(known) + _MAX_FULL_GRID_STARTS):
+            for path, reach in itertools.islice(paths, len(known) + _MAX_FULL_GRID_STARTS):
                 with state.attempt():
-                    return [self._clear_finely(state, kept.anew(), path)]
+                    return [self._clear_finely(state, kept.anew(), path, reach)]
             return []
-        for number, path in enumerate(paths, 1):
-            if all(path.duration < each.duration for _, each in clear):
+        for number, (path, reach) in enumerate(paths, 1):
+            if reach > 1 or all(path.duration < each.duration for _, each in clear):
                 with state.attempt():
-                    clear.append(self._clear_coarsely(state, kept.anew(), path))
+                    clear.append(self._clear_coarsely(state, kept.anew(), path, reach))
             if number == len(known) or len(clear) == _CLEAR_ANSWERS:
                 if freed := self._finely_cleared(state, clear):
                     return freed
@@ -749,10 +758,15 @@ class ManoeuvreSearch:
         return []
 
     def _other_paths(
-        self, state: _SearchState, known: Sequence[Trajectory], found: Sequence[object]
-    ) -> Iterator[Trajectory]:
-        """Yield other solutions that need not keep clear, from guesses on a coarse grid, then those
-        guesses that led to known ones, while nothing is ``found``.
+        self,
+        state: _SearchState,
+        kept: KeptDistances,
+        known: Sequence[Trajectory],
+        found: Sequence[object],
+    ) -> Iterator[tuple[Trajectory, float]]:
+        """Yield other paths with the share of the largest reach in which clear ones are looked for:
+        solutions that need not keep clear, from guesses on a coarse grid, then, while nothing is
+        ``found``, guesses that keep clear, but do not end at the goal.
         """
         problem = state.problem
         if problem.boundary.drifts and problem.motion is None:
@@ -762,24 +776,24 @@ class ManoeuvreSearch:
         solver = self._solver(problem, state.coarse)
         brakes = problem.motion is not None and not problem.boundary.drifts
         most = _MAX_CLEAR_STARTS_IN_MOTION if brakes else _MAX_CLEAR_STARTS
-        starts, unused = min(problem.options.starts, most), []
+        starts = min(problem.options.starts, most)
         others = itertools.islice(self._guesses(state, solver), len(state.solved), starts)
         solved = ((guess, self._solve_start(state, solver, guess)) for guess in others)
-        for guess, solution in itertools.chain(state.solved[:starts], solved):
+        for _, solution in itertools.chain(state.solved[:starts], solved):
             if state.is_over(found=bool(found)):
                 return
             if solution is None:
                 continue
             cost = problem.cost(solution)
-            if any(abs(cost - other) <= _SAME_COST_TOLERANCE * other for other in costs):
-                unused.append(guess)
-            else:
+            if all(abs(cost - other) > _SAME_COST_TOLERANCE * other for other in costs):
                 costs.append(cost)
-                yield solution
-        for guess in unused:
+                yield solution, 1.0
+        few = starts if brakes else problem.options.starts
+        for guess in itertools.islice(self._guesses(state, solver), few):
             if found or state.is_over(found=False):
                 return
-            yield guess
+            if not kept.approaches_of(guess):
+                yield guess, _REACH_FROM_GUESS
 
     def _has_coarse_paths(self, state: _SearchState) -> bool:
         """Whether paths are made clear on the coarse grid first."""
@@ -788,18 +802,18 @@ class ManoeuvreSearch:
         return problem.hastens and state.coarse != state.full and not problem.is_timed
 
     def _clear_coarsely(
-        self, state: _SearchState, kept: KeptDistances, path: Trajectory
+        self, state: _SearchState, kept: KeptDistances, path: Trajectory, reach: float
     ) -> tuple[KeptDistances, Trajectory]:
         """Return a fast path near to another one that keeps clear on the coarse grid, with the
         pairs that it keeps apart; UnusableCandidateError if none was found.
         """
         apart = _Apart(kept, state.coarse)
-        slow, _ = self._clear(state, apart, path, _CLEARING_TIME_FACTOR * path.duration)
+        slow, _ = self._clear(state, apart, path, _CLEARING_TIME_FACTOR * path.duration, reach)
         fast, _ = self._shorten(state, apart, slow, None)
         return kept, fast
 
     def _clear_finely(
-        self, state: _SearchState, kept: KeptDistances, path: Trajectory
+        self, state: _SearchState, kept: KeptDistances, path: Trajectory, reach: float = 1.0
     ) -> Manoeuvre:
         """Return a manoeuvre near to a path that keeps clear, by the full grid;
         UnusableCandidateError if none was found.
@@ -820,7 +834,7 @@ class ManoeuvreSearch:
             path = self._slow_to_effort_limits(path, problem.boundary)
             duration = max(_GENTLE_DURATION_FACTOR * path.duration, shortest)
         if made is None:
-            path, made = self._clear(state, apart, path, duration)
+            path, made = self._clear(state, apart, path, duration, reach)
             if problem.hastens:
                 path, made = self._shorten(state, apart, path, made)
         if problem.gentle:
@@ -835,28 +849,46 @@ class ManoeuvreSearch:
         return made
 
     def _clear(
-        self, state: _SearchState, apart: _Apart, path: Trajectory, duration: float
+        self,
+        state: _SearchState,
+        apart: _Apart,
+        path: Trajectory,
+        duration: float,
+        reach: float = 1.0,
     ) -> tuple[Trajectory, Manoeuvre | None]:
-        """Return a clear path near to one, in a given duration (s), and its held commands;
-        UnusableCandidateError if none was found.
+        """Return a clear path near to one, in a given duration (s), and its held commands; by
+        steps of a share of the largest reach at first. UnusableCandidateError if none was found.
+
+        Planes separate links along a path on which they do not touch. So if a path without contacts
+        leads to one with some, the latter's pairs are kept apart near to the former.
         """
         state.phase = SearchPhase.CLEARING
         kept, limits, lacks = apart.kept, state.problem.limits, [math.inf, math.inf]
         near, made = kept.approaches_of(path), None
+        is_free = not _touch(near)
+        kept.add(near)
         for _ in range(_MAX_CLEARING_ROUNDS):
-            (kept.widen if lacks[-1] < _NO_LACK else kept.add)(near)
-            guess = path.stretched(duration / path.duration)
             deepest = min((each.distance for each in near), default=0.0)
             largest_lack = max(_MIN_LARGEST_LACK, -_LACK_PER_DEPTH * deepest)
-            around = Neighbourhood.within(limits, largest_lack=largest_lack)
-            path, lack = self._solve_apart(state, apart, guess, duration, around)
-            near, made = self._approaches(apart, path)
+            around = Neighbourhood.within(limits, reach, largest_lack)
+            guess = path.stretched(duration / path.duration)
+            pairs = kept.pairs
+            solution, lack = self._solve_apart(state, apart, guess, duration, around)
+            near, made = self._approaches(apart, solution)
             if not near:
-                return path, made
+                return solution, made
             lacks.append(lack)
             goes_on = lack < _NO_LACK or lack <= _PROGRESS_SHARE * lacks[-3]
             if not goes_on or (apart.hold is None and state.is_over(found=False)):
                 break
+            if is_free and _touch(near):
+                kept.add(near)
+                if kept.pairs == pairs:
+                    reach /= 2
+                continue
+            (kept.widen if lack < _NO_LACK else kept.add)(near)
+            path, is_free = solution, not _touch(near)
+            reach = min(reach, 1.0) / 2 if lack < _NO_LACK else 1.0
         period = None if made is None else self._period
         raise UnusableCandidateError(kept.message(near[0], period))
 
@@ -865,7 +897,7 @@ class ManoeuvreSearch:
     ) -> tuple[Trajectory, Manoeuvre | None]:
         """Return a faster path near to a clear one, and its held commands; else that one itself."""
         state.phase = SearchPhase.SHORTENING
-        reach, limits = 1.0, state.problem.limits
+        reach, limits, begin = 1.0, state.problem.limits, path
         for number in range(_MAX_SHORTENING_ROUNDS):
             state.report("clear path", path.duration)
             is_over = number >= _MIN_SHORTENING_ROUNDS and state.is_over(found=True)
@@ -873,13 +905,15 @@ class ManoeuvreSearch:
                 break
             try:
                 faster, _ = self._solve_apart(
-                    state, apart, path, None, Neighbourhood.within(limits, reach)
+                    state, apart, begin, None, Neighbourhood.within(limits, reach)
                 )
                 near, found = self._approaches(apart, faster)
             except UnusableCandidateError:
-                reach /= _REACH_DIVISOR
+                reach, begin = reach / _REACH_DIVISOR, path
                 continue
             if near:
+                # Planes between links that do not touch lead to a clear path nearby.
+                begin = path if _touch(near) else faster
                 # A pair that is new has no planes yet.
                 if all(each.pair in apart.kept.pairs for each in near):
                     reach /= _REACH_DIVISOR
@@ -893,6 +927,7 @@ class ManoeuvreSearch:
                 path, made = faster, found
             if gain < _MIN_GAIN * reach:
                 break
+            begin = path
             reach = min(_REACH_FACTOR * reach, 1.0)
         return path, made
 
