@@ -159,10 +159,10 @@ _MIN_LARGEST_LACK, _LACK_PER_DEPTH = 0.1, 2.0
 """Distance by which links on the way to a clear path may be nearer than they ought to be, m: at
 least, and as a multiple of the depth of their contact."""
 
-_MAX_WORK_PER_ITERATION, _WORK_FACTOR_WITHOUT_PATH = 8e4, 1.5
+_MAX_WORK_PER_ITERATION, _WORK_FACTOR_WITHOUT_PATH = 8e4, 3.0
 """Largest work on clear paths, in nonzeros of Jacobians over all steps of the solver, for each step
 that ``optimal.iterations`` allows from one guess, and its factor where there is no clear path yet:
-12 and 18 s of an idle core (0.5 us a nonzero). With 1.25e5 two arms took 40 s for the same plan."""
+12 and 36 s of an idle core (0.5 us a nonzero). With 1.25e5 two arms took 40 s for the same plan."""
 
 _MIN_SHORTENING_ROUNDS = 3
 """Paths on the way to a fast one that are tried even so."""
@@ -877,8 +877,10 @@ class ManoeuvreSearch:
             near, made = self._approaches(apart, solution)
             if not near:
                 return solution, made
-            lacks.append(lack)
-            goes_on = lack < _NO_LACK or lack <= _PROGRESS_SHARE * lacks[-3]
+            # Pairs that are new may lack more than those before did.
+            is_new = any(each.pair not in pairs for each in near)
+            lacks = [math.inf, math.inf] if is_new else [*lacks, lack]
+            goes_on = is_new or lack < _NO_LACK or lack <= _PROGRESS_SHARE * lacks[-3]
             if not goes_on or (apart.hold is None and state.is_over(found=False)):
                 break
             if is_free and _touch(near):
