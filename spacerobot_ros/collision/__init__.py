@@ -1,4 +1,4 @@
-"""Distances between the bodies of a robot: shapes, pairs, exact checks, rows for a solver."""
+"""Distances between the bodies of a robot: solids, pairs, exact checks, functions for a solver."""
 
 from spacerobot_ros.collision.distances import Solid
 from spacerobot_ros.collision.geometry import BasePoses, CollisionGeometry, LinkPair, ObstaclePair

@@ -1,7 +1,7 @@
-"""Distances of two solids: exact by coal, or bounds by the rounded boxes around them.
+"""Distances of two solids: exact by coal, or bounds from the rounded boxes around them.
 
 J. Pan, S. Chitta, D. Manocha, "FCL: a general purpose library for collision and proximity queries",
-ICRA, 2012, whose successor coal is.
+ICRA, 2012; coal is its successor.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from spacerobot_ros.model.description import Array, Shape
 _LOG = logging.getLogger(__name__)
 
 WORLD_BODY = -1
-"""Index of the body of obstacles."""
+"""Body index of obstacles."""
 
 
 @dataclass(frozen=True)
@@ -34,8 +34,8 @@ class Solid:
     link
         Name of its link.
     body
-        Index of the rigid body that the link is part of; 0: the base, -1: an obstacle, whose link
-        frame is that of the world here.
+        Index of the rigid body that the link is part of; 0: the base, -1: an obstacle, given in the
+        frame of the world.
     shape
         Its description in the URDF.
     enclosure
@@ -57,10 +57,10 @@ class Solid:
 
 
 class DistanceFunction(Protocol):
-    """Distances (N,) in m of two solids, by their numbers, at poses of their links.
+    """Distances (N,), m, of two solids, given by index, at poses of their links.
 
-    Attitudes are (N, 3, 3), positions (N, 3) in m, both in a common frame. A negative distance is
-    the depth of the contact. Where ``exact`` is false, distances are lower bounds.
+    Attitudes are (N, 3, 3), positions (N, 3) in m, both in a common frame. A negative distance is a
+    penetration depth. If ``exact`` is false, distances are lower bounds.
     """
 
     exact: bool
@@ -76,9 +76,9 @@ class DistanceFunction(Protocol):
     ) -> tuple[Array, Array]:
         """Return the distances, and planes and points (N, 7) between the solids.
 
-        A plane touches the first solid where it is nearest to the second one: a unit normal (3,)
-        toward that and the distance of the plane from the origin, m, in the frame of the first
-        link. The point (3,) is the nearest one of the second solid in the frame of its link, m.
+        A plane touches the first solid at its point nearest to the second. It is a unit normal (3,)
+        toward the second solid and the distance from the origin, m, in the frame of the first link.
+        The point (3,) is the nearest point of the second solid in the frame of its link, m.
         """
         ...
 
@@ -99,7 +99,7 @@ def _coal() -> Any:
             _LOG,
             cache_directory(),
             "warned_of_coal",
-            "Distances between links are those of spheres, capsules and boxes around them, "
+            "Distances between links are lower bounds from enclosing spheres, capsules and boxes, "
             "because the package coal is not installed: `pip install '.[collision]'` in the clone.",
         )
         return None
@@ -107,7 +107,7 @@ def _coal() -> Any:
 
 
 class ExactDistances:
-    """Distances of the shapes themselves, and of the convex hulls of meshes, by coal."""
+    """Exact distances of shapes and of the convex hulls of meshes, by coal."""
 
     exact = True
 
@@ -180,12 +180,12 @@ class ExactDistances:
             yield compute(here, there, request, result), result, R_ab[k], r_ab[k]
 
     def placed(self) -> PlacedSolids:
-        """Return the same solids for one state after another."""
+        """Return the solids for evaluation in successive states."""
         return PlacedSolids(self._geometries, self._coal)
 
 
 class PlacedSolids:
-    """Solids at poses that change, and exact distances between them; see :class:`ExactDistances`.
+    """Moving solids and the exact distances between them; see :class:`ExactDistances`.
 
     Parameters
     ----------
@@ -212,7 +212,7 @@ class PlacedSolids:
         self._placed.clear()
 
     def distance(self, first: int, second: int) -> float:
-        """Return the distance of two solids, m; negative: the depth of their contact."""
+        """Return the distance of two solids, m; negative: the penetration depth."""
         compute = self._computers.get((first, second))
         if compute is None:
             compute = self._coal.ComputeDistance(self._shapes[first], self._shapes[second])

@@ -1,11 +1,10 @@
 """Collision geometry: the solids of a robot, and the pairs of them that may come into contact.
 
 A link has the shapes of its ``<collision>`` elements, or, if it has none, those of its
-``<visual>`` elements. A mesh counts as its convex hull, which encloses it, open or not.
+``<visual>`` elements. A mesh, closed or open, is replaced by its convex hull.
 
-Pairs of one rigid body are omitted, pairs of neighbouring bodies, pairs that an SRDF disables, and
-pairs that are in contact at each of 1000 random shapes: their contact is a matter of how the robot
-is drawn.
+A pair is omitted if its solids belong to one body or to neighbouring bodies, if an SRDF disables
+it, or if it is in contact in all of 1000 random configurations: an artefact of the drawing.
 """
 
 from __future__ import annotations
@@ -40,17 +39,17 @@ from spacerobot_ros.model.rotations import matrices_from_quaternions
 from spacerobot_ros.model.visuals import Visual, solid_mesh
 
 _SHAPES, _SEED = 1000, 0
-"""Number of random shapes that find pairs which are always in contact, and their seed."""
+"""Number of random configurations for finding pairs always in contact, and their seed."""
 
 _HALF_RANGE = {JointKind.PRISMATIC: 1.0}
-"""Half of the sampled range of a joint without limits, m; revolute joints have pi."""
+"""Half of the sampled range of an unlimited joint, m; pi for revolute joints."""
 
 
 _COAXIAL_TOLERANCE = 1e-9
-"""Largest distance (m) and tilt (rad) from the axis of a joint of a body of revolution about it."""
+"""Largest offset (m) and tilt (rad) of a body of revolution from the axis of its joint."""
 
 _UNKNOWN_BASE_DISTANCE = 1e9
-"""Distance of obstacles where the pose of the base is not known, m: they are ignored."""
+"""Distance of obstacles if the pose of the base is unknown, m: they are ignored."""
 
 
 class LinkPair(NamedTuple):
@@ -90,7 +89,7 @@ class BasePoses(NamedTuple):
         return BasePoses(self.position[rows], self.quaternion[rows])
 
     def between(self, before: npt.NDArray[np.int64], share: Array) -> BasePoses:
-        """Return poses (K,) between neighbours: shares (K, 1) of the way from ``before`` (K,)."""
+        """Return poses (K,) interpolated by ``share`` (K, 1) from ``before`` (K,) to the next."""
         r, x = self
         position = (1 - share) * r[before] + share * r[before + 1]
         next_ = (
@@ -108,7 +107,7 @@ class BasePoses(NamedTuple):
 
 @dataclass(frozen=True)
 class UnreadMesh:
-    """A mesh that cannot be read: contacts of its link are not all noticed.
+    """A mesh that cannot be read: some contacts of its link are not detected.
 
     Attributes
     ----------
@@ -117,7 +116,7 @@ class UnreadMesh:
     reason
         A sentence that says why.
     is_collision_shape
-        Whether it is that of a ``<collision>``, not only of a ``<visual>``.
+        Whether the mesh belongs to a ``<collision>``, not only to a ``<visual>``.
     """
 
     link: str
@@ -126,13 +125,13 @@ class UnreadMesh:
 
     @property
     def note(self) -> str:
-        """The fact in a sentence."""
-        return f"Contacts of link '{self.link}' are not all noticed: {self.reason}"
+        """A warning for the user, one sentence."""
+        return f"Some contacts of link '{self.link}' are not detected: {self.reason}"
 
 
 Poses = tuple[Array, Array]
-"""Attitudes ``R_BL`` (N, L, 3, 3) and positions ``r_BL_B`` (N, L, 3) of the links of a robot; among
-obstacles, the world is the last of them."""
+"""Attitudes ``R_BL`` (N, L, 3, 3) and positions ``r_BL_B`` (N, L, 3) of the links of a robot; if
+there are obstacles, the last entry is the world."""
 
 
 class CollisionGeometry:
@@ -153,12 +152,12 @@ class CollisionGeometry:
     solids
         All solids, link by link.
     pairs
-        (P, 2) indices of the solids whose distances count.
+        (P, 2) indices of the solids whose distances are checked.
     ignored_pairs
-        Reason why a pair of links does not count, for those that are neither of one body nor of
-        neighbouring ones.
+        Reason why a pair of links is ignored; pairs within one body or of neighbouring bodies are
+        not listed.
     notes
-        Sentences on links whose shape may surprise the user.
+        Notes on links whose geometry may be unexpected, one sentence each.
     unread_meshes
         Meshes that are omitted.
     """
@@ -202,7 +201,7 @@ class CollisionGeometry:
 
     @property
     def exact(self) -> bool:
-        """Whether distances are those of the shapes themselves rather than of their enclosures."""
+        """Whether distances are those of the shapes, not of their enclosures."""
         return self.distance_function.exact
 
     @property
@@ -218,18 +217,18 @@ class CollisionGeometry:
 
     @cached_property
     def with_obstacles(self) -> npt.NDArray[np.bool_]:
-        """Whether pairs (P,) are of a link and an obstacle."""
+        """Whether each pair (P,) is a link and an obstacle."""
         return np.array([self.solids[j].is_obstacle for _, j in self.pairs], dtype=np.bool_)
 
     def poses(self, shapes: Array, base: BasePoses | None = None) -> Poses:
-        """Return the poses of all links, and of the world, if there is one.
+        """Return the poses of all links, and of the world if there is one.
 
         Parameters
         ----------
         shapes
             (..., n), m or rad; with a base (N, n).
         base
-            Poses of the base; None: obstacles are far away.
+            Poses of the base; None: obstacles are ignored.
         """
         R, r = self._kinematics.link_poses(shapes)
         if self.robot.world is None:
@@ -257,7 +256,7 @@ class CollisionGeometry:
         return np.asarray(R_BW[0].T @ (r_BP - r_BW)[0])
 
     def lower_bounds(self, poses: Poses) -> Array:
-        """Return lower bounds (N, P), m, of the distances of all pairs, by balls around solids."""
+        """Return lower bounds (N, P), m, of the distances of all pairs, from bounding spheres."""
         R, r = poses
         centers = r[:, self._link_of] + np.einsum(
             "nsab,sb->nsa", R[:, self._link_of], self._centers
@@ -267,7 +266,7 @@ class CollisionGeometry:
         return np.asarray(apart - self._radii[first] - self._radii[second])
 
     def distances(self, pair: int, poses: Poses) -> Array:
-        """Return the distances (N,) of a pair, m; negative in contact: the depths."""
+        """Return the distances (N,) of a pair, m; negative: penetration depths."""
         R, r = poses
         i, j = self.pairs[pair]
         a, b = self._link_of[i], self._link_of[j]
@@ -277,8 +276,8 @@ class CollisionGeometry:
         """Return the distances (N,) of a pair, m, and planes and points (N, 7) between them.
 
         Planes are in the frame of the first link, points in that of the second one
-        (:meth:`.DistanceFunction.planes`). Of a link and an obstacle, planes are the obstacle's,
-        in W.
+        (:meth:`.DistanceFunction.planes`). For a link and an obstacle, planes belong to the
+        obstacle and are in W.
         """
         R, r = poses
         i, j = self.pairs[pair]
@@ -288,7 +287,7 @@ class CollisionGeometry:
         return self.distance_function.planes(i, R[:, a], r[:, a], j, R[:, b], r[:, b])
 
     def nearest(self, shape: Array) -> tuple[float, int] | None:
-        """Return the smallest distance at a shape (n,), m, and its pair; None without pairs."""
+        """Return the smallest distance at a configuration (n,), m, and its pair; None: no pairs."""
         if not len(self.pairs):
             return None
         distances, pairs = self.nearest_along(shape[np.newaxis])
@@ -297,9 +296,10 @@ class CollisionGeometry:
     def nearest_along(
         self, shapes: Array, base: BasePoses | None = None
     ) -> tuple[Array, npt.NDArray[np.int64]]:
-        """Return the smallest distances (N,) at shapes (N, n), m, and their pairs (N,).
+        """Return the smallest distances (N,) in configurations (N, n), m, and their pairs (N,).
 
-        Without pairs the distances are infinite; without poses of the base, obstacles do not count.
+        Distances are infinite if there are no pairs; obstacles are ignored without poses of the
+        base.
         """
         distances = np.full(len(shapes), np.inf)
         pairs = np.zeros(len(shapes), dtype=np.int64)
@@ -317,7 +317,7 @@ class CollisionGeometry:
         return distances, pairs
 
     def distances_of_links(self, shape: Array) -> dict[LinkPair, float]:
-        """Return the distances of links at a shape (n,), m, the smallest first."""
+        """Return the distances between links in a configuration (n,), m, the smallest first."""
         poses = self.poses(shape[np.newaxis])
         found: dict[LinkPair, float] = {}
         for pair in range(len(self.pairs)):
@@ -374,12 +374,13 @@ class CollisionGeometry:
     # -- motion -------------------------------------------------------------------------------
 
     def largest_lever_arms(self, shapes: Array) -> tuple[Array, Array]:
-        """Return a bound of the relative motion of solids, ``reaches @ |dtheta|`` (P,), m.
+        """Return lever arms: solids of a pair move by at most ``reaches @ |dtheta|`` (P,), m.
 
-        ``reaches`` (P, m) is the largest distance of a point of the pair from each of the moving
-        joints at any of the shapes (N, n), for joints between the two; zero for others, and for a
-        joint that turns a body of revolution, such as a reaction wheel, about its own axis. Of
-        pairs with obstacles, the distances (P,) from the base are returned, too; zero for others.
+        ``reaches`` (P, m) is the largest distance of a point of the pair from each moving joint
+        between the two solids, in any of the configurations (N, n). It is zero for other joints,
+        and for a joint that rotates a body of revolution, such as a reaction wheel, about its axis.
+        Also returned are the largest distances (P,) from the base for pairs with obstacles; zero
+        for others.
         """
         bodies = self.robot.bodies
         travel = np.abs(self.moving_positions(shapes)).max(axis=0)
@@ -409,7 +410,7 @@ class CollisionGeometry:
         return apart, np.where(self.with_obstacles, from_base[self.pairs[:, 0]], 0.0)
 
     def moving_positions(self, shapes: Array) -> Array:
-        """Return the positions (N, m) of all moving joints at shapes (N, n), m or rad."""
+        """Return the positions (N, m) of all moving joints in configurations (N, n), m or rad."""
         G, b = self.robot.coupling
         return np.asarray(shapes @ G.T + b)
 
@@ -458,9 +459,9 @@ def _random_shapes(robot: RobotDescription) -> Array:
 def solids_of(
     robot: RobotDescription, mesh_of: Callable[[Shape], TriangleMesh] = shape_mesh
 ) -> tuple[tuple[Solid, ...], tuple[str, ...]]:
-    """Return the solids of a robot, and sentences on links that may not be as expected.
+    """Return the solids of a robot, and notes on links whose geometry may be unexpected.
 
-    ``mesh_of`` is that of :class:`CollisionGeometry`.
+    See :class:`CollisionGeometry` for ``mesh_of``.
     """
     solids, notes, unread = _read_solids(robot, mesh_of)
     return solids, notes + tuple(each.note for each in unread)
@@ -476,7 +477,7 @@ def _read_solids(
     drawn = [link.name for link in robot.links if link.shapes and not link.collisions]
     if drawn and any(link.collisions for link in robot.links):
         names = ", ".join(f"'{name}'" for name in drawn[:3]) + ", ..." * (len(drawn) > 3)
-        notes.append(f"Links without <collision> have the shapes of their <visual>: {names}.")
+        notes.append(f"Links without <collision> use the shapes of their <visual>: {names}.")
     elif drawn:
         notes.append("No link has a <collision>: distances are those of the <visual> shapes.")
     for link in robot.links:
@@ -514,10 +515,10 @@ def _convex_hull(points: Array) -> Any:
 def collision_visuals(
     robot: RobotDescription, mesh_of: Callable[[Shape], TriangleMesh] = shape_mesh
 ) -> tuple[Visual, ...]:
-    """Return the solids whose distances count; a mesh is its convex hull, and one that cannot be
-    read is omitted.
+    """Return the solids used for distances; a mesh is replaced by its convex hull, or omitted if it
+    cannot be read.
 
-    ``mesh_of`` is that of :class:`~spacerobot_ros.collision.geometry.CollisionGeometry`.
+    See :class:`~spacerobot_ros.collision.geometry.CollisionGeometry` for ``mesh_of``.
     """
     solids, _ = solids_of(robot, mesh_of)
     return tuple(Visual(each.link, each.body, each.shape, _mesh_of(each)) for each in solids)
@@ -526,8 +527,8 @@ def collision_visuals(
 def obstacle_visuals(
     world: RobotDescription | None, mesh_of: Callable[[Shape], TriangleMesh] = shape_mesh
 ) -> tuple[tuple[Visual, Pose], ...]:
-    """Return the solids of obstacles by which distances are measured, each with the pose of its
-    link in the world; None: there are none. ``mesh_of`` is that of :func:`collision_visuals`.
+    """Return the solids of obstacles used for distances, each with the pose of its link in the
+    world. See :func:`collision_visuals` for ``mesh_of``.
     """
     if world is None:
         return ()

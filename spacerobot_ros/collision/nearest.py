@@ -1,10 +1,10 @@
-"""Nearest pairs: at one state after another, as fast as in flight, and along held commands.
+"""Nearest pairs: in successive states, fast enough for flight, and along held commands.
 
-Along held commands a pair of solids moves against each other by at most v in a tick
-(``CollisionGeometry.largest_lever_arms``). So its distance within the tick is at least
-``(d_0 + d_1 - v) / 2``, with d_0 and d_1 those at its ends. Ticks where that is less than the
-clearance are halved until v is small. Against obstacles the base moves, too, along a straight line
-and about one axis within a tick.
+While a command is held, two solids move relative to each other by at most v per tick
+(``CollisionGeometry.largest_lever_arms``). So their distance within the tick is at least
+``(d_0 + d_1 - v) / 2``, where d_0 and d_1 are the distances at its ends. Ticks in which this bound
+is below the clearance are bisected until v is small. Relative to obstacles, the base also moves:
+within a tick, along a straight line and about one axis.
 """
 
 from __future__ import annotations
@@ -19,16 +19,16 @@ from spacerobot_ros.errors import quantity
 from spacerobot_ros.model.description import Array
 
 _DISTANCE_MARGIN = 1e-9
-"""Rounding of the bounds by balls, m."""
+"""Margin for rounding errors of the bounds from bounding spheres, m."""
 
 
 class NearestPair:
-    """The smallest distance of the pairs of a robot, from the poses of its links.
+    """The smallest distance among the pairs of a robot, from the poses of its links.
 
     Parameters
     ----------
     geometry
-        The solids and at least one pair; its distances are exact.
+        The solids and at least one pair; distances must be exact.
     links
         The links in the order of the poses.
     """
@@ -71,7 +71,7 @@ class NearestPair:
         return best, nearest
 
     def links_in_contact(self, link_R: Array, link_r: Array, pose: Array) -> frozenset[LinkPair]:
-        """Return the links that touch, for poses as of :meth:`nearest`."""
+        """Return the pairs of links in contact; see :meth:`nearest` for the poses."""
         near = np.flatnonzero(self._bounds(link_R, link_r, pose) <= 0).tolist()
         return frozenset(
             self.geometry.links_of(pair)
@@ -107,15 +107,15 @@ class Approach:
     links
         Names of the links.
     pair
-        Number of the pair of solids in :attr:`CollisionGeometry.pairs`.
+        Index of the pair of solids in :attr:`CollisionGeometry.pairs`.
     distance
-        m; negative: the depth of the contact.
+        m; negative: the penetration depth.
     tick
-        When, in ticks from the first shape.
+        Time of the approach, in ticks from the first configuration.
     shape
-        (n,) there, m or rad.
+        (n,) at that time, m or rad.
     place_on_obstacle
-        (3,) there, in W, m, on the obstacle; None: the pair are two links.
+        (3,) nearest point on the obstacle in W, m; None for two links.
     """
 
     links: LinkPair
@@ -204,11 +204,11 @@ class PathCheck:
         Parameters
         ----------
         positions
-            (N + 1, n) shapes at the ticks, along straight lines in between; m or rad.
+            (N + 1, n) configurations at the ticks, with straight lines in between; m or rad.
         required
-            (P,) smallest distances of the pairs, m; minus infinity: any.
+            (P,) smallest allowed distances of the pairs, m; minus infinity: any distance.
         base
-            Poses of the base at the ticks; None: obstacles do not count.
+            Poses of the base at the ticks; None: obstacles are ignored.
         """
         if not len(self.geometry.pairs):
             return []
@@ -220,7 +220,7 @@ class PathCheck:
     def nearest(self, positions: Array, base: BasePoses | None = None) -> Approach | None:
         """Return the nearest approach of all pairs along a path (N + 1, n); None without pairs.
 
-        ``base`` are the poses of the base at the ticks; None: obstacles do not count.
+        ``base`` has the poses of the base at the ticks; None: obstacles are ignored.
         """
         if not len(self.geometry.pairs):
             return None

@@ -1,14 +1,14 @@
-"""Distances of pairs from planes between them, as smooth functions of the shape, for a solver.
+"""Distances of pairs as smooth functions of the configuration for a solver, from planes in between.
 
-Between two convex solids at given poses there is a plane that touches the first one where it is
-nearest to the second, and moves with it. The distance of the nearest point of the second one from
-that plane is that of the solids at these poses, or less the depth of their contact, and near them
-to first order. It is exact and cheap, and is made again along every path that a solver has found.
+For two convex solids at given poses, a plane touches the first one at its point nearest to the
+second, and moves with the first. The distance of the second solid's nearest point from this plane
+equals the distance of the solids (or minus the penetration depth) at these poses, and near them to
+first order. It is exact and cheap. The planes are recomputed along every path that a solver finds.
 
-Distances of two links depend on the shape q alone. Those of a link and an obstacle depend on the
-turn X of the base since the start, too: the centre of mass C of the system rests or drifts steadily
-at zero force, and a point of the link at ``r_BP(q)`` in the base is, seen from C in the attitude of
-the base at the start, at ``X (r_BP(q) - r_BC(q))``, where the obstacle is at rest.
+Distances between links depend on the configuration q alone. The distance of a link from an obstacle
+also depends on the rotation X of the base since the start: at zero force the centre of mass C of
+the system rests or drifts steadily. In a frame at C with the initial attitude of the base, the
+point ``r_BP(q)`` of a link is at ``X (r_BP(q) - r_BC(q))``, and the obstacle is at rest.
 
 J. Schulman et al., "Motion planning with sequential convex optimization and convex collision
 checking", International Journal of Robotics Research 33, 2014.
@@ -28,17 +28,17 @@ from spacerobot_ros.model.description import JointKind, RobotDescription
 from spacerobot_ros.model.kinematics import joint_positions
 
 PLANE_SIZE = 7
-"""Numbers of a plane and a point."""
+"""Number of entries of a plane and a point."""
 
 
 @dataclass(frozen=True)
 class PlaneDistance:
     """The distance of a pair from a plane between its solids, with derivatives.
 
-    The numbers ``w`` (7,) of a plane are a unit normal (3,) and the distance from the origin, m, in
-    the frame of the first link, and the point (3,), m, in that of the second one. For an obstacle
-    the plane is in the frame of the centre of mass with the attitude of the base at the start, and
-    the point in that of the link.
+    ``w`` (7,) is the unit normal (3,) of the plane and its distance from the origin, m, in the
+    frame of the first link, and the point (3,), m, in the frame of the second link. For an obstacle
+    the plane is in the frame of the centre of mass with the initial attitude of the base, and the
+    point in the frame of the link.
 
     Attributes
     ----------
@@ -62,7 +62,7 @@ class PlaneDistance:
     def of(
         cls, geometry: CollisionGeometry, pair: int, center_of_mass: ca.Function
     ) -> PlaneDistance:
-        """Derive the distance of a pair, by its number; ``center_of_mass`` is ``q -> r_BC``."""
+        """Derive the distance of a pair, given by index; ``center_of_mass`` is ``q -> r_BC``."""
         robot, of_obstacle = geometry.robot, bool(geometry.with_obstacles[pair])
         n = len(robot.joint_names)
         y, plane = ca.SX.sym("y", n + 4 if of_obstacle else n), ca.SX.sym("plane", PLANE_SIZE)
@@ -88,13 +88,13 @@ class PlaneDistance:
 
 
 _EDGE_ROUNDING = 0.03
-"""Rounds off the corners of projections, m: the distance is a little smaller for it."""
+"""Smoothing of the corners of projections, m; makes the distance slightly smaller."""
 
 
 def support_distance(
     geometry: CollisionGeometry, pair: int, center_of_mass: ca.Function
 ) -> ca.Function:
-    """Return ``(y, plane) -> d``, m: how far all of the second solid is in front of a plane.
+    """Return ``(y, plane) -> d``, m: the distance of the whole second solid from a plane.
 
     The arguments are those of :class:`PlaneDistance`, whose point is not used. For an obstacle the
     plane is in W, and ``y = [q; X; r]`` (n + 7) has the position of the centre of mass. The solid

@@ -1,10 +1,10 @@
 """Rounded boxes, which enclose the solids of a robot, and bounds of the distances between them.
 
 A rounded box is the set of all points within a radius of a box, its core. A sphere has a core of
-one point, a capsule a core of one line: so one formula bounds all distances. For any direction the
-gap between the projections of two convex bodies on it is not larger than their distance, and the
-direction between the nearest points attains it. The nearest points come from alternating
-projections; the directions of the separating axis theorem give the depth where cores overlap.
+one point, a capsule a core of one line: so one formula bounds all distances. The gap between the
+projections of two convex bodies on any direction is at most their distance; along the line between
+their nearest points it is equal. The nearest points come from alternating projections; the
+directions of the separating axis theorem give the depth where cores overlap.
 
 S. Gottschalk, M. Lin, D. Manocha, "OBBTree: a hierarchical structure for rapid interference
 detection", SIGGRAPH, 1996. W. Cheney, A. Goldstein, "Proximity maps for convex sets", Proceedings
@@ -21,7 +21,7 @@ import numpy as np
 from spacerobot_ros.model.description import Array, Pose, Shape
 
 _MAX_PROJECTIONS = 60
-"""Alternating projections to the nearest points; the bound holds after any number of them."""
+"""Number of alternating projections; the bound holds after any number."""
 
 _PARALLEL_TOLERANCE = 1e-9
 """Length of the cross product of two unit vectors below which they count as parallel."""
@@ -34,9 +34,9 @@ class RoundedBox:
     Attributes
     ----------
     pose
-        Of the box in the frame of its link: the origin is the middle, the axes are the edges'.
+        Of the box in the frame of its link: origin at the centre, axes along the edges.
     half
-        (3,) half edges of the core, m.
+        (3,) half edge lengths of the core, m.
     radius
         m.
     """
@@ -47,7 +47,7 @@ class RoundedBox:
 
     @property
     def bounding_radius(self) -> float:
-        """Radius of the ball about the middle that encloses it, m."""
+        """Radius of the bounding sphere about the centre, m."""
         return float(np.linalg.norm(self.half)) + self.radius
 
     @property
@@ -61,9 +61,9 @@ class RoundedBox:
 
     @classmethod
     def around(cls, shape: Shape, vertices: Array | None = None) -> RoundedBox:
-        """Return the smaller one of two rounded boxes that enclose a shape.
+        """Return the smaller of two rounded boxes that enclose a shape.
 
-        ``vertices`` (V, 3), m, in the frame of the link, are those of a mesh.
+        ``vertices`` (V, 3), m, are those of a mesh in the frame of the link.
         """
         match shape.kind:
             case "sphere":
@@ -104,14 +104,14 @@ def _around_points(points: Array, R: Array) -> RoundedBox:
 def separation(
     first: RoundedBox, R_1: Array, r_1: Array, second: RoundedBox, R_2: Array, r_2: Array
 ) -> Array:
-    """Return lower bounds (N,) of the distances of two rounded boxes, m; negative: depths.
+    """Return lower bounds (N,) of distances of two rounded boxes, m; negative: penetration depths.
 
     Parameters
     ----------
     first, second
         The rounded boxes, in the frames of their links.
     R_1, r_1, R_2, r_2
-        Poses of these frames in a common one: (N, 3, 3), and (N, 3) in m.
+        Poses of these frames in a common frame: (N, 3, 3), and (N, 3) in m.
     """
     return _widest_gaps(first, R_1, r_1, second, R_2, r_2)[0]
 
@@ -121,9 +121,9 @@ def separating_planes(
 ) -> tuple[Array, Array]:
     """Return the bounds of :func:`separation`, and planes and points (N, 7) that attain them.
 
-    A plane touches the first box: a unit normal toward the second one, and its distance from the
-    origin, m, in the frame of the first link. The point is the one of the second box that is
-    nearest to the plane, in the frame of its link, m. Parameters are those of :func:`separation`.
+    A plane touches the first box. It is a unit normal toward the second box and the distance from
+    the origin, m, in the frame of the first link. The point is that of the second box nearest to
+    the plane, in the frame of its link, m. Parameters are those of :func:`separation`.
     """
     bounds, directions = _widest_gaps(first, R_1, r_1, second, R_2, r_2)
     on_first = _support(first, R_1, directions)
@@ -156,7 +156,7 @@ def _widest_gaps(
     axes = np.concatenate([A, B, edges], axis=2)
 
     def gaps(directions: Array) -> Array:
-        """Return the gaps (N, k) between the projections on unit vectors (N, 3, k)."""
+        """Return the gaps (N, k) between the projections onto unit vectors (N, 3, k)."""
         apart = np.abs(np.einsum("na,nak->nk", between, directions))
         for R, half in ((A, first.half), (B, second.half)):
             apart = apart - np.einsum("a,nak->nk", half, np.abs(np.swapaxes(R, 1, 2) @ directions))
@@ -180,7 +180,7 @@ def _widest_gaps(
 def nearest_points(
     first: RoundedBox, R_1: Array, r_1: Array, second: RoundedBox, R_2: Array, r_2: Array
 ) -> Array:
-    """Return the points (N, 3) of the core of the second box that are about nearest to the first.
+    """Return the points (N, 3) of the second core that are approximately nearest to the first box.
 
     Parameters are those of :func:`separation`.
     """

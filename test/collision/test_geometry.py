@@ -66,7 +66,7 @@ def test_collision_shapes_come_before_visual_ones() -> None:
     assert kinds == [("a", "sphere"), ("b", "box"), ("b", "box"), ("c", "sphere")]
     assert [len(each.shapes) for each in robot.links] == [1, 1, 1]
     assert geometry.notes == (
-        "Links without <collision> have the shapes of their <visual>: 'a', 'c'.",
+        "Links without <collision> use the shapes of their <visual>: 'a', 'c'.",
     )
 
 
@@ -155,7 +155,9 @@ def test_a_mesh_that_is_missing_is_named() -> None:
     mesh = solid("collision", '<mesh filename="package://nowhere/arm.stl"/>')
     geometry = CollisionGeometry(parse_robot(chain((BALL,), (mesh,), (BALL,))))
     (note,) = [each for each in geometry.notes if "mesh" in each]
-    assert note.startswith("Contacts of link 'b' are not all noticed: The mesh 'package://nowhere")
+    assert note.startswith(
+        "Some contacts of link 'b' are not detected: The mesh 'package://nowhere"
+    )
     assert [each.link for each in geometry.solids] == ["a", "c"]
 
 
@@ -250,8 +252,8 @@ def test_without_coal_distances_are_bounds(
         monkeypatch.undo()
         distances_module._coal.cache_clear()
     assert [each.message for each in caplog.records if "coal" in each.message] == [
-        "Distances between links are those of spheres, capsules and boxes around them, because the "
-        "package coal is not installed: `pip install '.[collision]'` in the clone."
+        "Distances between links are lower bounds from enclosing spheres, capsules and boxes, "
+        "because the package coal is not installed: `pip install '.[collision]'` in the clone."
     ]
     assert exact.exact
     # The box around the bus and that around the arm are always in contact.
@@ -283,7 +285,7 @@ def test_installations_that_share_a_cache_are_each_told_once_that_coal_is_missin
         assert distances_module._coal() is None
         told.append([each.message.split(",")[0] for each in caplog.records])
     distances_module._coal.cache_clear()
-    sentence = "Distances between links are those of spheres"
+    sentence = "Distances between links are lower bounds from enclosing spheres"
     assert told == [[sentence], [sentence], []]
 
 
@@ -358,7 +360,9 @@ def test_plans_are_refused_where_the_mesh_of_a_collision_is_missing(
     drawn = parse_robot(chain((BALL,), (solid("visual", mesh),), (BALL,)))
     Clearance(drawn, 0.01).required(start)
     (warning,) = caplog.messages
-    assert warning.startswith("Contacts of link 'b' are not all noticed: The mesh 'package://nowh")
+    assert warning.startswith(
+        "Some contacts of link 'b' are not detected: The mesh 'package://nowh"
+    )
     world = f'<robot name="w"><link name="crate">{solid("visual", mesh)}</link></robot>'
     with pytest.raises(RobotDescriptionError, match=r"Obstacle 'crate' .*'package://nowhere/arm"):
         obstacles_from_topic(world)
