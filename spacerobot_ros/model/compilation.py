@@ -1,9 +1,10 @@
-"""CasADi functions made fast: generated C, compiled once with the machine's ``cc`` and cached.
+"""CasADi functions as generated C, compiled once with the machine's ``cc`` and cached.
 
 Without a compiler, or with ``SPACEROBOT_COMPILE=0``, the same functions run in CasADi's virtual
-machine: slower, with the same formulas. Compiled objects live in ``SPACEROBOT_CACHE_DIR``, by
+machine: slower, with the same formulas. Compiled objects are stored in ``SPACEROBOT_CACHE_DIR``, by
 default ``$XDG_CACHE_HOME/spacerobot_ros`` (``~/.cache/spacerobot_ros``), named by a hash of source,
-flags, compiler and C library. An object from the cache is whole and of this user (:class:`.Cache`).
+flags, compiler and C library. Only complete objects owned by this user are loaded
+(:class:`.Cache`).
 """
 
 from __future__ import annotations
@@ -36,8 +37,8 @@ _FLAGS = ("-O1", "-fPIC", "-shared", "-ffp-contract=off")
 """Flags of all objects: with fused multiply-adds, results would depend on the processor."""
 
 _MIN_OPERATIONS_TO_KEEP = 200
-"""Fewest operations of a function for the cache: it takes less to read than to derive, also where
-functions are derived together, of which only some are missing."""
+"""Smallest number of operations of a cached function: reading it is faster than deriving it, even
+if functions are derived together and only some are missing."""
 
 ANNOUNCEMENT_ATTRIBUTE = "announcement"
 """Attribute of log records that announce a long computation."""
@@ -47,22 +48,21 @@ _LOG = logging.getLogger(__name__)
 _Loaded = TypeVar("_Loaded")
 
 compilation_contexts: list[Callable[[], AbstractContextManager[None]]] = []
-"""Contexts around every run of the compiler, such as one in which a node reports to be busy."""
+"""Contexts around every run of the compiler, such as one in which a node reports itself busy."""
 
 
 class NoLibraryError(SpaceRobotError):
-    """A source cannot be compiled, or its object cannot be loaded; the text is a clause."""
+    """A source cannot be compiled, or its object cannot be loaded; the message is a clause."""
 
 
 class BufferedFunction:
     """A CasADi function with fixed memory: fill ``inputs``, call
     :meth:`evaluate`, read ``outputs``.
 
-    ``inputs`` and ``outputs`` are numpy arrays shaped like the function's arguments (vectors are
-    1-D) that stay in place for the life of the object; a call costs well under a microsecond
-    beside the computation itself.
+    ``inputs`` and ``outputs`` are numpy arrays with the shapes of the function's arguments (vectors
+    are 1-D), allocated once. A call costs well under a microsecond in addition to the computation.
 
-    ``held`` are the numbers of a last argument that stays the same: it is not among ``inputs``.
+    ``held`` is the constant value of a last argument, which is not among ``inputs``.
     """
 
     evaluate: Callable[[], None]
@@ -123,14 +123,14 @@ def dense_function(
 ) -> ca.Function:
     """Return a CasADi function with dense results and shared common subexpressions.
 
-    ``inputs`` and ``outputs`` are symbols and expressions by the names of arguments and results.
+    ``inputs`` and ``outputs`` map the names of arguments and results to symbols and expressions.
     """
     dense = ca.cse([ca.densify(output) for output in outputs.values()])
     return ca.Function(name, list(inputs.values()), dense, list(inputs), list(outputs))
 
 
 def compiled(function: ca.Function) -> ca.Function:
-    """Return the function as compiled C, or unchanged if it is not or cannot be compiled."""
+    """Return the function as compiled C, or unchanged if compilation is disabled or fails."""
     if not _is_compilation_enabled():
         return function
     name = function.name()
@@ -155,19 +155,19 @@ def load_library(
     libraries: Sequence[str] = (),
     language: Literal["c", "cpp"] = "c",
 ) -> _Loaded:
-    """Load the shared object of a source, which is compiled unless it is in the cache.
+    """Load the shared object of a source; it is compiled if it is not in the cache.
 
     Parameters
     ----------
     name
-        For the file in the cache.
+        Prefix of the file name in the cache.
     source, language
         Text of the source, and its language.
     load
-        Loads an object from its path; it raises ``OSError`` or ``RuntimeError`` if it cannot.
+        Loads an object from its path; raises ``OSError`` or ``RuntimeError`` on failure.
     flags, libraries
         Arguments of the compiler before and after the source. They are part of the key, so flags
-        may choose the processor's instructions.
+        may select processor-specific instructions.
 
     Returns
     -------
@@ -177,7 +177,7 @@ def load_library(
     Raises
     ------
     NoLibraryError
-        There is none; the text is a clause that says why.
+        The object cannot be built or loaded; the message is a clause that says why.
     """
     compiler = c_compiler() if language == "c" else cxx_compiler()
     if compiler is None:
@@ -194,7 +194,7 @@ def load_library(
             return load(str(kept[0]))
         except (OSError, RuntimeError):
             warn_once(
-                f"The compiled functions in '{kept[0].parent}' are whole but cannot be loaded, as "
+                f"The compiled functions in '{kept[0].parent}' are intact but cannot be loaded, as "
                 "on a file system that forbids execution; they are compiled at each start."
             )
     _announce_compilation()
@@ -239,27 +239,27 @@ def _run_compiler(command: Sequence[str], folder: Path) -> None:
 def _announce_compilation() -> None:
     """Log once per process that the first flight of a robot waits for the compiler."""
     _LOG.info(
-        "Compiling the equations of this robot: once, some seconds.",
+        "Compiling the equations of this robot: this takes some seconds, only once.",
         extra={ANNOUNCEMENT_ATTRIBUTE: True},
     )
 
 
 @lru_cache
 def source_hash(*names: str) -> str:
-    """Return a hash of modules of this package, and of CasADi's version, for keys of functions."""
+    """Return a hash of modules of this package and of CasADi's version, for keys of functions."""
     texts = [Path(str(sys.modules[name].__file__)).read_text("utf-8") for name in names]
     return _hash_text("\n".join([ca.__version__, *texts]))
 
 
 def cached_function(name: str, key: str, build: Callable[[], ca.Function]) -> ca.Function:
-    """Return an expensive function from the cache, or derive and cache it, with the same numbers.
+    """Return an expensive function from the cache, or derive and cache it; results are identical.
 
     Parameters
     ----------
     name
         The function's own.
     key
-        A hash of everything that the function is derived from.
+        A hash of everything on which the function depends.
     build
         Derives it.
     """

@@ -1,17 +1,17 @@
-"""Fast forward dynamics: composite rigid bodies, the base eliminated by hand.
+"""Fast forward dynamics by composite rigid bodies, with the base eliminated analytically.
 
-The ``z0ddot`` of paper 4, eq. (19), at 44 to 84 % of the operations that its barycentric vectors
-take, by the robot. Spatial vectors as in Featherstone, Rigid Body Dynamics
+``z0ddot`` of paper 4, eq. (19), takes 44 to 84 % of the operations that its barycentric vectors
+take, depending on the robot. Spatial vectors as in Featherstone, Rigid Body Dynamics
 Algorithms (2008), angular part first: motions ``[omega; v]`` and forces ``[n; f]``. All are in base
 components at one common point, the system's centre of mass, so that no body needs a transform and
 the inertia of the whole system is ``diag(D, M 1)``.
 
-Because that inertia is block-diagonal, the base drops out joint by joint. A unit rate of joint j
-gives its composite (all bodies that it carries) the momentum ``P_j = I^c_j S_j``; to cancel it the
-whole system moves by ``-B_j``, ``B_j = diag(D, M 1)^-1 P_j``. So ``S_j - B_j`` is how the bodies
-beyond joint j really move when the base is free, and
+Because that inertia is block-diagonal, the base can be eliminated joint by joint. A unit rate of
+joint j gives its composite (all bodies that it carries) the momentum ``P_j = I^c_j S_j``; to cancel
+it the whole system moves by ``-B_j``, ``B_j = diag(D, M 1)^-1 P_j``. So ``S_j - B_j`` is the motion
+of the bodies outboard of joint j if the base is free, and
 
-* ``K_ij = (S_i - B_i)' P_j``: inertia matrix of the shape alone, momentum given (i carries j;
+* ``K_ij = (S_i - B_i)' P_j``: inertia matrix of the joints alone at given momentum (i carries j;
   without the ``S_i`` term if neither carries the other);
 * ``omega = D^-1 L - sum_j B_j qdot_j`` (angular parts): the base's rate at angular momentum L;
 * ``K qddot = Q``, ``Q_j = tau_j - S_j' f_j + B_j' (f_0 - f_external)``, where ``f_j`` is the force
@@ -20,12 +20,12 @@ beyond joint j really move when the base is free, and
 For chains of up to about eight joints this takes fewer operations than the articulated-body
 algorithm, whose cost grows only linearly.
 
-:func:`state_rate` gives the motion under joint efforts and a base wrench with the total momenta
-among the states. The state is ``x = [q; quaternion_WB; qdot; p_W; L_W; r_WC_W]``, (2 n + 13,):
+:func:`state_rate` returns the motion under joint efforts and a base wrench; the total momenta are
+part of the state. The state is ``x = [q; quaternion_WB; qdot; p_W; L_W; r_WC_W]``, (2 n + 13,):
 shape, attitude (x, y, z, w), joint rates, total linear momentum (kg m/s), total angular momentum
 about the system's centre of mass (kg m^2/s), and position of that centre (m), the last three in W.
-The base's twist is no state: it follows from the momenta and the joint rates. Momenta that no
-thruster changes are therefore constant to the last bit, whatever the step:
+The base's twist is not a state: it follows from the momenta and the joint rates. Without thrusters
+the momenta are therefore constant to the last bit, for any step:
 
 * ``p_W_dot = R_WB f``, ``L_W_dot = R_WB (n + (r_origin - c) x f)``, ``r_WC_W_dot = p_W / M``;
 * ``K qddot = Q`` at the ``omega_WB_B`` that the momenta imply.
@@ -35,7 +35,7 @@ at the origin of the base link, base components. The attitude is integrated in R
 after each Runge-Kutta step.
 
 Under external loads (:mod:`spacerobot_ros.model.external_loads`) the state has the time (s) as its
-last entry, and the command the vector of loads. With ``F_k`` the load on composite k and the
+last entry, and the command the vector of loads. For the load ``F_k`` on composite k and the
 friction d, ``Q_j`` gains ``S_j' F_j - B_j' F_0 - d (K qdot)_j``; both momenta change by ``F_0``,
 the uniform gravity and the friction.
 """
@@ -149,8 +149,8 @@ class Composites:
     def D_q(self) -> ca.SX:
         """Angular momentum (3, n) of unit joint rates about the centre of mass (paper 4, eq. 16a).
 
-        The momentum about the centre of mass does not depend on how that centre moves, so the
-        composites' momenta at the common point are it.
+        This momentum does not depend on the motion of the centre of mass, so it equals the
+        composites' momenta at the common point.
         """
         return self.kin.gather(ca.horzcat(ca.SX(3, 0), *(P[:3] for P in self.P[1:])).T).T
 
@@ -235,12 +235,12 @@ def shape_system(kin: TreeKinematics) -> ShapeSystem:
 def motion_forces(
     parts: Composites, omega: ca.SX, qdot: ca.SX, qddot: ca.SX | None = None
 ) -> tuple[ca.SX, ...]:
-    """Return ``f_k`` (6,) for every composite k: the force that its motion at the rates
-    ``omega_WB_B`` (3,) and ``qdot`` (n,) demands while ``omega`` stays as it is, and ``qdot`` too
-    or, where ``qddot`` (n,) is given, changes by that.
+    """Return ``f_k`` (6,) for every composite k: the force that its motion requires at the rates
+    ``omega_WB_B`` (3,) and ``qdot`` (n,), constant ``omega``, and joint accelerations ``qddot``
+    (n,), by default zero.
 
-    Recursive Newton-Euler (Featherstone, table 5.1). A point x of body k, which turns at
-    ``omega_k`` and ``alpha_k``, accelerates by ``A_k x``, ``A_k = hat(alpha_k) + hat(omega_k)^2``,
+    Recursive Newton-Euler (Featherstone, table 5.1). If body k rotates at ``omega_k`` and
+    ``alpha_k``, its point x accelerates by ``A_k x``, ``A_k = hat(alpha_k) + hat(omega_k)^2``,
     relative to the body's origin. The base's origin is taken as unaccelerated: the terms of a
     common acceleration in ``S_j' f_j`` and ``B_j' f_0`` cancel in ``Q_j``.
     """
@@ -291,8 +291,8 @@ def shape_forces(
 ) -> tuple[ca.SX, ca.SX]:
     """Return ``Q`` (n,) of ``K qddot = Q`` and the remaining moment (3,) on the base.
 
-    ``external`` (6,) is the moment (N m) over the force (N) on the base from outside, base
-    components, about the system's centre of mass; ``tau`` (n,) are the joint efforts (N or N m).
+    ``external`` (6,) is the external moment (N m) over force (N) on the base, base components,
+    about the system's centre of mass; ``tau`` (n,) are the joint efforts (N or N m).
     """
     f = motion_forces(system.parts, omega, qdot)
     if loads is not None:
@@ -320,15 +320,15 @@ def joint_efforts(
     L_B: ca.SX | None = None,
     loads: ExternalLoads | None = None,
 ) -> ca.SX:
-    """Return the efforts (n,), N or N m, of a free robot whose shape moves at the rates ``qdot``
-    (n,) and changes them by ``qddot`` (n,): inverse dynamics.
+    """Return the efforts (n,), N or N m, of a free robot at joint rates ``qdot`` (n,) and
+    accelerations ``qddot`` (n,): inverse dynamics.
 
     ``L_B`` (3,) is the angular momentum about the system's centre of mass, kg m^2/s in base
-    components; None: zero. The base turns and accelerates such that both momenta stay as they are:
-    by ``-diag(D, M 1)^-1 f_0``, where ``f_0`` is the force that the motion of the joints alone
-    would demand from outside. So ``tau_j = S_j' f_j - P_j' diag(D, M 1)^-1 f_0``, and no inertia
-    matrix of the shape is needed. At zero momentum they are of second degree in time: the same path
-    in half the time takes four times the efforts. ``loads`` act from outside, if any.
+    components; None: zero. The base rotates and accelerates such that both momenta are constant: by
+    ``-diag(D, M 1)^-1 f_0``, where ``f_0`` is the external force that the motion of the joints
+    alone would require. So ``tau_j = S_j' f_j - P_j' diag(D, M 1)^-1 f_0``, and no inertia matrix
+    of the joints is needed. At zero momentum the same path in half the time takes four times the
+    efforts. ``loads`` are external loads, if any.
     """
     parts = composites(kin)
     D = SymmetricFactor(parts.rotational)
@@ -390,8 +390,8 @@ def shape_equations(kin: TreeKinematics, *, loaded: bool = False) -> ca.Function
 def state_rate(kin: TreeKinematics, *, holding: bool = False, loaded: bool = False) -> ca.Function:
     """Return the function ``(x, command) -> x_dot``.
 
-    With ``holding`` it takes a third argument ``free`` (n,): 1 for a joint that moves, 0 for one
-    that is held at its present rate. With ``loaded``, external loads act.
+    If ``holding``, it takes a third argument ``free`` (n,): 1 for a joint that moves, 0 for one
+    that is held at its present rate. If ``loaded``, external loads act.
     """
     x, command = _state_symbols(kin, loaded=loaded)
     free = ca.SX.sym("free", kin.n) if holding else ca.DM.ones(kin.n)

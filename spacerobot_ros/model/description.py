@@ -62,7 +62,7 @@ class Inertia:
     about_com: Array = field(default_factory=lambda: np.zeros((3, 3)))
 
     def moved(self, pose: Pose) -> Inertia:
-        """Return the inertia of the body in another frame, in which its frame has ``pose``."""
+        """Return the inertia in another frame, in which the present frame has ``pose``."""
         return Inertia(self.mass, pose.r + pose.R @ self.com, pose.R @ self.about_com @ pose.R.T)
 
     def __add__(self, other: Inertia) -> Inertia:
@@ -115,7 +115,7 @@ class Mimic:
 class Joint:
     """A joint between two links; ``origin``: the child's pose at zero, ``axis``: a unit vector.
 
-    A joint with ``mimic`` follows an independent joint: it is no coordinate of its own. The child
+    A joint with ``mimic`` follows an independent joint: its position is not a coordinate. The child
     of a joint with ``wheel`` is a reaction wheel.
     """
 
@@ -169,9 +169,10 @@ class RobotDescription:
     """A free-floating tree of links; the root link is the base body (the spacecraft).
 
     ``bodies`` are in topological order, the base first; the movable joints are those of
-    ``bodies[1:]`` that follow no other, in that order. ``frames`` maps every link to its body and
-    its pose in it. ``disabled_collisions`` are pairs of links that are not checked for collision.
-    ``world`` are the obstacles around the robot, whose root link is the frame W; None: none.
+    ``bodies[1:]`` that are not mimic joints, in that order. ``frames`` maps every link to its body
+    and its pose in that body. ``disabled_collisions`` are pairs of links that are not checked for
+    collision. ``world`` has the obstacles around the robot; its root link is the frame W; None:
+    none.
     """
 
     name: str
@@ -275,7 +276,7 @@ class RobotDescription:
         Raises
         ------
         KeyError
-            There is no movable joint of a name.
+            A name is not that of a movable joint.
         """
         unknown = set(positions) - set(self.joint_names)
         if unknown:
@@ -295,9 +296,9 @@ class RobotDescription:
     def with_model_error(self, error: float, seed: int) -> RobotDescription:
         """Return the robot with random errors of all masses and inertias.
 
-        Each is multiplied by a factor of its own, drawn uniformly from ``[1 - error, 1 + error]``,
-        two per link in the order of the links. Inertia tensors stay physical, since their principal
-        moments keep their ratios; centres of mass do not change.
+        Each is multiplied by an independent factor, drawn uniformly from
+        ``[1 - error, 1 + error]``, two per link in the order of the links. Inertia tensors stay
+        physical, since their principal moments keep their ratios; centres of mass do not change.
 
         Raises
         ------
@@ -329,7 +330,7 @@ def _leading_limit(limits: JointLimits, mimic: Mimic, kind: str) -> float:
 
 
 def editable_root(urdf: str) -> Element:
-    """Return the root of a URDF text with its comments, for texts that are written again.
+    """Return the root element of a URDF text, with its comments, for editing the text.
 
     Raises
     ------
@@ -357,7 +358,7 @@ def weld_links(
         if joint.child in parents:
             raise RobotDescriptionError(
                 f"Link '{joint.child}' is the child of two joints ('{parents[joint.child]}' and "
-                f"'{joint.name}'); a robot is a tree: leave one of the joints out."
+                f"'{joint.name}'); a robot is a tree: remove one of the joints."
             )
         parents[joint.child] = joint.name
         children[joint.parent].append(joint)
@@ -367,7 +368,7 @@ def weld_links(
         mend = (
             f"Connect '{roots[1]}' by a joint, or remove it."
             if roots
-            else "Leave out a joint of the ring: the base is the child of none."
+            else "Remove a joint of the ring: the base is not a child of any joint."
             if links
             else "Give it a <link>."
         )
@@ -396,7 +397,7 @@ def weld_links(
     if len(frames) != len(links):
         lost = sorted(set(links) - set(frames))
         raise RobotDescriptionError(
-            f"Link '{lost[0]}' is not connected to the root: its joints form a ring. Leave out one "
+            f"Link '{lost[0]}' is not connected to the root: its joints form a ring. Remove one "
             "of them, and connect the others to the robot."
         )
     return bodies, frames

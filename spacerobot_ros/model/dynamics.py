@@ -2,7 +2,7 @@
 
 Equations of motion ``H+ zddot + C+ = Q`` (paper 4, eqs 8-10 and 18-21). The independent velocities
 are ``z0dot = [v_cm; omega; qdot]``, the first two in base components (eq. 8), so that nothing
-depends on where the robot is or how it is turned. Inertia is that of composite rigid bodies
+depends on the pose of the robot. Inertias are those of composite rigid bodies
 (:mod:`.composite_rigid_body`).
 
 Momentum, and the base motion that it implies. With zero total momentum the base moves only because
@@ -107,7 +107,7 @@ def momentum_of_bodies(
     """Return linear momentum (3,), angular momentum about the system's centre of mass (3,) and
     kinetic energy, in base components, summed body by body.
 
-    This does not go through ``H+``: it is the momentum balance that the motion is held against.
+    This does not use ``H+``: it is the independent balance against which the motion is checked.
     """
     linear, angular, energy = ca.SX(3, 1), ca.SX(3, 1), ca.SX(0)
     qdot = kin.spread(qdot)
@@ -141,7 +141,7 @@ def base_twist(
     """Return ``(v_WB_B, omega_WB_B)`` that carry linear momentum ``p_B`` (kg m/s) and angular
     momentum ``L_B`` about the system's centre of mass (kg m^2/s), both in base components.
 
-    With both zero it is ``-A(q) qdot``.
+    If both are zero, the result is ``-A(q) qdot``.
     """
     excess = L_B - inertia.D_q @ qdot
     if kin.mass_properties.inputs:
@@ -175,9 +175,9 @@ def body_bracket(a: ca.SX, b: ca.SX) -> ca.SX:
 def curvature(A: ca.SX, q: ca.SX) -> list[list[ca.SX]]:
     """Return the curvature ``K[i][j]`` (6,) of ``qdot -> [v; omega]_B = F qdot``, ``F = -A``.
 
-    ``K_ij = dF_j/dq_i - dF_i/dq_j + [F_i, F_j]``. A small loop counter-clockwise in the plane
-    (q_i, q_j) moves the base by ``exp(K_ij * area)`` in body coordinates (paper 2, with the
-    bracket that its flat surface integral leaves out).
+    ``K_ij = dF_j/dq_i - dF_i/dq_j + [F_i, F_j]``. A small counter-clockwise loop in the plane
+    (q_i, q_j) moves the base by ``exp(K_ij * area)`` in body coordinates (paper 2, plus the bracket
+    that its flat surface integral omits).
     """
     F = -A
     n = q.shape[0]

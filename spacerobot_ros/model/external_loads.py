@@ -1,20 +1,19 @@
-"""Forces from outside on the links of a robot: wrenches, a gravity gradient, a tilted air table.
+"""External loads on the links of a robot: wrenches, a gravity gradient, a tilted air table.
 
-All loads of a robot are one vector, whose parts :class:`LoadLayout` names; times are those of the
-plant. The frame W falls freely on a circular orbit with the mean motion n, without turning. The
-orbital frame O has its x axis along the radius outward and its z axis along the orbit's normal, as
-in the equations of Clohessy and Wiltshire; ``R_WO`` is its attitude at time zero. With the unit
-vector o along the radius, a mass element at r from the origin of W accelerates by
-``n^2 (3 o o' - 1) r``, the first order of an inverse-square field (Hughes, Spacecraft Attitude
-Dynamics, chapter 8). Body k, whose centre of mass is at r_k, meets the force and the moment about
-its centre ::
+All loads of a robot form one vector (:class:`LoadLayout`); times are those of the plant. The frame
+W falls freely on a circular orbit with the mean motion n, without rotating. The orbital frame O has
+its x axis along the radius outward and its z axis along the orbit's normal, as in the equations of
+Clohessy and Wiltshire; ``R_WO`` is its attitude at time zero. With the unit vector o along the
+radius, a mass element at r from the origin of W accelerates by ``n^2 (3 o o' - 1) r``, the first
+order of an inverse-square field (Hughes, Spacecraft Attitude Dynamics, chapter 8). Body k with
+centre of mass r_k is subject to the force and the moment about this centre ::
 
     f_k = m_k n^2 (3 o o' - 1) r_k,    n_k = 3 n^2 o x I_k o
 
 Their sum over the bodies is the moment ``3 n^2 o x D o`` about the system's centre of mass, with
 the locked inertia D, and the force ``M n^2 (3 o o' - 1) r_C`` on that centre.
 
-On an air table every body is accelerated alike, and friction on it is proportional to its momentum:
+On an air table all bodies have the same acceleration, and friction is proportional to momentum:
 ``f_k = -d m_k v_k``, ``n_k = -d I_k omega_k``.
 """
 
@@ -101,8 +100,8 @@ class ExternalLoads:
         Moment over force (6,) about the system's centre of mass, of the wrenches and the gravity
         gradient, on every composite: a body and all bodies that it carries.
     gravity_W, friction
-        Uniform acceleration (3,) in W, m/s^2, and friction over momentum, 1/s. Both act on every
-        body by its mass, and so on the momenta and the shape independently.
+        Uniform acceleration (3,) in W, m/s^2, and friction over momentum, 1/s. Both act in
+        proportion to mass, so they affect momenta and joints independently.
     """
 
     composites: tuple[ca.SX, ...]
@@ -112,7 +111,7 @@ class ExternalLoads:
     def momentum_rates(
         self, R_WB: ca.SX, p_W: ca.SX, L_W: ca.SX, mass: float | ca.SX
     ) -> tuple[ca.SX, ca.SX]:
-        """Return the rates of both total momenta in W by the loads, N and N m."""
+        """Return the rates of both total momenta in W due to the loads, N and N m."""
         moment, force = self.composites[0][:3], self.composites[0][3:]
         return (
             R_WB @ force + mass * self.gravity_W - self.friction * p_W,
@@ -183,7 +182,7 @@ EARTH_RADIUS = 6378137.0
 
 
 def mean_motion_at(altitude: float) -> float:
-    """Return the mean motion of a circular orbit round the Earth, rad/s.
+    """Return the mean motion of a circular orbit around the Earth, rad/s.
 
     ``altitude`` is the height above the equatorial radius, m.
     """
@@ -219,7 +218,7 @@ def relative_motion(
     """
     r0, v0, times = (np.asarray(each, dtype=float) for each in (r0_O, v0_O, t))
     if not (math.isfinite(n) and n >= 0.0):
-        raise ParameterError(f"The mean motion is {n:g} rad/s; it must be finite and from 0.")
+        raise ParameterError(f"The mean motion is {n:g} rad/s; it must be finite and at least 0.")
     if not all(np.all(np.isfinite(each)) for each in (r0, v0, times)):
         raise ParameterError("Position, velocity and times of a relative motion must be finite.")
     if n == 0.0:

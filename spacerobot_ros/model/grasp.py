@@ -2,18 +2,18 @@
 
 With ``z = [v_WB_B; omega_WB_B; qdot]`` (6 + n,) of the robot, ``nu`` (6,) of the body (velocity of
 its centre of mass and angular velocity) and ``L`` (6,) the impulse of the grasp on the robot, force
-over torque at the point of the grasp, all along the axes of the base B,
+over torque at the point of the grasp, all in components of the base frame B,
 
     H (z+ - z) = J' L,    M (nu+ - nu) = -G' L,    J z+ = G nu+,
 
 where H is the robot's inertia matrix, M the spatial inertia of the body, J the Jacobian of the
 end-effector and G the map of the body's twist to the same point. The joints are free: no motor or
-brake gives an impulse. So
+brake exerts an impulse. So
 
     L = (J H^-1 J' + G M^-1 G')^-1 (G nu - J z),
 
-and half of ``(G nu - J z)' L`` of the energy is lost (Carnot). Momentum is conserved, because L
-acts on both with opposite signs. The formulation is that of Yoshida and Nenchev and of Dimitrov and
+and the energy ``(G nu - J z)' L / 2`` is lost (Carnot). Momentum is conserved, because L acts on
+both with opposite signs. The formulation is that of Yoshida and Nenchev and of Dimitrov and
 Yoshida; see the page on the theory of captures.
 """
 
@@ -40,7 +40,7 @@ from spacerobot_ros.model.space_robot import SpaceRobot
 
 @dataclass(frozen=True)
 class Payload:
-    """A body that a link of a robot holds.
+    """A body held by a link of a robot.
 
     Attributes
     ----------
@@ -103,7 +103,9 @@ class Payload:
                 raise ValueError(f"its centre of mass has {com.size} numbers")
             return cls(str(values["link"]), Inertia(float(values["mass"]), com, about))
         except (KeyError, TypeError, ValueError, RecursionError) as error:
-            raise RobotDescriptionError(f"The text describes no held body: {error}.") from error
+            raise RobotDescriptionError(
+                f"The text does not describe a held body: {error}."
+            ) from error
 
 
 _INERTIA_ENTRIES = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
@@ -131,7 +133,7 @@ class TargetBody:
         Raises
         ------
         RobotDescriptionError
-            Its joints move, or it has no such link.
+            It has movable joints, or no such link.
         """
         if target.joint_names:
             raise RobotDescriptionError(
@@ -140,7 +142,7 @@ class TargetBody:
             )
         if grapple_frame not in target.frames:
             raise RobotDescriptionError(
-                f"The target '{target.name}' has no link '{grapple_frame}' to be grasped at; it "
+                f"The target '{target.name}' has no link '{grapple_frame}' to grasp; it "
                 f"has {', '.join(target.frames)}: set parameter 'target.grapple_frame', or add the "
                 "link."
             )
@@ -158,7 +160,7 @@ class RobotMotion:
     twist
         (6,) ``v_WB_B`` in m/s and ``omega_WB_B`` in rad/s.
     q, qdot
-        (n,) joint positions (m or rad) and velocities (a second).
+        (n,) joint positions (m or rad) and velocities (per second).
     """
 
     pose: Array
@@ -220,9 +222,9 @@ class RelativeMotion:
     Attributes
     ----------
     distance, angle
-        Between the origins (m) and the attitudes (rad) of the two frames.
+        Between the origins (m) and between the attitudes (rad) of the two frames.
     speed, rate
-        Of the origin of one relative to that of the other (m/s), and of their rotation (rad/s).
+        Relative speed of the origins (m/s), and relative angular rate (rad/s).
     """
 
     distance: float
@@ -253,8 +255,8 @@ class GraspImpact:
     impulse
         (6,) on the robot at the origin of the end-effector: N s over N m s, in W.
     joint_impulses
-        (n,) of the grasp along the joints' coordinates, ``J_q' L``: those that motors or brakes
-        would have to give in order to hold the joints in their motion; N s or N m s.
+        (n,) of the grasp on the joints, ``J_q' L``, which motors or brakes would have to apply in
+        order to keep the joint rates; N s or N m s.
     energy_before, energy_lost
         Kinetic energy of both bodies before it, and its loss, J.
     """
@@ -280,7 +282,7 @@ def frame_motion(robot: SpaceRobot, link: str, motion: RobotMotion) -> BodyMotio
 def grasp_impact(
     robot: SpaceRobot, link: str, motion: RobotMotion, body: BodyMotion, inertia: Inertia
 ) -> GraspImpact:
-    """Return the impact by which a link grasps a floating body where both are.
+    """Return the impact of a link that grasps a floating body, both at their present poses.
 
     Parameters
     ----------
@@ -322,7 +324,7 @@ def grasp_impact(
 def combined_momenta(
     masses: tuple[float, float], centers: tuple[Array, Array], momenta: tuple[Array, Array]
 ) -> Array:
-    """Return the momenta (6,) of two systems together.
+    """Return the combined momenta (6,) of two systems.
 
     Parameters
     ----------
@@ -331,8 +333,8 @@ def combined_momenta(
     centers
         Their centres of mass in W (3,), m.
     momenta
-        Linear over angular momentum (6,) of each about its own centre of mass, in W; those of the
-        result are about the common one.
+        Linear over angular momentum (6,) of each about its own centre of mass, in W; the result is
+        about the common centre of mass.
     """
     first, second = momenta
     arm = centers[1] - centers[0]
@@ -345,7 +347,7 @@ def combined_momenta(
 def separated_momenta(
     masses: tuple[float, float], centers: tuple[Array, Array], together: Array, second: Array
 ) -> Array:
-    """Return the momenta (6,) of the first of two systems, from those of both and of the second.
+    """Return the momenta (6,) of the first system from the combined ones and those of the second.
 
     The arguments are those of :func:`combined_momenta`, which this inverts.
     """

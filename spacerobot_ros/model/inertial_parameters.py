@@ -1,7 +1,7 @@
 """Masses, centres of mass and inertias of a robot's bodies.
 
-:class:`InertialParameters` are their numbers, of one robot or of a batch of robots that differ in
-these numbers alone. In expressions they are either constants (:class:`MassProperties`: fewest
+:class:`InertialParameters` holds their values for one robot, or for a batch of robots that differ
+in these values alone. In expressions they are either constants (:class:`MassProperties`: fewest
 operations, one compilation for each set of numbers) or entries of an argument ``p``
 (:class:`SymbolicMassProperties`: one compilation for all sets).
 """
@@ -34,7 +34,7 @@ INERTIA_ENTRIES = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 class InertialParameters:
     """Mass properties of the ``bodies`` of a :class:`RobotDescription`, of one robot or a batch.
 
-    Leading dimensions (...) are the batch: none is one robot, (N,) are N robots.
+    Leading dimensions (...) are the batch: none for one robot, (N,) for N robots.
 
     Attributes
     ----------
@@ -97,8 +97,8 @@ class InertialParameters:
     ) -> InertialParameters:
         """Return the parameters with masses and inertias multiplied by factors (..., B).
 
-        Inertias take the factors of the masses (another density) unless they are given factors of
-        their own. Factors of shape (N, B), or (N, 1) for all bodies alike, turn one robot into a
+        Inertias have the factors of the masses (a change of density) unless separate ones are
+        given. Factors of shape (N, B), or (N, 1) for all bodies alike, turn one robot into a
         batch.
         """
         by_mass = np.asarray(masses, dtype=float)
@@ -113,7 +113,7 @@ class InertialParameters:
     def shifted(self, offsets: npt.ArrayLike) -> InertialParameters:
         """Return the parameters with centres of mass moved by offsets (..., B, 3), m.
 
-        The inertias about the centres of mass stay.
+        The inertias about the centres of mass do not change.
         """
         centers = self.centers + np.asarray(offsets, dtype=float)
         shape = centers.shape[:-1]
@@ -223,14 +223,14 @@ class MassProperties:
         self.inputs: dict[str, ca.SX] = {}
 
     def inertia(self, k: int, R: ca.SX) -> ca.SX:
-        """Return the inertia (3, 3) of body k about its centre, turned by R, kg m^2."""
+        """Return the inertia (3, 3) of body k about its centre, rotated by R, kg m^2."""
         return R @ sparse_constant(self._inertias[k].about_com) @ R.T
 
     def second_moment(self, k: int, R: ca.SX) -> ca.SX:
-        """Return the second moment of mass ``tr(I)/2 1 - I`` (3, 3) of body k, turned by R, kg m^2.
+        """Return the second moment of mass ``tr(I)/2 1 - I`` (3, 3) of body k rotated by R, kg m^2.
 
-        Along principal axes ``u``: ``J = lambda 1 + sum (lambda_u - lambda) u u'``. With the middle
-        moment as ``lambda``, a body with an axis of symmetry needs that axis alone.
+        Along principal axes ``u``: ``J = lambda 1 + sum (lambda_u - lambda) u u'``. If ``lambda``
+        is the middle moment, a body with an axis of symmetry needs only that axis.
         """
         about = self._inertias[k].about_com
         moments, axes = np.linalg.eigh(np.trace(about) / 2 * np.eye(3) - about)
@@ -264,13 +264,13 @@ class SymbolicMassProperties(MassProperties):
         self.inputs = {"p": self._p}
 
     def inertia(self, k: int, R: ca.SX) -> ca.SX:
-        """Return the inertia (3, 3) of body k about its centre, turned by R, kg m^2."""
+        """Return the inertia (3, 3) of body k about its centre, rotated by R, kg m^2."""
         return rotational(self.second_moment(k, R))
 
     def second_moment(self, k: int, R: ca.SX) -> ca.SX:
-        """Return the second moment of mass (3, 3) of body k, turned by R, kg m^2.
+        """Return the second moment of mass (3, 3) of body k, rotated by R, kg m^2.
 
-        As with constants, with the columns of R as axes, and terms for the products of inertia.
+        As for constants, with the columns of R as axes, and with terms for the products of inertia.
         """
         xx, yy, zz, xy, xz, yz = ca.vertsplit(self._moments[k])
         x, y, z = ca.horzsplit(R)

@@ -36,8 +36,8 @@ def runge_kutta_step(rate: ca.Function, attitude: slice) -> ca.Function:
     A last argument ``p`` of the rate (mass properties) stays the last, after ``h``.
 
     ``attitude`` is the slice of the quaternion in ``x``: it is integrated in R^4 and normalised
-    after the step. The four stages call one piece of code: inlined it would be 6 % faster and take
-    six times as long to compile.
+    after the step. The four stages call one function: inlined code would be 6 % faster and take six
+    times as long to compile.
     """
     x, held = _symbols_for_inputs(rate)
     h = ca.MX.sym("h")
@@ -70,9 +70,9 @@ def repeat_step(step: ca.Function, count: int) -> ca.Function:
 def attitude_step(locked_inertia: ca.Function) -> ca.Function:
     """Return one Runge-Kutta step ``(x, qdot, L_W, h) -> x`` of ``x = [q; quaternion_WB]``.
 
-    The reconstruction of the base's motion from the shape's, one held command at a time. Joint
-    velocities are constant over the step (servos hold them), so the shape is exact; the position
-    follows from the centre of mass. Only the attitude is integrated:
+    This reconstructs the base's motion from that of the joints, one held command at a time. Joint
+    velocities are constant over the step (servos hold them), so the configuration is exact; the
+    position follows from the centre of mass. Only the attitude is integrated:
     ``R_WB_dot = R_WB hat(omega)``, ``omega = D^-1 (R_WB' L_W - D_q qdot)`` (paper 1, eq. 3, with an
     angular momentum that need not be zero), as a quaternion in R^4, normalised.
 
@@ -98,13 +98,13 @@ def attitude_step(locked_inertia: ca.Function) -> ca.Function:
 
 
 def attitude_steps_without_momentum(locked_inertia: ca.Function, count: int) -> ca.Function:
-    """Return ``count`` of :func:`attitude_step` without momentum, ``(x, qdot, h, p) -> x``.
+    """Return ``count`` steps of :func:`attitude_step` at zero momentum, ``(x, qdot, h, p) -> x``.
 
-    Together they take the time ``h``; ``locked_inertia`` has the argument ``p``.
+    Together they cover the time ``h``; ``locked_inertia`` has the argument ``p``.
 
-    The body rate is then ``-D^-1 D_q qdot``, that of the shape alone: it is computed once for the
-    end of a step and the beginning of the next, and does not wait for the attitude. That saves half
-    of the operations; the numbers are those of :func:`attitude_step`.
+    The body rate is then ``-D^-1 D_q qdot``, independent of the attitude: it is computed once for
+    the end of a step and the beginning of the next. That saves half of the operations; the numbers
+    are those of :func:`attitude_step`.
     """
     p = ca.SX.sym("p", locked_inertia.size1_in(1))
     n = locked_inertia.size1_in(0)

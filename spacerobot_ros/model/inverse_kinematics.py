@@ -1,7 +1,7 @@
-"""Inverse kinematics of an arm whose base stays where it is: from the present shape, and a search.
+"""Inverse kinematics of an arm on a fixed base: from the present configuration, and by a search.
 
-A controller that holds its base follows a path with the arm alone; the page asks whether the arm
-can reach a goal at all. Both use the same errors and the same Jacobian.
+A controller that holds its base follows a path with the arm alone; the web page checks whether the
+arm can reach a goal at all. Both use the same errors and the same Jacobian.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ REACHED_DISTANCE = 1e-3
 _MAX_ITERATIONS = 30
 _DAMPING = 0.02
 _LARGEST_STEP = 0.2
-"""Iterations from the present shape, their damping, and the largest step of a joint, m or rad."""
+"""Iterations from the present configuration, damping, and largest joint step, m or rad."""
 
 _SEARCH_STARTS = 8
-"""Shapes from which a search starts: the present one, and random ones."""
+"""Number of configurations from which a search starts: the present one, and random ones."""
 
 _MAX_EVALUATIONS = 30
 
@@ -37,7 +37,7 @@ _RADIAN_LENGTH = 0.5
 
 
 class FixedBaseArm:
-    """An arm on a base that stays where it is.
+    """An arm on a fixed base.
 
     Parameters
     ----------
@@ -48,7 +48,7 @@ class FixedBaseArm:
     base
         Pose of the base in W.
     axes
-        Axes of the end-effector whose errors count; all, unless others are given.
+        Controlled axes of the end-effector; default: all.
     """
 
     def __init__(
@@ -59,9 +59,9 @@ class FixedBaseArm:
         self._rows = [AXES.index(axis) for axis in axes]
 
     def error(self, q: Array, goal: Pose) -> tuple[Array, Array]:
-        """Return the error (m,) of the end-effector in the axes that count, m over rad, in W.
+        """Return the error (m,) of the end-effector in the controlled axes, m over rad, in W.
 
-        Also returned is its derivative by the joints (m, n), with the sign of their motion.
+        Also returned is minus its derivative with respect to the joints (m, n).
         """
         robot, R_WB = self._robot, self.base.R
         R_BE, r_BE = robot.link_pose(self._link, q)
@@ -75,10 +75,10 @@ class FixedBaseArm:
         return error[self._rows], J_W[self._rows]
 
     def nearest_shape(self, q: Array, goal: Pose) -> tuple[Array, float]:
-        """Return the shape (n,) nearest to a pose that a search from ``q`` finds.
+        """Return the configuration (n,) nearest to a pose that a search from ``q`` finds.
 
-        Also returned is the largest error that remains, m or rad. The search is damped least
-        squares, with steps that are short enough to stay on one branch of solutions.
+        Also returned is the largest remaining error, m or rad. The search uses damped least
+        squares, with steps short enough to stay on one branch of solutions.
         """
         lower, upper = self._robot.lower, self._robot.upper
         distance = np.inf
@@ -93,11 +93,11 @@ class FixedBaseArm:
         return q, distance
 
     def search_shape(self, q: Array, goal: Pose) -> tuple[Array, float, float]:
-        """Return the shape (n,) nearest to a pose within all joint limits.
+        """Return the configuration (n,) nearest to a pose within all joint limits.
 
-        Also returned are the distance and the angle that remain in the axes that count, m and rad.
+        Also returned are the remaining distance and angle in the controlled axes, m and rad.
         The search starts at
-        ``q`` and at random shapes; for equal arguments the result is the same.
+        ``q`` and at random configurations; equal arguments give equal results.
         """
         # Imported here because scipy.optimize loads slowly.
         from scipy.optimize import least_squares
@@ -132,5 +132,5 @@ class FixedBaseArm:
 
 
 def is_reached(distance: float, angle: float) -> bool:
-    """Whether an arm with such an error after a search, m and rad, reaches its goal."""
+    """Whether an arm with this error after a search, m and rad, reaches its goal."""
     return distance <= 2 * _SEARCH_TOLERANCE and angle <= 4 * _SEARCH_TOLERANCE

@@ -1,9 +1,9 @@
 """Forward kinematics of the tree in base components, symbolic and numeric (paper 4, section II).
 
 The base frame B is the frame of the root link. All vectors here are expressed in B, which makes
-every quantity a function of the shape q alone. :func:`tree_kinematics` builds the equations that
-are compiled; :class:`ForwardKinematics` compiles nothing and gives the poses of the links to
-whatever draws a robot or publishes its frames.
+every quantity a function of the configuration q alone. :func:`tree_kinematics` builds the equations
+that are compiled; :class:`ForwardKinematics` needs no compilation and computes link poses for
+drawing a robot or publishing its frames.
 """
 
 from __future__ import annotations
@@ -89,7 +89,7 @@ class TreeKinematics:
 
     @property
     def per_mass(self) -> float | ca.SX:
-        """One over the mass of the system, 1/kg."""
+        """Inverse of the mass of the system, 1/kg."""
         # CasADi rewrites x * (1/d) as x/d; it leaves |1/d| as it is.
         per: float | ca.SX = 1 / self.mass_properties.total
         return per if isinstance(per, float) else ca.fabs(per)
@@ -107,7 +107,7 @@ class TreeKinematics:
         return self.robot.bodies[k].parent
 
     def is_revolute(self, k: int) -> bool:
-        """Whether body k turns (revolute, continuous) rather than slides."""
+        """Whether body k rotates (revolute, continuous) rather than slides."""
         joint = self.robot.bodies[k].joint
         return joint is not None and joint.kind is not JointKind.PRISMATIC
 
@@ -191,7 +191,7 @@ def tree_kinematics(
 
 
 def link_quaternion(description: RobotDescription, link: str, q: ca.SX) -> ca.SX:
-    """Return the quaternion (4,) of ``R_BL``, smooth in q: no matrix is turned into it."""
+    """Return the quaternion (4,) of ``R_BL``, smooth in q: not computed from a matrix."""
     index, pose = description.frames[link]
     quaternion, theta = _to_constant(pose.R), joint_positions(description, q)
     while index > 0:
@@ -211,10 +211,10 @@ def _to_constant(R: Array) -> ca.DM:
 
 
 class LinkPlacement:
-    """Poses in W of frames that are fixed to links, from the pose of the base and those of links.
+    """Poses in W of frames that are fixed to links, from the poses of base and links.
 
-    A function in the virtual machine: it has some hundred operations, which take it less time than
-    numpy takes for one product of matrices.
+    Evaluated in CasADi's virtual machine: its few hundred operations take less time than one matrix
+    product in numpy.
 
     Parameters
     ----------
@@ -275,7 +275,7 @@ class ForwardKinematics:
     """Poses of the links of a robot from the positions of its joints.
 
     Transforms are positions (m) and quaternions (x, y, z, w) side by side: (k, 7). A quaternion
-    turns by half the angle of its joint: it is continuous over several turns.
+    rotates by half the angle of its joint, so it is continuous over several revolutions.
 
     Parameters
     ----------
@@ -287,7 +287,7 @@ class ForwardKinematics:
     links
         Names of the links, the base link first, each after its parent.
     moving, fixed
-        Parent and child of the joints that move, and of those that do not.
+        Parent and child of each moving joint, and of each fixed one.
     transforms, fixed_transforms
         The poses of the same children in their parents: (k, 7), which :meth:`update` changes in
         place, and (m, 7).

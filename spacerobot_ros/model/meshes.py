@@ -8,8 +8,8 @@
                 mesh = shape_mesh(shape, most=20_000)   # MeshError: a message for the user
                 draw(mesh.vertices, mesh.faces, shape.rgba)
 
-STL and OBJ are read here; COLLADA, glTF and PLY by trimesh, where it is installed. Files may come
-from strangers, also inside bags: sizes are bounded, and no message quotes the content of a file.
+STL and OBJ are read here; COLLADA, glTF and PLY by trimesh, if it is installed. Files, also those
+in bags, may be untrusted: sizes are bounded, and no message quotes the content of a file.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ _MAX_MESH_BYTES = 100_000_000
 _MAX_TRIANGLES = 2_000_000
 
 _STL_HEADER_BYTES = 84
-"""Bytes of a binary STL file before its triangles: a text of 80, and their number."""
+"""Size of the header of a binary STL file, bytes: 80 of text, and the number of triangles."""
 
 _STL_TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 
@@ -51,7 +51,7 @@ Faces = npt.NDArray[np.int32]
 class TriangleMesh:
     """Triangles: ``vertices`` (N, 3) in m, ``faces`` (M, 3) of their indices.
 
-    The corners of a face go round counterclockwise, seen from outside, where the file has them so.
+    Seen from outside, the corners of a face are counterclockwise if they are so in the file.
     """
 
     vertices: Array
@@ -60,7 +60,7 @@ class TriangleMesh:
     def moved(self, pose: Pose, scale: tuple[float, ...] = (1.0, 1.0, 1.0)) -> TriangleMesh:
         """Return the mesh, scaled along its own axes, in the frame in which it has ``pose``.
 
-        A scale that mirrors turns the faces round, so that outside stays outside.
+        If the scale mirrors the mesh, faces are reversed, so that outside stays outside.
         """
         vertices = (self.vertices * np.asarray(scale)) @ pose.R.T + pose.r
         faces = self.faces if np.prod(scale) >= 0 else self.faces[:, ::-1]
@@ -69,8 +69,8 @@ class TriangleMesh:
     def coarsened(self, most: int) -> TriangleMesh:
         """Return a simplified mesh of at most ``most`` faces.
 
-        Vertices in one cell of a grid become their mean, and faces that lose their area go. The
-        grid has cubes, as fine as ``most`` allows among halvings of the whole.
+        Vertices in one cell of a grid are replaced by their mean, and faces without area are
+        removed. The cells are cubes: the whole is halved as often as ``most`` allows.
         """
         if len(self.faces) <= most:
             return self
@@ -131,7 +131,7 @@ def mesh_beside(resource: str, folder: Path) -> Path | None:
 def mesh_file(resource: str) -> Path | None:
     """Return the file of a mesh by its URI (``file://``, ``package://``) or path; None: not there.
 
-    Packages are looked for in the ROS environment; this package's own need none.
+    Packages are looked up in the ROS environment; meshes of this package need none.
     """
     url = urlparse(resource)
     if url.scheme == "package":
@@ -156,14 +156,15 @@ def _package_folder(name: str) -> Path | None:
 
 
 def shape_mesh(shape: Shape, most: int = _MAX_TRIANGLES) -> TriangleMesh:
-    """Return the triangles of a mesh of a URDF in the frame of its link, origin and scale applied.
+    """Return the triangles of a URDF's mesh in the frame of its link, with origin and scale
+    applied.
 
     Parameters
     ----------
     shape
         A visual of the kind ``mesh``.
     most
-        With more faces the mesh is made coarser (:meth:`TriangleMesh.coarsened`).
+        A mesh with more faces is simplified (:meth:`TriangleMesh.coarsened`).
 
     Raises
     ------
@@ -191,7 +192,7 @@ def read_mesh(path: str | Path) -> TriangleMesh:
     suffix = path.suffix.lower()
     if suffix not in (".stl", ".obj", *_TRIMESH_SUFFIXES):
         raise MeshError(
-            f"The mesh {path} is not of a kind that can be read (STL, OBJ, COLLADA, glTF, PLY): "
+            f"The mesh {path} has an unsupported format (not STL, OBJ, COLLADA, glTF or PLY): "
             "convert it to STL."
         )
     try:
@@ -221,7 +222,7 @@ def mesh_of_stl(data: bytes, name: str) -> TriangleMesh:
     Raises
     ------
     MeshError
-        It is damaged or too large; the message calls it ``name``.
+        The mesh is damaged or too large; the message calls it ``name``.
     """
     try:
         return _require_sound_mesh(_read_stl(data))
@@ -262,7 +263,7 @@ def _require_sound_mesh(mesh: TriangleMesh) -> TriangleMesh:
     if not np.isfinite(vertices).all():
         raise _DamagedError("a coordinate is not finite")
     if faces.size and (faces.min() < 0 or faces.max() >= len(vertices)):
-        raise _DamagedError("a face has the index of a missing vertex")
+        raise _DamagedError("a face refers to a missing vertex")
     faces = _without_degenerate_faces(faces)
     if not len(faces):
         raise _DamagedError("it has no triangle")
@@ -285,17 +286,17 @@ def _read_stl(data: bytes) -> TriangleMesh:
             triangles = np.frombuffer(data, _STL_TRIANGLE, count, _STL_HEADER_BYTES)
             return mesh_from_corners(triangles["corners"].reshape(-1, 3))
     if not data.lstrip().startswith(b"solid"):
-        raise _DamagedError("it is not an STL file, or it is cut")
+        raise _DamagedError("it is not an STL file, or it is truncated")
     if b"endsolid" not in data:
-        raise _DamagedError("its end is missing: the file is cut")
+        raise _DamagedError("its end is missing: the file is truncated")
     corners = np.array(_STL_VERTEX_PATTERN.findall(data), dtype=bytes).astype(float)
     if len(corners) % 3:
-        raise _DamagedError("a triangle has not three corners")
+        raise _DamagedError("a triangle does not have three corners")
     return mesh_from_corners(corners.reshape(-1, 3))
 
 
 def mesh_from_corners(corners: npt.NDArray[Any]) -> TriangleMesh:
-    """Return the mesh of triangles that are given by their corners (3 M, 3): equal ones are one."""
+    """Return the mesh of triangles given by their corners (3 M, 3); equal corners are merged."""
     if not len(corners):
         return TriangleMesh(np.zeros((0, 3)), np.zeros((0, 3), np.int32))
     # Adding 0.0 turns -0.0 into 0.0, so that equal numbers have equal bytes.
@@ -333,7 +334,7 @@ def _read_by_trimesh(path: Path, data: bytes) -> TriangleMesh:
             import collada  # noqa: F401  # What trimesh reads COLLADA with
     except ImportError:
         raise MeshError(
-            f"The mesh {path} is read by trimesh, which is not installed: "
+            f"The mesh {path} requires trimesh, which is not installed: "
             "`pip install '.[viewer]'` in the clone, or convert it to STL."
         ) from None
     load: Callable[..., Any] = trimesh.load

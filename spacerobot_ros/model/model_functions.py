@@ -81,7 +81,7 @@ class ModelFunctions:
 
     @classmethod
     def of(cls, robot: RobotDescription) -> ModelFunctions:
-        """Return the model with a robot's constants; equal robots of a process share it."""
+        """Return the model with a robot's constants; equal robots in a process share it."""
         return _model_of_key(_RobotKey.of(robot, robot))
 
     def function(self, name: str, *, compile: bool = True) -> ca.Function:
@@ -107,7 +107,7 @@ class ModelFunctions:
 
     @property
     def total_mass(self) -> float:
-        """Mass of the system, kg; the model has constants."""
+        """Mass of the system, kg; only for models with constants."""
         return float(self._kin.total_mass)
 
     @property
@@ -117,14 +117,14 @@ class ModelFunctions:
 
     @cached_property
     def equations_key(self) -> str:
-        """A hash of the equations at zero momentum: equal for robots that move alike."""
+        """A hash of the equations at zero momentum: equal for robots with the same motion."""
         digest = hashlib.sha256()
         for name in ("locked_inertia", "center_of_mass"):
             digest.update(self.function(name, compile=False).serialize().encode())
         return digest.hexdigest()
 
     def link_index(self, link: str) -> int:
-        """Return the number of a link.
+        """Return the index of a link.
 
         Raises
         ------
@@ -407,8 +407,8 @@ class SymbolicModels:
     def model(self, parameters: InertialParameters) -> tuple[ModelFunctions, Array]:
         """Return the model for inertial parameters (..., B), and its argument ``p`` (..., k).
 
-        Entries that are zero in the nominal robot are usually zero in all, and left out of ``p``.
-        If one is not, all entries are in ``p``.
+        Entries that are zero in the nominal robot are usually zero in all robots, and are omitted
+        from ``p``. If one of them is not zero, all entries are in ``p``.
         """
         vector = parameters.vector
         usual = not vector[..., ~self._free].any()

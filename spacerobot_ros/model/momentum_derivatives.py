@@ -1,32 +1,32 @@
-"""First and second derivatives of the angular momentum by the shape, in closed form.
+"""First and second derivatives of the angular momentum by the configuration, in closed form.
 
 At zero linear momentum the angular momentum about the centre of mass is ``L = D(q) omega + D_q(q)
 qdot`` (paper 1, eq. 3). For a vector ``eta``, ``eta' L`` is a sum over the bodies of
-``V1' I_k V2_k``, where V1 is the motion of a rigid system that turns at ``eta``, and V2_k the
+``V1' I_k V2_k``, where V1 is the motion of a rigid system that rotates at ``eta``, and V2_k the
 motion of body k at ``omega`` and ``qdot``. Spatial vectors and inertias as in
 :mod:`.composite_rigid_body`: angular part first, base components, at the system's centre of mass.
 
-Joint i turns all bodies that it carries. Seen from them, it is the rest of the system that moves
-the other way: V1 changes by ``a_i = V1 x S_i``, and the motion V2 of the carrier of joint i by
+Joint i moves all bodies that it carries. Seen from them, the rest of the system moves the other
+way: V1 changes by ``a_i = V1 x S_i``, and the motion V2 of the carrier of joint i by
 ``b_i = V2 x S_i``. With the momenta ``h1_i = I^c_i V1`` and ``h2_i = sum_k I_k V2_k`` of the bodies
 that joint i carries, ``S x*`` the product of motion and force, and P_j the momentum of a unit rate
 of joint j, the momenta change by
 
 * ``y1_i = S_i x* h1_i + I^c_i a_i`` and ``y2_i = S_i x* h2_i + I^c_i b_i``,
 
-and the second derivatives are, where joint i carries joint j or is joint j itself,
+and if joint i carries joint j or is joint j, the second derivatives are
 
 * by q_i and q_j: ``a_i' y2_j + b_i' y1_j``;
 * by q_i and qdot_j: ``a_i' P_j``; by q_j and qdot_i: ``S_i' y1_j``;
 * by q_i and omega: the angular part of ``y1_i``.
 
-They are zero for joints on different branches. All of this is at a given motion of the centre of
-mass. That it stays at rest takes away ``(f1_x' f2_y + f2_x' f1_y) / M``, where f1_x and f2_x are
-the changes of the linear momenta of both motions with the variables x and y.
+They are zero for joints on different branches. All of this holds for a given motion of the centre
+of mass. To keep it at rest, subtract ``(f1_x' f2_y + f2_x' f1_y) / M``, where f1_x and f2_x are the
+derivatives of the linear momenta of both motions by the variables x and y.
 
-These take a tenth of the operations of derivatives by CasADi. The formulas are our own; the change
-of a subtree's momentum with its joint is that of R. Featherstone, Rigid Body Dynamics Algorithms,
-2008, section 2.9.
+These formulas take a tenth of the operations of CasADi's derivatives. They are our own; the
+derivative of a subtree's momentum by its joint is from R. Featherstone, Rigid Body Dynamics
+Algorithms, 2008, section 2.9.
 """
 
 from __future__ import annotations
@@ -59,12 +59,12 @@ class MomentumDerivatives:
 def momentum_derivatives(
     parts: Composites, omega: ca.SX, qdot: ca.SX, eta: ca.SX
 ) -> MomentumDerivatives:
-    """Return the derivatives at a shape, at zero linear momentum.
+    """Return the derivatives in a configuration, at zero linear momentum.
 
     Parameters
     ----------
     parts
-        The composites at the shape.
+        The composites in the configuration.
     omega, qdot
         Rate of the base (3,) in base components, and joint rates (n,).
     eta

@@ -2,17 +2,17 @@
 
 The momentum of a body is linear in its parameters ``phi = [m, m c, I]`` (10,): mass, first moment
 and moments of inertia about the origin of the frame L that it is given in (Atkeson, An and
-Hollerbach, 1986). The robot's own momentum ``P_r`` is known by its model. Without loads other than
-the known impulse J since the first state, and with the total momentum P_0 then,
+Hollerbach, 1986). The robot's own momentum ``P_r`` is known from its model. Without loads other
+than the known impulse J since the first state, where the total momentum is P_0,
 
     P_r(t) + A(t) phi = P_0 + J(t),
 
-of linear momentum over angular momentum about a fixed point. P_0 is not known either. A motion that
-leaves columns of A without change (a planar one, say) does not determine all parameters: these are
-named, not invented. The others are physically consistent: some body has them. That is so if and
-only if the pseudo-inertia matrix ``[[tr(I)/2 1 - I, m c], [m c', m]]`` is positive definite
-(Wensing, Kim and Slotine, 2018), which its Cholesky factor with logarithms on the diagonal makes
-sure of (Rucker and Wensing, 2022). The sources are cited from memory.
+for linear momentum over angular momentum about a fixed point. P_0 is unknown, too. If columns of A
+are constant along a motion (such as a planar one), it does not determine all parameters; the
+undetermined ones are reported. The others are physically consistent: some rigid body has them. They
+are so if and only if the pseudo-inertia matrix ``[[tr(I)/2 1 - I, m c], [m c', m]]`` is positive
+definite (Wensing, Kim and Slotine, 2018), which a Cholesky factor with logarithms on the diagonal
+ensures (Rucker and Wensing, 2022). The sources are cited from memory.
 """
 
 from __future__ import annotations
@@ -35,28 +35,28 @@ _SMALLEST_SINGULAR_VALUE = 1e-7
 """Smallest singular value of a direction that motion determines, relative to the largest."""
 
 _MIN_SIGNAL_TO_NOISE = 10.0
-"""Least power of the motion that determines a direction, relative to that of its errors."""
+"""Smallest power of a motion that determines a direction, relative to that of its errors."""
 
 _MIN_JERK_RATIO = 3.0
-"""Second difference beyond which it counts as a jerk of the motion, relative to the median."""
+"""Second difference above which it is taken for a jerk of the motion, relative to the median."""
 
 _WALK_SHARES = np.append(0.0, np.geomspace(1e-6, 1e6, 73))
-"""Ratios of the power of a random walk to that of white noise that are tried."""
+"""Tested ratios of the power of a random walk to that of white noise."""
 
 _ROUNDS = 4
-"""Fits in which the parameters and the scatter of the momenta are found in turns."""
+"""Number of fits, which alternate between the parameters and the scatter of the momenta."""
 
 _MIN_UNDETERMINED_SHARE = 0.2
-"""Share of undetermined directions in a parameter from which it is undetermined itself."""
+"""Share of undetermined directions in a parameter above which it is undetermined."""
 
 _ROUNDING = 1e-11
-"""Least relative error of momenta, whose impulses are sums over ticks."""
+"""Smallest relative error of momenta; impulses are sums over ticks."""
 
 _PRIOR_WEIGHT = 1e-6
 """Weight of the prior of undetermined directions, relative to the largest singular value."""
 
 _MAX_NOISE_DISTANCE = 1.0
-"""Largest distance from some body that counts as noise, in standard deviations."""
+"""Largest distance from a physical body that is taken for noise, in standard deviations."""
 
 
 @dataclass(frozen=True)
@@ -68,14 +68,14 @@ class PayloadEstimate:
     link
         Name of the link.
     parameters
-        (10,) of :data:`PAYLOAD_PARAMETERS`; NaN where motion does not determine one.
+        (10,) of :data:`PAYLOAD_PARAMETERS`; NaN if the motion does not determine a parameter.
     deviations
-        (10,) their standard deviations, by the scatter of the momenta.
+        (10,) their standard deviations, from the scatter of the momenta.
     directions
         (k, 10) orthonormal combinations that are not determined, each parameter in units of the
         robot's mass and radius of gyration.
     corrected
-        Whether no body has the parameters that fit best, so that the nearest of a body are given.
+        Whether the best fit is not physical, so that the nearest physical parameters are given.
     """
 
     link: str
@@ -116,7 +116,7 @@ def momentum_regressor(motion: BodyMotion, about: Array) -> Array:
     motion
         Motion of the frame L of the parameters.
     about
-        (3,) point in W that angular momentum is about, m.
+        (3,) reference point of the angular momentum in W, m.
     """
     R = motion.R_WT
     v, omega = R.T @ motion.v, R.T @ motion.omega
@@ -137,23 +137,23 @@ def estimate_payload(
 ) -> PayloadEstimate:
     """Return the parameters of a held body, by least squares with errors in all variables.
 
-    Measured velocities have errors, on which both sides of the equation depend. Their covariance is
+    Errors of the measured velocities enter both sides of the equation. Their covariance is
     taken from second differences, and subtracted from the normal equations. A motion without errors
-    fulfils the equation in its differences, too, so that nothing is lost then.
+    also satisfies the equation in its differences, so nothing is lost.
 
-    Errors of successive states are not independent: what the impulse lacks adds up. In the modes of
-    a cosine transform over time white noise and a random walk are; each mode is weighted by its own
-    variance, and the one of the mean, which has the unknown P_0, is left out.
+    Errors of successive states are not independent: errors of the impulse add up. In a cosine
+    transform over time, the modes of white noise and of a random walk are independent; each mode is
+    weighted by its variance, and the mean, which contains the unknown P_0, is omitted.
 
     Parameters
     ----------
     link
         Link that holds it.
     regressors
-        (T, 3, 6, 10) of :func:`momentum_regressor` at T times three successive states, equally far
-        apart in time; no state is in two of them.
+        (T, 3, 6, 10) of :func:`momentum_regressor` at T triples of successive states, equally
+        spaced in time; no state is in two triples.
     known
-        (T, 3, 6) momenta of the robot without the body, less the impulse since the first state.
+        (T, 3, 6) momenta of the robot without the body, minus the impulse since the first state.
     mass, radius
         Mass (kg) and radius of gyration (m) of the robot: units in which parameters are compared.
     """

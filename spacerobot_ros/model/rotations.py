@@ -1,6 +1,6 @@
 """Attitude with numpy: rotation matrices, unit quaternions (x, y, z, w), rotation vectors.
 
-A quaternion or matrix named ``R_WB`` turns vectors given in B into vectors given in W.
+A quaternion or matrix named ``R_WB`` maps vectors given in B to vectors given in W.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 Array = npt.NDArray[np.float64]
-"""Numbers: the type of every vector and matrix of the package."""
+"""The type of every vector and matrix of the package."""
 
 
 def hat(a: npt.ArrayLike) -> Array:
@@ -22,7 +22,7 @@ def hat(a: npt.ArrayLike) -> Array:
 
 
 def cross(a: Array, b: Array) -> Array:
-    """Return the cross products (..., 3) of vectors (..., 3), as ``numpy.cross`` in less time."""
+    """Return the cross products (..., 3) of vectors (..., 3); faster than ``numpy.cross``."""
     if a.ndim == b.ndim == 1:
         ax, ay, az = a.tolist()
         bx, by, bz = b.tolist()
@@ -66,7 +66,7 @@ def matrix_from_rpy(rpy: npt.ArrayLike) -> Array:
 def rpy_from_matrix(R: npt.ArrayLike) -> Array:
     """Return roll, pitch and yaw (3,), rad, of a rotation (3, 3): :func:`matrix_from_rpy` inverted.
 
-    If the pitch is a right angle, roll and yaw are some of those that give the rotation.
+    If the pitch is a right angle, roll and yaw are not unique; one of the solutions is returned.
     """
     m = np.asarray(R, dtype=float)
     yaw = math.atan2(m[1, 0], m[0, 0])
@@ -98,7 +98,7 @@ def matrices_from_quaternions(quaternions: Array) -> Array:
 def quaternion_multiply(a: npt.ArrayLike, b: npt.ArrayLike) -> Array:
     """Return the product of two quaternions (x, y, z, w): the rotation b followed by a.
 
-    Either may be many, (N, 4); so is the product then.
+    Either may be an array (N, 4), and so is the product then.
     """
     ax, ay, az, aw = _components(np.asarray(a, dtype=float).T)
     bx, by, bz, bw = _components(np.asarray(b, dtype=float).T)
@@ -163,7 +163,7 @@ def compose_poses(outer: Array, inner: Array) -> Array:
 
 
 def relative_pose(outer: Array, pose: Array) -> Array:
-    """Return a pose (7,) relative to another one, ``outer``, in the frame of both."""
+    """Return a pose (7,) relative to the pose ``outer``, both given in one frame."""
     back = quaternion_inverse(outer[3:])
     position = matrix_from_quaternion(back) @ (pose[:3] - outer[:3])
     return np.concatenate([position, quaternion_multiply(back, pose[3:])])
@@ -172,8 +172,9 @@ def relative_pose(outer: Array, pose: Array) -> Array:
 def swing_angle(quaternion: npt.ArrayLike, axes: Array) -> float:
     """Return the angle, rad, between a rotation and the nearest rotation about axes (k, 3).
 
-    The axes are orthonormal; with one of them this is the swing that remains of a unit quaternion
-    (x, y, z, w) after its twist about the axis, with none the whole rotation.
+    The rotation is a unit quaternion (x, y, z, w), the axes are orthonormal. With one axis the
+    angle is that of the swing that remains after the twist about the axis, without axes that of the
+    whole rotation.
     """
     q = np.asarray(quaternion, dtype=float)
     about = axes @ q[:3]
@@ -223,7 +224,7 @@ def quaternion_from_matrix(R: Array) -> Array:
 def rotation_angles(R: Array) -> Array:
     """Return the angles (...), rad, from 0 to pi, of rotation matrices (..., 3, 3).
 
-    Of the sine and the cosine, so that small angles keep their digits.
+    They are computed from sine and cosine, so that small angles keep their digits.
     """
     twice_axis = np.stack(
         [

@@ -16,7 +16,7 @@ from spacerobot_ros.resources import robot_file
 from spacerobot_ros.times import SECOND
 
 DEFAULT_TICK_RATE = 20.0
-"""Ticks a second of a plant whose parameters do not say otherwise, Hz."""
+"""Default tick rate of a plant, Hz."""
 
 _MIN_RATE = 0.001  # Hz
 
@@ -33,7 +33,7 @@ Config = TypeVar("Config", bound="CommanderConfig")
 
 
 def automatic_tolerance(robot: RobotDescription) -> float:
-    """Return the largest position error of a goal that a robot reaches, m, of one digit."""
+    """Return the automatic position tolerance for a robot, m, rounded to one digit."""
     tolerance = min(max(_TOLERANCE_SHARE * robot.size, _SMALLEST_TOLERANCE), _LARGEST_TOLERANCE)
     return float(f"{tolerance:.1g}")
 
@@ -75,7 +75,7 @@ class AssumedRobotConfig(RobotConfig):
     model_error: float = nonnegative(
         0.0, "largest relative error of masses and inertias", maximum=0.9
     )
-    model_error_seed: int = nonnegative(0, "seed of the draw of these errors")
+    model_error_seed: int = nonnegative(0, "seed of these random errors")
 
     def assumed_robot(self, robot: RobotDescription) -> RobotDescription:
         """Return the robot with random errors of masses and inertias of up to ``model_error``."""
@@ -141,7 +141,7 @@ class CommanderConfig(WatchdogConfig, AssumedRobotConfig):
     tick_rate: float = nonnegative(
         0.0, "commands per second; 0: the plant's rate", "Hz", maximum=100000.0
     )
-    world_frame: str = parameter("world", "frame of goals that name no known frame")
+    world_frame: str = parameter("world", "frame of goals without a known frame")
     state_reliability: str = parameter(
         "auto",
         "reliability of the subscriptions to odom and joint_states; auto: reliable, or best "
@@ -150,7 +150,7 @@ class CommanderConfig(WatchdogConfig, AssumedRobotConfig):
     )
     diagnostics_period: float = nonnegative(
         1.0,
-        "simulated time between diagnostics; 0: ignored states only. Outside of a run in one "
+        "simulated time between diagnostics; 0: ignored states only. Except in a run in one "
         "process also once a second of wall time",
         "s",
     )
@@ -187,7 +187,7 @@ class CommanderConfig(WatchdogConfig, AssumedRobotConfig):
     def __post_init__(self) -> None:
         if 0.0 < self.tick_rate < _MIN_RATE:
             raise ParameterError(
-                f"Parameter 'tick_rate' is {self.tick_rate}; it must be 0 (that of the plant) or "
+                f"Parameter 'tick_rate' is {self.tick_rate}; it must be 0 (the plant's rate) or "
                 f"at least {_MIN_RATE:g} Hz."
             )
 

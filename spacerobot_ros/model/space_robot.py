@@ -31,7 +31,7 @@ _MIN_RELATIVE_INERTIA = 1e-6
 """Largest component of a joint that counts as zero in a motion without inertia."""
 
 _MIN_RELATIVE_COUPLING = 1e-9
-"""Smallest singular value of the connection that counts as a turn of the base, rad per rad."""
+"""Smallest singular value of the connection that counts as a rotation of the base, rad per rad."""
 
 
 class SpaceRobot:
@@ -81,8 +81,8 @@ class SpaceRobot:
     def with_inertial(self, parameters: InertialParameters) -> SpaceRobot:
         """Return the robot with other masses, centres of mass and inertias.
 
-        All such robots share their compiled functions. With its own numbers the robot returns
-        itself.
+        All such robots share their compiled functions. If the numbers are equal, the robot itself
+        is returned.
 
         Raises
         ------
@@ -100,7 +100,7 @@ class SpaceRobot:
         return SpaceRobot(description, self._build)
 
     def derived(self, description: RobotDescription) -> SpaceRobot:
-        """Return the robot of a description that was made from this one's, such as its gyrostat.
+        """Return the robot of a description derived from this one's, such as its gyrostat.
 
         If this robot shares its compiled functions with robots that differ only in mass
         properties, so does that one.
@@ -176,7 +176,7 @@ class SpaceRobot:
         tau: npt.ArrayLike | None = None,
     ) -> tuple[Array, Array]:
         """Return ``A`` (12 + 2 n, 12 + 2 n) and ``B`` (12 + 2 n, 6 + n) of the equations of motion
-        about a state and an actuation; omitted ones are zero.
+        about a state and an actuation; omitted arguments are zero.
 
         ``d/dt dx = A dx + B du`` to first order, with ``dx = [dr; dtheta; dq; dv; domega; dqdot]``:
         position (m) and rotation vector (rad) of the base from its motion in that state, joint
@@ -217,9 +217,9 @@ class SpaceRobot:
         return ca.Function("linearised", [q, v, omega, qdot, wrench, tau], results)
 
     def joint_efforts(self, q: npt.ArrayLike, qdot: npt.ArrayLike, qddot: npt.ArrayLike) -> Array:
-        """Return the efforts (n,), N or N m, of a motion of the shape at zero momentum.
+        """Return the efforts (n,), N or N m, of a motion of the joints at zero momentum.
 
-        No wrench acts on the base, which moves as the momenta demand.
+        No wrench acts on the base; its motion follows from the momenta.
         """
         return self._call_function("joint_efforts", q, qdot, qddot)[0]
 
@@ -239,8 +239,8 @@ class SpaceRobot:
     def generalised_jacobian(self, link: str, q: npt.ArrayLike) -> Array:
         """Return ``J*`` (6, n) of a link's frame origin at zero momentum, base components.
 
-        It maps ``qdot`` to linear over angular velocity in the world, while the base moves as the
-        momenta demand (Umetani and Yoshida's generalised Jacobian).
+        It maps ``qdot`` to linear over angular velocity in the world, while the base moves
+        according to the momenta (Umetani and Yoshida's generalised Jacobian).
 
         Raises
         ------
@@ -269,7 +269,7 @@ class SpaceRobot:
     def curvature(self, q: npt.ArrayLike) -> Array:
         """Return ``K`` (6, n, n) of ``F = -A``: ``dF_j/dq_i - dF_i/dq_j + [F_i, F_j]``.
 
-        A small loop counter-clockwise in (q_i, q_j) displaces the base by ``K[:, i, j] * area``.
+        A small counter-clockwise loop in (q_i, q_j) displaces the base by ``K[:, i, j] * area``.
         """
         stacked = self._call_function("curvature", q)[0]
         return stacked.reshape((6, self.n, self.n), order="F")
@@ -318,13 +318,13 @@ class SpaceRobot:
         return self._numeric_model.function(name, compile=compile)
 
     def buffered(self, name: str) -> BufferedFunction:
-        """Return a function with input and output buffers of its own, for one caller."""
+        """Return a function with its own input and output buffers, for one caller."""
         return BufferedFunction(self._model.function(name, compile=self._compiles), self._p)
 
     @cached_property
     def interpreted(self) -> SpaceRobot:
-        """The same robot for callers with few calls, for whom compiling does not pay: functions of
-        the model run in CasADi's virtual machine, with the same numbers, bit for bit.
+        """The same robot for callers with few calls, for which compilation does not pay: functions
+        of the model run in CasADi's virtual machine, with bit-identical results.
         """
         robot = copy.copy(self)
         robot._buffers, robot._compiles = {}, False
@@ -356,13 +356,13 @@ class SpaceRobot:
         """Compile a function of :meth:`expressions`, and return it with its own buffers.
 
         The argument ``p``, if it has one, is set to this robot's mass properties. Functions with
-        one ``key`` are the same: it is compiled once, as :meth:`cached_object` says.
+        equal ``key`` are the same function, compiled once (:meth:`cached_object`).
         """
         return BufferedFunction(self._model.composed(key, lambda: function), self._p)
 
     def cached_object(self, key: Hashable, make: Callable[[], _Made]) -> _Made:
-        """Return an object that is made of :meth:`expressions`, once per key for all robots that
-        share them: those with the same mass properties, or with these as an argument.
+        """Return an object built from :meth:`expressions`, once per key for all robots that share
+        them: those with the same mass properties, or with these as an argument.
         """
         derived = self._model.derived
         if key not in derived:
@@ -415,11 +415,13 @@ class SpaceRobot:
         moved = np.abs(vectors[6:, 0])
         box = "an <inertia>, for a box of sides a, b, c ixx = m (b^2 + c^2) / 12 and so on"
         if not moved.size or moved.max() < _MIN_RELATIVE_INERTIA:
-            mend = f"it turns without any mass moving. Give '{self.description.base_link}' {box}."
+            mend = (
+                f"it can rotate without moving any mass. Give '{self.description.base_link}' {box}."
+            )
         else:
             joint = self.description.movable_joints[int(moved.argmax())]
             mend = (
-                f"its joint '{joint.name}' can move without any mass moving, because the bodies on "
+                f"its joint '{joint.name}' can move without moving any mass, because the bodies on "
                 f"one side of it have no inertia about its axis. Give '{joint.child}' and "
                 f"'{joint.parent}' {box}, or make the joint fixed."
             )

@@ -1,7 +1,7 @@
-"""SRDF files: pairs of links whose contact does not count, as MoveIt writes them.
+"""SRDF files as MoveIt writes them: pairs of links whose contacts are ignored.
 
-The URDF text of a robot carries its pairs as the elements ``<disable_collisions>`` of SRDF, which
-other readers of URDF leave out: nodes and bags that get the text alone know them, too.
+The URDF text of a robot carries its pairs as SRDF elements ``<disable_collisions>``, which other
+URDF readers ignore. So nodes and bags need only the text.
 """
 
 from __future__ import annotations
@@ -20,8 +20,9 @@ from spacerobot_ros.resources import suggestion
 def with_srdf(robot: RobotDescription, path: str | Path) -> RobotDescription:
     """Return a robot with the disabled pairs of an SRDF file instead of its own.
 
-    Read are ``<disable_collisions link1="..." link2="..."/>``, ``<disable_default_collisions
-    link="..."/>`` and ``<enable_collisions link1="..." link2="..."/>``; the last one wins.
+    The elements ``<disable_collisions link1="..." link2="..."/>``,
+    ``<disable_default_collisions link="..."/>`` and
+    ``<enable_collisions link1="..." link2="..."/>`` are read; the last one takes precedence.
 
     Raises
     ------
@@ -44,7 +45,7 @@ def with_srdf(robot: RobotDescription, path: str | Path) -> RobotDescription:
 
 
 def disabled_pairs(root: Element, links: list[str], source: str) -> frozenset[frozenset[str]]:
-    """Return the pairs of links whose contact does not count, by the elements of SRDF.
+    """Return the pairs of links whose contacts are ignored, according to the elements of SRDF.
 
     Parameters
     ----------

@@ -1,7 +1,7 @@
 """Attitude with CasADi: the symbolic counterpart of :mod:`spacerobot_ros.model.rotations`.
 
-Quaternions are unit quaternions (x, y, z, w); one named ``R_WB`` or ``quaternion_WB`` turns vectors
-given in B into vectors given in W. Arguments are SX or MX alike.
+Quaternions are unit quaternions (x, y, z, w); one named ``R_WB`` or ``quaternion_WB`` maps vectors
+given in B to vectors given in W. Arguments may be SX or MX.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ def matrix_from_quaternion(quaternion: ca.SX) -> ca.SX:
 
 
 def quaternion_from_matrix(R: ca.SX) -> ca.SX:
-    """Return the unit quaternion (4,) of a rotation matrix (3, 3), as the numeric one does."""
+    """Return the unit quaternion (4,) of a rotation matrix (3, 3), like the numeric counterpart."""
     (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = (ca.horzsplit(row) for row in ca.vertsplit(R))
     trace = xx + yy + zz
     squares = [1 + 2 * xx - trace, 1 + 2 * yy - trace, 1 + 2 * zz - trace, 1 + trace]
@@ -58,7 +58,7 @@ def relative_vector(a: ca.SX, b: ca.SX) -> ca.SX:
 
 
 _HALF_TURN_ROUNDING = 1e-9
-"""Keeps the derivatives of half an angle finite at half a turn."""
+"""Keeps the derivatives of the half angle finite at a rotation by pi."""
 
 
 def half_angle_vector(R: ca.SX) -> ca.SX:
@@ -97,8 +97,8 @@ def quaternion_from_small_rotvec(rotvec: ca.SX) -> ca.SX:
 def rotation_error(quaternion: ca.SX, target: ca.SX) -> ca.SX:
     """Return the rotation vector (3,), rad, world components, from an attitude to its target.
 
-    It is the shortest: its length is at most pi, whichever of the two signs the quaternions have.
-    At half a turn, where both ways are as short, it takes one of them.
+    It is the shortest one: its length is at most pi for either sign of the quaternions. For a
+    rotation by pi, one of the two shortest vectors is returned.
     """
     inverse = ca.vertcat(-quaternion[:3], quaternion[3])
     error = quaternion_multiply(target, inverse)

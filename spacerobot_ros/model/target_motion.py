@@ -1,7 +1,7 @@
 """The motion of a free target, and of a frame that closes in on it, predicted over time.
 
-A target free of force and torque moves its centre of mass at constant velocity and keeps its
-angular momentum ``L_W`` about it, so that its attitude obeys Euler's equations,
+If no force or torque acts on a target, its centre of mass moves at constant velocity and its
+angular momentum ``L_W`` about it is constant, so that its attitude obeys Euler's equations,
 
     omega_T = I^-1 R_WT' L_W,    dR_WT/dt = R_WT hat(omega_T).
 
@@ -59,7 +59,7 @@ class FrameMotion:
     alpha: Array
 
     def between_samples(self, first: int, last: int, every: int = 1) -> FrameMotion:
-        """Return the motion at times from the first up to the last, which is not included."""
+        """Return the motion at times from the first up to, but not including, the last."""
         return self.rows(slice(first, last, every))
 
     def rows(self, chosen: slice | npt.NDArray[np.int64]) -> FrameMotion:
@@ -110,7 +110,7 @@ class RelativeMotionOverTime:
 
     @classmethod
     def stacked(cls, motions: Sequence[RelativeMotionOverTime]) -> RelativeMotionOverTime:
-        """Return motions one after the other."""
+        """Return the motions concatenated in time."""
         names = [each.name for each in fields(cls)]
         return cls(*(np.concatenate([getattr(each, name) for each in motions]) for name in names))
 
@@ -186,7 +186,7 @@ class RelativePath:
     start
         The motion at the beginning (K = 1).
     position
-        (3,) where it ends, m; the attitudes of E and G are then equal.
+        (3,) at the end, m; the attitudes of E and G are then equal.
     duration
         Time from beginning to end, s.
     """
@@ -246,7 +246,7 @@ def _evaluate_polynomials(coefficients: Array, t: Array) -> list[Array]:
 
 
 class TorqueFreeMotion:
-    """The motion of a free target from a measured state on.
+    """The motion of a free target, starting from a measured state.
 
     Parameters
     ----------
@@ -268,9 +268,7 @@ class TorqueFreeMotion:
         self._nodes = [quaternion_from_matrix(R)]
 
     def numbers(self, time: float) -> Array:
-        """Return all numbers of the motion from a time on, as :class:`TargetExpression` takes
-        them.
-        """
+        """Return all numbers of the motion from a time on, for :class:`TargetExpression`."""
         inertia, grapple = self._body.inertia, self._body.grapple
         at = self._quaternions(np.array([time]))[0]
         r = self._r + time * self._v
@@ -362,16 +360,16 @@ class TorqueFreeMotion:
 
 
 TARGET_SIZE = 28
-"""Numbers of a motion (:meth:`TorqueFreeMotion.numbers`)."""
+"""Length of the vector :meth:`TorqueFreeMotion.numbers`."""
 
 _EXPRESSION_STEPS = 4
-"""Steps of Runge-Kutta in an expression."""
+"""Number of Runge-Kutta steps in an expression."""
 
 
 class TargetExpression(NamedTuple):
     """A target at a time, in W: its grapple frame's attitude (3, 3), position, velocity and
-    angular velocity (3,); its mass; its centre of mass, that one's velocity, and the angular
-    momentum about it (3,).
+    angular velocity (3,); its mass; its centre of mass, the velocity of this centre, and the
+    angular momentum about it (3,).
     """
 
     R: ca.SX
@@ -385,7 +383,7 @@ class TargetExpression(NamedTuple):
 
     @classmethod
     def at(cls, numbers: ca.SX, time: ca.SX) -> TargetExpression:
-        """Return the target at a time near that of its numbers (:meth:`TorqueFreeMotion.numbers`),
+        """Return the target at a time near that of ``numbers`` (:meth:`TorqueFreeMotion.numbers`),
         by Euler's equations.
         """
         began, X, L, r, v, mass, about, arm, turn = ca.vertsplit(
@@ -427,15 +425,15 @@ def _rotate_vectors(R: Array, vectors: Array) -> Array:
 
 
 class PathInWorld:
-    """A path that is short in W, not relative to a frame G that turns: round the body of G.
+    """A path that is short in W; relative to the rotating frame G it leads around the body.
 
-    The position is a polynomial of fifth order in W, from a motion to that of a point that is fixed
-    in G; the attitude relative to G is that of another path.
+    The position is a polynomial of fifth order in W, from a motion to that of a point fixed in G;
+    the attitude relative to G is that of ``relative``.
 
     Parameters
     ----------
     relative
-        The path relative to G with the same ends.
+        The path relative to G with the same endpoints.
     target
         The target whose grapple frame G is.
     start
@@ -443,7 +441,7 @@ class PathInWorld:
     moving
         The motion in W at the beginning (K = 1).
     position
-        (3,) where the path ends, in G, m.
+        (3,) end of the path in G, m.
     """
 
     def __init__(

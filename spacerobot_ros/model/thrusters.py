@@ -1,6 +1,6 @@
-"""Thrusters as flight software: their table, allocation of a wrench, pulse modulation.
+"""Thrusters as flight software: table, wrench allocation, pulse modulation.
 
-A node of a real robot needs no plant for it::
+A node of a real robot can use it without a plant::
 
     table = find_thrusters("urdf", robot.description)
     modulator = ThrusterModulator(table, control_period=0.01)
@@ -45,12 +45,12 @@ _WRENCH_AXES = (
 _THRUSTER_KEYS = {"name", "link", "position", "rpy", "direction", "force", "min_on_time", "isp"}
 
 COST_WEIGHT = 1e-5
-"""Weight of the cost relative to the wrench. The cost takes some 1e-10 from the wrench, which is
-restored afterwards; a much smaller weight would be lost in the rounding of the solver."""
+"""Weight of the cost relative to the wrench. The cost changes the wrench by some 1e-10, which is
+restored afterwards; a much smaller weight would be lost in the rounding errors of the solver."""
 
 TIE_BREAK = 0.01
-"""Largest relative change of a cost. Thrusters placed symmetrically have many allocations
-of the same cost, among which rounding, which differs between machines, would choose."""
+"""Largest relative change of a cost. Symmetric thrusters have many allocations of equal cost, among
+which machine-dependent rounding errors would choose."""
 
 _ACHIEVED_TOLERANCE = 1e-9
 """Largest relative error of a wrench that counts as achieved."""
@@ -59,7 +59,7 @@ _WRENCH_WEIGHT = 1e4
 """Weight of the achieved part of a wrench beyond the thrust, relative to its cost."""
 
 _ROUNDING = 1e-9
-"""Shorter parts of a time count as zero."""
+"""Parts of a time below this share of it count as zero."""
 
 _MIN_UNMET_WRENCH = 1e-6
 """Smaller parts of a wrench are not counted as missing, N or N m."""
@@ -70,8 +70,9 @@ class ThrusterTable:
     """Thrusters on the base, m of them.
 
     ``r_B`` (m, 3) are the points of application from the origin of the base link, m;
-    ``direction_B`` (m, 3) the unit vectors of the forces on the base, against the plumes; ``force``
-    (m,) thrusts, N; ``min_on_time`` (m,) shortest pulses, s; ``isp`` (m,) specific impulses, s.
+    ``direction_B`` (m, 3) the unit vectors of the forces on the base, opposite to the plumes;
+    ``force`` (m,) thrusts, N; ``min_on_time`` (m,) shortest pulses, s; ``isp`` (m,) specific
+    impulses, s.
     """
 
     names: tuple[str, ...]
@@ -109,10 +110,10 @@ class ThrusterTable:
         return self.names.index(name)
 
     def missing(self, without: Sequence[str] = ()) -> str:
-        """Return the names of the wrenches that thrusters ``without`` some cannot produce; or "".
+        """Return the names of the wrenches that thrusters except ``without`` cannot produce; or "".
 
-        They produce every wrench if they produce both directions of the six axes with factors of
-        zero or more, because their wrenches form a convex cone.
+        They produce every wrench if they produce both directions of the six axes with nonnegative
+        factors, because their wrenches form a convex cone.
         """
         # Imported where it is used: scipy.optimize loads slowly.
         from scipy.optimize import linprog
@@ -238,7 +239,9 @@ def thruster_table(entries: Sequence[Mapping[str, Any]], robot: RobotDescription
         direction = _read_vector(entry, "direction", where, (1.0, 0.0, 0.0))
         length = float(np.linalg.norm(direction))
         if length < 1e-9:
-            raise ParameterError(f"The direction of {where} is zero; say which way it pushes.")
+            raise ParameterError(
+                f"The direction of {where} is zero; give the direction in which it pushes."
+            )
         numbers = [
             _read_number(entry, key, where, positive=key != "min_on_time")
             for key in ("force", "min_on_time", "isp")
@@ -308,11 +311,11 @@ class ThrusterAllocation:
 
     The levels solve ``wrenches @ levels = wanted`` with ``0 <= levels <= most``. They are found by
     non-negative least squares (Lawson and Hanson) with one more row for the cost: as its weight
-    goes to zero the solution goes to the cheapest of the exact ones. If a level would exceed its
+    tends to zero, the solution tends to the cheapest exact one. If a level would exceed its
     upper bound, a linear programme finds the largest achievable part of the wrench and its
-    cheapest allocation: the wrench keeps its direction as it does in
-    :class:`spacerobot_ros.control.ActuatorLimits`. For a wrench outside the cone of the thrusters
-    the nearest wrench in the cone is allocated, with torques weighted by the mean lever.
+    cheapest allocation: the wrench keeps its direction, as in
+    :class:`spacerobot_ros.control.ActuatorLimits`. If a wrench is outside the cone of the
+    thrusters, the nearest wrench in the cone is allocated, with torques weighted by the mean lever.
 
     Parameters
     ----------
@@ -339,7 +342,7 @@ class ThrusterAllocation:
         self._use(self._usable)
 
     def exclude(self, index: int) -> None:
-        """Never use a thruster from now on."""
+        """Exclude a thruster from now on."""
         self._use(self._usable[self._usable != index])
 
     def _use(self, usable: npt.NDArray[np.int64]) -> None:
@@ -388,16 +391,17 @@ class ThrusterAllocation:
 
 
 class ThrusterModulator:
-    """Turns a wanted wrench into on-times of thrusters, one control period after the other.
+    """Converts a wanted wrench into on-times of thrusters, control period by control period.
 
-    Sigma-delta modulation with shortest pulses. ``pending_impulse`` grows by the wanted wrench
-    times the period and shrinks by the impulses of the pulses fired. It is allocated again in every
-    period, so that opposite contributions cancel. The pending impulse is therefore at most one
-    shortest pulse of each thruster: with ``t`` that time and ``h`` the period, ``allocation <= t +
-    h - (remaining part of a shortest pulse)`` holds in every period if the wanted wrench is within
-    the thrust. A wrench beyond the thrust is dropped, not compensated for later.
+    The modulation is sigma-delta with shortest pulses. ``pending_impulse`` grows by the wanted
+    wrench times the period and shrinks by the impulses of the pulses fired. It is allocated again
+    in every period, so that opposite contributions cancel. The pending impulse is therefore at most
+    one shortest pulse of each thruster: for ``t`` the shortest on-time and ``h`` the period,
+    ``allocation <= t + h - (remaining part of a shortest pulse)`` holds in every period if the
+    wanted wrench is within the thrust. A wrench beyond the thrust is dropped, not compensated for
+    later.
 
-    Within a period a valve opens and closes at any time; a pulse begins with a period.
+    A pulse begins at the start of a period and may end at any time within a period.
 
     Parameters
     ----------
@@ -434,9 +438,9 @@ class ThrusterModulator:
         self.unmet = np.zeros(6)
         """Part of the last wanted wrench that the thrusters could not produce, N, N m."""
         self.unmet_periods = 0
-        """Number of periods in which they could not produce a part of the wrench."""
+        """Number of periods in which the thrusters could not produce the whole wrench."""
         self.begun = np.zeros(count, dtype=np.bool_)
-        """Whether a pulse of each thruster (m,) began with the last period."""
+        """Whether a pulse of each thruster (m,) began in the last period."""
         self.pulses = np.zeros(count, dtype=np.int64)
         """Number of pulses of each thruster (m,) so far."""
         self.on_time = np.zeros(count)

@@ -56,7 +56,7 @@ _MAX_NUMBER = 1e12
 _MAX_LINKS = 200
 
 _XACRO_CPU_TIME = 10
-"""Limit of processor time for the expansion of a xacro file, s; six times as much wall time."""
+"""Limit of processor time for expanding a xacro file, s; that of wall time is six times as long."""
 
 XACRO_ARGUMENTS_VARIABLE = "SPACEROBOT_XACRO_ARGS"
 """Environment variable with arguments of xacro files, ``NAME:=VALUE``, separated as in a shell."""
@@ -65,9 +65,9 @@ XACRO_ARGUMENTS_VARIABLE = "SPACEROBOT_XACRO_ARGS"
 def load_robot(path: str | Path) -> RobotDescription:
     """Read the robot of a URDF file, or of a xacro file (by its suffix), which is expanded.
 
-    Paths of meshes that are relative to the file, or in a package that is not installed and is a
-    folder around the file, become absolute in the text that the robot keeps. If an SRDF of the
-    same name is beside it, its disabled pairs of links do not count as contacts.
+    Mesh paths that are relative to the file, or in a package that is not installed and contains the
+    file, become absolute in the text of the robot. If an SRDF of the same name is in the folder,
+    contacts of its disabled pairs of links are ignored.
 
     Raises
     ------
@@ -88,7 +88,7 @@ def load_robot(path: str | Path) -> RobotDescription:
 def load_world(path: str | Path) -> RobotDescription:
     """Read obstacles that are fixed in the world from a URDF or xacro file.
 
-    The frame of the root link is that of the world, W. No link needs a mass.
+    The frame of the root link is that of the world, W. Links need no mass.
 
     Raises
     ------
@@ -107,13 +107,13 @@ def require_found_meshes(world: RobotDescription) -> None:
     Raises
     ------
     RobotDescriptionError
-        One is not; the message names it.
+        A mesh is not found; the message names it.
     """
     for link in world.links:
         for shape in link.collisions or link.shapes:
             if shape.kind == "mesh" and mesh_file(shape.resource) is None:
                 raise RobotDescriptionError(
-                    f"Obstacle '{link.name}' cannot be kept clear of: its mesh '{shape.resource}' "
+                    f"Obstacle '{link.name}' cannot be avoided: its mesh '{shape.resource}' "
                     "was not found. Give a path beside the URDF, or source the workspace of its "
                     "package."
                 )
@@ -215,7 +215,7 @@ def parse_robot(text: str) -> RobotDescription:
 
 
 def with_held_joints(robot: RobotDescription, positions: Array | None = None) -> RobotDescription:
-    """Return a robot whose joints are held: one rigid body, in its URDF text as well.
+    """Return a robot with locked joints: one rigid body, also in its URDF text.
 
     Parameters
     ----------
@@ -405,10 +405,10 @@ def describe_inertia_flaw(about: Array) -> str:
 
 
 def nearest_inertias(path: Path) -> tuple[str, dict[str, float]]:
-    """Return the URDF text of a file in which every link has an inertia that a body can have.
+    """Return the URDF text of a file with a physically possible inertia for every link.
 
-    An impossible one becomes the nearest possible one by the Frobenius norm. Also returned is by
-    which part of its norm the inertia of each such link has changed.
+    An impossible inertia is replaced by the nearest possible one in the Frobenius norm. Also
+    returned is the relative change of the inertia of each such link in that norm.
 
     Raises
     ------
@@ -556,7 +556,7 @@ def _with_leaders(joints: list[Joint]) -> list[Joint]:
                 )
             if follows.joint in passed:
                 raise RobotDescriptionError(
-                    f"The joint '{joint.name}' mimics itself, by way of {', '.join(passed[1:])}."
+                    f"The joint '{joint.name}' mimics itself, through {', '.join(passed[1:])}."
                     if passed[1:]
                     else f"The joint '{joint.name}' mimics itself."
                 )
@@ -586,7 +586,7 @@ def _require_common_range(robot: RobotDescription) -> None:
 
 
 _NO_LIMIT = 1e4
-"""Position, m or rad, from which on a limit of a joint stands for none."""
+"""Position, m or rad, from which on a joint limit means that there is none."""
 
 
 def _read_limits(limit: Element | None, kind: JointKind, where: str) -> JointLimits:
@@ -662,7 +662,7 @@ _ELEMENTS_READ = {
 """Tags of the elements to read, by the tag of their parent; other elements are ignored."""
 
 _EXACT_ELEMENTS = ("origin", "mimic")
-"""Elements of optional attributes: another one is a slip, and would leave another robot."""
+"""Elements with optional attributes: an unknown attribute is a slip and would change the robot."""
 
 _GEOMETRIES = ("box", "cylinder", "sphere", "capsule", "mesh")
 _ACCEPTED_GEOMETRIES = [[name] for name in _GEOMETRIES]
@@ -724,7 +724,7 @@ _REQUIRED_ELEMENTS = {
 }
 
 _LIMITS_NOT_READ = ("acceleration", "deceleration", "jerk")
-"""Limits of URDF 1.2 that nothing here keeps."""
+"""Limits of URDF 1.2 that are not enforced."""
 
 _JOINT_TYPES = tuple(kind.value for kind in JointKind)
 
@@ -766,7 +766,7 @@ def _checked_root(text: str) -> Element:
     if ignored:
         warn_once(
             f"The limits of {' and '.join(sorted(ignored))} in the URDF of "
-            f"'{root.get('name', '')}' are ignored: motions keep those of position, velocity and "
+            f"'{root.get('name', '')}' are ignored; enforced are those of position, velocity and "
             "effort."
         )
     if not root.get("name"):
@@ -810,7 +810,7 @@ def _require_type(joint: Element, where: str) -> None:
         raise RobotDescriptionError(
             f"The type of {where} is '{kind}'; a free-floating tree has "
             f"{', '.join(_JOINT_TYPES[:-1])} and {_JOINT_TYPES[-1]} joints. The base floats by "
-            "itself: leave out a joint that connects it with a world, and the link of that world."
+            "itself: remove a joint that connects it to a world, and the link of that world."
         )
 
 
@@ -834,7 +834,7 @@ def _require_element(element: Element, where: str) -> None:
     known = [attribute.name for attribute in attributes]
     unknown = set(element.keys()).difference(known)
     if unknown and element.tag in _EXACT_ELEMENTS:
-        flaw = f"the <{element.tag}> of {where} has '{min(unknown)}', no attribute of it"
+        flaw = f"the <{element.tag}> of {where} has the unknown attribute '{min(unknown)}'"
         raise _MalformedError(flaw, f"one of {', '.join(known)}")
     for child_element in element:
         _require_element(child_element, where)
@@ -852,7 +852,7 @@ def _require_geometry(geometry: Element, where: str) -> None:
 def _require_attribute(element: Element, attribute: _Attribute, where: str) -> None:
     given = element.get(attribute.name)
     count = attribute.count
-    numbers = {0: "", 1: "a number, "}.get(count, f"{count} numbers with blanks between them, ")
+    numbers = {0: "", 1: "a number, "}.get(count, f"{count} numbers separated by blanks, ")
     remedy = f'<{element.tag} {attribute.name}="..."/>: {numbers}{attribute.meaning}'
     owner = f"the <{element.tag}> of {where}"
     if given is None:

@@ -49,7 +49,7 @@ _BOX_FACES = (
 
 @dataclass(frozen=True)
 class Edges:
-    """Lines (K, 2, 3), and the normals of the two faces beside each (K, 2, 3)."""
+    """Lines (K, 2, 3), and the normals of the two faces adjacent to each (K, 2, 3)."""
 
     lines: Array
     normals: Array
@@ -90,7 +90,7 @@ class Visual:
 
     @property
     def outline(self) -> Array:
-        """Outline of the visual, lines (K, 2, 3) in the link's frame that hide no other part."""
+        """Outline of the visual in the link's frame, lines (K, 2, 3), which hide no other part."""
         shape = self.shape
         if self.is_rod:
             longest = int(np.argmax(shape.size))
@@ -193,7 +193,7 @@ def _surface_of_revolution(radii: list[float], heights: Array) -> TriangleMesh:
 
 
 def sharp_edges(mesh: TriangleMesh) -> Edges:
-    """Return the edges of a mesh at which its surface turns by more than 30 degrees, or ends."""
+    """Return the edges of a mesh at which its surface bends by more than 30 degrees, or ends."""
     a, b, c = np.moveaxis(mesh.vertices[mesh.faces], 1, 0)
     normals = np.cross(b - a, c - a)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
@@ -248,7 +248,7 @@ def meshes_from_attachments(
 ) -> dict[str, TriangleMesh]:
     """Return the meshes of a robot that are among the attachments of a bag, by their URIs.
 
-    No file is read: a stranger's bag may name any file of this machine.
+    No file is read, because an untrusted bag may name any file of this machine.
     """
     found = {}
     for resource in _mesh_uris(robot):
@@ -266,7 +266,7 @@ class MeshFolder:
     Parameters
     ----------
     attachments
-        Attachments of the bag, as of :func:`meshes_for_bag`.
+        Attachments of the bag, as returned by :func:`meshes_for_bag`.
 
     Raises
     ------
@@ -280,7 +280,7 @@ class MeshFolder:
         self._files: dict[str, Path | None] = {}
 
     def urdf_with_mesh_files(self, urdf: str) -> str:
-        """Return the URDF text with meshes that only the bag has as files of this folder.
+        """Return the URDF text in which meshes that only the bag has are files of this folder.
 
         Other meshes keep their names.
         """

@@ -1,4 +1,4 @@
-"""Reaction wheels: bodies of revolution on the base that turn about their axes.
+"""Reaction wheels: bodies of revolution on the base that spin about their axes.
 
 A wheel is the child of a continuous joint with the element ``<wheel/>``, whose ``<limit>`` has its
 largest rate and torque. Since it is a body of revolution, its angle changes nothing; only its spin
@@ -10,8 +10,8 @@ inertial space, base and arm obey the equations of a robot without wheels (a gyr
     hdot = tau_w,                                                                              (2)
 
 where M has the wheels' masses but not their moments J about their axes (Hughes, Spacecraft Attitude
-Dynamics, chapter 3). So a law for base and arm serves a robot with wheels as it is: the wheels
-realise a part of its base torque.
+Dynamics, chapter 3). So a law for base and arm also works for a robot with wheels, which realise a
+part of its base torque.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from spacerobot_ros.model.description import Array, Body, JointKind, RobotDescri
 _MAX_OFFSET = 1e-4  # m, of the centre of mass from the axis
 
 _MOMENTUM_ROUNDING, _LEAST_MOMENTUM = 1e-9, 1e-12
-"""Angular momentum that wheels may leave to the base, relative to all of it, and kg m^2/s."""
+"""Largest angular momentum left to the base by the wheels, relative and in kg m^2/s."""
 
 _REST_SHARE = 1e-9
 
@@ -89,7 +89,7 @@ class ReactionWheels:
         return len(self.names)
 
     def are_spinning(self, qdot: Array) -> bool:
-        """Return whether any wheel turns in the base, at joint velocities (n,), rad/s."""
+        """Return whether any wheel spins relative to the base at joint velocities (n,), rad/s."""
         return bool(np.any(np.abs(qdot[self.index]) > _REST_SHARE * self.rate))
 
     def spins(self, omega_WB_B: Array, rates: Array) -> Array:
@@ -99,22 +99,23 @@ class ReactionWheels:
     def rates_for(
         self, L_B: Array, near: Array | None = None, largest: Array | None = None
     ) -> Array:
-        """Return rates (k,), rad/s, at which the wheels hold all of an angular momentum while base
-        and arm rest: of redundant wheels the nearest ones, or the smallest ones within the limits.
+        """Return rates (k,), rad/s, at which the wheels store an angular momentum while base and
+        arm rest. For redundant wheels they are nearest to ``near``, or the smallest ones within the
+        limits.
 
         Parameters
         ----------
         L_B
             (3,) in the base, kg m^2/s.
         near
-            (k,) rates that redundant wheels stay near to, rad/s; None: zero.
+            (k,) preferred rates of redundant wheels, rad/s; None: zero.
         largest
             (k,) largest rates, rad/s; None: those of the wheels.
 
         Raises
         ------
         UnreachableError
-            No rates within the limits do; the message is a clause that says why.
+            No rates within the limits suffice; the message is a clause that says why.
         """
         rate = self.rate if largest is None else largest
         near = np.zeros(len(self)) if near is None else near
@@ -124,7 +125,7 @@ class ReactionWheels:
         left = float(np.linalg.norm(stored @ nearest - L_B))
         if left > _MOMENTUM_ROUNDING * float(np.linalg.norm(L_B)) + _LEAST_MOMENTUM:
             raise UnreachableError(
-                f"their axes leave out a direction in which it has {left:.3g} kg m^2/s",
+                f"their axes do not span a direction in which it has {left:.3g} kg m^2/s",
                 Proof.MOMENTUM,
             )
         if np.all(np.abs(nearest) <= rate):
@@ -145,7 +146,7 @@ class ReactionWheels:
         )
         if found.fun > 1:
             raise UnreachableError(
-                f"it is {found.fun:.4g} times the largest that they hold in its direction",
+                f"it is {found.fun:.4g} times the largest that they can store in its direction",
                 Proof.MOMENTUM,
             )
         shares = found.x[:k]
@@ -169,12 +170,12 @@ class ReactionWheels:
 
 
 def require_reaction_wheels(robot: RobotDescription) -> None:
-    """Refuse wheels that are not bodies of revolution on the base with limits.
+    """Check that wheels are bodies of revolution on the base with limits.
 
     Raises
     ------
     RobotDescriptionError
-        One is not; the message names its joint.
+        A wheel is not; the message names its joint.
     """
     followed = {joint.mimic.joint for joint in robot.moving_joints if joint.mimic is not None}
     parents = {body.parent for body in robot.bodies}
@@ -186,14 +187,14 @@ def require_reaction_wheels(robot: RobotDescription) -> None:
         if joint.kind is not JointKind.CONTINUOUS:
             flaw = f'is {joint.kind.value}: give it type="continuous"'
         elif joint.mimic is not None or joint.name in followed:
-            flaw = "is coupled to another joint by <mimic>: a wheel turns by itself"
+            flaw = "is coupled to another joint by <mimic>: a wheel spins independently"
         elif body.parent != 0:
             flaw = (
                 f"is on link '{robot.bodies[body.parent].name}', which joints move: a reaction "
-                "wheel is on the base; leave <wheel> out, and it is a joint like others"
+                "wheel is on the base; without <wheel> it is an ordinary joint"
             )
         elif number in parents:
-            flaw = "carries a joint: nothing moves on a reaction wheel"
+            flaw = "carries a joint: a reaction wheel cannot carry joints"
         elif not (0 < joint.limits.velocity < np.inf and 0 < joint.limits.effort < np.inf):
             flaw = (
                 "has no limits of rate and torque: give it "
@@ -212,7 +213,7 @@ def _imbalance_clause(body: Body) -> str:
     offset = float(np.linalg.norm(np.cross(axis, inertia.com)))
     if offset > _MAX_OFFSET:
         return (
-            f"is not balanced: its centre of mass is {offset:.3g} m beside its axis; "
+            f"is not balanced: its centre of mass is {offset:.3g} m off its axis; "
             "move the origin of its <inertial>"
         )
     spin = _spin_inertia(body)
@@ -221,7 +222,7 @@ def _imbalance_clause(body: Body) -> str:
     if np.abs(inertia.about_com - symmetric).max() > _MAX_ASYMMETRY * max(spin, across):
         return (
             "is not balanced: its inertia is not that of a body of revolution about its axis; "
-            "give it equal moments across the axis, and no products"
+            "give it equal moments across the axis, and no products of inertia"
         )
     return ""
 

@@ -1,8 +1,8 @@
 """Obstacles that are fixed in the world.
 
 The URDF text of a robot carries the obstacles around it as an element ``<world>`` with the URDF of
-the obstacles inside, which other readers of URDF leave out: nodes and bags that get the text of the
-robot alone know them, too.
+the obstacles inside, which other URDF readers ignore. So nodes and bags need only the text of the
+robot.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ from spacerobot_ros.model.urdf import parse_world, require_found_meshes
 
 
 def with_world(robot: RobotDescription, world: RobotDescription | None) -> RobotDescription:
-    """Return a robot among obstacles (:func:`.load_world`), instead of its present ones.
+    """Return a robot with the obstacles of a world (:func:`.load_world`) instead of its own.
 
-    Without a world there are none around it.
+    If the world is None, there are no obstacles.
     """
     root = editable_root(robot.urdf)
     carried = root.findall("world")
@@ -39,15 +39,15 @@ def obstacles_from_topic(text: str) -> RobotDescription | None:
     Raises
     ------
     RobotDescriptionError
-        It has obstacles of its own around it or a mesh that is not found, or :func:`.parse_world`
-        refuses it.
+        It has an element ``<world>`` or a mesh that is not found, or :func:`.parse_world` refuses
+        it.
     """
     if not text.strip():
         return None
     world = parse_world(text)
     if world.world is not None:
         raise RobotDescriptionError(
-            "Obstacles have no obstacles of their own: leave the element <world> out of their URDF."
+            "Obstacles cannot have obstacles of their own: remove <world> from their URDF."
         )
     require_found_meshes(world)
     return world

@@ -1,6 +1,6 @@
 """Expands one xacro file, as a program: ``python xacro_files.py FILE SECONDS [NAME:=VALUE ...]``.
 
-The limits of time and memory stand against mistakes, such as a macro that calls itself. They do not
+The limits of time and memory guard against mistakes, such as a macro that calls itself. They do not
 confine the file: expressions of xacro are Python, so only files that the user names ``.xacro`` are
 expanded.
 

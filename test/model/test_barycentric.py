@@ -274,7 +274,9 @@ def test_without_an_orbit_bodies_go_straight() -> None:
 def test_a_bad_mean_motion_is_refused(n: float) -> None:
     with pytest.raises(ParameterError) as refused:
         relative_motion(n, R0, V0, 1.0)
-    assert str(refused.value) == f"The mean motion is {n:g} rad/s; it must be finite and from 0."
+    assert (
+        str(refused.value) == f"The mean motion is {n:g} rad/s; it must be finite and at least 0."
+    )
 
 
 @pytest.mark.parametrize("bad", [(R0 * np.nan, V0, 1.0), (R0, V0 * np.inf, 1.0), (R0, V0, np.nan)])

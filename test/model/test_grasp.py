@@ -220,7 +220,7 @@ def test_a_payload_survives_as_a_text() -> None:
     ],
 )
 def test_a_text_that_is_no_payload_is_refused(text: str) -> None:
-    with pytest.raises(RobotDescriptionError, match=r"^The text describes no held body: "):
+    with pytest.raises(RobotDescriptionError, match=r"^The text does not describe a held body: "):
         Payload.from_text(text)
 
 

@@ -215,7 +215,7 @@ def test_an_attitude_by_a_quaternion_is_that_of_pinocchio() -> None:
     np.testing.assert_allclose(found.origin.R, turned.as_matrix(), atol=1e-12)
     with pytest.raises(RobotDescriptionError, match="has 'rpy' and 'quat_xyzw'"):
         parse_robot(robot(HULL, ARM, elbow.replace("quat_xyzw", 'rpy="0 0 1" quat_xyzw')))
-    with pytest.raises(RobotDescriptionError, match="has 'rpw', no attribute of it"):
+    with pytest.raises(RobotDescriptionError, match="has the unknown attribute 'rpw'"):
         parse_robot(robot(HULL, ARM, elbow.replace("quat_xyzw", "rpw")))
 
 
@@ -416,7 +416,7 @@ def test_a_text_is_obstacles_and_an_empty_one_is_none() -> None:
         ("<robot", "is not XML"),
         (
             BALL_AND_POST.replace("</robot>", f"<world>{BALL_AND_POST}</world></robot>"),
-            "^Obstacles have no obstacles of their own: leave the element <world> out",
+            "^Obstacles cannot have obstacles of their own: remove <world>",
         ),
         (BALL_AND_POST.replace("0.3", "${radius}"), "radius"),
     ],
@@ -502,7 +502,7 @@ def test_attributes_have_their_count_of_numbers(
             parse_robot(text)
         return str(refused.value)
 
-    numbers = {0: "", 1: "a number, "}.get(count, f"{count} numbers with blanks between them, ")
+    numbers = {0: "", 1: "a number, "}.get(count, f"{count} numbers separated by blanks, ")
     remedy = f'; write <{tag} {name}="..."/>: {numbers}{meaning}.'
     if needed:
         missing = refusal("")

@@ -114,15 +114,15 @@ PLACE = '<origin xyz="0 0 0.1"/>'
         (
             wheel("bad", PLACE, parent="elbow_body"),
             "The wheel 'bad' is on link 'elbow_body', which joints move: a reaction wheel is on "
-            "the base; leave <wheel> out, and it is a joint like others.",
+            "the base; without <wheel> it is an ordinary joint.",
         ),
         (
             wheel("bad", PLACE, f'{LIMIT}<wheel/><mimic joint="elbow"/>'),
-            "The wheel 'bad' is coupled to another joint by <mimic>: a wheel turns by itself.",
+            "The wheel 'bad' is coupled to another joint by <mimic>: a wheel spins independently.",
         ),
         (
             wheel("bad", PLACE, com="0.001 0 0"),
-            "The wheel 'bad' is not balanced: its centre of mass is 0.001 m beside its axis; "
+            "The wheel 'bad' is not balanced: its centre of mass is 0.001 m off its axis; "
             "move the origin of its <inertial>.",
         ),
         (
@@ -135,7 +135,7 @@ PLACE = '<origin xyz="0 0 0.1"/>'
         ),
         (
             wheel("bad", PLACE) + wheel("next", PLACE, LIMIT, parent="bad_body"),
-            "The wheel 'bad' carries a joint: nothing moves on a reaction wheel.",
+            "The wheel 'bad' carries a joint: a reaction wheel cannot carry joints.",
         ),
         (
             wheel("bad", PLACE) + wheel("next", PLACE, f'{LIMIT}<mimic joint="bad"/>'),

@@ -152,7 +152,7 @@ def test_redundant_wheels_keep_the_motion_that_has_no_momentum() -> None:
 def test_a_direction_that_wheels_leave_out_is_refused() -> None:
     wheels = wheels_of(TWO)
     across = np.cross(*(wheels.axes_B.T))
-    with pytest.raises(UnreachableError, match="leave out a direction") as refusal:
+    with pytest.raises(UnreachableError, match="do not span a direction") as refusal:
         wheels.rates_for(0.1 * across)
     assert refusal.value.proof is Proof.MOMENTUM
 

@@ -443,7 +443,7 @@ LEADING_JOINT = """<link name="slide"><inertial><mass value="1"/><inertia ixx="1
     [
         (
             {"target.grapple_frame": "handle"},
-            "The target 'block' has no link 'handle' to be grasped at; it has block, grapple: set "
+            "The target 'block' has no link 'handle' to grasp; it has block, grapple: set "
             "parameter 'target.grapple_frame', or add the link.",
         ),
         (
