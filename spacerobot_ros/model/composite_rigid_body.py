@@ -1,10 +1,10 @@
 """Fast forward dynamics by composite rigid bodies, with the base eliminated analytically.
 
-``z0ddot`` of paper 4, eq. (19), takes 44 to 84 % of the operations that its barycentric vectors
-take, depending on the robot. Spatial vectors as in Featherstone, Rigid Body Dynamics
-Algorithms (2008), angular part first: motions ``[omega; v]`` and forces ``[n; f]``. All are in base
-components at one common point, the system's centre of mass, so that no body needs a transform and
-the inertia of the whole system is ``diag(D, M 1)``.
+``z0ddot`` of paper 4, eq. (19), with 44 to 84 % of the operations of its barycentric vectors,
+depending on the robot. Spatial vectors as in Featherstone, Rigid Body Dynamics Algorithms (2008),
+angular part first: motions ``[omega; v]`` and forces ``[n; f]``. All are in base components at one
+common point, the system's centre of mass, so that no body needs a transform and the inertia of the
+whole system is ``diag(D, M 1)``.
 
 Because that inertia is block-diagonal, the base can be eliminated joint by joint. A unit rate of
 joint j gives its composite (all bodies that it carries) the momentum ``P_j = I^c_j S_j``; to cancel
@@ -15,7 +15,7 @@ of the bodies outboard of joint j if the base is free, and
   without the ``S_i`` term if neither carries the other);
 * ``omega = D^-1 L - sum_j B_j qdot_j`` (angular parts): the base's rate at angular momentum L;
 * ``K qddot = Q``, ``Q_j = tau_j - S_j' f_j + B_j' (f_0 - f_external)``, where ``f_j`` is the force
-  that the motion alone, at ``qddot = 0``, demands of composite j.
+  on composite j that the motion alone requires, at ``qddot = 0``.
 
 For chains of up to about eight joints this takes fewer operations than the articulated-body
 algorithm, whose cost grows only linearly.

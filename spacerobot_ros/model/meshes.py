@@ -174,8 +174,8 @@ def shape_mesh(shape: Shape, most: int = _MAX_TRIANGLES) -> TriangleMesh:
     path = mesh_file(shape.resource)
     if path is None:
         raise MeshError(
-            f"The mesh '{shape.resource}' was not found: give a path beside the URDF, or source "
-            "the workspace of its package."
+            f"The mesh '{shape.resource}' was not found: give a path relative to the URDF, or "
+            "source the workspace of its package."
         )
     return read_mesh(path).coarsened(most).moved(shape.pose, shape.size)
 

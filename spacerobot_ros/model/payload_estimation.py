@@ -61,7 +61,7 @@ _MAX_NOISE_DISTANCE = 1.0
 
 @dataclass(frozen=True)
 class PayloadEstimate:
-    """Estimated parameters of a body that a link holds, in the frame of the link.
+    """Estimated parameters of a body held by a link, in the frame of the link.
 
     Attributes
     ----------

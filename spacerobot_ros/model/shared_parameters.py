@@ -150,8 +150,8 @@ class CommanderConfig(WatchdogConfig, AssumedRobotConfig):
     )
     diagnostics_period: float = nonnegative(
         1.0,
-        "simulated time between diagnostics; 0: ignored states only. Except in a run in one "
-        "process also once a second of wall time",
+        "simulated time between diagnostics; 0: ignored states only. Also published "
+        "once a second of wall time, except in a run in one process",
         "s",
     )
     position_tolerance: float = nonnegative(

@@ -209,7 +209,7 @@ def thruster_table(entries: Sequence[Mapping[str, Any]], robot: RobotDescription
     """Check thrusters and express them in the base link.
 
     Each has ``name``, ``position`` (m) in the frame of ``link`` (default: the base link),
-    ``direction`` of its force (default: x, like the axis of a joint) in that frame turned by
+    ``direction`` of its force (default: x, like the axis of a joint) in that frame rotated by
     ``rpy`` (rad), ``force`` (N), ``isp`` (s) and ``min_on_time`` (s, default: 0).
 
     Raises
@@ -260,8 +260,8 @@ def _pose_of_link(link: str, robot: RobotDescription, where: str) -> Pose:
     body, pose = robot.frames[link]
     if body:
         raise ParameterError(
-            f"The {where} is on link '{link}', which joints move; thrusters are fixed to the base "
-            f"'{robot.base_link}'."
+            f"The {where} is on link '{link}', which joints move; thrusters must be fixed to "
+            f"the base '{robot.base_link}'."
         )
     return pose
 
@@ -469,7 +469,7 @@ class ThrusterModulator:
         self._excluded.append(name)
 
     def reset(self) -> None:
-        """Close all thrusters and drop the pending impulse; the counts continue."""
+        """Close all thrusters and drop the pending impulse; counters are kept."""
         self.pending_impulse = np.zeros(6)
         """Impulse (6,) that was wanted and has not been fired yet, N s, N m s."""
         self._remaining[:] = 0.0

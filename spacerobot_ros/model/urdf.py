@@ -114,8 +114,8 @@ def require_found_meshes(world: RobotDescription) -> None:
             if shape.kind == "mesh" and mesh_file(shape.resource) is None:
                 raise RobotDescriptionError(
                     f"Obstacle '{link.name}' cannot be avoided: its mesh '{shape.resource}' "
-                    "was not found. Give a path beside the URDF, or source the workspace of its "
-                    "package."
+                    "was not found. Give a path relative to the URDF, or source the workspace of "
+                    "its package."
                 )
 
 
@@ -152,7 +152,7 @@ def _expand_xacro(path: Path) -> str:
     if find_spec("xacro") is None:
         raise RobotDescriptionError(
             f"{path} is a xacro file, and the package xacro is not installed: `pip install xacro`, "
-            f"or expand it where it is: {by_hand}."
+            f"or expand it where xacro is installed: {by_hand}."
         )
     arguments = shlex.split(os.environ.get(XACRO_ARGUMENTS_VARIABLE, ""))
     for each in arguments:

@@ -110,7 +110,7 @@ def visuals_of(
 ) -> tuple[Visual, ...]:
     """Return all visuals of a robot that can be drawn.
 
-    If there are none, a ball stands for each link and a bar for each offset of a joint.
+    If there are none, links are drawn as balls and offsets of joints as bars.
 
     Parameters
     ----------

@@ -20,7 +20,7 @@ _MAX_MEMORY = 2**30
 
 
 def package_around(name: str, folder: Path) -> Path | None:
-    """Return the folder of the package that has a file in ``folder``, or of one beside it.
+    """Return the folder of the package around ``folder``, or of a package next to it, by its name.
 
     The name of a package is that in its ``package.xml``, or else that of its folder. None: no such
     package.

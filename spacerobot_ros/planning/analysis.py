@@ -1,4 +1,4 @@
-"""Abilities of a robot: turns of its base by joint motions, and the methods that suit it."""
+"""Capabilities of a robot: rotations of its base by joint motions, and suitable gait methods."""
 
 from __future__ import annotations
 
@@ -48,22 +48,23 @@ class Analysis:
     robot
         The model.
     shape
-        (n,) the examined shape: the given one, the best nominal one, or the middle.
+        (n,) the examined configuration: the given one, the best nominal one, or the middle one.
     nominal
-        The three joints and their M there; None with fewer than three joints, or where loops turn
-        the base about fewer than three axes everywhere.
+        The three joints and their M in this configuration; None with fewer than three joints, or if
+        no loops rotate the base about three axes.
     at_shape, anywhere
-        The span of first-order brackets at ``shape``, and at the best of many shapes.
+        The span of first-order brackets at ``shape``, and at the best of many configurations.
     conditions
-        (300,) condition numbers of the best three brackets, shapes all over the shape space.
+        (300,) condition numbers of the best three brackets, in configurations all over the shape
+        space.
     planar, sliding
         The tests of papers 3 and 1.
     objections
         Reason why a method does not suit the robot, by name of the method; None if it does.
     geometry
-        The solids of the robot, and the pairs of them whose distance counts.
+        The solids of the robot, and the pairs whose distances are checked.
     end_effector
-        The link whose workspaces are computed; "" if none is named, and none is called so.
+        The link whose workspaces are computed; "" if none is given and the default does not exist.
     """
 
     robot: SpaceRobot
@@ -90,7 +91,7 @@ class Analysis:
 
     @property
     def chosen(self) -> str:
-        """The method that ``auto`` mostly chooses: ``optimal`` if it suits; "" if none does."""
+        """The method that ``auto`` usually chooses: ``optimal`` if it suits; "" if none does."""
         suits = [
             name
             for name, objection in self.objections.items()
@@ -104,12 +105,12 @@ def analyze(
 ) -> Analysis:
     """Return the analysis of a robot at a shape (n,), or at the best shape for loops.
 
-    ``end_effector`` is the link whose workspaces are asked for, if not ``end_effector``.
+    ``end_effector`` names the link whose workspaces are computed; "": the default one.
 
     Raises
     ------
     ParameterError
-        The shape is none of this robot, or the link.
+        The shape or the link is not one of this robot.
     """
     link = robot.description.end_effector(end_effector)
     if link:

@@ -24,7 +24,7 @@ from spacerobot_ros.planning.methods.registry import build_method, method_option
 from spacerobot_ros.resources import robot_file
 
 EndEffectorValues = npt.ArrayLike | Mapping[str, npt.ArrayLike]
-"""Numbers of the goal of one end-effector, or of several, by the names of their links."""
+"""Values of the goal of one end-effector, or of several by the names of their links."""
 
 _DEFAULT_TOLERANCE = Tolerance(1e-6, 1e-6, 1e-6)
 
@@ -74,13 +74,13 @@ def plan(
         near to zero as the joint limits allow.
     linear_momentum, angular_momentum
         (3,) each in W, kg m/s and kg m^2/s, the second about the centre of mass; None: those of the
-        start. ``optimal`` plans for robots that drift.
+        start. Only ``optimal`` plans for robots that drift.
     method
         Name of a gait method; ``options`` are its own. None: ``resolved_rate`` for a goal with a
         path, and else ``optimal``.
     control_period, tolerance, integration_step
         Duration of a command (s), largest error at the goal, and longest step of the prediction
-        (s): the plant's, for a flight that ends where the plan does.
+        (s). Use the plant's values for a flight that ends where the plan does.
     clearance
         Smallest distance of links during the motion, m; 0 disables collision checks. With
         obstacles, 0 means 0.01 m.
@@ -93,7 +93,7 @@ def plan(
     PlanningError
         The goal is refused or cannot be reached; the message says why.
     ParameterError
-        There is no such robot, method or option, or one of them or a momentum is refused.
+        The robot, the method or an option does not exist or is refused, or a momentum is refused.
     RobotDescriptionError
         The robot or the world is refused.
     """
@@ -164,7 +164,7 @@ def end_effector_goals(
     Raises
     ------
     GoalError
-        One is not a position or a pose, or a link has two goals, or one is named twice.
+        A goal is not a position or a pose, a link has two goals, or the link is given twice.
     """
     goals = []
     for values, count in ((position, 3), (pose, 7), (path, None)):
@@ -173,7 +173,7 @@ def end_effector_goals(
         by_link = values if isinstance(values, Mapping) else {link: values}
         if link and isinstance(values, Mapping):
             raise GoalError(
-                f"The goals of end-effectors are given by name, and '{link}' is named beside them."
+                f"The goals of end-effectors are given by name, and '{link}' is named in addition."
             )
         for name, numbers in by_link.items():
             if count is None:

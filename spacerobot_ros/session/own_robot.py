@@ -148,8 +148,8 @@ def _visual_remarks(robot: RobotDescription) -> Iterator[str]:
     if missing:
         more = f" and {len(missing) - 1} more" if len(missing) > 1 else ""
         yield (
-            f"The mesh '{missing[0]}'{more} was not found: give a path beside the URDF, or source "
-            "the workspace of its package. Only pictures need it."
+            f"The mesh '{missing[0]}'{more} was not found: give a path relative to the URDF, or "
+            "source the workspace of its package. Only pictures need it."
         )
     if not any(link.shapes for link in robot.links):
         yield "No link has a <visual>: the robot is drawn as lines between its joints."

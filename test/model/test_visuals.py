@@ -352,7 +352,9 @@ def test_sizes_are_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
         read_mesh(path)
     with pytest.raises(MeshError, match=r"cannot be read: No such file or directory[.]"):
         read_mesh(tmp_path / "gone.stl")
-    with pytest.raises(MeshError, match=r"'gone\.stl' was not found: give a path beside the URDF"):
+    with pytest.raises(
+        MeshError, match=r"'gone\.stl' was not found: give a path relative to the URDF"
+    ):
         shape_mesh(Shape("mesh", (1.0, 1.0, 1.0), Pose(), resource="gone.stl"))
 
 

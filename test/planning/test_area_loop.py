@@ -379,7 +379,7 @@ def test_a_base_that_comes_no_nearer_is_given_up(arm_of_area_loop_refusals: Spac
     needed = float(str(method.plan(stuck, GOAL).notes["expected_cycles"]))
     for _ in range(int(60 - needed)):
         method.plan(stuck, GOAL, correction=True)
-    with pytest.raises(PlanningError, match=r"more than most_cycles = 60; \d+ are flown"):
+    with pytest.raises(PlanningError, match=r"more than most_cycles = 60; \d+ have been flown"):
         method.plan(stuck, GOAL, correction=True)
     # Another goal begins from nothing.
     again = Goal.checked(GOAL.position, GOAL.quaternion)
@@ -579,8 +579,8 @@ def test_cycles_are_counted_with_the_loop_that_is_flown(roomy_arm: SpaceRobot) -
         limited.plan(request)
     cycles = float(str(shrunk.notes["expected_cycles"]))
     assert str(refusal.value) == (
-        f"The goal takes about {cycles:.4g} cycles, more than most_cycles = {most}; 0 are flown. "
-        "In a loop twice as large, links 'a' and 'b' come within 0.004 m."
+        f"The goal takes about {cycles:.4g} cycles, more than most_cycles = {most}; "
+        "0 have been flown. In a loop twice as large, links 'a' and 'b' come within 0.004 m."
     )
 
 

@@ -167,7 +167,7 @@ def test_all_places_of_a_goal_are_displaced() -> None:
 def test_a_planar_robot_that_tumbles_is_refused() -> None:
     tumbling = [0.3, 0.0, 0.4]
     with pytest.raises(
-        PlanningError, match=r"0\.5 kg m\^2/s, which rotates its base about another"
+        PlanningError, match=r"0\.5 kg m\^2/s, which rotates its base about an axis other"
     ):
         plan("planar_chain", rotvec=[0, 0, 0.1], angular_momentum=tumbling, **QUICK)
 
@@ -306,7 +306,7 @@ def test_a_plan_that_comes_too_late_is_made_again(late: int) -> None:
     loop.held.release()
     loop.tick(2)
     assert loop.states == []
-    (told,) = [each for each in loop.notices if "made again" in each]
+    (told,) = [each for each in loop.notices if "is repeated" in each]
     assert f"The plan came {(late + 1) * TICK - 2.0:.3g} s after its start" in told
     loop.held.release()
     status = loop.until(PlannerState.REACHED, PlannerState.FAILED)

@@ -198,7 +198,7 @@ def test_no_shape_is_beyond_the_radius_and_goals_beyond_are_refused() -> None:
     [
         ({"end_effector_position": (1, 0, 0), "end_effector": "hand"}, "does not have"),
         ({"end_effector_position": (1, 0, 0), "end_effector": "base_link"}, "is the base"),
-        ({"end_effector_position": (1, 0, 0, 0)}, "takes 3, a position, or 7"),
+        ({"end_effector_position": (1, 0, 0, 0)}, "needs 3, a position, or 7"),
         ({"end_effector_pose": (1, 0, 0)}, "a pose has 7"),
         ({"end_effector_pose": (1, 0, 0, 0, 0, 0, 0)}, "zero quaternion"),
         ({"end_effector_position": (1, 0, np.nan)}, "not finite"),
@@ -246,7 +246,9 @@ def test_a_pose_of_more_coordinates_than_the_joints_move_is_reached_where_it_can
         assert (found["base_link"][1].inv() * turned).magnitude() < 1e-6
     off = R * Rotation.from_rotvec([0.1, -0.2, 0.1])
     numbers = 5 if base is None else 3
-    with pytest.raises(NotFoundError, match=f"6 independent coord.* no more than {numbers}: ask"):
+    with pytest.raises(
+        NotFoundError, match=f"6 independent coord.* no more than {numbers}: request"
+    ):
         plan(name, end_effector_pose=[*r, *off.as_quat()], start=at_rest(ARM), **given, **QUICK)
 
 

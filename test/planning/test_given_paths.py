@@ -288,11 +288,11 @@ def test_another_method_refuses_before_it_plans(name: str) -> None:
 
 def test_one_end_effector_follows_a_path_and_the_base_is_free() -> None:
     paths = {HAND: SHORT}
-    with pytest.raises(PlanningError, match="takes one end-effector along a path, and the goal is"):
+    with pytest.raises(PlanningError, match="moves one end-effector along a path, and the goal is"):
         plan(
             "three_joint_arm", end_effector_path=paths, end_effector_position={"link_3": [1, 1, 1]}
         )
-    with pytest.raises(PlanningError, match="also asks for the pose of the base"):
+    with pytest.raises(PlanningError, match="also requests the pose of the base"):
         plan("three_joint_arm", end_effector_path=paths, position=[0, 0, 0])
     with pytest.raises(GoalError, match="has 2 goals; it can have one"):
         plan("three_joint_arm", end_effector_path=paths, end_effector_position={HAND: [1, 1, 1]})
@@ -303,10 +303,10 @@ def test_one_end_effector_follows_a_path_and_the_base_is_free() -> None:
     [
         ([], "The path of 'hand' has no poses."),
         (np.zeros((0, 7)), "The path of 'hand' has no poses."),
-        ([1.0, 2.0, 3.0], r"The path of 'hand' is of shape \(3,\); each of its poses takes 3"),
+        ([1.0, 2.0, 3.0], r"The path of 'hand' is of shape \(3,\); each of its poses has 3"),
         (np.ones((3, 4)), r"is of shape \(3, 4\)"),
         (np.ones((2, 3, 3)), r"is of shape \(2, 3, 3\)"),
-        (np.zeros((MAX_PATH_POSES + 1, 3)), "has 10001 poses; it can have 10000."),
+        (np.zeros((MAX_PATH_POSES + 1, 3)), "has 10001 poses; it can have at most 10000."),
         ([[0, 0, 0], [0, np.nan, 0]], r"Pose 2 of the path of 'hand' is \[0.0, nan, 0.0\], which"),
         ([[0, 0, 0], [0, 0, 0], [2e12, 0, 0]], "Pose 3 of .* farther than 1e\\+12 m away"),
         ([[0, 0, 0, 0, 0, 0, 1], [1, 0, 0, 0, 0, 0, 0]], "Pose 2 of .* has a zero quaternion"),

@@ -162,7 +162,7 @@ def test_meetings_that_cannot_be_are_refused_in_a_sentence() -> None:
 
     # From rest to 6 m/s takes 17 kg 128 s by 0.8 N.
     leaving = refusal(slab((2.5, 0.0, 0.0), (6.0, 0.0, 0.0)))
-    assert_one_sentence(leaving, "leaves at 6 m/s", "0.8 N", "target.horizon", "120 s")
+    assert_one_sentence(leaving, "recedes at 6 m/s", "0.8 N", "target.horizon", "120 s")
     touching = refusal(slab((0.4, 0.0, 0.0)))
     assert_one_sentence(touching, "obstacle 'slab' touch at the start", "target.clearance")
     short = refusal(slab((2.5, 0.2, -0.1)), duration=3.0)

@@ -324,7 +324,7 @@ def test_ends_in_motion_and_a_drift_shorten_the_bound() -> None:
     assert bound_of(robot, drifting, **limits, axes=WHOLE).seconds <= 0.2 / 0.1
     slow = bound_of(robot, rest, **limits, axes=WHOLE, more={"base_rate_limit": 0.01})
     assert slow.seconds == pytest.approx(20.0)
-    assert slow.reason == "the base turns by 0.2 rad at optimal.max_base_rate at most"
+    assert slow.reason == "the base rotates by 0.2 rad at optimal.max_base_rate at most"
     # A turn about another axis than the only one is no part of the goal.
     along = bound_of(robot, rest, **limits, axes=np.array([[1.0, 0.0, 0.0]]))
     assert along == DurationBound(0.0, "")
@@ -369,7 +369,7 @@ def no_search(monkeypatch: pytest.MonkeyPatch) -> None:
         (
             {"robot": "planar_chain", "rotvec": (0, 0, 2.6), "longest": 1.0},
             r"within optimal\.longest = 1 s: no manoeuvre to this goal takes less than 1\.\d+ s, "
-            r"as the base turns by 2\.6 rad within the velocity and acceleration limits of the "
+            r"as the base rotates by 2\.6 rad within the velocity and acceleration limits of the "
             r"joints\. Allow more time\.",
         ),
         (
@@ -403,7 +403,7 @@ def no_search(monkeypatch: pytest.MonkeyPatch) -> None:
                 "max_base_rate": 0.05,
                 "longest": 9.0,
             },
-            r"no manoeuvre to this goal takes less than 10 s, as the base turns by 0\.5 rad at "
+            r"no manoeuvre to this goal takes less than 10 s, as the base rotates by 0\.5 rad at "
             r"optimal\.max_base_rate at most\. Allow more time\.",
         ),
     ],

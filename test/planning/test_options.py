@@ -106,7 +106,7 @@ def test_what_is_no_shape_is_refused(shape: npt.ArrayLike) -> None:
 
 def test_a_goal_of_the_end_effector_without_a_name_is_refused_by_that() -> None:
     with pytest.raises(
-        GoalError, match=r"^The goal of the end-effector is 2 number\(s\); it takes 3"
+        GoalError, match=r"^The goal of the end-effector is 2 number\(s\); it needs 3"
     ):
         EndEffectorGoal.checked("", [1.0, 0.0])
     with pytest.raises(GoalError, match=r"^The end-effector has 2 goals; it can have one\.$"):
@@ -329,8 +329,8 @@ def test_limits_are_the_robots_narrowed_by_options(arm: SpaceRobot) -> None:
     assert found.acceleration.tolist() == [1.0, 2.0, 3.0]
     for wrong, words in (
         ({"max_velocity": (1.0,)}, "1 number(s); robot 'three_joint_arm' has 3 joints ("),
-        ({"max_velocity": (1.0, 0.0, 1.0)}, f"'{arm.joint_names[1]}' is limited to 0 a second"),
-        ({"max_acceleration": (1.0, 0.0, 1.0)}, "and 0 a second squared; area_loop needs"),
+        ({"max_velocity": (1.0, 0.0, 1.0)}, f"'{arm.joint_names[1]}' is limited to 0 per second"),
+        ({"max_acceleration": (1.0, 0.0, 1.0)}, "and 0 per second squared; area_loop needs"),
     ):
         with pytest.raises(ParameterError, match=re.escape(words)):
             MotionLimits.of(arm, OptimalOptions(**wrong), "area_loop")
@@ -352,8 +352,11 @@ def parabola(steps: int, acceleration: float, first: float) -> Trajectory:
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"keep_axis": (0.0, 0.0, 2.0)}, "takes all of optimal.keep_axis, optimal.keep_direction"),
-        ({"keep_angle": 0.5}, "takes all of optimal.keep_axis"),
+        (
+            {"keep_axis": (0.0, 0.0, 2.0)},
+            "requires all of optimal.keep_axis, optimal.keep_direction",
+        ),
+        ({"keep_angle": 0.5}, "requires all of optimal.keep_axis"),
         (
             {"keep_axis": (0.0, 0.0, 0.0), "keep_direction": (1.0, 0.0, 0.0), "keep_angle": 0.5},
             "optimal.keep_axis is (0.0, 0.0, 0.0); it must be three numbers, not all zero.",
@@ -367,7 +370,7 @@ def parabola(steps: int, acceleration: float, first: float) -> Trajectory:
             "has 3 numbers; a box of shapes has 3 lower and 3 upper ones.",
         ),
         ({"keep_out": (0.0, 0.0, 0.0, 1.0, 0.0, 1.0)}, "lower bound is not below its upper."),
-        ({"keep_out": (-9e6,) * 3 + (9e6,) * 3}, "holds all shapes of the robot."),
+        ({"keep_out": (-9e6,) * 3 + (9e6,) * 3}, "contains all shapes of the robot."),
     ],
 )
 def test_constraints_that_make_no_sense_are_refused(

@@ -107,7 +107,7 @@ def test_the_path_of_many_cycles_is_predicted_at_the_end_of_some() -> None:
 def test_a_planar_robot_is_described_by_its_links_and_by_its_largest_curvature() -> None:
     found = check_planar_chain(SpaceRobot.from_file(FOLDER / "planar_chain.urdf"))
     words = found.message
-    assert words.startswith("3 links in a plane: loops of joints 'pin_1' and 'pin_2' turn")
+    assert words.startswith("3 links in a plane: loops of joints 'pin_1' and 'pin_2' rotate")
     shapes = np.stack(np.meshgrid(*2 * [np.linspace(-np.pi, np.pi, 181)]), axis=-1)
     top = np.abs(phase_density(shapes)).max()
     assert float(words.split(" rad per unit")[0].rsplit(" ", 1)[1]) == pytest.approx(top, rel=5e-3)
@@ -141,7 +141,7 @@ def test_a_jump_of_time_is_reported_with_both_times(jump: float, after: str) -> 
     assert loop.executive.phase is Phase.EXECUTING
     loop.measured.stamp_ns += round(jump * 1e9)
     loop.tick()
-    words = f"has jumped from {before} s to {after} s, where no motion is planned."
+    words = f"has jumped from {before} s to {after} s, for which no motion is planned."
     assert any(words in notice for notice in loop.notices), loop.notices
 
 

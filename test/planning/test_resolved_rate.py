@@ -266,19 +266,19 @@ def test_a_joint_at_its_limit_ends_the_line() -> None:
         ({"rotvec": (0.1, 0.0, 0.0)}, "the goal is for the base: use optimal for it"),
         (
             {"end_effector_position": (1.5, 0.4, 0.3), "position": (0, 0, 0)},
-            "also asks for the pose of the base: use optimal for both",
+            "also requests the pose of the base: use optimal for both",
         ),
         (
             {"end_effector_position": (1.5, 0.4, 0.3), "joint_positions": (0, 0, 0.5)},
-            "also asks for joint positions",
+            "also requests joint positions",
         ),
         (
             {"end_effector_pose": (1.5, 0.4, 0.3, 0, 0, 0, 1)},
-            "asks for 6 independent coordinates, .* no more than 3: ask for a position instead",
+            "requires 6 independent coordinates, .* no more than 3: request a position instead",
         ),
         (
             {"end_effector_position": (1.5, 0.4, 0.3), "keep_attitude": 1},
-            "with the attitude of the base kept asks for 6 .* leave out resolved_rate.keep_attit",
+            "with the attitude of the base kept requires 6 .* leave out resolved_rate.keep_attit",
         ),
     ],
 )

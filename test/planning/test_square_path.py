@@ -380,7 +380,7 @@ def test_wheels_on_their_mass_centres_turn_the_base_by_no_loop() -> None:
     wheels = [Part(0, np.array([x, 0.0]), np.zeros(2), 5.0, 1.0) for x in (0.5, -0.5)]
     tree = PlanarTree((base, *wheels), np.eye(3))
     text = refusal_of(SpaceRobot.from_urdf(tree.urdf), at_rest(np.zeros(2)), NEAR)
-    assert "cannot be turned" in text
+    assert "cannot be rotated" in text
     assert "joint limits" not in text
 
 

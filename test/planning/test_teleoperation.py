@@ -250,12 +250,12 @@ def test_links_do_not_come_too_near() -> None:
     [
         ("nobody", LINEAR, "world", "Robot 'three_joint_arm' has no end-effector 'nobody'."),
         ("base_link", LINEAR, "world", "Robot 'three_joint_arm' has no end-effector 'base_link'."),
-        (HAND, LINEAR, "odom", "The frame 'odom' of the twist is none of"),
+        (HAND, LINEAR, "odom", "The frame 'odom' of the twist is not one of"),
         (
             HAND,
             LINEAR,
             "",
-            "The frame '' of the twist is none of 'inertial', 'base_link', 'end_eff",
+            "The frame '' of the twist is not one of 'inertial', 'base_link', 'end_eff",
         ),
         (HAND, [0.0, np.nan, 0.0], "inertial", "The twist has a number that is not finite."),
         (HAND, [0.0, 1e155, 0.0], "inertial", "The twist has a number beyond 1e+06 m/s"),

@@ -1,4 +1,4 @@
-"""Cancellation of plans: the caller asks for it, and long searches look for it."""
+"""Cancellation of plans: the caller requests it, and long searches poll it."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class _Never(Cancellation):
     """A cancellation for plans that run to their end."""
 
     def cancel(self) -> NoReturn:
-        """Refuse: every plan without a cancellation of its own shares this one."""
+        """Raise an error: all plans without their own cancellation share this one."""
         raise RuntimeError("NEVER cannot be cancelled: all plans that run to their end share it.")
 
 

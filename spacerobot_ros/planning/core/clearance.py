@@ -1,4 +1,4 @@
-"""Clearance of plans: how near the bodies of a robot may come to each other and to obstacles."""
+"""Clearance of plans: smallest distances between the bodies of a robot, and to obstacles."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ DEFAULT_CLEARANCE = 0.01
 """Smallest distance between two links of a plan, m; 0: contacts are ignored."""
 
 _CLEARANCE_OF_OBSTACLES = 0.01
-"""Smallest distance among obstacles if none is asked for, m."""
+"""Smallest distance if there are obstacles and none is requested, m."""
 
 _SRDF_REMEDY = ", or have an SRDF disable the pair (planner.srdf)"
 
@@ -44,8 +44,8 @@ _DISTANCE_ERROR = 1e-6
 _CLEARANCE_FACTOR_FOR_LOOPS = 5.0
 
 _MIN_START_SHARE = 0.5
-"""Share of the clearance from which on a start is refused: a flight that has ended at the clearance
-may be a little nearer."""
+"""Share of the clearance below which a start is refused: a flight that ended at the clearance may
+be slightly nearer."""
 
 
 class Clearance:
@@ -60,7 +60,7 @@ class Clearance:
     parameter
         Name of its parameter, for messages.
     obstacles_alone
-        Whether two links of the robot may come as near as they will.
+        Whether distances between two links of the robot are ignored.
     """
 
     def __init__(
@@ -82,7 +82,7 @@ class Clearance:
     ) -> Clearance | None:
         """Return the requested clearance of a robot; None for a distance of zero.
 
-        Among obstacles, a distance of zero stands for 0.01 m.
+        If there are obstacles, a distance of zero means 0.01 m.
 
         Raises
         ------
@@ -106,7 +106,7 @@ class Clearance:
 
     @property
     def has_obstacles(self) -> bool:
-        """Whether the motion of the base also counts, because there are obstacles."""
+        """Whether the motion of the base matters, because there are obstacles."""
         return bool(self.geometry.with_obstacles.any())
 
     @cached_property
@@ -127,11 +127,12 @@ class Clearance:
         )
 
     def required(self, start: Array, base: BasePoses | None = None) -> Array:
-        """Return the distances (P,) that all pairs keep from a start (n,) on, m.
+        """Return the distances (P,), m, that are required of all pairs in a motion from a start
+        (n,).
 
-        A pair that is nearer than the clearance at the start does not come nearer than there.
-        Links that touch each other at the start are not looked at (minus infinity), with a warning.
-        ``base`` is the pose of the base there; None: obstacles do not count.
+        If a pair is nearer than the clearance at the start, its distance there is required. Links
+        in contact at the start are ignored (minus infinity), with a warning. ``base`` is the pose
+        of the base at the start; None: obstacles are ignored.
 
         Raises
         ------
@@ -181,7 +182,7 @@ class Clearance:
                 and not pairs <= robot.disabled_collisions
             ):
                 raise UnreadMeshError(
-                    f"Link '{each.link}' cannot be kept clear of others: {each.reason} Or disable "
+                    f"Contacts of link '{each.link}' cannot be checked: {each.reason} Or disable "
                     f"its pairs by an SRDF (planner.srdf), or set {self._parameter} to 0."
                 )
             warn_once(each.note)
@@ -199,7 +200,7 @@ class Clearance:
             )
 
     def is_roomy(self, shapes: Array) -> npt.NDArray[np.bool_]:
-        """Return for shapes (N, n) whether all links are far enough for loops (N,)."""
+        """Return (N,) whether all links have room for loops in configurations (N, n)."""
         geometry, room = self.geometry, _CLEARANCE_FACTOR_FOR_LOOPS * self.distance
         roomy = np.ones(len(shapes), dtype=np.bool_)
         if not len(geometry.pairs):
@@ -212,7 +213,7 @@ class Clearance:
         return roomy
 
     def is_clear(self, shapes: Array, required: Array) -> bool:
-        """Whether links keep the ``required`` distances (P,), m, at all of some shapes (N, n).
+        """Whether links keep the ``required`` distances (P,), m, in all configurations (N, n).
 
         Obstacles do not count.
         """
@@ -240,10 +241,9 @@ class Clearance:
         positions
             (N + 1, n) shapes at the ticks, m or rad.
         required
-            (P,) distances that are to be kept, m; None: those :meth:`required` from the first
-            shape on.
+            (P,) required distances, m; None: those :meth:`required` from the first shape on.
         base
-            Poses of the base at the ticks; None: obstacles do not count.
+            Poses of the base at the ticks; None: obstacles are ignored.
         """
         if not len(self.geometry.pairs):
             return []
@@ -252,7 +252,7 @@ class Clearance:
         return self._check.approaches(positions, required, base)
 
     def clause(self, approach: Approach, control_period: float | None) -> str:
-        """Return a clause about a path that comes too near; without a control period no times."""
+        """Return a clause about a path that is too near; without a control period no times."""
         when = ""
         if control_period is not None:
             when = f" after {approach.tick * control_period:.4g} s,"
@@ -270,7 +270,7 @@ class Clearance:
         Raises
         ------
         UnreachableError
-            They do; the message says which.
+            Links are too near; the message names them.
         """
         found = self.approaches(shape[np.newaxis], required, base)
         if found:

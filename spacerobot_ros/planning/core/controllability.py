@@ -1,10 +1,10 @@
 """Rotations of the base by closed motions of the joints: rank and conditioning.
 
-A small loop in the plane of two joints turns the base by curvature times area (papers 1 and 2).
+A small loop in the plane of two joints rotates the base by curvature times area (papers 1 and 2).
 Three such first-order brackets that span the three axes of rotation satisfy the Lie algebra rank
 condition, and attitude and shape are controllable (paper 1, proposition 1); brackets are analytic,
 so their span at one shape is that at almost all shapes (proposition 2). The position follows from
-attitude and shape; it is controllable with them where three sliders have independent slots.
+attitude and shape; it is also controllable if three sliders have independent slots.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array, JointKind
 
 MAX_CONDITION = 1e6
-"""Condition number above which brackets count as linearly dependent: rounding decides on their
-directions."""
+"""Condition number above which brackets count as linearly dependent: their directions are rounding
+errors."""
 
 ZERO_TURN_PER_AREA = 1e-12
 """Singular values of brackets below this, rad per unit area, count as zero."""
@@ -30,7 +30,7 @@ _SAMPLED_SHAPE_COUNT = 24
 """Number of sampled shapes; brackets that span at any shape span at almost all shapes."""
 
 _UNLIMITED_HALF_RANGE = {JointKind.PRISMATIC: 1.0}
-"""Half of the sampled range of a slider without limits, m; revolute joints have pi."""
+"""Half of the sampled range of an unlimited slider, m; pi for revolute joints."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class Controllability:
     Attributes
     ----------
     rank, required_rank
-        Number of axes of rotation that the brackets span, and the number to be spanned.
+        Number of axes of rotation that the brackets span, and the required number.
     singular_values
         (3,) of the best three brackets, rad per unit area (rad^2, rad m or m^2), descending.
     joints
@@ -48,7 +48,7 @@ class Controllability:
     shape
         (n,) shape at which the brackets are taken, m or rad.
     message
-        The finding for the user; where ``controllable`` is false, the reason.
+        The result, a sentence for the user; if ``controllable`` is false, the reason.
     """
 
     rank: int
@@ -69,7 +69,7 @@ class Controllability:
         Raises
         ------
         PlanningError
-            It is not; the message says why.
+            The robot is not controllable; the message says why.
         """
         if not self.controllable:
             raise PlanningError(self.message)
@@ -82,8 +82,7 @@ class Controllability:
 
 
 def shape_box(robot: SpaceRobot) -> tuple[Array, Array]:
-    """Return finite bounds (n,), (n,) of the shape space: one turn for joints without
-    limits."""
+    """Return finite bounds (n,), (n,) of the shape space: one revolution for unlimited joints."""
     joints = robot.description.movable_joints
     half = np.array([_UNLIMITED_HALF_RANGE.get(joint.kind, np.pi) for joint in joints])
     lower = np.where(
@@ -94,7 +93,7 @@ def shape_box(robot: SpaceRobot) -> tuple[Array, Array]:
 
 
 def sample_shapes(robot: SpaceRobot, count: int) -> Array:
-    """Return shapes (count, n) spread evenly over the shape space, without a seed."""
+    """Return shapes (count, n) spread evenly over the shape space; they depend on no seed."""
     lower, upper = shape_box(robot)
     # Multiples of independent irrational numbers are evenly spread.
     fractions = np.outer(np.arange(1, count + 1), np.sqrt(_first_primes(robot.n))) % 1.0
@@ -113,14 +112,14 @@ def curvatures(robot: SpaceRobot, shapes: Array) -> Array:
 def curvature_matrices(K: Array, joints: Sequence[int]) -> Array:
     """Return ``M`` (..., 3, 3) of three joints from curvature (..., 3, n, n): paper 2.
 
-    Its columns are the turns per area of the pairs (1, 2), (2, 3), (3, 1).
+    Its columns are the rotations per area of the pairs (1, 2), (2, 3), (3, 1).
     """
     i, j, k = joints
     return K[..., [i, j, k], [j, k, i]]
 
 
 def best_triple(K: Array, among: Sequence[int]) -> tuple[tuple[int, int, int], Array]:
-    """Return the three joints of best conditioned ``M`` (3, 3), from curvature (3, n, n)."""
+    """Return the three joints with the best conditioned ``M`` (3, 3), from curvature (3, n, n)."""
     triples = list(itertools.combinations(among, 3))
     matrices = np.array([curvature_matrices(K, triple) for triple in triples])
     values = np.linalg.svd(matrices, compute_uv=False)

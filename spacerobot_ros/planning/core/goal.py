@@ -41,10 +41,10 @@ _MAX_COORDINATE = 1e12
 """Largest coordinate, m or rad; a float64 resolves a millimetre up to it."""
 
 MAX_PATH_POSES = 10_000
-"""Largest number of poses of a given path: it bounds the time of a plan."""
+"""Largest number of poses of a given path: it limits the time of planning."""
 
 _MAX_ANGLE = 2e6 * np.pi
-"""A million turns, rad: beyond them an angle does not resolve its attitude."""
+"""A million revolutions, rad: a larger angle does not resolve its attitude."""
 
 
 @dataclass(frozen=True)
@@ -60,9 +60,9 @@ class EndEffectorGoal:
     quaternion
         (4,) of R_WE, (x, y, z, w); None: any attitude.
     waypoints
-        Places before the goal through which straight lines lead to it, in their order: positions
-        (K, 3), m, or poses (K, 7) where the goal has an attitude, which turns in step. The link
-        moves straight to the first. None: the method chooses the way.
+        Waypoints before the goal, connected by straight lines: positions (K, 3), m, or poses (K, 7)
+        if the goal has an attitude, which rotates along the lines. The link moves straight to the
+        first. None: the method chooses the path.
     """
 
     link: str
@@ -83,7 +83,7 @@ class EndEffectorGoal:
         values = as_numbers(pose, f"The goal of {name}", GoalError)
         if values.shape not in ((3,), (7,)):
             raise GoalError(
-                f"The goal of {name} is {values.size} number(s); it takes 3, a position, or 7, "
+                f"The goal of {name} is {values.size} number(s); it needs 3, a position, or 7, "
                 "a position and a quaternion."
             )
         given = Goal.checked(values[:3], values[3:] if len(values) == 7 else [0, 0, 0, 1])
@@ -98,7 +98,7 @@ class EndEffectorGoal:
         Raises
         ------
         GoalError
-            There are no poses or too many of them, or one is none.
+            There are no poses or too many of them, or one is not a pose.
         """
         values, name = (
             as_numbers(poses, f"The goal path of '{link}'", GoalError),
@@ -108,11 +108,13 @@ class EndEffectorGoal:
             raise GoalError(f"{name} has no poses.")
         if values.ndim != 2 or values.shape[1] not in (3, 7):
             raise GoalError(
-                f"{name} is of shape {values.shape}; each of its poses takes 3 numbers, a "
+                f"{name} is of shape {values.shape}; each of its poses has 3 numbers, a "
                 "position, or 7, a position and a quaternion."
             )
         if len(values) > MAX_PATH_POSES:
-            raise GoalError(f"{name} has {len(values)} poses; it can have {MAX_PATH_POSES}.")
+            raise GoalError(
+                f"{name} has {len(values)} poses; it can have at most {MAX_PATH_POSES}."
+            )
         refused = ~(np.abs(values) <= _MAX_COORDINATE).all(axis=1)
         if refused.any():
             k = int(np.argmax(refused))
@@ -134,24 +136,24 @@ class EndEffectorGoal:
 
     @classmethod
     def of_numbers(cls, link: str, numbers: npt.ArrayLike) -> EndEffectorGoal:
-        """Return the goal as files have it: one position or pose, or a list of them, a path.
+        """Return the goal from its form in files: one position or pose, or a list of them, a path.
 
         Raises
         ------
         GoalError
-            As for :meth:`checked` and :meth:`along`.
+            See :meth:`checked` and :meth:`along`.
         """
         nested = isinstance(numbers, Sequence) and any(isinstance(x, Sequence) for x in numbers)
         return cls.along(link, numbers) if nested else cls.checked(link, numbers)
 
     @property
     def numbers(self) -> list[float] | list[list[float]]:
-        """The goal as :meth:`of_numbers` takes it."""
+        """The goal in the form that :meth:`of_numbers` accepts."""
         return list(self.values) if self.waypoints is None else self.path_values.tolist()
 
     @property
     def path_values(self) -> Array:
-        """The waypoints and the goal (K + 1, 3) or (K + 1, 7), as :meth:`along` takes them."""
+        """The waypoints and the goal (K + 1, 3) or (K + 1, 7), as accepted by :meth:`along`."""
         end = np.array(self.values)[np.newaxis]
         return end if self.waypoints is None else np.vstack([self.waypoints, end])
 
@@ -168,8 +170,8 @@ class EndEffectorGoal:
 
     @property
     def values(self) -> tuple[float, ...]:
-        """Position (3,), or position and quaternion (7,), of the goal itself, as :meth:`checked`
-        takes them.
+        """Position (3,), or position and quaternion (7,), of the goal itself, as accepted by
+        :meth:`checked`.
         """
         attitude = [] if self.quaternion is None else self.quaternion.tolist()
         return (*self.position.tolist(), *attitude)
@@ -188,13 +190,13 @@ class Goal:
     joint_positions
         (n,) in the order of the robot's joints, m or rad; None: the method chooses.
     end_effectors
-        Goals of links, each of another one.
+        Goals of links, at most one for each link.
     base
-        The parts of the pose of the base that are asked for. With end-effectors it may be any of
-        them or none; the base is then where the motion leaves it.
+        The requested parts of the pose of the base. With end-effectors, any or none of them may be
+        requested; the motion determines the others.
     asked
-        The parts of the pose of the base that the sender has given as numbers. Others are those
-        of the start (:meth:`kept_at`), and the goal is reached without them.
+        The parts of the pose of the base that the sender has given as numbers. Others are those of
+        the start (:meth:`kept_at`), and are not needed for the goal to be reached.
     """
 
     position: Array
@@ -292,17 +294,17 @@ class Goal:
         quaternion: Sequence[float],
         joint_positions: npt.ArrayLike | None = None,
     ) -> Goal:
-        """Return the goal of a message, as :meth:`checked`; a part of NaN is not asked for.
+        """Return the goal of a message, as :meth:`checked`; a part of NaN is not requested.
 
         Raises
         ------
         GoalError
-            As for :meth:`checked`, or all of the pose is NaN.
+            See :meth:`checked`; or all of the pose is NaN.
         """
         parts: dict[Controlled, Sequence[float]] = {"position": position, "attitude": quaternion}
         asked = frozenset(part for part, numbers in parts.items() if not np.isnan(numbers).all())
         if not asked:
-            raise GoalError("The goal is a pose of NaN, which asks for nothing.")
+            raise GoalError("The goal is a pose of NaN, which requests nothing.")
         made = cls.checked(
             position if "position" in asked else [0.0, 0.0, 0.0],
             quaternion if "attitude" in asked else [0.0, 0.0, 0.0, 1.0],
@@ -335,7 +337,7 @@ class Goal:
         Raises
         ------
         GoalError
-            It is not a goal, or the angles are not three finite numbers.
+            The goal is invalid, or the angles are not three finite numbers.
         """
         angles = as_numbers(rpy_deg, "The goal roll, pitch and yaw", GoalError)
         if angles.shape != (3,) or not np.all(np.abs(angles) <= np.degrees(_MAX_ANGLE)):
@@ -375,9 +377,9 @@ class Goal:
         return replace(self, end_effectors=tuple(sorted(goals, key=lambda each: each.link)))
 
     def joined_with(self, other: Goal) -> Goal:
-        """Return the goal with the parts of another one, which has precedence.
+        """Return the goal with the parts of another one, which takes precedence.
 
-        A goal of the base only replaces another one.
+        If both are goals for the base only, the other one is returned.
         """
         if not self.end_effectors and not other.end_effectors:
             return other
@@ -387,7 +389,7 @@ class Goal:
         return replace(of_base, joint_positions=shape, end_effectors=tuple(links.values()))
 
     def kept_at(self, position: Array, quaternion: Array) -> Goal:
-        """Return the goal with the parts of a pose of the base in place of those not asked for."""
+        """Return the goal with the parts that are not requested taken from a pose of the base."""
         if self.asked == POSE or not self.base:
             return self
         return replace(
@@ -447,7 +449,7 @@ class RobotState:
     linear_momentum, angular_momentum
         (3,) each in W, the second about the centre of mass of the system; kg m/s and kg m^2/s.
     qdot
-        (n,) joint velocities, m/s or rad/s; None: zero. Plans from rest read those of reaction
+        (n,) joint velocities, m/s or rad/s; None: zero. Plans from rest use those of reaction
         wheels, which spin while the other joints rest.
     """
 
@@ -492,7 +494,7 @@ class PoseError:
     ) -> PoseError:
         """Return the error from a pose, and from the shape ``q`` (n,) if given, to the goal.
 
-        The errors of end-effectors take the shape and the robot.
+        The errors of end-effectors require the shape and the robot.
         """
         shape = np.zeros(0)
         hands: tuple[PoseError, ...] = ()
@@ -551,7 +553,7 @@ class PoseError:
 def end_effector_pose(
     robot: SpaceRobot, link: str, position: Array, quaternion: Array, q: Array
 ) -> tuple[Array, Array]:
-    """Return where a link is: r_WE (3,), m, and the quaternion (4,) of R_WE.
+    """Return the pose of a link: r_WE (3,), m, and the quaternion (4,) of R_WE.
 
     ``position`` (3,), ``quaternion`` (4,) and ``q`` (n,) are the pose of the base and the shape.
 
@@ -566,7 +568,7 @@ def end_effector_pose(
 
 
 def uncontrolled_parts(goal: Goal, controls: frozenset[Controlled]) -> tuple[Controlled, ...]:
-    """Return the parts of the base and of the shape that a goal asks for beyond ``controls``."""
+    """Return the parts of base and shape that a goal requests and that are not in ``controls``."""
     asked: list[Controlled] = [part for part in ("position", "attitude") if part in goal.base]
     if goal.joint_positions is not None:
         asked.append("shape")
@@ -576,8 +578,8 @@ def uncontrolled_parts(goal: Goal, controls: frozenset[Controlled]) -> tuple[Con
 def missed_parts(
     goal: Goal, error: PoseError, controls: frozenset[Controlled], tolerance: Tolerance
 ) -> dict[str, str]:
-    """Return the parts of the base that were asked for, are out of tolerance and not controlled,
-    each with its error and unit.
+    """Return the requested parts of the base that are out of tolerance and not controlled, each
+    with its error and unit.
     """
     errors: dict[Controlled, tuple[float, float, str]] = {
         "position": (error.distance, tolerance.position, "m"),
@@ -591,7 +593,7 @@ def missed_parts(
 
 
 def missed_turn(angle: float, tolerance: Tolerance) -> dict[str, str]:
-    """Return, as :func:`missed_parts`, that the attitude of an end-effector (rad) is missed."""
+    """Return a missed attitude (rad) of an end-effector in the form of :func:`missed_parts`."""
     return {"end-effector's attitude": f"{angle:.3g} rad"} if angle > tolerance.attitude else {}
 
 
@@ -606,7 +608,7 @@ def reached_message(remaining: str, missed: Mapping[str, str]) -> str:
 class Tolerance:
     """Largest errors of a reached goal: ``position`` m, ``attitude`` rad, joints m or rad.
 
-    Those of the pose hold for the base and for end-effectors.
+    Those of the pose apply to the base and to end-effectors.
     """
 
     position: float
@@ -614,7 +616,8 @@ class Tolerance:
     shape: float = 1e-3
 
     def require_control(self, goal: Goal, controls: frozenset[Controlled], who: str) -> None:
-        """Refuse a goal with these tolerances (0: none) if ``who`` does not control one of them.
+        """Refuse a goal with these tolerances (0: none) if ``who`` does not control one of its
+        parts.
 
         ``controls`` are the parts of the goal that ``who``, a method or a law, controls.
 
@@ -629,7 +632,7 @@ class Tolerance:
             named = " and ".join("joints" if part == "shape" else part for part in missing)
             raise GoalError(
                 f"The goal gives a tolerance for its {named}, which {who} does not control here: "
-                "leave that tolerance 0 to take any error."
+                "set that tolerance to 0 to accept any error."
             )
 
     def admits(self, error: PoseError, controls: frozenset[Controlled] = POSE) -> bool:

@@ -1,4 +1,4 @@
-"""Joint efforts of held commands, beside their limits."""
+"""Joint efforts of held commands, compared with their limits."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
 
 _MAX_EXCESS = 1e-6
-"""Part of a limit by which it may be exceeded: rounding."""
+"""Share of a limit by which rounding errors may exceed it."""
 
 _MAX_CHECKED_TICKS = 4000
 """Number of ticks up to which the efforts of all of them are compared with limits."""
@@ -23,9 +23,8 @@ class JointEfforts:
     """The efforts of one robot whose joints follow held commands, and their limits.
 
     Between two commands the joints have the mean of their velocities and the acceleration that
-    leads from one to the other in a control period; the efforts of that motion follow by inverse
-    dynamics (:func:`.joint_efforts` of the model), as the plant under velocity actuation publishes
-    them.
+    leads from one to the other in a control period. The efforts follow from inverse dynamics
+    (:func:`.joint_efforts` of the model), as in the plant under velocity actuation.
 
     Parameters
     ----------
@@ -66,9 +65,10 @@ class JointEfforts:
         L_B: Array | None = None,
         after: Array | float = 0.0,
     ) -> float:
-        """Return the factor by which held commands must be slower; at most 1: they need not be.
+        """Return the factor by which held commands must be slowed down; at most 1: they need not
+        be.
 
-        Arguments are those of :meth:`shares`. Of a robot that drifts it is an estimate, as its
+        Arguments are those of :meth:`shares`. For a robot that drifts it is an estimate, as its
         efforts are not quadratic in the speed.
         """
         shares = self.shares(positions, velocity, L_B, after)
@@ -83,8 +83,8 @@ class JointEfforts:
     ) -> str:
         """Return the clause that says which joints take more than their limits; empty: none.
 
-        Arguments are those of :meth:`shares`. Of many ticks, those are compared at which the joints
-        accelerate most, and some in between.
+        Arguments are those of :meth:`shares`. If there are many ticks, only those with the largest
+        accelerations and some in between are checked.
         """
         rates, changes = self._rates(positions, velocity, after)
         if len(positions) > _MAX_CHECKED_TICKS:
@@ -141,9 +141,9 @@ class JointEfforts:
 
 
 def given_effort_limits(robot: SpaceRobot) -> Array | None:
-    """Return the effort limits (n,) of the URDF; None if it gives none.
+    """Return the effort limits (n,) of the URDF; None if it has none.
 
-    A limit of zero stands for one that is not known: nothing moves under it.
+    A limit of zero means that the limit is unknown, since nothing could move under it.
     """
     limit = np.where(robot.effort_limit > 0, robot.effort_limit, np.inf)
     return limit if np.isfinite(limit).any() else None

@@ -36,7 +36,7 @@ END_EFFECTOR_METHOD = "optimal"
 """Name of the method that plans for goals of end-effectors."""
 
 PATH_METHOD = "resolved_rate"
-"""Name of the method that takes end-effectors along given paths."""
+"""Name of the method that moves end-effectors along given paths."""
 
 _LIMIT_SLACK = 1e-9  # m or rad
 
@@ -50,8 +50,8 @@ class InitialMotion:
     velocity
         (n,) joint velocities that are held until then, m/s or rad/s.
     remaining
-        (M + 1, n) shapes at the ticks that are planned from there on so far, to rest; the first is
-        that in which the gait begins.
+        (M + 1, n) shapes at the ticks of the present plan from there on, to rest; the gait begins
+        in the first one.
     """
 
     velocity: Array
@@ -78,7 +78,7 @@ class PlanRequest:
         method, and methods that plan piece by piece continue from its ``progress``.
     motion
         Motion of the joints at the beginning of the gait; None: they rest. Only methods that
-        declare ``starts_in_motion`` are asked with it.
+        declare ``starts_in_motion`` receive it.
     """
 
     state: RobotState
@@ -107,8 +107,8 @@ NO_JOINTS = (
 class GaitMethod(ABC):
     """An algorithm that turns a goal pose into a gait.
 
-    A method is built once for a robot and plans many times. It keeps nothing between the calls of
-    :meth:`plan` but functions that it has compiled.
+    A method is built once for a robot and plans many times. Between calls of :meth:`plan` it keeps
+    nothing but compiled functions.
 
     Parameters
     ----------
@@ -117,7 +117,7 @@ class GaitMethod(ABC):
     control_period
         Duration of a command, s.
     integration_step
-        Longest Runge-Kutta step of the predicted attitude, s; the plant's, for equal numbers.
+        Longest Runge-Kutta step of the predicted attitude, s; use the plant's for equal results.
     options
         An instance of the method's ``Options``; None: the defaults.
     clearance
@@ -131,11 +131,11 @@ class GaitMethod(ABC):
         The parts of a goal that the method's schedules control. A method that selects among others
         states them in each schedule only.
     plans_for_base, plans_for_end_effectors
-        Whether it plans goals of the base, and goals of end-effectors.
+        Whether it plans for goals of the base, and for goals of end-effectors.
     follows_paths
-        Whether it takes end-effectors along given paths.
+        Whether it moves end-effectors along given paths.
     repeats_cycles
-        Whether its gaits repeat a cycle of the shape, by which reports show them.
+        Whether its gaits repeat a cycle of the shape, which reports then show.
     starts_in_motion
         Whether its gaits may begin while the joints move (``PlanRequest.motion``).
     Options
@@ -195,12 +195,12 @@ class GaitMethod(ABC):
 
     @classmethod  # noqa: B027 - any robot is suitable by default
     def require_suitable(cls, robot: SpaceRobot) -> None:
-        """Refuse a robot for which the method plans no goal with any options.
+        """Refuse a robot for which the method cannot plan any goal, whatever its options.
 
         Raises
         ------
         PlanningError
-            It is such a robot; the message says why.
+            The method cannot plan for the robot; the message says why.
         """
 
     @abstractmethod
@@ -232,14 +232,14 @@ class GaitMethod(ABC):
     ) -> GaitSchedule:
         """Return shapes (N + 1, n) at the ticks as a schedule of this method.
 
-        ``velocity`` and ``end_velocities`` (n,) are held before and after. Of efforts beyond the
-        limits of the URDF there is a note; ``L_B`` (N + 1, 3) is the angular momentum in the base
+        ``velocity`` and ``end_velocities`` (n,) are held before and after. Efforts beyond the
+        limits of the URDF are noted; ``L_B`` (N + 1, 3) is the angular momentum in the base
         for them (:class:`JointEfforts`).
 
         Raises
         ------
         PlanningError
-            Links come too near to each other or to obstacles; ``is_clear``: that has been checked.
+            Links come too near to each other or to obstacles; ``is_clear``: this has been checked.
         """
         if not self.plans_for_end_effectors:
             self.require_goal_of_base(goal)
@@ -298,9 +298,9 @@ class GaitMethod(ABC):
         Raises
         ------
         GoalError
-            It is of another robot.
+            The shape is that of another robot.
         UnreachableError
-            It is beyond the joint limits.
+            The shape is beyond the joint limits.
         """
         wanted, robot = goal.joint_positions, self.robot
         if wanted is None:

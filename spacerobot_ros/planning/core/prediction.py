@@ -19,17 +19,17 @@ from spacerobot_ros.planning.core.goal import RobotState
 from spacerobot_ros.planning.core.schedule import BasePath
 
 _MIN_PATH_POSES = 200
-"""Fewest poses of a predicted base path; a path has at most twice as many."""
+"""Smallest number of poses of a predicted base path; a path has at most twice as many."""
 
 _LARGE_ERROR, _MAX_HALVINGS = 1e-7, 8
-"""Error of an integration, rad, from which its extrapolation is off by more than a nanoradian, and
-how often its steps are halved at most."""
+"""Integration error, rad, above which its extrapolation is off by more than a nanoradian, and the
+largest number of halvings of its steps."""
 
 
 def coasting_positions(
     robot: SpaceRobot, state: RobotState, time: Array, shapes: Array, quaternions: Array
 ) -> Array:
-    """Return the base position (K, 3) in W, m: off the coasting centre of mass by c(q).
+    """Return the base position (K, 3) in W, m: at -c(q) from the coasting centre of mass.
 
     Parameters
     ----------
@@ -59,7 +59,7 @@ class BasePrediction:
     control_period
         Duration of a command, s.
     integration_step
-        Longest Runge-Kutta step of the attitude, s; the plant's, for equal numbers.
+        Longest Runge-Kutta step of the attitude, s; use the plant's for equal results.
 
     Raises
     ------
@@ -78,11 +78,11 @@ class BasePrediction:
         return self._integrate(positions, quaternion, L_W, self._control_period)
 
     def true_end(self, positions: Array, attitudes: Array, L_W: Array) -> Array:
-        """Return the attitude (4,) at the end of the shapes (N + 1, n), whatever their speed.
+        """Return the attitude (4,) at the end of the shapes (N + 1, n), independent of their speed.
 
         The ``attitudes`` (N + 1, 4) are those of the plant's steps. Their error, which is of order
-        four, is estimated from half of the steps (Richardson's extrapolation); while it is large,
-        from half of these.
+        four, is estimated with halved steps (Richardson extrapolation); while it is large, steps
+        are halved again.
         """
         coarse, path, period = attitudes[-1], positions, self._control_period
         for _ in range(_MAX_HALVINGS):
@@ -114,7 +114,7 @@ class BasePrediction:
         return attitudes
 
     def positions(self, state: RobotState, time: Array, shapes: Array, quaternions: Array) -> Array:
-        """Return the base position (K, 3) in W, as :func:`coasting_positions` has it."""
+        """Return the base position (K, 3) in W; see :func:`coasting_positions`."""
         return coasting_positions(self._robot, state, time, shapes, quaternions)
 
     def poses(

@@ -1,7 +1,7 @@
 """Progress of searches, and announcements of other long work.
 
 A search writes its progress into the log, in a record that :func:`report_progress` finds. So it
-passes through methods that do not know of it, and out of the threads in which plans are made.
+passes through methods that do not handle it, and out of planning threads.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ _PACKAGE = "spacerobot_ros"
 
 
 class SearchPhase(Enum):
-    """Phase of a search: it searches for solutions, refines them, makes them clear, and shortens
-    clear ones.
+    """Phase of a search: it searches for solutions, refines them, removes contacts, and shortens
+    the result.
     """
 
     SEARCHING = "searching"
@@ -37,8 +37,8 @@ class SearchProgress:
     Attributes
     ----------
     starts, max_starts
-        Initial guesses that were tried, and those that are tried at most: a search ends sooner
-        where enough solutions agree.
+        Number of initial guesses tried so far, and the largest number: a search ends sooner if
+        enough solutions agree.
     best_s
         Duration of the best manoeuvre so far, s; infinite before the first.
     phase

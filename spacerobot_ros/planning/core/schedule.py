@@ -53,8 +53,8 @@ class GaitSchedule:
     positions
         (N + 1, n) shape at the ticks 0..N, m or rad.
     end_velocities
-        (n,) joint velocities that are held from the end on, m/s or rad/s: reaction wheels that
-        have taken up momentum spin on. None: all joints rest.
+        (n,) joint velocities that are held from the end on, m/s or rad/s: reaction wheels that have
+        taken up momentum keep spinning. None: all joints rest.
     path
         Predicted base path at instants of the method's choice, the first and the last included.
     goal
@@ -62,14 +62,14 @@ class GaitSchedule:
     notes
         Named results of the method, for reports (with the symbols of its paper).
     partial
-        It ends short of the goal on purpose: the next piece is planned from the pose that is
+        Whether it ends short of the goal by design: the next piece is planned from the pose
         measured at its end.
     remaining
         Expected duration of the schedules after a partial one until the goal is reached, s.
     controls
         The parts of the goal that it controls; its result is evaluated by these.
     progress
-        State of its method for the next schedule to the same goal, of a type of its own; see
+        State of its method for the next schedule to the same goal, of a method-specific type; see
         ``PlanRequest.previous``.
     """
 
@@ -130,8 +130,8 @@ def straight_motion(
     Every leg is a straight line of the shape, from rest to rest (paper 3, section III): under
     ``u = (2 pi D / T^2) sin(2 pi t / T)``, eqs (12) to (18), a leg D is travelled as
     ``D (t/T - sin(2 pi t/T) / (2 pi))``, whose peak speed is twice the mean. The ends are shapes
-    (n,) with the durations of the legs to them, s. A leg takes longer where a joint is slow, a
-    whole number of ticks, and no time where nothing moves.
+    (n,) with the durations of the legs to them, s. A leg takes a whole number of ticks, longer if a
+    joint is slow, and no time if nothing moves.
 
     Raises
     ------

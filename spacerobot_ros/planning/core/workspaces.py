@@ -1,12 +1,12 @@
 """Path-independent and path-dependent workspaces of an end-effector while the base floats.
 
 At zero momentum the generalised Jacobian ``J*(q)`` maps joint rates to the velocity of the
-end-effector. If it loses rank no rates move the end-effector in some direction: a dynamic
-singularity. The shape decides whether it does. Its distance from the system's centre of mass,
-which rests, depends on the shape alone, too, and the base may have any attitude; so a distance at
-which some singular shape puts the end-effector is *path-dependent*: whether the robot is singular
-there depends on the path that led there. Distances that no singular shape has are
-*path-independent* (Papadopoulos and Dubowsky; paper 4, section V).
+end-effector. If it loses rank, no rates move the end-effector in some direction: a dynamic
+singularity. Whether it does depends on the shape. So does the distance of the end-effector from the
+system's centre of mass, which rests, while the base may have any attitude. A distance that some
+singular shape has is therefore *path-dependent*: whether the robot is singular there depends on the
+path that led there. Distances that no singular shape has are *path-independent* (Papadopoulos and
+Dubowsky; paper 4, section V).
 
 Singular shapes are solutions ``(q, u)`` of ``J*(q)^T u = 0, |u| = 1``, with the direction ``u`` in
 which nothing moves. From seeded shapes all over the shape space the nearest solutions are found
@@ -29,7 +29,7 @@ from spacerobot_ros.planning.core.controllability import sample_shapes, shape_bo
 
 _SEED = 20
 _SAMPLED_SHAPES = 48
-"""Shapes from which singular ones are sought, and shapes that are examined for the reach."""
+"""Number of shapes from which to search for singular ones, and of shapes examined for the reach."""
 
 _EXTREME_STARTS = 3
 _NEWTON_STEPS, _LONGEST_NEWTON_STEP = 40, 0.5
@@ -37,7 +37,7 @@ _WALK_STEPS, _LONGEST_STEP, _SHORTEST_STEP = 60, 0.25, 1e-4
 """Steps along curves of singular shapes, rad (or m) of the joint that moves most."""
 
 _ZERO_RESIDUAL = 1e-9
-"""Error of the equations of a singular shape that counts as zero; they are without units."""
+"""Error of the dimensionless equations of a singular shape that counts as zero."""
 
 _ZERO_RATE = 1e-6
 """Singular value of J* over the reach that counts as zero."""
@@ -58,13 +58,13 @@ class Workspaces:
     link
         The link.
     within_limits
-        Whether the joints keep their limits; else those that turn have none.
+        Whether joint limits are enforced; if not, revolute joints have none.
     distance_range
         The smallest and the largest distance.
     path_dependent
         Closed intervals of distances at which a singular shape puts the link, in ascending order.
     dimensions
-        Of the space in which the joints move it at zero momentum: 2 in a plane.
+        Of the space in which the joints move the link at zero momentum: 2 in a plane.
     singular_shapes
         Number of singular shapes from which the intervals were found.
     """
@@ -87,12 +87,12 @@ class Workspaces:
 
 
 def workspaces(robot: SpaceRobot, link: str) -> tuple[Workspaces, ...]:
-    """Return the workspaces of a link's origin at zero momentum: without limits of the joints that
-    turn, and then within the limits where these exist.
+    """Return the workspaces of a link's origin at zero momentum: without limits of revolute joints,
+    and then within the limits if there are any.
 
-    Every interval consists of distances of singular shapes that were found, but for gaps of less
-    than 0.2 % of the reach. That there are no others is exact only as far as the seeded shapes
-    lead to all curves of singular ones: with two joints in a plane each curve is met many times.
+    Every interval consists of distances of singular shapes that were found, except for gaps of less
+    than 0.2 % of the reach. The intervals are complete only if the seeded shapes lead to all curves
+    of singular shapes: with two joints in a plane each curve is met many times.
 
     Raises
     ------
@@ -200,7 +200,7 @@ class _Equations:
         return g.T, derivatives, r.ravel(), gradients
 
     def starts(self, shapes: Array) -> Array:
-        """Return z (K, n + m) for shapes (K, n), with the directions that move least."""
+        """Return z (K, n + m) for shapes (K, n), with the directions of least motion."""
         n = shapes.shape[1]
         J = self.jacobian(shapes.T).full().reshape(self.dimensions, -1, n).transpose(1, 0, 2)
         return np.hstack([shapes, np.linalg.svd(J)[0][:, :, -1]])
@@ -247,8 +247,8 @@ class _Search:
         self._lower, self._upper = np.append(lower, -m), np.append(upper, m)
 
     def intervals(self, shapes: Array) -> tuple[list[Interval], int]:
-        """Return the intervals of distances of the singular shapes to which shapes (K, n) lead, and
-        the number of these.
+        """Return the intervals of distances of the singular shapes found from shapes (K, n), and
+        the number of singular shapes.
         """
         z = self._project_to_singular_shapes(self._equations.starts(shapes), _NEWTON_STEPS)
         g, _, _, _ = self._equations.evaluate(z)
@@ -280,7 +280,7 @@ class _Search:
         last: list[tuple[bytes, tuple[Array, ...]]] = []
 
         def at(y: Array) -> tuple[Array, ...]:
-            """Return equations, derivatives, distance and gradient; the solver asks for each."""
+            """Return equations, derivatives, distance and gradient; the solver requests each."""
             if not last or last[0][0] != y.tobytes():
                 found = self._equations.evaluate(y[np.newaxis])
                 last[:] = [(y.tobytes(), tuple(each[0] for each in found))]

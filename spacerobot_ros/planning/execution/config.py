@@ -16,7 +16,7 @@ from spacerobot_ros.planning.methods.optimal import OptimalGait
 from spacerobot_ros.planning.methods.registry import METHODS
 
 _BACKGROUND_REPLAN_PERIOD = 2.0
-"""Default of ``replan_period`` where plans are made in the background, s."""
+"""Default of ``replan_period`` if plans are made in the background, s."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class PlannerConfig(CommanderConfig):
         maximum=1000.0,
     )
     srdf: str = parameter(
-        "", "SRDF file with pairs of links that are not checked; '': NAME.srdf beside the URDF"
+        "", "SRDF file with pairs of links that are not checked; '': NAME.srdf next to the URDF"
     )
     max_corrections: int = nonnegative(
         3, "new plans after the first", maximum=1000, read_only=False
@@ -134,9 +134,9 @@ class PlannerConfig(CommanderConfig):
 
     @property
     def method_options(self) -> Mapping[str, Any]:
-        """The options of the methods by name; the output decides on those that are left open.
+        """The options of the methods by name; defaults depend on the output.
 
-        A controller that is given a reference has a reserve of efforts for its feedback.
+        If a controller is given a reference, efforts are reserved for its feedback.
         """
         optimal = self.options.get(OptimalGait.name, OptimalGait.Options())
         if self.output != "reference" or optimal.effort_limits != 0:

@@ -1,8 +1,8 @@
 """The planner's state machine: from goals and measured states to setpoints, without ROS.
 
 Read top to bottom: the phases and the transitions between them, the data of a goal and of its
-plans, then the :class:`Executive`, whose :meth:`~Executive.update` answers every measured state.
-``docs/planner_state_machine.md`` draws the machine.
+plans, then the :class:`Executive`, whose :meth:`~Executive.update` is called for every measured
+state. ``docs/planner_state_machine.md`` draws the machine.
 
 Other modules do the work of a phase: :mod:`.tracker` computes the commands along a schedule,
 :mod:`.worker` makes plans, :mod:`.state_average` averages measured states, and
@@ -76,7 +76,7 @@ _MAX_IN_MOTION_ATTEMPTS = 2
 before."""
 
 _LATE_TIME_SHARE = 1 / 3
-"""Share of a motion's duration that remains when the motion counts as late."""
+"""Remaining share of a motion's duration from which on the motion counts as late."""
 
 
 # -- phases and transitions -------------------------------------------------------------------
@@ -216,14 +216,13 @@ class ActiveGoal:
 
 
 class Executive:
-    """Brings a robot to successive goals, and answers every state with a setpoint.
+    """Brings a robot to successive goals, with a setpoint for every state.
 
-    With a worker that plans at once, the measured state waits for its plan, and a plan that is
-    requested while the joints move begins with their braking. With one that plans in the
-    background, the joints brake to rest before a plan is requested, and hold their shape until it
-    is there. If the methods of both schedules allow it, neither happens: a plan takes over in
-    motion, at a tick ahead. That tick follows from parameters and from the stamp of the request,
-    not from the time that planning takes.
+    If the worker plans at once, the measured state waits for its plan, and a plan that is requested
+    while the joints move begins with braking. If it plans in the background, the joints brake to
+    rest before a plan is requested, and hold their shape until it is available. If the methods of
+    both schedules allow it, neither happens: a plan takes over in motion at a later tick. That tick
+    depends on parameters and on the stamp of the request, not on the planning time.
 
     Parameters
     ----------
@@ -237,7 +236,7 @@ class Executive:
     Raises
     ------
     ParameterError
-        An option of the gait method does not go with the robot or with another option.
+        An option of the gait method is incompatible with the robot or with another option.
     """
 
     def __init__(
@@ -258,7 +257,7 @@ class Executive:
         self.plant_rests = False
         """Whether the plant reports that no command is in force, as set by the owner."""
         self._stamp_ns = 0
-        """Stamp of the state that :meth:`update` answers, ns."""
+        """Stamp of the state that :meth:`update` processes, ns."""
         self._new_goal: IdentifiedGoal | None = None
         self._in_motion_attempts = 0
         self._pending_plan: PlanJob | ReadyPlan | None = None
@@ -267,13 +266,13 @@ class Executive:
         self._replan_ns = 0
         """Stamp from which on the remaining motion is planned again, ns."""
         self._commanded_from_ns = 0
-        """Stamp of the first state that the present schedule or plan answers, ns."""
+        """Stamp of the first state of the present schedule or plan, ns."""
         self._total_plan_time, self._plan_count, self._command_count = 0.0, 0, 0
         self._teleoperation = Teleoperation(robot, config, self._worker.clearance)
 
     @property
     def setpoint(self) -> Setpoint:
-        """The return value of every :meth:`update`; its arrays stay in place."""
+        """The return value of every :meth:`update`; its arrays are reused."""
         return self._tracker.setpoint
 
     @property
@@ -316,18 +315,18 @@ class Executive:
 
     @property
     def unfinished_goals(self) -> frozenset[str]:
-        """Ids of the goals that are pursued, planned for, or wait to be."""
+        """Ids of the goals that are pursued, being planned, or waiting for a plan."""
         pursued = self._pursued_goal()
         return self.waiting_goals | ({pursued.goal_id} if pursued is not None else set())
 
     @property
     def waiting_goals(self) -> frozenset[str]:
-        """Ids of the goals that are planned for, or wait to be; also a goal that is replanned."""
+        """Ids of the goals being planned or waiting for a plan, including one that is replanned."""
         goals = (self._new_goal, self._planned_goal())
         return frozenset(goal.goal_id for goal in goals if goal is not None)
 
     def progress(self, goal_id: str) -> tuple[str, float | None]:
-        """Return the work that is done for a goal, and the expected time until its end, s.
+        """Return the present work on a goal, and the expected time until its end, s.
 
         None: no schedule leads to the goal yet.
         """
@@ -375,9 +374,9 @@ class Executive:
     ) -> bool:
         """Give up every goal at once, because the plant no longer obeys commands.
 
-        If it rests because commands did not come, a goal continues for which nothing was commanded
-        until then, and one whose plan has taken so long that no state was answered. A goal that was
-        to replace it is planned for from rest.
+        If it rests because no commands arrived, a goal continues if nothing was commanded for it
+        until then, or if its plan took so long that no state was processed. A goal that was to
+        replace it is planned for from rest.
         """
         if commanded_until_ns is not None and not self._commands_were_obeyed(
             commanded_until_ns, rests_since_ns
@@ -416,9 +415,9 @@ class Executive:
         Parameters
         ----------
         why
-            Clause that tells why it ended early; empty: it was followed to its end.
+            Clause that says why it ended early; empty: it was followed to its end.
         final
-            Whether nothing is planned again: the goal fails unless it is reached.
+            Whether there are no further plans: the goal fails unless it is reached.
         """
         active = self._active_goal
         if active is None:
@@ -467,20 +466,20 @@ class Executive:
         self._teleoperation = Teleoperation(robot, self.config, worker.clearance)
 
     def plan_at_once(self) -> None:
-        """Make later plans while states wait for them: the plant is in lockstep."""
+        """From now on, plan while states wait: the plant is in lockstep."""
         self.config = replace(self.config, plan_in_background=False)
         self._worker.plans_in_background = False
 
     def use_obstacles(self, make_worker: Callable[[], PlanningWorker]) -> None:
         """Plan around other obstacles from now on.
 
-        A plan that is being made is made again. If the rest of the present schedule comes too
-        near, the joints brake, and the remaining motion is planned again.
+        A plan in progress is restarted. If the rest of the present schedule comes too near to
+        obstacles, the joints brake, and the remaining motion is planned again.
 
         Parameters
         ----------
         make_worker
-            Returns the worker that knows the obstacles; called when no plan is made any more.
+            Returns the worker that knows the obstacles; called when no plan is in progress.
         """
         self._drop_plan()
         self._worker.close()
@@ -536,7 +535,7 @@ class Executive:
     # -- measured states ----------------------------------------------------------------------
 
     def add_base_measurement(self, measured: MeasuredState) -> None:
-        """Use a base measurement that arrives after its state was answered."""
+        """Use a base measurement that arrives after its state was processed."""
         if self.phase is Phase.TELEOPERATING:
             self._teleoperation.keep_base_pose(measured)
         elif self.measuring:
@@ -906,7 +905,7 @@ class Executive:
             self._add_notice(
                 Severity.INFO,
                 f"The plan came {result.late:.3g} s after its start, while the robot drifts: it is "
-                "made again, to begin later.",
+                "repeated with a later start.",
             )
             return
         job, self._pending_plan = self._pending_plan, None
@@ -1057,7 +1056,7 @@ class Executive:
         before, now = self._stamp_ns / 1e9, stamp_ns / 1e9
         self._add_notice(
             Severity.WARNING,
-            f"The time of the states has jumped from {before:.9g} s to {now:.9g} s, where no "
+            f"The time of the states has jumped from {before:.9g} s to {now:.9g} s, for which no "
             "motion is planned.",
         )
 

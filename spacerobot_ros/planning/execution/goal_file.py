@@ -35,10 +35,10 @@ class IdentifiedGoal:
     goal_id
         Its id; empty if unknown.
     tolerance
-        Its largest errors where it is reached; None: those of the commander's parameters.
+        Its tolerance; None: those of the commander's parameters.
     resumes
-        Whether a restarted commander continues it. The client of an action is told that its
-        goal has ended when the commander stops, so nothing continues.
+        Whether a restarted commander continues it. A goal of an action is not continued: its client
+        is told that it has ended when the commander stops.
     required
         The tolerances that its sender has given, 0: none. A goal with a tolerance for a part that
         the method or the law does not control is refused.
@@ -51,7 +51,7 @@ class IdentifiedGoal:
     required: Tolerance = NO_TOLERANCE
 
     def kept_at(self, position: Array, quaternion: Array) -> IdentifiedGoal:
-        """Return it with its goal of :meth:`Goal.kept_at`."""
+        """Return it with the goal of :meth:`Goal.kept_at`."""
         return replace(self, goal=self.goal.kept_at(position, quaternion))
 
 
@@ -83,8 +83,8 @@ class GoalIds:
 class GoalFile:
     """A file with the present goals of a commander; reached and abandoned goals are removed.
 
-    A commander that is restarted loads them and continues. The file follows what an executive
-    reports: :meth:`pursue` and :meth:`end`.
+    A commander that is restarted loads them and continues. The reports of an executive update the
+    file: :meth:`pursue` and :meth:`end`.
 
     Parameters
     ----------
@@ -101,7 +101,7 @@ class GoalFile:
         """Ids of the goals in the file."""
 
     def pursue(self, pursued: PursuedGoals) -> str:
-        """Save goals; return a message if they cannot be saved, empty if all is well."""
+        """Save goals; return a message if they cannot be saved, else an empty text."""
         try:
             self.save(pursued.goals)
         except ParameterError as error:
@@ -109,12 +109,12 @@ class GoalFile:
         return ""
 
     def end(self, goal_id: str, *, refused: bool) -> None:
-        """Delete the file with a decision, unless it is the refusal of another goal."""
+        """Delete the file when a goal is decided, unless another goal is refused."""
         if self._ids and (goal_id in self._ids or not refused):
             self.delete()
 
     def save(self, goals: Mapping[str, IdentifiedGoal]) -> None:
-        """Replace the content of the file by the goals that resume, in one atomic step.
+        """Replace the content of the file with the goals to resume, in one atomic step.
 
         Raises
         ------
@@ -151,7 +151,7 @@ class GoalFile:
         Raises
         ------
         ParameterError
-            The file holds something else, or others could have written it.
+            The file has other content, or other users could have written it.
         """
         if self._path is None:
             return {}
@@ -163,7 +163,7 @@ class GoalFile:
             return {}
         except UntrustedFileError as error:
             raise ParameterError(
-                f"Parameter 'resume_file' is '{self._path}', whose goal is not flown to: {error}"
+                f"Parameter 'resume_file' is '{self._path}', whose goal is refused: {error}"
             ) from error
         except (OSError, ValueError, RecursionError, PlanningError) as error:
             why = str(error).rstrip(".")

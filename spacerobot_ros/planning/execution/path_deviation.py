@@ -1,10 +1,10 @@
-"""Deviation of the measured base from its predicted path, and the errors of masses behind it.
+"""Deviation of the measured base from its predicted path, and the mass errors that explain it.
 
-At zero momentum the turn of the base depends on the path of the shape and on ratios of masses and
-inertias alone. A turn that differs from the predicted one shows errors of these in the model. To
-first order the deviation of the base path is linear in their relative errors: a sensitivity of the
-path multiplies each. Linear least squares over many noisy poses, with a prior on the errors, give
-the estimate (one step of Gauss-Newton about the model).
+At zero momentum the rotation of the base depends on the path of the shape and on ratios of masses
+and inertias alone. A rotation that differs from the prediction indicates errors of these in the
+model. To first order the deviation of the base path is linear in their relative errors: each is
+multiplied by a sensitivity of the path. Linear least squares over many noisy poses, with a prior on
+the errors, give the estimate (one step of Gauss-Newton about the model).
 """
 
 from __future__ import annotations
@@ -53,8 +53,8 @@ cause, such as a jump of the measurements."""
 
 _NEAR_SHARES, _AIM_SHARES = (0.6, 0.8), (0.4, 0.6)
 """Two shares of the tolerances each, for early and late in a motion: the remaining motion is
-planned again where its expected error exceeds the first, and the new plan may end within the
-second. Turns of the base that are left for late take long."""
+planned again if its expected error exceeds the first, and the new plan may end within the second.
+Rotations of the base that are left until late take long."""
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ class TrackingError:
 class PathCheck:
     """Compares measured states with the predicted base path of a schedule.
 
-    The methods are for a state that is :meth:`due`.
+    The methods require a state that is :meth:`due`.
 
     Parameters
     ----------
@@ -84,7 +84,8 @@ class PathCheck:
     config
         Of the planner: bounds of the tracking error, and the deadband of shapes.
     average
-        Measured poses whose mean deviation from the path counts for plans in motion; 0: none are.
+        Number of measured poses whose mean deviation from the path is used for plans in motion; 0:
+        none.
     sensitivity, masses
         Derivatives of the path by errors of masses, and their estimate: see :class:`PathDeviation`.
     """
@@ -208,7 +209,7 @@ class PathDeviation:
     """Mean deviation of the latest measured base poses from a predicted path.
 
     At zero momentum the base follows the path of the shape, seen from its own pose: a base that is
-    off the predicted path by a rotation and a displacement keeps to that path, rotated and
+    off the predicted path by a rotation and a displacement continues on that path, rotated and
     displaced.
 
     Parameters
@@ -244,7 +245,7 @@ class PathDeviation:
 
         ``lag`` (6,) is the part of its deviation, displacement (m) and rotation vector (rad) in W,
         that comes from joints which lag behind the schedule. It vanishes when they catch up, so it
-        is no part of the mean deviation.
+        is excluded from the mean deviation.
         """
         predicted = self._path.quaternion[k]
         turn = matrix_from_quaternion(predicted) @ attitude_error(predicted, quaternion)
@@ -387,8 +388,8 @@ class MassEstimate:
 
     The first pose of each path is measured with an error. So each path has an unknown constant
     offset, which is eliminated from the normal equations. Deviations that only implausible errors
-    explain (a sensor that fails, say) do not count: the estimate is zero, and their path is
-    forgotten.
+    explain (such as those of a failing sensor) are ignored: the estimate is zero, and their path is
+    discarded.
 
     Parameters
     ----------
@@ -417,7 +418,7 @@ class MassEstimate:
         self._clear_path()
 
     def add(self, sensitivity: Array, deviation: Array) -> None:
-        """Add the deviation (6,) of a pose, where the path has the sensitivity (6, P)."""
+        """Add the deviation (6,) of a pose at which the path has the sensitivity (6, P)."""
         self._poses += 1
         self._sum_J += sensitivity
         self._sum_y += deviation

@@ -21,7 +21,7 @@ _REST_RATE = 1e-9  # m/s or rad/s
 
 
 class BaseMeasurement(NamedTuple):
-    """The part of a measured state beside stamp and shape: ``pose`` (7,), ``twist`` (6,) of the
+    """The part of a measured state besides stamp and shape: ``pose`` (7,), ``twist`` (6,) of the
     base, ``qdot`` (n,)."""
 
     pose: Array
@@ -47,9 +47,9 @@ class MeasuredState(Protocol):
 class StateAverage:
     """Averages measured states, and estimates the total momenta from states at rest.
 
-    While joints move, the momentum of a robot whose masses are not quite known is uncertain; at
-    rest the base alone shows it, and without thrust it stays. So the momenta of a state are those
-    that were measured last at rest, where any were.
+    While joints move, the momentum of a robot with uncertain masses is uncertain; at rest it
+    follows from the base alone, and without thrust it is constant. So the momenta of a state are
+    the last ones measured at rest, if any.
 
     Parameters
     ----------
@@ -58,8 +58,8 @@ class StateAverage:
     count
         States to average.
     rest_tolerance
-        Averaged rates of base and joints up to this are noise about rest, m/s or rad/s; the
-        momentum is then zero. With 0 every measured momentum counts.
+        Averaged rates of base and joints up to this count as noise about rest, m/s or rad/s; the
+        momentum is then zero. 0: every measured momentum is used.
     """
 
     def __init__(self, robot: SpaceRobot, count: int = 1, rest_tolerance: float = 0.0) -> None:
@@ -103,7 +103,7 @@ class StateAverage:
         Raises
         ------
         PlanningError
-            It is not finite.
+            The average is not finite.
         """
         poses, q = np.array(self._poses), np.mean(self._shapes, axis=0)
         rates = np.mean(self._rates, axis=0)

@@ -38,7 +38,7 @@ class PlannerState(str, Enum):
     EXECUTING = "executing"
     REACHED = "reached"
     REACHED_PARTLY = "reached_partly"
-    """A part of the base that was asked for is out of tolerance, and not controlled."""
+    """A requested part of the base is out of tolerance, and not controlled."""
     FAILED = "failed"
     REFUSED = "refused"
     ABORTED = "aborted"
@@ -86,8 +86,8 @@ class PlannerStatus:
     position_error_m, attitude_error_rad
         Remaining error of the measured base pose; None if it was not evaluated.
     manoeuvre_time_s
-        Duration of all schedules for the goal so far, as far as later ones did not cut them off;
-        0: none.
+        Duration of all schedules for the goal so far, without the parts that later ones cut off; 0:
+        none.
     ends_at_s
         Simulated time at which the latest schedule ends; 0: none.
     remaining_s
@@ -132,7 +132,7 @@ class PlannerStatus:
         Raises
         ------
         SpaceRobotError
-            They are not a status of a planner.
+            The values are not a status of a planner.
         """
         return _FORMAT.from_values(cls, values, message=message)
 
@@ -260,7 +260,8 @@ def describe_remaining_error(
 ) -> str:
     """Return a clause with the remaining error in the parts of the goal that are controlled.
 
-    With a tolerance it names that of each part, with a goal also the parts that are not controlled.
+    If a tolerance is given, it names that of each part; if a goal is given, also the parts that are
+    not controlled.
     """
     parts: dict[Controlled, str] = {
         "position": quantity(error.distance, "m"),
@@ -310,8 +311,8 @@ def _describe_tolerance(
 def manoeuvre_time(statuses: Iterable[tuple[float, PlannerStatus]], end_s: float) -> float | None:
     """Return the duration of the flown schedules for the last goal, s.
 
-    As the planner counts it, less the rest of the last schedule where the flight was cut off; where
-    the planner has not counted it, as after an abort, :func:`time_to_end`.
+    It is the planner's value, minus the rest of the last schedule if the flight was cut off. If the
+    planner has no value, as after an abort, it is that of :func:`time_to_end`.
 
     Parameters
     ----------
@@ -321,7 +322,7 @@ def manoeuvre_time(statuses: Iterable[tuple[float, PlannerStatus]], end_s: float
     Returns
     -------
     float | None
-        None where no schedule was flown.
+        None if no schedule was flown.
     """
     given = list(statuses)
     flown = [
@@ -342,19 +343,19 @@ def manoeuvre_time(statuses: Iterable[tuple[float, PlannerStatus]], end_s: float
 def time_to_end(statuses: Iterable[tuple[float, PlannerStatus]], end_s: float) -> float | None:
     """Return the time, s, from the beginning of the first schedule for the last goal to the end.
 
-    Waiting in between, such as for a planner that was started again, is part of it.
+    Waiting in between, such as for a restarted planner, is included.
 
     Parameters
     ----------
     statuses
         Time (s) and status, in order of time.
     end_s
-        When the flight ended, s: the end where no status reports that the goal was decided.
+        When the flight ended, s; used if no status reports that the goal was decided.
 
     Returns
     -------
     float | None
-        None where no schedule was flown.
+        None if no schedule was flown.
     """
     given = list(statuses)
     schedules = [i for i, (_, status) in enumerate(given) if status.state is PlannerState.EXECUTING]

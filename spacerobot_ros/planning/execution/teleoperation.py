@@ -1,9 +1,9 @@
-"""Teleoperation: rates of the joints that give an end-effector a twist while the base floats.
+"""Teleoperation: joint rates that give an end-effector a twist while the base floats.
 
 At zero momentum the generalised Jacobian ``J*(q)`` maps the rates of the joints to the twist of an
-end-effector (Umetani and Yoshida), so ``qdot = J*^+ [v; omega]``: of all rates that give the twist
-those that are least, each joint measured by its velocity limit. With ``keep_attitude`` the base
-turns by ``-A qdot = 0`` besides, and the rates lie in the reaction null space.
+end-effector (Umetani and Yoshida), so ``qdot = J*^+ [v; omega]``: the smallest rates that give the
+twist, each joint relative to its velocity limit. With ``keep_attitude``, ``-A qdot = 0`` is also
+required of the base's rotation, so the rates lie in the reaction null space.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ _LOOK_AHEAD = 1e-3
 """Motion of the fastest joint after which the progress is checked again, rad."""
 
 _TRIED_SPEED_SHARES = (1.0, 0.5, 0.25, 0.0)
-"""Shares of the rates that are tried where links come too near; with the last one joints brake."""
+"""Shares of the rates that are tried if links come too near; with the last one the joints brake."""
 
 _MAX_TWIST = 1e6
 """Largest number of a twist, m/s or rad/s: squares of much larger ones overflow."""
@@ -65,7 +65,7 @@ class TwistFrame(Enum):
 
 @dataclass(frozen=True)
 class TwistCommand:
-    """The wanted twist of a link's origin, against the world.
+    """The wanted twist of a link's origin, relative to the world.
 
     Attributes
     ----------
@@ -86,7 +86,7 @@ class TwistCommand:
     def checked(
         cls, robot: SpaceRobot, link: str, linear: Array, angular: Array, frame: str, world: str
     ) -> TwistCommand:
-        """Return a twist in the frame of a name; ``world`` is that of the world.
+        """Return a twist in the frame of a name; ``world`` is the world frame.
 
         Raises
         ------
@@ -105,7 +105,7 @@ class TwistCommand:
         found = frames.get(frame) or frames.get(frame.rpartition("/")[2])
         if found is None:
             names = "', '".join(frames)
-            raise PlanningError(f"The frame '{frame}' of the twist is none of '{names}'.")
+            raise PlanningError(f"The frame '{frame}' of the twist is not one of '{names}'.")
         if not (np.all(np.isfinite(linear)) and np.all(np.isfinite(angular))):
             raise PlanningError("The twist has a number that is not finite.")
         if max(np.abs(linear).max(), np.abs(angular).max()) > _MAX_TWIST:
@@ -123,7 +123,7 @@ class TwistCommand:
 
 
 class TwistStep(NamedTuple):
-    """The answer to one state while an end-effector follows twists.
+    """The result of one state while an end-effector follows twists.
 
     ``rates`` (n,) are those of the joints; None: they keep their shape. ``message`` is for the
     status, empty if it says nothing new. ``ended``: the joints rest, and twists are over.
@@ -156,8 +156,8 @@ class _Following:
 class Teleoperation:
     """End-effectors that follow twists, one at a time, until none has come for ``twist_timeout``.
 
-    After a refusal, and after an abort, twists are refused until none has come for that time: so
-    an operator who continues sending moves nothing by surprise.
+    After a refusal, and after an abort, twists are refused until none has come for that time: so an
+    operator who keeps sending does not cause unexpected motion.
 
     Parameters
     ----------
@@ -186,12 +186,12 @@ class Teleoperation:
             self._following.follower = self._follower_of(self._following.follower.link)
 
     def receive(self, twist: TwistCommand, stamp_ns: int) -> None:
-        """Follow a twist from the next state on; ``stamp_ns`` is that of the state before it.
+        """Follow a twist from the next state on; ``stamp_ns`` is the stamp of the state before it.
 
         Raises
         ------
         PlanningError
-            It is refused; the message says why.
+            The twist is refused; the message says why.
         """
         refused, following = self._refused_ns, self._following
         try:
@@ -217,7 +217,7 @@ class Teleoperation:
         self._refused_ns = stamp_ns
 
     def abort(self, stamp_ns: int) -> None:
-        """Let the joints brake, and refuse the twists that still come."""
+        """Let the joints brake, and refuse the twists that still arrive."""
         self.refuse(stamp_ns)
         if self._following is not None:
             self._following.twist = None
@@ -242,7 +242,7 @@ class Teleoperation:
             following.pose, following.pose_ns = base.pose, measured.stamp_ns
 
     def step(self, measured: MeasuredState, before: Array, *, goal_waits: bool) -> TwistStep:
-        """Return the answer to a state: braking if the twist is old or a goal waits.
+        """Return the result of a state: braking if the twist is stale or a goal waits.
 
         ``before`` (n,) are the rates that were commanded last.
         """
@@ -281,8 +281,8 @@ class Teleoperation:
 class TwistFollower:
     """Rates of the joints for twists of one link, within all limits.
 
-    The rotation follows the twist where the joints have the freedom for it; otherwise the origin of
-    the link alone does. The robot slows down and stops before a dynamic singularity, before the
+    The rotation follows the twist if the joints have enough freedom; otherwise only the origin of
+    the link does. The robot slows down and stops before a dynamic singularity, before the
     limits of its joints, and before links come too near; a twist that leads away is followed.
 
     Parameters
@@ -301,7 +301,7 @@ class TwistFollower:
     Raises
     ------
     PlanningError
-        The joints cannot move the link as twists demand.
+        The joints cannot move the link according to twists.
     """
 
     def __init__(
@@ -397,7 +397,7 @@ class TwistFollower:
             )
             reason = (
                 f"'{self.link}' is near a dynamic singularity: it moves by {progress:.3g} of its "
-                "reach for a radian of the fastest joint."
+                "reach per radian of the fastest joint."
             )
         with np.errstate(divide="ignore", invalid="ignore"):
             factor = min(factor, float(np.nanmin(limits.velocity / np.abs(rates))))

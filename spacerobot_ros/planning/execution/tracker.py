@@ -1,6 +1,6 @@
 """Tracks schedules: from a schedule and the measured shape to the setpoint of every tick.
 
-Joints that do not follow their commands are found on the way.
+Joints that do not follow their commands are detected.
 """
 
 from __future__ import annotations
@@ -148,11 +148,11 @@ class ScheduleFollower:
 
 
 class BrakingFollower:
-    """Continues along a schedule ever more slowly, to rest on its path.
+    """Slows down along a schedule, to rest on its path.
 
     The gait's time runs at the rate ``1 - t/T``: the shape stays on the gait's path, and so does
-    the base, which at zero momentum follows the path of the shape and not its speed. Wheels that
-    spin on after the schedule go over to their rates after it, which stop the base at its goal.
+    the base, whose path at zero momentum does not depend on speed. Wheels that keep spinning after
+    the schedule change to their final rates, which stop the base at its goal.
 
     Parameters
     ----------
@@ -250,7 +250,7 @@ class TrajectoryTracker:
         # No feedback here: a controller closes its own loop around the reference.
         self._commands_plant = config.output != "reference"
         self._ends_by_result = config.output == "trajectory"
-        """Whether the robot's own controller follows schedules, and says when they are over."""
+        """Whether the robot's own controller follows schedules, and reports their end."""
         self._has_result = False
         self._follower: ScheduleFollower | BrakingFollower | None = None
         self._holds_position = False
@@ -331,8 +331,8 @@ class TrajectoryTracker:
     def take_over(self, stamp_ns: int, q: Array, after: float) -> TakeOver | None:
         """Return the tick, at least ``after`` s from now, at which a plan may take over.
 
-        Its first shape is the wanted one, but for joints whose measured position in ``q`` (n,) is
-        off by more than noise. None if no schedule is tracked, or it is over by then.
+        Its first shape is the wanted one, except for joints whose measured position in ``q`` (n,)
+        is off by more than noise. None if no schedule is tracked, or it is over by then.
         """
         if not isinstance(self._follower, ScheduleFollower):
             return None
@@ -374,8 +374,8 @@ class TrajectoryTracker:
     def track(self, stamp_ns: int, q: Array, *, obeyed: bool = True) -> list[int]:
         """Write the setpoint for the present shape ``q`` (n,); return the stuck joints.
 
-        For a shape that is not finite the setpoint is to rest. While no command is in force at the
-        plant (``obeyed`` is false), joints that do not move prove nothing.
+        If the shape is not finite, the setpoint is rest. While no command is in force at the plant
+        (``obeyed`` is false), joints that do not move do not count as stuck.
         """
         assert self._follower is not None
         position, velocity = self.setpoint.position, self.setpoint.velocity
@@ -408,14 +408,14 @@ class TrajectoryTracker:
         return bool(len(self._wheels)) and not self._spins
 
     def forget_wheels(self) -> None:
-        """Keep the measured rates of wheels next, and not those that were commanded."""
+        """Keep the measured rates of wheels next, not the commanded ones."""
         self._spins = False
 
     def hold(self, q: Array, qdot: Array | None = None, *, obeyed: bool = True) -> None:
         """Write the setpoint that keeps the shape without a schedule.
 
-        Reaction wheels keep their last commanded rates, or at first the measured ones, of ``qdot``
-        (n,): braking them would turn the base.
+        Reaction wheels keep their last commanded rates, or initially the measured ones in ``qdot``
+        (n,): braking them would rotate the base.
         """
         # The reference of a controller must not follow the measured shape; for a plant, rest is any
         # shape. Motions while no command is in force are not undone afterwards.
@@ -445,7 +445,7 @@ _MAX_STANDSTILL_WINDOWS = 8
 """Number of windows without motion of any joint before joints count as stuck."""
 
 _CHECK_PERIOD = 16
-"""Ticks between two checks of joints that have all followed so far: a check takes time."""
+"""Ticks between two checks while all joints follow: a check takes time."""
 
 _MIN_JOINT_ERROR = 1e-6  # m or rad
 
@@ -453,19 +453,19 @@ _MIN_JOINT_ERROR = 1e-6  # m or rad
 class StuckJointWatch:
     """Watches the joints while a schedule is tracked, tick by tick.
 
-    Since it was last seen to follow, every joint has gone over some range and was commanded to go
-    over another; a joint is stuck when it was commanded to move in N ticks or more and the first
-    range is a small part of the second. So joints that are not commanded to move, slow ones, and
-    ones whose measurements are noisy are not taken for stuck. If no joint moves at all, or none
-    has moved for half of N ticks although several were commanded to, they are watched for longer:
-    a plant that is restarted takes a while to receive commands.
+    For every joint, the range of positions since it last followed is compared with the commanded
+    range. A joint is stuck if it was commanded to move in N ticks or more and the first range is a
+    small part of the second. So joints that are not commanded to move, slow joints, and noisy
+    measurements are not mistaken for stuck joints. If no joint moves at all, or none has moved for
+    half of N ticks although several were commanded to, they are watched for longer: a plant that is
+    restarted takes a while to receive commands.
 
     Parameters
     ----------
     joints
         Their number.
     ticks
-        N; 0: nothing is ever stuck.
+        N; 0: joints are never stuck.
     control_period
         Duration of a command, s.
     band

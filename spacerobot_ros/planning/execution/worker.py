@@ -1,4 +1,4 @@
-"""Plans on request: at once while time stands still, or in a thread while states are answered."""
+"""Plans on request: at once while time stands still, or in a thread while states are processed."""
 
 from __future__ import annotations
 
@@ -34,8 +34,8 @@ MAX_THREAD_END_TIME = 1.5
 """Largest wall time for a planning thread to end after its cancellation, s."""
 
 _COASTING_TIME, _COASTING_FACTOR = 2.0, 2.0
-"""Rest with which a plan in the background begins where the robot drifts, s, and, where that was
-too short, the factor of the time from its start to the end of planning."""
+"""Rest at the start of a plan in the background if the robot drifts, s, and, if it was too short,
+the factor of the time from its start to the end of planning."""
 
 _MAX_COASTING_TIME = 600.0
 """Longest such time, s."""
@@ -62,7 +62,7 @@ class PlanReason(Enum):
 
 @dataclass(frozen=True)
 class PlanJob:
-    """A requested plan; this base class serves new goals from rest or with braking first."""
+    """A requested plan; this base class is for new goals, from rest or with braking first."""
 
     identified: IdentifiedGoal
     reason: PlanReason
@@ -111,14 +111,14 @@ class PlanningTask:
     required
         Parts of the goal that a plan without them must control.
     braking
-        (K + 1, n) shapes at the ticks, m or rad, in which the joints brake before the gait, or rest
+        (K + 1, n) shapes at the ticks, m or rad, while the joints brake before the gait, or rest
         while the base drifts; None: the gait begins at once.
     rates_after_braking
         (n,) velocities that are held from there on, m/s or rad/s: those of reaction wheels; None:
         zero.
     take_over
-        When the plan takes over from a schedule that is tracked until then; None: it begins at
-        rest, or with the braking. The state of the request is that of now.
+        Tick at which the plan takes over from a schedule that is tracked until then; None: it
+        begins at rest, or with the braking. The state of the request is the present one.
     """
 
     request: PlanRequest
@@ -140,7 +140,7 @@ class Planned:
 
 @dataclass(frozen=True)
 class Postponed:
-    """A plan that was ready too late, by a time in s, and is made again to begin later."""
+    """A plan that was ready too late, by a time in s, and is repeated with a later start."""
 
     late: float
     wall_time: float
@@ -181,10 +181,9 @@ class PlanningWorker:
     """Plans with the method of a planner, one plan at a time.
 
     With ``plan_in_background`` a thread plans: CasADi and numpy release Python's lock for most of
-    it. A robot that drifts meanwhile is not where the plan began: such plans begin with a rest,
-    which is longer the next time if planning took longer than it. The thread uses the robot's
-    functions, whose buffers are shared: as long as the worker is :attr:`busy`, nothing else may use
-    them.
+    it. A robot that drifts moves during planning: its plans begin with a rest, which is longer the
+    next time if planning took longer. The thread uses the robot's functions, whose buffers are
+    shared: as long as the worker is :attr:`busy`, nothing else may use them.
 
     Parameters
     ----------
@@ -230,11 +229,11 @@ class PlanningWorker:
         """The latest method without stuck joints, and its task."""
         self._job: _PlanThread | None = None
         self._coasting: _Coasting | None = None
-        """The rest that the requested plan begins with, because the base drifts meanwhile."""
+        """Rest at the beginning of the requested plan, because the base drifts meanwhile."""
 
     @property
     def is_busy(self) -> bool:
-        """Whether a plan is in work, its result waits, or its thread still runs."""
+        """Whether a plan is in progress, its result waits, or its thread still runs."""
         return self._job is not None
 
     def _drifts(self, state: RobotState) -> bool:
@@ -267,9 +266,10 @@ class PlanningWorker:
                 job.run()
 
     def poll(self, stamp_ns: int) -> Planned | Refused | Postponed | None:
-        """Return the result at a state of a stamp; None before the end and for a cancelled plan.
+        """Return the result at a state of a stamp; None until the plan has ended, or if it was
+        cancelled.
 
-        A defect of the method is raised here.
+        Unexpected errors of the method are raised here.
         """
         result, coasting = self.take_result(), self._coasting
         if not isinstance(result, Planned):
@@ -291,7 +291,7 @@ class PlanningWorker:
         return Postponed(elapsed - coasting.duration, result.wall_time)
 
     def take_result(self) -> Planned | Refused | None:
-        """Return the result of the work once; None before its end and after its cancellation."""
+        """Return the result of the work once; None until it has ended, or if it was cancelled."""
         job = self._job
         if job is None or not job.done:
             return None

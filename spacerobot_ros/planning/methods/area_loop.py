@@ -1,16 +1,16 @@
-"""Closed motions of three joints turn a spacecraft about three axes: paper 2.
+"""Closed motions of three joints rotate a spacecraft about three axes: paper 2.
 
-Small loops round a nominal shape turn the base by ``dTheta = M S``: M (3, 3) the curvature of the
-connection for the joint pairs (1, 2), (2, 3), (3, 1), S the areas that the loop encloses in their
-planes. Each cycle makes up for the share k of the turn that is left, ``S = k M^-1 dTheta``; the
-error of the first order is left for the next, which begins from the measured attitude.
+Small loops around a nominal shape rotate the base by ``dTheta = M S``: M (3, 3) the curvature of
+the connection for the joint pairs (1, 2), (2, 3), (3, 1), S the areas that the loop encloses in
+their planes. Each cycle corrects the share k of the remaining rotation, ``S = k M^-1 dTheta``; the
+first-order error is left to the next cycle, which begins from the measured attitude.
 
-All edges are straight lines of the shape from rest to rest: the turn of the base depends on the
+All edges are straight lines of the shape from rest to rest: the rotation of the base depends on the
 path alone, and held commands move along it.
 
 Loops go along joint axes and enclose given areas (figure 5) in the planes of the joints (1, 2),
-(2, 3) and (3, 1); an area is positive where the path goes round counter-clockwise. Six edges of a
-box enclose all three at once, rectangles one by one.
+(2, 3) and (3, 1); an area is positive if the path is counter-clockwise. Six edges of a box enclose
+all three at once, rectangles one by one.
 """
 
 from __future__ import annotations
@@ -40,17 +40,17 @@ from spacerobot_ros.planning.methods.nominal_shape import (
 )
 
 _MAX_SHRINKS = 14
-"""A cycle on which links come too near to each other is tried this often, each time half as large.
+"""Attempts for a cycle on which links come too near to each other, each half as large as before.
 """
 
 _MAX_CYCLE_TRIALS = 6
 """Attempts for a cycle that would not bring the base nearer, each half as large as before."""
 
 _MAX_CYCLE_SHARE = 1.0 - 1e-9
-"""Share k of the missing turn above which one cycle makes up for the whole turn."""
+"""Share k of the remaining rotation above which one cycle corrects all of it."""
 
 _NEGLIGIBLE_AREA_SHARE = 1e-3
-"""Share of the largest area below which an area counts as zero: a later cycle makes up for it."""
+"""Share of the largest area below which an area counts as zero: a later cycle corrects it."""
 
 _IDENTITY = np.array([0.0, 0.0, 0.0, 1.0])
 
@@ -135,7 +135,7 @@ class AreaLoopGait(GaitMethod):
     @classmethod
     @override
     def require_suitable(cls, robot: SpaceRobot) -> None:
-        """Refuse robots whose base cannot be turned about three axes by loops of three joints."""
+        """Refuse robots whose base cannot be rotated about three axes by loops of three joints."""
         if robot.n < 3:
             raise PlanningError(
                 f"area_loop needs three joints (paper 2); robot '{robot.description.name}' has "
@@ -148,7 +148,7 @@ class AreaLoopGait(GaitMethod):
         """Plan the way to the nominal shape and the next cycle; see :meth:`GaitMethod.plan`.
 
         The schedule is ``partial`` unless its own prediction reaches the goal. ``most_cycles`` and
-        ``longest`` bound the cycles for the goal, with those before (``request.previous``).
+        ``longest`` bound the cycles for the goal, including those before (``request.previous``).
         """
         state, goal, tolerance = request.state, request.goal, request.tolerance
         self.require_rest(state)
@@ -281,7 +281,7 @@ class AreaLoopGait(GaitMethod):
             share /= 2
         else:
             raise PlanningError(
-                f"None of {_MAX_CYCLE_TRIALS} cycles of area_loop round the nominal shape "
+                f"None of {_MAX_CYCLE_TRIALS} cycles of area_loop around the nominal shape "
                 f"{np.round(nominal.shape, 4).tolist()}, each half as large as the one before, "
                 f"brings the base nearer to its goal than {missing:.3g} rad."
             )
@@ -315,7 +315,7 @@ class AreaLoopGait(GaitMethod):
             why = f" In a loop twice as large, {too_near}." if too_near else ""
             raise PlanningError(
                 f"The goal takes about {cycles:.4g} cycles, more than most_cycles = {most}; "
-                f"{flown} are flown.{why}"
+                f"{flown} have been flown.{why}"
             )
         return cycles
 
@@ -429,10 +429,10 @@ class EdgePath:
     Attributes
     ----------
     loops
-        Each (V, 3): the vertices in the order of travel, the first again at the end; the middle of
-        the box that holds them is the origin.
+        Each (V, 3): the vertices in the order of travel, the first again at the end; the centre of
+        their bounding box is the origin.
     edge_ratio
-        Largest ratio of an edge to the longest that is allowed.
+        Largest ratio of an edge to the longest allowed one.
     """
 
     loops: tuple[Array, ...]
@@ -449,9 +449,9 @@ class EdgePath:
 def edge_path(areas: Array, longest: Array) -> EdgePath:
     """Return the path around ``areas`` (3,), with edges of at most ``longest`` (3,) if possible.
 
-    The cube-like path is taken where its edges are short enough, or shorter than those of
-    rectangles. Areas that are too large give a path with ``excess`` over 1: edges go as the root
-    of the areas.
+    The cube-like path is used if its edges are short enough, or shorter than those of rectangles.
+    If the areas are too large, ``excess`` is above 1; edges scale with the square root of the
+    areas.
     """
     areas = np.where(np.abs(areas) > _NEGLIGIBLE_AREA_SHARE * np.abs(areas).max(), areas, 0.0)
     rectangles = _rectangle_path(areas, longest)
@@ -463,7 +463,7 @@ def edge_path(areas: Array, longest: Array) -> EdgePath:
 
 
 def cube_edges(areas: Array) -> tuple[Array, bool]:
-    """Return the edges ``d`` (3,) of the box, and whether its path is gone backwards.
+    """Return the edges ``d`` (3,) of the box, and whether its path is traversed backwards.
 
     Edges +d1, +d2, +d3, -d1, -d2, -d3 have the projected areas (d1 d2, d2 d3, -d1 d3); backwards
     these change sign. No area may be zero.

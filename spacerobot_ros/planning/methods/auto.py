@@ -38,13 +38,13 @@ class AutoGait(GaitMethod):
 
     If a method that suits the robot controls the position, methods that do not are omitted. A
     manoeuvre that ends off the goal, or controls less of it than another, is taken only if there
-    is no better one. A goal stays with the method of the schedule that was flown for it before, as
-    long as that plans. A schedule is that of the chosen method, in all but its notes.
+    is no better one. A goal keeps the method of the schedule flown for it before, as long as that
+    method finds a plan. A schedule is that of the chosen method, except for its notes.
 
     Parameters
     ----------
     candidates
-        The methods by name; of equally long manoeuvres that of the first is taken.
+        The methods by name; of equally long manoeuvres, that of the first method is taken.
     """
 
     name: ClassVar[str] = "auto"
@@ -78,8 +78,8 @@ class AutoGait(GaitMethod):
         Raises
         ------
         PlanningError
-            No method plans; the messages of all of them say why. It is an `UnreachableError` where
-            one of them proves it, and else a `NotFoundError` where one of them searched.
+            No method plans; the messages of all of them say why. It is an `UnreachableError` if one
+            of them proves it, else a `NotFoundError` if one of them searched.
         """
         if not self.robot.n:
             raise PlanningError(NO_JOINTS.format(self.robot.description.name))

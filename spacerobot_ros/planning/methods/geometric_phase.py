@@ -1,13 +1,13 @@
-"""Planar robots, and the turn of their base by a path of shapes: the geometric phase of paper 3.
+"""Planar robots, and the rotation of their base by a path of shapes: paper 3's geometric phase.
 
-A planar robot's joints all turn about parallel axes, and nothing tilts its base. The attitude is
+A planar robot's joints all rotate about parallel axes, and nothing tilts its base. The attitude is
 one angle theta about the axis of the robot. At zero angular momentum
 ``theta_dot = -s(psi)' psi_dot`` (eq. 3), where ``s_i = N_i / D`` is the component about the axis of
 the mechanical connection, ``D`` the inertia of the locked robot about the axis and ``N_i`` its
-coupling to joint i. The turn along a path of shapes is the line integral of ``-s`` (eq. 11): it
+coupling to joint i. The rotation along a path of shapes is the line integral of ``-s`` (eq. 11): it
 depends on the path and not on the speed.
 
-Small loops turn the base most where the curvature is largest (remark 2). Boxes (2, 2) are lower
+Small loops rotate the base most where the curvature is largest (remark 2). Boxes (2, 2) are lower
 over upper bounds of two joints, rad.
 """
 
@@ -30,7 +30,7 @@ from spacerobot_ros.planning.core.controllability import (
 )
 
 _MAX_AXIS_TILT = 1e-5
-"""Largest tilt of an axis of a planar robot, and turn about other axes per radian of a joint:
+"""Largest tilt of an axis of a planar robot, and rotation about other axes per radian of a joint:
 the rounding error of angles with six digits."""
 
 _SAMPLED_SHAPE_COUNT = 8
@@ -64,9 +64,9 @@ _NEIGHBOUR_OFFSETS = np.array([[x, y] for x in (0.0, -1.0, 1.0) for y in (0.0, -
 
 
 def planar_axis(robot: SpaceRobot) -> Array:
-    """Return the unit vector (3,), base components, that a planar robot of three links turns about.
+    """Return the axis (3,) of a planar robot of three links, a unit vector in base components.
 
-    Its largest component is positive, however the joints are oriented.
+    Its largest component is positive, whatever the orientation of the joints.
 
     Raises
     ------
@@ -86,7 +86,7 @@ def planar_axis(robot: SpaceRobot) -> Array:
         if joint.kind is JointKind.PRISMATIC:
             raise PlanningError(
                 f"Robot '{name}' is not planar in the sense of paper 3: joint '{joint.name}' "
-                "slides, and all joints must turn about parallel axes."
+                "slides, and all joints must rotate about parallel axes."
             )
         # Turns about parallel axes do not move the axes, so one shape suffices for the test.
         rotations.append(rotations[body.parent] @ body.origin.R)
@@ -114,7 +114,7 @@ def _require_turn_about(robot: SpaceRobot, axis: Array) -> None:
     if tilts[worst] > _MAX_AXIS_TILT:
         raise PlanningError(
             f"Robot '{robot.description.name}' is not planar: joint "
-            f"'{robot.joint_names[worst[1]]}' also turns the base about other axes than its own, "
+            f"'{robot.joint_names[worst[1]]}' also rotates the base about axes other than its own, "
             f"by up to {tilts[worst]:.2g} rad per rad; the causes are mass centres outside of one "
             "plane, or products of inertia."
         )
@@ -136,8 +136,8 @@ def check_planar_chain(robot: SpaceRobot) -> Controllability:
         tops.append((abs(float(plane.curvature(shape[[i, j]]))), (names[i], names[j]), shape))
     largest, pair, shape = max(tops, key=lambda top: top[0])
     message = (
-        f"{robot.n + 1} links in a plane: loops of joints '{pair[0]}' and '{pair[1]}' turn the "
-        f"base by up to {largest:.3g} rad per unit of area, round {np.round(shape, 3).tolist()} "
+        f"{robot.n + 1} links in a plane: loops of joints '{pair[0]}' and '{pair[1]}' rotate the "
+        f"base by up to {largest:.3g} rad per unit of area, around {np.round(shape, 3).tolist()} "
         "(paper 3)."
     )
     if largest <= ZERO_TURN_PER_AREA:
@@ -147,7 +147,7 @@ def check_planar_chain(robot: SpaceRobot) -> Controllability:
 
 
 class PlanarPhase:
-    """Turns of the base of a planar robot about its axis, rad, by paths of the shape.
+    """Rotations of the base of a planar robot about its axis, rad, by paths of the shape.
 
     Parameters
     ----------
@@ -162,7 +162,7 @@ class PlanarPhase:
 
     def __init__(self, robot: SpaceRobot) -> None:
         self.axis = planar_axis(robot)
-        """Axis (3,) of positive turns, a unit vector in base components."""
+        """Axis (3,) of positive rotations, a unit vector in base components."""
         psi = ca.SX.sym("psi", robot.n)
         D, D_q = robot.function("locked_inertia", compile=False)(psi)
         axis = ca.DM(self.axis)
@@ -171,7 +171,7 @@ class PlanarPhase:
         self._N_D = ca.Function("N_D", [psi], [ca.densify(N_D)])
 
     def turns_by_legs(self, starts: Array, ends: Array) -> Array:
-        """Return the turns (L,) along straight legs of the shape, starts and ends (L, n)."""
+        """Return the rotations (L,) along straight legs of the shape, starts and ends (L, n)."""
         return _integrate_legs(self._connection_row, starts, ends)
 
     def plane(self, psi: Array, i: int, j: int) -> PhasePlane:
@@ -189,11 +189,12 @@ class PlanarPhase:
 
 
 class PhasePlane:
-    """Turns of the base by two joints, in closed form.
+    """Rotations of the base by two joints, in closed form.
 
-    Each joint turns one rigid part of the robot against the other, and ``N_i``, ``N_j`` and ``D``
-    are sums of products of two vectors, each fixed in some body. They are trigonometric polynomials
-    of degree one in either angle: ``f = h(psi_i)' C h(psi_j)`` with ``h(x) = [1, cos x, sin x]``.
+    Each joint rotates one rigid part of the robot relative to the other, and ``N_i``, ``N_j`` and
+    ``D`` are sums of products of two vectors, each fixed in some body. They are trigonometric
+    polynomials of degree one in either angle: ``f = h(psi_i)' C h(psi_j)`` with
+    ``h(x) = [1, cos x, sin x]``.
 
     Parameters
     ----------
@@ -205,7 +206,8 @@ class PhasePlane:
         self._C = coefficients
 
     def curvature(self, points: Array) -> Array:
-        """Return the turn of the base per area of small loops, 1/rad, (...), at points (..., 2).
+        """Return the rotation of the base per area of small loops, 1/rad, (...), at points (...,
+        2).
 
         Loops are counter-clockwise in the plane (psi_i, psi_j): it is ``-H``, eq. (10), with
         ``H = ds_j/dpsi_i - ds_i/dpsi_j``.
@@ -217,7 +219,7 @@ class PhasePlane:
         return np.asarray((N_i_j * D - N_i * D_j - N_j_i * D + N_j * D_i) / D**2)
 
     def turns_by_squares(self, centres: Array, sides: Array) -> Array:
-        """Return the turns (R,) of the base by counter-clockwise squares with centres (R, 2)."""
+        """Return the rotations (R,) of the base by counter-clockwise squares, centres (R, 2)."""
         corners = square_corners(centres, sides)
         ends = np.roll(corners, -1, axis=1)
         legs = _integrate_legs(self._connection_row, corners.reshape(-1, 2), ends.reshape(-1, 2))
@@ -255,10 +257,10 @@ def _integrate_legs(s: Callable[[Array], Array], starts: Array, ends: Array) -> 
 
 
 def centre_box(at: Array, lower: Array, upper: Array) -> Array:
-    """Return the box that holds every different point within the limits (2,) once.
+    """Return the box that holds every distinct point within the limits (2,) once.
 
-    Shapes repeat after a turn: a joint that goes further than once round has all its points within
-    half a turn of ``at`` (2,), or of the end of its range that is nearest to that.
+    Shapes repeat after a revolution: a joint whose range is larger has all its points within half a
+    revolution of ``at`` (2,), or of the end of its range nearest to ``at``.
     """
     width = np.minimum(upper - lower, 2 * math.pi)
     start = np.clip(at - width / 2, lower, upper - width)
@@ -268,7 +270,7 @@ def centre_box(at: Array, lower: Array, upper: Array) -> Array:
 def curvature_peaks(plane: PhasePlane, at: Array, boxes: Array) -> Array:
     """Return the points (R, 2) of the largest |curvature| in boxes (R, 2, 2).
 
-    Of equally good points it is the one that is nearest to ``at`` (2,).
+    Among equally good points, it is the one nearest to ``at`` (2,).
     """
     # Boxes of joints without limits do not depend on the size of the square.
     flat, row = np.unique(boxes.reshape(-1, 4), axis=0, return_inverse=True)

@@ -1,11 +1,11 @@
 """Sliding masses, first-order Lie brackets: the manoeuvre of paper 1, section 5.
 
 Step 1 finds the final shape ``zf`` that puts the base at the goal position (eq. 9). Step 2 slides
-the masses there (eq. 10). Step 3 turns the base by n equal cycles of three frequencies whose
-brackets add up to the attitude that is missing.
+the masses there (eq. 10). Step 3 rotates the base by n equal cycles of three frequencies whose
+brackets add up to the remaining rotation.
 
 The plant holds each command for a tick, so the sliders trace polygons inside the smooth curves.
-Their area is smaller by ``sin(x)/x``, ``x`` the phase per tick; the amplitudes allow for it.
+Their area is smaller by ``sin(x)/x``, ``x`` the phase per tick; the amplitudes compensate for it.
 """
 
 from __future__ import annotations
@@ -44,10 +44,10 @@ from spacerobot_ros.planning.core.schedule import BasePath, GaitSchedule, Notes
 _MIN_CYCLE_TICKS = 12
 _MAX_REFINEMENTS = 20
 _SHRINK_FACTOR = 1.4
-"""Factor by which a cycle on which links come too near is made smaller."""
+"""Factor by which a cycle on which links come too near is reduced."""
 
 _PATH_POSES_PER_STEP = 100
-"""Fewest poses of the predicted path in each step; a step has at most twice as many."""
+"""Smallest number of poses of the predicted path in a step; a step has at most twice as many."""
 
 _ZERO_ROTATION_ANGLE = 1e-9
 _ZERO_MOTION = 1e-9
@@ -132,14 +132,14 @@ class LieBracketGait(GaitMethod):
     def final_shape(self, state: RobotState, goal: Goal, enough: float = 0.0) -> Array:
         """Step 1: the shape ``zf`` (n,) that solves eq. (9), nearest to the present one.
 
-        Where strokes are too short for it, it may miss the position by ``enough``, m.
+        If strokes are too short, it may miss the position by ``enough``, m.
 
         Raises
         ------
         UnreachableError
-            ``zf`` is beyond a stroke, of a robot that has sliders only.
+            ``zf`` is beyond a stroke, and the robot has sliders only.
         PlanningError
-            It is, of another robot; or there are no three independent slots.
+            ``zf`` is beyond a stroke of another robot, or there are no three independent slots.
         """
         robot = self.robot
         R0, Rf = matrix_from_quaternion(state.quaternion), matrix_from_quaternion(goal.quaternion)
@@ -311,7 +311,7 @@ class LieBracketGait(GaitMethod):
                 if too_near:
                     raise PlanningError(f"In loops of the sliders, {too_near}.")
                 raise PlanningError(
-                    f"The turn would take more than {longest:.6g} s within the strokes and "
+                    f"The rotation would take more than {longest:.6g} s within the strokes and "
                     f"rates of the sliders at the final shape {np.round(z_f, 4).tolist()}; "
                     "a goal with more room for the sliders takes less."
                 )

@@ -1,8 +1,8 @@
-"""The nominal shape of the area loops: where three joints turn the base best (paper 2).
+"""The nominal shape of the area loops: where three joints rotate the base best (paper 2).
 
-Loops go round the nominal shape. It is good where the curvature matrix M is well conditioned,
-turns are large, and limits leave room for edges: the measure is the smallest singular value of M
-times the largest areas, the turn about the worst axis by loops as large as they may be.
+Loops go around the nominal shape. It is good if the curvature matrix M is well conditioned,
+rotations are large, and limits leave room for edges: the measure is the smallest singular value of
+M times the largest areas, the rotation about the worst axis by the largest loops.
 """
 
 from __future__ import annotations
@@ -49,14 +49,14 @@ _NEIGHBOUR_OFFSETS = np.array(list(itertools.product((0.0, -1.0, 1.0), repeat=3)
 
 
 _BOX_SHARES = (1.0, 0.5, 0.25, 0.125)
-"""Edges of the boxes in which links keep clear, as shares of the longest edges of loops."""
+"""Edges of the boxes in which links keep the clearance, as shares of the longest edges of loops."""
 
 _BOX_GRID_POINTS = 7
 
 _MAX_BOXES = 300
 
 ClearanceTest = Callable[[Array], bool]
-"""Whether links keep clear at all of some shapes (N, n)."""
+"""Whether links keep the clearance at all shapes (N, n)."""
 
 LoopRoomTest = Callable[[Array], npt.NDArray[np.bool_]]
 """Whether links have room to move (N,) at shapes (N, n)."""
@@ -73,7 +73,8 @@ class NominalShape:
     joints
         Indices of the three.
     M
-        (3, 3) turn of the base, rad, base components, per area of the pairs (1, 2), (2, 3), (3, 1).
+        (3, 3) rotation of the base, rad, base components, per area of the pairs (1, 2), (2, 3), (3,
+        1).
     longest
         (3,) longest edges that fit into the joint limits, m or rad.
     """
@@ -113,7 +114,7 @@ class NominalShapeChooser:
     Raises
     ------
     ParameterError
-        ``joints`` does not name three joints, or ``nominal`` is no shape of the robot.
+        ``joints`` does not name three joints, or ``nominal`` is not a shape of the robot.
     """
 
     def __init__(
@@ -146,23 +147,23 @@ class NominalShapeChooser:
     def at(self, q: Array, kept: NominalShape | None = None) -> NominalShape:
         """Return the nominal shape to use from shape ``q`` (n,).
 
-        Other joints than the three rest; ``kept``, an earlier choice, holds as long as they do.
+        The other joints rest; ``kept``, an earlier choice, is returned if they have not moved.
 
         Raises
         ------
         PlanningError
-            Limits leave no room for loops, or loops there do not turn the base about all axes.
+            Limits leave no room for loops, or loops there do not rotate the base about all axes.
         """
         if self._only_choice is not None:
             return self._only_choice
         return kept if kept is not None and self._can_be_kept(kept, q) else self._choose_nominal(q)
 
     def shapes_with_more_room(self, q: Array, is_clear: ClearanceTest) -> Iterator[NominalShape]:
-        """Yield other nominal shapes from shape ``q`` (n,), round which loops have room.
+        """Yield other nominal shapes from shape ``q`` (n,), around which loops have room.
 
-        All shapes in a box round one keep clear, as ``is_clear`` says. The edges of the first box
+        All shapes in a box around one keep the clearance (``is_clear``). The edges of the first box
         are as long as edges of loops may be, those of the next half as long, and so on. None is
-        yielded where users have given the nominal shape.
+        yielded if users have given the nominal shape.
         """
         if self._given_shape is not None:
             return
@@ -174,7 +175,7 @@ class NominalShapeChooser:
                 yield found
 
     def move_to_nearest_turn(self, nominal: NominalShape, q: Array) -> NominalShape:
-        """Return the nominal shape with unlimited joints moved by full turns to near ``q``."""
+        """Return the nominal shape with unlimited joints moved by revolutions to near ``q``."""
         turns = np.where(self._repeating, np.round((q - nominal.shape) / (2 * math.pi)), 0.0)
         return replace(nominal, shape=nominal.shape + 2 * math.pi * turns)
 
@@ -206,7 +207,7 @@ class NominalShapeChooser:
             raise PlanningError(
                 f"The curvature matrix of joints {', '.join(names)} is singular at the nominal "
                 f"shape {np.round(chosen.shape, 4).tolist()} (condition number "
-                f"{chosen.condition:.2g}): loops there do not turn the base about all axes."
+                f"{chosen.condition:.2g}): loops there do not rotate the base about all axes."
             )
         return chosen
 
@@ -216,7 +217,7 @@ def nominal_at_shape(
 ) -> NominalShape:
     """Return a given shape (n,) with the best of the triples of joints.
 
-    Boxes that do not fit round it are moved into the limits; see :class:`NominalShape`.
+    Boxes that do not fit around it are moved into the limits; see :class:`NominalShape`.
     """
     K = curvatures(robot, shape[np.newaxis])[0]
     lower, upper = robot.lower, robot.upper
@@ -234,10 +235,10 @@ def best_nominal(
     largest_edge: float,
     is_roomy: LoopRoomTest | None = None,
 ) -> NominalShape:
-    """Return the best nominal shape over all triples; other joints stay as in ``held`` (n,).
+    """Return the best nominal shape over all triples; other joints are those of ``held`` (n,).
 
-    Boxes of the longest edges fit round it into the limits. Links have room there, as ``is_roomy``
-    says, if they have anywhere.
+    Boxes of the longest edges around it fit into the limits. Links have room there (``is_roomy``)
+    if they have room anywhere.
     """
     triples = _select_best_triples(robot, triples, largest_edge)
     points = _GRID_POINTS.get(len(triples), 5)
@@ -258,10 +259,10 @@ def nominal_with_clearance(
     share: float,
     is_clear: ClearanceTest,
 ) -> NominalShape | None:
-    """Return the best nominal shape of a grid round which links keep clear; None if none is found.
+    """Return the best nominal shape of a grid around which links keep the clearance, or None.
 
-    They keep clear in a box with a share of the longest edges; the edges of its loops are no
-    longer. Other joints than three stay as in ``held`` (n,).
+    They keep it in a box with a share of the longest edges, which bounds the edges of its loops.
+    The other joints are those of ``held`` (n,).
     """
     ranked: list[tuple[float, NominalShape]] = []
     for triple in _select_best_triples(robot, triples, largest_edge):

@@ -1,9 +1,9 @@
 """Given paths of an end-effector: straight lines through poses, rounded at their corners.
 
-Within a distance ``d`` of a corner both lines are blended: the place is ``c - a l_1 + b l_2``, with
-the lines ``l_1`` and ``l_2`` to and from the corner ``c``, ``a = (1 - t)^2 d / |l_1|``, and
-``b = t^2 d / |l_2|``, for t from 0 to 1. The tangent is continuous, and the place at most ``d / 4``
-beside the lines. The attitude is blended in the same way, by rotations.
+Within a distance ``d`` of a corner both lines are blended: the position is ``c - a l_1 + b l_2``,
+with the lines ``l_1`` and ``l_2`` to and from the corner ``c``, ``a = (1 - t)^2 d / |l_1|``, and
+``b = t^2 d / |l_2|``, for t from 0 to 1. The tangent is continuous, and the position is at most
+``d / 4`` off the lines. The attitude is blended in the same way, by rotations.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from spacerobot_ros.model.rotations import (
 )
 
 MAX_CORNERS = 500
-"""Largest number of corners that is planned for: it bounds the time of a plan."""
+"""Largest number of corners of a path: it limits the planning time."""
 
 _SAME_POSE = 1e-10  # m or rad
 
@@ -40,7 +40,7 @@ _BLEND_PARTS = 4
 
 @dataclass(frozen=True)
 class PosePath:
-    """Straight lines through poses, the attitude turning about one axis in step with each.
+    """Straight lines through poses; along each, the attitude rotates about one axis.
 
     Attributes
     ----------
@@ -67,7 +67,7 @@ class PosePath:
 
     @cached_property
     def turns(self) -> Array:
-        """Rotation vectors (K - 1, 3) from attitude to attitude, rad, as the positions are seen."""
+        """Rotation vectors (K - 1, 3) from attitude to attitude, rad, in the positions' frame."""
         between = quaternion_multiply(
             self.quaternions[1:], quaternion_inverse(self.quaternions[:-1])
         )
@@ -107,13 +107,13 @@ class PosePath:
     def simplified(self, tolerance: float) -> PosePath:
         """Return a path through fewer of the poses, off the others by at most a tolerance.
 
-        ``tolerance`` is in m and rad. (Douglas and Peucker; places are compared after equal shares
-        of the length, so that a way there and back stays one.)
+        ``tolerance`` is in m and rad. (Douglas and Peucker; positions are compared at equal shares
+        of the length, so that a path there and back is preserved.)
 
         Raises
         ------
         PlanningError
-            It has too many corners.
+            The path has too many corners.
         """
         kept, open_parts = {0, len(self.positions) - 1}, [(0, len(self.positions) - 1)]
         while open_parts:
@@ -155,7 +155,7 @@ class PosePath:
         return np.asarray(np.maximum(off, np.linalg.norm(left, axis=1)))
 
     def split_at_reversals(self, tolerance: float) -> Iterator[PosePath]:
-        """Yield the parts between stops: at sharp corners, and without a tolerance at each."""
+        """Yield the parts between stops: at sharp corners, or at each if there is no tolerance."""
         directions = np.hstack([self.chords, self.turns])
         size = np.linalg.norm(directions, axis=1)
         cosines = (directions[1:] * directions[:-1]).sum(axis=1) / (size[1:] * size[:-1])
@@ -165,7 +165,7 @@ class PosePath:
 
 
 class RoundedPath:
-    """The way along a path, rounded at the corners: a displacement and a turn from its start.
+    """The way along a path with rounded corners: displacement and rotation from its start.
 
     Parameters
     ----------
@@ -174,7 +174,7 @@ class RoundedPath:
     tolerance
         Largest distance of the way from the lines, m, and of its attitudes, rad.
     before, total_length
-        Metres before its start, and of the whole path, for messages.
+        Length before its start, and of the whole path, m, for messages.
 
     Attributes
     ----------
@@ -216,7 +216,7 @@ class RoundedPath:
         return np.asarray(b_rate * chords[after] - a_rate * chords[before])
 
     def rotation(self, share: float) -> Array:
-        """Return the turn (4,) since the start after a share of the way."""
+        """Return the rotation (4,) since the start after a share of the way."""
         base, before, after, a, b, _, _ = self._blend_at(share)
         path = self._path
         to_base = quaternion_multiply(
@@ -233,7 +233,7 @@ class RoundedPath:
         return np.asarray(b_rate * turns[after] - a_rate * (carried @ turns[before]))
 
     def travelled_length(self, share: float) -> float:
-        """Return the metres of the whole path after a share of the way."""
+        """Return the length of the whole path, m, after a share of the way."""
         return self._length_before + float(
             np.interp(share * self._total, self._path.lengths_at_poses, self._metres_at_poses)
         )

@@ -45,7 +45,8 @@ def build_method(
 ) -> GaitMethod:
     """Return a method for a robot; ``options`` holds instances of ``Options`` by method.
 
-    A method that is not among them has its defaults. Schedules keep the clearance, if there is one.
+    A method that is not among them uses its defaults. Schedules keep the clearance, if there is
+    one.
 
     Raises
     ------

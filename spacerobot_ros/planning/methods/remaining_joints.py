@@ -1,4 +1,4 @@
-"""Plans for robots with stuck joints by the other joints."""
+"""Plans for robots with stuck joints, which use the other joints."""
 
 from __future__ import annotations
 
@@ -43,15 +43,15 @@ class _RemainingProgress:
 class RemainingJointsGait(GaitMethod):
     """Plans for a robot with stuck joints, each of which welds two bodies together.
 
-    Its schedules name every joint; the stuck ones rest in them.
+    Its schedules have every joint; the stuck ones rest.
 
     Parameters
     ----------
     robot, control_period, integration_step
         As for any :class:`GaitMethod`.
     stuck
-        Positions of the joints that do not move, m or rad, by name: the model is that of the robot
-        with these joints fixed there.
+        Positions of the joints that do not move, m or rad, by name: the model is the robot with
+        these joints fixed there.
     method, options
         The method for the remaining joints, as for :func:`build_method`; if it refuses, ``auto`` is
         tried.

@@ -1,12 +1,12 @@
 """End-effectors along given lines while the base floats: resolved-rate motion.
 
 At zero momentum the generalised Jacobian ``J*(q)`` maps the rates of the joints to the velocity of
-an end-effector in the world (Umetani and Yoshida). The rates that take it along a line, straight,
-through waypoints or along a given path, are ``qdot = J*^+ xdot``. Where ``J*`` loses rank no rates
-do: a dynamic singularity. Whether the line meets one depends on the shape alone, which depends on
+an end-effector in the world (Umetani and Yoshida). The rates that move it along a line (straight,
+through waypoints, or a given path) are ``qdot = J*^+ xdot``. If ``J*`` loses rank, no rates do: a
+dynamic singularity. Whether the line meets one depends on the shape alone, which depends on
 the path that led there (paper 4, section V; path-dependent workspaces).
 
-The path is followed in its own length, not in time: its tangent is a vector of the null space of
+The path is parametrised by its length, not by time: its tangent is a vector of the null space of
 ``[J*, -x']``, which is finite up to the singularity, where the progress on the line becomes zero.
 The motion along the path is the fastest within the limits of velocity and acceleration (a linear
 program in the squares of the speed). Held commands move the shape on straight lines between ticks,
@@ -63,11 +63,11 @@ _TRACE_STEP = 0.02
 _MIN_TRACE_STEPS = 20
 
 MIN_PROGRESS_RATE = 0.01
-"""Progress on the line below which a singularity is near: the line in reaches of the end-effector,
-for a motion of the joints by one radian of the fastest one."""
+"""Progress on the line below which a singularity is near: in reaches of the end-effector, per
+radian of the fastest joint."""
 
 _ZERO_PROGRESS_RATE = 1e-8
-"""Progress below which the path has come to the singularity itself."""
+"""Progress below which the path has reached the singularity."""
 
 _SINGULARITY_STEP_SHARE = 0.25
 
@@ -84,7 +84,7 @@ _TIMING_INTERVALS = 160
 _MAX_TIMING_INTERVALS = 1600
 
 _USED_ACCELERATION_SHARE = 0.99
-"""Share of the limits of acceleration for the path; corrections of the ticks may use the rest."""
+"""Share of the limits of acceleration for the path; corrections at the ticks may use the rest."""
 
 _MAX_CORRECTION_ITERATIONS = 8
 """Newton steps at a tick, and attempts to keep the limits with more ticks."""
@@ -160,7 +160,7 @@ class _SmoothPath:
         return np.asarray(self._rate(share))
 
     def rotation(self, share: float) -> Array:
-        """Return the turn (4,) since the start after a share of the way."""
+        """Return the rotation (4,) since the start after a share of the way."""
         return quaternion_from_rotvec(share * self._turn)
 
     def rotation_derivative(self, share: float) -> Array:
@@ -168,7 +168,7 @@ class _SmoothPath:
         return self._turn
 
     def travelled_length(self, share: float) -> float:
-        """Return the metres of the way after a share of it."""
+        """Return the length of the way, m, after a share of it."""
         return share * self.length
 
 
@@ -244,7 +244,7 @@ class _LinkPaths:
         return np.asarray(np.concatenate(rates) * self._row_scales)
 
     def jacobian(self, q: Array, X: Array) -> Array:
-        """Return the rows (m, n) of J* in B_0, for a shape and a turn (4,) of the base."""
+        """Return the rows (m, n) of J* in B_0, for a shape and a rotation (4,) of the base."""
         R_X = matrix_from_quaternion(X)
         rows = []
         for line in self._lines:
@@ -268,7 +268,7 @@ class _LinkPaths:
         return self.joint_scales * least, float(np.linalg.norm(miss))
 
     def tangent(self, q: Array, X: Array, share: float) -> tuple[Array, Array, float]:
-        """Return the path's tangent: (n,) of the shape, (4,) of the turn, and the progress."""
+        """Return the path's tangent: (n,) of the shape, (4,) of the rotation, and the progress."""
         M = np.column_stack(
             [self.scaled_jacobian(q, X), -self._scaled_derivative(share) / self.length]
         )
@@ -300,12 +300,12 @@ class _LinkPaths:
             done = line.path_from_start.travelled_length(share)
             return f"after {done:.6g} of {way:.6g} m of the {kind} of '{line.link}'"
         turn = float(np.linalg.norm(line.path_from_start.rotation_derivative(share)))
-        return f"after {share * turn:.6g} of {turn:.6g} rad of the turn of '{line.link}'"
+        return f"after {share * turn:.6g} of {turn:.6g} rad of the rotation of '{line.link}'"
 
 
 @dataclass(frozen=True)
 class JointPath:
-    """A path of the shape that takes end-effectors along their lines.
+    """A path of the shape that moves end-effectors along their lines.
 
     Attributes
     ----------
@@ -314,11 +314,11 @@ class JointPath:
     shapes
         (K, n) shapes, m or rad.
     turns
-        (K, 4) attitudes of the base in that at the start.
+        (K, 4) attitudes of the base relative to that at the start.
     path_fractions
         (K,) shares of the lines, 0 to 1.
     progress_rate
-        (K,) progress on the lines a length of the path of the joints; zero at a singularity.
+        (K,) progress on the lines per length of the path of the joints; zero at a singularity.
     """
 
     arc_length: Array
@@ -487,16 +487,16 @@ class PathProgress:
     Attributes
     ----------
     route
-        The path in W, from where the end-effector was.
+        The path in W, from the place of the end-effector at the start.
     travelled_lengths
-        (M + 1,) length of the route that is done at the last M + 1 ticks, metres and radians.
+        (M + 1,) length of the route that is completed at the last M + 1 ticks, metres and radians.
     """
 
     route: PosePath
     travelled_lengths: Array
 
     def remaining_route(self, positions: Array, q: Array) -> PosePath:
-        """Return the part of the route that is ahead in a shape (n,).
+        """Return the remaining part of the route in a shape (n,).
 
         ``positions`` (N + 1, n) are the shapes at the ticks of the schedule.
         """
@@ -509,10 +509,10 @@ class PathProgress:
 class ResolvedRateGait(GaitMethod):
     """End-effectors on straight lines, or along paths, to their goals, with the base free.
 
-    From rest to rest, as fast as the limits of the joints allow. Positions, or poses with a turn
-    about one axis, of one end-effector or of several at once; along a given path, of one. Lines
-    that meet a dynamic singularity, a limit of a joint or a contact are refused, or followed until
-    shortly before; ``optimal`` reaches most of their ends.
+    From rest to rest, as fast as the limits of the joints allow. Positions, or poses with a
+    rotation about one axis, of one end-effector or of several at once; along a given path, of one.
+    Lines that meet a dynamic singularity, a limit of a joint or a contact are refused, or followed
+    until shortly before; ``optimal`` reaches most of their ends.
     """
 
     name: ClassVar[str] = "resolved_rate"
@@ -593,7 +593,7 @@ class ResolvedRateGait(GaitMethod):
         state, goal = request.state, request.goal
         if len(goal.end_effectors) > 1:
             raise PlanningError(
-                f"{self.name} takes one end-effector along a path, and the goal is for "
+                f"{self.name} moves one end-effector along a path, and the goal is for "
                 f"{len(goal.end_effectors)}: send their paths one after the other."
             )
         (aim,) = goal.end_effectors
@@ -671,14 +671,14 @@ class ResolvedRateGait(GaitMethod):
     def path(self, request: PlanRequest, cancellation: Cancellation = NEVER) -> JointPath:
         """Return the path along the lines of a goal, to their ends or to a singularity.
 
-        A path that the goal gives does not count: the lines lead straight to its end.
+        A path of the goal is ignored: the lines lead straight to its end.
 
-        It is the same whatever the limits of the joints are, which may end it before.
+        The result does not depend on the limits of the joints, which may end the motion earlier.
 
         Raises
         ------
         PlanningError
-            The goal is of another kind, or asks for too much; see :meth:`plan`.
+            The goal is of another kind, or requests too much; see :meth:`plan`.
         """
         goal = request.goal.for_robot(self.robot.description)
         self._require_goal_of_end_effectors(goal)
@@ -706,8 +706,8 @@ class ResolvedRateGait(GaitMethod):
         if goal.base or goal.joint_positions is not None:
             part = "the pose of the base" if goal.base else "joint positions"
             raise PlanningError(
-                f"{self.name} has its joints follow the line of the end-effector, and the goal "
-                f"also asks for {part}: use optimal for both."
+                f"{self.name} moves the joints along the line of the end-effector, and the goal "
+                f"also requests {part}: use optimal for both."
             )
 
     def _link_paths(
@@ -778,9 +778,9 @@ class ResolvedRateGait(GaitMethod):
             still = " with the attitude of the base kept" if self.options.keep_attitude else ""
             less = ", or leave out resolved_rate.keep_attitude" if still else ""
             raise PlanningError(
-                f"The line of {names}{still} asks for {wanted} independent coordinates, and the "
-                f"joints of robot '{self.robot.description.name}' move no more than {rank}: ask "
-                f"for a position instead of a pose{less}."
+                f"The line of {names}{still} requires {wanted} independent coordinates, and the "
+                f"joints of robot '{self.robot.description.name}' move no more than {rank}: "
+                f"request a position instead of a pose{less}."
             )
 
     def _find_obstacle(self, lines: _LinkPaths, path: JointPath) -> tuple[int, str] | None:
@@ -805,7 +805,7 @@ class ResolvedRateGait(GaitMethod):
         name, value = lines.singularity_measure(path.shapes[nearest], path.turns[nearest])
         first = lines.singularity_measure(path.shapes[0], path.turns[0])[1]
         shape = ", ".join(f"{x:.6g}" for x in path.shapes[nearest])
-        meets, least, there = "meets", "zero", "no rates of the joints lead on"
+        meets, least, there = "meets", "zero", "no rates of the joints continue the line"
         if path.is_complete:
             meets, least = "comes near to", f"{value:.3g}"
             there = "the joints would have to move fast for little progress"

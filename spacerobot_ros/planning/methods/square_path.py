@@ -1,9 +1,8 @@
 """Planar chains, square paths in shape space: the reorientation of paper 3, section III.
 
-Step 1 brings the shape to the wanted one, ``psi_e``. Step 2 goes to the corner of a square that is
-nearest to it, step 3 goes round the square, step 4 comes back by the path of step 2. The square is
-such that its geometric phase is the turn of the base that is missing after step 1; steps 2 and 4
-cancel.
+Step 1 brings the shape to the wanted one, ``psi_e``. Step 2 moves to the nearest corner of a
+square, step 3 goes around the square, step 4 returns along the path of step 2. The geometric phase
+of the square is the rotation of the base that remains after step 1; steps 2 and 4 cancel.
 
 Every leg is a straight line of the shape from rest to rest; the paper's laws also start from joint
 rates that are not zero (its property 3), for which this method does not plan. The plant holds each
@@ -12,7 +11,7 @@ tick, and the geometric phase, which depends on the path alone, is that of the s
 exactly.
 
 The side ``z*`` of the square solves ``phase(z*) = wanted phase``; its centre ``psi*`` is where the
-curvature is largest, remark 2, among the centres round which it fits into the joint limits.
+curvature is largest, remark 2, among the centres around which it fits into the joint limits.
 """
 
 from __future__ import annotations
@@ -46,20 +45,19 @@ from spacerobot_ros.planning.methods.geometric_phase import (
 )
 
 _MIN_CORRECTED_SHARE = 0.1
-"""Share of the tolerance below which a missing turn is not corrected."""
+"""Share of the tolerance below which a remaining rotation is not corrected."""
 
 _ZERO_ROTATION_ANGLE = 1e-9
 
 _MAX_SIDE = math.pi
-"""rad. Over a whole turn of both joints the curvature has mean zero: beyond about half a turn a
-larger square adds curvature of the other sign."""
+"""rad. Over a revolution of both joints the curvature has mean zero: beyond about half a revolution
+a larger square adds curvature of the other sign."""
 
 _SIDE_SAMPLES = 8
 """Number of tried sides between zero and the largest side that fits."""
 
 _USED_RANGE_SHARE = 1.0 - 1e-9
-"""Share of the free range that the largest square takes: rounding must not put a corner beyond
-it."""
+"""Share of the free range used by the largest square: rounding must not put a corner beyond it."""
 
 
 @dataclass(frozen=True)
@@ -166,7 +164,7 @@ class SquarePathGait(GaitMethod):
             raise PlanningError(
                 f"The base will be at {np.round(path.position[-1], 4).tolist()} m, "
                 f"{left.distance:.3g} m from the goal position: without thrust, attitude and shape "
-                "decide where the base is; with check_position 0 the goal position is ignored."
+                "determine where the base is; with check_position 0 the goal position is ignored."
             )
         notes: Notes = {
             "psi_e": psi_e.tolist(),
@@ -215,7 +213,7 @@ class SquarePathGait(GaitMethod):
 
 @dataclass(frozen=True)
 class SquareLoop:
-    """A square in shape space that turns the base by the wanted angle.
+    """A square in shape space that rotates the base by the wanted angle.
 
     Attributes
     ----------
@@ -226,7 +224,7 @@ class SquareLoop:
     side
         ``z*``, rad.
     loops
-        Number of times round it.
+        Number of loops.
     clockwise
         Sense of travel in the plane (psi_i, psi_j).
     corners
@@ -254,23 +252,23 @@ class _SquareFamily:
 
     @property
     def largest(self) -> float:
-        """The largest turn of the base by one loop, rad."""
+        """The largest rotation of the base by one loop, rad."""
         return float(np.abs(self.geometric_phases).max())
 
 
 class SquareSearch:
-    """Finds the square loop for a wanted turn.
+    """Finds the square loop for a wanted rotation.
 
     Parameters
     ----------
     robot
-        The model; it gives joint names and limits.
+        The model, with joint names and limits.
     phase
         Its geometric phase.
     most_loops
-        The wanted turn may take this many loops.
+        The wanted rotation may take this many loops.
     centre
-        (2,) where all squares are centred, rad; None: where the curvature is largest.
+        (2,) centre of all squares, rad; None: where the curvature is largest.
     too_near
         Returns the clause that says where links come too near on straight lines between shapes
         (K, n); empty: nowhere.
@@ -296,16 +294,16 @@ class SquareSearch:
         self._movable: list[int] = np.flatnonzero(robot.velocity_limit > 0).tolist()
 
     def find_loop(self, psi_e: Array, wanted: float) -> SquareLoop:
-        """Return the loop for a turn ``wanted`` (rad), with other joints at ``psi_e`` (n,).
+        """Return the loop for a rotation ``wanted`` (rad), with other joints at ``psi_e`` (n,).
 
         Of all pairs of joints it is the one that takes the fewest loops, and of those the one
-        with the smallest square; where links come too near on all of these, it takes more loops
-        round smaller squares.
+        with the smallest square; if links come too near on all of these, it takes more loops around
+        smaller squares.
 
         Raises
         ------
         PlanningError
-            No square within the joint limits turns the base far enough, or links come too near on
+            No square within the joint limits rotates the base far enough, or links come too near on
             all of them.
         """
         pairs = itertools.combinations(self._movable, 2)
@@ -370,21 +368,21 @@ class SquareSearch:
             )
         given = ""
         if self._centre is not None:
-            given = f" round the given centre {np.round(self._centre, 4).tolist()} rad"
+            given = f" around the given centre {np.round(self._centre, 4).tolist()} rad"
         if largest is None:
             return f"No square loop{given} fits into the joint limits."
         i, j = largest.pair
         names = self._robot.joint_names
         most = (
-            f"square loops of joints '{names[i]}' and '{names[j]}'{given} turn it by at most about "
-            f"{largest.largest:.3g} rad each"
+            f"square loops of joints '{names[i]}' and '{names[j]}'{given} rotate it by at most "
+            f"about {largest.largest:.3g} rad each"
         )
         if largest.sides[-1] < _MAX_SIDE * _USED_RANGE_SHARE:
             most += f", with sides of up to {largest.sides[-1]:.3g} rad within the joint limits"
         if largest.largest < _ZERO_ROTATION_ANGLE:
-            return f"The base cannot be turned by {wanted:.4g} rad by square loops: {most}."
+            return f"The base cannot be rotated by {wanted:.4g} rad by square loops: {most}."
         return (
-            f"A turn of the base by {wanted:.4g} rad takes "
+            f"A rotation of the base by {wanted:.4g} rad takes "
             f"{math.ceil(abs(wanted) / largest.largest)} loops, more than most_loops = "
             f"{self._most_loops}: {most}."
         )

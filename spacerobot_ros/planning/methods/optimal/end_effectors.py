@@ -1,16 +1,16 @@
 """End-effectors at the end of a motion: conditions on the last shape and attitude.
 
-At zero momentum the centre of mass C of the system rests, so the last shape q and the turn X of the
-base since the start place every link E: seen from C, in the attitude B_0 of the base at the start,
+At zero momentum the centre of mass C of the system rests, so the last shape q and the rotation X of
+the base since the start place every link E: relative to C, in the initial attitude B_0 of the base,
 
 ``r_CE = X (r_BE(q) - r_BC(q))``,  ``R = X R_BE(q)``.
 
-A goal of an end-effector is a value of the first, or of both; the position of the base is that of
-the base link, too. These are :class:`EndEffectorRows` of the optimal control problem, along
-those directions alone in which the joints move the link at all. Its guesses end in shapes that
-inverse kinematics finds (:meth:`EndEffectorSpecification.boundary_conditions`), each with the turn
-of the base on the direct way there (Umetani and Yoshida's generalised Jacobian), because the solver
-finds the nearest minimum only, and every family of shapes has its own.
+A goal of an end-effector is a value of the first, or of both; the position of the base is treated
+as that of the base link. These are :class:`EndEffectorRows` of the optimal control problem, only
+along directions in which the joints can move the link. Its guesses end in shapes that inverse
+kinematics finds (:meth:`EndEffectorSpecification.boundary_conditions`), each with the rotation of
+the base on the direct path there (Umetani and Yoshida's generalised Jacobian), because the solver
+finds only the nearest minimum, and every family of shapes has its own.
 """
 
 from __future__ import annotations
@@ -63,10 +63,10 @@ _MIN_MOTION = 1e-9
 """Motion of a link per metre or radian of the joints that counts as zero, m or rad."""
 
 _PARAMETERS_PER_LINK = 7
-"""Numbers that a goal of a link takes: r_CE and a quaternion."""
+"""Number of values of a link's goal: r_CE and a quaternion."""
 
 _STARTS, _ADDITIONAL_STARTS = 16, 96
-"""Start shapes of inverse kinematics, and additional ones where none of these succeeds."""
+"""Start shapes of inverse kinematics, and additional ones if none of these succeeds."""
 
 _ITERATIONS = 40
 """Steps of inverse kinematics."""
@@ -82,13 +82,13 @@ _DIRECT_PATH_STEPS = 12
 _MAX_STEP = 0.5  # m or rad
 
 _POSSIBLE_ENDS = 6
-"""Ends that guesses of the search have, one after the other."""
+"""Number of ends that guesses of the search have in turn."""
 
 _MIN_END_DIFFERENCE = 0.05
-"""Ends nearer than this, as shares of the joints' ranges, are the same."""
+"""Ends nearer than this, as shares of the joints' ranges, count as equal."""
 
 _DAMPING_OF_EXACT_ENDS = 1e-9
-"""The same where ends are to meet their goals exactly."""
+"""The same if ends must meet their goals exactly."""
 
 _GIVEN_SHAPE_ERROR = 1e-9
 """Smallest error at which given joint positions contradict a goal of an end-effector, m or rad."""
@@ -97,7 +97,7 @@ _GIVEN_SHAPE_ERROR = 1e-9
 @dataclass(frozen=True)
 class LinkDirections:
     """Directions, in B_0, along which the joints move a link: (k, 3) of its origin, (l, 3) of its
-    rotation; no rows of rotation where any attitude will do.
+    rotation; no rows of rotation if any attitude is allowed.
     """
 
     link: str
@@ -106,7 +106,7 @@ class LinkDirections:
 
 
 class EndEffectorRows:
-    """Rows that vanish where links of one robot are at their goals.
+    """Rows that vanish if links of one robot are at their goals.
 
     Parameters
     ----------
@@ -115,7 +115,7 @@ class EndEffectorRows:
     links
         Links, each with whether its attitude is part of the goal.
     axes
-        (m, 3) directions in the base about which loops of the joints turn it.
+        (m, 3) directions in the base about which loops of the joints rotate it.
     """
 
     def __init__(self, robot: SpaceRobot, links: Sequence[tuple[str, bool]], axes: Array) -> None:
@@ -126,12 +126,12 @@ class EndEffectorRows:
 
     @cached_property
     def turn(self) -> ca.Function:
-        """How a step of the shape turns the base (:func:`.turn_function`)."""
+        """How a step of the shape rotates the base (:func:`.turn_function`)."""
         return turn_function(self.robot)
 
     @cached_property
     def function(self) -> ca.Function:
-        """The rows, of SX: turn (4,) of the base, shape (n,) and parameters (:meth:`pack`)."""
+        """The rows, of SX: rotation (4,) of the base, shape (n,) and parameters (:meth:`pack`)."""
         X, q = ca.SX.sym("X", 4), ca.SX.sym("q", self.robot.n)
         parameters = ca.SX.sym("p", self.parameters)
         center = self.robot.function("center_of_mass", compile=False)(q)
@@ -176,8 +176,8 @@ class EndEffectorRows:
     def evaluate(self, X: Array, q: Array, parameters: Array) -> tuple[Array, Array, Array]:
         """Return rows (K, m) and their derivatives (K, m, 3) and (K, m, n) at K ends.
 
-        The derivatives are by a rotation of the base, in its components, and by the shape;
-        ``X`` (K, 4) and ``q`` (K, n).
+        The derivatives are with respect to a rotation of the base, in its components, and to the
+        shape; ``X`` (K, 4) and ``q`` (K, n).
         """
         K = len(q)
         p = np.repeat(parameters[:, np.newaxis], K, axis=1)
@@ -190,7 +190,7 @@ class EndEffectorRows:
         )
 
     def turns_along_direct_path(self, start: Array, ends: Array) -> Array:
-        """Return the turns (K, 4) of the base on straight ways from a shape (n,) to ends (K, n)."""
+        """Return the rotations (K, 4) of the base on straight paths from a shape to ends (K, n)."""
         N = _DIRECT_PATH_STEPS
         step = (ends - start) / N
         shapes = start + step[:, np.newaxis] * np.arange(N)[:, np.newaxis]
@@ -205,7 +205,7 @@ class EndEffectorRows:
     def rank(self, fixed_attitude: bool) -> tuple[int, int]:
         """Return how many of the rows the joints move independently, and how many rows there are.
 
-        Shapes in general position decide, with the attitude of the base given or free.
+        They are counted at shapes in general position, with the attitude of the base given or free.
         """
         ranks, rows = [], 0
         for q, turn in zip(*self._samples(), strict=True):
@@ -222,7 +222,7 @@ class EndEffectorRows:
     def require_directions(
         self, state: RobotState, goals: Sequence[EndEffectorGoal], tolerance: tuple[float, float]
     ) -> None:
-        """Refuse goals off the directions in which the links move at all.
+        """Refuse goals off the directions in which the links can move.
 
         ``tolerance`` is that of positions, m, and of attitudes, rad.
 
@@ -253,7 +253,7 @@ class EndEffectorRows:
             turn = np.append(R_WB.T @ turn[:3], turn[3])
             swing = swing_angle(turn, each.rotations)
             if swing > tolerance[1]:
-                where = {0: "does not turn", 1: "turns about one axis"}
+                where = {0: "does not rotate", 1: "rotates about one axis"}
                 raise UnreachableError(
                     f"The end-effector '{each.link}' of robot '{name}' "
                     f"{where[len(each.rotations)]} whatever the joints do, and its goal is tilted "
@@ -304,15 +304,15 @@ class EndEffectorSpecification:
     Attributes
     ----------
     rows
-        Rows of the end-effectors, and of the base link where its position is asked for.
+        Rows of the end-effectors, and of the base link if its position is requested.
     base
-        How the joints turn the base.
+        How the joints rotate the base.
     attitude, position, shape
         Whether attitude and position of the base, and joint positions are parts of the goal.
     overdetermined
         Whether the goal has more coordinates than the joints move independently. Hardly any such
-        goal can be reached; one that can is reached in single shapes, which inverse kinematics
-        finds before the motion is planned.
+        goal can be reached, and only in single shapes, which inverse kinematics finds before the
+        motion is planned.
     """
 
     rows: EndEffectorRows
@@ -365,16 +365,16 @@ class EndEffectorSpecification:
 
     @property
     def axes(self) -> Array:
-        """Directions (m, 3) in the base along which its attitude is to be reached."""
+        """Directions (m, 3) in the base along which its attitude must be reached."""
         if self.ends_in_one_shape:
             return self.rows.axes
         return self.base.base_rotations.axes if self.attitude else np.zeros((0, 3))
 
     @property
     def rows_at_end(self) -> EndEffectorRows | None:
-        """The rows of the optimal control problem; none where it ends in one shape.
+        """The rows of the optimal control problem; none if it ends in one shape.
 
-        The attitude that goes with the shape is then that of the goal.
+        The attitude that belongs to the shape is then that of the goal.
         """
         return None if self.ends_in_one_shape else self.rows
 
@@ -397,7 +397,7 @@ class EndEffectorSpecification:
         NotFoundError
             No shape with the end-effectors at their goals was found.
         PlanningError
-            No such goal is planned.
+            The method does not plan for such a goal.
         """
         state, goal, tolerance = request.state, request.goal, request.tolerance
         if robot.n == 0:
@@ -548,16 +548,16 @@ class EndEffectorSpecification:
         robot = self.rows.robot.description.name
         names = " and ".join(f"'{link}'" for link, _ in self.rows.links)
         remedy = (
-            "A nearer goal may help, a position instead of a pose, or more freedom of the base."
+            "A nearer goal, a position instead of a pose, or more freedom of the base may help."
         )
         if self.overdetermined:
             rank, count = self.rows.rank(self.attitude)
             remedy = (
-                f"The goal asks for {count} independent coordinates, and the joints move no more "
-                f"than {rank}: ask for a position instead of a pose, or for less of the base."
+                f"The goal requires {count} independent coordinates, and the joints move no more "
+                f"than {rank}: request a position instead of a pose, or less of the base."
             )
         return NotFoundError(
-            f"No shape of robot '{robot}' that puts {names} to the goal was found from "
+            f"No shape of robot '{robot}' with {names} at the goal was found from "
             f"{2 * _STARTS + _ADDITIONAL_STARTS} shapes; the nearest is {nearest:.3g} m or rad "
             f"away. {remedy}"
         )
@@ -637,7 +637,7 @@ def _require_within_radius(
 
 
 def reach_of_end_effector(robot: SpaceRobot, lower: Array, upper: Array, link: str) -> float:
-    """Return a distance, m, that no shape puts a link's origin farther from the centre of mass.
+    """Return an upper bound, m, of the distance of a link's origin from the centre of mass.
 
     ``r_CE`` is the mean of the vectors from the centres of mass of the bodies to E, weighted by
     their masses, and each is no longer than the chain of joints between (triangle inequality).
@@ -653,7 +653,7 @@ def reach_of_end_effector(robot: SpaceRobot, lower: Array, upper: Array, link: s
     ]
 
     def chain(body: int, point: Array) -> dict[int, tuple[Array, float]]:
-        """Return, for a body and each that carries it, a point of it and the vector from there."""
+        """Return a point, and the vector from there, for a body and each body that carries it."""
         found, way = {body: (point, 0.0)}, 0.0
         while body > 0:
             way += float(np.linalg.norm(point)) + travel[body - 1]

@@ -1,9 +1,8 @@
-"""Goal specification: the parts of a goal that are to be reached, and whether the joints can.
+"""Goal specification: the parts of a goal to be reached, and whether the joints can reach them.
 
-At zero momentum ``omega_WB_B = F(q) qdot``. Where all columns of F are along one axis the base
-turns about that axis only, by an angle. Otherwise the brackets of the columns fill up the
-rotations, provided that the curvature of the connection is not zero everywhere (paper 1,
-section 4).
+At zero momentum ``omega_WB_B = F(q) qdot``. If all columns of F are along one axis, the base
+rotates about that axis only. Otherwise the brackets of the columns span all rotations, provided
+that the curvature of the connection is not zero everywhere (paper 1, section 4).
 """
 
 from __future__ import annotations
@@ -48,17 +47,17 @@ _SINGULAR_VALUE_TOLERANCE = 1e-7
 _AXIS_TOLERANCE = 1e-6
 
 _MIN_BASE_TURN = 1e-12
-"""Turn of the base per metre or radian of the joints that counts as zero, rad."""
+"""Rotation of the base per metre or radian of the joints that counts as zero, rad."""
 
 _MAX_SHAPE_GUESSES = 8
 
 _INTEGRATION_STEPS, _INTEGRATION_ERROR = 1000, 1e-5
-"""Steps in which the turn by one joint is integrated, and the error that this may make, rad."""
+"""Steps of the integration of the rotation by one joint, and its largest error, rad."""
 
 _JOINT_LIMIT_ROUNDING = 1e-9  # m or rad
 
 _QUADRATURE_NODES = 48
-"""Nodes of Gauss and Legendre along the way to a shape."""
+"""Gauss-Legendre nodes along the path to a shape."""
 
 _MAX_REPORTED_RANGE_FACTOR = 4.0
 """Ratio to the joint range up to which a shape beyond the limits is reported."""
@@ -73,11 +72,11 @@ class GoalSpecification:
     Attributes
     ----------
     position, attitude
-        Whether these are parts of it.
+        Whether these are controlled.
     same_shape
-        Whether goals without a shape of their own end in the one that they start from.
+        Whether goals without a shape end in the shape at the start.
     base_rotations
-        How the joints turn the base.
+        How the joints rotate the base.
     """
 
     position: bool
@@ -110,7 +109,7 @@ class GoalSpecification:
 
     @property
     def axes(self) -> Array:
-        """Directions (m, 3) in the base along which the attitude is to be reached."""
+        """Directions (m, 3) in the base along which the attitude must be reached."""
         return self.base_rotations.axes if self.attitude else np.zeros((0, 3))
 
     def require_suitable(self, robot: SpaceRobot) -> None:
@@ -119,7 +118,7 @@ class GoalSpecification:
         Raises
         ------
         PlanningError
-            There is none; the message says why.
+            The robot can reach none; the message says why.
         """
         name = robot.description.name
         if robot.n == 0:
@@ -157,7 +156,7 @@ class GoalSpecification:
         NotFoundError
             No shape with the base at its goal was found.
         PlanningError
-            No such goal is planned.
+            The method does not plan for such a goal.
         """
         self.require_suitable(robot)
         state, goal, tolerance = request.state, request.goal, request.tolerance
@@ -208,12 +207,12 @@ class GoalSpecification:
         return BoundaryConditions(state.q, turn, likely, None, center, direction)
 
     def require_turning_with_drift(self, robot: SpaceRobot, state: RobotState) -> None:
-        """Refuse robots that drift, and whose joints turn the base about no or another axis.
+        """Refuse drifting robots whose joints rotate the base about no axis or about another one.
 
         Raises
         ------
         PlanningError
-            The robot is such a robot.
+            The robot cannot stop its base.
         """
         L_W, name = state.angular_momentum, robot.description.name
         if not L_W.any():
@@ -233,8 +232,8 @@ class GoalSpecification:
             off = max(np.linalg.norm(np.cross(axis, x)) for x in (turned, D @ axis / D.max()))
             if off > _AXIS_TOLERANCE:
                 raise PlanningError(
-                    f"{drifts}, which rotates its base about another axis than its joints "
-                    "do: no motion of them stops that. With "
+                    f"{drifts}, which rotates its base about an axis other than that of its "
+                    "joints: no joint motion stops that. With "
                     "optimal.base_attitude 0 the attitude of the goal is ignored."
                 )
 
@@ -246,7 +245,7 @@ class GoalSpecification:
             if not len(axes):
                 raise UnreachableError(
                     f"The attitude of robot '{name}' is uncontrollable: its joints do not rotate "
-                    f"its base, and the goal is turned by {tilt:.4g} rad.",
+                    f"its base, and the goal is rotated by {tilt:.4g} rad.",
                     Proof.RANK,
                 )
             raise tilted_goal_error(robot, axes[0], tilt)
@@ -265,9 +264,9 @@ class GoalSpecification:
         wanted = 2 * math.atan2(float(axis @ turn[:3]), float(turn[3]))
         if abs(math.remainder(wanted - angle, 2 * math.pi)) > max(tolerance, _ZERO_ROTATION_ANGLE):
             raise UnreachableError(
-                f"The attitude of robot '{robot.description.name}' is uncontrollable where the "
-                "final shape is given: loops of its joints do not rotate its base, and the way to "
-                f"that shape turns it by {angle:.4g} rad.",
+                f"The attitude of robot '{robot.description.name}' is uncontrollable if the "
+                "final shape is given: loops of its joints do not rotate its base, and the path to "
+                f"that shape rotates it by {angle:.4g} rad.",
                 Proof.RANK,
             )
         return quaternion_from_rotvec(axis * angle)
@@ -275,18 +274,18 @@ class GoalSpecification:
 
 @dataclass(frozen=True)
 class BaseRotations:
-    """The turns of the base that motions of the joints cause.
+    """The rotations of the base that motions of the joints cause.
 
     Attributes
     ----------
     axes
-        (m, 3) in base components: one unit vector for a planar robot, the unit matrix where all
-        attitudes can be reached, none where the joints do not turn the base or only to and fro
+        (m, 3) in base components: one unit vector for a planar robot, the unit matrix if all
+        attitudes can be reached, none if the joints do not rotate the base or only back and forth
         along one curve of attitudes.
     turns_base
-        Whether they turn it at all.
+        Whether joints rotate the base at all.
     loops_turn_base
-        Whether closed loops of the shape turn it.
+        Whether closed loops of the shape rotate it.
     """
 
     axes: Array
@@ -340,8 +339,8 @@ def _require_within_one_joint(
         angle = (wanted + np.pi) % whole - np.pi
         raise UnreachableError(
             f"The goal attitude is beyond the joint limits: joint '{joint.name}', which is the "
-            f"only one, turns the base by {least:.4g} to {most:.4g} rad from here, and the goal "
-            f"is turned by {angle:.4g} rad.",
+            f"only one, rotates the base by {least:.4g} to {most:.4g} rad from here, and the goal "
+            f"is rotated by {angle:.4g} rad.",
             Proof.LIMITS,
         )
 
@@ -368,12 +367,12 @@ def shape_for_center(
 ) -> Array:
     """Return the shape (n,), near ``start``, whose centre of mass is at ``wanted`` (3,), m, in B.
 
-    If there is none it may be ``enough`` (m) beside.
+    If there is none, it may be ``enough`` (m) off.
 
     Raises
     ------
     UnreachableError
-        There is none within the limits: the base cannot be where the goal wants it.
+        There is none within the limits: the base cannot reach the goal position.
     NotFoundError
         None was found.
     """
@@ -413,7 +412,7 @@ def shape_for_center(
 def nearest_shape_for_center(
     robot: SpaceRobot, limits: MotionLimits, near: Array, wanted: Array
 ) -> Array | None:
-    """Return the shape (n,) next to ``near`` whose centre of mass is at ``wanted`` (3,) exactly."""
+    """Return the shape nearest to ``near`` whose centre of mass is at ``wanted`` (3,) exactly."""
     q = _shape_without_limits(robot, near, wanted)
     if np.maximum(limits.lower - q, q - limits.upper).max() > _JOINT_LIMIT_ROUNDING:
         return near if _distance_to_center(robot, near, wanted) <= _POSITION_TOLERANCE else None
@@ -447,8 +446,8 @@ def _unreachable_center_error(
             f"No shape of '{name}' that puts the base at the goal position was found from "
             f"{_MAX_SHAPE_GUESSES} starts: without thrust the centre of mass stays where it is, "
             "and the nearest shape that was found puts the base "
-            f"{distance:.3g} m from it. A nearer position may help, "
-            "another attitude, or optimal.base_position 2, which ignores the position."
+            f"{distance:.3g} m from it. A nearer position, "
+            "another attitude, or optimal.base_position 2, which ignores the position, may help."
         )
     free = _shape_without_limits(robot, near, wanted)
     # With three sliders, one centre of mass has one shape.

@@ -1,4 +1,4 @@
-"""Turns smooth trajectories into commands held for a tick that end at the goal exactly.
+"""Converts smooth trajectories to commands held for a tick that end at the goal exactly.
 
 The shapes at the ticks are points of the trajectory; between them the shape moves along chords,
 with velocities that are means over a tick. So joints, velocities and accelerations keep their
@@ -8,16 +8,16 @@ the plant's own prediction ends on the goal. The first variation of the final at
 
 ``eta = R_f' sum_k R_k K(q_k)(dq_k, q_k' dt)``,  K the curvature of the connection,
 
-for a change ``dq`` that vanishes at both ends, and more terms where the robot drifts
-(:class:`DriftVariation`). If that needs more speed or acceleration than
-the limits allow, the least change of the commands is sought that keeps them, by a quadratic program
-whose unknowns are the changes of all shapes at the ticks; the end is linear in them to first order,
-and a few programs one after the other reach it (sequential quadratic programming). Otherwise the
-manoeuvre takes a few ticks longer.
+for a change ``dq`` that vanishes at both ends, and more terms if the robot drifts
+(:class:`DriftVariation`). If that needs more speed or acceleration than the limits allow, a
+quadratic program finds the smallest change of the commands that keeps them. Its unknowns are the
+changes of all shapes at the ticks; the end is linear in them to first order, and a few successive
+programs reach it (sequential quadratic programming). Otherwise the manoeuvre takes a few
+ticks longer.
 
-If that fails and the last shape is free, it is changed as well: loops of some robots do not turn
-the base. A manoeuvre of a few ticks only is a polygon, whose chords are no image of the curve any
-more; one of two or three may have too few corners to end on the goal, and takes a tick more.
+If that fails and the last shape is free, it is changed as well: loops of some robots do not rotate
+the base. A manoeuvre of a few ticks is a polygon that does not resemble the curve any more; with
+two or three ticks it may have too few corners to end on the goal, and takes one more.
 """
 
 from __future__ import annotations
@@ -59,11 +59,11 @@ _ATTITUDE_TOLERANCE = 1e-11  # rad
 _MAX_NEWTON_STEPS = 25
 _MAX_STRETCHES = 40
 _MAX_STRETCH_FACTOR = 1.25
-"""Largest factor that stretches a manoeuvre to keep its limits: another start does
+"""Largest factor that stretches a manoeuvre to keep its limits; otherwise other starts are
 better."""
 
 _MAX_PROGRAMS = 4
-"""Numbers of ticks, one after the other, at which all shapes are changed to keep the limits."""
+"""Number of durations, in ticks, for which all shapes are changed in turn to keep the limits."""
 
 _PROGRAM_STRETCH = 1.01
 """Factor between them, rounded up to a tick."""
@@ -73,7 +73,7 @@ _FIT_TOLERANCE = 1e-5
 """Error before the last program, rad, m or m/s; the remaining error is far smaller."""
 
 _MIN_SMOOTH_TICKS = 20
-"""Fewest ticks of a smooth manoeuvre; shorter manoeuvres are polygons."""
+"""Smallest number of ticks of a smooth manoeuvre; shorter manoeuvres are polygons."""
 
 _TICK_ROUNDING = 0.02
 """Share of a tick by which a solver's duration may miss a whole number of ticks."""
@@ -105,9 +105,9 @@ class ManoeuvreModel:
     axes
         (m, 3) directions in the base along which the attitude is reached.
     constraints, efforts, distances
-        Constraints of the path; no efforts, no distances: any.
+        Constraints of the path; efforts, distances None: unlimited.
     end_effectors
-        Rows of the end-effectors that are to be reached; None: none are.
+        Rows of the end-effectors that must be reached; None: none.
     """
 
     robot: SpaceRobot
@@ -133,7 +133,7 @@ class ManoeuvreModel:
 
 
 class CommandHolder:
-    """Turns trajectories of one robot into held commands."""
+    """Converts trajectories of one robot to held commands."""
 
     def __init__(self, model: ManoeuvreModel) -> None:
         self._robot = robot = model.robot
@@ -156,10 +156,10 @@ class CommandHolder:
     ) -> HeldCommands | None:
         """Return the commands of a trajectory that end in the shape and attitude of the goal.
 
-        They take the trajectory's time, rounded up to ticks, or as much longer as it takes to keep
-        the limits (``fixed``: not longer); None where that is not found. If the boundary
-        conditions leave the last shape free, it is the trajectory's, or one near to it. ``before``
-        are the velocities (n,) that are held until then; None: those of the boundary conditions.
+        They take the trajectory's time, rounded up to ticks, or longer if needed to keep the limits
+        (``fixed``: not longer); None if none are found. If the boundary conditions leave the last
+        shape free, it is the trajectory's, or one near to it. ``before`` are the velocities (n,)
+        that are held until then; None: those of the boundary conditions.
         """
         before = boundary.velocity if before is None else before
         final = np.clip(trajectory.shapes[-1], limits.lower, limits.upper)
@@ -294,7 +294,7 @@ class CommandHolder:
     ) -> BoundaryConditions:
         """Return boundary conditions whose solution ends at the goal as commands of ``ticks``.
 
-        The goal attitude is turned by the difference between the end of a trajectory and that of
+        The goal attitude is rotated by the difference between the end of a trajectory and that of
         its commands. If the robot drifts, the solver's attitude is of order two only.
         """
         reached = self._attitudes(trajectory.at_ticks(ticks), boundary)[-1]
@@ -465,7 +465,7 @@ class DriftVariation:
         """Return xi (K, 3, n) at the end of K steps of a duration, s, by the changes dq of each.
 
         ``shapes`` (K, n), ``L_B`` (K, 3) and ``R`` (K, 3, 3) are those of the steps, and ``turned``
-        (K, 3, n) what curvature adds to xi in each.
+        (K, 3, n) the contribution of curvature to xi in each.
         """
         columns = (each.full().T for each in self._function(shapes.T, L_B.T))
         G, M = (each.reshape(len(shapes), -1, 3).transpose(0, 2, 1) for each in columns)
@@ -484,7 +484,7 @@ class DriftVariation:
 # -- the least change of commands -----------------------------------------------------------------
 
 _LIMIT_RESERVE = 1e-4
-"""Share of velocity and acceleration limits that is left for the last, small correction."""
+"""Share of velocity and acceleration limits that is reserved for the last, small correction."""
 
 _OPTIONS = {
     "error_on_fail": False,
@@ -512,12 +512,12 @@ def least_change(
     *,
     moves_end: bool,
 ) -> Array | None:
-    """Return the least change (N + 1, n) of shapes at ticks with which they keep all limits.
+    """Return the smallest change (N + 1, n) of shapes at ticks such that they keep all limits.
 
     Parameters
     ----------
     positions
-        (N + 1, n) shapes at the ticks, m or rad; the first one stays.
+        (N + 1, n) shapes at the ticks, m or rad; the first one is fixed.
     rows, error
         (m, N + 1, n) derivatives of m numbers at the end by the shapes, and their change (m,).
     limits
@@ -532,8 +532,8 @@ def least_change(
     Returns
     -------
     :
-        The change, least in the sum of squares of each joint's over its speed; None: there is none,
-        or no solver of quadratic programs.
+        The change with the least sum of squares, each joint's divided by its speed; None: there is
+        none, or no solver of quadratic programs.
     """
     if not ca.has_conic("osqp"):
         return None

@@ -1,10 +1,10 @@
-"""Initial guesses of the search for a manoeuvre: loops upon the direct way.
+"""Initial guesses of the search for a manoeuvre: loops on the direct path.
 
 A path that only goes from one shape to the other is a saddle: to first order no small change of it
-turns the base elsewhere. So guesses are the direct way with loops upon it, whose size is such that
-their areas, times the curvature, are about the wanted turn. The loops are those of the papers, a
-cycle of three frequencies (paper 1, section 5) and a square (paper 3, section III), and random
-trigonometric ones.
+rotates the base differently. So guesses are the direct path with loops, sized such that their areas
+times the curvature are about the wanted rotation. The loops are those of the papers, a cycle of
+three frequencies (paper 1, section 5) and a square (paper 3, section III), and random trigonometric
+ones.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ _CANDIDATES_PER_GUESS = 24
 """Number of random loops of one kind, of which the nearest to the goal is the guess."""
 
 _MIN_LOOP_SIZE = 0.1
-"""Least size of loops on the way to a possible end, in half ranges, from the second guess on."""
+"""Smallest size of loops on the path to a possible end, in half ranges, after the first guess."""
 
 _MAX_RANGE_SHARE = 0.85
 
@@ -52,8 +52,8 @@ _LEAST_TURN_TIME, _TURN_STRETCHES = 0.5, tuple(1.15**k for k in range(16))
 _TURNED_GUESSES = 3
 
 _BRAKING_TIME_FACTOR = 4.0
-"""A joint that moves at the start is back on the way of its guess after this many times the time
-that it takes to brake."""
+"""A joint that moves at the start is back on the path of its guess after this multiple of its
+braking time."""
 
 Loop = Callable[[np.random.Generator, Array, int], Array]
 """A function for a closed path (N + 1, n) of about unit size at instants (N + 1,) in [0, 1]."""
@@ -122,11 +122,11 @@ class InitialGuesses:
         limits: MotionLimits,
         robot: SpaceRobot,
     ) -> Iterator[Trajectory]:
-        """Yield guesses in which reaction wheels turn the base to its goal.
+        """Yield guesses in which reaction wheels rotate the base to its goal.
 
-        The base turns about a fixed axis, one way or the other, from its present rate to rest; the
-        other joints go to their last shape, later with loops on the way; and the wheels have the
-        rates that momentum asks for.
+        The base rotates about a fixed axis, in either direction, from its present rate to rest; the
+        other joints move to their last shape, later with loops on the way; and the wheel rates
+        follow from the momentum.
         """
         direct = self._direct_path(boundary.start, boundary.likely_final_shape)
         loops = self.generate(boundary, limits, boundary.likely_final_shape)

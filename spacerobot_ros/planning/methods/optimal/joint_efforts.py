@@ -1,9 +1,9 @@
 """Joint efforts of a motion, and their limits.
 
-The efforts of held commands (:class:`.JointEfforts`) are those of servos that follow them; where
-the plant is driven by efforts, they are a controller's command beside its feedback. At zero
-momentum efforts are quadratic in the speed: so a motion whose efforts are f^2 times their limits
-keeps these in f times its time.
+The efforts of held commands (:class:`.JointEfforts`) are those of servos that follow them; if the
+plant is driven by efforts, they are a controller's command without its feedback. At zero momentum
+efforts are quadratic in the speed: a motion whose efforts are f^2 times their limits keeps the
+limits if it takes f times as long.
 """
 
 from __future__ import annotations
@@ -36,10 +36,10 @@ from spacerobot_ros.planning.methods.optimal.problem import (
 from spacerobot_ros.planning.methods.optimal.transcription import PathInequality, Stages
 
 _PLANNED_EFFORT_SHARE = 0.98
-"""Share of the limits that a solution uses: changes of its path take the rest."""
+"""Share of the limits that a solution uses: the rest is for changes of its path."""
 
 _AT_LIMITS_FROM, _AT_LIMITS_BEYOND = 0.9, 0.1
-"""Shares of the limits at which guesses count as made for them, below and beyond one."""
+"""Shares of the limits by which efforts of a guess at the limits may be below and above them."""
 
 
 class LimitedEfforts(JointEfforts):
@@ -50,7 +50,7 @@ class LimitedEfforts(JointEfforts):
     Raises
     ------
     ParameterError
-        A joint has no effort at all.
+        The effort limit of a joint is not positive.
     """
 
     def __init__(self, robot: SpaceRobot, limit: Array, control_period: float) -> None:
@@ -119,8 +119,8 @@ class LimitedEfforts(JointEfforts):
 class EffortLimitedShooting(MultipleShooting):
     """Multiple shooting that also keeps joint efforts within limits.
 
-    The problem is solved without them first: they cost time, and for most motions of most robots
-    do not matter. If the solution exceeds them, the problem with them is solved from there.
+    The problem is solved without them first: they cost time, and do not matter for most motions. If
+    the solution exceeds them, the problem with them is solved from there.
 
     Parameters
     ----------

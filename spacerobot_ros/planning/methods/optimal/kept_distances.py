@@ -1,10 +1,10 @@
-"""Pairs of links, and of links and obstacles, that a solver keeps apart: only those that a solution
-without has brought near.
+"""Pairs of links, and of links and obstacles, that a solver keeps apart: only those that come near
+in a solution without them.
 
-Rows for all pairs would be dear, and few of them matter. So a problem is solved without any first.
-Where held commands bring links too near, by the exact check, the pairs get rows: their distances
-from planes between them (:mod:`spacerobot_ros.collision.planes`), which hold near the path that
-they are made for alone.
+Rows for all pairs would be expensive, and few of them matter. So a problem is solved without any
+first. If the exact check finds links too near in held commands, their pairs get rows: their
+distances from planes between them (:mod:`spacerobot_ros.collision.planes`), which are valid only
+near the path for which they are made.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ _INITIAL_MARGIN = 2e-3
 _NO_TURN = np.array([0.0, 0.0, 0.0, 1.0])
 
 _MIN_INSTANTS = 80
-"""Instants of a manoeuvre at which links are kept apart on a grid at least: between the knots of a
-coarse one they would come too near."""
+"""Smallest number of instants of a manoeuvre at which links are kept apart: between the knots of a
+coarse grid they would come too near."""
 
 _SHARE_OF_ENDS = 0.1
 """Share of a path at an end with a given shape where pairs need not have room."""
@@ -48,7 +48,7 @@ def instants_of(intervals: int) -> int:
 
 
 class DistanceLibrary:
-    """The rows of pairs of one robot, derived where they are needed.
+    """The rows of pairs of one robot, derived when they are needed.
 
     Parameters
     ----------
@@ -74,7 +74,7 @@ class DistanceLibrary:
     def begin(self, boundary: BoundaryConditions, *, turn_is_known: bool) -> KeptDistances:
         """Return the pairs that are kept apart between two ends: none yet.
 
-        ``turn_is_known``: the turn of the base at the end is that of the boundary conditions.
+        ``turn_is_known``: the rotation of the base at the end is that of the boundary conditions.
 
         Raises
         ------
@@ -96,9 +96,9 @@ class DistanceLibrary:
     def base_poses(
         self, boundary: BoundaryConditions, shapes: Array, turns: Array
     ) -> BasePoses | None:
-        """Return the poses of the base at shapes (K, n) and turns (K, 4) since the start.
+        """Return the poses of the base at shapes (K, n) and rotations (K, 4) since the start.
 
-        None: there are no obstacles, so that it does not count.
+        None: there are no obstacles, so the base does not matter.
         """
         if boundary.state is None or not self.clearance.has_obstacles:
             return None
@@ -106,7 +106,7 @@ class DistanceLibrary:
         return self._prediction.poses(boundary.state, shapes, attitudes)
 
     def planes(self, boundary: BoundaryConditions, pair: int, poses: Poses) -> tuple[Array, Array]:
-        """Return the distances (K,) of a pair, m, and its planes (K, 7) as rows take them."""
+        """Return the distances (K,) of a pair, m, and its planes (K, 7) in the form of rows."""
         geometry = self.clearance.geometry
         distances, planes = geometry.planes(pair, poses)
         if geometry.with_obstacles[pair]:
@@ -130,7 +130,7 @@ class KeptDistances:
     boundary
         Both ends.
     required
-        (P,) the distances that all pairs are to keep, m.
+        (P,) required distances of all pairs, m.
     """
 
     def __init__(
@@ -147,17 +147,17 @@ class KeptDistances:
     def approaches(self, positions: Array, turns: Array) -> list[Approach]:
         """Return the pairs that come too near along held commands (N + 1, n), nearest first.
 
-        ``turns`` (N + 1, 4) are those of the base since the start.
+        ``turns`` (N + 1, 4) are the rotations of the base since the start.
         """
         base = self._library.base_poses(self._boundary, positions, turns)
         return self._library.clearance.approaches(positions, self._required, base)
 
     def message(self, approach: Approach, control_period: float | None) -> str:
-        """Return a clause about a path that comes too near; no control period: of no times."""
+        """Return a clause about a path that comes too near; without a control period no times."""
         return self._library.clearance.clause(approach, control_period)
 
     def anew(self) -> KeptDistances:
-        """Return no pairs yet between the same ends."""
+        """Return the same ends without pairs."""
         return KeptDistances(self._library, self._boundary, self._required)
 
     def add(self, near: Sequence[Approach]) -> None:
@@ -166,7 +166,7 @@ class KeptDistances:
             self._room.setdefault(each.pair, _INITIAL_MARGIN)
 
     def widen(self, near: Sequence[Approach]) -> None:
-        """Add pairs that have come too near; those that are kept get as much room as they lack."""
+        """Add pairs that have come too near; pairs already kept apart get the room they lack."""
         kept = set(self._room)
         self.add(near)
         for each in near:
@@ -174,8 +174,8 @@ class KeptDistances:
                 self._room[each.pair] += self._required[each.pair] - each.distance
 
     def along(self, path: Trajectory) -> tuple[Array, Array]:
-        """Return shapes (N K, n) and turns (N K, 4) of the base since the start at the K instants
-        of all N intervals at which pairs are kept apart.
+        """Return shapes (N K, n) and rotations (N K, 4) of the base since the start at the K
+        instants of all N intervals at which pairs are kept apart.
         """
         intervals = len(path.shapes) - 1
         instants, X = instants_of(intervals), path.quaternions[:, np.newaxis]
@@ -196,9 +196,9 @@ class KeptDistances:
     ) -> MotionLimits:
         """Return limits with planes between all pairs at all instants of N intervals of a path.
 
-        Planes are shifted by the distances that pairs ought to keep with their room, or by those
-        that they have, where there is less room: so a clear path keeps to its own planes.
-        ``pushing``: pairs are to have their room, but for the ends, whose shapes are given.
+        Planes are shifted by the required distances of pairs plus their room, or by their present
+        distances if these are smaller: so a clear path satisfies its own planes. ``pushing``: pairs
+        must have their room, except at the ends, whose shapes are given.
         """
         if not self.pairs:
             return limits

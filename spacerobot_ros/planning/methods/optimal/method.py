@@ -1,7 +1,7 @@
 """Time-optimal manoeuvres within real limits, for any free-floating robot.
 
-The manoeuvre is the solution of an optimal control problem (:mod:`.multiple_shooting`) that begins
-at guesses with loops (:mod:`.initial_guesses`), made into held commands that end on the goal
+The manoeuvre is the solution of an optimal control problem (:mod:`.multiple_shooting`) that starts
+from guesses with loops (:mod:`.initial_guesses`), converted to held commands that end on the goal
 (:mod:`.held_commands`).
 """
 
@@ -79,11 +79,11 @@ _ZERO_ERROR = 1e-10
 _ACTIVE_LIMIT_SHARE = 0.95
 
 _MAX_MOVING_AIMS = 4
-"""Largest number of fastest manoeuvres to where a goal is at the end of the one before, seen from a
-centre of mass that coasts."""
+"""Largest number of fastest manoeuvres, each to the place of the goal at the end of the previous
+one, relative to a coasting centre of mass."""
 
 _MOVING_AIM_FACTORS = (1.05, 1.2, 1.5)
-"""Factors of the duration of the last one, in which a manoeuvre is planned if they do not agree."""
+"""Factors of the last duration at which a manoeuvre is planned if they do not agree."""
 
 _STARTS_BEFORE_COASTING = 8
 """Guesses without a solution after which a robot that drifts coasts with its joints at rest."""
@@ -92,28 +92,28 @@ _STARTS_AFTER_COASTING = 3
 """Guesses without a solution after which the next pass of the goal is tried."""
 
 _MAX_ANGLE_WITHOUT_COASTING = math.radians(40.0)
-"""Angle by which the base turns in the longest manoeuvre that begins at once."""
+"""Angle by which the base rotates in the longest manoeuvre that begins at once."""
 
 _COASTING_ANGLE = math.radians(5.0)
-"""Angle between the attitudes at which it is looked whether the base passes the goal."""
+"""Angle between attitudes at which to check whether the base passes the goal."""
 
 _COASTING_TURNS = 4.0
 
 _MAX_COASTING_ENDS = 3
-"""Largest number of instants at which the coasting base passes the goal that are tried."""
+"""Largest number of tried instants at which the coasting base passes the goal."""
 
 _STARTS_PER_COASTING_END = 8
-"""Guesses for the turn that remains when the base passes the goal."""
+"""Guesses for the rotation that remains when the base passes the goal."""
 
 _MAX_DURATION_RATIO = 2.5
 """Longest time of a manoeuvre that ends at a pass, as multiple of that at zero momentum."""
 
 _STARTS_BEFORE_FASTEST = 2
-"""Guesses without a manoeuvre in the asked time after which the fastest one is looked for."""
+"""Guesses without a manoeuvre in the requested time after which the fastest one is searched for."""
 
 _MAX_FASTEST_RATIO = 1.25
-"""Largest ratio of the fastest manoeuvre that is found to the asked time at which the search goes
-on: there may be a faster one, but none so much faster."""
+"""Largest ratio of the duration of the fastest manoeuvre found to the requested time at which the
+search continues: there may be a faster one, but not so much faster."""
 
 _LIMIT_ROUNDING = 1e-8
 
@@ -155,7 +155,7 @@ class _Task:
 
     @property
     def velocity(self) -> Array | float:
-        """The velocities (n,) of the joints that are held before."""
+        """Joint velocities (n,) that are held before the start."""
         motion = self.request.motion
         return self.boundary.velocity if motion is None else motion.velocity
 
@@ -180,11 +180,11 @@ class _GoalKind:
 class OptimalGait(GaitMethod):
     """Minimum time, or least effort in a given time, from rest to rest.
 
-    It reaches the attitude; the position where sliders can put the base anywhere, or where the
-    options ask for it; and the final shape where the goal gives one. Of goals of end-effectors it
-    reaches these, and the parts of the pose of the base that they name. The search has a budget of
-    starts and of steps of the solver, so equal requests have equal schedules on any machine, idle
-    or busy; only where the user limits its wall time as well, they need not.
+    It reaches the attitude; the position if sliders can put the base anywhere, or if the options
+    request it; and the final shape if the goal has one. For goals of end-effectors it reaches
+    these, and the requested parts of the pose of the base. The search has a budget of starts and of
+    steps of the solver, so equal requests have equal schedules on any machine, idle or busy, unless
+    the user also limits its wall time.
     """
 
     name: ClassVar[str] = "optimal"
@@ -240,16 +240,16 @@ class OptimalGait(GaitMethod):
     @classmethod
     @override
     def require_suitable(cls, robot: SpaceRobot) -> None:
-        """Refuse robots that cannot turn their base; see :meth:`GaitMethod.require_suitable`."""
+        """Refuse robots that cannot rotate their base; see :meth:`GaitMethod.require_suitable`."""
         GoalSpecification.of(robot, OptimalOptions()).require_suitable(robot)
 
     @override
     def plan(self, request: PlanRequest, cancellation: Cancellation = NEVER) -> GaitSchedule:
         """Plan within the search budget; see :meth:`GaitMethod.plan`.
 
-        A correction takes the smallest way instead of the fastest, and may use the margins. Where
-        the centre of mass coasts, goals that are places are planned for in its frame, in which
-        they move: where they are when the manoeuvre ends depends on its duration.
+        A correction takes the smallest motion instead of the fastest, and may use the margins. If
+        the centre of mass coasts, goal positions are planned for in its frame, in which they move:
+        their place at the end of the manoeuvre depends on its duration.
         """
         self._require_suitable_setup()
         # Measured shapes may be a little beyond the joint limits.
@@ -317,7 +317,7 @@ class OptimalGait(GaitMethod):
         fast = np.abs(begin) > limit * (1 + _LIMIT_ROUNDING)
         if fast.any():
             names = ", ".join(np.array(self.robot.joint_names)[fast])
-            raise PlanningError(f"Wheels turn faster than the velocity limits of optimal: {names}.")
+            raise PlanningError(f"Wheels spin faster than the velocity limits of optimal: {names}.")
         begin = np.clip(begin, -limit, limit)
         L_B = boundary.angular_momentum
         if boundary.drifts:
@@ -325,7 +325,7 @@ class OptimalGait(GaitMethod):
             if not len(axes):
                 raise PlanningError(
                     f"The robot has an angular momentum of {np.linalg.norm(L_B):.3g} kg m^2/s, "
-                    "which its wheels take up as its attitude at the end asks for: give the goal "
+                    "which its wheels take up depending on its final attitude: give the goal "
                     "an attitude of the base (with optimal.base_attitude 1)."
                 )
             L_B = matrix_from_quaternion(boundary.goal_rotation).T @ L_B
@@ -335,7 +335,7 @@ class OptimalGait(GaitMethod):
             raise UnreachableError(
                 f"The wheels cannot hold the angular momentum of {np.linalg.norm(L_B):.4g} kg "
                 f"m^2/s that the robot has at the attitude of the goal: {clause}. Without thrust "
-                "the momentum stays: dump it to thrusters, or choose another attitude.",
+                "the momentum is constant: dump it with thrusters, or choose another attitude.",
                 clause.proof,
             ) from None
         final = boundary.final
@@ -356,7 +356,7 @@ class OptimalGait(GaitMethod):
         if self._has_obstacles:
             raise PlanningError(
                 f"The robot drifts: its centre of mass moves at {np.linalg.norm(velocity):.3g} "
-                "m/s, and among obstacles optimal plans only where it rests."
+                "m/s, and optimal plans around obstacles only if it rests."
             )
         in_frame = replace(request, state=replace(state, linear_momentum=np.zeros(3)))
         if not goal.end_effectors and "position" not in self._specification.controls:
@@ -364,8 +364,8 @@ class OptimalGait(GaitMethod):
         if goal.joint_positions is not None and not goal.end_effectors:
             raise PlanningError(
                 "The robot drifts: its centre of mass moves at "
-                f"{np.linalg.norm(velocity):.3g} m/s, so attitude and shape of the goal put the "
-                "base to its position at one instant at most. Leave the shape out, or ignore the "
+                f"{np.linalg.norm(velocity):.3g} m/s, so with attitude and shape of the goal, the "
+                "base is at its position at one instant at most. Omit the shape, or ignore the "
                 "position with optimal.base_position 2."
             )
 
@@ -395,8 +395,8 @@ class OptimalGait(GaitMethod):
             except PlanningError as reason:
                 refusal = str(reason)
         raise NotFoundError(
-            "The robot drifts, and no manoeuvre was found that ends when the goal is where it "
-            f"leads, seen from the centre of mass: {refusal}"
+            "The robot drifts, and no manoeuvre was found that ends where the goal then is, "
+            f"relative to the centre of mass: {refusal}"
         )
 
     def _plan_about_center(

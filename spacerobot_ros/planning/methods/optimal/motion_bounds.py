@@ -2,21 +2,21 @@
 
 :class:`CenterReach` bounds the centre of mass in the base, a proof for goals beyond. Without thrust
 the centre of mass rests in the world, so a pose of the base determines it in the base. Sliders
-whose directions are fixed in the base move it along straight slots, exactly. Everything that turns
-is in a ball round the first joint that turns it (triangle inequality over the links behind that
-joint). The sum of both is a convex set that holds the centre of mass in all shapes; for robots that
-have only such sliders it is the set of all centres of mass.
+whose directions are fixed in the base move it along straight slots, exactly. Everything that
+rotates is in a ball around the first joint that rotates it (triangle inequality over the links
+behind that joint). The sum of both is a convex set that holds the centre of mass in all shapes; for
+robots that have only such sliders it is the set of all centres of mass.
 
 :class:`ConnectionBounds` bounds the motion of the base by each joint. While one joint moves and the
-others rest, the robot is two rigid bodies of masses ``m_P`` and ``m_D``, before and behind the
-joint. With the locked inertia ``H`` about the centre of mass, and the angular momentum about it
-``h_i`` that the joint causes at unit rate while the base rests, the base turns at ``-H^-1 h_i``.
+others rest, the robot is two rigid bodies of masses ``m_P`` and ``m_D``, inboard and outboard of
+the joint. With the locked inertia ``H`` about the centre of mass, and the angular momentum about it
+``h_i`` that the joint causes at unit rate while the base rests, the base rotates at ``-H^-1 h_i``.
 The distances of the centres of mass from the joint bound ``|h_i|`` in all shapes, and the least
-principal moments of all bodies bound ``H`` from below. The energy is another bound: what the base
-takes up by its motion is missing behind the joint, ``omega . (H + I_base) omega <= M_ii``. The
+principal moments of all bodies bound ``H`` from below. The energy is another bound: the energy of
+the base's motion is missing outboard of the joint, ``omega . (H + I_base) omega <= M_ii``. The
 smaller bound counts.
 
-:class:`DurationBound` follows from both, and from the longest way of a joint in a given time. No
+:class:`DurationBound` follows from both, and from the largest travel of a joint in a given time. No
 shape is sampled.
 """
 
@@ -37,18 +37,18 @@ from spacerobot_ros.planning.core.method import PlanRequest
 from spacerobot_ros.planning.methods.optimal.problem import BoundaryConditions, MotionLimits
 
 _BOUND_ROUNDING = 1e-6
-"""Relative rounding error of a bound: manoeuvres end beside their goals by less than that."""
+"""Relative rounding error of a bound: manoeuvres miss their goals by less than that."""
 
 _BISECTIONS, _LONGEST = 32, 1e10
-"""Halvings of the interval of a shortest time, and the longest time that is looked for, s."""
+"""Number of bisections for a shortest time, and the longest time searched for, s."""
 
 _WITHIN = "within the velocity and acceleration limits"
 
 _PARALLEL = 1e-12
-"""Sine of the angle between two directions below which they are the same."""
+"""Sine of the angle between two directions below which they count as equal."""
 
 _MIN_SLIDER_RANGE = 1e-12
-"""Bounds of a slider differ at least by this, m: the solver wants room between them."""
+"""Bounds of a slider differ at least by this, m: the solver needs room between them."""
 
 
 @dataclass(frozen=True)
@@ -159,12 +159,12 @@ class ConnectionBounds:
     Attributes
     ----------
     turn
-        (n,) largest turn of the base with each joint, rad per rad or m; infinite: not known.
+        (n,) largest rotation of the base by each joint, rad per rad or m; infinite: not known.
     center
         (n,) largest displacement of the centre of mass in the base, m per rad or m.
     inertia
-        Smallest moment of inertia of the robot with its joints locked, kg m^2; of planar robots,
-        about the axis that they turn about.
+        Smallest moment of inertia of the robot with its joints locked, kg m^2; for planar robots,
+        about their axis.
     """
 
     turn: Array
@@ -172,13 +172,13 @@ class ConnectionBounds:
     inertia: float
 
     def drift(self, boundary: BoundaryConditions) -> float:
-        """Return the largest turn of the base with its joints at rest, rad/s."""
+        """Return the largest rate of the base with its joints at rest, rad/s."""
         momentum = float(np.linalg.norm(boundary.angular_momentum))
         return momentum / self.inertia if momentum > 0 else 0.0
 
     @classmethod
     def of(cls, robot: SpaceRobot, axes: Array) -> ConnectionBounds:
-        """Return the bounds of a robot whose base turns about ``axes`` (m, 3), base components."""
+        """Return the bounds of a robot whose base rotates about ``axes`` (m, 3), in the base."""
         tree = _Tree.of(robot)
         least, base = sum(tree.least_moments), tree.least_moments[0]
         if len(axes) == 1:
@@ -210,7 +210,7 @@ class LinkBounds:
     Attributes
     ----------
     turn
-        (n,) largest turn of the link with each joint, rad per rad or m.
+        (n,) largest rotation of the link by each joint, rad per rad or m.
     place
         (n,) largest displacement of its origin, m per rad or m.
     distance
@@ -298,8 +298,8 @@ class _Tree:
         return momentum, energy, first_moment / total
 
     def chain(self, body: int, point: Array) -> tuple[Array, Array]:
-        """Return how far each moving joint (m,) turns (rad/rad) and displaces (m/rad or m/m) a
-        ``point`` (3,) of a body at most while the base rests.
+        """Return the largest rotation (rad/rad) and displacement (m/rad or m/m) of a ``point`` (3,)
+        of a body by each moving joint (m,) while the base rests.
         """
         turning, levers = (np.zeros(len(self.bodies) - 1) for _ in range(2))
         way = 0.0
@@ -317,9 +317,9 @@ class _Tree:
         self, at: int, point: Array, came_from: int, measured: Array
     ) -> Iterator[tuple[int, float]]:
         """Yield the largest distances, m, of centres of mass from a ``point`` (3,) of body ``at``,
-        for this body and all that are reached from it, but by way of ``came_from``.
+        for this body and all that are reached from it, except through ``came_from``.
 
-        The matrix ``measured`` (3, 3) multiplies the vectors in this body, whose norms count.
+        The matrix ``measured`` (3, 3) multiplies vectors in this body before their norms are taken.
         """
 
         def way(joint: int, vector: Array, R: Array) -> float:
@@ -346,8 +346,8 @@ class _Tree:
 
 @dataclass(frozen=True)
 class Demand:
-    """A motion that takes time: ``weights`` times the ways of the joints, plus ``drift`` times the
-    duration, are at least ``amount``.
+    """A motion that takes time: ``weights`` times the travels of the joints, plus ``drift`` times
+    the duration, must be at least ``amount``.
 
     Attributes
     ----------
@@ -369,14 +369,14 @@ class Demand:
 
 @dataclass(frozen=True)
 class DurationBound:
-    """A duration that no manoeuvre to a goal is shorter than.
+    """A lower bound of the duration of all manoeuvres to a goal.
 
     Attributes
     ----------
     seconds
         The duration, a multiple of the control period.
     reason
-        The motion that takes it, as a clause.
+        The motion that requires it, as a clause.
     """
 
     seconds: float
@@ -409,13 +409,13 @@ class DurationBound:
         final_is_given
             Whether the last shape of the boundary conditions is the only one at the goal.
         base_rate_limit
-            Fastest turn of the base, rad/s; 0: any.
+            Largest rate of the base, rad/s; 0: any.
         demands
             Further ones.
         """
         demands = list(demands)
         angle = _least_turn(boundary.goal_rotation, axes)
-        turns = f"the base turns by {angle:.4g} rad"
+        turns = f"the base rotates by {angle:.4g} rad"
         if angle > 0:
             reason = f"{turns} {_WITHIN} of the joints"
             demands.append(Demand(connection.turn, angle, reason, connection.drift(boundary)))
@@ -461,7 +461,7 @@ def link_demands(
     boundary: BoundaryConditions,
     connection: ConnectionBounds,
 ) -> Iterator[Demand]:
-    """Yield the ways of the end-effectors to the goals of a request, less its tolerances."""
+    """Yield the motions of the end-effectors to the goals of a request, minus its tolerances."""
     state, tolerance, drift = request.state, request.tolerance, connection.drift(boundary)
     for goal in request.goal.end_effectors:
         of_link = connection.of_link(robot, goal.link)
@@ -475,7 +475,7 @@ def link_demands(
             continue
         turn = quaternion_multiply(quaternion_inverse(quaternion), goal.quaternion)
         angle = _least_turn(turn, np.eye(3)) - tolerance.attitude
-        turns = f"'{goal.link}' turns by {angle:.4g} rad {_WITHIN} of the joints"
+        turns = f"'{goal.link}' rotates by {angle:.4g} rad {_WITHIN} of the joints"
         yield Demand(of_link.turn, angle, turns, drift)
 
 

@@ -30,7 +30,7 @@ _FEASIBILITY_TOLERANCE = 1e-4
 """Violation of the constraints below which an iterate counts as a trajectory, SI units."""
 
 _INFEASIBLE = "Infeasible_Problem_Detected"
-"""The solver's status where it ends at a least violation of the constraints."""
+"""The solver's status if it ends at a minimum of the violation of the constraints."""
 
 TOLERANCE = 1e-5
 """Durations within a thousandth of a control period, for manoeuvres of some seconds."""
@@ -58,20 +58,20 @@ _IPOPT_OPTIONS = {
 
 
 _WARM_OPTIONS = {"ipopt.mu_init": 3e-3, "ipopt.bound_push": 1e-3, "ipopt.bound_frac": 1e-3}
-"""With distances: the guess is a solution without some of them, which is not to be left far."""
+"""With distances: the guess is a solution without some of them; the solver must stay near it."""
 
 _REFINING_OPTIONS = {"ipopt.mu_init": 1e-3}
 """The guess is a solution on a coarser grid."""
 
 _WARM_STRETCH = 1.5
 """With distances: factor of the time of the guess. At full speed velocities and accelerations are
-at their limits, which leaves the solver no room to go round."""
+at their limits, which leaves the solver no room to go around."""
 
 _LARGEST_REACH, _LARGEST_REACH_SHARE = 0.3, 0.15
 """Largest reach of a neighbourhood, rad or m, and as a share of a joint's range."""
 
 _COST_OF_LACK = 300.0
-"""Cost of a distance that is lacking, in durations or efforts of the guess per m."""
+"""Cost of missing distance, in durations or efforts of the guess per m."""
 
 
 @dataclass(frozen=True)
@@ -81,12 +81,12 @@ class StopRule:
     Attributes
     ----------
     iterations
-        Steps that it takes at most.
+        Largest number of its steps.
     cancellation
         Stops it at its next iterate.
     deadline, last_call
         ``time.monotonic()``, s, at which it stops with a feasible iterate, and without one;
-        infinite where no wall time limits the search.
+        infinite if no wall time limits the search.
     watch
         Called at every iterate.
     """
@@ -118,15 +118,15 @@ class DurationBounds:
 
 @dataclass(frozen=True)
 class Neighbourhood:
-    """The paths near to a guess among which a solver looks for one that keeps links apart.
+    """Neighbourhood of a guess in which a solver searches for a path that keeps links apart.
 
     Attributes
     ----------
     reach
         (n,) largest change of the shape anywhere on the path, m or rad.
     largest_lack
-        Distance by which links may be nearer than they ought to be, m. It costs much, so that it
-        vanishes where the solver finds a way.
+        Distance by which links may be nearer than required, m. Its cost is high, so that it
+        vanishes if the solver finds a path.
     """
 
     reach: Array
@@ -149,7 +149,7 @@ class MultipleShooting:
     stages, intervals
         The functions of the problem, and the number of intervals N.
     tolerance
-        Of the optimality conditions, where the solver ends.
+        Of the optimality conditions, at which the solver ends.
     """
 
     def __init__(self, stages: Stages, intervals: int, tolerance: float = TOLERANCE) -> None:
@@ -157,7 +157,7 @@ class MultipleShooting:
         self.iterations, self.converged = 0, False
         """Number of the solver's steps for its last solution, and whether the solver converged."""
         self.lack = 0.0
-        """Distance by which links are nearer in its last solution than they ought to be, m."""
+        """Distance by which links are nearer in its last solution than required, m."""
         self.turn = stages.rotation_of_step
         self._drifting = stages.drifting
         self._program = program(stages, intervals)
@@ -198,13 +198,13 @@ class MultipleShooting:
         Parameters
         ----------
         boundary, limits, guess
-            The problem, and where the solver begins.
+            The problem, and the start of the solver.
         stop
             Conditions on which the solver stops early.
         duration
             Its bounds.
         near
-            Where the solution is to be near the guess; None: anywhere.
+            Neighbourhood of the guess for the solution; None: anywhere.
         refining
             Whether the guess is a solution on a coarser grid.
         """
@@ -274,7 +274,7 @@ class MultipleShooting:
 def build_solver(
     name: str, program: Program, monitor: SolverMonitor, options: Mapping[str, object]
 ) -> ca.Function:
-    """Return IPOPT for a program, with options beside those of all solvers."""
+    """Return IPOPT for a program, with options in addition to those of all solvers."""
     # The solver's matrices are small: threads of its linear algebra would wait for each other.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     derivatives = {"jac_g": program.jac_g, "hess_lag": program.hess_lag}
@@ -357,7 +357,7 @@ class SolverMonitor(ca.Callback):
     def eval_buffer(
         self, arguments: tuple[memoryview, ...], results: tuple[memoryview, ...]
     ) -> int:
-        """Look at an iterate; return whether the solver stops, by its results."""
+        """Process an iterate; return whether the solver stops."""
         x, f, g = (np.frombuffer(each) for each in arguments[:3])
         if f[0] < self._least:
             worst = max((self._lower - g).max(), (g - self._upper).max())

@@ -163,7 +163,7 @@ class OptimalOptions(MotionOptions):
 
 
 _UNLIMITED_HALF_RANGE = np.pi
-"""Half of the range that a guess uses of a joint without limits, rad or m."""
+"""Half of the range that a guess uses for an unlimited joint, rad or m."""
 
 _SMOOTH_BODY_EXPONENT = 8
 
@@ -175,7 +175,7 @@ _CONSTRAINT_RESERVE = 0.02
 
 
 class UnusableCandidateError(PlanningError):
-    """A solution or a state is not usable; the text is a clause that says why."""
+    """A solution or a state is not usable; the message is a clause that says why."""
 
 
 @dataclass(frozen=True)
@@ -188,30 +188,30 @@ class PossibleEnd:
 
 @dataclass(frozen=True)
 class BoundaryConditions:
-    """Both ends of a motion, seen from the attitude that it starts at.
+    """Both ends of a motion, relative to its initial attitude.
 
     Attributes
     ----------
     start
         (n,) first shape, m or rad.
     goal_rotation
-        (4,) quaternion of the goal attitude in the starting one.
+        (4,) quaternion of the goal attitude relative to the initial one.
     likely_final_shape
-        (n,) last shape for all that is known before the search.
+        (n,) last shape as far as it is known before the search.
     final
-        (n,) last shape; None: any. That of a reaction wheel is not a number: any.
+        (n,) last shape; None: any. That of a reaction wheel is NaN: any.
     center
         (3,) centre of mass of the system in the base at the end, m; None: anywhere.
     direction
-        (3,) kept direction of the path constraints, in the starting base.
+        (3,) kept direction of the path constraints, in the initial base frame.
     velocity
-        (n,) first velocities of the joints, m/s or rad/s; a number is that of all.
+        (n,) first velocities of the joints, m/s or rad/s; a number applies to all.
     final_velocity
         (n,) velocities that the joints keep from the end on, rad/s or m/s.
     end_effectors
         (7 k,) goals of k links (:meth:`.EndEffectorRows.pack`).
     possible_ends
-        Ends of the guesses, in turn; none: the likely shape, and the turn.
+        Ends of the guesses, in turn; none: the likely shape, and the rotation.
     state
         The state at the start.
     angular_momentum
@@ -238,14 +238,12 @@ class BoundaryConditions:
 
     @property
     def is_timed(self) -> bool:
-        """Whether the motion leads elsewhere where it takes longer: the robot drifts, or joints
-        move at an end.
-        """
+        """Whether the end depends on the duration: the robot drifts, or joints move at an end."""
         return self.drifts or bool(np.any(self.velocity) or np.any(self.final_velocity))
 
     def momenta_in_base(self, quaternions: Array) -> Array | None:
-        """Return the angular momentum (..., 3) in the base at turns (..., 4) since the start; None:
-        it is zero.
+        """Return the angular momentum (..., 3) in the base at rotations (..., 4) since the start;
+        None: it is zero.
         """
         if not self.drifts:
             return None
@@ -255,8 +253,8 @@ class BoundaryConditions:
 
 @dataclass(frozen=True)
 class MotionLimits:
-    """Bounds (n,) of the joints: ``lower`` and ``upper`` in m or rad, ``velocity`` a second,
-    ``acceleration`` a second squared; ``distances`` (N, M) are the planes that keep pairs of
+    """Bounds (n,) of the joints: ``lower`` and ``upper`` in m or rad, ``velocity`` per second,
+    ``acceleration`` per second squared; ``distances`` (N, M) are the planes that keep pairs of
     links apart in N intervals (:meth:`.KeptDistances.within`).
     """
 
@@ -270,14 +268,14 @@ class MotionLimits:
     def of(cls, robot: SpaceRobot, options: MotionOptions, method: str = "optimal") -> MotionLimits:
         """Return the robot's own limits, narrowed by the options of a method.
 
-        Without ``max_acceleration``, reaction wheels accelerate as the torque of their motors has
-        them do while the base rests.
+        Without ``max_acceleration``, that of reaction wheels is the acceleration by their motor
+        torque while the base rests.
 
         Raises
         ------
         ParameterError
-            A list has not one number a joint, or a joint without speed limit has none for its
-            acceleration.
+            A list does not have one number per joint, or a joint has no speed limit and no
+            acceleration limit.
         """
         velocity = robot.velocity_limit.copy()
         if options.max_velocity:
@@ -297,8 +295,8 @@ class MotionLimits:
                 )
             if not (v > 0 and np.isfinite(a) and a > 0):
                 raise ParameterError(
-                    f"Joint '{name}' is limited to {v:.4g} a second and {a:.4g} a second squared; "
-                    f"{method} needs a speed above zero and a finite acceleration: see "
+                    f"Joint '{name}' is limited to {v:.4g} per second and {a:.4g} per second "
+                    f"squared; {method} needs a speed above zero and a finite acceleration: see "
                     f"{method}.max_acceleration."
                 )
         return cls(robot.lower.copy(), robot.upper.copy(), velocity, acceleration)
@@ -306,7 +304,7 @@ class MotionLimits:
     def within(self, margin: Array, *shapes: Array) -> MotionLimits:
         """Return limits that keep ``margin`` (n,) from the ends of the joints' ranges.
 
-        Shapes (n,) that are given are admitted all the same.
+        Given shapes (n,) are admitted in any case.
         """
         # Where two margins overlap the joint keeps to the middle of its range.
         with np.errstate(invalid="ignore"):
@@ -321,7 +319,7 @@ class MotionLimits:
         )
 
     def joint_ranges(self, q: Array) -> tuple[Array, Array]:
-        """Return middle and half width (n,) of the range, finite round ``q`` (n,)."""
+        """Return middle and half width (n,) of the range, finite around ``q`` (n,)."""
         lower = np.maximum(self.lower, q - 2 * _UNLIMITED_HALF_RANGE)
         upper = np.minimum(self.upper, q + 2 * _UNLIMITED_HALF_RANGE)
         middle = np.where(np.isfinite(self.lower) & np.isfinite(self.upper), (lower + upper) / 2, q)
@@ -334,12 +332,12 @@ class MotionLimits:
         velocity: Array | float = 0.0,
         after: Array | float = 0.0,
     ) -> tuple[float, float]:
-        """Return the factor by which held commands must be slower, and the largest overrun.
+        """Return the factor by which held commands must be slowed down, and the largest overrun.
 
         ``positions`` (N + 1, n) are the shapes at ticks of ``period`` seconds; the velocities
-        ``velocity`` and ``after`` (n,) are held before and after. The factor is at most 1 where
-        velocities and accelerations keep their limits; the overrun is the farthest that a joint is
-        beyond its limits, m or rad.
+        ``velocity`` and ``after`` (n,) are held before and after. The factor is at most 1 if
+        velocities and accelerations keep their limits; the overrun is the largest distance of a
+        joint beyond its limits, m or rad.
         """
         speed, change = self.limit_shares(positions, period, velocity, after)
         beyond = np.maximum(self.lower - positions, positions - self.upper)
@@ -369,7 +367,7 @@ class Trajectory:
     """N steps of ``step`` seconds with constant accelerations.
 
     ``shapes`` and ``velocities`` (N + 1, n) at the knots between them, and the attitude
-    ``quaternions`` (N + 1, 4) in the one at the start.
+    ``quaternions`` (N + 1, 4) relative to the one at the start.
     """
 
     step: float
@@ -423,7 +421,7 @@ class _SmoothBody:
             or upper[i] < min(robot.upper[i], _UNBOUNDED_FROM)
         ]
         if not bounded:
-            raise ParameterError("A box of optimal.keep_out holds all shapes of the robot.")
+            raise ParameterError("A box of optimal.keep_out contains all shapes of the robot.")
         # No joint gets beyond its limits, so a distant side may move to a finite distance.
         width = robot.upper - robot.lower
         lower = np.maximum(lower, robot.lower - width)[bounded]
@@ -438,11 +436,11 @@ class PathConstraints:
     Attributes
     ----------
     base_rate_limit
-        Fastest turn of the base, rad/s; 0: any.
+        Largest rate of the base, rad/s; 0: any.
     axis_B, direction_W, cone_half_angle
         The direction ``axis_B`` (3,), fixed in the base, stays out of the cone of half angle
-        ``cone_half_angle`` (rad) round ``direction_W`` (3,), as an instrument that must not see the
-        Sun.
+        ``cone_half_angle`` (rad) around ``direction_W`` (3,), like an instrument that must not see
+        the Sun.
     keep_out_boxes
         (K, 2, n) lower and upper corners of boxes of shapes that the joints must not enter.
     smooth_keep_out_bodies
@@ -458,7 +456,7 @@ class PathConstraints:
 
     @classmethod
     def of(cls, robot: SpaceRobot, options: OptimalOptions) -> PathConstraints:
-        """Return the constraints that the options ask for.
+        """Return the constraints that the options specify.
 
         Raises
         ------
@@ -469,7 +467,7 @@ class PathConstraints:
         direction = _unit_direction("direction", options.keep_direction)
         if len({axis is None, direction is None, options.keep_angle == 0}) > 1:
             raise ParameterError(
-                "A direction that is kept away takes all of optimal.keep_axis, "
+                "A direction that is kept away requires all of optimal.keep_axis, "
                 "optimal.keep_direction and optimal.keep_angle."
             )
         joints, boxes = robot.n, options.keep_out
@@ -507,7 +505,7 @@ class PathConstraints:
         Raises
         ------
         UnusableCandidateError
-            It violates a constraint.
+            The path violates a constraint.
         """
         for box in self.keep_out_boxes:
             inside = np.all((positions > box[0]) & (positions < box[1]), axis=1)
@@ -528,7 +526,7 @@ class PathConstraints:
         if self.base_rate_limit > 0:
             rate = _largest_base_rate(quaternions, period)
             if rate > self.base_rate_limit * (1 + 1e-6):
-                raise UnusableCandidateError(f"the base turns at {rate:.4g} rad/s")
+                raise UnusableCandidateError(f"the base rotates at {rate:.4g} rad/s")
 
     @property
     def imposed_base_rate(self) -> float:
@@ -583,7 +581,7 @@ def per_joint(
     Raises
     ------
     ParameterError
-        A list of numbers has another length, or a name is that of no joint.
+        A list of numbers has the wrong length, or a name is not that of a joint.
     """
     names = robot.joint_names
     if any(isinstance(each, str) for each in values):

@@ -5,16 +5,16 @@
    full one, until some solutions agree.
 3. **Full grid**: the best solution, and the next if it is about as good, are refined.
 4. **Held commands**: a solution becomes commands that end on the goal. If its duration matters (the
-   robot drifts, or joints move at an end), it can not be stretched to whole control periods: the
+   robot drifts, or joints move at an end), it cannot be stretched to whole control periods: the
    path of least effort in as many periods, or a few more, is solved for.
 5. **Clear**: if held commands bring links too near to each other or to obstacles, clear paths are
-   looked for near to them, then near to other solutions, then near to guesses, and made fast.
+   searched for near them, then near other solutions, then near guesses, and made faster.
 
 Each step is a few methods of :class:`ManoeuvreSearch`.
 
 J. Schulman et al., "Motion planning with sequential convex optimization and convex collision
-checking", International Journal of Robotics Research 33, 2014, clear paths by steps that are
-quadratic programs; here they are the manoeuvre's own problem.
+checking", International Journal of Robotics Research 33, 2014, clear paths in steps that are
+quadratic programs; here the steps are the manoeuvre's own problem.
 """
 
 from __future__ import annotations
@@ -73,11 +73,12 @@ _NO_HELD_COMMANDS = "held commands could not be brought to the goal within the l
 # -- constants, each with its reason --------------------------------------------------------------
 
 _MIN_TICKS, _MIN_TICKS_IN_MOTION = 2, 4
-"""Fewest ticks of a manoeuvre: one begins to move, another one stops; in motion, one brakes."""
+"""Smallest number of ticks of a manoeuvre: one to start, another one to stop; in motion, one to
+brake."""
 
 _GENTLE_TICKS, _GENTLE_TIME = 20, 1.0
-"""A gentle manoeuvre has as many ticks or takes as long, s, whichever is less: it corrects a
-small error, and haste would leave a larger one."""
+"""Ticks or time, s, of a gentle manoeuvre, whichever is less: it corrects a small error, and a
+faster one would leave a larger error."""
 
 _GENTLE_DURATION_FACTOR = 4.0
 """A gentle manoeuvre is the path of least effort in this many times the time of its guess, then as
@@ -90,7 +91,7 @@ _COARSE_GRID_RATIO, _COARSE_GRID_RATIO_IN_MOTION = 5, 4
 """Ratio of the full grid to the coarse one: in motion, what remains may be planned on it alone."""
 
 _MIN_COARSE_INTERVALS, _MIN_COARSE_INTERVALS_IN_MOTION = 8, 10
-"""Fewest intervals of a coarse grid; with fewer there is none."""
+"""Smallest number of intervals of a coarse grid; with fewer there is none."""
 
 _COARSE_TOLERANCE = 1e-4
 """Tolerance on a coarse grid from rest, whose solutions differ by more from those that follow."""
@@ -103,11 +104,11 @@ _MAX_REFINED_COST_RATIO = 1.1
 coarse grid underestimates some costs by more than others."""
 
 _SAME_COST_TOLERANCE = 1e-3
-"""Relative difference of costs up to which two solutions are the same one."""
+"""Relative difference of costs up to which two solutions count as the same."""
 
 _AGREEING_COST_TOLERANCE = 3e-3
-"""Solutions whose costs are this near, relative, agree: the coarse grid and the tolerance of the
-solver leave as much between them."""
+"""Relative difference of costs up to which solutions agree: the coarse grid and the solver's
+tolerance cause such differences."""
 
 _AGREEING_SOLUTIONS_WITH_GUESS = 2
 """Agreeing solutions that end a search whose first guess was given."""
@@ -120,44 +121,43 @@ _MAX_FULL_GRID_STARTS = 3
 are made clear on it alone: it costs the most."""
 
 _LIMIT_SHARE_IN_GIVEN_TIME = 0.99
-"""Share of velocity and acceleration limits for manoeuvres of a given duration: held commands take
-the rest."""
+"""Share of velocity and acceleration limits for manoeuvres of a given duration: the rest is for
+held commands."""
 
 _ACCELERATION_SHARES_IN_MOTION = (0.98, 1.0)
-"""In motion: shares of accelerations that are planned with, one after the other: changes of a path
-take the rest, but a joint near its limit may need all to come to rest in time."""
+"""In motion: shares of accelerations that plans use, tried in turn: the rest is for changes of the
+path, but a joint near its limit may need all of it to come to rest in time."""
 
 _VELOCITY_RESERVE_IN_MOTION = 0.02
-"""In motion: share of velocities that is left for the same reason, at most: a joint at full speed
-is slowed down to the rest in a quarter of a control period."""
+"""In motion: largest share of velocities reserved for the same reason: a joint at full speed is
+slowed down by it in a quarter of a control period."""
 
 _ADDITIONAL_TICKS, _ADDITIONAL_SHARES_OF_STOPS = (0, 0, 1, 3, 7), (0.03, 0.08)
-"""Control periods that are added where held commands miss the goal or a limit (the second time, the
-end is corrected), and shares of the duration where wheels stop the base: they use their torque all
+"""Control periods that are added if held commands miss the goal or a limit (the second time, the
+end is corrected), and shares of the duration if wheels stop the base: they use their torque all
 the time."""
 
 _MAX_RATE_EXCESS, _RATE_RESERVE = 1.1, 1.002
-"""Largest excess of the base rate of held commands over its bound at which they are made slower, as
-the bound is imposed at the steps of a solution alone, and the factor of that excess."""
+"""Largest excess of the base rate of held commands over its bound at which they are slowed down, as
+the bound is imposed only at the steps of a solution, and the factor of that excess."""
 
 _HELD_REACH_SHARE = 0.3
-"""Share of the largest reach by which a clear path may change where it is solved for in whole
-ticks."""
+"""Share of the largest reach by which a clear path may change in a solution in whole ticks."""
 
 _CLEARING_TIME_FACTOR, _RESAMPLED_TIME_FACTOR = 2.0, 1.2
-"""Ratios of the time of a path that is to become clear to that of a path in collision, and to that
-of a clear path on a coarse grid: slow joints leave room to go round."""
+"""Ratios of the time of a path to be made clear to that of a path in collision, and to that of a
+clear path on a coarse grid: slow joints leave room to go around."""
 
 _MAX_CLEARING_ITERATIONS = 80
-"""Steps of the solver between paths that planes are made for at most: what takes more diverges."""
+"""Largest number of solver steps between paths for which planes are made: more steps diverge."""
 
 _MAX_CLEARING_ROUNDS, _MAX_SHORTENING_ROUNDS = 15, 10
-"""Paths on the way to a clear one, and from there to a fast one, at most: most take a few, but a
-servicer's plan is not found in seven."""
+"""Largest number of paths on the way to a clear one, and from there to a fast one: most take a few,
+but a servicer's plan is not found in seven."""
 
 _MIN_LARGEST_LACK, _LACK_PER_DEPTH = 0.1, 2.0
-"""Distance by which links on the way to a clear path may be nearer than they ought to be, m: at
-least, and as a multiple of the depth of their contact."""
+"""Distance by which links on the way to a clear path may be nearer than required, m: at least, and
+as a multiple of their penetration depth."""
 
 _MAX_WORK_PER_ITERATION, _WORK_FACTOR_WITHOUT_PATH = 8e4, 3.0
 """Largest work on clear paths, in nonzeros of Jacobians over all steps of the solver, for each step
@@ -165,20 +165,20 @@ that ``optimal.iterations`` allows from one guess, and its factor where there is
 12 and 36 s of an idle core (0.5 us a nonzero). With 1.25e5 two arms took 40 s for the same plan."""
 
 _MIN_SHORTENING_ROUNDS = 3
-"""Paths on the way to a fast one that are tried even so."""
+"""Paths on the way to a fast one that are tried in any case."""
 
 _NO_LACK = 1e-3
-"""Lack of distance below which all planes are kept, m."""
+"""Missing distance below which all planes are kept, m."""
 
 _PROGRESS_SHARE = 0.9
-"""Largest ratio of the lack of distance to the one two paths before at which it is going on."""
+"""Largest ratio of the missing distance to that two paths before at which there is progress."""
 
 _MIN_GAIN = 0.01
-"""Relative gain of time below which a clear path is not made faster any more, at the full reach."""
+"""Relative gain of time below which a clear path is no longer made faster, at the full reach."""
 
 _REACH_DIVISOR, _REACH_FACTOR, _MIN_REACH_SHARE = 3.0, 2.0, 0.02
-"""Divisor of the reach where a faster path is not clear, its factor where it is, and the share of
-the largest reach at which paths are not made faster any more."""
+"""Divisor of the reach if a faster path is not clear, its factor if it is, and the share of the
+largest reach at which paths are no longer made faster."""
 
 _REACH_FROM_GUESS = 4.0
 """Factor of the largest reach from a guess, which is far from the goal."""
@@ -204,7 +204,7 @@ class Manoeuvre:
     duration
         s.
     solution
-        The trajectory that was made into held commands.
+        The trajectory that was converted to held commands.
     starts
         Guesses that were tried.
     solutions
@@ -223,7 +223,7 @@ class Manoeuvre:
 
 @dataclass(frozen=True)
 class SearchClock:
-    """The wall time of a plan, of which all its searches take.
+    """The wall time of a plan, which all its searches share.
 
     Attributes
     ----------
@@ -273,14 +273,14 @@ class SearchProblem:
     options
         The options of ``optimal``.
     guess
-        (M, n) shapes that, moved to the ends, come before all other guesses; None: none.
+        (M, n) shapes that are moved to the ends and come before all other guesses; None: none.
     gentle
-        Whether the manoeuvre takes the path of least effort, whose turn of the base depends least
-        on errors of masses.
+        Whether the manoeuvre takes the path of least effort, whose rotation of the base depends
+        least on errors of masses.
     max_failed_starts
         Guesses without any solution after which the search ends.
     motion
-        Motion of the joints at the start, whose rest is the first guess; None: they rest.
+        Motion of the joints at the start, whose remainder is the first guess; None: they rest.
     """
 
     boundary: BoundaryConditions
@@ -295,7 +295,7 @@ class SearchProblem:
 
     @property
     def is_timed(self) -> bool:
-        """Whether the motion leads elsewhere where it takes longer."""
+        """Whether the end of the motion depends on its duration."""
         return self.boundary.is_timed or self.motion is not None
 
     @property
@@ -304,7 +304,7 @@ class SearchProblem:
         return self.options.duration == 0 and not self.gentle
 
     def cost(self, trajectory: Trajectory) -> float:
-        """Return the cost: the duration, or the effort where the duration is given."""
+        """Return the cost: the duration, or the effort if the duration is given."""
         if self.options.duration == 0:
             return trajectory.duration
         scale = np.where(np.isfinite(self.limits.velocity), self.limits.velocity, 1.0)
@@ -432,14 +432,14 @@ class ManoeuvreSearch:
         cancellation: Cancellation = NEVER,
         clock: SearchClock | None = None,
     ) -> Manoeuvre:
-        """Return the fastest manoeuvre found; ``clock`` is that of the plan, None: one of its own.
+        """Return the fastest manoeuvre found; ``clock`` is that of the plan; None: a new one.
 
         Raises
         ------
         NotFoundError
             None was found.
         PlanningError
-            None is as short as is asked for, or links are too near at an end.
+            No manoeuvre is as short as requested, or links are too near at an end.
         PlanningCancelled
             The search was cancelled.
         """

@@ -8,18 +8,18 @@ simple bounds on s keep the joint limits between the knots, too. The dynamics ar
 
 ``v+ = v + h a``, ``s+ = s + h v+``, ``X+ = X exp(Omega(s, h v, h v+))``.
 
-Omega is the Magnus expansion, order four, of the rates at two Gauss points of the interval, where
-momentum is zero: ``D(q) w + D_q(q) u = 0`` (paper 1, eq. 3). So the attitude follows from the path
-of the shape, however fast it is travelled, and the base's position needs no state: the centre of
-mass rests, and the last shape and attitude tell where the base is.
+Omega is the Magnus expansion, order four, of the rates at two Gauss points of the interval; at zero
+momentum, ``D(q) w + D_q(q) u = 0`` (paper 1, eq. 3). So the attitude follows from the path of the
+shape, whatever its speed, and the base's position needs no state: the centre of mass rests, and the
+last shape and attitude determine it.
 
 If a robot drifts, its angular momentum L about the centre of mass is constant in the world, so
 ``D(q) w + D_q(q) u = h X' L_0``, with L_0 in the base at the start. X at a Gauss point is the
 weighted mean of the quaternions at both knots, normalised, which makes the attitude of order two.
-These functions are others than those at zero momentum, and are made where a robot drifts.
+These functions differ from those at zero momentum, and are derived only if a robot drifts.
 
-All stages have the same functions. Their derivatives are made once, and put in their places in
-the program's sparse matrices.
+All stages have the same functions. Their derivatives are derived once, and inserted into the
+program's sparse matrices.
 
 Method: H. G. Bock and K. J. Plitt, "A multiple shooting algorithm for direct solution of optimal
 control problems", IFAC World Congress, 1984.
@@ -58,14 +58,14 @@ _DIRECTION_SIZE = 3
 """Size of the kept direction, the first parameter of an interval."""
 
 _LEAST_MULTIPLIER = 3e-2
-"""Multiplier below which a distance bends nothing: durations or efforts, of about one, per m."""
+"""Multiplier below which a distance has no effect: durations or efforts, of about one, per m."""
 
 Indices = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True)
 class PathInequality:
-    """An inequality ``function(q, qdot, qddot, L_B) >= 0`` that holds on the way.
+    """An inequality ``function(q, qdot, qddot, L_B) >= 0`` that holds along the path.
 
     Attributes
     ----------
@@ -138,7 +138,7 @@ class ConstraintBlock:
         *,
         repetitive: bool = True,
     ) -> ConstraintBlock:
-        """Take the expressions of rows, Jacobian and Hessian; find common subexpressions where they
+        """Take the expressions of rows, Jacobian and Hessian; find common subexpressions if they
         are ``repetitive``.
         """
         g, H = ca.densify(g), ca.triu(H)
@@ -163,7 +163,7 @@ class Stages:
     beginning, interval, end
         Rows of the first knot, of two neighbouring knots, and of the last one.
     path_row_count
-        Rows of the interval that are inequalities, ``>= 0``: the last ones of it.
+        Rows of the interval that are inequalities, ``>= 0``: its last ones.
     rotation_of_step
         The rotation vector (3,) of a step (:func:`turn_function`).
     distances
@@ -203,13 +203,13 @@ class Stages:
         robot
             The model.
         axes
-            (m, 3) directions in the base along which the attitude is to be reached.
+            (m, 3) directions in the base along which the attitude must be reached.
         position
-            Whether the centre of mass is to end at ``center`` in the base.
+            Whether the centre of mass must end at ``center`` in the base.
         constraints, inequalities
             Constraints of the path.
         end_effectors
-            Of SX: ``(turn (4,), shape (n,), parameters)``, rows that vanish at the end.
+            Of SX: ``(rotation (4,), shape (n,), parameters)``, rows that vanish at the end.
         drifting
             Whether the angular momentum is a parameter; else it is zero.
         """
@@ -276,7 +276,7 @@ def _cached_interval(
 
 
 def hash_of(facts: Sequence[str]) -> str:
-    """Return the key of what is derived from some facts."""
+    """Return the cache key of an object that is derived from some facts."""
     return hashlib.sha256("\n".join(facts).encode()).hexdigest()
 
 
@@ -324,8 +324,8 @@ def _interval_block(
 
 @dataclass(frozen=True)
 class AttitudeRows:
-    """Rows (4,) of an interval that vanish where its attitudes follow from the rotations at the
-    Gauss points, with their derivatives by its variables.
+    """Rows (4,) of an interval that vanish if its attitudes follow from the rotations at the Gauss
+    points, with their derivatives by its variables.
 
     Attributes
     ----------
@@ -363,8 +363,8 @@ class AttitudeRows:
             The arguments of ``rotation`` at the Gauss points.
         rotation
             Rotation, its Jacobian and the Hessian of its product with multipliers. Common
-            subexpressions are found in it: in the expressions of an interval that takes several
-            times as long, and finds one more in a hundred.
+            subexpressions are searched for in it; a search in the expressions of an interval takes
+            several times as long, and finds one per cent more.
         defect
             A parameter (3,) that is added to the rotation vector of the step; None: none.
         """
@@ -564,8 +564,8 @@ def magnus(first: ca.SX, second: ca.SX) -> ca.SX:
 def turn_function(robot: SpaceRobot, *, drifting: bool = False) -> ca.Function:
     """Return ``(q, u, u+) -> Omega`` (3,): the rotation vector of a step, base components.
 
-    Drifting, a fourth argument is the angular impulse (3,) of the step: the angular momentum in
-    the base about half-way, times the duration of the step.
+    If the robot drifts, a fourth argument is the angular impulse (3,) of the step: the angular
+    momentum in the base about half-way, times the duration of the step.
     """
     q, u, u_next = (ca.SX.sym(name, robot.n) for name in ("q", "u", "u_next"))
     impulse = ca.SX.sym("impulse", 3 if drifting else 0)
@@ -615,7 +615,7 @@ class Layout:
 
 @dataclass(frozen=True)
 class Program:
-    """Functions of variables x and parameters p, as IPOPT takes them; the bounds are those of g."""
+    """Functions of variables x and parameters p, as IPOPT requires; the bounds are those of g."""
 
     problem: dict[str, ca.MX]
     jac_g: ca.Function
@@ -653,7 +653,7 @@ class PlacedBlock:
         return cls(block, variables, of_block, parameters)
 
     def called(self, function: ca.Function, x: ca.MX, *more: ca.MX) -> list[ca.MX]:
-        """Return the results at all places, each place's nonzeros after the other's."""
+        """Return the results at all places: the nonzeros of one place after the other."""
         count = len(self.variables)
         z = ca.reshape(x[self.variables.ravel().tolist()], -1, count)
         p = self.parameters

@@ -1,8 +1,8 @@
-"""What may come too near in a motion under thrust: links, obstacles, and a target that tumbles.
+"""What may come too near in a motion under thrust: links, obstacles, and a tumbling target.
 
-Seen from a target its body is an obstacle that rests. So the exact check is that of obstacles, with
-the base relative to the target; a plane between a link and the target is turned into W where the
-target is at that time.
+Relative to a target, its body is an obstacle at rest. So the exact check is that of obstacles, with
+the base relative to the target; a plane between a link and the target is transformed to W by the
+pose of the target at that time.
 """
 
 from __future__ import annotations
@@ -85,7 +85,7 @@ class Bodies:
     robot
         The model.
     clearance
-        The distances of links and obstacles; None: they are not looked at.
+        The distances of links and obstacles; None: they are not checked.
     grapple
         The target, whose grapple frame ``link`` meets; None: there is none.
     """
@@ -106,7 +106,8 @@ class Bodies:
         """Distances (P,) of all pairs, m."""
 
     def begin(self, shape: Array, pose: Array) -> None:
-        """Require the distances of a motion from a shape (n,) and a pose (7,) of the base on.
+        """Set the distances required of a motion that starts in a shape (n,) and a pose (7,) of the
+        base.
 
         Raises
         ------

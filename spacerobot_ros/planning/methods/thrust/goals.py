@@ -1,4 +1,4 @@
-"""Where motions under thrust begin and end."""
+"""Starts and goals of motions under thrust."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from spacerobot_ros.planning.methods.thrust.motion import ThrustMotion
 
 @dataclass(frozen=True)
 class ThrustStart:
-    """Where a motion begins: pose (7,) of the base and its twist ``v_WB_B``, ``omega_WB_B`` (3,),
+    """Start of a motion: pose (7,) of the base and its twist ``v_WB_B``, ``omega_WB_B`` (3,),
     positions and velocities (n,) of the joints.
     """
 
@@ -42,11 +42,11 @@ class Grapple:
     Attributes
     ----------
     motion
-        The motion of the target from the start of the robot's on.
+        The motion of the target, beginning at the start of the robot's.
     description
-        Its body, one link, of which the robot keeps clear; None: it is not known.
+        Its body, one link, from which the robot keeps clear; None: it is not known.
     clearance
-        Distance from its body, m; 0: it is not looked at.
+        Distance from its body, m; 0: it is not checked.
     horizon
         Time within which it is met, s.
     detumbles
@@ -77,7 +77,7 @@ class Grapple:
 
 @dataclass(frozen=True)
 class ThrustGoal:
-    """Where a motion ends, at rest or with a target.
+    """Goal of a motion, at rest or with a target.
 
     ``base`` and ``end_effector`` are poses (7,), position and quaternion in W, or None;
     ``shape`` are joint positions (n,), NaN for joints that are free, None for all free;
@@ -101,7 +101,8 @@ def base_for_hand(robot: SpaceRobot, link: str, shape: Array, hand: Array) -> Ar
 
 def shortest_catch(distance: float, leaving: float, acceleration: float) -> float:
     """Return the least time (s) in which a body at rest meets one that is ``distance`` m away and
-    leaves at a speed (m/s, negative: it comes), with its velocity, by an acceleration (m/s^2).
+    recedes at a speed (m/s, negative: it approaches), with equal velocity, at an acceleration
+    (m/s^2).
     """
     slack = leaving**2 / 2 + acceleration * max(distance, 0.0)
     return max((leaving + 2 * math.sqrt(slack)) / acceleration, abs(leaving) / acceleration)

@@ -1,4 +1,4 @@
-"""A motion under thrust over time: exact states, and the accelerations and efforts that go with."""
+"""A motion under thrust over time: exact states, accelerations and efforts."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ class MotionFunctions(NamedTuple):
 
 
 class ThrustMotion:
-    """A planned motion, as its controls fly it: integrated from the start on.
+    """A planned motion as flown by its controls: integrated from the start.
 
     Parameters
     ----------
@@ -116,7 +116,7 @@ class ThrustMotion:
 
     @property
     def spent(self) -> float:
-        """What the levels cost: kg of propellant of thrusters in a table, else N s."""
+        """Cost of the levels: kg of propellant of thrusters in a table, else N s."""
         return self.step * float(np.sum(self.propulsion.cost_of(self.levels)))
 
     def _through(self, k: int, state: Array) -> Array:
@@ -147,7 +147,7 @@ class ThrustMotion:
         return reached
 
     def at(self, time: float) -> MotionSample:
-        """Return the motion at a time since its start, s; from its end on the state there."""
+        """Return the motion at a time since its start, s; after its end, the state at the end."""
         N, h = len(self.levels), self.step
         time = min(max(time, 0.0), self.duration)
         k = min(int(time / h), N - 1)
@@ -215,7 +215,7 @@ def _sample(robot: SpaceRobot, link: str) -> ca.Function:
     R, force, torque = matrix_from_quaternion(X), wrench[:3], wrench[3:]
 
     def rate(of: ca.SX) -> ca.SX:
-        """Differentiate an expression of q and qdot by time."""
+        """Differentiate an expression of q and qdot with respect to time."""
         return ca.jtimes(of, ca.vertcat(q, qdot), ca.vertcat(qdot, qddot))
 
     H = robot.function("inertia_matrix", compile=False)(q)

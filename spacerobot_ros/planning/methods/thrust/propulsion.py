@@ -1,4 +1,4 @@
-"""What pushes a base: a table of thrusters, or a wrench in any direction within two norms."""
+"""Propulsion of a base: a table of thrusters, or a wrench in any direction within two norms."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from spacerobot_ros.model.thrusters import ThrusterTable
 
 @dataclass(frozen=True)
 class Propulsion:
-    """Levels (m,) whose wrench on the base is ``wrenches @ levels``, and what they cost.
+    """Levels (m,) whose wrench on the base is ``wrenches @ levels``, and their cost.
 
     Attributes
     ----------
@@ -22,7 +22,7 @@ class Propulsion:
         (6, m) force (N) over torque (N m) at the origin of the base link, in base components, at
         level one.
     cost
-        (m,) cost of a second at level one: kg of propellant where there is a table, else N s of
+        (m,) cost of a second at level one: kg of propellant if there is a table, else N s of
         impulse.
     norms
         Groups of levels whose Euclidean norm is at most one, and which go from -1 to 1. All other
@@ -47,18 +47,18 @@ class Propulsion:
 
     @classmethod
     def of_table(cls, table: ThrusterTable, reserve: float = 0.0) -> Propulsion:
-        """Return thrusters of a table, of whose levels a share is left to feedback.
+        """Return thrusters of a table, with a share of the levels reserved for feedback.
 
         Raises
         ------
         ParameterError
-            They cannot produce every wrench.
+            The thrusters cannot produce every wrench.
         """
         missing = table.missing()
         if missing:
             raise ParameterError(
                 f"The thrusters cannot produce {missing}; motions under thrust are planned for "
-                "bases that can be pushed and turned in every direction."
+                "bases that can be pushed and rotated in every direction."
             )
         share = 1.0 - reserve
         return cls(share * table.wrenches, share * table.mass_flow)
@@ -90,7 +90,7 @@ class Propulsion:
         return float(np.linalg.norm(one_way))
 
     def cost_of(self, levels: Array) -> Array:
-        """Return what levels (..., m) cost a second (...)."""
+        """Return the cost per second (...) of levels (..., m)."""
         within = [i for group in self.norms for i in group]
         cost = np.delete(levels, within, -1) @ np.delete(self.cost, within)
         for group in self.norms:

@@ -2,9 +2,9 @@
 
 The search is short, as base and arm are pushed in every direction: a straight guess leads to the
 solution in most cases. It is solved for the shortest time, then in a longer time for the least
-propellant, then again with the defects of its intervals until it flies exactly. Pairs that come too
-near, by the exact check, get planes along a path that is clear of them, which bow away from
-obstacles finds.
+propellant, then again with the defects of its intervals until it is exact. Pairs that come too
+near, by the exact check, get planes along a path clear of them, which is found by bowing it away
+from obstacles.
 """
 
 from __future__ import annotations
@@ -77,17 +77,17 @@ propellant, and swing into their own robot."""
 _TIME_REGULARISATION = 1e-5
 
 _ROUNDINGS = (0.1, 0.01, 0.003)
-"""Levels at which costs of norms are rounded off, one after the other: the last one alone takes
-three times the steps."""
+"""Levels at which costs of norms are rounded off, in turn: the last one alone takes three times the
+steps."""
 
 _EXACT_END, _MAX_CORRECTIONS = 1e-5, 10
 """Largest error at the end, m and rad, and the largest number of corrections that lead there."""
 
 _NEAR_END = 1e-2
-"""Error at the end from which on the nearest exact motion will do, m and rad."""
+"""Error at the end below which the nearest exact motion is searched for, m and rad."""
 
 _LARGEST_END_ERROR = 1e-3
-"""Error at the end beyond which a motion is no solution, m and rad."""
+"""Error at the end above which a motion is not a solution, m and rad."""
 
 _END_REACH = 0.3
 """Distance of the joints at the end from the shape that inverse kinematics finds, m or rad."""
@@ -96,13 +96,13 @@ _ROOM = 4e-3
 """Distance beyond the clearance at these instants: paths bend between them, m."""
 
 _COST_OF_LACK = 1e3
-"""Weight of a metre of distance that pairs lack."""
+"""Weight of a metre of missing distance of pairs."""
 
 _LARGEST_LACK = 1e-4
-"""Distance that pairs may lack in a solution that counts as clear before the exact check, m."""
+"""Missing distance of pairs up to which a solution counts as clear before the exact check, m."""
 
 _MAX_ROUNDS = 6
-"""Times that a path is made clear of pairs by new planes."""
+"""Number of times that new planes are made to clear a path of pairs."""
 
 _GRASP_REACH = 0.6
 """Distance of the joints from their shape at the start on the way to a grasp, m or rad: the base
@@ -115,15 +115,15 @@ _SHARES_LEFT = (0.0, 0.25, 0.5)
 """Shares of the angular momentum after a grasp that may be left."""
 
 _MEETING_PERIOD = 1.0
-"""Between times at which a guess meets a target, s."""
+"""Interval between times at which a guess meets a target, s."""
 
 _LARGEST_STRETCH = 4.0
 """Largest factor of the time of a motion whose efforts are too large."""
 
 _BOW_SHARES = (0.0, 0.25, 0.5, 0.75, 1.0, 1.5, 2.0)
 _BOW_DIRECTIONS = 12
-"""Heights of bows away from a straight line, as shares of the least that is worth a try, and
-directions."""
+"""Heights of bows away from a straight line, relative to the smallest one worth trying, and number
+of directions."""
 
 
 @dataclass(frozen=True)
@@ -132,7 +132,7 @@ class ThrustOptions(MotionOptions):
 
     time_factor: float = parameter(
         1.5,
-        "duration of a motion of least propellant, by the shortest possible; 1: in the shortest",
+        "duration of a motion of least propellant, relative to the shortest; 1: the shortest",
         minimum=1.0,
         maximum=1e3,
     )
@@ -141,13 +141,13 @@ class ThrustOptions(MotionOptions):
     )
     reserve: float = parameter(
         0.2,
-        "share of thrust and of joint efforts that is left to the feedback of the controller",
+        "share of thrust and of joint efforts reserved for the feedback of the controller",
         minimum=0.0,
         maximum=0.9,
     )
     intervals: int = parameter(30, "steps of the problem", minimum=10, maximum=1000)
     iterations: int = parameter(
-        300, "steps of the solver from one guess at most", minimum=1, maximum=100000
+        300, "largest number of solver steps from one guess", minimum=1, maximum=100000
     )
     clearance: float = parameter(
         DEFAULT_CLEARANCE,
@@ -166,7 +166,7 @@ class ThrustPlanner:
     robot
         The model, with its world if it has one.
     propulsion
-        What pushes its base, less the reserve.
+        Propulsion of its base, minus the reserve.
     options
         The options.
     link
@@ -212,7 +212,7 @@ class ThrustPlanner:
         Raises
         ------
         PlanningError
-            There is none within the limits, or none is found; or it was cancelled.
+            There is no motion within the limits, none was found, or the search was cancelled.
         """
         self._solvers = {key: each for key, each in self._solvers.items() if not key[1]}
         stop = StopRule(self.options.iterations, cancellation)
@@ -272,7 +272,7 @@ class ThrustPlanner:
         return self._solvers[kind, kept]
 
     def motion(self, knots: ThrustKnots) -> ThrustMotion:
-        """Return the motion that the controls of a solution fly."""
+        """Return the motion flown by the controls of a solution."""
         return ThrustMotion(self._functions, self.propulsion, knots)
 
     # -- both ends ----------------------------------------------------------------------------
@@ -317,7 +317,7 @@ class ThrustPlanner:
         least = shortest_catch(near, leaving, force / robot.total_mass)
         if least > grapple.horizon:
             raise UnreachableError(
-                f"The target is {distance:.3g} m away and leaves at {leaving:.3g} m/s: with a "
+                f"The target is {distance:.3g} m away and recedes at {leaving:.3g} m/s: with a "
                 f"force of {force:.3g} N the robot meets it after {least:.4g} s at the earliest, "
                 f"and 'target.horizon' is {grapple.horizon:g} s.",
                 Proof.LIMITS,
@@ -428,7 +428,7 @@ class ThrustPlanner:
     def bows(
         self, boundary: ThrustBoundary, path: ThrustKnots, bodies: Bodies, near: Sequence[Approach]
     ) -> Iterator[ThrustKnots]:
-        """Yield straight guesses and those beside them that are clear, in the time of a path, the
+        """Yield straight guesses and clear guesses beside them, in the time of a path, the
         straightest first.
         """
         r0 = boundary.state[7:10]
@@ -507,7 +507,7 @@ class _Search:
         self._room: dict[int, float] = {}
         """Room of the pairs that are kept apart, m."""
         self._places: dict[int, set[int]] = {}
-        """Instants at which they are."""
+        """Instants at which they are kept apart."""
         self._nearest: Approach | None = None
         """The nearest pair of the last path that was not clear."""
         self.path: ThrustKnots
@@ -701,7 +701,7 @@ class _Search:
             least = planner.options.intervals
             raise PlanningError(
                 self._failure(
-                    f"its plan ends {error:.3g} m or rad beside it; set plan.intervals to more "
+                    f"its plan ends {error:.3g} m or rad off the goal; set plan.intervals to more "
                     f"than {least}"
                 )
             )

@@ -62,7 +62,7 @@ _OPTIONS: Mapping[str, Mapping[str, object]] = {
         "ipopt.tol": 1e-8,
     },
 }
-"""Options of IPOPT by where it begins."""
+"""Options of IPOPT by its starting point."""
 
 
 @dataclass(frozen=True)
@@ -127,7 +127,7 @@ class ThrustBoundary:
         are free.
     final_velocity, final_momentum
         (n,) velocities of the joints, NaN for those that are free, and angular momentum (3,) at the
-        end, where the centre of mass rests: zero, but for wheels that go on spinning. None: the
+        end, where the centre of mass rests: zero, except for wheels that keep spinning. None: the
         momenta are free, too.
     keeps_shape
         Whether the joints that have a position at the end have it all the way.
@@ -145,11 +145,11 @@ class ThrustBoundary:
 
 
 class Weights(NamedTuple):
-    """What a motion is to be least in.
+    """Weights of the terms that a motion minimises.
 
-    Weights of the duration (1/s), of the cost of propulsion, of the squares of joint accelerations
-    over their limits, and of those of levels; of the distance that pairs lack (1/m), and the level
-    at which the cost of a norm is rounded off.
+    They are those of the duration (1/s), of the cost of propulsion, of the squares of joint
+    accelerations over their limits, and of those of levels; of the missing distance of pairs (1/m),
+    and the level at which the cost of a norm is rounded off.
     """
 
     duration: float
@@ -216,7 +216,7 @@ class ThrustSolver:
         Parameters
         ----------
         boundary, limits, guess, weights
-            The problem, and where the solver begins.
+            The problem, and the start of the solver.
         stop, duration
             Conditions on which it stops early, and bounds of the duration.
         planes

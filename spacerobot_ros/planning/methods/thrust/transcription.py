@@ -11,7 +11,7 @@ Gauss points tau_i of an interval,
 ``L+ = L + h sum R_i (n - c_i x f) / 2``, ``X+ = X exp(Omega)``,
 
 and Omega is the Magnus expansion of the rates at the Gauss points, ``D w + D_q u = h R_i' L_i``.
-Momenta as states keep what is exact in the equations exact: without thrust both rest, whatever the
+Momenta as states keep their conservation exact: without thrust both are constant, whatever the
 joints do. Every interval has a defect as a parameter, added to its end: the difference to an exact
 integration of the same controls, found beforehand, so that solutions obey the equations themselves
 and not their discretisation (deferred correction).
@@ -57,7 +57,7 @@ from spacerobot_ros.planning.methods.optimal.transcription import (
 from spacerobot_ros.planning.methods.thrust.propulsion import Propulsion
 
 DEFECT_SIZE = 12
-"""Numbers of an interval's defect: rotation vector, then L, r and V at its end."""
+"""Length of an interval's defect: rotation vector, then L, r and V at its end."""
 
 INSTANTS = 2
 """Instants of an interval at which pairs are kept apart."""
@@ -92,7 +92,7 @@ class ThrustStages:
     def of(cls, robot: SpaceRobot, propulsion: Propulsion, kind: EndKind) -> ThrustStages:
         """Derive the functions of a robot's problem, or read them from the cache.
 
-        The wrenches are parameters: thrusters that break have the same functions.
+        The wrenches are parameters, so the functions stay the same if thrusters break.
         """
         facts = [
             source_hash(
@@ -120,7 +120,7 @@ class ThrustStages:
 
 
 class EndKind(NamedTuple):
-    """What is given at the end: the pose of the base, that of a link (empty: none), or that the
+    """Quantities given at the end: the pose of the base, that of a link (empty: none), or that the
     link has the pose and the velocities of a target's grapple frame; then the angular momentum of
     robot and target together may be given, too.
     """
