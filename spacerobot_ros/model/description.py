@@ -306,7 +306,7 @@ class RobotDescription:
             ``error`` is not in [0, 1).
         """
         if not 0.0 <= error < 1.0:
-            raise ValueError(f"a relative error of {error} leaves no mass positive")
+            raise ValueError(f"a relative error of {error} is not in [0, 1)")
         factors = np.random.default_rng(seed).uniform(1 - error, 1 + error, (len(self.links), 2))
         links = []
         for link, (mass, moment) in zip(self.links, factors, strict=True):

@@ -5,8 +5,8 @@ are ``z0dot = [v_cm; omega; qdot]``, the first two in base components (eq. 8), s
 depends on the pose of the robot. Inertias are those of composite rigid bodies
 (:mod:`.composite_rigid_body`).
 
-Momentum, and the base motion that it implies. With zero total momentum the base moves only because
-the shape does: ``[v; omega]_B = -A(q) qdot``, the mechanical connection (paper 1). A closed loop of
+Momentum, and the base motion that it implies. At zero total momentum the base moves only if the
+shape changes: ``[v; omega]_B = -A(q) qdot``, the mechanical connection (paper 1). A closed loop of
 the shape leaves a net motion of the base: to first order, the curvature times the area of the loop
 (paper 2).
 """
@@ -38,7 +38,8 @@ def bias(kin: TreeKinematics, v_cm: ca.SX, omega: ca.SX, qdot: ca.SX) -> ca.SX:
     """Return ``C+`` (6 + n,) by d'Alembert: the generalised force that keeps ``z0ddot`` at zero.
 
     Outward recursion of the velocity-product accelerations, inward sum of their inertia forces.
-    Accelerations are taken relative to the system's centre of mass, whose own is ``omega x v_cm``.
+    Accelerations are taken relative to the system's centre of mass, whose own acceleration is
+    ``omega x v_cm``.
     """
     M, qdot = kin.total_mass, kin.spread(qdot)
     omegas, alphas, accelerations = [omega], [ca.SX(3, 1)], [ca.SX(3, 1)]

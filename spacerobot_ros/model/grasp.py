@@ -128,7 +128,7 @@ class TargetBody:
 
     @classmethod
     def of(cls, target: RobotDescription, grapple_frame: str) -> TargetBody:
-        """Return the body of a description, with a link of it as grapple frame.
+        """Return the body of a description, with one of its links as grapple frame.
 
         Raises
         ------

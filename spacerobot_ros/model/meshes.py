@@ -186,7 +186,7 @@ def read_mesh(path: str | Path) -> TriangleMesh:
     Raises
     ------
     MeshError
-        The file is too large, damaged, or of a kind that cannot be read.
+        The file is too large or damaged, or has an unsupported format.
     """
     path = Path(path)
     suffix = path.suffix.lower()

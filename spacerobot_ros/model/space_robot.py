@@ -88,7 +88,7 @@ class SpaceRobot:
         ------
         RobotDescriptionError
             A number is not finite, a mass is negative, all masses are zero, or an inertia is not
-            that of a body.
+            physical.
         """
         parameters.require_physical([body.name for body in self.description.bodies])
         if np.array_equal(parameters.vector, self.inertial.vector):
@@ -103,7 +103,7 @@ class SpaceRobot:
         """Return the robot of a description derived from this one's, such as its gyrostat.
 
         If this robot shares its compiled functions with robots that differ only in mass
-        properties, so does that one.
+        properties, so does the new one.
         """
         shared = None if self._p is None else SymbolicModels.of(description)
         return SpaceRobot(description, shared)
@@ -179,9 +179,9 @@ class SpaceRobot:
         about a state and an actuation; omitted arguments are zero.
 
         ``d/dt dx = A dx + B du`` to first order, with ``dx = [dr; dtheta; dq; dv; domega; dqdot]``:
-        position (m) and rotation vector (rad) of the base from its motion in that state, joint
-        positions, twist of the base, and joint velocities, the vectors in base components, and
-        ``du = [f; n; tau]``, the change of force, torque and efforts.
+        position (m) and rotation vector (rad) of the base relative to its motion in that state,
+        joint positions, twist of the base, and joint velocities, the vectors in base components,
+        and ``du = [f; n; tau]``, the change of force, torque and efforts.
         """
         n = self.n
         given = zip((3, 3, n, 6, n), (v_WB_B, omega_WB_B, qdot, wrench_B, tau), strict=True)

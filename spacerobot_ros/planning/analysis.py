@@ -170,8 +170,8 @@ def _check_shape(robot: SpaceRobot, shape: Sequence[float]) -> Array:
     values = np.asarray(shape, dtype=float)
     if values.shape != (robot.n,) or not np.all(np.isfinite(values)):
         raise ParameterError(
-            f"The shape has {values.size} number(s); robot '{robot.description.name}' has "
-            f"{robot.n} joints, each with a finite one: {', '.join(robot.joint_names)}."
+            f"The shape has {values.size} number(s); robot '{robot.description.name}' "
+            f"needs a finite one for each joint: {', '.join(robot.joint_names)}."
         )
     return values
 

@@ -65,10 +65,10 @@ def plan(
         (exponential coordinates; no rotation), and the final ``joint_positions`` (n,) in m or rad.
     end_effector_position, end_effector_pose
         Position (3,) in m, or position and quaternion (7,), of the link ``end_effector`` (its name;
-        empty: the link of that name); or of several links, by name.
+        empty: the default one); or of several links, by name.
     end_effector_path
-        Positions (K, 3) in m, or positions and quaternions (K, 7), which one end-effector passes
-        on straight lines; the last one is its goal.
+        Positions (K, 3) in m, or positions and quaternions (K, 7), through which one end-effector
+        moves on straight lines; the last one is its goal.
     start
         The start: a state, or the shape (n,) with the base at the origin of W; None: zero, or as
         near to zero as the joint limits allow.
@@ -77,7 +77,7 @@ def plan(
         start. Only ``optimal`` plans for robots that drift.
     method
         Name of a gait method; ``options`` are its own. None: ``resolved_rate`` for a goal with a
-        path, and else ``optimal``.
+        path, otherwise ``optimal``.
     control_period, tolerance, integration_step
         Duration of a command (s), largest error at the goal, and longest step of the prediction
         (s). Use the plant's values for a flight that ends where the plan does.

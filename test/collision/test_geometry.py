@@ -352,7 +352,7 @@ def test_plans_are_refused_where_the_mesh_of_a_collision_is_missing(
     mesh = '<mesh filename="package://nowhere/arm.stl"/>'
     declared = parse_robot(chain((BALL,), (solid("collision", mesh),), (BALL,)))
     start = np.zeros(len(declared.joint_names))
-    with pytest.raises(PlanningError, match=r"Link 'b' .*'package://nowhere/arm.stl' .* SRDF"):
+    with pytest.raises(PlanningError, match=r"link 'b' .*'package://nowhere/arm.stl' .* SRDF"):
         Clearance(declared, 0.01).required(start)
     pairs = [frozenset({"b", link.name}) for link in declared.links if link.name != "b"]
     disabled = replace(declared, disabled_collisions=frozenset(pairs))

@@ -239,7 +239,7 @@ def test_waypoints_that_lead_nowhere_are_refused(arm: tuple[GaitSchedule, Pose, 
     with pytest.raises(UnreachableError, match="in one plane"):
         planned("planar_chain", np.array([0.4, -0.9]), "segment_2", tip, waypoints=above)
     both = {"left_link_7": [1.0, 1.0, 1.0], "right_link_7": [1.0, -1.0, 1.0]}
-    with pytest.raises(PlanningError, match="lead one end-effector, and the goal is for 2"):
+    with pytest.raises(PlanningError, match="are for one end-effector, and the goal is for 2"):
         plan(
             "dual_arm",
             start=RobotState(PLACE, ATTITUDE.as_quat(), DUAL),

@@ -348,7 +348,7 @@ def test_joints_that_are_too_few_are_told() -> None:
     with pytest.raises(PlanningError) as found:
         TwistFollower(robot, HAND, ResolvedRateOptions(keep_attitude=1), TICK)
     assert str(found.value) == (
-        "The joints of robot 'planar_manipulator' are too few to move 'end_effector' by twists and "
+        "Robot 'planar_manipulator' has too few joints to move 'end_effector' by twists and "
         "keep the attitude of the base."
     )
     assert not TwistFollower(robot, HAND, ResolvedRateOptions(), TICK).turns

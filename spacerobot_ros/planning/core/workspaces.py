@@ -9,10 +9,10 @@ path that led there. Distances that no singular shape has are *path-independent*
 Dubowsky; paper 4, section V).
 
 Singular shapes are solutions ``(q, u)`` of ``J*(q)^T u = 0, |u| = 1``, with the direction ``u`` in
-which nothing moves. From seeded shapes all over the shape space the nearest solutions are found
-(Gauss-Newton), and from each one curves of solutions are followed to larger and to smaller
-distances. Distances change continuously on a curve, so all between its ends are path-dependent;
-the ends are refined to the extreme distances nearby.
+which nothing moves. Starting from seeded shapes all over the shape space, Gauss-Newton finds the
+nearest solutions; from each, curves of solutions are followed to larger and to smaller distances.
+Distances change continuously on a curve, so all between its ends are path-dependent; the ends are
+refined to the extreme distances nearby.
 """
 
 from __future__ import annotations

@@ -69,7 +69,7 @@ from spacerobot_ros.planning.execution.worker import (
 )
 
 _MAX_GAP, _MAX_GAP_PERIODS = 1.0, 10
-"""Times between two states above these, or below zero, are jumps of time: s, control periods."""
+"""Times between two states above these limits, or below zero, are jumps: s, control periods."""
 
 _MAX_IN_MOTION_ATTEMPTS = 2
 """Largest number of plans in motion for one goal: each takes over twice as late as the one

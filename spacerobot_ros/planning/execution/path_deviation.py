@@ -48,7 +48,7 @@ _POSE_NOISE = 1e-3
 """Standard deviation of each component of a measured pose, m or rad."""
 
 _MAX_PLAUSIBLE_ERROR = 6 * _PRIOR_DEVIATION
-"""Largest relative error of masses and inertias that is believed; larger estimates have another
+"""Largest relative error of masses and inertias that is plausible; larger estimates have another
 cause, such as a jump of the measurements."""
 
 _NEAR_SHARES, _AIM_SHARES = (0.6, 0.8), (0.4, 0.6)
@@ -82,7 +82,7 @@ class PathCheck:
     start_ns
         Stamp of its first tick, ns.
     config
-        Of the planner: bounds of the tracking error, and the deadband of shapes.
+        Parameters of the planner: bounds of the tracking error, and the deadband of shapes.
     average
         Number of measured poses whose mean deviation from the path is used for plans in motion; 0:
         none.

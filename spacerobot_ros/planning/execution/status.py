@@ -62,7 +62,7 @@ class PlannerState(str, Enum):
 
 @dataclass(frozen=True)
 class PlannerStatus:
-    """A status of the planner, as planner/status carries it.
+    """A status of the planner, as published on planner/status.
 
     Attributes
     ----------
@@ -91,7 +91,7 @@ class PlannerStatus:
     ends_at_s
         Simulated time at which the latest schedule ends; 0: none.
     remaining_s
-        Expected duration of the schedules after it until the goal is reached; 0: it reaches it.
+        Expected duration of later schedules until the goal is reached; 0: none is needed.
     method
         Gait method of the schedule that begins; empty: none begins.
     duration_s

@@ -126,7 +126,7 @@ class TwistStep(NamedTuple):
     """The result of one state while an end-effector follows twists.
 
     ``rates`` (n,) are those of the joints; None: they keep their shape. ``message`` is for the
-    status, empty if it says nothing new. ``ended``: the joints rest, and twists are over.
+    status, empty if there is nothing new. ``ended``: the joints rest, and twists are over.
     """
 
     rates: Array | None
@@ -154,7 +154,8 @@ class _Following:
 
 
 class Teleoperation:
-    """End-effectors that follow twists, one at a time, until none has come for ``twist_timeout``.
+    """End-effectors that follow twists, one at a time, until none has arrived for
+    ``twist_timeout``.
 
     After a refusal, and after an abort, twists are refused until none has come for that time: so an
     operator who keeps sending does not cause unexpected motion.
@@ -328,7 +329,7 @@ class TwistFollower:
         if len(self._displacements) + kept > robot.n or not len(self._displacements):
             still = " and keep the attitude of the base" if kept else ""
             raise PlanningError(
-                f"The joints of robot '{robot.description.name}' are too few to move '{link}' by "
+                f"Robot '{robot.description.name}' has too few joints to move '{link}' by "
                 f"twists{still}."
             )
         self.turns = len(self._displacements) + len(self._rotations) + kept <= robot.n

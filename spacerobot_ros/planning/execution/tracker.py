@@ -62,7 +62,7 @@ class TakeOver:
 
 
 class ScheduleFollower:
-    """Follows one schedule by stamps, so that a missed tick delays no later tick.
+    """Follows one schedule by stamps, so that a missed tick does not delay later ones.
 
     Parameters
     ----------
@@ -71,7 +71,7 @@ class ScheduleFollower:
     start_ns
         Stamp of its first tick, ns.
     shape_gain
-        Feedback from shape error to velocity, 1/s.
+        Feedback gain from shape error to velocity, 1/s.
     deadband
         Shape errors up to this are noise and not fed back, m or rad.
     """
@@ -165,7 +165,7 @@ class BrakingFollower:
     duration
         T, s; the gait continues for half of it.
     shape_gain
-        Feedback from shape error to velocity, 1/s.
+        Feedback gain from shape error to velocity, 1/s.
     """
 
     def __init__(
@@ -269,7 +269,7 @@ class TrajectoryTracker:
         )
 
     def use_robot(self, robot: SpaceRobot) -> None:
-        """Track the later schedules with a robot of the same joints and other masses."""
+        """Track the later schedules with a robot that has the same joints but other masses."""
         self._robot = robot
         self._sensitivity = PathSensitivity(robot) if self._config.replanning > 0 else None
         self._mass_estimate = MassEstimate(
@@ -490,7 +490,7 @@ class StuckJointWatch:
         self._standstill_ticks = 0
 
     def find_stuck(self, q: Array, wanted: Array, velocity: Array) -> list[int]:
-        """Return the indices of the joints that are stuck since this tick, mostly none.
+        """Return the indices of the joints that are stuck since this tick, usually none.
 
         ``q`` and ``wanted`` (n,) are the measured and the wanted shape now, ``velocity`` (n,) the
         command until the next tick.

@@ -242,7 +242,7 @@ class PlanningWorker:
         return any(self._method.significant(each).any() for each in momenta)
 
     def starts_in_motion(self, schedule: GaitSchedule) -> bool:
-        """Whether a plan may take over from a schedule: the methods of both allow for it."""
+        """Whether a plan may take over from a schedule: the methods of both must allow it."""
         maker = METHODS.get(schedule.method, type(self._method))
         return self._method.starts_in_motion and maker.starts_in_motion
 
@@ -282,7 +282,7 @@ class PlanningWorker:
         if elapsed > _MAX_COASTING_TIME:
             return Refused(
                 f"The robot drifts, and {elapsed:.3g} s of planning were not enough for a plan "
-                "that begins in time; smaller optimal.starts take less",
+                "that begins in time; a smaller optimal.starts takes less time",
                 result.wall_time,
             )
         # The base has drifted past the start of the plan.
@@ -336,7 +336,7 @@ class PlanningWorker:
         Raises
         ------
         PlanningError
-            There is none; the message says why.
+            No plan is found; the message says why.
         """
         method = self._choose_method(task)
         if task.take_over is not None:

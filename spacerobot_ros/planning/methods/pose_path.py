@@ -210,7 +210,7 @@ class RoundedPath:
         return np.asarray(place - a * chords[before] + b * chords[after])
 
     def displacement_derivative(self, share: float) -> Array:
-        """Return the derivative (3,) of the displacement by the share."""
+        """Return the derivative (3,) of the displacement with respect to the share."""
         _, before, after, _, _, a_rate, b_rate = self._blend_at(share)
         chords = self._path.chords
         return np.asarray(b_rate * chords[after] - a_rate * chords[before])

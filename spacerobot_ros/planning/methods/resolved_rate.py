@@ -692,7 +692,7 @@ class ResolvedRateGait(GaitMethod):
             return np.zeros((0, 3))
         if len(goal.end_effectors) > 1:
             raise PlanningError(
-                f"{self.name}.waypoints lead one end-effector, and the goal is for "
+                f"{self.name}.waypoints are for one end-effector, and the goal is for "
                 f"{len(goal.end_effectors)}: give a goal of one, or leave them out."
             )
         return np.reshape(self.options.waypoints, (-1, 3))

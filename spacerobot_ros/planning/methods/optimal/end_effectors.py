@@ -640,7 +640,7 @@ def reach_of_end_effector(robot: SpaceRobot, lower: Array, upper: Array, link: s
     """Return an upper bound, m, of the distance of a link's origin from the centre of mass.
 
     ``r_CE`` is the mean of the vectors from the centres of mass of the bodies to E, weighted by
-    their masses, and each is no longer than the chain of joints between (triangle inequality).
+    their masses, and each is no longer than the chain of joints in between (triangle inequality).
     ``lower`` and ``upper`` (n,) are the limits of the joints.
     """
     bodies = robot.description.bodies

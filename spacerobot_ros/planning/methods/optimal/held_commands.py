@@ -81,13 +81,13 @@ _TICK_ROUNDING = 0.02
 _LIMIT_ROUNDING = 1e-9
 
 _FADING_ZONE = 0.02
-"""Share of half a joint's range, off its ends, within which waves are smaller."""
+"""Distance from the ends of a joint's range, in half ranges, within which waves are smaller."""
 
 
 @dataclass(frozen=True)
 class HeldCommands:
     """Shapes ``positions`` (N + 1, n) at the ticks, and the attitudes ``quaternions`` (N + 1, 4)
-    that they cause, from the starting one.
+    that they cause, from the initial one.
     """
 
     positions: Array

@@ -195,7 +195,7 @@ class OptimalGait(GaitMethod):
 
     @override
     def setup(self) -> None:
-        """Compute what robot and options decide; see :meth:`GaitMethod.setup`."""
+        """Compute what depends on robot and options only; see :meth:`GaitMethod.setup`."""
         # A plan calls the model's functions a few times each.
         self.robot = robot = self.robot.interpreted
         chosen = self.options

@@ -1,11 +1,11 @@
-"""Bounds that are proved before a search: where the base can be, and how long a manoeuvre takes.
+"""Bounds proved before a search: where the base can be, and how long a manoeuvre takes.
 
-:class:`CenterReach` bounds the centre of mass in the base, a proof for goals beyond. Without thrust
-the centre of mass rests in the world, so a pose of the base determines it in the base. Sliders
-whose directions are fixed in the base move it along straight slots, exactly. Everything that
-rotates is in a ball around the first joint that rotates it (triangle inequality over the links
-behind that joint). The sum of both is a convex set that holds the centre of mass in all shapes; for
-robots that have only such sliders it is the set of all centres of mass.
+:class:`CenterReach` bounds the centre of mass in the base, which proves that goals beyond are out
+of reach. Without thrust the centre of mass rests in the world, so a pose of the base determines it
+in the base. Sliders whose directions are fixed in the base move it along straight slots, exactly.
+Everything that rotates is in a ball around the first joint that rotates it (triangle inequality
+over the links behind that joint). The sum of both is a convex set that holds the centre of mass in
+all shapes; for robots that have only such sliders it is the set of all centres of mass.
 
 :class:`ConnectionBounds` bounds the motion of the base by each joint. While one joint moves and the
 others rest, the robot is two rigid bodies of masses ``m_P`` and ``m_D``, inboard and outboard of
@@ -75,7 +75,7 @@ class CenterReach:
 
     @classmethod
     def of(cls, robot: SpaceRobot, lower: Array, upper: Array) -> CenterReach:
-        """Return the set of a robot whose joints keep to ``lower`` and ``upper`` (n,)."""
+        """Return the set of a robot whose joints keep within ``lower`` and ``upper`` (n,)."""
         bodies = robot.description.bodies
         if robot.description.has_mimic_joints:
             lower, upper = moving_joint_ranges(robot, lower, upper)
@@ -139,7 +139,7 @@ class _FrameBounds:
     radius: float
 
     def of_child(self, index: int, body: Body, lower: float, upper: float) -> _FrameBounds:
-        """Return the place of a body behind this one, which a joint with these limits carries."""
+        """Return the place of a body outboard of this one, carried by a joint with these limits."""
         assert body.joint is not None
         slides = body.joint.kind is JointKind.PRISMATIC
         if self.R is None:

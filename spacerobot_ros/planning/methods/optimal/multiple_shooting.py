@@ -351,7 +351,7 @@ class SolverMonitor(ca.Callback):
         return ca.Sparsity.dense(self._sizes[ca.nlpsol_out(i)])
 
     def has_eval_buffer(self) -> bool:
-        """Return True, as iterates are read from the solver's memory: they come by the thousand."""
+        """Return True, as iterates are read from the solver's memory: there are thousands."""
         return True
 
     def eval_buffer(

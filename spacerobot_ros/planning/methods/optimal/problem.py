@@ -168,10 +168,10 @@ _UNLIMITED_HALF_RANGE = np.pi
 _SMOOTH_BODY_EXPONENT = 8
 
 _UNBOUNDED_FROM = 1e6
-"""Bounds of a box beyond this, m or rad, do not count for joints without limits."""
+"""Bounds of a box beyond this, m or rad, are ignored for joints without limits."""
 
 _CONSTRAINT_RESERVE = 0.02
-"""Distance of a solution from its path constraints, relative: they are imposed at steps alone."""
+"""Distance of a solution from its path constraints, relative: they are imposed only at steps."""
 
 
 class UnusableCandidateError(PlanningError):

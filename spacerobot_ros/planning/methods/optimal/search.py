@@ -1,6 +1,6 @@
 """The search for the fastest manoeuvre, from guesses to held commands, in the order of this file.
 
-1. **Guesses**: the direct way with loops upon it; in motion, the rest of the motion comes first.
+1. **Guesses**: the direct path with loops; in motion, the remainder of the motion comes first.
 2. **Coarse solutions**: guesses are solved on a coarse grid, at a small part of the cost of the
    full one, until some solutions agree.
 3. **Full grid**: the best solution, and the next if it is about as good, are refined.
@@ -94,7 +94,7 @@ _MIN_COARSE_INTERVALS, _MIN_COARSE_INTERVALS_IN_MOTION = 8, 10
 """Smallest number of intervals of a coarse grid; with fewer there is none."""
 
 _COARSE_TOLERANCE = 1e-4
-"""Tolerance on a coarse grid from rest, whose solutions differ by more from those that follow."""
+"""Tolerance on a coarse grid from rest, whose solutions differ more from later ones."""
 
 _MAX_REFINED_SOLUTIONS, _MAX_REFINED_SOLUTIONS_IN_MOTION = 2, 1
 """Largest number of solutions that are refined: in motion, the robot flies on meanwhile."""
@@ -312,7 +312,7 @@ class SearchProblem:
         return float(np.mean(np.sum(change**2, axis=1)))
 
     def solutions_agree(self, solutions: Sequence[Trajectory]) -> bool:
-        """Whether enough of the solutions are the best one."""
+        """Whether enough of the solutions agree with the best one."""
         costs = np.array([self.cost(each) for each in solutions])
         agreeing = self.options.agreeing
         if self.guess is not None:

@@ -1,4 +1,4 @@
-"""Motions under thrust for goals: a guess, the shortest time, the least propellant, and clear.
+"""Motions under thrust for goals: a guess, the shortest time, the least propellant, and clearance.
 
 The search is short, as base and arm are pushed in every direction: a straight guess leads to the
 solution in most cases. It is solved for the shortest time, then in a longer time for the least
@@ -521,7 +521,7 @@ class _Search:
         Raises
         ------
         PlanningError
-            There is none, or none is found.
+            There is no motion, or none is found.
         """
         fastest = self._fastest(guess)
         if fastest is None:
