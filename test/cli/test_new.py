@@ -94,7 +94,7 @@ def test_a_robot_whose_collision_meshes_are_missing_flies_without_them(
         plan = CliRunner().invoke(main, [*turn, *words])
         assert plan.exit_code == code, plan.output
         said = plan.output + caplog.text
-        assert len(re.findall("cannot be kept clear .*'package://gone/", said)) == 1
+        assert len(re.findall("cannot be checked: .*'package://gone/", said)) == 1
         caplog.clear()
     result = CliRunner().invoke(main, ["new", robot.name])
     assert result.exit_code == 0, result.output

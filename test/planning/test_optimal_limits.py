@@ -252,7 +252,7 @@ def test_two_links_turn_but_not_in_place() -> None:
     robot = SpaceRobot.from_urdf(chain(2))
     schedule = plan(robot, rotvec=[0, 0, 0.3], **QUICK)
     assert reached(schedule, [0, 0, 0.3]) <= 1e-6
-    with pytest.raises(PlanningError, match="uncontrollable where the final shape is given"):
+    with pytest.raises(PlanningError, match="uncontrollable if the final shape is given"):
         plan(robot, rotvec=[0, 0, 0.3], final_shape=1, **QUICK)
     with pytest.raises(PlanningError, match="no joints"):
         plan(SpaceRobot.from_urdf(chain(1)), rotvec=[0, 0, 0.3], **QUICK)
@@ -271,7 +271,7 @@ def test_a_goal_that_takes_too_long_is_refused(arm: SpaceRobot) -> None:
     [
         ({"max_velocity": [1.0]}, "optimal.max_velocity has 1 number"),
         ({"max_acceleration": [1.0, 0.0, 1.0]}, "'shoulder_pitch' is limited to 0.5"),
-        ({"keep_axis": EAST}, "takes all of"),
+        ({"keep_axis": EAST}, "requires all of"),
         ({"keep_axis": [0.0, 0, 0], "keep_direction": SUN, "keep_angle": 1.0}, "not all zero"),
         ({"keep_out": [0.0, 1.0]}, "3 lower and 3 upper"),
         ({"keep_out": [1.0, 1, 1, 0, 0, 0]}, "is not below"),
