@@ -1,4 +1,4 @@
-"""State and reference to thruster wrench and joint efforts: one module a law, one common base."""
+"""Control laws, from state and reference to thruster wrench and joint efforts."""
 
 from typing import TYPE_CHECKING
 

@@ -1,12 +1,12 @@
-"""The approach to a target: when the end-effector sets out, and the reference that it follows.
+"""The approach to a target: its start time and the reference of the end-effector.
 
-The reference is a path relative to the grapple frame, which moves as the target's torque-free
-motion predicts (:mod:`spacerobot_ros.model.target_motion`). From where the end-effector is held
-the path leads to a standoff; there the end-effector moves with the grapple frame for a while, then
-closes in along a straight line of that frame. At contact both have the same pose and velocity.
+The reference is a path relative to the grapple frame, whose motion is predicted from the target's
+torque-free motion (:mod:`spacerobot_ros.model.target_motion`). The path leads from the present pose
+to a standoff; there the end-effector moves with the grapple frame for a while, then closes in along
+a straight line in that frame. At contact both have the same pose and velocity.
 
-The robot sets out at the earliest time at which the whole reference keeps the limits of references,
-and at which the arm follows it, the base at its place, within joint limits and joint rates.
+The approach starts at the earliest time for which the whole reference is within its limits and the
+arm can follow it, with the base fixed, within joint limits and joint rates.
 """
 
 from __future__ import annotations
@@ -45,20 +45,20 @@ _SHORTEST_PATH, _PATH_RATIO, _LONGEST_PATH = 4.0, 1.4, 60.0
 """Shortest duration of a path to the standoff, ratio of two that are tried, and the longest, s."""
 
 _CLOSING_SHARE = 0.5
-"""Share of the largest acceleration for closing in; the grapple frame's own takes the rest."""
+"""Share of the largest acceleration for closing in; the grapple frame's motion needs the rest."""
 
 _STANDOFF_FACTORS = (1.0, 2.0, 3.0)
-"""Standoff distances that are tried where the target blocks the way, over the given one."""
+"""Factors of the given standoff distance that are tried if the target blocks the path."""
 
 _MAX_BLOCKED_PATHS = 100
 
 _ARM_RATE_SHARE = 0.9
-"""Share of the joint rates that the path of an arm may take."""
+"""Largest joint rates on an arm's path, as a share of their limits."""
 
 
 @dataclass(frozen=True)
 class ApproachOptions:
-    """Where and how an end-effector approaches a target."""
+    """Parameters of the approach to a target."""
 
     grapple_frame: str = parameter("grapple", "link of the target that the end-effector meets")
     standoff: tuple[float, ...] = parameter(
@@ -107,7 +107,7 @@ class ApproachOptions:
 
 @dataclass(frozen=True)
 class ApproachPlan:
-    """The times of an approach, s since the state that it was planned in, and its paths.
+    """Times of an approach, s since the state from which it was planned, and its paths.
 
     Attributes
     ----------
@@ -118,8 +118,8 @@ class ApproachPlan:
     standoff_time
         Time at the standoff, s.
     distance
-        Smallest distance of the robot from the body of the target on the way, m; infinite where
-        nothing can touch.
+        Smallest distance between robot and target body on the way, m; infinite if nothing can
+        touch.
     """
 
     start: float
@@ -150,7 +150,7 @@ class ApproachPlan:
 
 
 class ArmReach:
-    """Whether an arm follows motions of its end-effector while the base stays where it is.
+    """Whether an arm can follow motions of its end-effector with a fixed base.
 
     Parameters
     ----------
@@ -176,16 +176,16 @@ class ArmReach:
         self._q = state.q.copy()
 
     def distance_to(self, motion: FrameMotion, k: int) -> float:
-        """Return the distance (m or rad) that remains to the k-th pose, from the present shape."""
+        """Return the smallest distance (m or rad) of the arm from the k-th pose of a motion."""
         return self._arm.nearest_shape(self._q, Pose(motion.R[k], motion.r[k]))[1]
 
     def present_shapes(self, count: int) -> Array:
-        """Return the present shape, ``count`` times (count, n)."""
+        """Return the present shape, repeated ``count`` times (count, n)."""
         return np.tile(self._q, (count, 1))
 
     def shapes_along(self, motion: FrameMotion, period: float) -> tuple[Array, str]:
-        """Return the shapes (K, n) of the arm that follows a motion from its present shape on, and
-        the reason why it does not; empty: it does.
+        """Return the shapes (K, n) of the arm along a motion, from its present shape, and the
+        reason if it cannot follow; empty: it can.
 
         ``period`` is the time between two poses of the motion, s.
         """
@@ -216,17 +216,17 @@ def plan_approach(
     axes: tuple[str, ...],
     clearance: TargetClearance | None = None,
 ) -> ApproachPlan:
-    """Return the approach that begins earliest.
+    """Return the approach with the earliest start.
 
-    If the body of the target is in the way, the end-effector goes round: along a path that is
-    short in W, to the standoff or to one two or three times as far away; or it sets out later.
+    If the target body is in the way, the end-effector avoids it: along a path that is short in W,
+    to the standoff or to one at two or three times the distance; or it starts later.
 
     Parameters
     ----------
     target
         Predicted motion of the target.
     held
-        Reference of the end-effector until it sets out; one that moves sets out at once.
+        Reference of the end-effector before the approach; if it moves, the approach starts at once.
     options, limits
         The standoff, and the limits of references in W.
     reach
@@ -234,12 +234,12 @@ def plan_approach(
     axes
         Axes of the end-effector that are controlled.
     clearance
-        Distances from the body of the target; None: its body is not known.
+        Distances from the target body; None: the body is unknown.
 
     Raises
     ------
     PlanningError
-        There is none within the horizon: the message says which limit stands against it.
+        No approach starts within the horizon; the message names the limit that prevents it.
     """
     moving = bool(held.velocity.any() or held.angular_velocity.any())
     starts = np.arange(0.0, 0.0 if moving else options.horizon, _START_PERIOD)
@@ -358,9 +358,9 @@ class _RefusalReasons:
         self._distance, self._nearest_at = np.inf, 0.0
         self._why, self._tried_at = "", 0.0
         self.blocks = 0
-        """Number of paths that come too near to the body of the target."""
+        """Number of paths that come too close to the target body."""
         self._beside = -np.inf, "", 0.0
-        """Distance of the best of them, m, the clause about it, and the time of contact, s."""
+        """Distance of the best such path, m, the clause about it, and its time of contact, s."""
 
     def note(self, excess: float, limit: str) -> None:
         if excess < self._excess:
@@ -407,7 +407,7 @@ class _RefusalReasons:
 
 @dataclass(frozen=True)
 class NearestLinks:
-    """The smallest distance in a motion, m; the links of robot and target; and the sample."""
+    """The smallest distance in a motion, m, with its links of robot and target and its sample."""
 
     distance: float
     links: LinkPair
@@ -415,24 +415,23 @@ class NearestLinks:
 
 
 class TargetClearance:
-    """Distances between the links of a robot and those of a target.
+    """Distances between the links of a robot and of a target.
 
-    Seen from the target its body is an obstacle that stands still, and the robot moves. So the
-    checks of obstacles serve: the target is the world of the robot, and the base has its pose
-    relative to it.
+    Relative to the target, its body is a fixed obstacle. The collision checks therefore take the
+    target as the robot's world, and the base pose relative to the target.
 
     Parameters
     ----------
     robot
         The robot.
     link
-        Its end-effector, whose rigid body may touch the target once it closes in.
+        Link of the end-effector, whose rigid body may touch the target when closing in.
     target
         The target, one rigid body.
     grapple
         Pose of the grapple frame in the frame T of the target.
     min_distance
-        The distance that is to be kept, m.
+        Smallest permitted distance, m.
     """
 
     def __init__(
@@ -453,18 +452,18 @@ class TargetClearance:
     def nearest(
         self, base: Pose, shapes: Array, grapple: FrameMotion, closes: int
     ) -> NearestLinks | None:
-        """Return the nearest approach of a motion; None: nothing can touch.
+        """Return the smallest distance in a motion; None: nothing can touch.
 
         Parameters
         ----------
         base
-            Pose of the base in W, which stays.
+            Pose of the base in W, which is fixed.
         shapes
             (K, n) joint positions, m or rad.
         grapple
-            The grapple frame at the same times.
+            Motion of the grapple frame at the same times.
         closes
-            The sample from which on the end-effector closes in.
+            First sample at which the end-effector closes in.
         """
         geometry = self._geometry
         if not len(geometry.pairs):

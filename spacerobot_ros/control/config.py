@@ -21,7 +21,7 @@ from spacerobot_ros.parameters import group, nonnegative, parameter, registered
 
 @dataclass(frozen=True)
 class ErrorMargin:
-    """Margin beyond twice the distance of a goal at which growing errors abort it."""
+    """Margin beyond twice the distance of a goal at which growing errors abort the goal."""
 
     position: float = nonnegative(
         1.0,
@@ -35,26 +35,26 @@ class ErrorMargin:
     )
 
     def as_errors(self) -> OutputErrors:
-        """Return the margins: infinite for 0, and for joints, which have limits of their own."""
+        """Return the margins: infinite if 0, and for joints, which have their own limits."""
         return OutputErrors(self.position or math.inf, self.attitude or math.inf, math.inf)
 
 
 @dataclass(frozen=True)
 class ControllerConfig(CommanderConfig):
-    """Parameters of a controller: outputs, law, limits, and the decision about goals."""
+    """Parameters of a controller: outputs, law, limits, and criteria for goals."""
 
     law: str = parameter("transposed_jacobian", "control law", choices=LAWS)
     end_effector_frame: str = parameter(
         "", "link of the end-effector; '': 'end_effector', if it exists"
     )
     base_outputs: str = parameter(
-        "", "axes of the base that are outputs: x y z rx ry rz; all three '': by the robot"
+        "", "axes of the base that are outputs: x y z rx ry rz; if all three are '': by the robot"
     )
     end_effector_outputs: str = parameter("", "axes of the end-effector that are outputs")
     joint_outputs: str = parameter("", "joints that are outputs")
     profile: str = parameter(
         "quintic",
-        "profile of references to goals; planned: for the thrust there is, around obstacles",
+        "profile of references to goals; planned: within the available thrust, around obstacles",
         choices=(*PROFILES, PlannedReference.name),
     )
     plan: PlannedOptions = group(PlannedOptions())
@@ -74,8 +74,8 @@ class ControllerConfig(CommanderConfig):
     )
     reference_timeout: float = nonnegative(
         1.0,
-        "time that states wait for a silent publisher of joint_reference or base_reference, "
-        "simulated or, in lockstep, wall time; 0: forever",
+        "time for which states wait for a silent publisher of joint_reference or base_reference: "
+        "simulated time, or wall time in lockstep; 0: forever",
         "s",
     )
     settle_time: float = nonnegative(

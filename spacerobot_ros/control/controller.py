@@ -68,14 +68,14 @@ from spacerobot_ros.planning.core.cancellation import Cancellation
 from spacerobot_ros.planning.methods.thrust.goals import Grapple
 
 _FREE_AXIS_MARGIN = 5.0
-"""Tolerances by which a goal may differ from the pose in an axis that the law leaves as it is:
-noise takes a measured pose out of the plane of a planar robot."""
+"""Number of tolerances by which a goal may differ from the pose in an uncontrolled axis: noise
+moves a measured pose out of the plane of a planar robot."""
 
 _LONGEST_MOTION = 1e9
-"""Longest duration of a reference, s: that of the longest flights."""
+"""Longest duration of a reference, s, as of the longest flights."""
 
 _BRAKE_RATE = 2.0
-"""Decay rate of joint motion when the base is no longer known, 1/s."""
+"""Decay rate of joint motion when the base state is unknown, 1/s."""
 
 
 _MAX_HELD_PERIODS = 20
@@ -91,13 +91,13 @@ class Mode(str, Enum):
 
 
 _MEASURED = Mode.MEASURED
-"""Found faster than the member of the enum, for every state."""
+"""Looked up faster than the enum member, at every state."""
 
 
 class CoordinatedController:
     """Controls spacecraft and arm together, with a command for every state.
 
-    Until a goal is given the robot holds the pose of its first state. A goal starts a new reference
+    Until a goal is set, the robot holds the pose of its first state. A goal starts a new reference
     profile from the present reference, for the base and the end-effector together.
 
     Parameters
@@ -105,20 +105,20 @@ class CoordinatedController:
     law
         The control law, with its outputs.
     limits
-        Limits of thrusters and joint efforts; the loss of a command to them is reported.
+        Limits of thrusters and joint efforts; the excess of a command over them is reported.
     rates
-        Limits of joint rates; the loss to them is reported as well.
+        Limits of joint rates; the excess over them is reported as well.
     profile, motion
-        Profile and limits of references; accelerations beyond the thrust are lowered.
+        Profile and limits of references; the thrust lowers accelerations further.
     control_period
         Time between two commands, s.
     estimation_time
         Longest time for which the base is estimated by integration when its measurements stop
-        (paper 4, section IV), s. Then the thrusters are off and the joints are brought to rest.
+        (paper 4, section IV), s. After it the thrusters are off and the joints are brought to rest.
     wheels
-        The reaction wheels of a robot that has some: the law's robot is its gyrostat.
+        The reaction wheels, if the robot has any; the law's robot is then its gyrostat.
     planner
-        Plans the references of goals; None: they have the profile.
+        Plans the references of goals; None: the profile is used.
     """
 
     def __init__(
@@ -150,14 +150,14 @@ class CoordinatedController:
         """Time of the last command, s."""
         self._estimator: DeadReckoning | None = None
         self.gains_checked = False
-        """Whether the gains were compared with the control period: at the next state, if not."""
+        """Whether the gains were checked against the control period."""
         self._brake: tuple[ComputedTorqueLaw, Reference] | None = None
         self.coming_to_rest = False
         """Whether the robot is being brought to rest, at any pose."""
         self._to_rest: Callable[[ControlState], Actuation] = rates.braking_command
 
     def reset(self) -> None:
-        """Drop goals and measurements; the next state counts as the first."""
+        """Drop goals and measurements; the next state is treated as the first."""
         self.law.reset_integral()
         self.profile, self._followed = None, Reference()
         self.coming_to_rest = False
@@ -185,11 +185,11 @@ class CoordinatedController:
         end_effector: PoseReference | None = None,
         joints: Array | None = None,
     ) -> None:
-        """Start towards new goals; a group without a new goal keeps its earlier goal.
+        """Start towards new goals; a group without a new goal keeps its earlier one.
 
-        An end-effector without a goal since the robot was held or brought to rest has none: the
-        base carries it, so that the arm keeps its shape. The integral of the errors begins again.
-        The reference has the profile that is not planned.
+        If the end-effector has had no goal since the robot was held or brought to rest, the base
+        carries it and the arm keeps its shape. The integral of the errors is reset. The reference
+        follows the profile; it is not planned.
         """
         start, goal, _, carries = self.motion_to(
             time, state, base=base, end_effector=end_effector, joints=joints
@@ -224,8 +224,8 @@ class CoordinatedController:
     def plan_grapple(
         self, time: float, state: ControlState, grapple: Grapple, lead: float
     ) -> PlanJob[GrappleReference]:
-        """Return the work on a reference to a target, whose motion is given from ``time`` on. The
-        plan begins ``lead`` s later, where reference and target will be then.
+        """Return the job that plans a reference to a target, whose motion is given from ``time``
+        on. The plan begins ``lead`` s later, from the reference and target predicted for that time.
         """
         planner = self.planner
         assert planner is not None
@@ -253,16 +253,15 @@ class CoordinatedController:
         base: PoseReference | None = None,
         end_effector: PoseReference | None = None,
     ) -> None:
-        """Refuse goals that differ from the present pose in an axis that the law leaves as it is.
+        """Refuse goals that differ from the present pose in an axis that the law does not control.
 
-        The law of a planar robot controls the axes of its plane alone. A position or an attitude
-        without any controlled axis is no matter of an axis: such a part is not controlled at all.
+        The law of a planar robot controls only the axes of its plane. A position or an attitude
+        without any controlled axis is not checked: that part is not controlled at all.
 
         Raises
         ------
         PlanningError
-            A goal is farther from the pose than some tolerances of the configuration; the message
-            names the axes.
+            A goal is several tolerances away from the pose; the message names the axes.
         """
         selection, labels = self.law.outputs.selection, ", ".join(self.law.outputs.labels)
         here = Reference.present(self.law.robot, state, selection.end_effector_link)
@@ -294,12 +293,12 @@ class CoordinatedController:
         base: PoseReference | None = None,
         end_effector: PoseReference | None = None,
     ) -> None:
-        """Refuse goals to which the reference would take longer than any flight.
+        """Refuse goals whose reference would take longer than any flight.
 
         Raises
         ------
         PlanningError
-            It would; the message says how long it takes.
+            The reference takes too long; the message states its duration.
         """
         here = Reference.present(
             self.law.robot, state, self.law.outputs.selection.end_effector_link
@@ -374,7 +373,8 @@ class CoordinatedController:
     def come_to_rest(self, law: Callable[[ControlState], Actuation] | None = None) -> None:
         """Bring the whole robot to rest, at any pose, until there is a new goal or reference.
 
-        ``law`` returns the command for a state, not limited; None: that of the joint rate limits.
+        ``law`` returns the command for a state, not limited; None:
+        :meth:`.JointRateLimits.braking_command`.
         """
         self.coming_to_rest = True
         self._to_rest = law or self.joint_rate_limits.braking_command
@@ -382,8 +382,8 @@ class CoordinatedController:
     def detumbling(self, payload: Payload | None, torque_limit: float) -> Detumbling:
         """Return the law that brings the robot to rest by its thrusters, wheels and joints.
 
-        ``payload`` is the body that it holds, ``torque_limit`` the largest torque of its grasp, N
-        m; 0: no limit.
+        ``payload`` is the body that the robot holds, ``torque_limit`` the largest torque of the
+        grasp, N m; 0: no limit.
         """
         torque, wheels = self._limits.torque, self.wheels
         if wheels is not None:
@@ -399,7 +399,7 @@ class CoordinatedController:
         return ArmReach(self.law.robot, link, axes, state, rates)
 
     def reference_at(self, time: float, state: ControlState) -> Reference:
-        """Return the present reference; before the first one, the pose of the robot at rest."""
+        """Return the reference at a time; before the first one, the pose of the robot at rest."""
         return self._present_reference(time, state)
 
     def shift_time(self, seconds: float) -> None:
@@ -426,7 +426,7 @@ class CoordinatedController:
     ) -> Saturated:
         """Return the actuation at ``time`` (s), within limits.
 
-        ``measured`` is the state, None if the base was not measured; ``q`` and ``qdot`` (n,) are
+        ``measured`` is the state, or None if the base was not measured; ``q`` and ``qdot`` (n,) are
         the joints, which are always measured.
 
         Raises
@@ -512,16 +512,16 @@ class CoordinatedController:
 
     @property
     def goal(self) -> Reference:
-        """Pose and shape in which the references come to rest; empty before the first state."""
+        """Pose and shape at the end of the references; empty before the first state."""
         return Reference() if self.profile is None else self.profile.goal
 
     @property
     def time_since_measurement(self) -> float:
-        """Time since the base was measured last, s."""
+        """Time since the last measurement of the base, s."""
         return self._estimator.elapsed if self._estimator is not None else 0.0
 
     def reference_moves(self, time: float) -> bool:
-        """Whether a reference has not come to rest yet at ``time`` (s)."""
+        """Whether the reference still moves at ``time`` (s)."""
         return self.profile is not None and not self.reference_at_rest(time)
 
     def time_until_blocked(self, time: float) -> float:
@@ -559,7 +559,7 @@ class CoordinatedController:
         return self.distance_between(self.law.state, self.goal)
 
     def distance_between(self, state: ControlState, goal: Reference) -> OutputDistance:
-        """Return the distance of the outputs in a state from a goal for all of them."""
+        """Return the distance of the outputs in a state from a goal for all outputs."""
         outputs = self.law.outputs
         return outputs.selection.distance(outputs.errors(state, goal))
 
@@ -571,9 +571,9 @@ class CoordinatedController:
         """Return the errors (m,) of the outputs beyond which control is lost.
 
         Call it after the first command towards the present goals. The bound is the same for all
-        outputs of a kind: a margin (m, rad) beyond twice the larger of the distance that the
-        reference travels and the largest present error, with the error that its rate adds until it
-        is damped.
+        outputs of a kind: a margin (m, rad) plus twice the larger of two values: the distance of
+        the reference's motion, and the largest present error plus what its rate adds until it is
+        damped.
         """
         assert self.profile is not None
         law, far = self.law, self.profile.distances()
@@ -663,7 +663,7 @@ def build_controller(robot: SpaceRobot, config: ControllerConfig) -> Coordinated
     Raises
     ------
     ParameterError
-        The robot does not have the outputs that are named, or the law cannot drive them.
+        The robot does not have the selected outputs, or the law cannot drive them.
     """
     law_type = LAWS[config.law]
     thrust = config.use_thrusters
@@ -710,7 +710,7 @@ def build_controller(robot: SpaceRobot, config: ControllerConfig) -> Coordinated
 def controlled_outputs(
     robot: SpaceRobot, config: ControllerConfig, law_type: type[ControlLaw]
 ) -> OutputSelection:
-    """Return the outputs that a configuration names, or else those of the law.
+    """Return the outputs selected in a configuration, or the law's default outputs.
 
     The robot is one without wheels, or its gyrostat.
     """
@@ -737,13 +737,13 @@ def _require_torque(
     name, turns = robot.description.name, [axis for axis in outputs.base if axis.startswith("r")]
     if len(turns) < len(outputs.base):
         raise ParameterError(
-            f"The position of the base of robot '{name}' is not controlled without thrusters "
-            "(use_thrusters is false): leave x, y and z out of base_outputs."
+            f"The position of the base of robot '{name}' cannot be controlled without thrusters "
+            "(use_thrusters is false): remove x, y and z from base_outputs."
         )
     rank = 0 if wheels is None else wheels.rank
     if len(turns) > rank:
         raise ParameterError(
             f"Robot '{name}' has no thrusters (use_thrusters is false), and its reaction wheels "
-            f"turn it about {rank} of {len(turns)} controlled axes: leave rx, ry or rz out of "
+            f"rotate it about {rank} of {len(turns)} controlled axes: remove rx, ry or rz from "
             "base_outputs."
         )

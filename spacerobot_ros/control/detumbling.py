@@ -1,8 +1,9 @@
-"""Detumbling: a robot that has captured a target is brought to rest, its grasp not overloaded.
+"""Detumbling: brings a robot that has captured a target to rest without overloading its grasp.
 
-The torque ``n`` about the centre of mass changes the angular momentum ``L`` of robot and target by
-no more than ``n_max``; so no control brings it to zero in less than ``|L0| / n_max``. A torque of
-that size against ``L`` takes exactly this time, and leaves the direction of ``L`` in W unchanged.
+The torque ``n`` about the centre of mass changes the angular momentum ``L`` of robot and target at
+most at the rate ``n_max``; so no control brings it to zero in less than ``|L0| / n_max``. A torque
+of that size against ``L`` takes exactly this time, and leaves the direction of ``L`` in W
+unchanged.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from spacerobot_ros.parameters import nonnegative, parameter
 
 @dataclass(frozen=True)
 class DetumbleOptions:
-    """The load on a grasp while a robot is brought to rest, and when it is at rest."""
+    """Limit of the load on a grasp while a robot is brought to rest, and criteria for rest."""
 
     grapple_torque_limit: float = nonnegative(
         0.0, "largest torque of the grasp on the target; 0: no limit", "N m"
@@ -46,7 +47,7 @@ def shortest_detumbling(momentum: float, torque: float) -> float:
     momentum
         Angular momentum about the centre of mass, N m s.
     torque
-        Largest torque, N m; infinite: any.
+        Largest torque, N m; infinite: no limit.
     """
     if momentum == 0.0 or math.isinf(torque):
         return 0.0
@@ -56,7 +57,7 @@ def shortest_detumbling(momentum: float, torque: float) -> float:
 def largest_feasible_share(start: Array, change: Array, limit: float) -> float:
     """Return the largest share ``s`` in [0, 1] with ``|start + s change| <= limit``.
 
-    If there is none, the share with the least norm.
+    If there is none, return the share with the smallest norm.
     """
     square, along = float(change @ change), float(start @ change)
     if square == 0.0:
@@ -80,7 +81,7 @@ class GraspWrenchModel:
 
     @classmethod
     def of(cls, robot: SpaceRobot, payload: Payload) -> GraspWrenchModel:
-        """Return the load of the grasp of a robot, whose model has the body."""
+        """Return the wrench model of a robot's grasp; the robot's model includes the body."""
         return cls(payload, BufferedFunction(_grasp_wrench(robot, payload)))
 
     def wrench(self, state: ControlState, z: Array, zdot: Array) -> Array:
@@ -121,18 +122,18 @@ def _grasp_wrench(robot: SpaceRobot, payload: Payload) -> ca.Function:
 class Detumbling:
     """Brings a robot to rest with a limited torque at its grasp.
 
-    Angular momentum is removed first, by the largest torque against it, then linear momentum by the
-    thrust that the torque leaves; joints are braked. All three decay together where the grasp would
-    be loaded beyond its limit: the whole demand is lowered.
+    Angular momentum is removed first, with the largest torque against it, then linear momentum with
+    the remaining thrust; joints are braked. If the grasp would be overloaded, the whole command is
+    scaled down and all three decay together.
 
     Parameters
     ----------
     robot
-        The model, with the body that the robot holds; a gyrostat, where there are wheels.
+        The model, with the body that the robot holds; a gyrostat if there are wheels.
     payload
-        That body; None: there is no grasp whose torque is limited.
+        That body; None: the torque of the grasp is not limited.
     force, torque
-        Largest force of the thrusters, N, and torque on the base, N m; infinite: any.
+        Largest force of the thrusters, N, and torque on the base, N m; infinite: no limit.
     torque_limit
         Largest torque of the grasp, N m; 0: no limit.
     control_period
@@ -153,7 +154,7 @@ class Detumbling:
         self._limit = torque_limit or math.inf
         self._grasp = None if payload is None else GraspWrenchModel.of(robot, payload)
         self.largest_grasp_torque = 0.0
-        """Largest torque of the grasp that a command asked for, N m."""
+        """Largest torque of the grasp due to a command, N m."""
 
     def angular_momentum(self, state: ControlState) -> Array:
         """Return the angular momentum (3,) about the centre of mass, N m s, base components."""

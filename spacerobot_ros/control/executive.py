@@ -1,4 +1,4 @@
-"""The executive of coordinated control: goals accepted, pursued, decided, aborted and saved."""
+"""The executive of coordinated control: it accepts, pursues, decides, aborts and saves goals."""
 
 from __future__ import annotations
 
@@ -52,11 +52,11 @@ END_EFFECTOR = "end_effector"
 """Key of the goal of the end-effector in files of goals."""
 
 GOAL_KEYS = (BASE_GOAL_KEY, END_EFFECTOR)
-"""Keys of goals: frames of the robot that goal poses are for."""
+"""Keys of goals: the frames of the robot that have goal poses."""
 
 
 Output = ControllerStatus | Event | PursuedGoals
-"""An output of an executive other than its commands."""
+"""Output of an executive, apart from its commands."""
 
 
 class _Next(IntEnum):
@@ -68,7 +68,7 @@ class _Next(IntEnum):
     HOLD = 2
     """The robot holds the measured pose, without a goal."""
     ABORT = 3
-    """The same, and the abort is reported."""
+    """Like ``HOLD``, and the abort is reported."""
 
 
 # Names of the module are found faster than members of an enum: they are needed for every state.
@@ -83,18 +83,19 @@ class ControlExecutive:
 
     * ``WAITING``: the base has not been measured yet.
     * ``HOLDING``: no goal was accepted; the robot holds the pose of its first state.
-    * ``TRACKING``: a goal is pursued; ``STALLED`` while the robot comes no nearer to it
-      (:class:`.StallMonitor`). ``REACHED`` once all errors have stayed within the tolerances
-      for the settling time after the reference has come to rest; ``FAILED`` if that does not happen
+    * ``TRACKING``: a goal is pursued; ``STALLED`` while the robot makes no progress
+      (:class:`.StallMonitor`). ``REACHED`` once all errors have stayed within the tolerances for
+      the settling time after the reference has come to rest; ``FAILED`` if that does not happen
       within the time limit. In both cases the robot then holds the goal.
     * ``ABORTED``: the goal was given up; the robot holds the pose of the next measured state. After
-      a loss of control (a joint is far beyond its rate against its motor, or the errors of a goal
-      grow instead of shrinking), the robot is brought to rest instead.
+      a loss of control (a joint moves far beyond its rate limit, or the errors of a goal grow
+      instead of shrinking), the robot is brought to rest instead.
 
     :class:`.GoalMonitor` decides about a goal.
 
     While the base is not measured, the reported state is ``ESTIMATING`` or ``STOPPED`` instead, and
-    the state of the goal stays as it is. ``REFUSED`` is reported of a single goal and is no state.
+    the state of the goal stays as it is. ``REFUSED`` is reported for a single goal and is not a
+    state.
 
     Parameters
     ----------
@@ -109,13 +110,13 @@ class ControlExecutive:
         config = config.for_robot(controller.law.robot.description)
         self._config = self._goal_config = config
         self._goal_tolerance: Tolerance | None = None
-        """Tolerances of the present goal; None: those of the parameters."""
+        """Tolerances of the present goal; None: the parameters'."""
         self.outputs: deque[Output] = deque()
-        """Outputs to publish, in order; the owner removes published outputs. There is a status
-        whenever the state changes, when commands begin or cease to be limited, and every
-        ``status_period``."""
+        """Outputs to publish, in order; the owner removes published outputs. A status is added when
+        the state changes, when commands begin or cease to be limited, and every ``status_period``.
+        """
         self.servicing = Servicing(config)
-        """The tasks before goals, with the target; the owner tells it the body that is held."""
+        """The tasks before goals, with the target; the owner sets the body that is held."""
         self._longest_gap = _longest_gap(config)
         self._planning = GoalPlanning(in_background=config.plan_in_background)
         self.reset()
@@ -128,8 +129,8 @@ class ControlExecutive:
         """Time of the last state, s."""
         self._next = _Next.GO_ON
         self.plant_blocked = False
-        """Whether the plant ignores commands, set by the owner. Each command then holds the pose of
-        its state, so that none of them moves the robot when the plant obeys again."""
+        """Whether the plant ignores commands, set by the owner. If so, each command holds the pose
+        of its state, so that the robot does not move when the plant obeys again."""
         self._abort_message = ""
         self._pending: dict[str, IdentifiedGoal] = {}
         """Accepted goals that wait for the next measured state."""
@@ -137,10 +138,10 @@ class ControlExecutive:
         self._goals: dict[str, IdentifiedGoal] = {}
         """Goals that are pursued together, by part of the robot."""
         self._goal_id = ""
-        """Id of the latest of them, which statuses have."""
+        """Id of the latest goal, which statuses carry."""
         self._asked: frozenset[Controlled] = frozenset()
         self._asked_of_hand: frozenset[Controlled] = frozenset()
-        """Parts of the pose of the base that the present goals ask for."""
+        """Parts of the base pose, and of the end-effector pose, that the present goals request."""
         self._monitor, self._stall = GoalMonitor(), StallMonitor()
         self._was_measured = False
         self.servicing.end()
@@ -152,7 +153,7 @@ class ControlExecutive:
         self._error_bounds: Array | None = None
         """Errors (m,) of the outputs beyond which control is lost."""
         self._guided = False
-        """Whether the last command followed a reference from outside."""
+        """Whether the last command followed an external reference."""
         self._next_report = 0.0
         self._limited = False
         self._command_report: CommandReport | None = None
@@ -162,16 +163,16 @@ class ControlExecutive:
         """The first contact on the way to the present goal, and when; empty: there was none."""
 
     def cancel_plan(self) -> None:
-        """Cancel the reference in the making; any thread may call this."""
+        """Cancel the reference being planned; any thread may call this."""
         self._planning.cancel()
 
     def plan_at_once(self) -> None:
-        """Make later plans while states wait for them: the plant is in lockstep."""
+        """Make later plans synchronously: the plant is in lockstep, and states wait for them."""
         self._planning.in_background = False
 
     @property
     def plan_time(self) -> float:
-        """Wall time for which references have been planned, s."""
+        """Total wall time of planning references, s."""
         return self._planning.time
 
     def configure(self, config: ControllerConfig) -> None:
@@ -204,7 +205,7 @@ class ControlExecutive:
 
     @property
     def unfinished_goals(self) -> frozenset[str]:
-        """Ids of the goals that are pursued or wait, also those whose abort is not reported yet."""
+        """Ids of pursued and waiting goals, including those whose abort is not reported yet."""
         present = self._next is _Next.ABORT or self._goal_state is ControllerState.TRACKING
         pursued = self._goals.values() if present else ()
         return self.waiting_goals.union(goal.goal_id for goal in pursued)
@@ -215,7 +216,7 @@ class ControlExecutive:
         return frozenset(goal.goal_id for goal in self._pending.values())
 
     def progress(self, goal_id: str) -> tuple[str, float | None]:
-        """Return the work that is done for a goal, and the predicted time until its end, s."""
+        """Return the present activity for a goal, and the predicted time until its end, s."""
         task, ends = self.servicing.task, self.controller.reference_ends
         if self._planning.active and goal_id in self.waiting_goals:
             return "planning", None
@@ -226,14 +227,15 @@ class ControlExecutive:
         return self.state.value, max(0.0, ends - self._time) + self._config.settle_time
 
     def submit(self, key: str, goal: IdentifiedGoal) -> None:
-        """Accept a goal of the ``base`` or the ``end_effector``, pursued from the next state on.
+        """Accept a goal of the ``base`` or the ``end_effector``, effective from the next state.
 
-        The other one keeps its goal. A goal that names an end-effector is for both, or for that.
+        The other frame keeps its goal. A goal that names an end-effector is for that end-effector,
+        and for the base if it has a base pose.
 
         Raises
         ------
         PlanningError
-            The law does not control it, or the goal's shape has another number of joints.
+            The law does not control the frame, or the goal's shape has another number of joints.
         """
         if key == END_EFFECTOR:
             self._require_output(key)
@@ -268,7 +270,7 @@ class ControlExecutive:
             if each.waypoints is not None:
                 raise PlanningError(
                     f"The goal of '{each.link}' is a path, which a controller does not follow: "
-                    "plan it by the method 'resolved_rate'."
+                    "plan it with the method 'resolved_rate'."
                 )
             turned = any(axis.startswith("r") for axis in axes)
             if each.quaternion is None and turned:
@@ -311,7 +313,7 @@ class ControlExecutive:
         identified.required.require_control(goal, controls, who)
 
     def request(self, task: Task) -> None:
-        """Do a task from the next measured state on, without a goal after it."""
+        """Begin a task at the next measured state, without a goal after it."""
         self._requested = (task,)
 
     def refuse(self, message: str, goal_id: str = "") -> None:
@@ -325,7 +327,7 @@ class ControlExecutive:
         Raises
         ------
         ParameterError
-            The goals are those of another robot or law; none is accepted.
+            The goals belong to another robot or law; none is accepted.
         """
         try:
             for key, goal in saved.items():
@@ -362,8 +364,8 @@ class ControlExecutive:
         return True
 
     def take_contacts(self, contacts: tuple[str, ...], time: float) -> None:
-        """Take the links that touch from a time on, s: a goal that they are met on the way to is
-        not reached.
+        """Take the links that touch from a time on, s. A goal fails if a new contact occurs on the
+        way.
         """
         met = [each for each in contacts if each not in self._contacts]
         self._contacts = contacts
@@ -377,9 +379,9 @@ class ControlExecutive:
     def use_obstacles(self, world: RobotDescription | None) -> None:
         """Plan around other obstacles from now on; None: around none.
 
-        A plan that is being made is made again. If the rest of the present motion comes too near,
-        the remaining one is planned anew: in motion if there is time, else from the pose in which
-        the robot is held.
+        A plan in progress is restarted. If the rest of the present motion comes too close to an
+        obstacle, the motion is replanned: while moving if there is time, otherwise from a held
+        pose.
         """
         planner = self.controller.planner
         if planner is None:
@@ -395,12 +397,13 @@ class ControlExecutive:
             self._pending = {**self._goals, **self._pending}
 
     def reference_ended(self, remaining: Reference) -> None:
-        """Go on with the references that remain: to a goal again, else hold the measured pose."""
+        """Continue with the remaining references: restart the goal, or hold the measured pose if
+        there is none."""
         self.controller.follow(remaining)
         self._begin_anew_or_hold()
 
     def plant_reset(self) -> None:
-        """Begin the goal again at the next measured state; without a goal, hold its pose."""
+        """Restart the goal at the next measured state; without a goal, hold its pose."""
         self.servicing.end()
         if self._goal_state is ControllerState.TRACKING and self._after_tasks:
             self._pending = {**self._after_tasks, **self._pending}
@@ -418,10 +421,10 @@ class ControlExecutive:
     def use_controller(
         self, controller: CoordinatedController, payload: Payload | None = None
     ) -> None:
-        """Control by another controller of the same outputs: the robot's masses have changed.
+        """Use another controller of the same outputs, because the robot's masses have changed.
 
-        The goal begins again at the next measured state; without a goal the robot holds where it
-        held. ``payload`` is the body that the robot holds from now on.
+        The goal restarts at the next measured state; without a goal the robot continues to hold.
+        ``payload`` is the body that the robot holds from now on.
         """
         controller.take_over_goals(self.controller)
         self.controller = controller
@@ -461,7 +464,7 @@ class ControlExecutive:
     ) -> Saturated:
         """Return the actuation for a state; see :meth:`CoordinatedController.command`.
 
-        ``reference`` is that of a planner for this state; groups that it lacks are held.
+        ``reference`` is a planner's reference for this state; groups that it lacks are held.
 
         Raises
         ------
@@ -510,7 +513,7 @@ class ControlExecutive:
         return Saturated(wheels.actuation(result.realised), excess)
 
     def dump_momentum(self) -> str:
-        """Dump the momentum of the reaction wheels, and return a sentence; or CommandError."""
+        """Dump the momentum of the reaction wheels and return a message, or raise CommandError."""
         if self.controller.wheels is None:
             name = self.controller.law.robot.description.name
             raise CommandError(f"Robot '{name}' has no reaction wheels.")
@@ -901,11 +904,11 @@ class ControlExecutive:
                 return self._abort_message
             case ControllerState.ESTIMATING:
                 elapsed = self.controller.time_since_measurement
-                return f"The base is not measured; it is estimated since {elapsed:.3g} s."
+                return f"The base is not measured; it has been estimated for {elapsed:.3g} s."
             case ControllerState.STOPPED:
-                return "The base is not measured any more: thrusters off, joints brought to rest."
+                return "The base is no longer measured: thrusters off, joints brought to rest."
             case ControllerState.REFUSED:
-                raise ValueError("a refusal has a message of its own")
+                raise ValueError("a refusal has its own message")
 
 
 def _touch(contacts: Sequence[str], time: float) -> str:
@@ -924,10 +927,10 @@ def decided_message(
     missed: Mapping[str, str] = _NOTHING_MISSED,
     touched: str = "",
 ) -> str:
-    """Return the message about a goal that is reached or failed, at a distance from the goal.
+    """Return the message about a reached or failed goal, with the distance from it.
 
-    ``cause`` is why the robot came no nearer, as far as is known; ``missed`` are the parts of a
-    goal that is reached partly; ``touched`` is the contact for which it is not reached.
+    ``cause`` is the known reason why the robot came no closer; ``missed`` are the missed parts of a
+    partly reached goal; ``touched`` is the contact that makes the goal fail.
     """
     limits = (
         (distance.position, config.position_tolerance),
@@ -949,13 +952,13 @@ def decided_message(
 _NO_ROTATION = np.array([0.0, 0.0, 0.0, 1.0])
 
 _PLACE: frozenset[Controlled] = frozenset({"position"})
-"""What a goal of an end-effector asks for that leaves its attitude open."""
+"""What an end-effector goal requests if its attitude is free."""
 
 _MAX_STATE_GAP, _MAX_STATE_GAP_PERIODS = 1.0, 10
 """Longest gap between two states, s, and in control periods; longer gaps are jumps of time."""
 
 _LATE_POSE_PERIODS = 1.5
-"""Longest time without a measured base that is not reported, in control periods."""
+"""Longest time without a measurement of the base that is not reported, in control periods."""
 
 
 def controlled_parts(axes: Sequence[str], joints: Sequence[str] = ()) -> frozenset[Controlled]:
@@ -968,7 +971,7 @@ _STATE_AND_EVENT_OF_DECISION = {
     Decision.REACHED: (ControllerState.REACHED, EventKind.GOAL_REACHED),
     Decision.FAILED: (ControllerState.FAILED, EventKind.GOAL_FAILED),
 }
-"""State and event of decisions, except for a loss of control, which is an abort."""
+"""State and event of each decision except a loss of control, which is an abort."""
 
 
 def _longest_gap(config: ControllerConfig) -> float:

@@ -1,4 +1,4 @@
-"""Whether a goal of a controller is reached, failed or lost: one monitor, of numbers or symbols.
+"""Monitor of a controller's goal (reached, failed or lost), in numbers or symbols.
 
 The executive evaluates the monitor with numbers, state by state; SIMD lanes compile the same
 methods with CasADi symbols. Conditions are therefore numbers, 1 or 0, combined by arithmetic:
@@ -24,10 +24,10 @@ LOST_STATES = 3
 """Consecutive states beyond a bound after which control is lost: one may be a bad measurement."""
 
 AUTOMATIC_TIME_LIMIT = 300.0
-"""Time (s) after the end of its reference after which a goal without a time limit has failed."""
+"""Time (s) from the end of the reference after which a goal without a time limit fails."""
 
 _ROUNDING = 1e-9
-"""Largest rounding of a sum of control periods, s."""
+"""Largest rounding error of a sum of control periods, s."""
 
 _NOT_WITHIN_TOLERANCE = -1.0
 """Value of ``within_since`` while an error is beyond its tolerance."""
@@ -52,10 +52,10 @@ class GoalMonitor:
     Attributes
     ----------
     started
-        Time at which the goal was begun, s.
+        Start time of the goal, s.
     within_since
-        Time since which every error has been within its tolerance with the reference at rest, s;
-        -1 while that is not so.
+        Time since which every error has been within its tolerance and the reference at rest, s; -1
+        if not.
     fast_states, large_error_states
         Numbers of consecutive states in which a joint was too fast, and an error beyond its bound.
     """
@@ -66,7 +66,7 @@ class GoalMonitor:
     large_error_states: Scalar = 0
 
     def begin(self, time: Scalar) -> None:
-        """Begin a goal at a time (s), and keep the count of states with too fast joints."""
+        """Begin a goal at a time (s); the count of states with too fast joints is kept."""
         self.started, self.within_since, self.large_error_states = time, _NOT_WITHIN_TOLERANCE, 0
 
     def restart_settling(self) -> None:
@@ -79,7 +79,7 @@ class GoalMonitor:
         self.restart_settling()
 
     def check_rates(self, largest_share: Scalar) -> Scalar:
-        """Count a state by its largest joint rate, as a share of that joint's limit.
+        """Count a state whose largest joint rate, as a share of that joint's limit, is too high.
 
         Returns whether joints were beyond :data:`LOST_RATE` in :data:`LOST_STATES` states.
         """
@@ -87,7 +87,7 @@ class GoalMonitor:
         return self.fast_states >= LOST_STATES
 
     def check_errors(self, largest_share: Scalar) -> Scalar:
-        """Count a state by its largest error, as a share of that error's bound.
+        """Count a state whose largest error, as a share of its bound, is too large.
 
         Returns whether errors were beyond their bounds in :data:`LOST_STATES` states.
         """
@@ -95,7 +95,7 @@ class GoalMonitor:
         return self.large_error_states >= LOST_STATES
 
     def is_late(self, time: Scalar, ends: Scalar, config: ControllerConfig) -> Scalar:
-        """Whether a goal is late at a time (s), whose reference ``ends`` at another (s)."""
+        """Whether a goal is late at a time (s); its reference ``ends`` at another time (s)."""
         if config.time_limit:
             return time - self.started >= config.time_limit - _ROUNDING
         return time - ends >= AUTOMATIC_TIME_LIMIT - _ROUNDING
@@ -108,18 +108,19 @@ class GoalMonitor:
         errors: OutputErrors,
         config: ControllerConfig,
     ) -> Scalar:
-        """Return the :class:`Decision` about a goal under control, by the errors of a state.
+        """Return the :class:`Decision` about a goal from the errors of a state, if control is not
+        lost.
 
         Parameters
         ----------
         time
             Time of the state, s.
         at_rest
-            Whether the reference has come to rest in the goal.
+            Whether the reference has come to rest at the goal.
         ends
-            Time at which it does, s.
+            Time at which the reference comes to rest, s.
         errors
-            Largest errors of the outputs by their kind.
+            Largest errors of the outputs by kind.
         config
             Tolerances, settling time and time limit.
         """
@@ -147,7 +148,7 @@ class GoalMonitor:
         error_share: Scalar,
         config: ControllerConfig,
     ) -> Scalar:
-        """Return the :class:`Decision` by one state: lost, or else :meth:`decide_by_errors`."""
+        """Return the :class:`Decision` from one state: lost, or else :meth:`decide_by_errors`."""
         rates, lost = self.check_rates(rate_share), self.check_errors(error_share)
         controlled = (1 - rates) * (1 - lost)
         outcome = self.decide_by_errors(time, at_rest, ends, errors, config)

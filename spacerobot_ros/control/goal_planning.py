@@ -1,4 +1,4 @@
-"""The plan of a reference in the making, beside the control loop."""
+"""Planning of references, in parallel with the control loop."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from spacerobot_ros.planning.execution.goal_file import IdentifiedGoal
 
 
 class Aims(TypedDict):
-    """Poses and joint positions that goals ask for; None: they do not."""
+    """Poses and joint positions that goals request; None: not requested."""
 
     base: PoseReference | None
     end_effector: PoseReference | None
@@ -27,8 +27,8 @@ class Aims(TypedDict):
 
 @dataclass(frozen=True)
 class PlannedGoals:
-    """What goals aim at, the parts of the base's pose that they ask for, their planned reference,
-    and the time at which it begins, s.
+    """Poses and joints of goals, the requested parts of the base pose, the planned reference, and
+    its start time, s.
     """
 
     aims: Aims
@@ -47,7 +47,7 @@ class _Plan:
     job: PlanJob[PlannedReference]
 
     def is_for(self, pending: Mapping[str, IdentifiedGoal]) -> bool:
-        """Whether these goals wait for it."""
+        """Whether this plan is for the given pending goals."""
         same = (goal is pending.get(part) for part, goal in self.pending.items())
         return len(pending) == len(self.pending) and all(same)
 
@@ -58,25 +58,25 @@ class GoalPlanning:
     Parameters
     ----------
     in_background
-        Whether a thread plans, while states are answered.
+        Whether a thread plans while states are handled.
     """
 
     def __init__(self, *, in_background: bool) -> None:
         self.in_background = in_background
         self.time = 0.0
-        """Wall time for which references have been planned, s."""
+        """Total wall time of planning references, s."""
         self._plan: _Plan | None = None
         self._job: PlanJob[PlannedReference] | None = None
-        """The last work, which may not have ended although it is cancelled."""
+        """The last job, which may still run although it is cancelled."""
         self._lead = PLANNING_TIME
 
     @property
     def active(self) -> bool:
-        """Whether a reference is in the making."""
+        """Whether a reference is being planned."""
         return self._plan is not None
 
     def is_for(self, pending: Mapping[str, IdentifiedGoal]) -> bool:
-        """Whether a reference for these goals is in the making."""
+        """Whether a reference for these goals is being planned."""
         return self._plan is not None and self._plan.is_for(pending)
 
     def planned(
@@ -87,9 +87,9 @@ class GoalPlanning:
         pending: Mapping[str, IdentifiedGoal],
         aims: Callable[[], tuple[Aims, frozenset[Controlled]]],
     ) -> PlannedGoals | None:
-        """Return the planned reference for pending goals; None: it is in the making.
+        """Return the planned reference for pending goals, or None while it is being planned.
 
-        ``aims`` returns what they aim at, and what they ask for.
+        ``aims`` returns the poses and joints of the goals, and the requested parts.
 
         Raises
         ------
@@ -147,18 +147,18 @@ class GoalPlanning:
         return plan
 
     def cancel(self) -> None:
-        """End the work; any thread may call this."""
+        """Cancel the job; any thread may call this."""
         plan = self._plan
         if plan is not None:
             plan.job.cancel()
 
     def drop(self) -> None:
-        """End the work, without a result."""
+        """Cancel the job and drop its result."""
         self.cancel()
         self._plan = None
 
     def close(self) -> None:
-        """End the work, and wait until its thread has ended."""
+        """Cancel the job and wait for its thread to end."""
         self._plan = None
         if self._job is not None:
             self._job.close()

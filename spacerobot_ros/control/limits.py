@@ -1,8 +1,8 @@
-"""Limits of actuators, of joint rates, and of references, which actuators must be able to follow.
+"""Limits of actuators, of joint rates, and of references.
 
-A law commands forces, whatever speeds follow. While a goal is far away, a measurement is late or a
-thruster is stuck open, joints would become faster than their motors allow, and faster than commands
-that are held for a control period can follow: :class:`JointRateLimits` lowers their efforts.
+A law commands forces without regard to the resulting speeds. If a goal is far away, a measurement
+is late or a thruster is stuck open, joints would exceed the rates of their motors, and rates that
+commands held for a control period can control: :class:`JointRateLimits` lowers their efforts.
 """
 
 from __future__ import annotations
@@ -25,15 +25,15 @@ from spacerobot_ros.model.space_robot import SpaceRobot
 from spacerobot_ros.parameters import parameter
 
 _REFERENCE_THRUST_SHARE = 0.5
-"""Share of the thrust for references; feedback and mass errors need the other part."""
+"""Share of the thrust for references; feedback and mass errors need the rest."""
 
 
 _MIN_PERIODS_TO_LIMIT = 2
-"""Shortest time for a joint to reach its rate limit, in control periods: neither the held
-efforts nor the next ones may carry it beyond, even if the model is slightly wrong."""
+"""Shortest time for a joint to reach its rate limit, in control periods: neither the held efforts
+nor the next ones may exceed it, even if the model is slightly wrong."""
 
 _SLOW_RATE_SHARE = 0.5
-"""Share of a joint's largest rate up to which, after the next period, its dynamics are not
+"""Share of a joint's rate limit; if the rate after the next period is below, dynamics are not
 evaluated."""
 
 _MOBILITY_SHAPES = 16
@@ -50,7 +50,7 @@ _REST_RATE_PER_PERIOD = 0.5
 class MotionLimits:
     """Largest speeds and accelerations of references, of poses and of joints.
 
-    ``joint_speed`` and ``joint_acceleration`` hold for every joint (m or rad, s); they are not
+    ``joint_speed`` and ``joint_acceleration`` apply to every joint (m or rad, s); they are not
     parameters of the controller node, whose goals are poses.
 
     Raises
@@ -83,10 +83,10 @@ class MotionLimits:
     ) -> MotionLimits:
         """Return the limits with accelerations lowered to those that the thrusters can produce.
 
-        The robot is treated as one rigid body of the shape ``q`` (n,): force over total mass;
-        torque over the largest moment of inertia about the centre of mass; and the torque that the
-        force at the base needs if the centre of mass is elsewhere. Without thrusters nothing is
-        lowered.
+        The robot is treated as one rigid body in the shape ``q`` (n,): force over total mass;
+        torque over the largest moment of inertia about the centre of mass; and the torque that
+        balances the force at the base if the centre of mass is elsewhere. Without thrusters nothing
+        is lowered.
         """
         force, torque = (_REFERENCE_THRUST_SHARE * x for x in (actuators.force, actuators.torque))
         lever = float(np.linalg.norm(robot.center_of_mass(q)))
@@ -128,7 +128,7 @@ class ActuatorLimits:
 
     The thrusters produce any force up to ``force`` (N) and any torque up to ``torque`` (N m), both
     in Euclidean norm and independently of each other. A larger force or torque is scaled to its
-    limit and keeps its direction. Each joint produces up to its ``effort`` (n,), N m or N. A limit
+    limit, keeping its direction. Each joint produces up to its ``effort`` (n,), N m or N. A limit
     that does not exist is infinite.
 
     Raises
@@ -203,18 +203,18 @@ def _smallest_positive(accelerations: list[float]) -> float:
 
 
 class JointRateLimits:
-    """Keeps the rates of joints within limits, by the dynamics over the next control periods.
+    """Keeps joint rates within limits, using the dynamics over the next control periods.
 
     The joints obey ``Js(q) qddot + Fs = tau + G(q) wrench``: the last rows of paper 4, eq. (19),
-    with the base's acceleration eliminated. A commanded acceleration that would bring a joint
-    beyond its rate within some control periods is lowered to one that does not, and the efforts
-    are those of the lowered accelerations. If motors are too weak to hold joints against the
-    thrust of the base, the thrust is lowered and keeps its direction.
+    with the base's acceleration eliminated. If a commanded acceleration would bring a joint beyond
+    its rate within a few control periods, it is lowered, and the efforts are those of the lowered
+    accelerations. If motors are too weak to hold joints against the thrust on the base, the thrust
+    is lowered, keeping its direction.
 
     Parameters
     ----------
     robot
-        The model, as the controller believes it.
+        The controller's model of the robot.
     rates
         Largest rates (n,), m/s or rad/s; zero or infinite: no limit.
     control_period
@@ -237,7 +237,7 @@ class JointRateLimits:
     def apply(
         self, state: ControlState, given: Actuation, effort: Array, periods: int = 1
     ) -> Actuation:
-        """Return a command that keeps the joint rates within limits: the given one, if it does.
+        """Return a command that keeps the joint rates within limits: the given one if possible.
 
         ``effort`` (n,) are the largest joint efforts, N m or N, which ``given`` keeps; ``periods``
         is the number of control periods for which it will probably be held.
@@ -285,15 +285,15 @@ class JointRateLimits:
         return ca.logic_and(near > 0, ca.sum1(ca.vertcat(*beyond)) > 0)
 
     def largest_rate_share(self, qdot: Array) -> float:
-        """Return the largest of rates (n,) as a share of its limit."""
+        """Return the largest of the rates (n,) as a share of its limit."""
         # Python numbers: arrays of a few joints take longer, and every state calls this.
         return max((0.0, *map(abs, map(mul, qdot.tolist(), self._inverse))))
 
     def braking_command(self, state: ControlState) -> Actuation:
-        """Return the command, not limited, under which joint rates and momenta decay.
+        """Return the unlimited command under which joint rates and momenta decay.
 
-        The thrusters remove both total momenta, which joint efforts do not change, and the motors
-        the joint rates: each decays independently, at any pose of the base.
+        The thrusters remove both total momenta, which joint efforts do not change; the motors
+        remove the joint rates. Each decays independently, at any base pose.
         """
         robot, r = self._robot, self._rest_rate
         J = robot.jacobian(robot.base_link, state.q)

@@ -1,13 +1,13 @@
-"""The outputs z1 of a law: their selection and their symbols (paper 4, eqs 22, 23, 26).
+"""The outputs z1 of a law: their selection and symbolic expressions (paper 4, eqs 22, 23, 26).
 
 The independent velocities are the paper's ``z0dot = [v_cm; omega; qdot]`` (eq. 8), the first two
 in base components. The outputs are components in W of poses, and joints. The Jacobian here is eq.
 (23) without its Euler-rate matrices: attitude is a quaternion, its error a rotation vector, and
-the velocity of an attitude output is a component of the angular velocity. So the representation
-has no singularity, and ``J_z`` loses rank only where the manipulator does.
+the velocity of an attitude output is a component of the angular velocity. So the representation has
+no singularity, and ``J_z`` loses rank only if the manipulator is singular.
 
 The rate of an attitude error is ``omega_des - omega``. About one fixed axis (every planar robot)
-it is the derivative of the error; in general it is so to first order.
+it is the derivative of the error; in general only to first order.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from spacerobot_ros.model.symbolic_rotations import (
 )
 
 _PARALLEL_TOLERANCE = 1e-6
-"""Sine of the largest angle between axes that count as parallel."""
+"""Sine of the largest angle between axes that are considered parallel."""
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,7 @@ class OutputSelection:
 
     @property
     def distances(self) -> tuple[tuple[str, tuple[int, ...]], ...]:
-        """The outputs that make up one distance, angle or error of a joint: kind and places."""
+        """Kind and indices of the outputs that form one distance, angle or joint error."""
         count = len(self.base)
         found: list[tuple[str, tuple[int, ...]]] = []
         for axes, first in (self.base, 0), (self.end_effector, count):
@@ -135,13 +135,13 @@ class OutputDistance:
 
 
 def default_selection(description: RobotDescription, end_effector_link: str) -> OutputSelection:
-    """Return the outputs of a robot and the link that is its end-effector (empty: none).
+    """Return the default outputs of a robot with an end-effector link (empty: none).
 
     * A planar robot (:func:`plane_normal`) whose plane is a coordinate plane of its base: the base
-      in that plane (x, y, rz for the plane x-y), and with two joints or more the position of the
-      end-effector in it. The axes are those of W, so the base must fly in that plane.
-    * Any other robot: the whole pose of the base, and of the end-effector its whole pose with six
-      joints or more, its position with three to five.
+      in that plane (x, y, rz for the plane x-y), and with two or more joints the position of the
+      end-effector in it. The axes are those of W, so the base must move in that plane of W.
+    * Any other robot: the whole pose of the base, and the pose (six or more joints) or the position
+      (three to five) of the end-effector.
     * Without an end-effector, or with too few joints for one: the pose of the base and the joints.
 
     So there are never more outputs than degrees of freedom.
@@ -194,7 +194,7 @@ class _OutputGroup:
 
 
 class OutputVector:
-    """The selected outputs of a robot, as expressions for a law to build its function from.
+    """The selected outputs of a robot, as expressions from which a law builds its function.
 
     ``m`` outputs, ``N = 6 + n`` degrees of freedom. The expressions are functions of the symbols
     ``state`` and ``reference`` (see :meth:`pack_state` and :meth:`pack_reference`):
@@ -318,8 +318,8 @@ class OutputVector:
         require_finite("reference", memory)
 
     def without_force(self, Q: ca.SX) -> ca.SX:
-        """Return generalised forces (N,) without their force on the centre of mass, if no
-        actuator makes one.
+        """Return generalised forces (N,); their force on the centre of mass is zero if no actuator
+        exerts one.
         """
         return Q if self.thrust else ca.vertcat(ca.SX.zeros(3), Q[3:])
 

@@ -1,4 +1,4 @@
-"""References that a plan under thrust gives."""
+"""References from plans under thrust."""
 
 from __future__ import annotations
 
@@ -38,8 +38,7 @@ from spacerobot_ros.planning.methods.thrust.propulsion import Propulsion
 from spacerobot_ros.planning.methods.thrust.search import ThrustOptions, ThrustPlanner
 
 PLANNING_TIME = 2.0
-"""Time from which a reference that moves is continued by a plan, s; twice as much if planning takes
-longer."""
+"""Time after which a plan continues a moving reference, s; doubled if planning takes longer."""
 
 
 @dataclass(frozen=True)
@@ -48,18 +47,18 @@ class PlannedOptions(ThrustOptions):
 
     thrusters: str = parameter(
         "",
-        "table of the thrusters that a plan uses: 'urdf' or a YAML file; '': a wrench within "
+        "thruster table that a plan uses: 'urdf' or a YAML file; '': any wrench within "
         "max_force and max_torque",
     )
 
 
 class PlannedReference(ReferenceProfile):
-    """A motion of base and joints that is planned under the thrust there is, around obstacles.
+    """A motion of base and joints, planned within the available thrust and around obstacles.
 
     Parameters
     ----------
     start, goal, limits, carries
-        Those of every profile.
+        See :class:`.ReferenceProfile`.
     motion
         The plan.
     """
@@ -127,12 +126,12 @@ class PlannedReference(ReferenceProfile):
 
 
 class GrappleReference(PlannedReference):
-    """A planned motion to a target, and with it from then on.
+    """A planned motion to a target, then with the target.
 
     Parameters
     ----------
     start, limits, motion
-        Those of a planned reference.
+        See :class:`PlannedReference`.
     grapple
         The target, whose motion begins with the plan.
     """
@@ -178,9 +177,7 @@ def _pose(frame: FrameSample) -> PoseReference:
 
 
 class GoalMotion(NamedTuple):
-    """From which reference to which one a motion leads, at rest, within limits; ``carries``: the
-    arm keeps its shape.
-    """
+    """Start and goal of a motion, and its limits; ``carries``: the arm keeps its shape."""
 
     start: Reference
     goal: Reference
@@ -194,18 +191,19 @@ class ReferencePlanner:
     Parameters
     ----------
     robot
-        The model that the law controls: without wheels, whose torque a plan does not use.
+        The model that the law controls, without wheels: plans do not use their torque.
     outputs
         The outputs of the law.
     limits
-        Limits of the thrusters, which count without a table.
+        Limits of the thrusters, used if there is no thruster table.
     options
         The options of the plan.
 
     Raises
     ------
     ParameterError
-        The thrust has no limits, or cannot produce every wrench; or an option is refused.
+        The thrust has no limits, the thrusters cannot produce every wrench, or an option is
+        invalid.
     """
 
     def __init__(
@@ -223,7 +221,7 @@ class ReferencePlanner:
             propulsion = Propulsion.within(limits.force, limits.torque, options.reserve)
         if not outputs.base:
             raise ParameterError(
-                "The profile 'planned' moves a base whose pose is controlled: set base_outputs, or "
+                "The profile 'planned' requires a controlled base pose: set base_outputs, or set "
                 "profile to quintic."
             )
         self._planner = ThrustPlanner(robot, propulsion, options, outputs.end_effector_link)
@@ -234,8 +232,8 @@ class ReferencePlanner:
         self._clearance = self._planner.clearance_among(world)
 
     def time_until_blocked(self, profile: PlannedReference, time: float) -> float:
-        """Return how long a reference stays clear of the obstacles, s, from a time after its start
-        on; infinite: to its end.
+        """Return how long a reference stays clear of obstacles, s, counted from a time after its
+        start; infinite: to its end.
         """
         clearance, motion = self._clearance, profile.motion
         if clearance is None or not clearance.has_obstacles or time >= motion.duration:
@@ -257,8 +255,8 @@ class ReferencePlanner:
     def plan(
         self, motion: GoalMotion, state: ControlState, cancellation: Cancellation
     ) -> PlannedReference:
-        """Return the planned reference of a motion; ``state`` has the joints where no reference
-        does.
+        """Return the planned reference of a motion; ``state`` provides joints that have no
+        reference.
 
         Raises
         ------
@@ -329,21 +327,21 @@ _Planned = TypeVar("_Planned", bound=PlannedReference)
 
 
 class PlanJob(Generic[_Planned]):
-    """A plan in the making.
+    """A planning job.
 
     Parameters
     ----------
     work
         Returns the plan, or raises PlanningError.
     begins
-        Time at which the plan begins if it is ready by then, s; minus infinity: when it is ready.
+        Start time of the plan if it is ready by then, s; minus infinity: as soon as it is ready.
     """
 
     def __init__(self, work: Callable[[Cancellation], _Planned], begins: float) -> None:
         self.begins = begins
         self.done = False
         self.wall_time = 0.0
-        """Wall time of the work, s."""
+        """Wall time of the job, s."""
         self._cancellation = Cancellation()
         self._work = work
         self._result: _Planned | None = None
@@ -352,7 +350,7 @@ class PlanJob(Generic[_Planned]):
         self._thread = Thread(target=self._run, daemon=True)
 
     def start(self, *, in_background: bool, after: PlanJob[_Planned] | None = None) -> None:
-        """Do the work, in a thread, once that of another job has ended, or at once."""
+        """Run the job: in a thread, after another job has ended, or immediately."""
         self._after = after
         if in_background:
             self._thread.start()
@@ -374,11 +372,11 @@ class PlanJob(Generic[_Planned]):
         self.done = True
 
     def cancel(self) -> None:
-        """End the work; its result is dropped. Any thread may call this."""
+        """Cancel the job; its result is dropped. Any thread may call this."""
         self._cancellation.cancel()
 
     def close(self) -> None:
-        """End the work, and wait until its thread has ended."""
+        """Cancel the job and wait for its thread to end."""
         self.cancel()
         if self._thread.is_alive():
             # A thread inside CasADi would crash a process that ends.

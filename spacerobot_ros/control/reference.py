@@ -1,7 +1,7 @@
-"""References over time: profiles from the present poses and joints to the goals.
+"""Reference profiles from the present poses and joints to the goals.
 
-The paper sets the goal at once (:class:`StepReference`): simple, with the largest demand on the
-actuators at the first instant. :class:`QuinticReference` moves the reference there smoothly.
+The paper sets the goal at once (:class:`StepReference`): simple, but with the largest actuator
+command at the start. :class:`QuinticReference` moves the reference there smoothly.
 """
 
 from __future__ import annotations
@@ -33,9 +33,7 @@ _QUINTIC_PEAK_ACCELERATION = 10 / math.sqrt(3)
 
 @dataclass(frozen=True)
 class OutputErrors:
-    """Largest errors of the outputs: distances of positions (m), angles of attitudes (rad), and of
-    single joints (m or rad).
-    """
+    """Largest errors of the outputs: positions (m), attitudes (rad), single joints (m or rad)."""
 
     position: float
     attitude: float
@@ -43,7 +41,7 @@ class OutputErrors:
 
 
 class ReferenceProfile(ABC):
-    """A reference over time, from ``start`` to ``goal``, at rest at both ends.
+    """A reference over time from ``start`` to ``goal``, at rest at both ends.
 
     Parameters
     ----------
@@ -54,8 +52,7 @@ class ReferenceProfile(ABC):
     limits
         Largest speeds and accelerations.
     carries
-        Whether the end-effector has no goal: it moves with the base, so that the arm keeps its
-        shape.
+        Whether the end-effector has no goal and moves with the base: the arm keeps its shape.
 
     Raises
     ------
@@ -120,10 +117,10 @@ class StepReference(ReferenceProfile):
 class QuinticReference(ReferenceProfile):
     """Positions along straight lines, attitudes along geodesics (one fixed axis), in W.
 
-    An end-effector that the base carries rotates about the base's origin, which is on its line.
+    An end-effector that the base carries rotates about the base's origin, which moves on its line.
     All share one profile, ``s = 10 u^3 - 15 u^4 + 6 u^5`` of ``u = t / T``: rest to rest, without
-    a jump in acceleration. T is the shortest time in which all are within their limits: the one
-    that needs longest sets the pace, and all reach their goals together.
+    a jump in acceleration. T is the shortest time for which all motions are within their limits:
+    the slowest sets the pace, and all reach their goals together.
     """
 
     name: ClassVar[str] = "quintic"
@@ -172,7 +169,7 @@ def _quintic(u: Any, T: Any) -> tuple[Any, Any, Any]:
 
 
 def profile_numbers(profile: ReferenceProfile, base: bool, end_effector: bool, n: int) -> Array:
-    """Return the numbers of a profile that :func:`profile_expression` takes.
+    """Return a profile as the numbers that :func:`profile_expression` takes.
 
     Parameters
     ----------
@@ -196,9 +193,9 @@ def profile_numbers(profile: ReferenceProfile, base: bool, end_effector: bool, n
 def profile_expression(
     numbers: ca.SX, time: ca.SX, base: bool, end_effector: bool, n: int
 ) -> ca.SX:
-    """Return the reference of :meth:`ReferenceProfile.at` as the argument of a law's function.
+    """Return :meth:`ReferenceProfile.at` as the argument of a law's function.
 
-    ``numbers`` are those of :func:`profile_numbers`, ``time`` is since the start, s.
+    ``numbers`` come from :func:`profile_numbers`, ``time`` is since the start, s.
     """
     sizes = _profile_sizes(base, end_effector, n)
     duration, *rest = ca.vertsplit(numbers, np.cumsum([0, *sizes]).tolist())
@@ -225,7 +222,7 @@ def profile_expression(
 
 
 def profile_size(base: bool, end_effector: bool, n: int) -> int:
-    """Return how many numbers :func:`profile_numbers` returns."""
+    """Return the size of the array of :func:`profile_numbers`."""
     return sum(_profile_sizes(base, end_effector, n))
 
 
@@ -236,8 +233,8 @@ def _profile_sizes(base: bool, end_effector: bool, n: int) -> list[int]:
 class HeldVelocityReference:
     """Joint references from commands whose velocities are held over a control period.
 
-    At the instant of a command the velocity jumps: the reference has the mean of the velocities
-    before and after, and the acceleration that leads from one to the other within a period.
+    At a command the velocity jumps: the reference has the mean of the velocities before and after,
+    and the acceleration between them over one period.
 
     Parameters
     ----------
@@ -295,7 +292,7 @@ class _PoseInterpolation:
 
     @property
     def numbers(self) -> list[npt.ArrayLike]:
-        """All numbers of the line, and the pose of its end."""
+        """All numbers of the line, and its end pose."""
         line = [self._r, self._d, self._e, self._c, self._start.quaternion, self._half_turn]
         return [*line, self._turn_W, [self.angle], self._goal.position, self._goal.quaternion]
 

@@ -1,7 +1,7 @@
-"""Tasks before a goal: the approach to a target until it is captured, and detumbling after it.
+"""Tasks before a goal: the approach to a target until its capture, and detumbling after it.
 
-A task works on the controller's references, state by state, until it is done or has failed. An
-approach gives the reference of the end-effector; detumbling replaces the law until the robot rests.
+A task sets the controller's references, state by state, until it is done or has failed. An approach
+sets the reference of the end-effector; detumbling replaces the law until the robot is at rest.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ from spacerobot_ros.model.target_motion import RelativeMotionOverTime, TorqueFre
 from spacerobot_ros.planning.methods.thrust.goals import Grapple
 
 _PREDICTION_TOLERANCE = 0.02
-"""Distance (m) and angle (rad) of a target from its predicted motion beyond which the approach is
-planned again."""
+"""Deviation (m and rad) of a target from its predicted motion beyond which the approach is
+replanned."""
 
 
 class Task(str, Enum):
@@ -48,7 +48,7 @@ class Task(str, Enum):
 
     @classmethod
     def parsed(cls, text: str) -> tuple[Task, ...]:
-        """Return the tasks of a text, separated by spaces.
+        """Return the tasks in a text, separated by spaces.
 
         Raises
         ------
@@ -72,7 +72,7 @@ class TaskState(Enum):
     REFUSED = "refused"
     """It cannot begin."""
     FAILED = "failed"
-    """It was given up on the way."""
+    """It was aborted after it had begun."""
 
 
 @dataclass(frozen=True)
@@ -87,14 +87,14 @@ _ACTIVE, _DONE = TaskProgress(TaskState.ACTIVE), TaskProgress(TaskState.DONE)
 
 
 class MeasuredTarget:
-    """The target as it was measured last.
+    """The last measurement of the target.
 
     Attributes
     ----------
     description, body
-        Its description, and the body; None: it is not described.
+        Description and body of the target; None: not received.
     why_unknown
-        Why the body is not known; empty: nothing was received.
+        Why the body is unknown; empty: nothing was received.
     motion, time
         Motion of its root link, and the time of the measurement, s; None before the first one.
     """
@@ -115,7 +115,8 @@ class MeasuredTarget:
             self.body, self.why_unknown = None, str(error)
 
     def measure(self, time: float, pose: Array, twist: Array) -> None:
-        """Take pose (7,) and twist (6,), in its own frame, of its root link at a time, s."""
+        """Take pose (7,) and twist (6,) of the root link at a time, s; the twist is in the link's
+        frame."""
         self.motion, self.time = BodyMotion.of(pose, twist), time
 
 
@@ -128,7 +129,7 @@ class MotionPlan:
 
     @property
     def contact(self) -> float:
-        """When the end-effector has the pose of the grapple frame."""
+        """Time at which the end-effector has the pose of the grapple frame, s."""
         return self.reference.duration
 
     def relative(self, times: Array) -> RelativeMotionOverTime:
@@ -137,11 +138,12 @@ class MotionPlan:
 
 
 _LATEST_BEGIN = 0.1
-"""How much later than planned a motion may begin, s."""
+"""Longest delay of a motion relative to its planned start, s."""
 
 
 class ApproachTask:
-    """One approach: it is planned in its first state, and again if the target leaves its path.
+    """One approach, planned at its first state and replanned if the target deviates from its
+    prediction.
 
     Parameters
     ----------
@@ -162,7 +164,7 @@ class ApproachTask:
         self._remaining = math.inf
         """Time until contact, s."""
         self._job: PlanJob[GrappleReference] | None = None
-        """The work on a planned approach."""
+        """The job that plans an approach."""
         self._lead = PLANNING_TIME
 
     def step(
@@ -173,7 +175,7 @@ class ApproachTask:
         *,
         in_background: bool,
     ) -> TaskProgress:
-        """Give the controller the reference of a state."""
+        """Set the controller's reference for a state."""
         options = self.config.target
         target, link = self.target, controller.law.outputs.selection.end_effector_link
         if not controller.law.outputs.selection.end_effector:
@@ -222,7 +224,7 @@ class ApproachTask:
         return _ACTIVE
 
     def close(self) -> None:
-        """End the work on a plan."""
+        """Cancel the planning job and wait for its end."""
         if self._job is not None:
             self._job.close()
             self._job = None
@@ -316,7 +318,7 @@ class ApproachTask:
         )
         message = (
             f"Base and end-effector set out at {job.begins:.4g} s and meet the target at "
-            f"{contact:.4g} s; {left:.4g} N m s are planned to be left after the grasp."
+            f"{contact:.4g} s; the plan leaves {left:.4g} N m s after the grasp."
         )
         about = {
             "starts_s": f"{job.begins:.9g}",
@@ -370,7 +372,7 @@ class DetumblingTask:
     Parameters
     ----------
     payload
-        The body that the robot holds; None: none.
+        The body that the robot holds, if any.
     config
         Parameters of the controller.
     """
@@ -383,7 +385,7 @@ class DetumblingTask:
         self._at_rest_since: float | None = None
 
     def close(self) -> None:
-        """Nothing goes on beside it."""
+        """Do nothing: there is no background work."""
 
     def step(
         self,
@@ -416,8 +418,8 @@ class DetumblingTask:
         if limit and time - self._began > limit:
             return TaskProgress(
                 TaskState.FAILED,
-                f"The robot is not at rest after {limit:g} s: it still turns at "
-                f"{quantity(self._fastest, 'rad/s')}, its centre of mass moves at "
+                f"The robot is not at rest after {limit:g} s: it still rotates at "
+                f"{quantity(self._fastest, 'rad/s')}, and its centre of mass moves at "
                 f"{quantity(speed, 'm/s')}.",
             )
         return _ACTIVE
@@ -425,7 +427,7 @@ class DetumblingTask:
     @property
     def message(self) -> str:
         """Sentence about the remaining motion."""
-        return f"Detumbling: base and joints turn at {quantity(self._fastest, 'rad/s')}."
+        return f"Detumbling: base and joints rotate at up to {quantity(self._fastest, 'rad/s')}."
 
     def _begin(self, time: float, state: ControlState, controller: CoordinatedController) -> None:
         limit = self.config.detumble.grapple_torque_limit
@@ -458,7 +460,7 @@ class DetumblingTask:
 
 
 class Servicing:
-    """The tasks of a controller: those before its goals, and those that are requested.
+    """The tasks of a controller: those before its goals, and those on request.
 
     Parameters
     ----------
@@ -505,7 +507,7 @@ class Servicing:
         self._remaining_tasks = list(tasks)
 
     def restart(self) -> None:
-        """Begin the present task again."""
+        """Restart the present task."""
         self._drop_present()
 
     def _drop_present(self) -> None:
@@ -514,7 +516,7 @@ class Servicing:
         self._present = None
 
     def end(self) -> None:
-        """Give up the tasks that are left."""
+        """Drop the remaining tasks."""
         self._drop_present()
         self._remaining_tasks = []
 
@@ -532,7 +534,7 @@ class Servicing:
         *,
         in_background: bool = False,
     ) -> TaskProgress:
-        """Work on the present task; DONE with the last one. ``in_background``: a thread plans."""
+        """Advance the present task; DONE after the last one. ``in_background``: a thread plans."""
         while self._remaining_tasks:
             if self.task is not Task.APPROACH or self.payload is None:
                 if self._present is None:

@@ -1,4 +1,4 @@
-"""Whether a controller still comes nearer to its goal, and if not, why: a report, no decision."""
+"""Reports whether a controller makes progress towards its goal, and if not, why."""
 
 from __future__ import annotations
 
@@ -17,42 +17,42 @@ _SHORTEST_WINDOW, _LONGEST_WINDOW = 2.0, 10.0
 """Shortest and longest time over which errors are compared, s."""
 
 _LIMITED_WINDOW = 5.0
-"""The same while commands are limited, which makes loops slower, s."""
+"""The same time while commands are limited, which slows the loop, s."""
 
 _LEAST_WINDOW_PERIODS = 20
-"""Shortest such time in control periods."""
+"""Shortest comparison time, in control periods."""
 
 _SAMPLES = 32
-"""Number of states in such a time whose errors are checked."""
+"""Number of states whose errors are checked within a comparison time."""
 
 _LEAST_PROGRESS = 0.02
-"""Share by which errors shrink at least from one time to the next; in a time constant, linear loops
-shrink them by 0.6."""
+"""Smallest share by which errors must shrink from one window to the next; a linear loop shrinks
+them by 0.6 in a time constant."""
 
 _LAG_SHARE = 0.5
-"""Share of the way of a reference that a robot without trouble does not lag behind."""
+"""Largest lag of an unimpeded robot behind its reference, as a share of the distance."""
 
 _LEAST_SMALLEST_TOLERANCE = 1e-9
-"""Tolerance (m, rad) that stands for zero."""
+"""Tolerance (m, rad) used instead of zero."""
 
 _STOP_SHARE = 0.005
-"""Distance from a stop at which a joint is at it, as a share of its range."""
+"""Distance at which a joint is considered at its stop, as a share of its range."""
 
 _SINGULAR_SHARE = 0.7
-"""Share of the error in singular directions that makes them the cause."""
+"""Share of the error in singular directions from which a singularity is the cause."""
 
 
 class StallMonitor:
-    """Compares the largest error, as a share of its tolerance, over successive times.
+    """Compares the largest error, as a share of its tolerance, between successive windows of time.
 
-    Such a time is as long as the slowest error of the closed loop takes to decay to a third
-    (:meth:`.ControlLaw.slowest_decay`), within 2 to 10 s; 5 s while commands are limited. The
-    robot is stalled if the largest
-    error shrinks from one time to the next by less than 2 %, and by less than before:
+    A window lasts as long as the slowest error of the closed loop takes to decay to a third
+    (:meth:`.ControlLaw.slowest_decay`), within 2 to 10 s; 5 s while commands are limited. The robot
+    is stalled if the largest error shrinks from one window to the next by less than 2 %, and by
+    less than before:
 
     * after the reference has come to rest, and while an error is beyond its tolerance;
-    * on its way, if the robot lags behind it by more than half of the way, beyond its tolerance,
-      and the error has not begun to shrink.
+    * while the reference moves, if the robot lags behind by more than half of the distance and more
+      than its tolerance, and the error has not begun to shrink.
 
     It is no longer stalled when the errors shrink again.
     """
@@ -63,14 +63,14 @@ class StallMonitor:
         self.restart()
 
     def restart(self) -> None:
-        """Begin again: at a new goal, and after a jump of time or of the robot."""
+        """Restart, at a new goal and after a jump of time or of the robot."""
         self.cause = ""
         self._ends = self._next_sample = -math.inf
         self._window = 0.0
         self._at_rest = False
-        """Whether the reference was at rest since the present time began."""
+        """Whether the reference was at rest when the present window began."""
         self._largest: list[float] = []
-        """Largest shares in the present time and in those before, the latest first."""
+        """Largest shares in the present and earlier windows, the latest first."""
         self._share = self._lag = 0.0
         """Largest share, and lag behind the reference, in the last state."""
         self._samples = self._limited = 0
@@ -82,7 +82,7 @@ class StallMonitor:
         result: Saturated,
         config: ControllerConfig,
     ) -> None:
-        """Take the state, and the command for it, at a time (s)."""
+        """Take the controller's state and its command at a time (s)."""
         if time < self._next_sample:
             return
         if not self._largest:
@@ -143,7 +143,7 @@ class StallMonitor:
             cause = "the arm is stretched out or folded (singular)"
             profile = controller.profile
             if profile is not None and not profile.carries:
-                cause += "; the end-effector keeps a goal of its own until ~/abort"
+                cause += "; the end-effector keeps its own goal until ~/abort"
             return cause
         if limited:
             for part, name in (

@@ -1,4 +1,4 @@
-"""Inputs and outputs of control laws: states, references, actuations; states by dead reckoning."""
+"""Inputs and outputs of control laws (states, references, actuations), and dead reckoning."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class TargetNotSetError(SpaceRobotError):
 
 
 class NotFiniteError(SpaceRobotError):
-    """A state or reference has a number that is not finite, so that there is no command."""
+    """A state or reference has a number that is not finite; no command is computed."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ class ControlState:
         return cls(r_WB, quaternion_WB, np.zeros(3), np.zeros(3), q, np.zeros(len(q)))
 
     def stack(self, memory: Array) -> None:
-        """Write the six parts one after the other into ``memory`` (13 + 2 n,).
+        """Write the six parts in sequence into ``memory`` (13 + 2 n,).
 
         Raises
         ------
@@ -67,7 +67,7 @@ class ControlState:
         np.concatenate(parts, out=memory)
 
     def copied(self) -> ControlState:
-        """Return a copy, as the memory of a state may be used again for the next one."""
+        """Return a copy, because the memory of a state may be reused for the next one."""
         memory = np.empty(13 + 2 * len(self.q))
         self.stack(memory)
         return ControlState.unstack(memory)
@@ -97,7 +97,7 @@ class PoseReference:
     def with_body_twist(
         cls, position: Array, quaternion_WB: Array, v_B: Array, omega_B: Array
     ) -> PoseReference:
-        """Return the reference of a frame B whose velocities are given in B, as odometry is."""
+        """Return the reference of a frame B from velocities in components of B, as in odometry."""
         R_WB = matrix_from_quaternion(quaternion_WB)
         return cls(position, quaternion_WB, R_WB @ v_B, R_WB @ omega_B)
 
@@ -173,10 +173,11 @@ class Actuation(NamedTuple):
 
 
 class DeadReckoning:
-    """Paper 4, end of section IV: the state by integration of eq. (19) under the commands sent.
+    """Paper 4, end of section IV: the state from integration of eq. (19) under the commands sent.
 
-    It starts at the last measured state and steps a control period at a time under held actuation,
-    by Runge-Kutta 4. Differences between the model and the real robot accumulate over the time
+    It starts from the last measured state and integrates one control period at a time under held
+    actuation, with Runge-Kutta 4. Differences between the model and the real robot accumulate over
+    the time
     :attr:`elapsed`.
 
     The integrated state is that of :mod:`spacerobot_ros.model.composite_rigid_body`, with both
@@ -187,7 +188,7 @@ class DeadReckoning:
     Parameters
     ----------
     robot
-        The model, as the controller believes it.
+        The controller's model of the robot.
     control_period
         Duration of a step, s.
     integration_step
@@ -237,7 +238,7 @@ class DeadReckoning:
     ) -> ControlState:
         """Advance one control period under held actuation and return the estimate at its end.
 
-        ``q`` and ``qdot`` (n,) are the joints measured at the end of the period, if they are.
+        ``q`` and ``qdot`` (n,) are the joints measured at the end of the period, if available.
         """
         self._command[:] = np.concatenate([actuation.tau, actuation.wrench_B])
         for _ in range(self._substeps):

@@ -1,4 +1,4 @@
-"""Status of a controller: the state of its goal, and how well its last command was defined."""
+"""Status of a controller: the state of its goal, and the conditioning of its last command."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ class ControllerState(str, Enum):
     HOLDING = "holding"
     TRACKING = "tracking"
     STALLED = "stalled"
-    """A goal is tracked, and the robot comes no nearer."""
+    """A goal is tracked, but the robot makes no progress."""
     REACHED = "reached"
     REACHED_PARTLY = "reached_partly"
-    """A part of the base that was asked for is out of tolerance, and not controlled."""
+    """A requested part of the base pose is out of tolerance and not controlled."""
     FAILED = "failed"
     REFUSED = "refused"
     ABORTED = "aborted"
@@ -73,12 +73,12 @@ class CommandReport:
     singular, smallest_singular_value, damping
         See :class:`spacerobot_ros.control.LawStatus`.
     lost_force_N, lost_torque_Nm, lost_effort
-        Part of the command beyond the limits: norms for the thrusters, the largest of the joints
-        (N or N m).
+        Part of the command beyond the limits: norms for the thrusters, maximum over the joints (N
+        or N m).
     errors
         Error of each output by its label, m or rad.
     wheels
-        Rate of each reaction wheel by name, as a share of its largest one.
+        Rate of each reaction wheel by name, as a share of its largest rate.
     momentum
         Angular momentum about the centre of mass, N m s: of ``base``, ``arm``, ``wheels``, and
         their ``sum``; empty without reaction wheels.
@@ -101,7 +101,7 @@ class CommandReport:
     def controls(self, part: str = "base") -> frozenset[Controlled]:
         """Return which of position, attitude and shape the outputs control.
 
-        ``part`` is the part of the robot whose pose is meant: ``base`` or ``end_effector``.
+        ``part`` is ``base`` or ``end_effector``.
         """
         kinds: dict[Controlled, tuple[str, ...]] = {
             "position": (f"{part}.x", f"{part}.y", f"{part}.z"),
@@ -130,10 +130,10 @@ class ControllerStatus:
     command
         Report on the last command; None before the first.
     task
-        The work before the goal is pursued: ``approach`` or ``detumble``; empty: nothing.
+        The task before the goal: ``approach`` or ``detumble``; empty: none.
     ends_at_s
-        Simulated time at which the goal is to be reached, when the reference has ended and the
-        robot has settled, s; 0: not known.
+        Expected simulated time at which the goal is reached: end of the reference and settling, s;
+        0: unknown.
     """
 
     state: ControllerState
@@ -150,12 +150,12 @@ class ControllerStatus:
 
     @classmethod
     def from_values(cls, values: Mapping[str, str], message: str = "") -> ControllerStatus:
-        """Return the status of the pairs of :meth:`to_values`.
+        """Return the status from the pairs of :meth:`to_values`.
 
         Raises
         ------
         SpaceRobotError
-            The pairs are not those of a controller.
+            The pairs are not a controller's status.
         """
         command = None
         if "law" in values:
@@ -193,7 +193,8 @@ def tracking_time(states: Iterable[tuple[float, ControllerState]]) -> float | No
     Parameters
     ----------
     states
-        Time (s) and state of the controller's statuses; without either of them the result is None.
+        Time (s) and state of the controller's statuses; without a tracked state or a decision the
+        result is None.
     """
     given = list(states)
     began = [time for time, state in given if state is ControllerState.TRACKING]

@@ -1,4 +1,4 @@
-"""Errors in which a controlled robot comes to rest under a constant wrench from outside."""
+"""Steady-state errors of a controlled robot under a constant external wrench."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.rotations import matrix_from_quaternion
 
 _MAX_ROUNDING_SHARE = 1e-6
-"""Largest share of a disturbance outside of the outputs that counts as rounding."""
+"""Largest share of a disturbance outside the outputs that is considered rounding."""
 
 
 def steady_errors(
     law: ControlLaw, state: ControlState, link: str, wrench_W: npt.ArrayLike
 ) -> Array:
-    """Return the errors (m,) of the outputs in which a robot rests under a wrench on a link.
+    """Return the steady-state errors (m,) of the outputs under a wrench on a link.
 
     At rest the actuators balance the wrench: ``[f; n; tau] = -J_q^-T Q_d``, with its generalised
-    force ``Q_d = J_link' F`` (paper 4, eqs 18 and 21). With eq. (29) this takes the errors
+    force ``Q_d = J_link' F`` (paper 4, eqs 18 and 21). With eq. (29) the errors are
     ``e = -Kp^-1 J_z^-T Q_d``, with eq. (27) ``e = -Kp^-1 J_z H+^-1 Q_d``. An integral gain makes
     the error of its output zero.
 

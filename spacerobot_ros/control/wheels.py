@@ -1,8 +1,8 @@
-"""Reaction wheels as flight software: allocation of a torque, saturation, dumping, failures.
+"""Flight software of reaction wheels: torque allocation, saturation, dumping, failures.
 
-A law for base and arm wants a torque on the base of the gyrostat (:mod:`spacerobot_ros.model.
-wheels`). The wheels give as much of it as their torques and rates allow; the rest is left to the
-thrusters, if there are any.
+A law for base and arm commands a torque on the base of the gyrostat (:mod:`spacerobot_ros.model.
+wheels`). The wheels provide as much of it as their torques and rates allow; the thrusters, if any,
+provide the rest.
 """
 
 from __future__ import annotations
@@ -37,19 +37,19 @@ _DUMP_TIME = 5.0
 _DUMPED_SHARE = 0.02
 
 _DUMP_TORQUE_SHARE = 0.5
-"""Share of the thrusters' torque for dumping; control needs the other part."""
+"""Share of the thrusters' torque for dumping; control needs the rest."""
 
 _MOTION_SHARE = 0.5
-"""Share of the torque and of the momentum of wheels for references."""
+"""Share of the wheels' torque and momentum for references."""
 
 _FAILURE_TIME = 0.5
 """Time at full torque after which the response of a wheel is checked, s."""
 
 _MIN_RESPONSE_SHARE = 0.5
-"""Smallest share of the commanded impulse that an intact wheel takes up."""
+"""Smallest share of the commanded impulse that an intact wheel absorbs."""
 
 _MIN_BOUND_WIDTH = 1e-12
-"""Smallest width of the solver's bounds, N m, and the share of a torque that counts as zero."""
+"""Smallest width of the solver's bounds, N m, and the share of a torque that is considered zero."""
 
 _SMOOTHING = 1e-6
 """Weight of the torques relative to their sum, which chooses the smallest of equal allocations."""
@@ -77,8 +77,8 @@ class WheelOptions:
 class WheelAllocation:
     """Distributes a torque over wheels by least squares within bounds.
 
-    The torques solve ``min |A tau - torque|`` with ``lower <= tau <= upper``; of several solutions
-    it is the one with the smallest shares of the largest torques.
+    The torques solve ``min |A tau - torque|`` with ``lower <= tau <= upper``; if there are several
+    solutions, it is the one with the smallest shares of the largest torques.
 
     Parameters
     ----------
@@ -125,7 +125,7 @@ class WheelAllocation:
 
 
 class WheelControl:
-    """The wheels of a controlled robot: measured rates, commanded torques, and announcements.
+    """The wheels of a controlled robot: measured rates, commanded torques, and events.
 
     Parameters
     ----------
@@ -136,12 +136,12 @@ class WheelControl:
     control_period
         Time between two commands, s.
     thruster_torque
-        Largest torque of the thrusters, N m; infinite: any, zero: there are no thrusters.
+        Largest torque of the thrusters, N m; infinite: no limit, zero: there are no thrusters.
 
     Raises
     ------
     ParameterError
-        A name is that of no wheel, or momentum is to be dumped without thrusters.
+        There is no wheel with a given name, or momentum is to be dumped without thrusters.
     """
 
     def __init__(
@@ -178,18 +178,18 @@ class WheelControl:
         self.torque = np.zeros(count)
         """Commanded torques (k,) of the motors, N m."""
         self.thrust = np.zeros(6)
-        """Wrench (6,) that is left to the thrusters, N and N m."""
+        """Wrench (6,) for the thrusters, N and N m."""
         self.rates, self._omega = np.zeros(count), np.zeros(3)
         self._q, self._spins = np.zeros(0), np.zeros(count)
         self._announced = np.zeros(count)
-        """Share of its largest rate at which each wheel was last reported; zero: it was not."""
+        """Rate of each wheel when last reported, as a share of the largest; zero: not reported."""
         self.dumping = False
         """Whether momentum is being dumped."""
         self._events: list[Event] = []
         self.reset_response_check()
 
     def reset_response_check(self) -> None:
-        """Restart the check of the wheels' response: earlier commands were not obeyed."""
+        """Restart the check of the wheels' response, because earlier commands were not executed."""
         self._asked, self._answered = np.zeros(len(self.wheels)), np.zeros(len(self.wheels))
         self._known = False
 
@@ -205,7 +205,7 @@ class WheelControl:
 
     @property
     def torque_about_every_axis(self) -> float:
-        """Largest torque that the wheels in use give about every axis, N m; 0: not about all."""
+        """Largest torque that the wheels in use provide about every axis, N m; 0: not about all."""
         if self.rank < 3:
             return 0.0
         return self._allocate.within(self.wheels.torque[self._used])
@@ -215,7 +215,7 @@ class WheelControl:
     def observe(
         self, measured: ControlState | None, q: Array, qdot: Array
     ) -> tuple[ControlState | None, Array, Array]:
-        """Take a state of the robot; return that of the gyrostat."""
+        """Take a state of the robot; return the state of the gyrostat."""
         wheels = self.wheels
         self._q, self.rates = q, qdot[wheels.index]
         q, qdot = q[wheels.other], qdot[wheels.other]
@@ -228,7 +228,7 @@ class WheelControl:
         return replace(measured, q=q, qdot=qdot), q, qdot
 
     def reference(self, reference: Reference | None) -> Reference | None:
-        """Return a reference for the robot as one for the gyrostat."""
+        """Return a reference of the robot as a reference of the gyrostat."""
         if reference is None or reference.joints is None:
             return reference
         parts = (getattr(reference.joints, name) for name in ("q", "qdot", "qddot"))
@@ -236,7 +236,7 @@ class WheelControl:
         return replace(reference, joints=joints)
 
     def shape_with_wheels(self, q: Array) -> Array:
-        """Return the shape of the robot with the joints (n - k,) of the gyrostat."""
+        """Return the shape (n,) of the robot from the joints (n - k,) of the gyrostat."""
         whole = np.zeros(len(self.wheels) + len(self.wheels.other))
         whole[self.wheels.other] = q
         return whole
@@ -255,9 +255,9 @@ class WheelControl:
     # -- torques ------------------------------------------------------------------------------
 
     def command_torque(self, torque: Array) -> Array:
-        """Command torques for a wanted torque (3,) on the base, N m; return the part they give.
+        """Command wheel torques for a torque (3,) on the base, N m; return the part they provide.
 
-        The torque ``omega x A h`` of turning the spins with the base is compensated for.
+        The gyroscopic torque ``omega x A h`` of the spins is compensated for.
         """
         A = self.wheels.axes_B
         gyroscopic = cross(self._omega, A @ self.wheels.spins(self._omega, self.rates))
@@ -306,17 +306,17 @@ class WheelControl:
     # -- momentum -----------------------------------------------------------------------------
 
     def request_dump(self) -> str:
-        """Begin to dump the momentum of the wheels; return a sentence.
+        """Begin to dump the momentum of the wheels; return a message.
 
         Raises
         ------
         CommandError
-            Nothing could take it.
+            Without thrusters momentum cannot be dumped.
         """
         if not self.has_thrusters:
             raise CommandError(
-                "There are no thrusters (use_thrusters is false) that could take the momentum of "
-                "the wheels."
+                "There are no thrusters (use_thrusters is false) that could absorb the momentum "
+                "of the wheels."
             )
         if self.dumping:
             return "Momentum is being dumped already."
@@ -326,15 +326,15 @@ class WheelControl:
         return "The momentum of the wheels is dumped to the thrusters."
 
     def budget(self, q: Array, qdot: Array) -> dict[str, float]:
-        """Return the parts of the angular momentum about the centre of mass by name, N m s: see
-        :func:`momentum_budget`; of the joints (n - k,) of the gyrostat.
+        """Return the norms of the parts of :func:`momentum_budget` by name, N m s, for the joints
+        (n - k,) of the gyrostat.
         """
         parts = momentum_budget(self.wheels, self.gyrostat, self._omega, q, qdot, self.rates)
         return {name: float(np.linalg.norm(part)) for name, part in parts.items()}
 
     @property
     def shares(self) -> dict[str, float]:
-        """Rate of each wheel as a share of its largest one, by name, with its sign."""
+        """Signed rate of each wheel as a share of its largest rate, by name."""
         return dict(zip(self.wheels.names, (self.rates / self.wheels.rate).tolist(), strict=True))
 
     @property
@@ -370,7 +370,7 @@ class WheelControl:
                 self._announced[i] = 0.0
             elif share >= _SATURATED_SHARE > self._announced[i]:
                 self._announced[i] = share
-                message = f"{turns}: it is saturated, and takes no more torque in this direction."
+                message = f"{turns}: it is saturated and provides no more torque in this direction."
                 self._add(EventKind.WHEEL_SATURATED, message, 1, name)
             elif share >= options.warning_rate and not self._announced[i]:
                 self._announced[i] = share
@@ -388,10 +388,10 @@ class WheelControl:
     def _saturation_clause(self, i: int) -> str:
         """Return a clause on the time in which a wheel saturates at its present torque."""
         seconds = self.time_to_saturation(i)
-        return f", and is saturated in {seconds:.3g} s" if math.isfinite(seconds) else ""
+        return f", and will saturate in {seconds:.3g} s" if math.isfinite(seconds) else ""
 
     def time_to_saturation(self, i: int) -> float:
-        """Return the time in which wheel i reaches its largest rate at its torque, s."""
+        """Return the time until wheel i reaches its largest rate at its present torque, s."""
         tau, wheels = self.torque[i], self.wheels
         if tau == 0.0:
             return math.inf
@@ -418,8 +418,8 @@ class WheelControl:
         self._allocate = self._make_allocation()
         left = ", and thrusters" if self.has_thrusters else ""
         message = (
-            f"Wheel '{name}' took {answered:.3g} of {asked:.3g} N m s, and is out of use: "
-            f"{np.count_nonzero(self._used)} wheel(s){left} are left."
+            f"Wheel '{name}' absorbed {answered:.3g} of {asked:.3g} N m s and is out of use: "
+            f"{np.count_nonzero(self._used)} wheel(s){left} remain."
         )
         self._add(EventKind.WHEEL_FAILED, message, 1, name)
 
@@ -443,8 +443,9 @@ def momentum_budget(
     """Return the parts (3,) of the angular momentum about the centre of mass by name, N m s, base
     components.
 
-    ``base`` is that of the gyrostat turning with the base, its joints at rest; ``arm`` is that of
-    its joints (q, qdot: (n - k,)) with the base at rest; ``wheels`` is ``A h``; ``sum`` their sum.
+    ``base`` is that of the gyrostat rotating with the base, its joints at rest; ``arm`` is that of
+    the gyrostat's joints (q, qdot: (n - k,)) with the base at rest; ``wheels`` is ``A h``; ``sum``
+    their sum.
     """
     H = gyrostat.inertia_matrix(q)
     parts = {

@@ -1,8 +1,8 @@
-"""Actuators of a plant: thrusters and actuator faults around the rigid-body dynamics; disturbances.
+"""Actuators of a plant: thrusters, actuator faults and disturbances.
 
-:func:`build_plant` makes the plant of a configuration: :class:`.VelocityPlant` or
-:class:`.EffortPlant`, within a :class:`.CapturePlant` if there is a target, within a
-:class:`ThrusterPlant` if thrusters are modelled, within a :class:`PlantWithFaults`.
+:func:`build_plant` builds the plant of a configuration: a :class:`.VelocityPlant` or
+:class:`.EffortPlant`, wrapped in a :class:`.CapturePlant` if there is a target, in a
+:class:`ThrusterPlant` if thrusters are modelled, and in a :class:`PlantWithFaults`.
 """
 
 from __future__ import annotations
@@ -36,20 +36,20 @@ from spacerobot_ros.simulation.plant import InitialState, Plant, WrappedPlant
 from spacerobot_ros.simulation.velocity_plant import VelocityPlant
 
 _FAULT_TIME_ROUNDING = 1e-6
-"""Rounding error allowed in the time of a fault, share of a tick."""
+"""Allowed rounding error in the time of a fault, as a share of a tick."""
 
 _MIN_STEP = 1e-5
 """Shortest Runge-Kutta step, s; shorter steps add more rounding than accuracy."""
 
 _MAX_STEPS_PER_TICK = 1e6
-"""Largest number of Runge-Kutta steps in a tick: more take minutes."""
+"""Largest number of Runge-Kutta steps in a tick; more would take minutes."""
 
 
 class ThrusterPlant(WrappedPlant):
     """A plant under efforts whose base wrench is realised by on/off pulses of thrusters.
 
-    The dynamics are stepped with the wrench that the thrusters really give, averaged over the
-    tick, so the momentum balance stays exact. Beside the attributes of :class:`Plant` there are
+    The dynamics are stepped with the actual wrench of the thrusters, averaged over the tick, so the
+    momentum balance stays exact. In addition to the attributes of :class:`Plant` there are
 
     ``wrench``
         (6,) mean force (N) over torque (N m) of the thrusters in the last tick, at the origin of
@@ -62,14 +62,14 @@ class ThrusterPlant(WrappedPlant):
     ``propellant``
         Total consumption, kg. It does not change the mass of the robot.
     ``unmet``, ``unmet_ticks``
-        (6,) part of the last commanded wrench that the thrusters could not give, and the number
+        (6,) part of the last commanded wrench that the thrusters could not produce, and the number
         of ticks with such a part.
     ``thruster_health``, ``stuck_on``
         (m,) real over nominal thrust (1 unless set), and whether a thruster is stuck open. The
-        allocation knows neither; see :meth:`exclude`.
+        allocation ignores both; see :meth:`exclude`.
     ``wrench_fault``
         Factor (6,) on the wrench of the thrusters, and wrench (6,) added to it; None: no fault. The
-        modulation does not know it.
+        modulation ignores it.
 
     Parameters
     ----------
@@ -80,12 +80,12 @@ class ThrusterPlant(WrappedPlant):
     table
         The thrusters.
     excluded
-        Names of thrusters that are out of use.
+        Names of disabled thrusters.
 
     Raises
     ------
     ParameterError
-        There is no thruster of an excluded name.
+        There is no thruster with an excluded name.
     """
 
     def __init__(
@@ -111,16 +111,16 @@ class ThrusterPlant(WrappedPlant):
 
     @property
     def missing(self) -> str:
-        """A clause on wrenches that the thrusters in use cannot give; empty: none."""
+        """Clause on wrenches that the enabled thrusters cannot produce; empty: none."""
         return self._modulator.missing
 
     @property
     def unmet_ticks(self) -> int:
-        """Number of ticks in which the thrusters could not give the whole commanded wrench."""
+        """Number of ticks in which the thrusters could not produce the whole commanded wrench."""
         return self._modulator.unmet_periods
 
     def exclude(self, name: str) -> None:
-        """Exclude a thruster; the other thrusters give its share of the wrench, if possible.
+        """Exclude a thruster; the others take over its share of the wrench if possible.
 
         Raises
         ------
@@ -130,7 +130,7 @@ class ThrusterPlant(WrappedPlant):
         self._modulator.exclude(name)
 
     def reset(self) -> None:
-        """Return to the initial state, thrusters off; totals and counters continue."""
+        """Return to the initial state with thrusters off; totals and counters continue."""
         super().reset()
         self._modulator.reset()
         self.wrench[:] = self.duty[:] = self.thrust[:] = 0.0
@@ -145,7 +145,7 @@ class ThrusterPlant(WrappedPlant):
         CommandError
             A command is not finite; the tick is not taken.
         SpaceRobotError
-            The wrapped plant refuses the tick.
+            The wrapped plant cannot take the tick.
         """
         wanted = np.broadcast_to(np.asarray(wrench, dtype=float), (6,))
         for command in (effort, wanted):
@@ -177,16 +177,17 @@ def with_thrusters(plant: Plant, control_period: float, source: str, excluded: s
     control_period
         Duration of a tick, s.
     source
-        ``urdf``: those of its URDF; the path of a YAML file; empty: returns the plant unchanged.
+        ``urdf``: the thrusters of the URDF; the path of a YAML file; empty: returns the plant
+        unchanged.
     excluded
-        Names of thrusters that are out of use, separated by spaces.
+        Names of disabled thrusters, separated by spaces.
 
     Raises
     ------
     ParameterError
-        The file or a thruster in it is refused, or an excluded thruster is unknown.
+        The file or one of its thrusters is invalid, or an excluded thruster is unknown.
     RobotDescriptionError
-        A thruster of the URDF is refused, or there is none.
+        A thruster of the URDF is invalid, or there is none.
     """
     if not source:
         return plant
@@ -202,15 +203,15 @@ def thrusters_in(plant: Plant) -> ThrusterPlant | None:
 
 
 class PlantWithFaults(WrappedPlant):
-    """A :class:`Plant` whose actuators have the faults of a timeline, and which disturbances push.
+    """A :class:`Plant` with scheduled actuator faults and disturbances.
 
-    Its state arrays are those of the wrapped plant. A reset sets back neither the time nor the
-    faults and disturbances. A tick without faults costs one comparison, and as long as there is no
-    disturbance, the plant steps without external loads.
+    Its state arrays are those of the wrapped plant. A reset keeps the time, the faults and the
+    disturbances. A tick without faults costs one comparison. Until the first disturbance, the plant
+    steps without external loads.
 
-    The command of a joint gets bias and noise added, then is scaled if the joint is slow; a stuck
-    joint is held in place (:meth:`Plant.hold`). Faults of the wrench act on the commanded wrench,
-    or on that of the thrusters if these are modelled.
+    Bias and noise are added to the command of a joint, which is then scaled if the joint is slow; a
+    stuck joint is held in place (:meth:`Plant.hold`). Wrench faults act on the commanded wrench, or
+    on the thrusters' wrench if thrusters are modelled.
 
     Parameters
     ----------
@@ -227,7 +228,7 @@ class PlantWithFaults(WrappedPlant):
     disturbances
         The disturbances, one per line (:func:`.parse_disturbance`).
     surroundings
-        Loads that act in the whole flight, of an orbit or a table; None: none.
+        Loads of an orbit or a table, which act during the whole flight; None: none.
 
     Raises
     ------
@@ -249,13 +250,13 @@ class PlantWithFaults(WrappedPlant):
         super().__init__(plant)
         self._thrusters = thrusters_in(plant)
         self.capturing = capture_in(plant)
-        """The target, and what captures it; None: there is no target."""
+        """The plant that captures the target; None: there is no target."""
         nozzles = self._thrusters.table.names if self._thrusters is not None else ()
         self.timeline = fault_timeline(
             faults, FaultTargets(plant.robot.joint_names, wrench, nozzles)
         )
         self.takes_wrench = wrench
-        """Whether a step takes a wrench on the base beside the joint commands."""
+        """Whether a step takes a base wrench in addition to the joint commands."""
         self.tick = 0
         """Ticks since the beginning."""
         self.step: Callable[..., bool] = self._step
@@ -273,7 +274,7 @@ class PlantWithFaults(WrappedPlant):
         self.injected: tuple[Fault | Disturbance, ...] = ()
         """Active faults and disturbances; a new tuple object after every change."""
         self.loads: PlantLoads | None = None
-        """External loads; None: there never were any."""
+        """External loads; None: there have been none so far."""
         self._disturbances = disturbance_timeline(disturbances, self.robot.link_names)
         self._surroundings = surroundings or Surroundings()
         if self._disturbances.entries or self._surroundings.has_loads:
@@ -316,7 +317,7 @@ class PlantWithFaults(WrappedPlant):
         self._apply_active_disturbances()
 
     def succeed(self, before: PlantWithFaults) -> None:
-        """Go on with the time, faults and disturbances of the plant of the robot so far."""
+        """Take over the time, faults and disturbances of the robot's previous plant."""
         self.tick = before.tick
         self.timeline.copy_from(before.timeline)
         self._disturbances.copy_from(before._disturbances)
@@ -464,13 +465,13 @@ def build_plant(
     config
         The parameters of the plant.
     initial
-        Initial state instead of the configuration's.
+        Initial state, if not the configuration's.
 
     Raises
     ------
     ParameterError
         The integration step is too short, or the initial state, the target, a thruster, a fault or
-        a disturbance is refused.
+        a disturbance is invalid.
     """
     config = config.decided()
     kind, step = PLANTS[config.actuation], config.integration_step

@@ -1,9 +1,9 @@
-"""A target that floats beside the robot, and its capture: an inelastic impact, then one body.
+"""A free-floating target and its capture: an inelastic impact, then one body.
 
-Until the capture robot and target move by themselves, each with its own momenta. The
+Until the capture, robot and target move independently, each with its own momenta. The
 capture (:mod:`spacerobot_ros.model.grasp`) takes place between two ticks. After it the plant
 integrates the joined robot, whose momenta are the sum of both: no rounding of the impact changes
-them. A release parts them where they are, each with the velocity that it has.
+them. A release separates both without changing their poses and velocities.
 """
 
 from __future__ import annotations
@@ -49,12 +49,12 @@ _GENERIC_POSE = Pose(matrix_from_quaternion(unit_quaternion([0.1, 0.2, 0.3, 0.9]
 
 
 def load_target(config: TargetConfig) -> RobotDescription | None:
-    """Return the target of a configuration; None: it names none.
+    """Return the target of a configuration; None: it has none.
 
     Raises
     ------
     ParameterError
-        There is no such file; the target or the positions of its joints are refused.
+        The file does not exist, or the target or its joint positions are invalid.
     """
     if not config.given:
         return None
@@ -75,8 +75,8 @@ def load_target(config: TargetConfig) -> RobotDescription | None:
 
 
 def target_parameters(text: str) -> dict[str, Any]:
-    """Return the plant's parameters that give the target by the URDF text of a loaded one, whose
-    joints are held already.
+    """Return the plant's parameters for a target from the URDF text of a loaded target, whose
+    joints are already held.
     """
     return {"target.robot_description": text, "target.joint_positions": []}
 
@@ -122,7 +122,7 @@ class Target:
         self._plant = VelocityPlant(self._model, period, self._start(self._initial), step)
         self.pose, self.twist = self._plant.pose, self._plant.twist
         self.loads: PlantLoads | None = None
-        """External loads on it; None: none."""
+        """External loads on the target; None: none."""
         self._clock: PlantLoads | None = None
 
     @property
@@ -140,18 +140,18 @@ class Target:
         self.release(self._initial)
 
     def release(self, motion: BodyMotion) -> None:
-        """Float freely from this motion on."""
+        """Float freely from a given motion."""
         self._plant.initial = self._start(motion)
         self._plant.reset()
 
     def load(self, loads: PlantLoads) -> None:
-        """Feel the surroundings of the robot's loads from now on, at their time; wrenches on the
+        """Apply the surroundings of the robot's loads from now on, at their time; wrenches on the
         robot's links do not act on the target.
 
         Raises
         ------
         ParameterError
-            It would not stay on the table.
+            The target would not stay on the table.
         """
         loads.surroundings.require_flat(self.description.name, self.motion, self.inertia)
         if loads.surroundings.has_loads:
@@ -206,12 +206,12 @@ class CaptureReport:
         Linear over angular momentum (6,) of robot and target, about their common centre of mass,
         in W.
     residual
-        Relative difference between these momenta and those summed over the joined bodies after
-        the impact.
+        Relative difference between these momenta and their sum over the joined bodies after the
+        impact.
     requested
-        Whether it was requested, not automatic.
+        Whether the capture was requested, not automatic.
     joint_names, joint_impulse_limit
-        The joints, and the largest joint impulse that they stand, N m s or N s; 0: any.
+        The joints, and the largest permissible joint impulse, N m s or N s; 0: no limit.
     """
 
     impact: GraspImpact
@@ -242,7 +242,7 @@ class CaptureReport:
         }
 
     def event(self, time_s: float) -> Event:
-        """Return the event of the capture; a warning if a joint impulse is beyond its limit."""
+        """Return the event of the capture; it is a warning if a joint impulse exceeds its limit."""
         impact, limit = self.impact, self.joint_impulse_limit
         force, moment = np.linalg.norm(impact.impulse[:3]), np.linalg.norm(impact.impulse[3:])
         message = (
@@ -263,7 +263,7 @@ class CaptureReport:
 
 @dataclass(frozen=True)
 class ReleaseReport:
-    """A release: the target's velocity (3,), m/s, and rate (3,), rad/s, in W."""
+    """The target's velocity (3,), m/s, and rate (3,), rad/s, in W at a release."""
 
     velocity: Array
     rate: Array
@@ -280,9 +280,9 @@ class ReleaseReport:
 
 
 def capture_values(about: Mapping[str, str]) -> dict[str, Any]:
-    """Return :meth:`CaptureReport.to_values` from the facts of its event; empty: they are others.
+    """Return :meth:`CaptureReport.to_values` from the data of its event; empty: of another event.
 
-    Numbers survive to the last bit.
+    Numbers are restored exactly.
     """
     try:
         return {name: json.loads(text) for name, text in about.items()}
@@ -291,10 +291,10 @@ def capture_values(about: Mapping[str, str]) -> dict[str, Any]:
 
 
 class CapturePlant(WrappedPlant):
-    """A plant beside a target, which it can capture and release.
+    """A plant with a target, which it can capture and release.
 
-    The state arrays are its own: those of the robot, alone or joined with the target, are copied
-    into them after each tick. Links, joints and commands stay the same.
+    It has its own state arrays: the robot's state, alone or joined with the target, is copied into
+    them after each tick. Links, joints and commands stay the same.
 
     Attributes
     ----------
@@ -303,16 +303,16 @@ class CapturePlant(WrappedPlant):
     target_pose
         (7,) position (m) and quaternion (x, y, z, w) of its root link in W.
     target_twist
-        (6,) its velocity (m/s) and angular velocity (rad/s), in its own frame.
+        (6,) velocity (m/s) and angular velocity (rad/s) of that link, in its frame.
     payload
         The held target; None: it floats freely.
     reports
-        Captures and releases since the owner emptied the list.
+        Captures and releases since the owner cleared the list.
 
     Parameters
     ----------
     build
-        Builds the dynamics of a robot in an initial state.
+        Builds the plant of a robot from an initial state.
     robot, initial
         The robot alone, and its initial state.
     target
@@ -323,7 +323,7 @@ class CapturePlant(WrappedPlant):
     Raises
     ------
     ParameterError
-        The robot has no end-effector, or the initial state is refused.
+        The robot has no end-effector, or the initial state is invalid.
     """
 
     def __init__(
@@ -354,7 +354,7 @@ class CapturePlant(WrappedPlant):
         self._changed: RobotMotion | None = None
         """The motion after a capture or a release, until the next tick."""
         self._ready = True
-        """Whether an automatic capture is due as soon as its conditions hold."""
+        """Whether an automatic capture takes place as soon as its conditions hold."""
         self._compile(initial)
 
     def _compile(self, initial: InitialState) -> None:
@@ -369,7 +369,7 @@ class CapturePlant(WrappedPlant):
 
     @property
     def present_robot(self) -> SpaceRobot:
-        """The robot that is integrated: alone, or with the mass properties of the target."""
+        """The integrated robot: alone, or with the mass properties of the target."""
         return self.plant.robot
 
     @property
@@ -380,7 +380,7 @@ class CapturePlant(WrappedPlant):
 
     @property
     def expected_momenta(self) -> Array:
-        """Linear over angular momentum (6,) in W: from the beginning, and by all impulses."""
+        """Linear over angular momentum (6,) in W: the initial one plus all impulses."""
         return self._momenta
 
     def hold(self, joints: Flags) -> None:
@@ -389,8 +389,8 @@ class CapturePlant(WrappedPlant):
         self.plant.hold(joints)
 
     def load(self, loads: PlantLoads) -> None:
-        """Step under external loads on the robot from now on, whether it holds the target or not;
-        their numbers may change before each step. A free target feels their surroundings.
+        """Apply external loads on the robot from now on, whether it holds the target or not; their
+        values may change before each step. Surroundings also act on a free target.
         """
         self._loads = loads
         self.target.load(loads)
@@ -407,12 +407,12 @@ class CapturePlant(WrappedPlant):
         self._update()
 
     def resume(self, state: InitialState, payload: Payload | None, body: BodyMotion) -> None:
-        """Go on from a later state of a flight.
+        """Continue from a later state of a flight.
 
         Parameters
         ----------
         state
-            State of the robot; its momenta are those of robot and held body together.
+            State of the robot; its momenta include the held body.
         payload
             The body that the robot holds; None: the target floats freely.
         body
@@ -421,7 +421,7 @@ class CapturePlant(WrappedPlant):
         Raises
         ------
         ParameterError
-            Another link holds the body, or the state is not one of this robot.
+            Another link holds the body, or the state does not fit this robot.
         """
         robot = self._alone.robot
         if payload is not None and payload.link != self.link:
@@ -453,8 +453,8 @@ class CapturePlant(WrappedPlant):
         self._continue(robot, motion, momenta)
 
     def step(self, *commands: Any) -> bool:
-        """Advance a tick under the commands of the robot; first capture the target if that is
-        automatic and possible. Returns whether a joint was limited.
+        """Advance a tick under the robot's commands; before it, capture the target if captures are
+        automatic and the conditions hold. Returns whether a joint was limited.
         """
         if self._config.mode == "automatic" and self.payload is None:
             far = self._distance() > self._config.distance
@@ -489,7 +489,7 @@ class CapturePlant(WrappedPlant):
         Raises
         ------
         CommandError
-            It is held already, or too far away or too fast; the message says by how much.
+            The target is already held, too far away or too fast; the message states the excess.
         """
         if self.payload is not None:
             raise CommandError(
@@ -510,7 +510,7 @@ class CapturePlant(WrappedPlant):
             Nothing is held.
         """
         if self.payload is None:
-            raise CommandError(f"'{self.link}' holds nothing that could be released.")
+            raise CommandError(f"'{self.link}' holds no target to release.")
         motion, body, robot = self._motion(), self._body(), self._alone.robot
         # The target takes its share of the momenta along, the robot keeps the rest.
         self.target.release(body)
@@ -613,7 +613,7 @@ class CapturePlant(WrappedPlant):
 
 
 def capture_in(plant: Plant) -> CapturePlant | None:
-    """Return the part of a plant that captures, looking through its wrappers; None: no target."""
+    """Return the capturing part of a plant, looking through its wrappers; None: no target."""
     while isinstance(plant, WrappedPlant) and not isinstance(plant, CapturePlant):
         plant = plant.plant
     return plant if isinstance(plant, CapturePlant) else None

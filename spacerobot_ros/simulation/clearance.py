@@ -1,7 +1,6 @@
 """The clearance of a plant in flight: the smallest distance of its links, and their contacts.
 
-An exact plant integrates the motion of bodies that do not push each other: it continues through a
-contact, and reports that it does.
+An exact plant has no contact forces: it continues through a contact, and reports this.
 """
 
 from __future__ import annotations
@@ -33,17 +32,17 @@ _LOG = logging.getLogger(__name__)
 _OK, _ERROR = 0, 2
 
 _OBSTACLE = "obstacle"
-"""Value of the key ``second_is`` where the second of a pair is an obstacle."""
+"""Value of the key ``second_is`` if the second of a pair is an obstacle."""
 
 
 @dataclass(frozen=True)
 class ClearanceStatus:
-    """The smallest distance between two links at one time, as on the topic ``clearance``.
+    """The smallest distance between two links at one time, as published on ``clearance``.
 
     Attributes
     ----------
     distance
-        m; negative if the links touch: the depth of the contact.
+        m; if the links touch, the negative depth of the contact.
     links
         The two links.
     time_s
@@ -81,7 +80,7 @@ class ClearanceStatus:
         Raises
         ------
         SpaceRobotError
-            They are not those of a clearance.
+            The pairs are not a clearance status.
         """
         with _FORMAT.reading():
             kind = ObstaclePair if values.get("second_is") == _OBSTACLE else LinkPair
@@ -102,11 +101,11 @@ class ClearanceMonitor:
     Parameters
     ----------
     geometry
-        The solids of the robot, with at least one pair, and exact distances.
+        The robot's solids, with at least one pair and exact distances.
     links
         The links in the order of the poses.
     has_contact_forces
-        Whether bodies that touch push each other, as the events say.
+        Whether bodies in contact push each other, for the text of events.
     """
 
     def __init__(
@@ -132,11 +131,11 @@ class ClearanceMonitor:
         capturing: CapturePlant | None = None,
         has_contact_forces: bool = False,
     ) -> ClearanceMonitor | None:
-        """Return the monitor of a robot; None: none of its links could touch.
+        """Return the monitor of a robot; None: no links can touch.
 
-        ``before`` is that among other obstacles, whose contacts continue or end. The target of
-        ``capturing``, while it is free, is to be touched by the body of the end-effector alone.
-        It is None, too, where the package coal is not installed, which the log says.
+        ``before`` is the monitor for earlier obstacles, whose contacts continue or end. While the
+        target of ``capturing`` is free, only the body of the end-effector may touch it. If the
+        package coal is not installed, the result is None, and a warning is logged.
         """
         geometry = CollisionGeometry(robot)
         if not len(geometry.pairs):
@@ -191,11 +190,11 @@ class ClearanceMonitor:
 
     @property
     def contacts(self) -> tuple[str, ...]:
-        """The links that touch in the last state, as a status of the plant has them."""
+        """The links that touch in the last state, as in the plant's status."""
         return tuple(sorted(each.subject for each in self.touching))
 
     def _begun(self, links: LinkPair, time_s: float) -> Event:
-        then = "push each other" if self._pushing else "the simulation goes on through the contact"
+        then = "push each other" if self._pushing else "the simulation continues through contact"
         joint = " and" if self._pushing else ";"
         message = f"{_subject(links)} touch{joint} {then}."
         return Event(EventKind.CONTACT, message, _ERROR, time_s, about=_names(links))

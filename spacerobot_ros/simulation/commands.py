@@ -1,9 +1,9 @@
 """Validation of commands: the rules by which a plant accepts them, for its node and for bags.
 
-A command comes from a *source* (one topic) with a stamp and values, and answers the state of that
-stamp. In lockstep the command of a tick is the first one that is stamped with it; a refused one
-makes it a tick at rest. In real time a command answers any state that was published lately, and
-holds until it is older than the timeout; only one publisher may command.
+A command comes from a *source* (one topic) with a stamp and values; the stamp is that of a state.
+In lockstep the command of a tick is the first one with its stamp; if it is refused, the tick is
+taken at rest. In real time a command may carry the stamp of any recent state, and remains in force
+until the timeout; only one publisher may command.
 """
 
 from __future__ import annotations
@@ -27,24 +27,22 @@ from spacerobot_ros.simulation.plant import Plant
 from spacerobot_ros.times import SECOND
 
 NO_STAMP = -math.inf
-"""The stamp that stands for a missing command."""
+"""The stamp that represents a missing command."""
 
 
 _START_TIME = 1.0
-"""Time after the start during which a stamp of zero means the first state, without a timeout, s."""
+"""Time after the start in which a zero stamp means the first state, if there is no timeout, s."""
 
 _STAMP_ROUNDING = 1_000
 """Allowed rounding error of stamps, from commanders with floating-point time, ns."""
 
-_OUTDATED_STATE_CLAUSE = (
-    "it answers a state that is older than the last start, reset or stop of the plant"
-)
+_OUTDATED_STATE_CLAUSE = "it is for a state before the last start, reset or stop of the plant"
 
 _BRAKING_RATE = 20.0
 """Joint rates decay as exp(-20 t/s) while the motors are strong enough."""
 
 _MAX_RATE_PER_TICK = 0.5
-"""A held effort must not stop a joint in less than two ticks: it would swing back."""
+"""A held effort must not stop a joint in less than two ticks, or the joint would swing back."""
 
 Quantity = Literal["velocity", "effort", "wrench"]
 
@@ -64,9 +62,9 @@ class Reason(str, Enum):
     """Stamped before the command that is in force."""
     BEYOND_LIMITS = "beyond_limits"
     SECOND_COMMANDER = "second_commander"
-    """Another commander has answered the same state."""
+    """Another node has already commanded for the same state."""
     LATCHED = "latched"
-    """A fault is latched: nothing moves until it is rearmed."""
+    """A fault is latched: nothing moves until the plant is rearmed."""
 
 
 @dataclass(frozen=True)
@@ -80,7 +78,7 @@ class Refusal:
     clause
         The reason in words, with numbers and names; it completes "the command was refused:".
     latches
-        Whether it has latched a fault: nothing moves until the plant is rearmed.
+        Whether the refusal has latched a fault: nothing moves until the plant is rearmed.
     """
 
     reason: Reason
@@ -96,7 +94,7 @@ def joint_order(joints: Sequence[str], named: Sequence[str]) -> npt.NDArray[np.i
     joints
         Names of the robot's joints.
     named
-        Names in the message: all joints, in any order.
+        Names in the message: every joint, in any order.
 
     Raises
     ------
@@ -116,29 +114,29 @@ def joint_order(joints: Sequence[str], named: Sequence[str]) -> npt.NDArray[np.i
 
 
 def require_values(named: Sequence[str], quantity: str, count: int) -> None:
-    """Check that a message has as many values as joints.
+    """Check that a message has one value per joint.
 
     Raises
     ------
     CommandError
-        It has another number of values.
+        The number of values differs.
     """
     if count != len(named):
         raise CommandError(f"{len(named)} joint(s) are named but {count} {quantity} value(s) given")
 
 
 def require_frame(frame: str, base_link: str, prefix: str = "") -> None:
-    """Check that a wrench is in the frame of the base link; an empty name is that frame.
+    """Check that a wrench is in the frame of the base link; an empty name means that frame.
 
     The name may have the prefix of the robot's frames.
 
     Raises
     ------
     CommandError
-        It is in another frame.
+        The wrench is in another frame.
     """
     if frame not in ("", base_link, prefix + base_link):
-        raise CommandError(f"the wrench is in frame '{frame}'; it is taken in '{base_link}'")
+        raise CommandError(f"the wrench is in frame '{frame}'; it must be in '{base_link}'")
 
 
 class CommandSource:
@@ -153,8 +151,8 @@ class CommandSource:
     limits
         (size,) largest magnitude of each value.
     kept
-        Indices of the values that stay in force where a command is revoked: the rates of reaction
-        wheels, because stopping them would turn the base.
+        Indices of the values that stay in force if a command is revoked: the rates of reaction
+        wheels, because stopping them would rotate the base.
     command
         (size,) command in force: of the joints (m/s, rad/s, N or N m), or force (N) over torque
         (N m) at the origin of the base link, base components.
@@ -221,7 +219,7 @@ class CommandValidator:
         robot = plant.robot
         kept = ReactionWheels.of(robot.description).index
         self.sources = [CommandSource("joint_commands", "velocity", robot.velocity_limit, kept)]
-        """Sources in the order of the arguments of a step: the joints' first."""
+        """Sources in the order of the arguments of a step: joints first."""
         self._brakes: _JointBrakes | None = None
         if config.actuation == "effort":
             self.sources = [
@@ -242,16 +240,16 @@ class CommandValidator:
         self.fault = ""
         """The latched fault, as a clause; empty: none."""
         self.fault_reason = ""
-        """Its word: the value of a :class:`Reason`, ``abort``, or ``watchdog``."""
+        """Reason of that fault: the value of a :class:`Reason`, ``abort``, or ``watchdog``."""
         self.timed_out = False
-        """Whether the last command was revoked because of its age."""
+        """Whether the last command was revoked because it was too old."""
         self.timeouts = 0
         """Number of such revocations."""
         self.last_stamp_ns: float = NO_STAMP
-        """Stamp of the command before the latest one."""
+        """Stamp of the last command before the latest timeout."""
 
     def succeed(self, before: CommandValidator) -> None:
-        """Go on with the faults and counts of the validator of the same plant so far."""
+        """Take over the faults and counts of the plant's previous validator."""
         self.counts, self.timeouts = before.counts, before.timeouts
         self.fault, self.fault_reason = before.fault, before.fault_reason
         self.last_stamp_ns, self._earliest = before.last_stamp_ns, before._earliest
@@ -323,7 +321,7 @@ class CommandValidator:
         return refusal
 
     def unreadable(self, source: CommandSource, error: CommandError, now_ns: int) -> Refusal:
-        """Refuse bytes that are not a message; without a stamp the bytes answer no tick."""
+        """Refuse bytes that are not a message; they have no stamp and so belong to no tick."""
         return self._refuse(source, Refusal(Reason.MALFORMED, str(error)), now_ns)
 
     def begin_step(self) -> list[Array]:
@@ -335,12 +333,12 @@ class CommandValidator:
         return self._commands
 
     def revoke_before(self, now_ns: int) -> None:
-        """Revoke all commands, and accept only answers to states stamped ``now_ns`` or later."""
+        """Revoke all commands, and accept only commands stamped ``now_ns`` or later."""
         self.rest()
         self._earliest = now_ns
 
     def reset(self, now_ns: int) -> None:
-        """Begin again (:meth:`revoke_before`) with a plant whose wheels rest, as initially."""
+        """Restart (:meth:`revoke_before`) with the plant's wheels at rest, as initially."""
         for source in self.sources:
             source.command[:] = 0.0
         self.revoke_before(now_ns)
@@ -353,14 +351,15 @@ class CommandValidator:
             source.arrived = False
 
     def latch(self, reason: str, clause: str, now_ns: int) -> None:
-        """Bring everything to rest until :meth:`rearm`; of several faults the first is shown.
+        """Bring everything to rest until :meth:`rearm`; if there are several faults, the first is
+        reported.
 
-        Commands that answer a state from before the fault are refused even after that.
+        Commands for states before the fault are refused even after :meth:`rearm`.
 
         Parameters
         ----------
         reason
-            A word: the value of a :class:`Reason`, ``abort`` or ``watchdog``.
+            The value of a :class:`Reason`, ``abort`` or ``watchdog``.
         clause
             The fault in words; it completes "a fault is latched:".
         now_ns
@@ -442,7 +441,7 @@ class CommandValidator:
         if late == 0 and source.commanders > 1 and self._one_commander:
             return Refusal(
                 Reason.SECOND_COMMANDER,
-                f"the same state was answered before, and {source.commanders} nodes command",
+                f"a command for the same state is in force, and {source.commanders} nodes command",
             )
         return None
 
@@ -493,8 +492,7 @@ class _JointBrakes:
     def efforts(self) -> Array:
         """Return the efforts (n,) of the next tick, N or N m, before limits.
 
-        The rows of the joints in ``H+ z0ddot + C+ = Q`` (paper 4, eq. 19), with those of the base
-        inserted.
+        The joint rows of ``H+ z0ddot + C+ = Q`` (paper 4, eq. 19), with the base rows inserted.
         """
         q, qdot = self._plant.q[self._braked], self._plant.qdot[self._braked]
         (H,), (C,) = self._inertia(q), self._bias(q, np.zeros(3), self._plant.twist[3:], qdot)

@@ -17,7 +17,7 @@ _MAX_INITIAL_VALUE = 1e9
 """Largest quantity of an initial state, and longest time, SI."""
 
 _CONTACT_PERIOD = 0.1
-"""Longest simulated time between two looks at contacts, s."""
+"""Longest simulated time between two contact checks, s."""
 
 
 def period_ns(tick_rate: float) -> int:
@@ -60,9 +60,9 @@ class SensorConfig:
     """Errors of the sensors: 1 sigma of their noise, their biases, and the seed."""
 
     position_noise: float = _noise("1 sigma an axis of odom, in world", "m")
-    attitude_noise: float = _noise("likewise, a rotation vector in base", "rad")
-    velocity_noise: float = _noise("likewise, of the twist", "m/s")
-    angular_velocity_noise: float = _noise("likewise", "rad/s")
+    attitude_noise: float = _noise("1 sigma an axis, of a rotation vector in base", "rad")
+    velocity_noise: float = _noise("1 sigma an axis of the velocity", "m/s")
+    angular_velocity_noise: float = _noise("1 sigma an axis of the angular velocity", "rad/s")
     joint_noise: float = _noise("1 sigma of every joint position", "m or rad")
     joint_rate_noise: float = _noise("of every joint velocity", "m/s or rad/s")
     position_bias: tuple[float, ...] = _bias("of odom, in world", "m")
@@ -77,14 +77,14 @@ class TargetSensorConfig:
 
     position_noise: float = _noise("1 sigma an axis of target/odom", "m")
     attitude_noise: float = _noise(
-        "likewise, a rotation vector in the frame of its root link", "rad"
+        "1 sigma an axis, of a rotation vector in the frame of its root link", "rad"
     )
-    velocity_noise: float = _noise("likewise, of the twist", "m/s")
-    angular_velocity_noise: float = _noise("likewise", "rad/s")
+    velocity_noise: float = _noise("1 sigma an axis of the velocity", "m/s")
+    angular_velocity_noise: float = _noise("1 sigma an axis of the angular velocity", "rad/s")
     position_bias: tuple[float, ...] = _bias(
         "of target/odom, in the rotating frame of the root link", "m"
     )
-    attitude_bias: tuple[float, ...] = _bias("likewise, a rotation vector", "rad")
+    attitude_bias: tuple[float, ...] = _bias("rotation vector in the same frame", "rad")
     delay: float = nonnegative(
         0.0, "age of the state that target/odom carries, in whole ticks", "s", maximum=60.0
     )
@@ -101,7 +101,7 @@ class TargetSensorConfig:
 
 @dataclass(frozen=True)
 class TargetConfig:
-    """A body that floats beside the robot: its URDF, its grapple frame and its initial state."""
+    """A free-floating target: its URDF, its grapple frame and its initial state."""
 
     robot: str = parameter("", "URDF file of the target, whose joints are locked; '': no target")
     robot_description: str = parameter(
@@ -117,7 +117,7 @@ class TargetConfig:
     position: tuple[float, ...] = _initial(
         "initial position of the target's root link in the world", "m"
     )
-    orientation: tuple[float, ...] = _orientation("likewise, quaternion x, y, z, w")
+    orientation: tuple[float, ...] = _orientation("its initial quaternion x, y, z, w in the world")
     velocity: tuple[float, ...] = _initial("of the origin of its root link, in world", "m/s")
     angular_velocity: tuple[float, ...] = _initial("in world", "rad/s")
 
@@ -131,12 +131,12 @@ class TargetConfig:
 
 @dataclass(frozen=True)
 class CaptureConfig:
-    """When the target is captured: on request or automatically, within these bounds."""
+    """Conditions of a capture: on request or automatic, within these bounds."""
 
     mode: str = parameter(
         "manual",
-        "manual: the service ~/capture captures the target; automatic: the plant does as soon as "
-        "possible",
+        "manual: the service ~/capture captures the target; automatic: the plant captures it as "
+        "soon as possible",
         choices=("manual", "automatic"),
     )
     end_effector: str = parameter(
@@ -150,15 +150,14 @@ class CaptureConfig:
     rate: float = nonnegative(0.1, "largest rate of rotation of one relative to the other", "rad/s")
     joint_impulse_limit: float = nonnegative(
         0.0,
-        "impulse of the capture along a joint's coordinate beyond which its event is a warning; 0: "
-        "none",
+        "joint impulse of the capture beyond which its event is a warning; 0: none",
         "N m s or N s",
     )
 
 
 @dataclass(frozen=True)
 class OrbitConfig:
-    """A circular orbit, on which the origin of the world frame falls freely."""
+    """A circular orbit, on which the origin of the world frame is in free fall."""
 
     altitude: float = nonnegative(
         0.0,
@@ -190,7 +189,7 @@ class TableConfig:
     gravity: float = nonnegative(9.80665, "acceleration of gravity", "m/s^2", maximum=1000.0)
     friction: float = nonnegative(
         0.0,
-        "viscous friction of the bearings: force on every body over its momentum",
+        "viscous friction of the bearings: force on a body divided by its momentum",
         "1/s",
         maximum=1000.0,
     )
@@ -202,7 +201,7 @@ class PlantConfig(WatchdogConfig, RobotConfig):
 
     actuation: str = parameter(
         "auto",
-        "type of joint_commands; auto: that of the first command that moves anything",
+        "type of joint_commands; auto: the type of the first command that moves anything",
         choices=("auto", "velocity", "effort"),
     )
     engine: str = parameter(
@@ -288,7 +287,7 @@ class PlantConfig(WatchdogConfig, RobotConfig):
         "by joint order of the URDF; []: zero", "m or rad", (), length=None
     )
     initial_joint_velocities: tuple[float, ...] = _initial(
-        "likewise, under efforts; []: zero", "m/s or rad/s", (), length=None
+        "by joint order, under efforts; []: zero", "m/s or rad/s", (), length=None
     )
     initial_center_of_mass: tuple[float, ...] = _initial(
         "of the system in the world, instead of initial_position", "m", ()
@@ -315,8 +314,8 @@ class PlantConfig(WatchdogConfig, RobotConfig):
     def decided(self, actuation: str = "") -> PlantConfig:
         """Return the configuration with an actuation instead of ``auto``.
 
-        ``actuation`` is what commands carry; empty: velocities, unless thrusters or moving joints
-        need efforts.
+        ``actuation`` is the type of the commands; empty: velocities, unless thrusters or moving
+        joints need efforts.
         """
         if self.actuation != "auto":
             return self
@@ -324,7 +323,7 @@ class PlantConfig(WatchdogConfig, RobotConfig):
         return replace(self, actuation=actuation or ("effort" if needs_efforts else "velocity"))
 
     def prefix_for(self, robot: RobotDescription) -> str:
-        """Return the prefix of the names of a robot's frames, so that none is the world's."""
+        """Return the prefix of a robot's frame names, so that none equals the world's."""
         taken = self.world_frame in robot.frames
         return self.frame_prefix or ("robot/" if taken else "")
 
@@ -335,16 +334,16 @@ class PlantConfig(WatchdogConfig, RobotConfig):
 
     @property
     def clearance_ticks(self) -> int:
-        """Ticks from one clearance to the next in lockstep; 0: none."""
+        """Ticks between two clearances in lockstep; 0: none."""
         return self.ticks_of(self.clearance_period)
 
     @property
     def contact_ticks(self) -> int:
-        """Ticks from one look at contacts to the next; 0: never."""
+        """Ticks between two contact checks; 0: no checks."""
         return self.ticks_of(min(self.clearance_period, _CONTACT_PERIOD))
 
     def ticks_of(self, period: float) -> int:
-        """Return the ticks of a period in s, at least one; 0: the period is 0."""
+        """Return the number of ticks in a period, s: at least one, or 0 if the period is 0."""
         return max(1, round(period * SECOND / self.period_ns)) if period else 0
 
     @property

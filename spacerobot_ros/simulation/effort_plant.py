@@ -9,14 +9,13 @@ A stop acts between the two links of its joint, along the joint's coordinate: an
 which changes neither total momentum; the other joints and the base react to it. With ``K`` the
 inertia matrix of the shape, stops do two things:
 
-* Arrival: of all rates that lead beyond no limit, ``qdot+`` is the nearest to ``qdot-`` in the
-  metric of K. The joint does not rebound; ``(qdot+ - qdot-)' K (qdot+ - qdot-) / 2`` of energy is
-  lost (Carnot). The time of arrival is found to rounding.
+* Arrival: ``qdot+`` is the nearest to ``qdot-``, in the metric of K, of all rates that exceed no
+  limit. The joint does not rebound; the energy ``(qdot+ - qdot-)' K (qdot+ - qdot-) / 2`` is lost
+  (Carnot). The time of arrival is exact up to rounding.
 * Holding: a joint on its stop stays there through an integration step if it is pushed outwards,
-  that is, if the rates nearest to ``qdot + h K^-1 Q`` that do not lead beyond a limit have it at
-  rest (Gauss's principle of least constraint over a step, Moreau's time stepping). It leaves with a
-  delay of at most one step, which ends the ever shorter hops of joints that knock each other off
-  their stops.
+  that is, if it is at rest in the admissible rates nearest to ``qdot + h K^-1 Q`` (Gauss's
+  principle of least constraint over a step, Moreau's time stepping). It leaves with a delay of at
+  most one step, which ends the ever shorter hops of joints that knock each other off their stops.
 
 A locked joint (a brake, a jam) is brought to rest by the same kind of impulse and held.
 """
@@ -44,7 +43,8 @@ BISECTIONS = 40
 """Bisections of the time of arrival: the error is 1e-12 of an integration step."""
 
 _STOP_TOLERANCE = 1e-12
-"""Distance beyond a limit at which a joint counts as outside: relative, below one in m or rad."""
+"""Distance beyond a limit at which a joint is considered outside: relative, or absolute (m or rad)
+for limits below one."""
 
 
 FAILURES = tuple(
@@ -55,8 +55,8 @@ FAILURES = tuple(
 """Reasons why :class:`JointStops` cannot advance a state."""
 
 MAX_ARRIVALS_PER_STEP = 2
-"""Largest number of arrivals at stops per joint and integration step, on average over a tick: the
-joints of a robot that commands drive around knock each other off their stops ever more often."""
+"""Largest number of arrivals at stops per joint and integration step, averaged over a tick:
+strongly driven joints knock each other off their stops ever more often."""
 
 
 class JointStops:
@@ -82,7 +82,7 @@ class JointStops:
 
     @staticmethod
     def limits(robot: SpaceRobot) -> dict[str, Array]:
-        """Return the limits (n,) of the joints, and those beyond which they count as outside."""
+        """Return the joint limits (n,), and those beyond which joints are considered outside."""
         return {
             "LOWER": robot.lower,
             "UPPER": robot.upper,
@@ -93,15 +93,15 @@ class JointStops:
     def advance(
         self, state: Array, command: Array, duration: float, locked: Flags | None = None
     ) -> tuple[Array, Flags]:
-        """Return the state after ``duration`` s under a held command, and the joints (n,) that
-        their stops have brought to rest or held.
+        """Return the state after ``duration`` s under a held command, and whether each joint (n,)
+        was stopped or held by its stop.
 
         ``locked`` (n,) joints are brought to rest at once and held at any position.
 
         Raises
         ------
         SpaceRobotError
-            The motion is no longer finite, or joints arrive at their stops without end.
+            The motion is no longer finite, or joints hit their stops without end.
         """
         x, left = state.copy(), duration
         steps = duration / self._integration_step
@@ -194,11 +194,11 @@ def stop_joints(compliance: Array, rates: Array, joints: Flags) -> tuple[Array, 
 
 
 def joints_stopped(compliance: Array, rates: Array, inward: Array, guess: Flags) -> Flags:
-    """Return the joints (n,) that their stops bring to rest, so that ``inward * rates >= 0``.
+    """Return which joints (n,) their stops bring to rest, so that ``inward * rates >= 0``.
 
     ``inward`` is 1 or -1 on a stop and 0 elsewhere. The rates after the impulses are the nearest to
-    those before in the metric of K. The linear complementarity problem is solved by Murty's
-    least-index pivoting, which ends for every positive definite K from every ``guess``.
+    the rates before in the metric of K. The linear complementarity problem is solved by Murty's
+    least-index pivoting, which terminates for every positive definite K from any ``guess``.
     """
     joints = guess.copy()
     tried: set[bytes] = set()
@@ -216,12 +216,12 @@ def joints_stopped(compliance: Array, rates: Array, inward: Array, guess: Flags)
 DEFAULT_INTEGRATION_STEP = 0.001
 """Longest Runge-Kutta step, s.
 
-With it the energy of a tumbling six-joint arm, its joints turning at several rad/s, drifts by about
-1e-12 in 100 s, relative; by 2e-10 with four times the step. A step takes some microseconds.
+With this step the energy of a tumbling six-joint arm whose joints rotate at several rad/s drifts by
+about 1e-12 in 100 s, relative; with four times the step, by 2e-10. A step takes some microseconds.
 """
 
 _MAX_FINITE_STATE = 1e100
-"""Magnitude (SI units) beyond which a state counts as diverged."""
+"""Magnitude (SI units) beyond which a state is considered diverged."""
 
 
 class EffortPlant:
@@ -248,7 +248,8 @@ class EffortPlant:
     Raises
     ------
     ParameterError
-        The initial shape has the wrong length or lies outside the joint limits, or a number is bad.
+        The initial shape has the wrong length or lies outside the joint limits, or a number is
+        invalid.
     """
 
     def __init__(
@@ -289,7 +290,7 @@ class EffortPlant:
 
     @property
     def expected_momenta(self) -> Array:
-        """Linear over angular momentum (6,) in W: from the beginning, by thrust and loads."""
+        """Linear over angular momentum (6,) in W: the initial one plus thrust and loads."""
         _, _, _, p_W, L_W, _ = state_slices(self.robot.n)
         return self._next_state[p_W.start : L_W.stop]
 
@@ -310,7 +311,7 @@ class EffortPlant:
 
     @property
     def state(self) -> Array:
-        """The state (2 n + 13,) of :mod:`spacerobot_ros.model.composite_rigid_body` now."""
+        """The present state (2 n + 13,) of :mod:`spacerobot_ros.model.composite_rigid_body`."""
         return self._next_state
 
     def place(self, state: Array) -> None:
@@ -326,7 +327,7 @@ class EffortPlant:
         self._holding = bool(joints.any())
 
     def load(self, loads: PlantLoads) -> None:
-        """Step under external loads; their numbers may change before each step."""
+        """Apply external loads; their values may change before each step."""
         robot, substeps = self.robot, self._substeps
         loaded = robot.composed(
             f"loaded_effort_tick_{substeps}",

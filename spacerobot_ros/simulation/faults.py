@@ -5,8 +5,8 @@ A fault is ``KIND TARGET [VALUE] [at SECONDS] [until SECONDS]``, for example
 values. A disturbance is a constant wrench from outside on a link,
 ``LINK [force X Y Z] [torque X Y Z] [in world|link] [at SECONDS] [until SECONDS]``, for example
 ``hand force 1 0 0 torque 0 0 0.2 in link at 10 until 50``. Force (N) and torque (N m) act at the
-origin of the link's frame, in components of the world or of the link, with which they then turn.
-Without ``at`` either begins at once, without ``until`` it never ends.
+origin of the link's frame, in components of the world or of the link; the latter rotate with the
+link. Without ``at`` a fault or disturbance begins at once, without ``until`` it never ends.
 """
 
 from __future__ import annotations
@@ -46,13 +46,13 @@ class FaultKind:
     Attributes
     ----------
     targets
-        Names of targets; ``joint`` and ``nozzle`` stand for all names of joints and thrusters.
+        Names of targets; ``joint`` and ``nozzle`` represent all joint and thruster names.
     value
-        Meaning of its number; empty: it has none.
+        Meaning of its value; empty: it has none.
     minimum, maximum
         Range of that number.
     sensor
-        Whether it changes measurements instead of the motion.
+        Whether the fault affects measurements instead of the motion.
     """
 
     targets: tuple[str, ...]
@@ -133,7 +133,7 @@ def parse_fault(line: str, targets: FaultTargets, now: float = 0.0) -> Fault:
     targets
         Targets of this plant.
     now
-        Begin of the fault if the line has none, s.
+        Start time of the fault if the line has none, s.
 
     Raises
     ------
@@ -167,10 +167,10 @@ def parse_fault(line: str, targets: FaultTargets, now: float = 0.0) -> Fault:
 
 
 def edited_fault(line: str, part: str, text: str) -> str:
-    """Return the line of a fault with another part: ``kind``, ``target``, ``value``, ``at``, or
-    ``until``.
+    """Return the line of a fault with one part replaced: ``kind``, ``target``, ``value``, ``at``,
+    or ``until``.
 
-    A kind without a value drops that of the line, and takes none.
+    If the new kind has no value, the value of the line is dropped.
     """
     kind, target, *times = line.split()
     value = [times.pop(0)] if FAULT_KINDS[kind].value else []
@@ -214,7 +214,7 @@ class Disturbance:
     """One disturbance: active from ``start`` s on and until before ``end`` s of simulated time.
 
     ``force`` (3,), N, and ``torque`` (3,), N m, act at the origin of the frame of ``link``, in
-    components of that frame where ``in_link``, else of the world.
+    components of that frame if ``in_link``, else of the world.
     """
 
     link: str
@@ -243,7 +243,7 @@ def parse_disturbance(line: str, links: Sequence[str], now: float = 0.0) -> Dist
     links
         Names of the robot's links.
     now
-        Begin of the disturbance if the line has none, s.
+        Start time of the disturbance if the line has none, s.
 
     Raises
     ------
@@ -273,7 +273,7 @@ def parse_disturbance(line: str, links: Sequence[str], now: float = 0.0) -> Dist
         in_link, rest = rest[1] == "link", rest[2:]
     start, end = parse_times(rest, f"the {given[-1]}", now, refusal)
     if start < 0.0:
-        raise refusal(f"it begins at {start:g} s, before the simulation does")
+        raise refusal(f"it begins at {start:g} s, before the simulation begins")
     return Disturbance(link, vectors["force"], vectors["torque"], in_link, start, end)
 
 
@@ -294,10 +294,10 @@ MAX_TIME = 1e9
 """Largest time in a line, s."""
 
 _MAX_ENTRIES = 1000
-"""Largest number of entries of a timeline: more take longer than a tick to search."""
+"""Largest number of entries in a timeline; searching more would take longer than a tick."""
 
 Refusal = Callable[[str], ParameterError]
-"""Returns the error that refuses a line for a reason, a clause."""
+"""Returns the error that refuses a line, given the reason as a clause."""
 
 
 class Timed(Protocol):
@@ -313,17 +313,17 @@ class Timed(Protocol):
 
 
 def line_refusal(line: str, noun: str) -> Refusal:
-    """Return the refusal of a line, which the message quotes."""
+    """Return the refusal of a line; its message quotes the line."""
     return lambda reason: ParameterError(f"The {noun} '{line.strip()[:80]}' is refused: {reason}.")
 
 
 def parse_number(text: str, refusal: Refusal) -> float:
-    """Return a finite number of a line.
+    """Return a number in a line, which must be finite.
 
     Raises
     ------
     ParameterError
-        The text is not one.
+        The text is not a finite number.
     """
     try:
         number = float(text)
@@ -337,27 +337,27 @@ def parse_number(text: str, refusal: Refusal) -> float:
 def parse_times(
     words: Sequence[str], before: str, now: float, refusal: Refusal
 ) -> tuple[float, float]:
-    """Return begin and end (s) of the last words of a line, ``[at SECONDS] [until SECONDS]``.
+    """Return start and end (s) from the last words of a line, ``[at SECONDS] [until SECONDS]``.
 
     Parameters
     ----------
     words
         The words.
     before
-        The words of the line before them, for messages.
+        The part of the line before them, for messages.
     now
-        Begin if the words name none, s.
+        Start time if the words have none, s.
     refusal
         Of the line.
 
     Raises
     ------
     ParameterError
-        The words are not times, or they end before they begin.
+        The words are not times, or the end is not after the start.
     """
     times = {"at": now, "until": math.inf}
     if words[0::2] not in ([], ["at"], ["until"], ["at", "until"]) or len(words) % 2:
-        raise refusal(f"after {before} come only 'at SECONDS' and 'until SECONDS'")
+        raise refusal(f"only 'at SECONDS' and 'until SECONDS' may follow {before}")
     for word, text in zip(words[0::2], words[1::2], strict=True):
         times[word] = parse_number(text, refusal)
         if abs(times[word]) > MAX_TIME:
@@ -371,12 +371,12 @@ _TIME = re.compile(r"\b(at|until) [\d.e+-]+")
 
 
 def with_seconds(line: str) -> str:
-    """Return the line of a fault or of a disturbance with the unit of its times, for people."""
+    """Return the line of a fault or disturbance with the unit of its times, for display."""
     return _TIME.sub(r"\g<0> s", line)
 
 
 def format_times(start: float, end: float) -> str:
-    """Return begin and end as the last words of a line."""
+    """Return start and end as the last words of a line."""
     # With six digits, an entry that is short and late would begin and end at the same time.
     until = f" until {end:.12g}" if math.isfinite(end) else ""
     return f"at {start:.12g}{until}"
@@ -393,7 +393,7 @@ class Timeline(Generic[Entry]):
     lines
         One entry per line.
     parse
-        Reads an entry from its line; the second argument is its begin if the line has none, s.
+        Reads an entry from its line; the second argument is its start time if the line has none, s.
     noun
         Name of an entry, for messages.
     """
@@ -410,7 +410,7 @@ class Timeline(Generic[Entry]):
         self.read(lines)
 
     def read(self, lines: Iterable[str], now: float = 0.0) -> None:
-        """Add an entry per line; an entry without a time begins ``now`` (s).
+        """Add one entry per line; an entry without a time begins at ``now`` (s).
 
         Raises
         ------
@@ -427,7 +427,8 @@ class Timeline(Generic[Entry]):
         self.next_change = -math.inf
 
     def inject(self, text: str, now: float) -> None:
-        """Add the entries of a text, one per line, or remove all (``clear``), future ones too.
+        """Add the entries of a text, one per line, or remove all entries (``clear``), including
+        future ones.
 
         Raises
         ------
@@ -440,7 +441,7 @@ class Timeline(Generic[Entry]):
             self.read(text.splitlines(), now)
 
     def copy_from(self, other: Timeline[Entry]) -> None:
-        """Take the entries of another timeline instead of these."""
+        """Replace the entries by those of another timeline."""
         self.entries, self.next_change = list(other.entries), -math.inf
 
     def clear(self) -> None:
@@ -449,7 +450,7 @@ class Timeline(Generic[Entry]):
         self.next_change = -math.inf
 
     def at(self, time: float) -> tuple[Entry, ...]:
-        """Return the entries that are active at a time (s), which must not run backwards."""
+        """Return the entries that are active at a time (s), which must not decrease."""
         if time >= self.next_change:
             active = tuple(each for each in self.entries if each.start <= time < each.end)
             if active != self.active:

@@ -1,4 +1,4 @@
-"""External loads of a plant as numbers, and ticks under them."""
+"""External loads of a plant as numbers, and ticks with loads."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _PLANE_TOLERANCE = 1e-9
 
 @dataclass(frozen=True)
 class Surroundings:
-    """Loads by the environment of a robot, constant during a flight.
+    """Loads from the robot's environment, constant during a flight.
 
     Attributes
     ----------
@@ -34,7 +34,7 @@ class Surroundings:
     gravity_W
         (3,) uniform acceleration, m/s^2.
     friction
-        Viscous friction of every body over its momentum, 1/s.
+        Viscous friction force on a body divided by its momentum, 1/s.
     """
 
     mean_motion: float = 0.0
@@ -49,13 +49,13 @@ class Surroundings:
         Raises
         ------
         ParameterError
-            The orbit is given twice, or its orientation is not a quaternion, or there is a table
+            The orbit is specified twice, its orientation is not a quaternion, or there is a table
             in an orbit.
         """
         if orbit.altitude and orbit.mean_motion:
             raise ParameterError(
                 f"Parameters 'orbit.altitude' ({orbit.altitude:g} m) and 'orbit.mean_motion' "
-                f"({orbit.mean_motion:g} rad/s) both give the orbit: leave one of them 0."
+                f"({orbit.mean_motion:g} rad/s) both define the orbit: set one of them to 0."
             )
         try:
             orientation = unit_quaternion(np.array(orbit.orientation))
@@ -77,7 +77,7 @@ class Surroundings:
 
     @property
     def on_table(self) -> bool:
-        """Whether a table acts: slope or friction."""
+        """Whether a table acts, by slope or friction."""
         return bool(any(self.gravity_W) or self.friction)
 
     @property
@@ -86,13 +86,13 @@ class Surroundings:
         return bool(self.mean_motion or self.on_table)
 
     def require_suitable(self, robot: SpaceRobot, quaternion_WB: Array) -> None:
-        """Refuse a robot that does not stand on the table.
+        """Refuse a robot that does not fit on the table.
 
         Raises
         ------
         ParameterError
-            The robot is not planar, or its plane is not that of the table at its attitude
-            ``quaternion_WB`` (4,).
+            The robot is not planar, or with the attitude ``quaternion_WB`` (4,) its plane is not
+            the table's.
         """
         if not self.on_table:
             return
@@ -106,7 +106,7 @@ class Surroundings:
         if np.abs(normal_W[:2]).max() > _PLANE_TOLERANCE:
             raise ParameterError(
                 f"Parameters 'table.*' are set, but the plane of robot '{robot.description.name}' "
-                "is not the x-y plane of the world: turn 'initial_orientation'."
+                "is not the x-y plane of the world: change 'initial_orientation'."
             )
 
     def require_flat(self, name: str, motion: BodyMotion, inertia: Inertia) -> None:
@@ -124,8 +124,8 @@ class Surroundings:
         Raises
         ------
         ParameterError
-            It moves out of the plane, or turns about an axis across its normal, or about one that
-            is not a principal axis.
+            It moves out of the plane, or rotates about an axis other than its normal or a
+            non-principal axis.
         """
         if not self.on_table:
             return
@@ -136,12 +136,13 @@ class Surroundings:
         if np.abs(np.append(out_of_plane, tilting)).max() > _PLANE_TOLERANCE:
             raise ParameterError(
                 f"Parameters 'table.*' are set, but the target '{name}' does not stay in the x-y "
-                "plane of the world: it must move in it, and turn about a principal axis along z."
+                "plane of the world: it must move in this plane and rotate about a principal axis "
+                "along z."
             )
 
 
 class PlantLoads:
-    """The loads on a robot, which change in place; at first there are no wrenches.
+    """The loads on a robot, which change in place; initially there are no wrenches.
 
     Parameters
     ----------
@@ -202,14 +203,14 @@ class PlantLoads:
 
 
 class LoadedTick:
-    """A tick under loads, evaluated on the buffers of the tick without loads.
+    """A tick with loads, evaluated on the buffers of the tick without loads.
 
     Parameters
     ----------
     plain
         The tick without loads, whose inputs and outputs are read and written.
     loaded
-        The tick under loads: it takes the vector of loads as one more input, and may have further
+        The tick with loads: it has the vector of loads as its last input, and may have further
         outputs.
     loads
         The loads.

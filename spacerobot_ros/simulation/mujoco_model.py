@@ -23,16 +23,16 @@ from spacerobot_ros.model.rotations import (
 )
 
 TARGET = "target/"
-"""Before the names of the target's bodies and shapes."""
+"""Prefix of the names of the target's bodies and shapes."""
 
 _OBSTACLE = "obstacle/"
-"""Before the names of the shapes of obstacles."""
+"""Prefix of the names of obstacle shapes."""
 
 _CONTACT_TIME_CONSTANT = 2.0
-"""Time constant of contacts, stops and welds, in steps: the least that MuJoCo recommends."""
+"""Time constant of contacts, stops and welds, in steps: the smallest that MuJoCo recommends."""
 
 _MIN_INERTIA = 1e-12
-"""Smallest principal inertia, kg m^2: MuJoCo takes no point masses."""
+"""Smallest principal inertia, kg m^2: MuJoCo does not accept point masses."""
 
 
 def import_mujoco() -> Any:
@@ -41,12 +41,12 @@ def import_mujoco() -> Any:
 
 
 def body_name(link: str) -> str:
-    """Return the name of a link's body in MuJoCo, whose own world is called ``world``."""
+    """Return the name of a link's body in MuJoCo, where ``world`` is reserved."""
     return "link world" if link == "world" else link
 
 
 def robot_spec(mujoco: Any, description: RobotDescription) -> Any:
-    """Return MuJoCo's specification of a robot whose base is free; its shapes are omitted.
+    """Return MuJoCo's specification of a robot with a free base; its shapes are omitted.
 
     Raises
     ------
@@ -91,7 +91,7 @@ def _add_motors(mujoco: Any, spec: Any, description: RobotDescription) -> None:
 
 
 def joint_addresses(model: Any, description: RobotDescription) -> tuple[list[int], list[int]]:
-    """Return the indices of the joints, by the order of the robot, in ``qpos`` and in ``qvel``."""
+    """Return the indices of the joints, in the robot's order, in ``qpos`` and in ``qvel``."""
     joints = [model.joint(name) for name in description.joint_names]
     return [int(each.qposadr[0]) for each in joints], [int(each.dofadr[0]) for each in joints]
 
@@ -122,8 +122,9 @@ def build_model(
     step
         Step of its Runge-Kutta 4, s.
     contacts
-        Whether bodies push each other, joints stop, and the masses are those of the description,
-        which may differ from the URDF; else the robot is in free motion, as MuJoCo reads the URDF.
+        Whether there are contact forces and joint stops, and the masses are the description's,
+        which may differ from the URDF's; otherwise the robot moves freely, with the model as MuJoCo
+        reads it from the URDF.
 
     Raises
     ------
@@ -273,7 +274,7 @@ def _set_options(mujoco: Any, model: Any, step: float) -> None:
 
 
 class MujocoLoads:
-    """External loads on the bodies of a robot in MuJoCo, by :mod:`.model.external_loads`.
+    """External loads on the bodies of a robot in MuJoCo; see :mod:`.model.external_loads`.
 
     Parameters
     ----------
@@ -292,7 +293,7 @@ class MujocoLoads:
         """Indices of the links' bodies."""
 
     def apply(self, vector: Array, time: float) -> None:
-        """Apply the loads of a vector at a time, s, to all bodies where they are and as they move.
+        """Apply the loads of a vector at a time, s, to all bodies in their present motion.
 
         Poses and velocities of the bodies must belong to MuJoCo's present state.
         """
@@ -320,7 +321,7 @@ class MujocoLoads:
             data.xfrc_applied[body] = np.concatenate([force, torque])
 
     def momentum_rates(self, center: Array) -> Array:
-        """Return force over moment (6,) about a centre (3,) of the loads last applied, in W."""
+        """Return force over moment (6,) about a centre (3,) of the last applied loads, in W."""
         F, T = self._data.xfrc_applied[self.bodies].T.reshape(2, 3, -1)
         arms = self._data.xipos[self.bodies] - center
         return np.append(F.sum(axis=1), T.sum(axis=1) + cross(arms, F.T).sum(axis=0))

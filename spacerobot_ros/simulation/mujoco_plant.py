@@ -1,13 +1,13 @@
-"""The plant in MuJoCo: links, obstacles and the target push each other, and a grasp is a weld.
+"""The plant in MuJoCo, with contact forces between links, obstacles and target; a grasp is a weld.
 
-The parameter ``engine`` chooses it instead of :class:`.EffortPlant` or :class:`.VelocityPlant`;
+The parameter ``engine`` selects it instead of :class:`.EffortPlant` or :class:`.VelocityPlant`;
 commands, states and topics are the same. MuJoCo integrates by Runge-Kutta 4; contacts, joint stops,
 locked joints and welds are its soft constraints, with a time constant of two steps. They are
-internal forces, so that total momentum changes by the error of the integration alone: with steps of
-1 ms about 1e-9 of its largest value in free motion, 1e-5 by a grasp.
+internal forces, so that total momentum changes only by the integration error: with steps of 1 ms by
+about 1e-9 of its largest value in free motion, and by 1e-5 during a grasp.
 
-Under velocities, a change of the commanded rates takes effect within a step. Beyond that the servos
-give at most the efforts that the limits of the URDF allow: a joint that meets a contact stalls.
+Under velocities, a change of the commanded rates takes effect within a step. Apart from that, the
+servos provide at most the effort limits of the URDF: a joint that meets an obstacle stalls.
 """
 
 from __future__ import annotations
@@ -45,20 +45,20 @@ DEFAULT_INTEGRATION_STEP = 0.001
 """Longest Runge-Kutta step, s."""
 
 _STOP_DISTANCE = 1e-4
-"""Distance from its limit, m or rad, at which a joint counts as stopped: stops are soft."""
+"""Distance from its limit, m or rad, at which a joint is considered stopped: stops are soft."""
 
 _SHARES = (1 / 6, 2 / 6, 2 / 6, 1 / 6)
-"""Shares of the stages of Runge-Kutta 4 in a step."""
+"""Weights of the Runge-Kutta 4 stages in a step."""
 
 _CONTROL_CALLBACK = Lock()
-"""MuJoCo has one callback in a process: plants in threads take turns."""
+"""MuJoCo has one callback per process: plants in threads take turns."""
 
 _RIGID = 1e15
-"""Inertia of a motor, kg or kg m^2, whose rate nothing changes."""
+"""Inertia of a motor that keeps its rate, kg or kg m^2."""
 
 
 class MujocoPlant:
-    """A free-floating robot in MuJoCo, and the target beside it.
+    """A free-floating robot in MuJoCo, with its target.
 
     After :meth:`step`, the attributes are those of :class:`.Plant`, and
 
@@ -66,12 +66,12 @@ class MujocoPlant:
         (6,) force (N) over torque (N m) of the last tick at the origin of the base link, base
         components.
     ``holds_target``
-        Whether the target is welded to the robot: momenta are those of both, then.
+        Whether the target is welded to the robot; if so, momenta include the target.
 
     Parameters
     ----------
     robot
-        The model; MuJoCo reads its URDF, from which masses must not differ.
+        The model; MuJoCo reads its URDF, so masses must not differ from it.
     control_period
         Duration of a tick, s.
     initial
@@ -79,17 +79,17 @@ class MujocoPlant:
     integration_step
         Longest Runge-Kutta step within a tick, s.
     actuation
-        ``velocity`` or ``effort``, as the parameter.
+        ``velocity`` or ``effort``, like the parameter.
     target
         The target, and the link that captures it; None: there is none.
     contacts
-        Whether there are contacts, joint stops and locks. Without them the model is as MuJoCo reads
-        the URDF, and joints under velocity commands keep their rates exactly.
+        Whether there are contacts, joint stops and locks. Without them, the model is as MuJoCo
+        reads it from the URDF, and joints under velocity commands keep their rates exactly.
 
     Raises
     ------
     ParameterError
-        The initial state is refused.
+        The initial state is invalid.
     RobotDescriptionError
         MuJoCo refuses the robot or the target, or a joint follows another one.
     SpaceRobotError
@@ -145,14 +145,14 @@ class MujocoPlant:
             np.zeros((3, len(robot.link_names))),
         )
         self.expected_momenta = np.zeros(6)
-        """Linear over angular momentum (6,) in W: from the beginning, by thrust and loads."""
+        """Linear over angular momentum (6,) in W: the initial one plus thrust and loads."""
         self.limit_counts: dict[str, Counts] = {
             kind: np.zeros(n, dtype=np.int64)
             for kind in ("rate" if self._velocity else "effort", "stroke")
         }
         self.holds_target = False
         self._aim = np.zeros(n)
-        """Rates that the servos aim at, from the last tick on."""
+        """Rates commanded to the servos in the last tick."""
         self._held: Flags = np.zeros(n, dtype=np.bool_)
         self._loads: PlantLoads | None = None
         self._loaded, self._stage = False, 0
@@ -189,7 +189,7 @@ class MujocoPlant:
     def go_on(
         self, motion: RobotMotion, target: BodyMotion | None = None, *, welded: bool = False
     ) -> None:
-        """Go on from these motions of robot and target, which are welded together or not."""
+        """Continue from the given motions of robot and target, welded together or not."""
         data = self._data
         data.qpos[:3], data.qpos[3:7] = motion.pose[:3], np.roll(motion.pose[3:], 1)
         data.qpos[self._q], data.qvel[self._qdot] = motion.q, motion.qdot
@@ -210,7 +210,7 @@ class MujocoPlant:
         self._held = joints.copy()
 
     def load(self, loads: PlantLoads) -> None:
-        """Step under external loads; their numbers may change before each step."""
+        """Apply external loads; their values may change before each step."""
         self._loads = loads
 
     def step(self, command: npt.ArrayLike, wrench: npt.ArrayLike = 0.0) -> bool:
@@ -262,8 +262,8 @@ class MujocoPlant:
     # -- the target ---------------------------------------------------------------------------
 
     def weld(self) -> None:
-        """Weld the target to the link that captures it, where both are, and have both ignore each
-        other's contacts.
+        """Weld the target to the capturing link in their present poses, and disable contacts
+        between both.
         """
         model, data = self._model, self._data
         weld = model.equality("grasp").id
@@ -431,7 +431,7 @@ class MujocoPlant:
 
 
 class MujocoTarget(Target):
-    """The target as a body of a :class:`MujocoPlant`, which moves it.
+    """The target as a body of a :class:`MujocoPlant`, which integrates its motion.
 
     Attributes
     ----------
@@ -452,7 +452,7 @@ class MujocoTarget(Target):
         return np.concatenate(self.motion.momenta(self.inertia))
 
     def reset(self) -> None:
-        """Return to the initial state, which the plant has done."""
+        """Copy the initial state, to which the plant has already returned."""
         self.step()
 
     def release(self, motion: BodyMotion) -> None:
@@ -471,7 +471,7 @@ class MujocoTarget(Target):
 
 
 class MujocoCapturePlant(CapturePlant):
-    """A plant in MuJoCo beside a target, to which a weld holds it."""
+    """A plant in MuJoCo with a target, which is captured by a weld."""
 
     def __init__(
         self,
@@ -542,7 +542,7 @@ def build_mujoco_plant(
     Raises
     ------
     ParameterError
-        The robot has no end-effector to capture the target with, or the initial state is refused.
+        The robot has no end-effector to capture the target with, or the initial state is invalid.
     RobotDescriptionError
         MuJoCo refuses the robot or the target.
     SpaceRobotError

@@ -1,4 +1,4 @@
-"""The interface of plants, a base class of plants that wrap others, and their initial state."""
+"""The interface of plants, a base class for wrapping plants, and the initial state."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Plant(Protocol):
     ``twist``
         (6,) ``v_WB_B`` in m/s and ``omega_WB_B`` in rad/s.
     ``q``, ``qdot``
-        (n,) joint positions (m or rad) and velocities (a second).
+        (n,) joint positions (m or rad) and velocities (per second).
     ``effort``
         (n,) efforts of the joints' actuators, N or N m.
     ``momentum``
@@ -58,7 +58,7 @@ class Plant(Protocol):
         """Lock the marked joints (n,) at their positions, and release all other joints."""
 
     def load(self, loads: PlantLoads) -> None:
-        """Step under external loads; their numbers may change before each step."""
+        """Apply external loads; their values may change before each step."""
 
     @property
     def step(self) -> Callable[..., bool]:
@@ -70,11 +70,11 @@ class Plant(Protocol):
 
     @property
     def expected_momenta(self) -> Array:
-        """Linear over angular momentum (6,) in W: from the beginning, by thrust and loads."""
+        """Linear over angular momentum (6,) in W: the initial one plus thrust and loads."""
 
 
 class WrappedPlant:
-    """Base class of plants around another: its state in the same arrays; subclasses add a step."""
+    """Base class of plants that wrap another and share its state arrays; subclasses add a step."""
 
     def __init__(self, plant: Plant) -> None:
         self.plant = plant
@@ -90,7 +90,7 @@ class WrappedPlant:
 
     @property
     def expected_momenta(self) -> Array:
-        """Linear over angular momentum (6,) in W: from the beginning, by thrust and loads."""
+        """Linear over angular momentum (6,) in W: the initial one plus thrust and loads."""
         return self.plant.expected_momenta
 
     def hold(self, joints: Flags) -> None:
@@ -98,7 +98,7 @@ class WrappedPlant:
         self.plant.hold(joints)
 
     def load(self, loads: PlantLoads) -> None:
-        """Step under external loads; their numbers may change before each step."""
+        """Apply external loads; their values may change before each step."""
         self.plant.load(loads)
 
     def reset(self) -> None:
@@ -110,7 +110,7 @@ class WrappedPlant:
 class InitialState:
     """Initial state of a plant: base pose in W (m; quaternion x, y, z, w), shape, momenta in W.
 
-    ``joint_positions`` None means zero, or the nearest limit of a joint whose range excludes zero.
+    ``joint_positions`` None means zero, or the nearest limit if a joint's range excludes zero.
     ``angular_momentum`` (kg m^2/s) is about the system's centre of mass. ``joint_velocities`` None
     means zero; the base's twist follows from them and the momenta. ``center_of_mass`` (m, in W)
     places the system's centre of mass instead of the base link.
@@ -118,7 +118,7 @@ class InitialState:
     Raises
     ------
     ParameterError
-        Both ``position`` and ``center_of_mass`` are given.
+        Both ``position`` and ``center_of_mass`` are set.
     """
 
     position: Array = field(default_factory=lambda: np.zeros(3))
@@ -131,12 +131,12 @@ class InitialState:
 
     @classmethod
     def of(cls, config: PlantConfig) -> InitialState:
-        """Return the initial state of a configuration; empty lists mean defaults.
+        """Return the initial state of a configuration; empty lists select defaults.
 
         Raises
         ------
         ParameterError
-            The position is given twice.
+            The position is specified twice.
         """
         return cls(
             position=np.array(config.initial_position or (0.0, 0.0, 0.0)),
@@ -151,7 +151,7 @@ class InitialState:
     def __post_init__(self) -> None:
         if self.center_of_mass is not None and np.any(self.position):
             raise ParameterError(
-                "The initial position is given twice, of the base and of the centre of mass: "
+                "The initial position is set for both the base and the centre of mass: "
                 "leave one out."
             )
 
@@ -174,7 +174,7 @@ class InitialState:
         Raises
         ------
         ParameterError
-            One of them is not finite.
+            A momentum is not finite.
         """
         momenta = np.concatenate([self.linear_momentum, self.angular_momentum])
         if not np.all(np.isfinite(momenta)):
@@ -187,7 +187,7 @@ class InitialState:
         Raises
         ------
         ParameterError
-            Their number is wrong, or one lies outside its limits.
+            The number of joints is wrong, or a position lies outside its limits.
         """
         if self.joint_positions is None:
             return np.clip(np.zeros(robot.n), robot.lower, robot.upper)
@@ -208,7 +208,7 @@ class InitialState:
         Raises
         ------
         ParameterError
-            Their number is wrong, or one is not finite.
+            The number of joints is wrong, or a velocity is not finite.
         """
         if self.joint_velocities is None:
             return np.zeros(robot.n)
@@ -220,7 +220,7 @@ class InitialState:
         Raises
         ------
         ParameterError
-            It is not finite, or the shape or the orientation is refused.
+            The position is not finite, or the shape or the orientation is invalid.
         """
         if self.center_of_mass is not None:
             r_WC_W = np.asarray(self.center_of_mass, dtype=float)

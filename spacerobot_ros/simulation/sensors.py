@@ -1,4 +1,4 @@
-"""Sensors of a plant, and its state as the topics carry it: measured and true."""
+"""Sensors of a plant, and its measured and true state as published on topics."""
 
 from __future__ import annotations
 
@@ -37,10 +37,10 @@ class Sensors:
     """Measurements of the state of a plant, with bias, noise, delay and dropouts.
 
     ``pose`` (7,), ``twist`` (6,), ``q`` and ``qdot`` (n,) are the last measurements, arranged as
-    the state of the plant. Each call of :meth:`measure` draws new noise: flights with the same seed
-    are the same.
+    the state of the plant. Each call of :meth:`measure` draws new noise; flights with the same seed
+    are identical.
 
-    A delay begins with the state at its beginning: until it has passed, pose and twist stand still.
+    A delay starts with the state at its onset: pose and twist are frozen until it has passed.
 
     Parameters
     ----------
@@ -70,12 +70,12 @@ class Sensors:
         self.pose, self.twist = plant.pose.copy(), plant.twist.copy()
         self.q, self.qdot = plant.q.copy(), plant.qdot.copy()
         self.dropout = False
-        """Whether the pose is not measured, because of a dropout."""
+        """Whether the pose is missing because of a dropout."""
         self._pose_bias, self._joint_bias = np.zeros(6), np.zeros(n)
         self._noise = dict.fromkeys(_NOISE_PARAMETERS, 0.0)
         self.pose_covariance, self.twist_covariance = np.zeros(36), np.zeros(36)
-        """Covariances of pose and twist, each 6 x 6 in a row, of the noise alone: a sensor knows
-        neither its bias nor its delay."""
+        """Covariances of pose and twist, each 6 x 6 in row-major order, of the noise alone: bias
+        and delay are unknown to a sensor."""
         self._delay = 0
         self._past: deque[tuple[Array, Array]] = deque(maxlen=1)
         """Copies of the true poses and twists of the last ticks."""
@@ -83,11 +83,12 @@ class Sensors:
         self.used = self.is_imperfect or any(
             FAULT_KINDS[f.kind].sensor for f in plant.timeline.entries
         )
-        """Whether measurements ever differ from the truth: before, now or by a known fault."""
+        """Whether measurements differ from the truth at any time: so far, now or due to a known
+        fault."""
 
     @property
     def is_imperfect(self) -> bool:
-        """Whether measurements differ from the truth now."""
+        """Whether measurements presently differ from the truth."""
         return bool(
             self.dropout
             or self._delay
@@ -153,9 +154,9 @@ class TargetSensors:
     """Measurements of the motion of a target, with bias, noise, delay, loss and a rate.
 
     ``pose`` (7,) and ``twist`` (6,) are the last measurement, arranged as those of the target.
-    Each call of :meth:`measure` takes the same amount of random numbers, from a stream of its own.
+    Each call of :meth:`measure` draws the same number of random numbers, from a separate stream.
 
-    A delay begins with the state at its beginning: until it has passed, pose and twist stand still.
+    A delay starts with the state at its onset: pose and twist are frozen until it has passed.
 
     Parameters
     ----------
@@ -212,7 +213,7 @@ class TargetSensors:
 
 
 class ReportedState:
-    """The state of a plant as its topics carry it: measured, and true.
+    """The measured and true state of a plant, as published on its topics.
 
     Parameters
     ----------
@@ -228,14 +229,14 @@ class ReportedState:
     target_sensors
         Source of target/odom; None: there is no target.
     quantities
-        Arrays by the names of :attr:`StateField.quantity`, which change in place. It is replaced by
-        another dictionary when the sensors begin to err. Quantities that a plant does not have
-        (thrusters, an end-effector, a truth beside its measurements) are not in it.
+        Arrays by the names of :attr:`StateField.quantity`, which change in place. The dictionary is
+        replaced when the sensors begin to err. It lacks quantities that the plant does not have
+        (thrusters, an end-effector, true values separate from measurements).
 
     Raises
     ------
     ParameterError
-        The robot has no link of the name ``end_effector_frame``, or the sensors are refused.
+        The robot has no link ``end_effector_frame``, or the sensors are invalid.
     """
 
     def __init__(self, plant: PlantWithFaults, config: PlantConfig) -> None:
@@ -262,7 +263,7 @@ class ReportedState:
 
     @property
     def topics(self) -> list[Topic]:
-        """The state topics that this plant publishes now, in the order of publication."""
+        """The state topics that this plant presently publishes, in the order of publication."""
         return [
             topic
             for topic in state_topics(self._end_effectors)

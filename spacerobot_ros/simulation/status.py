@@ -26,25 +26,25 @@ from spacerobot_ros.times import SECOND
 
 
 def latched_text(fault: str) -> str:
-    """Return what a latched fault means, without a full stop."""
+    """Return the effect of a latched fault as a sentence without a full stop."""
     return f"The joints brake and the thrusters are off until the plant is rearmed: {fault}"
 
 
 class PlantState(str, Enum):
-    """State of a plant with regard to time and commands; the value of ``state`` in plant/status."""
+    """State of a plant regarding time and commands; the value of ``state`` in plant/status."""
 
     INACTIVE = "inactive"
     """The plant publishes no states and accepts no commands."""
     RUNNING = "running"
     """A command is in force, or a plant in lockstep waits for a command."""
     RESTING = "resting"
-    """Time goes on without a command in force: none has come yet, or the last is too old."""
+    """Time advances without a command in force: none has arrived yet, or the last is too old."""
     PAUSED = "paused"
     """Time is stopped; commands are accepted."""
     LATCHED = "latched"
-    """Time goes on with everything at rest, until the plant is rearmed."""
+    """Time advances with everything at rest, until the plant is rearmed."""
     FAILED = "failed"
-    """An error has stopped the plant: it is inactive until it is configured or activated again."""
+    """An error has stopped the plant: it is inactive until configured or activated again."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ class PlantStatus:
     state
         State of the plant.
     message
-        State and reason as a text for the user.
+        State and reason as text for the user.
     reason
         Reason as a word. Latched, or paused and latched: the reason to refuse a command, ``abort``
         or ``watchdog``; resting: ``no_command`` or ``timeout``; failed: ``model`` or ``exception``;
@@ -66,7 +66,7 @@ class PlantStatus:
     time_s
         Simulated time of the last change, s.
     rearms, resets
-        Number of rearms and resets, for subscribers that have missed a status.
+        Number of rearms and resets, for subscribers that missed a status.
     faults
         Lines of the active injected faults.
     disturbances
@@ -75,17 +75,16 @@ class PlantStatus:
         The body that the robot holds, as the text of a :class:`.Payload`; empty: none. With it the
         robot has another mass, inertia and momentum.
     contacts
-        The links that touch, obstacles and the target among them; the end-effector may touch the
-        target.
+        Links in contact, also with obstacles and the target; the end-effector may touch the target.
     timeouts
         Number of times that the joints were brought to rest because no command came in time.
     last_command_s
-        Stamp of the last command before the latest of these, s; None: there was none.
+        Stamp of the last command before the latest timeout, s; None: there was none.
     actuation
         What joint_commands carry: ``velocity`` or ``effort``; ``auto``: either, until a command
         decides; empty: the plant is not configured.
     tick_rate_hz
-        Ticks a second of simulated time, Hz; 0: the plant is not configured.
+        Ticks per second of simulated time, Hz; 0: the plant is not configured.
     time_mode
         Who drives time: ``realtime`` or ``lockstep``; empty: the plant is not configured.
     """
@@ -125,7 +124,7 @@ class PlantStatus:
         Raises
         ------
         SpaceRobotError
-            They are not those of a plant.
+            The pairs are not a plant's status.
         """
         return _FORMAT.from_values(cls, values, message=message)
 
@@ -158,7 +157,7 @@ class PlantMonitor:
     commands, plant
         The plant and the validator of its commands.
     config
-        Configuration of the plant. In lockstep it waits for commands, and so never rests.
+        Configuration of the plant. In lockstep the plant waits for commands and so never rests.
     """
 
     def __init__(
@@ -183,7 +182,7 @@ class PlantMonitor:
     def observe(
         self, commands: CommandValidator, plant: PlantWithFaults, config: PlantConfig
     ) -> None:
-        """Derive later statuses from these."""
+        """Use another validator, plant and configuration from now on."""
         self._commands, self._plant, self._config = commands, plant, config
 
     def update(self, activity: PlantState, time_s: float) -> list[Event]:
@@ -199,7 +198,7 @@ class PlantMonitor:
         Returns
         -------
         list[Event]
-            Events since the last update; empty: the status is the same.
+            Events since the last update; empty: the status is unchanged.
         """
         before, reports = self.status, self._take_reports()
         now = replace(

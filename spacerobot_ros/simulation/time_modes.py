@@ -1,4 +1,4 @@
-"""Time modes of a plant: stepped by its commanders (lockstep), or by the wall clock."""
+"""Time modes of a plant: driven by its commanders (lockstep) or by the wall clock."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from spacerobot_ros.simulation.commands import CommandValidator
 from spacerobot_ros.times import SECOND
 
 _MAX_LATE_TICKS = 10
-"""Largest number of late ticks that a real-time plant makes up; further ticks are lost."""
+"""Largest number of late ticks that a real-time plant catches up on; further ticks are lost."""
 
 _MAX_TICKS_AT_ONCE = 2
 """Largest number of ticks that a late plant takes before it reads commands again."""
@@ -27,7 +27,7 @@ class Lockstep:
         self._commands = commands
         self._looked_at = -1
         self.waits = False
-        """Whether the plant waited in the same tick at the last two checks."""
+        """Whether the plant was waiting in the same tick at the last two checks."""
 
     @property
     def may_step(self) -> bool:
@@ -37,9 +37,9 @@ class Lockstep:
     def must_step_at_check(self, tick: int, *, pose_lost: bool) -> bool:
         """Return whether a plant that checks periodically must step.
 
-        A state without a pose may get no answer: a commander cannot know that no pose will come
-        before it receives another state. So the plant steps without a command if it was still
-        waiting in the same tick at its last check.
+        A state without a pose may receive no command: a commander learns only from the next state
+        that the pose is missing. So the plant steps without a command if it was already waiting in
+        the same tick at its last check.
         """
         self.waits, self._looked_at = self._looked_at == tick, tick
         return (self.waits and pose_lost) or self.may_step
@@ -52,15 +52,15 @@ class TimingStatistics:
     Attributes
     ----------
     tick_rate
-        Ticks a second of wall time since the last report.
+        Ticks per second of wall time since the last report.
     ticks, ticks_late, worst_tick
-        Number of ticks; of those taken after the next one was due; largest delay, s.
+        Number of ticks; number of ticks taken after the next was due; largest delay, s.
     commands, commands_late, worst_command
-        Number of answered states; of those answered after the next tick was due; largest delay, s.
+        Number of commanded states; number commanded after the next tick was due; largest delay, s.
     command_age
-        Simulated time since the state that the command in force answers, s.
+        Age of the state of the command in force, simulated s.
     worse
-        Whether more was late than at the last report.
+        Whether there are more delays than at the last report.
     """
 
     tick_rate: float
@@ -77,8 +77,8 @@ class TimingStatistics:
 class RealTime:
     """Schedules ticks by the wall clock, and counts late ticks and commands.
 
-    A tick is late when it is taken after the next one is due; a command is late when it arrives
-    after the tick that follows its state is due.
+    A tick is late if it is taken after the next one is due. A command is late if it arrives after
+    the tick that follows its state is due.
 
     Parameters
     ----------
@@ -105,7 +105,7 @@ class RealTime:
         return self._pace / SECOND
 
     def start(self, now_ns: int, tick: int) -> None:
-        """Start from a tick whose state is due now."""
+        """Start at a tick whose state is due now."""
         self._origin = now_ns - tick * self._pace
 
     def due_ticks(self, now_ns: int, tick: int) -> int:
@@ -126,7 +126,7 @@ class RealTime:
             self._worst_tick = max(self._worst_tick, late)
 
     def count_command(self, now_ns: int, stamp_ns: float) -> None:
-        """Count a command in force that answers the state of a stamp (simulated time)."""
+        """Count a command in force for the state of a stamp (simulated time)."""
         if stamp_ns <= self._answered_ns:
             return  # A refused command leaves the command in force unchanged.
         self._answered_ns = stamp_ns

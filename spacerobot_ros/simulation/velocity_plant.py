@@ -1,8 +1,8 @@
 """The plant under velocity actuation: servos hold joint velocities, the base follows from momentum.
 
 One tick is one compiled function: limits, step, and every quantity that is published. The total
-linear and angular momenta are constants of the motion, zero unless the run starts otherwise; under
-external loads they are states, which change by the impulses.
+linear and angular momenta are constants of the motion, initially zero by default; under external
+loads they are states, which the impulses change.
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ from spacerobot_ros.simulation.loads import LoadedTick, PlantLoads
 from spacerobot_ros.simulation.plant import Flags, InitialState
 
 _ROUNDING = 1e-9
-"""Share of a rate, and motion in a tick (m or rad), beyond a limit that count as rounding."""
+"""Share of a rate, and motion in a tick (m or rad), beyond a limit that are considered rounding."""
 
 
 class VelocityPlant:
     """A free-floating robot whose servos realise held joint velocities.
 
-    After :meth:`step`, the attributes are those of :class:`Plant`: ``qdot`` has the velocities of
+    After :meth:`step`, the attributes are those of :class:`Plant`: ``qdot`` holds the velocities of
     the last tick, and ``effort`` the efforts of the servos, from inverse dynamics with the mean of
-    the velocities before and in the tick, and their difference over a tick. Effort limits do not
-    restrict servos.
+    the velocities before and in the tick, and their difference divided by the tick. Effort limits
+    do not restrict servos.
 
     Parameters
     ----------
@@ -47,8 +47,8 @@ class VelocityPlant:
     Raises
     ------
     ParameterError
-        The initial shape has the wrong length or lies outside the joint limits, its joints move,
-        or a number is bad.
+        The initial shape has the wrong length or lies outside the joint limits, its joints move, or
+        a number is invalid.
     """
 
     def __init__(
@@ -85,7 +85,7 @@ class VelocityPlant:
 
     @property
     def expected_momenta(self) -> Array:
-        """Linear over angular momentum (6,) in W: of the initial state, and by external loads."""
+        """Linear over angular momentum (6,) in W: the initial one plus external loads."""
         return self._momenta
 
     def reset(self) -> None:
@@ -111,7 +111,7 @@ class VelocityPlant:
         self._held = joints.copy() if joints.any() else None
 
     def load(self, loads: PlantLoads) -> None:
-        """Step under external loads; their numbers may change before each step."""
+        """Apply external loads; their values may change before each step."""
         robot, substeps = self.robot, self._substeps
         loaded = robot.composed(
             f"loaded_velocity_tick_{substeps}",
@@ -151,8 +151,8 @@ def tick_function(
     """Compose the tick from the model's functions; see :class:`VelocityPlant` for its results.
 
     With ``loaded``, the vector of external loads is the last input, and the momenta after the tick
-    are the last output. ``momentumless`` ticks have fewer operations and the same results where the
-    angular momentum is zero, whatever the argument for it says; the model has an argument ``p``.
+    are the last output. ``momentumless`` ticks have fewer operations and the same results if the
+    angular momentum is zero; they ignore the argument for it. The model has an argument ``p``.
     """
     n = robot.n
     state, command = ca.MX.sym("state", n + 4), ca.MX.sym("command", n)

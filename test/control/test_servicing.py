@@ -276,7 +276,9 @@ def test_base_and_arm_are_planned_to_a_target_and_anew_if_it_strays() -> None:
     loop.aim(base=goal_at(AIM, "5"))
     loop.answer(3)
     assert loop.kinds() == ["goal_accepted", "approach_started"]
-    assert_one_sentence(loop.events[-1].message, "Base and end-effector set out at", "left after")
+    assert_one_sentence(
+        loop.events[-1].message, "Base and end-effector set out at", "the plan leaves"
+    )
     about = loop.events[-1].about
     assert about["detumble"] == "none"
     # The block of 10 kg does not turn: what is left is that of the robot beside it.

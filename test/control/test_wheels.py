@@ -187,7 +187,7 @@ def test_saturation_is_announced_once_before_it_comes() -> None:
     observe(wheels, [182.0, 0.0, 0.0])
     (event,) = wheels.events()
     assert (event.kind, event.level) == (EventKind.WHEEL_NEAR_LIMIT, 1)
-    assert event.message == ("Wheel 'spin_c' turns at 182 of 200 rad/s, and is saturated in 1.8 s.")
+    assert event.message == "Wheel 'spin_c' turns at 182 of 200 rad/s, and will saturate in 1.8 s."
     assert event.about == {"wheel": "spin_c"}
     observe(wheels, [185.0, 0.0, 0.0])
     observe(wheels, [171.0, 0.0, 0.0])
@@ -198,8 +198,8 @@ def test_saturation_is_announced_once_before_it_comes() -> None:
     (event,) = wheels.events()
     assert (event.kind, event.level) == (EventKind.WHEEL_SATURATED, 1)
     assert event.message == (
-        "Wheel 'spin_c' turns at 198.5 of 200 rad/s: it is saturated, and takes no more torque in "
-        "this direction."
+        "Wheel 'spin_c' turns at 198.5 of 200 rad/s: it is saturated and provides no more torque "
+        "in this direction."
     )
     observe(wheels, [169.0, 0.0, 0.0])
     wheels.torque[:] = 0.0
@@ -259,7 +259,7 @@ def test_dumping_keeps_the_torques_of_motors_and_thrusters() -> None:
 def test_momentum_is_not_dumped_without_thrusters() -> None:
     wheels = control(0.0)
     observe(wheels, [100.0, 0.0, 0.0])
-    words = r"no thrusters \(use_thrusters is false\) that could take the momentum of the wheels"
+    words = r"no thrusters \(use_thrusters is false\) that could absorb the momentum of the wheels"
     with pytest.raises(CommandError, match=words):
         wheels.request_dump()
     assert not wheels.dumping
@@ -300,8 +300,8 @@ def test_a_wheel_that_does_not_answer_is_taken_out_of_use(share: float) -> None:
     )  # fmt: skip
     answered = {0.0: "0", 0.4: "0.06"}[share]
     assert event.message == (
-        f"Wheel 'spin_c' took {answered} of 0.15 N m s, and is out of use: 2 wheel(s), and "
-        "thrusters are left."
+        f"Wheel 'spin_c' absorbed {answered} of 0.15 N m s and is out of use: 2 wheel(s), and "
+        "thrusters remain."
     )
     assert wheels.rank == 2
     wheels.command_torque(np.array([0.01, 0.02, 0.03]))
@@ -355,7 +355,7 @@ def test_a_failure_without_thrusters_says_so() -> None:
     observe(wheels, [5.0, 0.0, 0.0])
     fly(wheels, [0.3, 0.0, 0.0], 0.0, 0.52)
     (event,) = wheels.events()
-    assert event.message.endswith("and is out of use: 2 wheel(s) are left.")
+    assert event.message.endswith("and is out of use: 2 wheel(s) remain.")
 
 
 # -- the gyrostat and the robot ---------------------------------------------------------------
@@ -447,11 +447,11 @@ def config(**changes: object) -> ControllerConfig:
     ("changes", "message"),
     [
         ({"base_outputs": "x rx"},
-         "The position of the base of robot 'gyro' is not controlled without thrusters "
-         "(use_thrusters is false): leave x, y and z out of base_outputs."),
+         "The position of the base of robot 'gyro' cannot be controlled without thrusters "
+         "(use_thrusters is false): remove x, y and z from base_outputs."),
         ({"wheels.excluded": "spin_a"},
-         "Robot 'gyro' has no thrusters (use_thrusters is false), and its reaction wheels turn it "
-         "about 2 of 3 controlled axes: leave rx, ry or rz out of base_outputs."),
+         "Robot 'gyro' has no thrusters (use_thrusters is false), and its reaction wheels rotate "
+         "it about 2 of 3 controlled axes: remove rx, ry or rz from base_outputs."),
     ],
 )  # fmt: skip
 def test_outputs_that_wheels_do_not_move_are_refused(
@@ -463,7 +463,7 @@ def test_outputs_that_wheels_do_not_move_are_refused(
 
 
 def test_a_base_without_wheels_and_thrusters_is_refused() -> None:
-    with pytest.raises(ParameterError, match="its reaction wheels turn it about 0 of 1 controlled"):
+    with pytest.raises(ParameterError, match="reaction wheels rotate it about 0 of 1 controlled"):
         build_controller(
             SpaceRobot.from_file(robot_file("planar_manipulator")), config(use_thrusters=False)
         )

@@ -76,7 +76,7 @@ def test_the_base_is_held_while_saturation_is_announced_and_momentum_dumped() ->
     # As docs/theory/wheels.md has it.
     assert (announced, began, ended - began) == pytest.approx((4.6, 8.4, 23.0), rel=0.02)
     said = next(e.message for e in flight.events if e.kind is EventKind.WHEEL_NEAR_LIMIT)
-    left = float(said.split("saturated in ")[1].removesuffix(" s."))
+    left = float(said.split("saturate in ")[1].removesuffix(" s."))
     assert left == pytest.approx(6.0, rel=0.05)
     assert rates.max() < 300.0
     after = flight.qdot[flight.time >= ended, :4]

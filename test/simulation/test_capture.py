@@ -290,7 +290,7 @@ def test_refusals() -> None:
     assert str(error.value) == (
         "The target is missed: its angle is 0.4067 rad, 0.3067 rad more than 'capture.angle', 0.1."
     )
-    with pytest.raises(CommandError, match=r"^'end_effector' holds nothing that could be released"):
+    with pytest.raises(CommandError, match=r"^'end_effector' holds no target to release"):
         capturing.release()
     assert capturing.reports == []
     capturing = capturing_of(plant_of(PAPER_ROBOT))

@@ -368,7 +368,7 @@ def test_in_real_time_a_refusal_says_how_far_off_it_is(
     assert rig.offer(round(7.4 * SECOND), round(7.4 * SECOND)) is None
     assert clause_of(rig, 7.15, 7.4) == "it is 0.25 s older than the one in force"
     rig.joints.commanders = 3
-    same = "the same state was answered before, and 3 nodes command"
+    same = "a command for the same state is in force, and 3 nodes command"
     assert clause_of(rig, 7.4, 7.4) == same
     assert rig.commands.fault == f"a command on 'joint_commands' was refused: {same}"
 

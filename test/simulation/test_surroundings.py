@@ -269,7 +269,7 @@ TABLE = TableConfig(tilt=0.01)
             "servicer",
             {"orbit": OrbitConfig(altitude=4e5, mean_motion=0.001)},
             "Parameters 'orbit.altitude' (400000 m) and 'orbit.mean_motion' (0.001 rad/s) both "
-            "give the orbit: leave one of them 0.",
+            "define the orbit: set one of them to 0.",
         ),
         (
             "servicer",
@@ -292,7 +292,7 @@ TABLE = TableConfig(tilt=0.01)
             "planar_manipulator",
             {"table": TableConfig(friction=0.1), "initial_orientation": (0.1, 0.0, 0.0, 0.99)},
             "Parameters 'table.*' are set, but the plane of robot 'planar_manipulator' is not the "
-            "x-y plane of the world: turn 'initial_orientation'.",
+            "x-y plane of the world: change 'initial_orientation'.",
         ),
     ],
 )
@@ -343,7 +343,7 @@ def test_a_plant_goes_on_through_a_contact_and_says_so() -> None:
     ]
     assert events[0].about == {"first": "left", "second": "right"}
     assert events[0].message == (
-        "Links 'left' and 'right' touch; the simulation goes on through the contact."
+        "Links 'left' and 'right' touch; the simulation continues through contact."
     )
     assert [each.level for each in found] == [2 if d <= 0 else 0 for d in truth]
     assert found[0].message == f"Links 'left' and 'right' are {truth[0]:.3g} m apart."

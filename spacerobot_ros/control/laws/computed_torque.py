@@ -1,4 +1,4 @@
-"""The shape alone, driven by joint efforts; the base floats free."""
+"""Control of the shape alone by joint efforts; the base floats freely."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from spacerobot_ros.model.space_robot import SpaceRobot
 
 
 class ComputedTorqueLaw(ControlLaw):
-    """Paper 3, eqs (2) and (6-9): ``tau = Js(q) u + Fs``, which makes the shape ``qddot = u``.
+    """Paper 3, eqs (2) and (6-9): ``tau = Js(q) u + Fs``, so that the shape obeys ``qddot = u``.
 
     Here ``u = qddot_ref + Kd (qdot_ref - qdot) + Kp (q_ref - q)`` (Kp in 1/s^2, Kd in 1/s). The
-    base answers by ``omegadot = -D^-1 (D_q u + C_omega)``, the rows of eq. (19) of paper 4 without
-    a wrench; inserted into its rows of the joints this gives ``Js = D_qq - D_q' D^-1 D_q`` and
-    ``Fs = C_q - D_q' D^-1 C_omega``. Written so it holds for any tree in space and any momentum;
-    the paper's case is a planar chain without angular momentum. No wrench is commanded, so that
-    both momenta are conserved.
+    base reacts with ``omegadot = -D^-1 (D_q u + C_omega)``, the base rows of eq. (19) of paper 4
+    without a wrench; inserted into the joint rows this gives ``Js = D_qq - D_q' D^-1 D_q`` and
+    ``Fs = C_q - D_q' D^-1 C_omega``. This form holds for any tree in space and any momentum; the
+    paper's case is a planar chain without angular momentum. No wrench is commanded, so that both
+    momenta are conserved.
     """
 
     name: ClassVar[str] = "computed_torque"

@@ -1,4 +1,4 @@
-"""Base class of control laws, from a state and a reference to a wrench and joint efforts."""
+"""Base class of control laws, which compute a wrench and joint efforts from state and reference."""
 
 from __future__ import annotations
 
@@ -42,10 +42,10 @@ _CRITICAL_STIFFNESS = 1 / 4
 """Automatic Kp of accelerations over the square of Kd: critical damping."""
 
 _LARGEST_GROWTH = 1.001
-"""Largest growth of errors in a control period that counts as none."""
+"""Largest growth factor of errors per control period that is considered stable."""
 
 _SINGULAR_DAMPING = 0.02
-"""Share that is added to the mobility of each output, so that automatic gains stay bounded at
+"""Relative increase of the mobility of each output, which keeps automatic gains bounded at
 singularities."""
 
 
@@ -55,17 +55,17 @@ class GainPair:
 
     Their units are the law's (:attr:`ControlLaw.gain_units`): a force or torque per error and per
     error rate with ``transposed_jacobian``, an acceleration per error and per error rate with the
-    laws that know the inertia. The unit of Ki is that of Kp over seconds.
+    laws that use the inertia. The unit of Ki is that of Kp over seconds.
 
-    An automatic gain follows the robot and the control period (:meth:`ControlLaw.set_gains`).
+    Automatic gains depend on the robot and the control period (:meth:`ControlLaw.set_gains`).
 
-    The integral gain removes the steady-state error under constant disturbances. With the laws
-    that know the inertia, each error is stable for ``ki < kp kd``; take much less.
+    The integral gain removes the steady-state error under constant disturbances. With the laws that
+    use the inertia, each error is stable for ``ki < kp kd``; choose much less.
 
-    Commands are held for a control period. A derivative gain that takes more than its velocity
-    within one makes the loop unstable: Kd times the period must stay well below 2 (with
-    ``transposed_jacobian``, below twice the least inertia that the output meets, which for the
-    attitude of an end-effector is that of the last wrist link about its joint).
+    Commands are held for a control period. A derivative gain that removes more than the whole
+    velocity within one period makes the loop unstable: Kd times the period must stay well below 2
+    (with ``transposed_jacobian``, below twice the smallest inertia that the output moves, which for
+    the attitude of an end-effector is that of the last wrist link about its joint).
     """
 
     kp: float = nonnegative(
@@ -100,7 +100,7 @@ def _matrix_parameter(name: str) -> Any:
     return parameter(
         (),
         f"matrix {name} of all outputs, row by row in the order of the statuses' errors, symmetric "
-        f"and positive definite, in place of the {name.lower()} of the groups; []: those",
+        f"and positive definite; []: the {name.lower()} of the groups",
         "by law",
         maximum=1e9,
         minimum=-1e9,
@@ -110,9 +110,9 @@ def _matrix_parameter(name: str) -> Any:
 
 @dataclass(frozen=True)
 class Gains:
-    """Kp, Kd (paper 4, eqs 27 and 29) and Ki: their diagonals by group, 0 in Kp or Kd: automatic.
+    """Diagonals of Kp, Kd (paper 4, eqs 27 and 29) and Ki by group; 0 in Kp or Kd: automatic.
 
-    ``kp_matrix`` and ``kd_matrix`` (m * m,), if given, are Kp and Kd of all outputs instead.
+    If given, ``kp_matrix`` and ``kd_matrix`` (m * m,) replace Kp and Kd of all outputs.
 
     Raises
     ------
@@ -144,12 +144,12 @@ class Gains:
         return cls(pair, pair, pair, pair, pair)
 
     def matrices(self, selection: OutputSelection) -> tuple[Array, Array]:
-        """Return Kp and Kd (m, m) of the selected outputs; 0 in their diagonals: automatic.
+        """Return Kp and Kd (m, m) of the selected outputs; 0 on a diagonal: automatic.
 
         Raises
         ------
         ParameterError
-            A matrix is not one of m * m numbers, symmetric and positive definite.
+            A matrix does not have m * m numbers, or is not symmetric and positive definite.
         """
         pairs = self._pairs(selection)
         return (
@@ -204,7 +204,7 @@ class LawStatus:
     """Conditioning of the last command.
 
     ``smallest_singular_value`` of ``J_z`` in SI units; ``singular``: it is below the law's
-    threshold; ``damping``: added to that singular value in quadrature, zero if none is needed.
+    threshold; ``damping``: added to that singular value in quadrature, zero if not needed.
     """
 
     smallest_singular_value: float
@@ -218,7 +218,7 @@ class LawOptions:
 
     singular_value_threshold: float = parameter(
         0.1,
-        "smallest singular value (SI units) of J_z below which it counts as singular",
+        "smallest singular value (SI units) of J_z below which J_z is considered singular",
         minimum=1e-06,
         maximum=1000000000.0,
     )
@@ -227,7 +227,7 @@ class LawOptions:
 class ControlLaw(ABC):
     """A function from the errors of the outputs to thruster forces and joint efforts.
 
-    A law is constructed once for a robot and commands once every control period. A subclass
+    A law is constructed once for a robot and computes one command per control period. A subclass
     defines ``name``, ``gain_units`` and :meth:`results`, and if it has options, ``Options``: a
     frozen dataclass derived from :class:`LawOptions`, whose fields become the parameters
     ``<name>.<option>`` of the controller node. A line in
@@ -236,17 +236,17 @@ class ControlLaw(ABC):
     Parameters
     ----------
     robot
-        The model, as the controller believes it.
+        The controller's model of the robot.
     outputs
-        The controlled outputs; :meth:`default_outputs` selects them by the robot.
+        The controlled outputs; :meth:`default_outputs` returns the robot's defaults.
     gains
         Diagonals of Kp and Kd by group, in the law's units (:class:`GainPair`).
     options
         An instance of the law's ``Options``; None: their defaults.
     thrust
-        Whether thrusters push the base; otherwise the law commands no force.
+        Whether thrusters act on the base; otherwise the law commands no force.
     control_period
-        Time for which a command is held, s; longer times give lower automatic gains.
+        Time for which a command is held, s; longer times lower the automatic gains.
 
     Raises
     ------
@@ -274,7 +274,7 @@ class ControlLaw(ABC):
         self.control_period = control_period
         """Time for which a command is held, s; 0: not known."""
         self.time = 0.0
-        """Time of the command, s, which the controller sets before each."""
+        """Time of the command, s; the controller sets it before each command."""
         self._damping_rate = _FASTEST_DAMPING
         """Automatic Kd per unit of mass, 1/s."""
         if control_period > 0:
@@ -350,7 +350,7 @@ class ControlLaw(ABC):
 
     @property
     def follows_accelerations(self) -> bool:
-        """Whether commands include the efforts of the reference's accelerations, by the masses."""
+        """Whether commands include the efforts for the reference's accelerations."""
         return self.gain_units != FORCE_GAINS or self._weighs
 
     @property
@@ -361,9 +361,9 @@ class ControlLaw(ABC):
     def automatic_effort(self, symbols: Mapping[str, ca.SX]) -> ca.SX:
         """Return the efforts (m,) of automatic gains, for a law that commands forces; else zeros.
 
-        They give the outputs whose ``kp`` and ``kd`` are 0 the accelerations of critically damped
-        errors: ``Htilde (z1ddot_des + Kd edot + Kp e)``, with the mass matrix ``Htilde`` of the
-        outputs (eq. 25), slightly damped so that singularities do no harm.
+        They make the errors of outputs whose ``kp`` and ``kd`` are 0 critically damped:
+        ``Htilde (z1ddot_des + Kd edot + Kp e)``, with the mass matrix ``Htilde`` of the outputs
+        (eq. 25), slightly damped so that it stays bounded at singularities.
         """
         z1 = self.outputs
         if not self._weighs:
@@ -384,7 +384,7 @@ class ControlLaw(ABC):
 
     @classmethod
     def default_outputs(cls, robot: SpaceRobot, end_effector_link: str) -> OutputSelection:
-        """Return the outputs if none are selected; see :func:`default_selection`."""
+        """Return the outputs for use if none are selected; see :func:`default_selection`."""
         return default_selection(robot.description, end_effector_link)
 
     @classmethod
@@ -401,8 +401,8 @@ class ControlLaw(ABC):
     def set_gains(self, gains: Gains) -> None:
         """Change the gains from the next command on.
 
-        Automatic gains damp every error critically, as fast as the control period permits: those
-        of a law that commands forces through the masses (:meth:`automatic_effort`).
+        Automatic gains damp every error critically, as fast as the control period permits; if the
+        law commands forces, they are scaled by the masses (:meth:`automatic_effort`).
 
         Raises
         ------
@@ -424,7 +424,7 @@ class ControlLaw(ABC):
                 self._in[name][:] = value
         couplings = tuple(K - np.diag(np.diag(K)) for K in gains.matrices(selection))
         self.couples = any(coupling.any() for coupling in couplings)
-        """Whether a gain matrix has numbers beside its diagonal."""
+        """Whether a gain matrix has off-diagonal elements."""
         if self.couples and not self.takes_matrices:
             raise ParameterError(f"The law '{self.name}' takes no matrices of gains.")
         self._couplings = couplings
@@ -435,7 +435,7 @@ class ControlLaw(ABC):
     def gain_arguments(self, gains: Gains) -> tuple[Array, Array]:
         """Return the arguments ``kp`` and ``kd`` (m,) of :attr:`function`.
 
-        Zeros among them are automatic gains that the function computes from the masses.
+        A zero is an automatic gain, which the function computes from the masses.
         """
         kp, kd = gains.diagonals(self.outputs.selection)
         return (kp, kd) if self.gain_units != ACCELERATION_GAINS else self._filled(kp, kd)
@@ -460,9 +460,9 @@ class ControlLaw(ABC):
         self._in["integral"][:] = self._ki * self._integral
 
     def start(self, time: float, start: Reference, goal: Reference) -> None:
-        """Restart: at ``time`` (s) the reference starts towards new goals.
+        """Restart the law: at ``time`` (s) the reference starts towards new goals.
 
-        A law that keeps a state between commands starts it here, after this base method.
+        A law that keeps a state between commands initialises it here, after calling this method.
         """
         self.reset_integral()
 
@@ -480,13 +480,13 @@ class ControlLaw(ABC):
 
     @property
     def gain_matrices(self) -> tuple[Array, Array]:
-        """Kp and Kd (m, m), as :attr:`gain_diagonals` and with the couplings between outputs."""
+        """Kp and Kd (m, m): :attr:`gain_diagonals` with the couplings between outputs."""
         (kp, kd), (beside_p, beside_d) = self.gain_diagonals, self._couplings
         return np.diag(kp) + beside_p, np.diag(kd) + beside_d
 
     @property
     def takes_matrices(self) -> bool:
-        """Whether gains may be matrices: a law with an integral term takes them by that."""
+        """Whether gains may be matrices; they act through the law's integral term."""
         return self._has_integral
 
     @property
@@ -502,9 +502,9 @@ class ControlLaw(ABC):
         TargetNotSetError
             The reference lacks a group of the outputs.
         NotFiniteError
-            The state or the reference holds a number that is not finite.
+            The state or the reference contains a number that is not finite.
         ValueError
-            A part of them has the wrong length.
+            A part of the state or the reference has the wrong length.
         """
         self.outputs.pack_state(state, self._in["state"])
         self.outputs.pack_reference(reference, self._in["reference"])
@@ -516,15 +516,15 @@ class ControlLaw(ABC):
         return self.actuation(reference)
 
     def slowest_decay(self) -> float:
-        """Return the rate (1/s) at which the slowest error decays, near the last state at rest."""
+        """Return the decay rate (1/s) of the slowest error, near the last state at rest."""
         Kp, Kd, _ = self._acceleration_gains()
         m = self.outputs.m
         motion = np.block([[np.zeros((m, m)), np.eye(m)], [-Kp, -Kd]])
         return float(-np.linalg.eigvals(motion).real.max())
 
     def sampling_warning(self) -> str:
-        """Return the warning that errors grow, near the last state at rest, if commands are held
-        for a control period and come a period late; empty: they decay.
+        """Return the warning that errors grow, near the last state at rest, if commands
+        are held for a control period and come a period late; empty: errors decay.
         """
         Kp, Kd, mobility = self._acceleration_gains()
         m, h = self.outputs.m, self.control_period
@@ -565,7 +565,7 @@ class ControlLaw(ABC):
 
     @property
     def singular_error_share(self) -> float:
-        """Share of the last error (its norm, SI) in directions that no actuator moves."""
+        """Share of the last error (norm, SI) in directions that no actuator moves."""
         error = self._out["error"]
         U, singular_values, _ = np.linalg.svd(self._out["J_z"], full_matrices=False)
         along = U[:, singular_values < self.singular_value_threshold].T @ error
@@ -573,7 +573,7 @@ class ControlLaw(ABC):
         return float(np.linalg.norm(along)) / size if size > 0 else 0.0
 
     def errors_under(self, state: ControlState, pull: Array) -> Array:
-        """Return the errors (m,) whose ``Kp e`` is a pull (m,), at rest in the shape of a state."""
+        """Return the errors (m,) with ``Kp e = pull`` (m,), at rest in the shape of a state."""
         kp, given = self.gain_diagonals[0], self._in["kp"]
         if not self._weighs:
             return np.asarray(np.linalg.solve(self.gain_matrices[0], pull))
@@ -633,9 +633,10 @@ class ControlLaw(ABC):
         return 0.0
 
     def inputs(self) -> Mapping[str, npt.ArrayLike]:
-        """Return the law's own arguments of its function, by name, with their initial values.
+        """Return the law's additional function arguments, by name, with their initial values.
 
-        They follow state, reference and gains; :meth:`actuation` may change them, in ``self._in``.
+        They come after state, reference and gains; :meth:`actuation` may change them in
+        ``self._in``.
         """
         return {}
 
@@ -645,7 +646,7 @@ class ControlLaw(ABC):
         same in every flight; None: some depend on the flight, or the function is not the whole
         command.
 
-        It is not in a law that overrides a step of the command and not :meth:`is_complete` too.
+        The latter holds if a law overrides a step of the command but not :meth:`is_complete`.
         """
         steps = min(map(self._owner, ("command", "actuation")))
         if steps < self._owner("is_complete"):
@@ -667,9 +668,9 @@ class ControlLaw(ABC):
         """Return the expressions of the law's results, other than the errors and ``J_z``, by name.
 
         ``actuation`` (6 + n,) is the command: force (N) and torque (N m) at the origin of the base
-        link in base components, then the joint efforts; other results are the law's own.
+        link in base components, then the joint efforts; other results are specific to the law.
         ``symbols`` has ``kp`` and ``kd`` (m,), ``integral`` (m,), to be added to ``kp`` times the
-        error, and one for each name of :meth:`inputs`; all else is in ``self.outputs``. A law
+        error, and one symbol per name of :meth:`inputs`; all others are in ``self.outputs``. A law
         whose ``actuation`` does not depend on ``integral`` refuses integral gains.
         """
 

@@ -28,7 +28,7 @@ class ModelBasedOptions(LawOptions):
     )
     posture_stiffness: float = nonnegative(
         0.0,
-        "pull of joints that are no outputs to the joint reference, as far as it moves no output",
+        "pull of joints that are not outputs to the joint reference, if it moves no output",
         "1/s^2",
         maximum=1000000000.0,
     )
@@ -37,14 +37,14 @@ class ModelBasedOptions(LawOptions):
 class ModelBasedLaw(ControlLaw):
     """Paper 4, eq. (27), which gives the error dynamics ``eddot + Kd edot + Kp e = 0`` (eq. 28).
 
-    Written with the acceleration ``a = z1ddot_des + Kd edot + Kp e`` and the mobility of the
-    outputs ``J_z H+^-1 J_z'``, whose inverse is the paper's ``Htilde`` (eq. 25) for a square J_z::
+    In terms of the acceleration ``a = z1ddot_des + Kd edot + Kp e`` and the mobility of the outputs
+    ``J_z H+^-1 J_z'``, whose inverse is the paper's ``Htilde`` (eq. 25) for a square J_z::
 
         Q = J_z' F + H+ xi + C+,    (J_z H+^-1 J_z') F = a - Jdot_z z0dot - J_z xi
 
-    This also serves fewer outputs than degrees of freedom: ``xi`` is the desired acceleration in
-    the null space of ``J_z``, which moves no output: damping of all velocities and, optionally, a
-    pull of the joints to the joint reference. For a square J_z it cancels.
+    This also holds for fewer outputs than degrees of freedom: ``xi`` is the desired acceleration in
+    the null space of ``J_z``, which moves no output. It damps all velocities and optionally pulls
+    the joints to the joint reference. For a square J_z it cancels.
 
     Near a singularity of J_z (smallest singular value ``s`` below the threshold ``t``) no bounded
     force accelerates the singular direction ``u`` of the outputs. There the law is damped:
@@ -61,8 +61,8 @@ class ModelBasedLaw(ControlLaw):
     Parameters
     ----------
     robot, outputs, gains, options
-        See :class:`ControlLaw`; Kp in 1/s^2, Kd in 1/s. ``posture_stiffness`` acts when a
-        reference has joints.
+        See :class:`ControlLaw`; Kp in 1/s^2, Kd in 1/s. ``posture_stiffness`` acts if the reference
+        has joints.
     """
 
     name: ClassVar[str] = "model_based"
@@ -75,7 +75,7 @@ class ModelBasedLaw(ControlLaw):
 
     @override
     def inputs(self) -> Mapping[str, npt.ArrayLike]:
-        """Return arguments of the law's own; see :meth:`ControlLaw.inputs`."""
+        """Return the law's additional arguments; see :meth:`ControlLaw.inputs`."""
         return {
             "null_space": (self.options.posture_stiffness, self.options.null_space_damping),
             "posture": np.zeros(self.robot.n),
@@ -85,7 +85,7 @@ class ModelBasedLaw(ControlLaw):
     @property
     @override
     def fixed_inputs(self) -> Mapping[str, npt.ArrayLike] | None:
-        """The fixed arguments; None with a posture: it is the reference's, or the present one."""
+        """The fixed arguments; None with a posture, which depends on the reference or the state."""
         return None if self.options.posture_stiffness else super().fixed_inputs
 
     @override

@@ -1,4 +1,4 @@
-"""Base class of control laws that are written in plain numpy, and that may have a state."""
+"""Base class of control laws in plain numpy, which may have a state."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from spacerobot_ros.model.description import Array
 
 
 class NumpyLaw(ControlLaw):
-    """A law that computes its command in Python, from a state and a reference.
+    """A law that computes its command from state and reference in Python.
 
-    A subclass gives ``name`` and :meth:`compute`. Before each call the base class evaluates
+    A subclass defines ``name`` and :meth:`compute`. Before each call the base class evaluates
     :attr:`error`, :attr:`error_rate` and :attr:`J_z` of the outputs; :attr:`gain_diagonals` are the
-    parameters ``gains``, which :attr:`gain_matrices` has whole. A law with a state keeps it in its
-    attributes, and starts it again in :meth:`start`. All engines but the lanes of campaigns fly
+    parameters ``gains``; :attr:`gain_matrices` include their couplings. A law with a state keeps it
+    in attributes and resets it in :meth:`start`. All engines except the lanes of campaigns support
     such a law.
 
     See :class:`ControlLaw` for the parameters and errors of the constructor.
@@ -51,7 +51,7 @@ class NumpyLaw(ControlLaw):
     @property
     @override
     def takes_matrices(self) -> bool:
-        """Whether gains may be matrices: :attr:`gain_matrices` are for :meth:`compute` to use."""
+        """Whether gains may be matrices; :meth:`compute` must then use :attr:`gain_matrices`."""
         return True
 
     @property
@@ -61,7 +61,7 @@ class NumpyLaw(ControlLaw):
 
     @override
     def command(self, state: ControlState, reference: Reference) -> Actuation:
-        """Return :meth:`compute`, after the errors of the outputs; see :class:`ControlLaw`."""
+        """Evaluate the output errors, then return :meth:`compute`; see :class:`ControlLaw`."""
         super().command(state, reference)
         given = self.compute(state, reference)
         try:
@@ -78,5 +78,5 @@ class NumpyLaw(ControlLaw):
 
     @override
     def results(self, symbols: dict[str, ca.SX]) -> dict[str, ca.SX]:
-        """Return no command: :meth:`compute` does."""
+        """Return no expressions: :meth:`compute` returns the command."""
         return {"actuation": ca.SX(6 + self.robot.n, 1)}

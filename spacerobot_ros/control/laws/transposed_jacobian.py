@@ -1,4 +1,4 @@
-"""A PD law of the outputs through the transpose of J_z: no inertia, no inverse."""
+"""A PD law of the outputs through the transpose of J_z, without inertia and inverse."""
 
 from __future__ import annotations
 
@@ -30,13 +30,15 @@ class TransposedJacobianLaw(ControlLaw):
     """Paper 4, eqs (29) and (30): ``[f; n; tau] = J_q^-T J_z' (Kp e + Kd edot)``.
 
     The product ``J_z J_q^-1`` maps the base twist and the joint rates to the output rates: the
-    masses cancel, and the law needs the robot's geometry alone. It inverts no matrix that can be
-    singular: near a singularity of ``J_z`` the command is as bounded as the errors are. It has no
-    acceleration feedforward. Automatic gains are matrices that do follow the masses, with
+    masses cancel, and the law needs only the robot's geometry. It inverts no matrix that can be
+    singular: if the errors are bounded, so is the command, even near a singularity of ``J_z``.
+    It has no
+    acceleration feedforward. Automatic gains are matrices that depend on the masses, with
     feedforward (:meth:`.ControlLaw.automatic_effort`).
 
-    With fewer outputs than degrees of freedom eq. (29) does not act on the other motion: arms
-    continue swinging. ``joint_damping`` subtracts ``joint_damping * qdot`` from the joint efforts.
+    If there are fewer outputs than degrees of freedom, eq. (29) does not act on the remaining
+    motion: arms continue to swing.
+    ``joint_damping`` subtracts ``joint_damping * qdot`` from the joint efforts.
 
     Parameters
     ----------
