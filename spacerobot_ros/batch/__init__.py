@@ -1,4 +1,4 @@
-"""Thousands of flights at once in SIMD lanes: one flight in each lane of a vector register."""
+"""Thousands of simultaneous flights in SIMD lanes, one flight per lane of a vector register."""
 
 from spacerobot_ros.batch.flights import (
     BatchResult,

@@ -1,4 +1,4 @@
-"""A controller of flights in batches: one flight at a time, or as one function for SIMD lanes."""
+"""A controller for batches of flights: one flight at a time, or as one function for SIMD lanes."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class BatchController:
     program
         Goals and gains of the flights.
     controller
-        See :func:`.build_controller`; the gains and goals that it has are replaced.
+        See :func:`.build_controller`; its gains and goals are replaced.
     """
 
     def __init__(self, program: ControlledGoals, controller: CoordinatedController) -> None:
@@ -96,7 +96,7 @@ class BatchController:
         Returns
         -------
         profile
-            The path of its references.
+            The profile of its references.
         bounds
             (m,) errors of the outputs beyond which control is lost.
 
@@ -118,11 +118,11 @@ class BatchController:
         return profile, controller.error_bounds(self._config.error_margin.as_errors())
 
     def time_of_tick(self, tick: int) -> float:
-        """Return the time of a tick as controllers know it, s."""
+        """Return the time of a tick as controllers compute it, s."""
         return tick * self._period_ns / SECOND
 
     def command(self, tick: int, state: ControlState) -> list[Array]:
-        """Return efforts and wrench for a state of the flight that was begun last."""
+        """Return efforts and wrench for a state of the last flight that was begun."""
         time = self.time_of_tick(tick)
         realised = self.controller.command(time, state, state.q, state.qdot).realised
         return [realised.tau, realised.wrench_B]
@@ -146,7 +146,7 @@ class BatchController:
         return Decision(int(found))
 
     def distance(self, state: ControlState, goal: Reference) -> OutputDistance:
-        """Return the distance of the outputs in a state from a goal for all of them."""
+        """Return the distance of the outputs in a state from a goal for all outputs."""
         return self.controller.distance_between(state, goal)
 
     # -- lanes --------------------------------------------------------------------------------
@@ -167,7 +167,7 @@ class BatchController:
     def exact_command(
         self, row: int, profile: ReferenceProfile, tick: int, state: ControlState
     ) -> Saturated:
-        """Return a command that :meth:`function` cannot give."""
+        """Return a command that :meth:`function` cannot compute."""
         self.law.set_gains(self._gains(row))
         commanded = self.law.command(state, profile.at(self.time_of_tick(tick)))
         return self.controller.apply_limits(state, commanded)
@@ -178,13 +178,13 @@ class BatchController:
         ``state``, ``pose``, ``twist``
             Of the plant.
         ``normals`` (12 + 2 n,), ``bias`` (6 + n,), ``sigma`` (6,)
-            Random numbers in the order of :class:`.Sensors`, measurement errors.
+            Random numbers in the order of :class:`.Sensors`, and measurement errors.
         ``time``, ``profile``, ``gains``, ``bounds``
             Time, s; :meth:`profile_argument`; :meth:`gains_argument`; of :meth:`begin_flight`.
         ``monitor``, ``next_monitor`` (3,)
             Memory of :class:`.GoalMonitor` without ``started``, which is zero.
         ``command`` (n + 6,)
-            Efforts and wrench, unless ``exact``: then :meth:`exact_command` gives them.
+            Efforts and wrench; if ``exact``, :meth:`exact_command` computes them instead.
         ``measured`` (13 + 2 n,)
             The measured state.
         ``verdict``
@@ -193,7 +193,7 @@ class BatchController:
         Raises
         ------
         ParameterError
-            The command of the law is more than one function.
+            The law's command is not a single function.
         """
         if any(
             gains.integral_diagonal(self.law.outputs.selection).any()
@@ -202,13 +202,13 @@ class BatchController:
             for gains in (*self.program.gains, self._config.gains)
         ):
             raise ParameterError(
-                "Controllers with integral gains (ki) or matrices of gains are not flown in lanes; "
-                "engine 'flights' flies them."
+                "Lanes do not support controllers with integral gains (ki) or gain matrices: "
+                "use engine 'flights'."
             )
         n, law, size = self._n, self.law, profile_size(*self._groups)
         fixed = law.fixed_inputs
         if fixed is None:
-            raise ParameterError(f"The law '{law.name}' with these options is not flown in lanes.")
+            raise ParameterError(f"Lanes do not support the law '{law.name}' with these options.")
         m = law.outputs.m
         sizes = (2 * n + 13, 7, 6, 12 + 2 * n, 6 + n, 6, 1, size, 2 * m, m, 3)
         inputs = [ca.SX.sym(name, count) for name, count in zip(CONTROL_INPUTS, sizes, strict=True)]

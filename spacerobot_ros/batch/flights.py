@@ -1,7 +1,7 @@
-"""A batch of flights: the numbers that all share, those of each flight, and the results.
+"""A batch of flights: shared numbers, numbers of each flight, and results.
 
-Rows are flights. A row has the numbers of :class:`.PlantConfig`, :class:`.InitialState` and
-:class:`.SensorConfig` for one flight; the same numbers give the same flight in the plant.
+Rows are flights. A row holds the numbers of :class:`.PlantConfig`, :class:`.InitialState` and
+:class:`.SensorConfig` for one flight; with the same numbers, the plant flies the same flight.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ NOISES = (
     "joint_noise",
     "joint_rate_noise",
 )
-"""Parameters of :class:`.SensorConfig` in the columns of :attr:`SensorErrors.noise`."""
+"""Parameters of :class:`.SensorConfig` in the order of columns of :attr:`SensorErrors.noise`."""
 
 
 @dataclass(frozen=True)
@@ -46,16 +46,16 @@ class InitialStates:
     Attributes
     ----------
     position
-        (N, 3) of the base link in W, m; with ``position_is_of_center_of_mass``, of the system's
-        centre of mass.
+        (N, 3) position of the base link, or, with ``position_is_of_center_of_mass``, of the
+        system's centre of mass, in W, m.
     quaternion
-        (N, 4) of ``R_WB`` (x, y, z, w), unit quaternions.
+        (N, 4) unit quaternions (x, y, z, w) of ``R_WB``.
     q, qdot
-        (N, n) joint positions and rates, m or rad (a second).
+        (N, n) joint positions and rates, m or rad (per second).
     momenta
         (N, 6) total linear (kg m/s) over angular momentum about the centre of mass (kg m^2/s), W.
     position_is_of_center_of_mass
-        (N,) whether ``position`` is that of the centre of mass.
+        (N,) whether ``position`` is the position of the centre of mass.
     """
 
     position: Array
@@ -72,7 +72,7 @@ class InitialStates:
         Raises
         ------
         ParameterError
-            The plant would refuse one of them.
+            The plant would refuse an initial state.
         """
         is_center_of_mass = [each.center_of_mass is not None for each in initial]
         positions = [
@@ -90,7 +90,7 @@ class InitialStates:
 
     @classmethod
     def repeated(cls, robot: SpaceRobot, initial: InitialState, count: int) -> InitialStates:
-        """Return ``count`` equal rows, whose columns the caller may change.
+        """Return ``count`` equal rows; the caller may change their columns.
 
         Raises
         ------
@@ -131,11 +131,11 @@ class SensorErrors:
         (N, 6) 1 sigma by group: position (m), attitude (rad), velocity (m/s), angular velocity
         (rad/s), joints (m or rad), joint rates.
     pose_bias
-        (N, 6) of the position in W (m) over a rotation vector in B (rad).
+        (N, 6) biases of the position in W (m) over a rotation vector in B (rad).
     joint_bias
-        (N, n) of the joint positions, m or rad.
+        (N, n) biases of the joint positions, m or rad.
     seeds
-        (N,) of the noise, which is the same as that of :class:`.Sensors` with this seed.
+        (N,) seeds of the noise, which equals that of :class:`.Sensors` with the same seed.
     """
 
     noise: Array
@@ -203,7 +203,7 @@ class SensorErrors:
 
     @property
     def is_active(self) -> npt.NDArray[np.bool_]:
-        """(N,) whether measurements differ from the truth: noise is drawn only then."""
+        """(N,) whether measurements differ from the truth; only then noise is drawn."""
         return np.asarray(
             self.noise.any(axis=1) | self.pose_bias.any(axis=1) | self.joint_bias.any(axis=1)
         )
@@ -220,7 +220,7 @@ class FollowedSchedule:
     shape_gain
         Feedback from measured shape errors to velocities, 1/s; 0: open loop.
     deadband
-        Shape errors up to this are not fed back, m or rad.
+        Shape errors up to this value are not fed back, m or rad.
     """
 
     positions: Array
@@ -235,7 +235,8 @@ class HeldCommands:
     Attributes
     ----------
     joints
-        (T, n) or (N, T, n) joint velocities or efforts, by the actuation; zero after the last.
+        (T, n) or (N, T, n) joint velocities or efforts, depending on the actuation; zero after the
+        last.
     wrench
         (T, 6) or (N, T, 6) force (N) over torque (N m) on the base, base components; None: none.
     """
@@ -246,23 +247,24 @@ class HeldCommands:
 
 @dataclass(frozen=True)
 class ControlledGoals:
-    """Commands of a :class:`.CoordinatedController` to goals that it has from the first state on.
+    """Commands of a :class:`.CoordinatedController` to goals that are set at the first state.
 
     Attributes
     ----------
     config
-        Its parameters, the same for all flights; its gains where ``gains`` gives none.
+        Parameters of the controller, the same for all flights; its gains apply if ``gains`` is
+        empty.
     base, end_effector
         Goals in W, (7,) or (N, 7): position (m) and quaternion; None: the initial pose is held.
     joints
-        Last shapes, (n,) or (N, n); None: the initial ones.
+        Goal shapes, (n,) or (N, n); None: the initial shapes.
     gains
-        Gains of each flight; empty: those of the configuration.
+        Gains of each flight; empty: the configuration's.
     robot
-        The controller's model of the robot; None: the nominal one of the flights.
+        The controller's model of the robot; None: the nominal robot of the flights.
     ends_when_decided
-        Whether a flight ends with the decision about its goal: a tick later, after the command for
-        that state. Otherwise it continues, and holds the goal.
+        Whether a flight ends with the decision about its goal: one tick later, after the command
+        for that state. Otherwise it continues and holds the goal.
     """
 
     config: ControllerConfig
@@ -279,7 +281,7 @@ FlightProgram = FollowedSchedule | HeldCommands | ControlledGoals
 
 @dataclass(frozen=True)
 class Flights:
-    """N flights of one robot that differ in numbers alone.
+    """N flights of one robot that differ only in numbers.
 
     Attributes
     ----------
@@ -296,13 +298,13 @@ class Flights:
     program
         Source of the commands.
     inertial
-        Masses, centres and inertias, (N, ...); None: those of the robot.
+        Masses, centres and inertias, (N, ...); None: the robot's.
     sensors
         Errors of sensors; None: none.
     integration_step
-        Longest Runge-Kutta step, s; 0: by the actuation.
+        Longest Runge-Kutta step, s; 0: the default of the actuation.
     report_ticks
-        Ticks after which the state is reported, ascending; 0 is the start. Empty: the end alone.
+        Ticks after which the state is reported, ascending; 0 is the start. Empty: only the end.
 
     Raises
     ------
@@ -328,7 +330,7 @@ class Flights:
         if self.actuation not in PLANTS:
             raise ParameterError(f"The actuation is '{self.actuation}', not velocity or effort.")
         if self.ticks < 1:
-            raise ParameterError(f"A flight of {self.ticks} ticks is too short; it needs one.")
+            raise ParameterError(f"A flight of {self.ticks} ticks is too short: use at least 1.")
         if not self.report_ticks:
             object.__setattr__(self, "report_ticks", (self.ticks,))
         self._require_program()
@@ -368,8 +370,8 @@ class Flights:
             case ControlledGoals(config=config, gains=gains):
                 if self.robot.description.wheel_names:
                     raise ParameterError(
-                        f"Robot '{self.robot.description.name}' has reaction wheels, which the "
-                        "controller of lanes does not turn: fly it with engine 'flights'."
+                        f"Robot '{self.robot.description.name}' has reaction wheels, which "
+                        "lanes do not support: use engine 'flights'."
                     )
                 if self.actuation != "effort":
                     raise ParameterError("A controller needs effort actuation.")
@@ -412,7 +414,7 @@ class BatchResult:
     Attributes
     ----------
     engine
-        Name of the engine that flew them.
+        Name of the engine that flew the flights.
     time
         (I,) s.
     pose
@@ -432,13 +434,13 @@ class BatchResult:
     peak_wrench
         (N, 2) largest force (N) and torque (N m) commanded on the base.
     impulse
-        (N, 2) integrals of their norms over time, N s and N m s.
+        (N, 2) time integrals of the norms of force and torque, N s and N m s.
     limited_ticks
-        (N, n) numbers of ticks in which each joint was limited, by the limit, as the plant counts.
+        (N, n) numbers of ticks in which each joint was limited, by kind of limit, as in the plant.
     fallback_ticks
-        (N,) numbers of ticks of which a step was done outside the lanes.
+        (N,) numbers of ticks with a step outside the lanes.
     lowest, highest
-        (N, n) ranges of the joint positions, over the states at all ticks.
+        (N, n) smallest and largest joint positions over all ticks.
     decision
         (N,) first :class:`.Decision` about the goal of a controller.
     decision_tick
@@ -448,12 +450,12 @@ class BatchResult:
     end_tick
         (N,) number of flown ticks.
     end_state
-        (N, 2 n + 20) the state then: q, qdot, pose, twist and momentum; NaN without a controller.
+        (N, 2 n + 20) the last state: q, qdot, pose, twist and momentum; NaN without a controller.
     momentum_drift
         (N, 2) largest change of linear and angular momentum that thrust does not explain; NaN
         without a controller.
     failures
-        Messages of the flights that failed, by their row; their later numbers are NaN.
+        Messages of failed flights, by row; the later numbers of these flights are NaN.
     """
 
     engine: str
@@ -518,8 +520,8 @@ class BatchResult:
         )
 
     def errors(self, position: Array, quaternion: Array) -> tuple[Array, Array]:
-        """Return distance (N, I) in m and angle (N, I) in rad to a pose (3,) and (4,), or to one of
-        each flight, (N, 3) and (N, 4).
+        """Return distance (N, I) in m and angle (N, I) in rad to a pose (3,) and (4,), or to one
+        pose per flight, (N, 3) and (N, 4).
         """
         wanted = np.broadcast_to(position, (len(self.pose), 3))[:, None]
         attitude = np.broadcast_to(quaternion, (len(self.pose), 4))[:, None]

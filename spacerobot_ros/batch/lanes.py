@@ -37,7 +37,7 @@ from spacerobot_ros.simulation.effort_plant import FAILURES
 from spacerobot_ros.times import SECOND
 
 _MAX_BLOCK_GROUPS = 64
-"""Largest number of lane groups in a block: more gain nothing."""
+"""Largest number of lane groups in a block; more bring no gain."""
 
 _CHUNK_TICKS = 2000
 """Number of ticks, with their noise, between two checks for signals."""
@@ -54,9 +54,9 @@ Flags = npt.NDArray[np.bool_]
 def fly_lanes(flights: Flights, target: Target | None = None) -> BatchResult:
     """Fly many flights at once, one in each SIMD lane, or each in a thread of a device.
 
-    Every flight equals that of the plant with the same numbers to rounding (1e-12 over the flights
-    of the benchmark). Without a C++ compiler the plant flies them one by one;
-    :attr:`BatchResult.engine` tells which of the two flew them.
+    Every flight equals the plant's flight with the same numbers up to rounding (1e-12 over the
+    flights of the benchmark). Without a C++ compiler, the plant flies the flights one by one;
+    :attr:`BatchResult.engine` names the engine used.
     """
     try:
         return _fly_all_in_lanes(flights, target or vector_unit())
@@ -82,7 +82,7 @@ def _fly_all_in_lanes(flights: Flights, target: Target) -> BatchResult:
 
 
 def symbolic_model_of(flights: Flights) -> tuple[ModelFunctions, Array]:
-    """Return the model of the robot and its arguments ``p`` (N, ...), the masses of the flights."""
+    """Return the model of the robot and its arguments ``p`` (N, ...): the masses of the flights."""
     inertial = flights.inertial
     if inertial is None:
         inertial = flights.robot.inertial.scaled(np.ones((len(flights), 1)))
@@ -121,7 +121,7 @@ def _block_size(flights: Flights, tick: CompiledTick) -> int:
 
 
 class LaneBlock:
-    """Memory of the flights that are in lanes at the same time.
+    """Memory of the flights that occupy the lanes at the same time.
 
     Surplus lanes repeat the last flight; their results are dropped.
     """
@@ -142,9 +142,9 @@ class LaneBlock:
         self._memory[:, self._rows["end_state"]] = np.nan
         self._noise = SensorNoise(flights, self._rows_of_lanes)
         self._ended: dict[int, int] = {}
-        """Ticks at which flights failed, by their lane in the block."""
+        """Ticks at which flights failed, by lane in the block."""
         self._profiles: dict[int, ReferenceProfile] = {}
-        """Reference profiles of flights with a controller, by their lane in the block."""
+        """Reference profiles of flights with a controller, by lane in the block."""
         self._write_starts(model, p[self._rows_of_lanes])
         self._write_errors_and_gains()
         self._loops = count if self._target.threads else self._groups
@@ -309,15 +309,15 @@ class LaneBlock:
         self._write_rows("h", np.full(len(self._rows_of_lanes), self._flights.control_period))
 
     def continue_from(self, other: LaneBlock) -> None:
-        """Take over the states of a block of the same flights, whose model has other masses."""
+        """Take over the states of a block of the same flights whose model has other masses."""
         for name in ("state", "before", "momenta", "r_cm", "alive"):
             if name in self._rows.slices:
                 self._write_rows(name, other._read_rows(name))
 
     def restart(self, model: ModelFunctions, p: Array, lanes: Counts) -> Array:
-        """Begin the flights of some lanes again, and return their reports (lanes, width).
+        """Restart the flights of some lanes, and return their reports (lanes, width).
 
-        ``p`` are their masses as arguments of the model.
+        ``p`` are the masses as arguments of the model.
         """
         self._write_starts(model, p, lanes)
         width = self._rows.row_count("command")
@@ -335,7 +335,7 @@ class LaneBlock:
         return self._target.to_numpy(reports)
 
     def end_lanes(self, lanes: Counts) -> None:
-        """End the flights of some lanes; a group whose lanes are all idle costs nothing."""
+        """End the flights of some lanes; a group with only idle lanes is skipped."""
         self._write_rows("alive", np.zeros((len(lanes), 1)), lanes)
 
     def step(
@@ -471,7 +471,7 @@ def _pad_table(table: Array, ticks: int, dimensions: int, count: int) -> Array:
 
 
 class SensorNoise:
-    """The random numbers of the sensors of a block's flights, as :class:`.Sensors` draws them."""
+    """The sensors' random numbers for the flights of a block, drawn as by :class:`.Sensors`."""
 
     def __init__(self, flights: Flights, rows: Counts) -> None:
         self._errors: SensorErrors | None = flights.sensors
@@ -490,7 +490,7 @@ class SensorNoise:
 
     @property
     def is_fed_back(self) -> bool:
-        """Whether commands depend on sensor errors: along schedules, on those of joints."""
+        """Whether commands depend on sensor errors; along schedules, on joint errors only."""
         errors = self._errors
         if errors is None:
             return False
@@ -498,11 +498,11 @@ class SensorNoise:
         return bool(self._affects_all or joints)
 
     def draw_noise(self, begin: int, end: int, alive: Array) -> Array | None:
-        """Draw the noise of the ticks from ``begin`` to before ``end``.
+        """Draw the noise of the ticks from ``begin`` up to but excluding ``end``.
 
-        ``alive`` (groups, lanes): whether flights are still under way. Returns the noise that the
-        commands depend on: that of joint positions, (groups, ticks, n, lanes), or with a controller
-        all of it; None if commands do not depend on noise.
+        ``alive`` (groups, lanes): whether flights are in progress. Returns the noise that the
+        commands depend on: of joint positions, (groups, ticks, n, lanes), or, with a controller,
+        all noise; None if commands do not depend on noise.
         """
         if self._errors is None:
             return None
@@ -527,7 +527,7 @@ class SensorNoise:
         return np.ascontiguousarray(np.moveaxis(grouped, 1, 3))
 
     def measure(self, result: BatchResult, rows: Counts) -> None:
-        """Write the measurements of the reported states of the flights in some rows."""
+        """Write the measurements of the reported states of some flights."""
         measured = result.pose[rows], result.q[rows]
         if self._errors is not None:
             at = np.repeat(self._rows[: len(rows)], len(self._instants))

@@ -1,8 +1,8 @@
-"""The ticks of a plant and of its commander, compiled for SIMD lanes: one flight in each lane.
+"""The ticks of a plant and its commander, compiled for SIMD lanes, one flight per lane.
 
 CasADi's functions become C++ in which every number is a vector register; ``driver.hpp`` loops over
-ticks and groups of lanes. Everything that Python and C++ have in common is declared here once and
-generated as C++: the rows of a group's memory (:class:`RowLayout`), the enumerations, and
+ticks and groups of lanes. Everything shared by Python and C++ is declared here once and generated
+as C++: the rows of a group's memory (:class:`RowLayout`), the enumerations, and
 :class:`Job`.
 """
 
@@ -30,7 +30,7 @@ from spacerobot_ros.simulation.effort_plant import JointStops
 
 
 class Program(IntEnum):
-    """Kind of commands: held, along a schedule, of a controller, or given before each step."""
+    """Kind of commands: held, along a schedule, from a controller, or set before each step."""
 
     HELD = 0
     FOLLOWED = 1
@@ -67,7 +67,7 @@ _MEMBER_TYPES: dict[str, Any] = {"long long": ctypes.c_longlong, "double": ctype
 
 
 class Job(ctypes.Structure):
-    """Argument of the functions in ``driver.hpp``; its members are those of ``_JOB_MEMBERS``."""
+    """Argument of the functions in ``driver.hpp``; ``_JOB_MEMBERS`` lists its members."""
 
     _fields_ = [(name, _MEMBER_TYPES.get(kind, ctypes.c_void_p)) for kind, name, _ in _JOB_MEMBERS]
 
@@ -76,7 +76,7 @@ _JOB = ctypes.POINTER(Job)
 
 
 class RowLayout:
-    """The rows of a group's memory by name; a row is one number of each flight in the group."""
+    """The rows of a group's memory by name; a row holds one number of each flight in the group."""
 
     def __init__(self, sizes: Mapping[str, int]) -> None:
         self.slices: dict[str, slice] = {}
@@ -90,7 +90,7 @@ class RowLayout:
         return self.slices[name]
 
     def first_row(self, name: str, offset: int = 0) -> int:
-        """Return the first row of a name, or one that is ``offset`` rows later."""
+        """Return the first row of a name, or the row ``offset`` rows later."""
         return int(self.slices[name].start) + offset
 
     def row_count(self, name: str) -> int:
@@ -105,7 +105,7 @@ class RowLayout:
 
 @dataclass(frozen=True)
 class CompiledTick:
-    """The compiled tick of flights that differ in numbers alone, and the rows of its memory.
+    """The compiled tick of flights that differ only in numbers, and the rows of its memory.
 
     Attributes
     ----------
@@ -139,9 +139,9 @@ class CompiledTick:
         Raises
         ------
         NoLibraryError
-            It cannot be compiled here.
+            The tick cannot be compiled here.
         ParameterError
-            The law cannot drive the selected outputs, or cannot be flown in lanes.
+            The law cannot drive the selected outputs, or lanes do not support it.
         """
         key: tuple[Any, ...] = (cls, flights.actuation, flights.substeps)
         key = (*key, link, target, compilation_settings())

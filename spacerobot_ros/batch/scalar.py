@@ -1,4 +1,4 @@
-"""Flights one after the other in the package's own plant: the reference for SIMD lanes."""
+"""Flights one by one in the package's own plant: the reference for SIMD lanes."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ from spacerobot_ros.simulation.sensors import Sensors
 from spacerobot_ros.times import SECOND
 
 _Commands = Callable[[int, Plant | Sensors], Sequence[Array]]
-"""Function from a tick and the measured state to the commands of a flight."""
+"""Function from a tick and a measured state to the commands of a flight."""
 
 
 def fly_one_by_one(flights: Flights, rows: Iterable[int] | None = None) -> BatchResult:
     """Fly the flights of some rows (all, unless given) in the plant, tick by tick.
 
-    The rows that are not flown are NaN or zero.
+    The other rows are NaN or zero.
     """
     result = BatchResult.empty(flights)
     failures: dict[int, str] = {}

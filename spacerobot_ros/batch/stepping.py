@@ -1,8 +1,8 @@
-"""Flights that a caller advances tick by tick, each with a start, a time and an end of its own.
+"""Flights that a caller advances tick by tick, each with its own start, time and end.
 
-:class:`SteppedFlights` is the plant of many flights at once: a policy, or any other source of
-commands, looks at the states and gives the next commands. The step is that of the plant, in SIMD
-lanes or, without them, in one plant for each flight.
+:class:`SteppedFlights` is the plant of many simultaneous flights: a policy, or any other source of
+commands, reads the states and provides the next commands. A step is the plant's, in SIMD lanes or,
+without them, in one plant per flight.
 """
 
 from __future__ import annotations
@@ -36,14 +36,14 @@ LINK_POSE_SIZE = 12
 class SteppedFlights:
     """N flights of one robot, advanced together by ticks under given commands.
 
-    After :meth:`reset` and :meth:`step`, the attributes have the states of the flights:
+    After :meth:`reset` and :meth:`step`, the attributes hold the states of the flights:
 
     ``pose``
         (N, 7) position ``r_WB`` (m) and quaternion ``R_WB`` (x, y, z, w) of the base.
     ``twist``
         (N, 6) ``v_WB_B`` (m/s) and ``omega_WB_B`` (rad/s).
     ``q``, ``qdot``
-        (N, n) joint positions (m or rad) and velocities (a second).
+        (N, n) joint positions (m or rad) and velocities (per second).
     ``momentum``
         (N, 7) linear (kg m/s) and angular momentum about the centre of mass (kg m^2/s), both in
         W, and kinetic energy (J).
@@ -52,21 +52,21 @@ class SteppedFlights:
     ``ticks``
         (N,) ticks since the last reset of each flight.
     ``has_not_ended``
-        (N,) whether the flight is under way: it has neither failed nor been ended.
+        (N,) whether the flight is in progress: it has neither failed nor been ended.
     ``failures``
         The messages of flights that failed since their last reset, by row.
 
-    The state of a flight that is not alive stays that of its last tick.
+    A flight that has ended keeps the state of its last tick.
 
     Parameters
     ----------
     robot, actuation, control_period, starts, inertial, integration_step
         See :class:`.Flights`; all flights begin at the starts.
     link
-        Link whose pose is wanted; empty: none.
+        Link whose pose is computed; empty: none.
     in_lanes
-        Whether the flights are in SIMD lanes; where these cannot be compiled, or if this is false,
-        each flight has a plant. Both give the same states to rounding.
+        Whether the flights are in SIMD lanes; if not, or if lanes cannot be compiled, each flight
+        has a plant. Both compute the same states up to rounding.
     plants
         Configurations of plants with thrusters, faults or external loads, which lanes do not have,
         for each flight; a reset makes a plant of the one that is then in the list. Empty: none.
@@ -76,7 +76,7 @@ class SteppedFlights:
     Raises
     ------
     ParameterError
-        Some values do not match, there is no such link, or a start is refused.
+        Some values do not match, there is no such link, or a start is invalid.
     RobotDescriptionError
         A mass or an inertia is not physical.
     """
@@ -158,7 +158,7 @@ class SteppedFlights:
     def reset(
         self, rows: npt.ArrayLike, starts: InitialStates, inertial: InertialParameters | None = None
     ) -> None:
-        """Begin some flights again; the others are not changed.
+        """Restart some flights; the others are unaffected.
 
         Parameters
         ----------
@@ -167,12 +167,12 @@ class SteppedFlights:
         starts
             Initial states, K rows.
         inertial
-            Masses, centres and inertias, (K, ...); None: those that the flights have.
+            Masses, centres and inertias, (K, ...); None: unchanged.
 
         Raises
         ------
         ParameterError
-            The numbers of rows differ, or a start is refused.
+            The numbers of rows differ, or a start is invalid.
         RobotDescriptionError
             A mass or an inertia is not physical.
         """
@@ -196,7 +196,7 @@ class SteppedFlights:
         self._begin(chosen)
 
     def require_startable(self, starts: InitialStates, inertial: InertialParameters) -> None:
-        """Refuse starts (K rows) with their masses as :meth:`reset` does, and reset nothing.
+        """Refuse starts (K rows) and masses as :meth:`reset` does, without a reset.
 
         Raises
         ------
@@ -208,19 +208,20 @@ class SteppedFlights:
         self._require_regular(replace(self._flights, initial_states=starts, inertial=inertial))
 
     def end(self, rows: npt.ArrayLike) -> None:
-        """End some flights: they are not stepped until they are reset."""
+        """End some flights; they are not stepped until they are reset."""
         chosen = np.atleast_1d(np.asarray(rows, dtype=np.int64))
         self.has_not_ended[chosen] = False
         self._engine.end(chosen)
 
     def step(self, commands: Array, ticks: int = 1) -> None:
-        """Advance all flights that are alive by some ticks, under commands that are held.
+        """Advance all flights in progress by some ticks under held commands.
 
         Parameters
         ----------
         commands
             (N, command_size) joint velocities, or efforts and a wrench on the base: force (N) over
-            torque (N m) at the origin of the base link, base components. Limits clip them.
+            torque (N m) at the origin of the base link, base components. Commands are clipped to
+            the limits.
         ticks
             Number of ticks.
 
@@ -229,14 +230,14 @@ class SteppedFlights:
         ParameterError
             The shape of the commands is wrong, or there are no ticks.
         CommandError
-            A command of a flight that is alive is not finite; no flight is stepped.
+            A command of a flight in progress is not finite; no flight is stepped.
         """
         if np.shape(commands) != (len(self), self.command_size):
             raise ParameterError(
                 f"The commands are {np.shape(commands)}, not ({len(self)}, {self.command_size})."
             )
         if ticks < 1:
-            raise ParameterError(f"A step of {ticks} ticks is too short; it needs one.")
+            raise ParameterError(f"A step of {ticks} ticks is too short: use at least 1.")
         bad = np.flatnonzero(self.has_not_ended & ~np.isfinite(commands).all(axis=1))
         if bad.size:
             raise CommandError(f"The command of flight {bad[0]} is not finite.")
@@ -290,7 +291,7 @@ class _Engine(Protocol):
         """End flights."""
 
     def step(self, commands: Array, ticks: int, failures: dict[int, str]) -> Array:
-        """Step the flights that are alive; those that fail are ended, with their messages."""
+        """Step the flights in progress; flights that fail are ended, with their messages."""
 
 
 class _LaneEngine:

@@ -62,7 +62,7 @@ NOT_A_NUMBER[1, 2, 0] = np.nan
     ("program", "changes", "sentence"),
     [
         (STILL, {"actuation": "speed"}, "The actuation is 'speed', not velocity or effort."),
-        (STILL, {"ticks": 0}, "A flight of 0 ticks is too short; it needs one."),
+        (STILL, {"ticks": 0}, "A flight of 0 ticks is too short: use at least 1."),
         (STILL, {"report_ticks": (0, 5, 11)},
          "The instants (0, 5, 11) are not ascending ticks of a flight of 10."),
         (STILL, {"report_ticks": (0, 5, 5)},
