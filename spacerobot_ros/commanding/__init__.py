@@ -1,1 +1,1 @@
-"""Commanders without ROS: how a planner or a controller answers the states of a plant."""
+"""Commanders without ROS: a planner or a controller that commands a plant state by state."""

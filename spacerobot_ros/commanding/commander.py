@@ -1,8 +1,8 @@
-"""Commanders without ROS: the answers of a planner or a controller to the states of a plant.
+"""Commanders without ROS: a planner or a controller that commands a plant state by state.
 
-A commander is given messages as they come (goals, odom, joints, the status of the plant) and calls
-its :class:`CommanderHost` in order: with statuses, events, lines for the log, and commands. Nodes
-are hosts that convert messages; the loop without ROS is one that passes arrays.
+A commander receives messages as they arrive (goals, odom, joints, the status of the plant) and
+calls its :class:`CommanderHost` in order, with statuses, events, log lines and commands. Nodes are
+hosts that convert messages; the loop without ROS is a host that passes arrays.
 """
 
 from __future__ import annotations
@@ -55,27 +55,28 @@ from spacerobot_ros.simulation.status import PlantState, PlantStatus
 from spacerobot_ros.times import SECOND
 
 _LONGEST_REPETITION = 1.0
-"""Longest simulated time between two poses that contradict others, by two publishers, s."""
+"""Longest simulated time between two contradictions that indicates two publishers, s."""
 
 _NEVER_NS = -(10**20)
 
 _REPORT_PERIOD = 1.0  # wall s, between warnings about ignored states
 
 _LONGEST_SILENCE, _SILENT_PERIODS = 1.0, 5
-"""Time without a state after which states are waited for, wall s, and at least control periods."""
+"""Time without a state after which it is reported as missing, wall s, and at least in control
+periods."""
 
 _SUSPENSION_TIME = 0.5
-"""Wall time between two looks beyond which this process itself stood still, s."""
+"""Wall time between two checks beyond which this process itself was suspended, s."""
 
 _EQUAL_RATES = 0.05
-"""Largest relative difference between two rates that count as one."""
+"""Largest relative difference between two rates that are considered equal."""
 
 _FAULT_LOG_PERIOD = 5.0  # wall s, of one kind of faulty message
 LogLevel = Literal["debug", "info", "warning", "error"]
 
 
 class CommanderActivity(Enum):
-    """Whether a commander answers states."""
+    """Whether a commander handles states."""
 
     INACTIVE = "inactive"
     ACTIVE = "active"
@@ -84,10 +85,10 @@ class CommanderActivity(Enum):
 
 
 class CommanderHost(Protocol):
-    """The surroundings of a commander: a node, a loop without ROS, or a test."""
+    """The host of a commander: a node, a loop without ROS, or a test."""
 
     def send_command(self, stamp_ns: int) -> None:
-        """Send the commander's present values as the answer to the state with a stamp."""
+        """Send the commander's present values as the command for the state with a stamp."""
 
     def publish_status(self, status: Any) -> None:
         """Publish a status of the goal."""
@@ -96,7 +97,7 @@ class CommanderHost(Protocol):
         """Publish an event."""
 
     def publish_start(self, start: ScheduleStart) -> None:
-        """Publish a schedule that begins; only planners have schedules."""
+        """Publish the start of a schedule; only planners have schedules."""
 
     def publish_path(self, path: BasePath, stamp_ns: int) -> None:
         """Publish the path of a planned reference that begins; only controllers have them."""
@@ -108,42 +109,42 @@ class CommanderHost(Protocol):
         """Whether a publisher of odom, or of a reference, is connected."""
 
     def waiting_states(self) -> tuple[Sequence[Stamped], Sequence[Stamped]]:
-        """Return received odoms and joints that the commander does not have yet."""
+        """Return received odoms and joints that the commander has not taken yet."""
 
 
 class GoalExecutive(Protocol):
     """The common interface of executives: goals, and the effects of the plant on them."""
 
     outputs: deque[Any]
-    """Statuses, events and the like to publish, in order; the commander removes them."""
+    """Statuses, events and other outputs to publish, in order; the commander removes them."""
 
     @property
     def unfinished_goals(self) -> frozenset[str]:
-        """Ids of the goals that are pursued or wait."""
+        """Ids of pursued and waiting goals."""
 
     @property
     def waiting_goals(self) -> frozenset[str]:
-        """Ids of the goals that wait to be pursued, such as for their plan."""
+        """Ids of goals that are not pursued yet, for example because they wait for a plan."""
 
     def progress(self, goal_id: str) -> tuple[str, float | None]:
-        """Return the work that is done for a goal, and the predicted time until its end, s.
+        """Return the present activity for a goal, and the predicted time until its end, s.
 
         None: there is no prediction.
         """
 
     def cancel_plan(self) -> None:
-        """Cancel the plan that is being made; any thread may call this."""
+        """Cancel the planning in progress; any thread may call this."""
         ...
 
     def plan_at_once(self) -> None:
-        """Make later plans while states wait for them: the plant is in lockstep."""
+        """Make later plans synchronously, because the plant is in lockstep."""
         ...
 
     def configure(self, config: Any) -> None:
         """Use the live parameters of another configuration from the next state on."""
 
     def abort(self, why: str) -> str | None:
-        """Give up all goals; return a message about the robot, None without a goal."""
+        """Give up all goals; return a message about the robot, or None without a goal."""
 
     def plant_stopped(
         self, why: str, commanded_until_ns: int | None = None, rests_since_ns: int = 0
@@ -155,10 +156,10 @@ class GoalExecutive(Protocol):
         why
             The message of the plant; it becomes part of the status.
         commanded_until_ns
-            For a plant that rests because commands did not come: the stamp of the last one that it
-            received. Goals that were begun later continue. None: the plant obeys nothing.
+            If the plant rests because commands were missing: the stamp of the last command that it
+            received; later goals continue. None: the plant obeys no commands.
         rests_since_ns
-            Stamp since which it rests then, ns.
+            Stamp since which that plant rests, ns.
 
         Returns
         -------
@@ -170,7 +171,7 @@ class GoalExecutive(Protocol):
         """React to a plant that obeys again."""
 
     def plant_reset(self) -> None:
-        """Begin the present goal again, because the state of the robot has changed."""
+        """Restart the present goal, because the state of the robot has changed."""
 
 
 class StateDecoder(Protocol):
@@ -182,7 +183,7 @@ class StateDecoder(Protocol):
     """Rates (n,) of the latest accepted joints, m/s or rad/s."""
 
     def check_robot(self, joints: Any) -> None:
-        """Refuse joint states of another robot: CommandError."""
+        """Raise CommandError if the joint states are of another robot."""
 
     def decode_joints(self, joints: Any) -> int:
         """Read joints into ``q`` and ``qdot``; return their stamp, ns, or raise CommandError."""
@@ -191,7 +192,7 @@ class StateDecoder(Protocol):
         """Return pose (7,) and twist (6,) of an odom or base reference, or raise CommandError."""
 
     def measured_base(self, odom: Any) -> tuple[Array, Array]:
-        """Return what :meth:`decode_base` does, in arrays that the next call may overwrite."""
+        """Like :meth:`decode_base`, but the next call may overwrite the returned arrays."""
 
     def target(self, odom: Any) -> tuple[Array, Array]:
         """Return pose (7,) and twist (6,) of an odom of the target, or raise CommandError."""
@@ -202,7 +203,7 @@ class StateDecoder(Protocol):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StateArrays:
-    """A state as arrays: the joints, and the base if it is measured; all messages in one."""
+    """A whole state as arrays: the joints, and the base if it is measured."""
 
     stamp_ns: int
     q: Array
@@ -245,17 +246,17 @@ class ArrayDecoder:
 class Commander(ABC):
     """Base class of the commanders: planner and controller.
 
-    States are answered while the commander is active and knows its robot and the rate of the plant,
-    and only those of the plant's present time (:class:`StampFilter`). Commands follow the rate of
-    the plant, whatever rate is configured. Goals that come before the robot wait for it. All goals
-    are given up when the plant reports that it does not obey (:class:`PlantListener`).
+    A commander sends commands while it is active and has the robot and the rate of the plant, and
+    only for states of the plant's present time (:class:`StampFilter`). Commands follow the rate of
+    the plant, whatever rate is configured. Goals received before the robot's description wait for
+    it. All goals are given up if the plant reports that it does not obey (:class:`PlantListener`).
 
     Parameters
     ----------
     config
         Parameters of the commander.
     host
-        Its surroundings.
+        Receives the outputs.
     goal_keys
         Parts of the robot that goals may be for.
     pose_required
@@ -277,38 +278,38 @@ class Commander(ABC):
     ) -> None:
         self.config, self.host, self._clock = config, host, clock
         self._given = config
-        """The configuration without what is learnt of robot and plant."""
+        """The configuration without adaptations to robot and plant."""
         self.activity = CommanderActivity.INACTIVE
         self.robot: SpaceRobot | None = None
         self.stamps = StampFilter(clock)
         self.states = StateSynchroniser(pose_required=pose_required)
         self._contradicted_ns = _NEVER_NS
-        """Stamp of the last pose that contradicted another one, ns."""
+        """Stamp of the last pose that contradicted another, ns."""
         self.plant = PlantListener()
         self._decoder: StateDecoder | None = None
         self._described: SpaceRobot | None = None
-        """The robot as it is described, without a body that it holds."""
+        """The robot as described, without a held body."""
         self._payload = ""
         self._held: Payload | None = None
+        """The body that the robot holds, if its text is valid."""
         self._obstacles: str | None = None
-        """The text on the topic obstacles; None: the robot has its own."""
+        """The text on the topic obstacles; None: the robot's own obstacles apply."""
         self._world: RobotDescription | None = None
         """The obstacles of this text."""
-        """The body that the robot holds, as far as its text is one."""
         self._goal_file = GoalFile(config.resume_file, goal_keys)
         self._goal_ids = GoalIds()
         self._waiting_goals: dict[str, IdentifiedGoal] = {}
         """Goals that were received before the robot's description."""
         self._fly_to = FlyToGoals(self._goal_errors, self._report_aborted)
         self._activated = self._heard = self._checked = clock()
-        """Wall times of the activation, the last state and the last look, s."""
+        """Wall times of the activation, the last state and the last check, s."""
         self.refusal = ""
-        """Why the last joint states were refused, as a clause; empty: they were not."""
+        """Why the last joint states were refused, as a clause; empty: not refused."""
         self._reported_missing = self._reported_waiting = ""
-        """What the last status said is waited for, as a clause, and the goal that waits; empty:
+        """What the last status reported as missing, as a clause, and the waiting goal; empty:
         nothing."""
         self._last_status: Status | None = None
-        """The last status that did not say so."""
+        """The last status that reported nothing missing."""
         self._ignored_reported, self._next_report = 0, 0.0
         self._fault_log_times: dict[str, float] = {}
         """Wall time of the last log line by kind of fault, s."""
@@ -317,7 +318,7 @@ class Commander(ABC):
 
     @property
     def active(self) -> bool:
-        """Whether states are answered and goals accepted."""
+        """Whether states are handled and goals are accepted."""
         return self.activity is CommanderActivity.ACTIVE
 
     def use_robot(self, robot: SpaceRobot, decoder: StateDecoder) -> None:
@@ -326,7 +327,7 @@ class Commander(ABC):
         Raises
         ------
         SpaceRobotError
-            The configuration does not go with the robot.
+            The configuration does not fit the robot.
         """
         self._described, self._payload = robot, self.plant.status.payload
         self.config = self._adapted(self._given)
@@ -366,12 +367,12 @@ class Commander(ABC):
         self.robot = self.executive = self._decoder = self._described = None
 
     def activate(self) -> None:
-        """Answer states from now on; resume the goals that an earlier process left undecided.
+        """Handle states from now on; resume the goals that an earlier process left undecided.
 
         Raises
         ------
         ParameterError
-            The file of goals is refused.
+            The file of goals is invalid.
         """
         self._activated = self._heard = self._checked = self._clock()
         self._reported_missing = ""
@@ -382,10 +383,10 @@ class Commander(ABC):
         self.answer()
 
     def deactivate(self, failure: str = "") -> None:
-        """Give up the goals and stop commanding, by a failure or not; the file of goals stays."""
+        """Give up the goals and stop commanding, after a failure or not; keep the file of goals."""
         why = f"Aborted: {failure or 'this node was deactivated.'}"
         if self.config.resume_file:
-            why += " A goal that came by topic is resumed when it is activated again."
+            why += " A goal from a topic is resumed when the node is activated again."
         if self.activity is not CommanderActivity.INACTIVE and self.executive is not None:
             self._stop_executive(why)
         self.activity, self._waiting_goals = CommanderActivity.INACTIVE, {}
@@ -396,21 +397,21 @@ class Commander(ABC):
     def receive_goal(
         self, key: str, sec: int, nanosec: int, read: Callable[[], Goal]
     ) -> IdentifiedGoal | None:
-        """Accept or refuse a goal; a status or the next answers report the result.
+        """Accept or refuse a goal; a status reports the result.
 
         Parameters
         ----------
         key
-            Part of the robot that the goal is for.
+            Part of the robot for which the goal is.
         sec, nanosec
-            Stamp of its header, which names it.
+            Stamp of the goal's header, which identifies the goal.
         read
             Returns the goal, or raises PlanningError with the message of the refusal.
 
         Returns
         -------
         IdentifiedGoal | None
-            The goal, None where it is refused.
+            The goal; None: it is refused.
         """
         goal_id = self._goal_ids.of(sec, nanosec)
         try:
@@ -432,16 +433,16 @@ class Commander(ABC):
         Parameters
         ----------
         goal_id
-            Id of the goal in statuses, which no other goal has.
+            Unique id of the goal in statuses.
         read
             Returns the goal, or raises PlanningError with the message of the refusal.
         client
-            Who waits for the result.
+            Client that waits for the result.
 
         Returns
         -------
         IdentifiedGoal | None
-            The goal, None where it is refused.
+            The goal; None: it is refused.
         """
         try:
             self._require_free()
@@ -459,12 +460,12 @@ class Commander(ABC):
         return accepted
 
     def cancel_fly_to(self, goal_id: str) -> None:
-        """Abort the goal of an action; one that is about to be replaced ends when it is."""
+        """Abort the goal of an action; a goal about to be replaced ends when it is replaced."""
         self._fly_to.request_abort(goal_id)
         self._abort_fly_to()
 
     def abort(self, why: str = "on request") -> str | None:
-        """Give up all goals; return the message of the answer, None without a goal."""
+        """Give up all goals; return a message for the client, or None without a goal."""
         if self._waiting_goals:
             message = f"Aborted {why}, before the robot was known."
             self._abort_waiting(message)
@@ -594,12 +595,13 @@ class Commander(ABC):
     # -- states -------------------------------------------------------------------------------
 
     def receive_odom(self, stamp_ns: int, odom: Any) -> None:
-        """Take a received odom; set it aside if its stamp belongs to another time."""
+        """Take a received odom; set it aside if its stamp is not of the present time."""
         if self.stamps.accepts_odom(stamp_ns, odom):
             self.take_odom(stamp_ns, odom)
 
     def receive_joints(self, stamp_ns: int, joints: Any) -> None:
-        """Take received joints: those of another time are set aside, and late ones skipped."""
+        """Take received joints; set them aside if they are not of the present time, and skip late
+        ones."""
         odoms, waiting = self.host.waiting_states()
         self._take_states(odoms, [Stamped(stamp_ns, joints), *waiting])
         if self._fly_to:
@@ -607,7 +609,7 @@ class Commander(ABC):
         self._heard = self._clock()
 
     def take_odom(self, stamp_ns: int, odom: Any) -> None:
-        """Take an odom of the present time, and answer its state if complete."""
+        """Take an odom of the present time, and handle its state if complete."""
         if self.states.put_odom(stamp_ns, odom):
             # One alone is a plant that was reset or restarted, whose status comes later.
             since = (stamp_ns - self._contradicted_ns) / SECOND
@@ -622,7 +624,7 @@ class Commander(ABC):
             self.answer()
 
     def take_joints(self, stamp_ns: int, joints: Any) -> None:
-        """Take joints of the present time, and answer their state if complete."""
+        """Take joints of the present time, and handle their state if complete."""
         self.states.put_joints(stamp_ns, joints)
         if not self.config.tick_rate:
             self._follow_rate()
@@ -658,7 +660,7 @@ class Commander(ABC):
 
     @property
     def missing(self) -> str:
-        """Clause that names what states wait for before they are answered; empty: nothing."""
+        """Clause that names the messages for which states wait; empty: none."""
         if self.robot is None:
             return "a robot on 'robot_description'"
         topics = {"joint_states": self.states.joints, "odom": self.states.odom}
@@ -700,7 +702,7 @@ class Commander(ABC):
             self._report_present_status()
 
     def answer_latest(self) -> None:
-        """Answer the latest state that has come, after work for which states have waited."""
+        """Handle the latest received state, after work during which states have waited."""
         self._take_states(*self.host.waiting_states())
         self.answer()
 
@@ -746,7 +748,7 @@ class Commander(ABC):
     # -- the plant ----------------------------------------------------------------------------
 
     def interrupt(self) -> None:
-        """Cancel the plan that is being made; any thread may call this."""
+        """Cancel the planning in progress; any thread may call this."""
         if self.executive is not None:
             self.executive.cancel_plan()
 
@@ -779,16 +781,16 @@ class Commander(ABC):
                 self._change_masses(self.robot)
 
     def receive_obstacles(self, text: str) -> None:
-        """Plan around the obstacles of a URDF text instead of those so far; empty: around none.
+        """Plan around the obstacles of a URDF text from now on; empty: no obstacles.
 
-        A text that is refused is logged, and the obstacles so far stay.
+        If the text is refused, this is logged and the previous obstacles are kept.
         """
         if text == self._obstacles:
             return
         try:
             self._world = obstacles_from_topic(text)
         except RobotDescriptionError as refusal:
-            kept = "The obstacles so far stay."
+            kept = "The previous obstacles are kept."
             self._log_fault("obstacles", printable(f"obstacles: {refusal} {kept}"))
             return
         self._obstacles = text
@@ -809,7 +811,7 @@ class Commander(ABC):
             return robot
 
     def on_plant_silent(self, message: str) -> None:
-        """Give up the goals, because nothing comes from the plant any longer."""
+        """Give up the goals, because the plant no longer sends anything."""
         self._give_up_goals(PlantStopped(message))
 
     def _give_up_goals(self, stopped: PlantStopped) -> None:
@@ -898,7 +900,7 @@ class Commander(ABC):
 
     @abstractmethod
     def answer(self) -> None:
-        """Answer the ready state, if any, while the commander is active."""
+        """Handle the ready state, if any, while the commander is active."""
 
     @abstractmethod
     def _forward_plant_state(self) -> None:

@@ -1,4 +1,4 @@
-"""Coordinated control without ROS: every state is answered with a wrench and joint efforts."""
+"""Coordinated control without ROS: a wrench and joint efforts for every state."""
 
 from __future__ import annotations
 
@@ -34,17 +34,17 @@ from spacerobot_ros.planning.execution.goal_file import BASE_GOAL_KEY, Identifie
 from spacerobot_ros.times import SECOND
 
 JOINT_REFERENCE, BASE_REFERENCE = "joint_reference", "base_reference"
-"""Topics of references for a controller; states wait for each topic that has a publisher."""
+"""Topics of references for a controller; states wait for every topic with a publisher."""
 
 TARGET_ODOMETRY = "target/odom"
 """Topic of the measured motion of the target."""
 
 _LONGEST_CHECK_PERIOD = 0.2
-"""Longest wall time that one look at waiting states counts for, s: this process may have slept."""
+"""Longest wall time counted between two checks of waiting states, s; this process may sleep."""
 
 
 class ControllerCommander(Commander):
-    """Answers every state with a wrench and joint efforts (:class:`ControlExecutive`).
+    """Commands a wrench and joint efforts for every state (:class:`ControlExecutive`).
 
     ``effort`` (n,), N m or N, and ``wrench`` (6,), N and N m in the base frame, are the values of
     the last command.
@@ -54,7 +54,7 @@ class ControllerCommander(Commander):
     config, host, clock
         See :class:`Commander`.
     partner_is_busy
-        Whether a planner is known to plan for long: states then wait for its reference.
+        Whether a planner is known to be planning for long; if so, states wait for its reference.
     """
 
     config: ControllerConfig
@@ -71,13 +71,13 @@ class ControllerCommander(Commander):
         super().__init__(config, host, GOAL_KEYS, pose_required=True, clock=clock)
         self._partner_is_busy = partner_is_busy
         self._silent: set[str] = set()
-        """Topics of references that are silent: no state waits for them."""
+        """Topics of references that are silent; states do not wait for them."""
         self._missed_since: dict[str, int] = {}
-        """Stamp of the first state without its reference by topic, ns."""
+        """Stamp of the first state without its reference, by topic, ns."""
         self._waited: dict[str, float] = {}
-        """Wall time for which states have waited since the last message by topic, s."""
+        """Wall time for which states have waited since the last message, by topic, s."""
         self._looked = clock()
-        """Wall time of the last look at it, s."""
+        """Wall time of the last check of waiting states, s."""
         self._pose_has_come = self._odom_was_connected = False
         self.effort, self.wrench = np.zeros(0), np.zeros(6)
         self._measured: ControlState | None = None
@@ -91,7 +91,7 @@ class ControllerCommander(Commander):
         return ControllerStatus(ControllerState(state), message, goal_id)
 
     def activate(self) -> None:
-        """Answer states from now on, each with the references that have a publisher."""
+        """Handle states from now on, each with the references that have a publisher."""
         for topic in (JOINT_REFERENCE, BASE_REFERENCE):
             self.states.require(topic, required=self.host.has_publisher(topic))
         self._silent.clear()
@@ -100,29 +100,29 @@ class ControllerCommander(Commander):
         super().activate()
 
     def dump_momentum(self) -> str:
-        """Dump the momentum of the reaction wheels; return a sentence.
+        """Dump the momentum of the reaction wheels; return a message.
 
         Raises
         ------
         CommandError
-            It is not dumped; the message says why.
+            The momentum is not dumped; the message states the reason.
         """
         return self._active_executive().dump_momentum()
 
     def request(self, task: Task) -> str:
-        """Do a task without a goal after it; return a sentence.
+        """Begin a task without a goal after it; return a message.
 
         Raises
         ------
         CommandError
-            It is refused; the message says why.
+            The task is refused; the message states the reason.
         """
         executive = self._active_executive()
         if self.plant.refusal_of_goals:
             raise CommandError(self.plant.refusal_of_goals)
         if task is Task.APPROACH and self._target is None:
             raise CommandError(
-                "There is no target to approach: none is on 'target/robot_description'."
+                "There is no target to approach: 'target/robot_description' has no message."
             )
         executive.request(task)
         return f"The task '{task.value}' begins; controller/status reports its progress."
@@ -140,15 +140,15 @@ class ControllerCommander(Commander):
             self.executive.servicing.target.describe(target, frame)
 
     def receive_target(self, stamp_ns: int, message: Any) -> None:
-        """Take odometry of the target, which is read with the next state while a task needs it.
+        """Take odometry of the target; the next state reads it if a task needs it.
 
-        No state waits for it: the motion since the last one is predicted.
+        States do not wait for it: the motion since the last odometry is predicted.
         """
         if self.executive is not None and self.executive.servicing.needs_target:
             self._target_odometry = Stamped(stamp_ns, message)
 
     def receive_reference(self, topic: str, stamp_ns: int, message: Any) -> None:
-        """Take a reference, and answer its state if complete."""
+        """Take a reference, and handle its state if complete."""
         self.states.put_required(topic, stamp_ns, message)
         self._missed_since.pop(topic, None)
         self._waited.pop(topic, None)
@@ -158,7 +158,7 @@ class ControllerCommander(Commander):
         self.answer()
 
     def take_odom(self, stamp_ns: int, odom: Any) -> None:
-        """Take odom of the present time, after answering a state whose reference never came."""
+        """Take odom of the present time, after handling a state whose reference never arrived."""
         missing = self.states.missing
         if missing and self.active and self.executive is not None:
             pairing = self.states.take_overdue()
@@ -168,7 +168,7 @@ class ControllerCommander(Commander):
         super().take_odom(stamp_ns, odom)
 
     def take_accepted_jump(self) -> str:
-        """Take a set-aside state once its time is accepted, and check what states wait for."""
+        """Take a set-aside state once its time is accepted, and check the waiting state."""
         warning = super().take_accepted_jump()
         if self.active:
             self._watch_waiting_state()
@@ -215,7 +215,7 @@ class ControllerCommander(Commander):
         super()._publish_status(status)
 
     def take_joints(self, stamp_ns: int, joints: Any) -> None:
-        """Take joints of the present time, after answering a state whose odom never came."""
+        """Take joints of the present time, after handling a state whose odom never arrived."""
         overdue = None
         if self.active and self.executive is not None and not self._waits_for_first_pose():
             overdue = self.states.take_overdue()
@@ -228,7 +228,7 @@ class ControllerCommander(Commander):
     def rehearse(self) -> None:
         """Rehearse a goal and a loss of the pose, so that no function is compiled in flight.
 
-        A controller that compiles keeps the plant waiting longer than its ``command_timeout``.
+        Otherwise compilation could keep the plant waiting longer than its ``command_timeout``.
         """
         robot = self.robot
         if robot is None:
@@ -337,7 +337,7 @@ class ControllerCommander(Commander):
         return not before
 
     def answer(self) -> None:
-        """Answer a state once, as soon as all its messages are there."""
+        """Handle a state once, as soon as all its messages have arrived."""
         if self.executive is not None and self.active and self._knows_rate:
             pairing = self.states.take_ready()
             if pairing is not None:

@@ -1,8 +1,8 @@
-"""Goals of actions: their feedback, and which of them ends with which result; without ROS.
+"""Goals of actions, with feedback and results, without ROS.
 
-A goal of an action is a goal like one of a topic: the commander gives it to its executive, and its
-statuses tell its course. :class:`FlyToGoals` knows which goals have a client that waits, and gives
-each exactly one result: that of the status that decides the goal.
+The goal of an action is handled like the goal of a topic: the commander passes it to its executive,
+and statuses report its progress. :class:`FlyToGoals` keeps the goals whose clients wait, and sends
+each client exactly one result: the status that decides the goal.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from spacerobot_ros.planning.execution.status import PlannerStatus
 from spacerobot_ros.times import SECOND
 
 FEEDBACK_PERIOD_NS = SECOND // 5
-"""Shortest simulated time between two feedbacks of a goal, ns."""
+"""Shortest simulated time between two feedback messages of a goal, ns."""
 
 
 @dataclass(frozen=True)
@@ -33,9 +33,9 @@ class FlyTo:
     goal
         Poses of the base and of end-effectors, and joint positions.
     tolerance
-        Its largest errors; 0: that of the commander's parameters.
+        Largest permissible errors; 0: the commander's parameter.
     time_limit
-        Simulated time after which it is given up, s; 0: never.
+        Simulated time after which the goal is given up, s; 0: never.
     """
 
     goal: Goal
@@ -44,7 +44,7 @@ class FlyTo:
 
     @classmethod
     def from_numbers(cls, goal: Goal, tolerance: Tolerance, time_limit: float) -> FlyTo:
-        """Return the goal of an action with numbers that were received.
+        """Return the goal of an action from received numbers.
 
         Raises
         ------
@@ -65,7 +65,7 @@ class FlyTo:
         return cls(goal, tolerance, time_limit)
 
     def tolerance_or(self, default: Tolerance) -> Tolerance:
-        """Return its tolerances; those that it leaves open come from a default."""
+        """Return the tolerances, with defaults for those not set."""
         mine = self.tolerance
         return Tolerance(
             mine.position or default.position,
@@ -76,16 +76,16 @@ class FlyTo:
 
 @dataclass(frozen=True)
 class GoalErrors:
-    """Distance of a state from a goal; NaN for parts left open or not measured.
+    """Distance of a state from a goal; NaN for parts not requested or not measured.
 
     Attributes
     ----------
     position, attitude
-        Of the base, m and rad.
+        Errors of the base, m and rad.
     end_effector_position, end_effector_attitude
-        The largest of an end-effector, m and rad.
+        Largest errors of an end-effector, m and rad.
     joints
-        The largest of a joint, m or rad.
+        Largest error of a joint, m or rad.
     """
 
     position: float = math.nan
@@ -101,7 +101,7 @@ class GoalErrors:
         Raises
         ------
         GoalError
-            The goal is for a link that the robot does not have.
+            The robot has no link of the goal's name.
         """
         goal = goal.for_robot(robot.description)
         error = PoseError.between(pose[:3], pose[3:], goal, q, robot)
@@ -115,7 +115,7 @@ class GoalErrors:
         )
 
     def reported_by(self, status: Status) -> GoalErrors:
-        """Return the errors with those that a status reports instead of its own."""
+        """Return the errors, replaced by those that a status reports."""
         if not isinstance(status, PlannerStatus):
             return self
         reported = {
@@ -146,11 +146,11 @@ class Progress:
     Attributes
     ----------
     phase
-        The work that is done for it.
+        Present activity for the goal.
     remaining_time
         Predicted time until the present motion ends, s; None: there is no prediction.
     elapsed_time
-        Time since the first state after it was sent, s.
+        Time since the first state after the goal was sent, s.
     stamp_ns
         Stamp of the last state, ns.
     pose
@@ -169,7 +169,7 @@ class Progress:
 
 @dataclass(frozen=True)
 class FlyToResult:
-    """Result of a goal: state and message of the status that decides it, and its errors."""
+    """Result of a goal: state and message of the deciding status, and the errors."""
 
     outcome: str
     message: str
@@ -191,28 +191,28 @@ class _ActionGoal:
     """A goal with a client that waits for its result."""
 
     client: FlyToClient | None
-    """Who waits for the result; None: nobody does, as the goal came by topic."""
+    """Client that waits for the result; None: the goal came by topic."""
     request: FlyTo | None
-    """None: it is refused, or came by topic."""
+    """None: the goal is refused, or came by topic."""
     first_state_ns: int | None = None
     """Stamp of the first state after the goal was sent, ns."""
     last_feedback_ns: int | None = None
     """Stamp of the state at the last feedback about the goal, ns."""
     give_up: str = ""
-    """Reason to abort the goal; empty: it is not."""
+    """Reason to abort the goal; empty: no abort."""
     aborted: bool = False
     """Whether the executive was asked to abort the goal."""
 
 
 class FlyToGoals:
-    """The goals that are pursued or wait to be, and the clients that wait for their results.
+    """Pursued and waiting goals, and the clients that wait for their results.
 
     Parameters
     ----------
     errors
         Returns the errors of the last measured state to a goal.
     report_aborted
-        Publishes that a goal of an id has been aborted, with a message, and returns this status.
+        Publishes the abort of a goal (id, message), and returns this status.
     """
 
     def __init__(
@@ -222,10 +222,10 @@ class FlyToGoals:
     ) -> None:
         self._errors, self._report_aborted = errors, report_aborted
         self._served: dict[str, _ActionGoal] = {}
-        """By goal id, in the order in which they came."""
+        """Goals by id, in order of arrival."""
         self._clients = 0
         self._accepted: list[str] = []
-        """Ids of the goals that were accepted and not refused, by action or by topic, in order."""
+        """Ids of accepted goals that were not refused later, from actions or topics, in order."""
 
     def __bool__(self) -> bool:
         """Whether a client waits."""
@@ -239,7 +239,7 @@ class FlyToGoals:
         self._clients += client is not None
 
     def accepted(self, goal_id: str) -> None:
-        """Note the goal that was accepted last."""
+        """Record the latest accepted goal."""
         self._accepted = [each for each in self._accepted if each in self._served]
         self._accepted.append(goal_id)
 
@@ -254,11 +254,11 @@ class FlyToGoals:
             served.give_up = served.give_up or why
 
     def abort_reason(self, waiting: Collection[str]) -> str:
-        """Return the reason to abort all goals now; empty: they are not.
+        """Return the reason to abort all goals now; empty: no abort.
 
-        An abort gives up every goal. So one that is about to be replaced waits until it is
-        replaced, or until the goal that came later is refused: while another one is among the ids
-        of the goals that are ``waiting``.
+        An abort gives up every goal. If a goal is about to be replaced, its abort therefore waits
+        until it is replaced or the later goal is refused: as long as ``waiting`` has the id of
+        another goal.
         """
         for goal_id, served in self._served.items():
             alone = self._accepted[-1:] == [goal_id] or set(waiting) <= {goal_id}
@@ -270,7 +270,7 @@ class FlyToGoals:
     def advance(self, now_ns: int, progress: Callable[[str, Goal, int], Progress]) -> None:
         """Check the time limits at a state, and send feedback to the clients.
 
-        ``progress`` returns the course of a goal by its id, its goal, and the stamp of its begin.
+        ``progress`` returns the progress of a goal from its id, the goal, and its start stamp.
         """
         for goal_id, served in self._served.items():
             if served.request is None or served.client is None:
@@ -305,9 +305,9 @@ class FlyToGoals:
         Parameters
         ----------
         pursued
-            Ids of the goals that are pursued, and of those that a status is about to decide.
+            Ids of pursued goals, and of goals that a status is about to decide.
         why
-            The reason for goals that no later goal replaces.
+            The reason, for goals not replaced by a later goal.
         """
         for goal_id in [each for each in self._served if each not in pursued]:
             message = why or "The goal is no longer pursued."

@@ -1,4 +1,4 @@
-"""The statuses of commanders: where each is published, and how those of one goal are followed."""
+"""The statuses of commanders: their topics, and how to follow the statuses of one goal."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ STATUS_TOPICS: Mapping[str, tuple[str, Callable[[Mapping[str, str], str], Status
     "planner": ("planner/status", PlannerStatus.from_values),
     "coordinated_control": ("controller/status", ControllerStatus.from_values),
 }
-"""By commander: the topic of its status, and the function that reads its values and message."""
+"""Status topic of each commander, and the function that reads its values and message."""
 
 
 class GoalFollower:
@@ -23,9 +23,9 @@ class GoalFollower:
     Parameters
     ----------
     goal_id
-        Id of the goal; None: no goal was sent yet, and no status decides.
+        Id of the goal; None: no goal was sent yet, so no status is about it.
     unnamed
-        Whether statuses without an id are about the goal too, as in bags of version 0.1.
+        Whether statuses without an id are also about the goal, as in bags of version 0.1.
     """
 
     def __init__(self, goal_id: str | None = None, *, unnamed: bool = False) -> None:

@@ -1,4 +1,4 @@
-"""The planner without ROS: every state is answered with a setpoint of the joints."""
+"""The planner without ROS: a setpoint of the joints for every state."""
 
 from __future__ import annotations
 
@@ -67,16 +67,16 @@ class _MeasuredState:
 
 
 class PlannerCommander(Commander):
-    """Answers every state with a setpoint of the joints (:class:`Executive`).
+    """Sends a setpoint of the joints for every state (:class:`Executive`).
 
     Parameters
     ----------
     config, host, clock
-        As of every commander.
+        See :class:`Commander`.
     method
-        Gait method; None: the one that the configuration names.
+        Gait method; None: the method of the configuration.
     long_work
-        Context in which plans are made that take long.
+        Context for planning that takes long.
     """
 
     config: PlannerConfig
@@ -97,7 +97,7 @@ class PlannerCommander(Commander):
         self._status: PlannerStatus | None = None
         self._disturbances: tuple[str, ...] = ()
         self.trajectories: TrajectoryOutput | None = None
-        """Where schedules are sent to, for ``output: trajectory``."""
+        """Receives schedules, for ``output: trajectory``."""
 
     def _make_status(self, state: str, message: str, goal_id: str) -> PlannerStatus:
         return PlannerStatus(PlannerState(state), message, goal_id)
@@ -109,7 +109,7 @@ class PlannerCommander(Commander):
 
     @property
     def setpoint(self) -> Setpoint:
-        """The command that answers the last state."""
+        """The command for the last state."""
         assert self.executive is not None
         return self.executive.setpoint
 
@@ -125,7 +125,7 @@ class PlannerCommander(Commander):
         return PlanningWorker(robot, self.config, method, self._on_long_work, described)
 
     def end_schedule(self, end: TrajectoryEnd) -> None:
-        """End the present schedule: the controller that follows it has ended it."""
+        """End the present schedule, because its controller has ended it."""
         if self.executive is not None:
             self.executive.schedule_ended(end.message, final=end.final)
 
@@ -164,7 +164,7 @@ class PlannerCommander(Commander):
             return ""
         return (
             "The plant takes efforts, but this planner sends velocities: start the plant with "
-            "actuation:=velocity, or the planner with output:=reference beside a "
+            "actuation:=velocity, or the planner with output:=reference together with a "
             "coordinated_control."
         )
 
@@ -194,14 +194,14 @@ class PlannerCommander(Commander):
         super()._accept_goal(BASE_GOAL_KEY, goal)
 
     def receive_twist(self, link: str, frame: str, linear: Array, angular: Array) -> None:
-        """Let a link follow a twist until twists stop; a log line gives the reason if it does not.
+        """Make a link follow a twist until twists stop; if it cannot, the reason is logged.
 
         Parameters
         ----------
         link
             Name of the link.
         frame
-            Name of the frame of both: the world's, the base's, or the link's own.
+            Frame of both velocities: the world's, the base's, or the link's own.
         linear, angular
             (3,) velocity of the link's origin, m/s, and angular velocity, rad/s.
         """
@@ -266,7 +266,7 @@ class PlannerCommander(Commander):
         return self.executive is not None and self.executive.measuring
 
     def answer(self) -> None:
-        """Answer a state as soon as its joints are there; only plans need its pose."""
+        """Handle a state as soon as its joints have arrived; only plans need its pose."""
         executive = self.executive
         if executive is None or not self.active or not self._knows_rate:
             return

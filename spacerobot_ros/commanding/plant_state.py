@@ -1,6 +1,6 @@
-"""A commander's knowledge of its plant: states of the present time, whole states, its status.
+"""A commander's view of its plant: states of the present time, whole states, status.
 
-Messages are opaque here: each comes with its stamp, in ns, and is handed over as it came.
+Messages are opaque here: each has a stamp, in ns, and is passed on unchanged.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from spacerobot_ros.simulation.status import PlantState, PlantStatus
 from spacerobot_ros.times import SECOND
 
 _NO_STAMP = -1
-"""The stamp that stands for a missing message; stamps of messages are never negative."""
+"""The stamp that represents a missing message; stamps of messages are never negative."""
 
 
 class Stamped(NamedTuple):
@@ -46,29 +46,29 @@ _MEETING_TIME = 1.0
 """Wall time from the first state in which poses may come before or long after their joints, s."""
 
 _MEASURED_STEPS = 8
-"""Number of steps that tell the rate of the states if they are not equal."""
+"""Number of steps from which the rate of the states is computed if they are not equal."""
 
 _STEADY = 1.2
-"""Largest ratio of two steps of a steady rate: states that a busy node skips make longer ones."""
+"""Largest ratio of two steps of a steady rate; states skipped by a busy node make steps longer."""
 
 _STEP_ROUNDING_NS = 1_000
-"""Largest difference between equal steps, from stamps that were computed as floating point, ns."""
+"""Largest difference between equal steps, due to stamps computed in floating point, ns."""
 
 
 class StampFilter:
     """Separates states of the plant's present time from states stamped with another time.
 
-    The steps between the states, and so the rate of the plant, are learnt from the stamps. A stamp
-    is of the present time if it is
+    The steps between states, and so the rate of the plant, are derived from the stamps. A stamp is
+    of the present time if it is
 
-    * equal to that of the state before, or at most 1.5 steps after it: no message was lost;
-    * further ahead by no more than twice the time that passed in as much wall time before:
-      messages were lost, or this process was stopped for a while.
+    * equal to the previous stamp, or at most 1.5 steps after it: no message was lost;
+    * further ahead by at most twice the simulated time expected for the elapsed wall time: messages
+      were lost, or this process was stopped for a while.
 
-    Any other state is a *time jump*, and set aside. If a state of the present time follows, the
-    jump is ignored and counted. If none does for 0.5 s of wall time, the time has really changed,
-    as after a restart of the plant, and the jump is accepted. A plant in lockstep waits that long
-    for its answer.
+    Any other state is a *time jump*, and is set aside. If a state of the present time follows, the
+    jump is ignored and counted. If none follows for 0.5 s of wall time, the time has really
+    changed, for example after a restart of the plant, and the jump is accepted. A plant in lockstep
+    waits that long for its command.
 
     Parameters
     ----------
@@ -81,9 +81,10 @@ class StampFilter:
         self._steps: deque[int] = deque(maxlen=_MEASURED_STEPS)
         """Latest steps between two states, ns."""
         self._longest_step = math.inf
-        """Largest step without a loss, ns; infinite while one state is known at most."""
+        """Largest step without a loss, ns; infinite before the second state."""
         self._first_ns, self._first_wall, self._wall = _NO_STAMP, 0.0, 0.0
-        """Stamp (ns) and wall time (s) of the first state of the present time; of the last one."""
+        """Stamp (ns) and wall time (s) of the first state of the present time; wall time (s) of the
+        last."""
         self._jump = self._jump_odom = _NO_MESSAGE
         self._jump_wall = 0.0
         self.now_ns = 0
@@ -95,7 +96,7 @@ class StampFilter:
 
     @property
     def rate(self) -> float:
-        """Rate of the states by their stamps, Hz; 0 while too few are known."""
+        """Rate of the states from their stamps, Hz; 0 while there are too few."""
         steps = list(self._steps)
         if len(steps) > 1 and abs(steps[-1] - steps[-2]) <= _STEP_ROUNDING_NS:
             return SECOND / steps[-1]
@@ -108,13 +109,13 @@ class StampFilter:
 
     @property
     def steady_rate(self) -> float:
-        """Rate of the states if many steps in a row agree, Hz; 0: they do not."""
+        """Rate of the states if many successive steps agree, Hz; 0 otherwise."""
         steps = self._steps
         steady = len(steps) == _MEASURED_STEPS and max(steps) <= _STEADY * min(steps)
         return self.rate if steady else 0.0
 
     def is_present(self, stamp_ns: int, behind_ns: float = 0.0) -> bool:
-        """Whether a stamp is of the present time, by at most ``behind_ns`` before the last one."""
+        """Whether a stamp is of the present time, and at most ``behind_ns`` before the last."""
         ahead = stamp_ns - self.now_ns
         if ahead <= self._longest_step:
             return ahead >= -behind_ns
@@ -143,7 +144,7 @@ class StampFilter:
     def accepts_odom(self, stamp_ns: int, odom: Any) -> bool:
         """Return whether a pose is of the present time; set other poses aside.
 
-        It comes before the joints of its stamp, or after them.
+        A pose may arrive before or after the joints of its stamp.
         """
         if self.is_present(stamp_ns, self._longest_step):
             return True
@@ -153,7 +154,7 @@ class StampFilter:
     def accepted_jump(self) -> tuple[Stamped | None, Stamped] | None:
         """Return set-aside odom (or None) and joints once their time is accepted.
 
-        To be called several times a second; None: no jump is accepted.
+        Call this several times per second; None: no jump is accepted.
         """
         joints, odom = self._jump, self._jump_odom
         if joints.message is None or self._clock() - self._jump_wall < _JUMP_CONFIRMATION_TIME:
@@ -191,32 +192,32 @@ class StampFilter:
 
 
 class Pairing(str, Enum):
-    """The messages of a state that a :class:`StateSynchroniser` hands over."""
+    """The messages of a state from a :class:`StateSynchroniser`."""
 
     WHOLE = "whole"
     """Joints and odom of one stamp."""
 
     WITHOUT_POSE = "without pose"
-    """Joints alone: their odom has not come."""
+    """Only joints: their odom has not arrived."""
 
     LATE_POSE = "late pose"
-    """Odom of a state that was handed over without odom before."""
+    """Odom of a state that was returned without odom before."""
 
 
 class StateSynchroniser:
-    """Pairs the latest odom and joints by their stamps, and hands every state over once.
+    """Pairs the latest odom and joints by their stamps, and returns every state once.
 
     A commander either requires the pose (a controller) or does not (a planner, which needs it
     only to plan):
 
-    * *Pose required:* a state is ready when its odom is there. Where odom fails, this is known
-      when the next joints come: the state before is then :meth:`overdue`. From then on states are
-      ready without their pose, until an odom comes again.
-    * *Pose optional:* a state is ready with its joints; odom that comes after them is handed over
-      as a :attr:`Pairing.LATE_POSE`.
+    * *Pose required:* a state is ready when its odom has arrived. If odom fails, this is detected
+      when the next joints arrive: the state before is then overdue (:meth:`take_overdue`). From
+      then on states are ready without their pose, until odom arrives again.
+    * *Pose optional:* a state is ready with its joints; odom that arrives after them is returned as
+      a :attr:`Pairing.LATE_POSE`.
 
-    Topics beside these two can be required as well (:meth:`require`): a state then waits for a
-    message of its stamp on each of them.
+    Further topics can be required as well (:meth:`require`): a state then waits for a message of
+    its stamp on each of these topics.
 
     Parameters
     ----------
@@ -233,7 +234,7 @@ class StateSynchroniser:
         self._odom_ns = self._joints_ns = _NO_STAMP
         self._odom_fresh = self._joints_fresh = self._without_pose = False
         self._required: dict[str, Stamped] = {}
-        """Latest messages of the topics that are required beside odom and joints."""
+        """Latest messages of the topics required in addition to odom and joints."""
 
     def require(self, topic: str, *, required: bool = True) -> None:
         """Set whether states wait for a message on a further topic."""
@@ -245,8 +246,8 @@ class StateSynchroniser:
     def put_odom(self, stamp_ns: int, odom: Any) -> bool:
         """Accept an odom; poses are measured (again).
 
-        Return whether it contradicts the one before, of the same stamp: then another node
-        publishes odom, too, and the state has no pose.
+        Return whether it contradicts the previous odom with the same stamp: if so, another node
+        also publishes odom, and the state has no pose.
         """
         contradicts = stamp_ns == self._odom_ns and odom != self.odom
         self._odom_ns, self.odom = stamp_ns, odom
@@ -254,23 +255,23 @@ class StateSynchroniser:
         return contradicts
 
     def forget_pose(self) -> None:
-        """Forget the latest odom: the plant shows another state of the same time.
+        """Forget the latest odom, because the plant publishes another state of the same time.
 
-        A later odom of this time is then no contradiction, nor the pose of joints that were
-        handed over before.
+        A later odom of this time then neither counts as a contradiction nor as the pose of joints
+        that were returned before.
         """
         self.odom, self._odom_ns, self._odom_fresh = None, _NO_STAMP, False
         if not self._joints_fresh:
             self.joints, self._joints_ns = None, _NO_STAMP
 
     def put_joints(self, stamp_ns: int, joints: Any) -> None:
-        """Accept joints; see :meth:`overdue` for the state before."""
+        """Accept joints; see :meth:`take_overdue` for the previous state."""
         self.joints, self._joints_ns = joints, stamp_ns
         self._joints_fresh = True
 
     @property
     def missing(self) -> tuple[str, ...]:
-        """Topics whose messages an otherwise complete state waits for."""
+        """Topics for whose messages an otherwise complete state waits."""
         if not (self._required and self._joints_fresh):
             return ()
         stamp = self._joints_ns
@@ -287,7 +288,7 @@ class StateSynchroniser:
         return self._required.get(topic, _NO_MESSAGE).message
 
     def take_ready(self) -> Pairing | None:
-        """Hand over a ready state once; None without a new ready state."""
+        """Return a ready state once; None without a new ready state."""
         stamp = self._joints_ns
         together = stamp == self._odom_ns
         if not self._pose_required:
@@ -307,10 +308,10 @@ class StateSynchroniser:
         return None
 
     def take_overdue(self) -> Pairing | None:
-        """Hand over a state that was never ready; call this before the next joints are put.
+        """Return a state that was never ready; call this before :meth:`put_joints`.
 
-        :attr:`Pairing.WITHOUT_POSE`: its odom is missing, and states are ready without from now
-        on. :attr:`Pairing.WHOLE`: another required topic is silent.
+        :attr:`Pairing.WITHOUT_POSE`: its odom is missing, and states are ready without odom from
+        now on. :attr:`Pairing.WHOLE`: another required topic is silent.
         """
         if not self._joints_fresh:
             return None
@@ -331,9 +332,10 @@ class PlantStopped:
     reason
         Message of the plant.
     commanded_until_ns
-        If it rests because no command came: the stamp of the last one; None: it obeys nothing.
+        If the plant rests because no command arrived: the stamp of the last command; None: it obeys
+        no commands.
     rests_since_ns
-        Time since which it rests then, as far as is known.
+        Time since which it rests, if known.
     """
 
     reason: str
@@ -342,7 +344,7 @@ class PlantStopped:
 
 
 class PlantChange(Enum):
-    """Changes other than a stop that a plant reports."""
+    """Changes reported by a plant, other than a stop."""
 
     OBEYS = "obeys"
     """Commands are accepted again."""
@@ -351,16 +353,16 @@ class PlantChange(Enum):
 
 
 class PlantListener:
-    """Follows plant/status: whether the plant obeys, and its resets; the topic is optional."""
+    """Follows plant/status (optional): whether the plant obeys, and its resets."""
 
     def __init__(self) -> None:
         self.status = PlantStatus(PlantState.RUNNING)
-        """The latest status; before the first one, that of a plant that obeys."""
+        """The latest status; before the first, the status of a plant that obeys."""
         self._heard, self._name = False, "plant"
 
     @property
     def refusal_of_goals(self) -> str:
-        """Message on why goals are refused at present; empty: goals are accepted."""
+        """Message on why goals are presently refused; empty: goals are accepted."""
         status = self.status
         if status.latched_fault:
             return f"'{self._name}' is latched: {status.latched_fault}; rearm it first."
@@ -375,18 +377,18 @@ class PlantListener:
 
     @property
     def has_no_command(self) -> bool:
-        """Whether no command is in force: none has come, or none is obeyed."""
+        """Whether no command is in force: none has arrived, or none is obeyed."""
         return self.status.state is PlantState.RESTING or bool(self.refusal_of_goals)
 
     @property
     def paused(self) -> bool:
-        """Whether the plant's time stands still."""
+        """Whether the plant's time is stopped."""
         return self.status.state is PlantState.PAUSED
 
     def update(self, status: PlantStatus, name: str = "plant") -> list[PlantStopped | PlantChange]:
         """Take the next status of the named plant; return the changes to react to.
 
-        Statuses may be missed: the counters of a plant tell the changes in between.
+        Statuses may be missed; the plant's counters reveal the changes in between.
         """
         before, heard, was_blocked = self.status, self._heard, bool(self.refusal_of_goals)
         self.status, self._name, self._heard = status, name, True

@@ -1,8 +1,7 @@
-"""Schedules for a server of FollowJointTrajectory: one at a time, and how each of them ends.
+"""Schedules for a FollowJointTrajectory server, one at a time, and their ends.
 
-Nothing here knows ROS: a :class:`TrajectoryServer` sends and cancels, and its answers come back
-with the number of the schedule that they are for. An answer about a schedule that was replaced or
-cancelled changes nothing.
+This module is independent of ROS: a :class:`TrajectoryServer` sends and cancels, and its responses
+carry the number of their schedule. A response about a replaced or cancelled schedule is ignored.
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ _ANSWER_TIMEOUT_NS = 5 * SECOND
 _SERVER_CHECK_PERIOD_NS = SECOND
 
 _PHASES_OF_MOTION = (Phase.EXECUTING, Phase.REPLANNING, Phase.TAKING_OVER, Phase.PLANNING)
-"""Phases in which a schedule is followed on; in PLANNING its successor replaces it."""
+"""Phases in which a schedule continues; in PLANNING its successor replaces it."""
 
 
 class ErrorCode(IntEnum):
@@ -50,9 +49,9 @@ class TrajectoryEnd:
     Attributes
     ----------
     message
-        A clause that tells why it ended early; empty: it was followed to its end.
+        Reason for an early end, as a clause; empty: the schedule was followed to its end.
     final
-        Whether a corrected schedule would end alike, so that none is planned.
+        Whether a corrected schedule would end in the same way, so that none is planned.
     """
 
     message: str = ""
@@ -63,13 +62,13 @@ class TrajectoryServer(Protocol):
     """The connection with the action server."""
 
     def is_available(self) -> bool:
-        """Whether the server is there."""
+        """Whether the server is available."""
 
     def send(self, number: int, start: ScheduleStart) -> None:
         """Send a schedule."""
 
     def cancel(self, number: int) -> None:
-        """Cancel a schedule, whether it is accepted yet or not."""
+        """Cancel a schedule, whether it is already accepted or not."""
 
 
 class TrajectoryOutput:
@@ -102,23 +101,23 @@ class TrajectoryOutput:
         """Stamp of the last check for the server, ns."""
 
     def start(self, start: ScheduleStart) -> None:
-        """Send a schedule; it replaces the one that is followed."""
+        """Send a schedule; it replaces the present schedule."""
         self._number += 1
         self._replaced, self._sent, self._accepted = self._sent, self._number, False
         self._watched_ns = None
         if not self._server.is_available():
-            self._end(TrajectoryEnd(f"no server of the action '{self._name}' is there", final=True))
+            self._end(TrajectoryEnd(f"the action '{self._name}' has no server", final=True))
             return
         self._server.send(self._number, start)
 
     def check_server(self, now_ns: int) -> None:
-        """End a schedule whose server does not answer, or is gone, at a state of a stamp."""
+        """End a schedule if its server does not respond or is gone, at a state with a stamp."""
         if self._sent is None:
             return
         if self._watched_ns is None or now_ns < self._watched_ns:
             self._watched_ns = self._looked_ns = now_ns
         if not self._accepted and now_ns - self._watched_ns > _ANSWER_TIMEOUT_NS:
-            self._give_up(f"the action '{self._name}' has not answered")
+            self._give_up(f"the action '{self._name}' has not responded")
         elif now_ns - self._looked_ns >= _SERVER_CHECK_PERIOD_NS:
             self._looked_ns = now_ns
             if not self._server.is_available():
@@ -130,7 +129,7 @@ class TrajectoryOutput:
         self._end(TrajectoryEnd(why, final=True))
 
     def on_phase_change(self, phase: Phase) -> None:
-        """Cancel the schedule if the planner has left it."""
+        """Cancel the schedule if the planner has abandoned it."""
         sent = self._sent
         if sent is None or phase in _PHASES_OF_MOTION:
             return
@@ -138,12 +137,12 @@ class TrajectoryOutput:
         self._server.cancel(sent)
 
     def accepted(self, number: int) -> None:
-        """Note that the server follows a schedule now."""
+        """Record that the server now follows a schedule."""
         if number == self._sent:
             self._accepted, self._replaced = True, None
 
     def rejected(self, number: int) -> None:
-        """End a schedule that the server rejects, and the schedule that it was to replace."""
+        """End a schedule that the server rejects, and the schedule that it would have replaced."""
         if number != self._sent:
             return
         if self._replaced is not None:
@@ -153,7 +152,7 @@ class TrajectoryOutput:
         )
 
     def ended(self, number: int, outcome: Outcome, code: int, text: str) -> None:
-        """End a schedule by the result of the server.
+        """End a schedule with the result of the server.
 
         Parameters
         ----------
@@ -187,6 +186,6 @@ def _motion_end(outcome: Outcome, code: int, text: str) -> TrajectoryEnd:
         name = ErrorCode(code).name
     except ValueError:
         name = f"error code {code}"
-    clause = f"the trajectory has ended early by {name}{told}"
+    clause = f"the trajectory has ended early with {name}{told}"
     violated = code in (ErrorCode.PATH_TOLERANCE_VIOLATED, ErrorCode.GOAL_TOLERANCE_VIOLATED)
     return TrajectoryEnd(clause, final=not violated)

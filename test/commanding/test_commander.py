@@ -281,7 +281,7 @@ class SilentServer:
 
 @pytest.mark.parametrize(
     ("goes", "words", "last"),
-    [(10, "the server of the action '/arm' is gone", 24), (999, "has not answered", 106)],
+    [(10, "the server of the action '/arm' is gone", 24), (999, "has not responded", 106)],
 )
 def test_a_goal_fails_with_a_server_of_trajectories_that_goes_or_is_silent(
     robot: SpaceRobot, goes: int, words: str, last: int
@@ -494,11 +494,11 @@ def test_obstacles_are_told_of_once_and_refused_ones_leave_those_so_far(robot: S
     rig.commander.receive_obstacles("")
     told = [
         "1 obstacle(s): ball",
-        "The obstacles so far stay",
+        "The previous obstacles are kept",
         "1 obstacle(s): stone",
         "0 obstacle(s)",
     ]
     assert len(rig.host.lines) == len(told)
     for (level, line), words in zip(rig.host.lines, told, strict=True):
         assert words in line
-        assert (level == "error") is ("stay" in words)
+        assert (level == "error") is ("are kept" in words)

@@ -69,19 +69,19 @@ def test_a_schedule_is_sent_and_ends_with_its_result() -> None:
 @pytest.mark.parametrize(
     ("outcome", "code", "text", "message", "final"),
     [
-        (Outcome.ABORTED, -4, "wrist off.", "the trajectory has ended early by "
+        (Outcome.ABORTED, -4, "wrist off.", "the trajectory has ended early with "
          "PATH_TOLERANCE_VIOLATED: wrist off", False),
-        (Outcome.ABORTED, -5, "", "the trajectory has ended early by GOAL_TOLERANCE_VIOLATED",
+        (Outcome.ABORTED, -5, "", "the trajectory has ended early with GOAL_TOLERANCE_VIOLATED",
          False),
-        (Outcome.ABORTED, -1, "", "the trajectory has ended early by INVALID_GOAL", True),
-        (Outcome.ABORTED, -2, "no wrist", "the trajectory has ended early by INVALID_JOINTS: "
+        (Outcome.ABORTED, -1, "", "the trajectory has ended early with INVALID_GOAL", True),
+        (Outcome.ABORTED, -2, "no wrist", "the trajectory has ended early with INVALID_JOINTS: "
          "no wrist", True),
-        (Outcome.ABORTED, -3, "", "the trajectory has ended early by OLD_HEADER_TIMESTAMP", True),
+        (Outcome.ABORTED, -3, "", "the trajectory has ended early with OLD_HEADER_TIMESTAMP", True),
         (Outcome.ABORTED, 0, "", "the trajectory was aborted without an error code", True),
-        (Outcome.ABORTED, 17, "", "the trajectory has ended early by error code 17", True),
+        (Outcome.ABORTED, 17, "", "the trajectory has ended early with error code 17", True),
         (Outcome.CANCELED, -4, "new goal", "another client has replaced or cancelled the "
          "trajectory: new goal", True),
-        (Outcome.SUCCEEDED, -5, "", "the trajectory has ended early by GOAL_TOLERANCE_VIOLATED",
+        (Outcome.SUCCEEDED, -5, "", "the trajectory has ended early with GOAL_TOLERANCE_VIOLATED",
          False),
     ],
 )  # fmt: skip
@@ -132,14 +132,14 @@ def test_a_server_that_is_not_there_or_does_not_answer_ends_the_goal() -> None:
     lost: Any = "lost"
     sent.output.start(lost)
     assert sent.server.sent == []
-    assert sent.ends.pop() == TrajectoryEnd("no server of the action '/arm/follow' is there", True)
+    assert sent.ends.pop() == TrajectoryEnd("the action '/arm/follow' has no server", True)
     sent.server.present = True
     number = sent.start(accepted=False)
     for second in range(6):
         assert not sent.ends
         sent.output.check_server(FIRST + second * SECOND)
     sent.output.check_server(FIRST + 5 * SECOND + 1)
-    assert sent.ends == [TrajectoryEnd("the action '/arm/follow' has not answered", True)]
+    assert sent.ends == [TrajectoryEnd("the action '/arm/follow' has not responded", True)]
     assert sent.server.cancelled == [number]
     # One that was accepted may take any time; a schedule that is left ends nothing.
     later = sent.start()
@@ -187,4 +187,4 @@ def test_texts_of_the_server_are_one_line_without_control_characters() -> None:
     sent = Sent()
     sent.output.ended(sent.start(), Outcome.ABORTED, -6, "stop\n\x1b[31mred")
     (end,) = sent.ends
-    assert end.message == "the trajectory has ended early by error code -6: stop \ufffd[31mred"
+    assert end.message == "the trajectory has ended early with error code -6: stop \ufffd[31mred"

@@ -120,4 +120,4 @@ def test_a_goal_without_a_server_fails_and_names_the_action(harness: Harness) ->
     state, _, message = flight.ended(NEAR)
     flight.server.close()
     assert state == "failed"
-    assert "no server of the action '/arm/follow' is there" in message
+    assert "the action '/arm/follow' has no server" in message

@@ -381,11 +381,11 @@ def test_a_violated_tolerance_is_corrected_from_the_measured_state() -> None:
     loop = flown(ticks=16)
     loop.tick(5)
     q = loop.plant.q.copy()
-    loop.executive.schedule_ended("the trajectory has ended early by PATH_TOLERANCE_VIOLATED")
+    loop.executive.schedule_ended("the trajectory has ended early with PATH_TOLERANCE_VIOLATED")
     loop.tick(2)
     told = [each for each in loop.outputs if isinstance(each, Notice)]
     assert (
-        Notice(Severity.WARNING, "The trajectory has ended early by PATH_TOLERANCE_VIOLATED.")
+        Notice(Severity.WARNING, "The trajectory has ended early with PATH_TOLERANCE_VIOLATED.")
         in told
     )
     _, second = stub_of(loop).requests
@@ -400,10 +400,10 @@ def test_a_violated_tolerance_is_corrected_from_the_measured_state() -> None:
 def test_a_trajectory_that_no_server_flies_fails_the_goal() -> None:
     loop = flown()
     loop.tick(2)
-    loop.executive.schedule_ended("no server of the action '/arm' is there", final=True)
+    loop.executive.schedule_ended("the action '/arm' has no server", final=True)
     status = loop.until(PlannerState.FAILED)
     assert status.message.startswith("The goal is not reached: ")
-    assert status.message.endswith(", and no server of the action '/arm' is there.")
+    assert status.message.endswith(", and the action '/arm' has no server.")
     assert status.corrections == 0
     assert len(stub_of(loop).requests) == 1
     loop.executive.schedule_ended("too late", final=True)  # There is no goal any more.
