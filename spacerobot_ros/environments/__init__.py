@@ -1,8 +1,8 @@
-"""Learning environments with the interface of Gymnasium, one robot each or thousands in SIMD lanes.
+"""Gymnasium environments, with one robot or with thousands in SIMD lanes.
 
-Importing this package registers ``spacerobot/ReorientArm-v0``, ``spacerobot/Reach-v0`` and, for
-tasks of one's own, ``spacerobot/Task-v0`` where Gymnasium is installed. Tasks and actions
-(:mod:`.tasks`) need no Gymnasium: a trained policy flies without it.
+If Gymnasium is installed, importing this package registers ``spacerobot/ReorientArm-v0``,
+``spacerobot/Reach-v0`` and, for custom tasks, ``spacerobot/Task-v0``. Tasks and actions
+(:mod:`.tasks`) do not need Gymnasium: a trained policy flies without it.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ __all__ = ["register"]
 NAMESPACE = "spacerobot"
 
 ENVIRONMENTS = {"ReorientArm-v0": "reorient", "Reach-v0": "reach", "Task-v0": ""}
-"""Names of the environments within :data:`NAMESPACE`, and their tasks; empty: to be given."""
+"""Environment names within :data:`NAMESPACE`, and their tasks; empty: task is an argument."""
 
 
 def import_gymnasium() -> Any:
@@ -27,7 +27,7 @@ def import_gymnasium() -> Any:
 
 
 def register() -> None:
-    """Make the environments known to Gymnasium.
+    """Register the environments with Gymnasium.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Episodes of N robots: starts and goals that are drawn, steps of the plant, rewards and ends."""
+"""Episodes of N robots: random starts and goals, steps of the plant, rewards and ends."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ _CHANGEABLE = ("reward", "spread", "time_limit", "tolerance")
 """Arguments that may change from episode to episode."""
 
 _BEYOND_LANES = "faults", "plant.thrusters", "plant.disturbances", "plant.orbit.", "plant.table."
-"""Beginnings of dispersions for which each robot has a plant."""
+"""Prefixes of dispersions for which each robot needs its own plant."""
 
 Counts = npt.NDArray[np.int64]
 
@@ -57,14 +57,14 @@ class EpisodeConfig:
     Attributes
     ----------
     task
-        ``reorient``: the joints turn the base; ``reach``: a link goes to a position; one of
-        :data:`.TASKS`, or a class derived from :class:`.Task`.
+        Name in :data:`.TASKS`, such as ``reorient`` (the joints rotate the base) or ``reach`` (a
+        link reaches a position), or a class derived from :class:`.Task`.
     scenario
         Name or file of a scenario, or of a robot; empty: the task's own.
     campaign
-        File of a campaign, whose draws are the starts, masses and goals; empty: none.
+        File of a campaign, whose draws determine the starts, masses and goals; empty: none.
     hold
-        Ticks of the plant in a step, in which the action is held.
+        Ticks of the plant per step, during which the action is held.
     time_limit
         Simulated time after which an episode is truncated, s.
     tolerance
@@ -75,12 +75,12 @@ class EpisodeConfig:
     spread
         Size of random goals, rad or m; 0: the task's own.
     link
-        Link of the goal; empty: that of the scenario, else the robot's end-effector.
+        Link of the goal; empty: the scenario's link, else the robot's end-effector.
     max_force, max_torque
-        Force (N) and torque (N m) on the base of an action of one under efforts; 0: those of the
-        scenario's controller, and if it has none, actions have no wrench.
+        Force (N) and torque (N m) on the base for an action of 1 under efforts; 0: the limits of
+        the scenario's controller; without them actions have no wrench.
     action_scale
-        Command of an action of ones; empty: limits of joints, force and torque.
+        Command for an action of ones; empty: limits of joints, force and torque.
     reward
         Changed weights of :class:`.RewardWeights`.
     """
@@ -106,7 +106,7 @@ class EpisodeConfig:
         Raises
         ------
         ParameterError
-            There is no such argument, or a value is refused.
+            There is no such argument, or a value is invalid.
         """
         known = [each.name for each in fields(cls)]
         for name in arguments:
@@ -149,11 +149,11 @@ class EpisodeConfig:
                 f"Argument 'reward' is {self.reward!r}; it must be a dictionary of weights."
             )
         if not self.time_limit:
-            raise ParameterError("Argument 'time_limit' is 0; episodes take longer, in s.")
+            raise ParameterError("Argument 'time_limit' is 0; it must be above 0 s.")
         if self.link and not self.kind.has_link:
             raise ParameterError(
-                f"Argument 'link' is '{self.link}', but in task '{self.task}' no link reaches: "
-                "leave it out, or take spacerobot/Reach-v0."
+                f"Argument 'link' is '{self.link}', but task '{self.task}' has no link: "
+                "leave it out, or use spacerobot/Reach-v0."
             )
         if self.scenario and self.campaign:
             raise ParameterError(
@@ -185,14 +185,14 @@ class _Start:
 
 
 class EpisodeStarts:
-    """Starts of episodes: of a scenario, or of the draws of a campaign.
+    """Starts of episodes, from a scenario or from the draws of a campaign.
 
-    Draws that are no robot or no start are omitted, with a warning.
+    Draws without a valid robot or start are omitted, with a warning.
 
     Raises
     ------
     ParameterError
-        Scenario or campaign is refused, or has parts that environments do not have.
+        The scenario or campaign is invalid, or has parts that environments do not support.
     """
 
     def __init__(self, config: EpisodeConfig) -> None:
@@ -212,21 +212,21 @@ class EpisodeStarts:
             or (plant.orbit, plant.table) != (OrbitConfig(), TableConfig())
             or any(name.startswith(_BEYOND_LANES) for name in dispersed)
         )
-        """Whether each robot has a plant of its own, for what lanes lack."""
+        """Whether each robot needs its own plant, for features that lanes lack."""
         self.has_sensor_errors = bool(
             SensorErrors.of(self.robot, [plant.sensors]).is_active[0]
         ) or any(name.startswith("plant.sensors.") for name in dispersed)
         self.nominal = _Start.of(self.robot, self.scenario)
         self._made: dict[int, _Start | str] = {}
-        """Starts of the draws by their numbers; texts are the reasons of refusals."""
+        """Starts of the draws by number; texts are the reasons for refusals."""
 
     def draw(self, rng: np.random.Generator, flights: SteppedFlights) -> _Start:
-        """Return the start of an episode: the scenario's, or that of a random draw of the campaign.
+        """Return the start of an episode: the scenario's, or a random draw's of the campaign.
 
         Raises
         ------
         ParameterError
-            A draw has a part that environments do not have, or too many are refused.
+            A draw has a part that environments do not support, or too many draws are refused.
         """
         if self._campaign is None:
             return self.nominal
@@ -239,8 +239,8 @@ class EpisodeStarts:
             if isinstance(start, _Start):
                 return start
         raise ParameterError(
-            f"{_MAX_REFUSED_DRAWS} draws of the campaign in succession are refused, the last "
-            f"one because: {start} Disperse within the possible values of the robot."
+            f"{_MAX_REFUSED_DRAWS} successive draws of the campaign are refused, the last one "
+            f"because: {start} Restrict the dispersions to values that the robot permits."
         )
 
     def _drawn(self, campaign: Campaign, number: int, flights: SteppedFlights) -> _Start | str:
@@ -253,7 +253,7 @@ class EpisodeStarts:
         except (ParameterError, RobotDescriptionError) as refusal:
             if not any(isinstance(each, str) for each in self._made.values()):
                 warn_once(
-                    f"Draw {number} of the campaign is left out, as are others that are refused: "
+                    f"Draw {number} of the campaign is omitted, as are other refused draws: "
                     f"{refusal}"
                 )
             return str(refusal)
@@ -272,8 +272,8 @@ def _require_steppable(scenario: Scenario) -> None:
     for part, given in parts.items():
         if given:
             raise ParameterError(
-                f"Scenario '{scenario.name}' has {part}, which environments do not have: leave "
-                "them out by another scenario or campaign."
+                f"Scenario '{scenario.name}' has {part}, which environments do not support: use "
+                "another scenario or campaign."
             )
 
 
@@ -290,12 +290,12 @@ class Episodes:
     count
         Their number N.
     in_lanes
-        Whether the robots are in SIMD lanes, or in a plant each.
+        Whether the robots are in SIMD lanes; otherwise each robot has a plant.
     """
 
     def __init__(self, config: EpisodeConfig, count: int, *, in_lanes: bool) -> None:
         if not isinstance(count, int | np.integer) or count < 1:
-            raise ParameterError(f"There are {count!r} environments to make; take at least one.")
+            raise ParameterError(f"The number of environments is {count!r}; it must be at least 1.")
         self._config = config
         self._source = EpisodeStarts(config)
         scenario, self.robot = self._source.scenario, self._source.robot
@@ -353,7 +353,7 @@ class Episodes:
         return vars(self._weights)
 
     def has_attribute(self, name: str) -> bool:
-        """Return whether :meth:`change` knows a name."""
+        """Return whether :meth:`change` accepts a name."""
         return name in _CHANGEABLE or (hasattr(self.task, name) and not name.startswith("_"))
 
     def attribute(self, name: str) -> Any:
@@ -366,12 +366,12 @@ class Episodes:
         Raises
         ------
         ParameterError
-            There is no such attribute, or the value is refused.
+            There is no such attribute, or the value is invalid.
         """
         if not self.has_attribute(name):
             raise ParameterError(
                 f"There is no attribute '{name}' to change; there are {', '.join(_CHANGEABLE)}, "
-                "and those of the task."
+                "and attributes of the task."
             )
         if name not in _CHANGEABLE:
             setattr(self.task, name, value)
@@ -385,8 +385,7 @@ class Episodes:
         link = self.robot.description.end_effector(link)
         if not link:
             raise ParameterError(
-                f"Robot '{self.robot.description.name}' has no end-effector that reaches: give "
-                "argument 'link'."
+                f"Robot '{self.robot.description.name}' has no end-effector: give argument 'link'."
             )
         return link
 
@@ -420,12 +419,12 @@ class Episodes:
 
     @property
     def engine(self) -> str:
-        """Name of the engine that steps."""
+        """Name of the engine that steps the flights."""
         return self._flights.engine
 
     @property
     def flights(self) -> SteppedFlights:
-        """The flights, whose states may be read."""
+        """The flights; read their states only."""
         return self._flights
 
     @property
@@ -440,16 +439,15 @@ class Episodes:
         goal: Any = None,
         start: Any = None,
     ) -> None:
-        """Begin the episodes of some rows again, by the random generators of all rows.
+        """Restart the episodes of some rows, with the random generators of all rows.
 
-        ``goal``, one for all (goal_size,) or one for each row (N, goal_size), replaces the goals
-        that are drawn. ``start``, a dictionary or one for each row, replaces some of the values of
-        :class:`.InitialState`.
+        ``goal``, one for all (goal_size,) or one per row (N, goal_size), replaces the drawn goals.
+        ``start``, a dictionary or one per row, replaces some values of :class:`.InitialState`.
 
         Raises
         ------
         ParameterError
-            A draw, the goal or the start is refused.
+            A draw, the goal or the start is invalid.
         """
         chosen = np.asarray(rows, dtype=np.int64)
         goals = None if goal is None else self._checked_goals(goal)
@@ -513,9 +511,7 @@ class Episodes:
             made.append({})
             for name, given in one.items():
                 if name not in known:
-                    raise ParameterError(
-                        f"There is no '{name}' of a start; there are {', '.join(known)}."
-                    )
+                    raise ParameterError(f"A start has no '{name}'; it has {', '.join(known)}.")
                 values = as_numbers(given, f"The start's {name}")
                 if values.shape != (known[name],) or not np.isfinite(values).all():
                     raise ParameterError(
@@ -529,8 +525,8 @@ class Episodes:
         values, count, size = as_numbers(goal, "The goal"), len(self._goals), self.task.goal_size
         if values.shape not in ((size,), (count, size)) or not np.isfinite(values).all():
             raise ParameterError(
-                f"The goal is {values.shape}; task '{self.task.name}' takes {size} finite numbers, "
-                f"or ({count}, {size}) for the robots one by one."
+                f"The goal has shape {values.shape}; task '{self.task.name}' takes {size} finite "
+                f"numbers, or ({count}, {size}) with one row per robot."
             )
         goals = np.broadcast_to(values, (count, size))
         return self.task.checked_goals(goals)
@@ -546,7 +542,7 @@ class Episodes:
         return self._camera.picture(self._states(at), self._goals[at])
 
     def end(self, rows: Counts) -> None:
-        """End episodes: they are not stepped until they begin again."""
+        """End episodes; they are not stepped until they are restarted."""
         self._flights.end(rows)
 
     def step(self, actions: Any) -> None:

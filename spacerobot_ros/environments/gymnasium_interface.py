@@ -1,4 +1,4 @@
-"""The environments as Gymnasium knows them: one robot in a plant, or many in SIMD lanes."""
+"""The Gymnasium environments: one robot in a plant, or many in SIMD lanes."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def _require_render_mode(render_mode: str | None) -> None:
     """Refuse a render mode by the error after which libraries make environments without one."""
     if render_mode not in (None, "rgb_array"):
         raise TypeError(
-            f"There is no render_mode '{render_mode}': take 'rgb_array', or leave it out."
+            f"There is no render_mode '{render_mode}': use 'rgb_array', or leave it out."
         )
 
 
@@ -44,7 +44,7 @@ def _begin_options(options: Mapping[str, Any] | None) -> dict[str, Any]:
     for name in options or {}:
         if name not in ("goal", "start", "reset_mask"):
             raise ParameterError(
-                f"There is no option '{name}' of a reset; there are goal, start, and of vectors "
+                f"A reset has no option '{name}'; it has goal, start, and for vector environments "
                 "reset_mask."
             )
     return {name: value for name, value in (options or {}).items() if name != "reset_mask"}
@@ -69,9 +69,9 @@ def _seeds_of(seed: Any, count: int) -> list[int | None]:
 
 
 class SpaceRobotEnv(gymnasium.Env, EzPickle):
-    """One robot; its step is that of the plant. The arguments are those of `EpisodeConfig`.
+    """One robot, stepped by a plant. The arguments are those of `EpisodeConfig`.
 
-    A copy, by pickle too, has the arguments and begins again. `get_wrapper_attr` and
+    A copy, also by pickle, has the same arguments and starts anew. `get_wrapper_attr` and
     `set_wrapper_attr` read and change arguments and attributes of the task: see `Episodes.change`.
 
     Raises
@@ -95,13 +95,13 @@ class SpaceRobotEnv(gymnasium.Env, EzPickle):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """Begin an episode; options ``goal`` and ``start`` replace what is drawn."""
+        """Begin an episode; options ``goal`` and ``start`` replace the drawn values."""
         super().reset(seed=seed)
         self.episodes.begin([0], [self.np_random], **_begin_options(options))
         return self.episodes.observations[0].copy(), self._info()
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """Step for the ticks of an action."""
+        """Step for the ticks of one action."""
         episodes = self.episodes
         episodes.step(np.asarray(action)[np.newaxis])
         ended = bool(episodes.terminations[0]), bool(episodes.truncations[0])
@@ -115,7 +115,7 @@ class SpaceRobotEnv(gymnasium.Env, EzPickle):
         return self.episodes.picture(0) if self.render_mode else None
 
     def has_wrapper_attr(self, name: str) -> bool:
-        """Return whether there is an attribute of this name, here or of the episodes."""
+        """Return whether this environment or its episodes have an attribute of this name."""
         return hasattr(self, name) or self.episodes.has_attribute(name)
 
     def get_wrapper_attr(self, name: str) -> Any:
@@ -134,17 +134,17 @@ class SpaceRobotEnv(gymnasium.Env, EzPickle):
 
 
 class SpaceRobotVectorEnv(VectorEnv, EzPickle):
-    """Many robots in SIMD lanes, each with the episodes of :class:`SpaceRobotEnv`.
+    """Many robots in SIMD lanes, with the same episodes as :class:`SpaceRobotEnv`.
 
-    Lane i of a seed s has the episodes of one environment with the seed s + i. A copy, by pickle
-    too, has the arguments and begins again.
+    With a seed s, lane i has the same episodes as one environment with the seed s + i. A copy, also
+    by pickle, has the same arguments and starts anew.
 
     Parameters
     ----------
     num_envs
         Number of robots.
     autoreset_mode
-        When episodes that have ended begin again: ``NextStep``, ``SameStep`` or ``Disabled``.
+        When ended episodes are restarted: ``NextStep``, ``SameStep`` or ``Disabled``.
     arguments
         Those of `EpisodeConfig`.
 
@@ -184,7 +184,7 @@ class SpaceRobotVectorEnv(VectorEnv, EzPickle):
         self._seeds = [seed for _, seed in seeded]
         self._begun = np.zeros(num_envs, dtype=np.bool_)
         self._ended = np.zeros(num_envs, dtype=np.bool_)
-        """Episodes that have ended and not begun again."""
+        """Episodes that have ended and were not restarted."""
 
     @property
     def np_random_seed(self) -> tuple[int, ...]:
@@ -202,9 +202,9 @@ class SpaceRobotVectorEnv(VectorEnv, EzPickle):
         seed: int | Sequence[int | None] | None = None,
         options: dict[str, Any] | None = None,
     ) -> tuple[Any, dict[str, Any]]:
-        """Begin all episodes, or those of ``options["reset_mask"]`` (num_envs,) only.
+        """Begin all episodes, or only those in ``options["reset_mask"]`` (num_envs,).
 
-        Options ``goal`` and ``start``, one for all or one for each robot, replace what is drawn.
+        Options ``goal`` and ``start``, one for all or one per robot, replace the drawn values.
         """
         mask, begin = np.ones(self.num_envs, dtype=np.bool_), _begin_options(options)
         if options is not None and "reset_mask" in options:
@@ -222,7 +222,7 @@ class SpaceRobotVectorEnv(VectorEnv, EzPickle):
         return self.episodes.observations.copy(), self._info(mask)
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
-        """Step all episodes; those that have ended begin again by the autoreset mode."""
+        """Step all episodes; ended episodes are restarted according to the autoreset mode."""
         episodes, mode = self.episodes, self.autoreset_mode
         if not self._begun.all():
             raise ResetNeeded(
@@ -231,8 +231,8 @@ class SpaceRobotVectorEnv(VectorEnv, EzPickle):
             )
         if mode is AutoresetMode.DISABLED and self._ended.any():
             raise ResetNeeded(
-                f"{int(self._ended.sum())} episodes have ended: reset them by options['reset_mask']"
-                " before the next step."
+                f"{int(self._ended.sum())} episodes have ended: reset them with "
+                "options['reset_mask'] before the next step."
             )
         again = np.flatnonzero(self._ended)
         if again.size:
@@ -264,7 +264,7 @@ class SpaceRobotVectorEnv(VectorEnv, EzPickle):
         return tuple(self.episodes.picture(row) for row in range(self.num_envs))
 
     def get_attr(self, name: str) -> tuple[Any, ...]:
-        """Return an attribute for each robot, which all share; see `Episodes.change`."""
+        """Return an attribute, shared by all robots, once per robot; see `Episodes.change`."""
         return (self.episodes.attribute(name),) * self.num_envs
 
     def set_attr(self, name: str, values: Any) -> None:

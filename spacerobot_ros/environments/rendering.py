@@ -23,13 +23,13 @@ from spacerobot_ros.report.solids import (
 WIDTH, HEIGHT = 640, 480
 
 _SHAPES = 50
-"""Number of shapes by which the size of the picture is chosen."""
+"""Number of shapes from which the size of the picture is chosen."""
 
 Picture = npt.NDArray[np.uint8]
 
 
 class Camera:
-    """Draws robots of one task; the base is in the middle, and one scale fits all shapes."""
+    """Draws robots of one task; the base is in the centre, and one scale fits all shapes."""
 
     def __init__(self, task: Task) -> None:
         self._task, self._robot = task, task.robot.description
@@ -43,7 +43,8 @@ class Camera:
         return robot_bodies(self._robot, self._meshes, poses, q, MAX_MESH_FACES)
 
     def picture(self, states: RobotStates, goals: Array) -> Picture:
-        """Return the picture (HEIGHT, WIDTH, 3) of one robot, given its state and goal as rows."""
+        """Return the picture (HEIGHT, WIDTH, 3) of one robot from its state and goal (one row
+        each)."""
         view, half = View(), self._reach * np.array([WIDTH / HEIGHT, 1.0])
         middle = view(states.pose[0, :3])
         canvas = Canvas(view, middle - half, middle + half, WIDTH)

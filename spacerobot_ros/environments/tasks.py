@@ -1,7 +1,7 @@
 """Tasks of environments: goals, observations, rewards, ends, and the command of an action.
 
-All functions take the states of N robots at once, so that one robot in a plant, many in lanes and a
-robot behind ROS topics are observed by the same code. A task of one's own is a class derived from
+All functions take the states of N robots at once, so that the same code observes one robot in a
+plant, many robots in lanes, and a robot behind ROS topics. A custom task is a class derived from
 :class:`Task`.
 """
 
@@ -36,12 +36,12 @@ from spacerobot_ros.simulation.plant import InitialState
 _SAMPLED_SHAPE_COUNT = 12
 
 _MIN_SHARE_OF_MOTION = 1e-7
-"""Singular values below this share of the largest are no motion."""
+"""Singular values below this share of the largest are considered no motion."""
 
 Flags = npt.NDArray[np.bool_]
 
 LARGEST_OBSERVATION = 1e6
-"""Bound of observed quantities that have none of their own; observations are clipped to it."""
+"""Bound of observed quantities without another bound; observations are clipped to it."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class RobotStates:
     q, qdot
         (N, n) joint positions and velocities.
     link_r
-        (N, 3) position in B of the link that reaches, m; None where no link does.
+        (N, 3) position in B of the task's link, m; None if the task has no link.
     """
 
     pose: Array
@@ -67,7 +67,7 @@ class RobotStates:
     link_r: Array | None = None
 
     def copy(self) -> RobotStates:
-        """Return a copy, which has these states when the arrays change."""
+        """Return a copy, which keeps these states when the arrays change."""
         link_r = None if self.link_r is None else self.link_r.copy()
         pose, twist, q, qdot = self.pose, self.twist, self.q, self.qdot
         return RobotStates(pose.copy(), twist.copy(), q.copy(), qdot.copy(), link_r)
@@ -75,7 +75,7 @@ class RobotStates:
 
 @dataclass(frozen=True)
 class Step:
-    """What N robots did in a step.
+    """A step of N robots.
 
     Attributes
     ----------
@@ -111,15 +111,15 @@ class RewardWeights:
     Attributes
     ----------
     progress
-        Per rad or m by which the error became smaller.
+        Reward per rad or m by which the error decreased.
     time
         Penalty per s.
     action
         Penalty per s, times the mean square of the action's entries.
     reached
-        Once, in the step in which the goal is reached.
+        Reward, once, in the step in which the goal is reached.
     failed
-        Penalty, once, where the flight cannot continue.
+        Penalty, once, if the flight cannot continue.
     """
 
     progress: float = 10.0
@@ -135,7 +135,7 @@ class RewardWeights:
         Raises
         ------
         ParameterError
-            There is no such weight, or it is no finite number.
+            There is no such weight, or it is not a finite number.
         """
         known = [each.name for each in fields(cls)]
         for name in changes or {}:
@@ -154,17 +154,17 @@ class RewardWeights:
 class Task(ABC):
     """A kind of goal: its draws, errors, observations and rewards.
 
-    Subclasses give a name, :attr:`goal_size`, :meth:`random_goal` and :meth:`remaining`, and what
-    differs from the rest below.
+    Subclasses define a name, :attr:`goal_size`, :meth:`random_goal` and :meth:`remaining`, and
+    override other members as needed.
 
     Parameters
     ----------
     robot
         The robot.
     link
-        Link of the argument ``link``, of the scenario, or the end-effector; empty: none.
+        Link from the argument ``link`` or the scenario, or the end-effector; empty: none.
     pushed
-        Whether actions push the base by a force, and turn it by a torque.
+        Whether actions have a force on the base, and a torque.
     """
 
     name: ClassVar[str]
@@ -173,9 +173,9 @@ class Task(ABC):
     scenario: ClassVar[str] = "arm_attitude"
     """Default scenario."""
     weights: ClassVar[type[RewardWeights]] = RewardWeights
-    """Class of the weights of the reward, which may have more of them."""
+    """Class of the reward weights, which may add further weights."""
     has_link: ClassVar[bool] = False
-    """Whether the task is about a link, whose place is then in :attr:`RobotStates.link_r`."""
+    """Whether the task has a link, whose position is then in :attr:`RobotStates.link_r`."""
     tolerance: float = 0.01
     """Default error within which the goal is reached."""
     spread: float = 1.0
@@ -197,10 +197,10 @@ class Task(ABC):
 
     @abstractmethod
     def remaining(self, states: RobotStates, goals: Array) -> Array:
-        """Return what is left to the goals (N, error_size): rotation vectors (rad), ways (m)."""
+        """Return the remaining errors (N, error_size): rotation vectors (rad) or vectors (m)."""
 
     def start(self, initial: InitialState, rng: np.random.Generator) -> InitialState:
-        """Return the initial state of an episode, given that of the scenario or draw."""
+        """Return the initial state of an episode, given the scenario's or the draw's."""
         return initial
 
     def goal_of(self, scenario: Scenario) -> Array:
@@ -209,10 +209,10 @@ class Task(ABC):
         Raises
         ------
         ParameterError
-            The scenario has none for this task.
+            The scenario has no goal for this task.
         """
         raise ParameterError(
-            f"Scenario '{scenario.name}' has no goal of task '{self.name}': take random goals."
+            f"Scenario '{scenario.name}' has no goal for task '{self.name}': use random goals."
         )
 
     def checked_goals(self, goals: Array) -> Array:
@@ -221,12 +221,12 @@ class Task(ABC):
         Raises
         ------
         ParameterError
-            One of them is refused.
+            A goal is invalid.
         """
         return goals
 
     def goal_poses(self, states: RobotStates, goals: Array) -> Array | None:
-        """Return poses (N, 7) in W at which pictures show the goals; None: they show none."""
+        """Return poses (N, 7) in W of the goals in pictures; None: goals are not shown."""
         return None
 
     def errors(self, remaining: Array) -> Array:
@@ -234,11 +234,11 @@ class Task(ABC):
         return np.asarray(np.linalg.norm(remaining, axis=1))
 
     def reached(self, states: RobotStates, errors: Array, tolerance: float) -> Flags:
-        """Return which goals are reached (N,), which ends their episodes."""
+        """Return which goals are reached (N,); a reached goal ends its episode."""
         return np.asarray(errors <= tolerance)
 
     def failed(self, states: RobotStates, goals: Array) -> Flags:
-        """Return which episodes end without success (N,), besides those that cannot continue."""
+        """Return which episodes fail (N,), apart from flights that cannot continue."""
         return np.zeros(len(states.q), dtype=np.bool_)
 
     def reward(self, step: Step, weights: Any) -> Array:
@@ -249,7 +249,7 @@ class Task(ABC):
         return np.asarray(reward + weights.reached * step.reached - weights.failed * step.failed)
 
     def observe(self, states: RobotStates, remaining: Array) -> Array:
-        """Return observations: what is left to the goal, q, qdot, twist of the base."""
+        """Return observations: remaining error, q, qdot, twist of the base."""
         parts = [remaining, states.q, states.qdot, states.twist]
         return np.clip(np.concatenate(parts, axis=1), *self._bounds)
 
@@ -258,7 +258,7 @@ class Task(ABC):
         return self.observation_bounds()
 
     def observation_bounds(self) -> tuple[Array, Array]:
-        """Return the least and the largest observations (error_size + 2 n + 6,)."""
+        """Return the smallest and largest observations (error_size + 2 n + 6,)."""
         robot, most = self.robot, LARGEST_OBSERVATION
         error, rest = np.full(self.error_size, self.largest_error), np.full(robot.n + 6, most)
         low = np.concatenate([-error, np.maximum(robot.lower, -most), -rest])
@@ -266,19 +266,19 @@ class Task(ABC):
 
 
 class Reorient(Task):
-    """The joints turn the base to a goal attitude; a goal is a quaternion (x, y, z, w) of R_WG."""
+    """The joints rotate the base to a goal attitude, a quaternion (x, y, z, w) of R_WG."""
 
     name, goal_size, tolerance, spread = "reorient", 4, 0.01, 0.15
     largest_error = np.pi
 
     @cached_property
     def directions(self) -> Array:
-        """Axes of random turns (m, 3) in B, orthonormal: one of a planar robot.
+        """Axes of random rotations (m, 3) in B, orthonormal: one axis for a planar robot.
 
         Raises
         ------
         ParameterError
-            Nothing turns the base.
+            Nothing rotates the base.
         """
         axes = BaseRotations.of(self.robot).axes
         if len(axes):
@@ -287,12 +287,13 @@ class Reorient(Task):
             raise ParameterError(
                 f"The joints of robot '{self.robot.description.name}' cannot rotate its base near "
                 "the start, so there are no random goals: give 'max_torque' under "
-                "efforts, or take the goal of a scenario (goals: scenario)."
+                "efforts, or use the goal of a scenario (goals: scenario)."
             )
         return np.eye(3)
 
     def random_goal(self, start: RobotStates, spread: float, rng: np.random.Generator) -> Array:
-        """Return an attitude within ``spread`` rad of the start; planar robots turn in plane."""
+        """Return an attitude within ``spread`` rad of the start; planar robots rotate in their
+        plane."""
         axes, axis = self.directions, rng.normal(size=3)
         if len(axes) == 1:
             axis = axes[0] * np.copysign(1.0, axis[0])
@@ -306,7 +307,7 @@ class Reorient(Task):
         )
 
     def goal_of(self, scenario: Scenario) -> Array:
-        """Return the attitude that the base goes to."""
+        """Return the goal attitude of the base."""
         return scenario.goal.quaternion
 
     def checked_goals(self, goals: Array) -> Array:
@@ -317,19 +318,19 @@ class Reorient(Task):
         return np.asarray(goals / sizes)
 
     def goal_poses(self, states: RobotStates, goals: Array) -> Array:
-        """Return the goals where the bases are."""
+        """Return the goal attitudes at the positions of the bases."""
         return np.hstack([states.pose[:, :3], goals])
 
 
 class Reach(Task):
-    """A link goes to a position; a goal is a position in W (3,), m."""
+    """A link reaches a goal position (3,) in W, m."""
 
     name, goal_size, tolerance, spread = "reach", 3, 0.02, 0.3
     scenario, has_link = "reach", True
 
     @cached_property
     def directions(self) -> Array:
-        """Directions (m, 3) in B, orthonormal, in which the link moves: two of a planar robot.
+        """Directions (m, 3) in B, orthonormal, in which the link moves: two for a planar robot.
 
         Raises
         ------
@@ -360,25 +361,25 @@ class Reach(Task):
         return np.asarray(self.link_positions(start)[0] + way)
 
     def remaining(self, states: RobotStates, goals: Array) -> Array:
-        """Return the ways (N, 3) from the links to the goals in B, m."""
+        """Return the displacements (N, 3) from the links to the goals in B, m."""
         R = matrices_from_quaternions(states.pose[:, 3:])
         of_base = np.einsum("nji,nj->ni", R, goals - states.pose[:, :3])
         assert states.link_r is not None
         return np.asarray(of_base - states.link_r)
 
     def goal_of(self, scenario: Scenario) -> Array:
-        """Return the position that the link goes to; see :meth:`Task.goal_of`."""
+        """Return the goal position of the link; see :meth:`Task.goal_of`."""
         for each in scenario.goal.end_effectors:
             if each.link == self.link:
                 return each.position
         if scenario.end_effector_goal is None:
             raise ParameterError(
-                f"Scenario '{scenario.name}' has no goal of link '{self.link}': take random goals."
+                f"Scenario '{scenario.name}' has no goal for link '{self.link}': use random goals."
             )
         return scenario.end_effector_goal.position
 
     def goal_poses(self, states: RobotStates, goals: Array) -> Array:
-        """Return the goals, with the attitude of the world."""
+        """Return the goals with the attitude of the world."""
         return np.hstack([goals, np.tile([0.0, 0.0, 0.0, 1.0], (len(goals), 1))])
 
     def link_positions(self, states: RobotStates) -> Array:
@@ -391,12 +392,12 @@ class Reach(Task):
 TASKS: Registry[Task] = Registry(
     "task", "spacerobot_ros.environment_tasks", Task, (Reorient, Reach)
 )
-"""Tasks by name; the registry's :meth:`~.Registry.register` adds one's own."""
+"""Tasks by name; the registry's :meth:`~.Registry.register` adds custom tasks."""
 TASKS.load()
 
 
 def action_scale(robot: SpaceRobot, actuation: str, max_force: float, max_torque: float) -> Array:
-    """Return the command of an action of ones: joint rates, or efforts, force (N), torque (N m).
+    """Return the command for an action of ones: joint rates, or efforts, force (N), torque (N m).
 
     Raises
     ------
@@ -407,8 +408,8 @@ def action_scale(robot: SpaceRobot, actuation: str, max_force: float, max_torque
     for name, limit in zip(robot.joint_names, limits.tolist(), strict=True):
         if not np.isfinite(limit):
             raise ParameterError(
-                f"Joint '{name}' has no limit of its {actuation}, which actions are shares of: "
-                "state one in its URDF, or give action_scale."
+                f"Joint '{name}' has no {actuation} limit, and actions are shares of this limit: "
+                "set it in the URDF, or give action_scale."
             )
     if actuation == "velocity":
         return limits.copy()
@@ -416,9 +417,9 @@ def action_scale(robot: SpaceRobot, actuation: str, max_force: float, max_torque
 
 
 def command_of(actions: Any, scale: Array, taken: Sequence[int] | npt.NDArray[np.int64]) -> Array:
-    """Return the commands (N, len(scale)) of actions (N, len(taken)), shares from -1 to 1.
+    """Return the commands (N, len(scale)) for actions (N, len(taken)), shares from -1 to 1.
 
-    ``taken`` are the entries of commands that actions have; the others are zero.
+    ``taken`` are the entries of commands that actions set; the others are zero.
     """
     shares = np.asarray(actions, dtype=float)
     commands = np.zeros((len(shares), len(scale)))

@@ -273,9 +273,9 @@ def test_draws_that_are_refused_are_left_out_with_one_warning(
     for seed in range(12):
         observations, _ = vector.reset(seed=seed)
         np.testing.assert_array_equal(observations[0], single.reset(seed=seed)[0])
-    (record,) = [each for each in caplog.records if "is left out" in each.message]
+    (record,) = [each for each in caplog.records if "is omitted" in each.message]
     assert re.search(
-        f"Draw .* of the campaign is left out, as are others .*{refusal}", record.message
+        f"Draw .* of the campaign is omitted, as are other .*{refusal}", record.message
     )
     made = vector.episodes._source._made.values()
     assert sum(isinstance(each, str) for each in made) > 3
@@ -286,7 +286,7 @@ def test_a_campaign_whose_draws_are_all_refused_says_so(tmp_path: Path) -> None:
     file = tmp_path / "draws.yaml"
     file.write_text(SLIDING.format("initial.joints.slider_1: {uniform: [3.0, 4.0]}"))
     environment = gymnasium.make(ARM, campaign=str(file))
-    with pytest.raises(ParameterError, match="100 draws of the campaign in succession are refused"):
+    with pytest.raises(ParameterError, match="100 successive draws of the campaign are refused"):
         environment.reset(seed=1)
 
 
@@ -323,10 +323,10 @@ def test_goals_of_a_scenario() -> None:
         ({"goals": "far"}, "Argument 'goals' is 'far'; it may be random, scenario"),
         ({"hold": 0}, "Argument 'hold' is 0; it must be a whole number of ticks"),
         ({"hold": 1.5}, "Argument 'hold' is 1.5; it must be a whole number of ticks"),
-        ({"time_limit": 0}, "Argument 'time_limit' is 0; episodes take longer, in s"),
+        ({"time_limit": 0}, "Argument 'time_limit' is 0; it must be above 0 s"),
         ({"time_limit": "x"}, "Argument 'time_limit' is 'x'; it must be finite, at least 0"),
         ({"scenario": 3}, "Argument 'scenario' is 3; it must be a text"),
-        ({"link": "segment_2"}, "Argument 'link' is 'segment_2', but in task 'reorient' no link"),
+        ({"link": "segment_2"}, "Argument 'link' is 'segment_2', but task 'reorient' has no link"),
         ({"reward": {"time": np.nan}}, "The weight 'time' of the reward is nan: give a finite"),
         ({"spread": -1.0}, "Argument 'spread' is -1.0; it must be finite, at least 0"),
         ({"time_limit": np.inf}, "Argument 'time_limit' is inf; it must be finite"),
@@ -336,7 +336,7 @@ def test_goals_of_a_scenario() -> None:
         ({"task": 3}, "Argument 'task' is 3; it must be a text"),
         ({"task": "hover"}, "Argument 'task' is 'hover'; it may be reorient, reach"),
         ({"task": Task}, "The task 'Task' lacks .*random_goal.*remaining"),
-        ({"scenario": "capture"}, "has a target, which environments do not have"),
+        ({"scenario": "capture"}, "has a target, which environments do not support"),
         ({"action_scale": [1.0]}, r"'action_scale' is \[1.0\]; robot .* takes a list of 8 finite"),
         ({"action_scale": 1.0}, "'action_scale' is 1.0; robot .* takes a list of 8 finite numbers"),
         ({"action_scale": "fast"}, "'action_scale' 'fast' is not a list of numbers"),
@@ -375,22 +375,24 @@ def test_bad_actions_goals_and_masks_are_refused() -> None:
         with pytest.raises(CommandError, match=message):
             vector.step(actions)
     for goal in ([0, 0, 0], np.ones((3, 4)), [0, 0, 0, np.nan]):
-        with pytest.raises(ParameterError, match=r"The goal is .*; task 'reorient' takes 4 finite"):
+        with pytest.raises(
+            ParameterError, match=r"The goal has shape .*; task 'reorient' takes 4 finite"
+        ):
             vector.reset(options={"goal": goal})
     for given in ("up", {"x": 1.0}, [[0, 0, 0, 1], [1]]):
         with pytest.raises(ParameterError, match=r"The goal .* is not a list of numbers\."):
             vector.reset(options={"goal": given})
     for options, message in (
-        ({"gaol": [0, 0, 0, 1]}, "There is no option 'gaol' of a reset; there are goal, start, "),
+        ({"gaol": [0, 0, 0, 1]}, "A reset has no option 'gaol'; it has goal, start, "),
         ({"start": [{}]}, r"The start is \[{}\]: give a dictionary, or a list of 2 of them"),
-        ({"start": {"q": [0, 0]}}, "There is no 'q' of a start; there are position, quaternion, "),
+        ({"start": {"q": [0, 0]}}, "A start has no 'q'; it has position, quaternion, "),
         ({"start": {"position": [0, 0]}}, r"The start's position is \[0, 0\]; it must be 3 finite"),
         ("goal", "The options of a reset are 'goal': give a dictionary"),
     ):
         with pytest.raises(ParameterError, match=message):
             vector.reset(options=options)
     for count in (0, 1.5, "2"):
-        with pytest.raises(ParameterError, match=f"There are {count!r} environments to make"):
+        with pytest.raises(ParameterError, match=f"number of environments is {count!r}"):
             gymnasium.make_vec(ARM, num_envs=count, scenario="planar_chain")
     with pytest.raises(ParameterError, match="a quaternion of zeros"):
         vector.reset(options={"goal": [0, 0, 0, 0]})
@@ -739,7 +741,7 @@ def test_other_render_modes_are_refused() -> None:
         assert make(ARM, scenario="planar_chain", render_mode=None).render_mode is None
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # Gymnasium may tell it before.
-            with pytest.raises(TypeError, match="There is no render_mode 'ansi': take 'rgb_array'"):
+            with pytest.raises(TypeError, match="There is no render_mode 'ansi': use 'rgb_array'"):
                 make(ARM, scenario="planar_chain", render_mode="ansi")
 
 
