@@ -286,7 +286,7 @@ class Farthest(FlightMetric):
 @pytest.mark.usefixtures("plugins")
 def test_a_metric_of_a_plugin_is_measured_and_required(tmp_path: Path) -> None:
     """The number is that of the flight's bag as another library reads it."""
-    with pytest.raises(ParameterError, match=r"no metric 'farthest_m'.*and yours by --plugin"):
+    with pytest.raises(ParameterError, match=r"no metric 'farthest_m'.*and metrics from --plugin"):
         campaign(metrics=["farthest_m"])
     (tmp_path / "farthest.py").write_text(_METRIC)
     add_plugin(tmp_path / "farthest.py")
@@ -313,7 +313,7 @@ def test_a_metric_of_a_plugin_is_measured_and_required(tmp_path: Path) -> None:
         (low, True),
         (high, False),
     ]
-    with pytest.raises(SpaceRobotError, match="no whole flights, of which 'farthest_m' is"):
+    with pytest.raises(SpaceRobotError, match="the metric 'farthest_m' needs whole flights"):
         run_campaign(campaign(**given, criteria=bounds), tmp_path / "lanes", engine="lanes")
 
 

@@ -1,1 +1,1 @@
-"""Campaigns: one scenario flown many times, with masses, sensors, starts and goals that differ."""
+"""Campaigns: one scenario flown many times with different masses, sensors, starts and goals."""

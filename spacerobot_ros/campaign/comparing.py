@@ -46,7 +46,7 @@ def require_same_draws(first: Campaign, second: Campaign) -> None:
             getattr(ours_is, key) == getattr(theirs_is, key) for key in ("distribution", "weights")
         )
         if not same:
-            raise ParameterError(f"{sentence}under 'disperse' is {a}, and {b}, in the same place.")
+            raise ParameterError(f"{sentence}'disperse' has {a} and {b} at the same place.")
 
 
 def write_comparison(folders: tuple[Path, Path], path: Path) -> list[str]:
@@ -66,8 +66,8 @@ def write_comparison(folders: tuple[Path, Path], path: Path) -> list[str]:
     rows_b = np.searchsorted(second.flight_numbers, common)
     if not common.size:
         raise ParameterError(
-            f"'{first.campaign.name}' and '{second.campaign.name}' have flown no common draw: fly "
-            "more flights of one of them."
+            f"'{first.campaign.name}' and '{second.campaign.name}' have flown no draw in common: "
+            "fly more flights of one of them."
         )
     # Metrics required by one campaign only are compared too, if both have them.
     names = list(dict.fromkeys([*first.shown_metrics, *second.shown_metrics]))
@@ -128,14 +128,14 @@ def _notes_on_failures(first: Results, second: Results) -> list[str]:
             share = f"{count} of {len(each)} flights"
             notes.append(f"Of {each.campaign.name}, {share} have the outcome {outcome}: {message}")
     if first.refused.any() or second.refused.any():
-        notes.append("Differences are those of draws whose goals neither campaign refused.")
+        notes.append("Differences exclude draws whose goal one of the campaigns refused.")
     return notes
 
 
 def _notes_on_control(first: Results, second: Results) -> list[str]:
     return [
-        f"{each.campaign.name} does not control the {' and '.join(parts)}: its error does not "
-        "count unless a criterion names it."
+        f"{each.campaign.name} does not control the {' and '.join(parts)}: the error is ignored "
+        "unless a criterion names it."
         for each in (first, second)
         if (parts := each.not_controlled)
     ]

@@ -46,7 +46,7 @@ ENGINES = ("auto", "lanes", "flights")
 
 @dataclass(frozen=True)
 class Criterion:
-    """Range that a metric must be in: from ``minimum`` to ``maximum``."""
+    """Permitted range of a metric, from ``minimum`` to ``maximum``."""
 
     metric: str
     minimum: float = -math.inf
@@ -68,7 +68,7 @@ class Campaign:
     name
         Name of its file.
     scenario
-        Scenario with the parameters that all flights share.
+        Scenario with the parameters common to all flights.
     flights, seed, sampler
         Number of draws, their seed, and their sampler.
     max_flight_time
@@ -76,9 +76,9 @@ class Campaign:
     dispersions
         Quantities that vary.
     criteria
-        Requirements on metrics, beside a goal that is reached.
+        Requirements on metrics, in addition to reaching the goal.
     metrics
-        Names of metrics that are measured and reported, beside those of the criteria.
+        Names of metrics that are measured and reported in addition to those of the criteria.
     engine
         Name of the engine: ``auto``, ``lanes`` or ``flights``.
     description
@@ -107,7 +107,7 @@ class Campaign:
 
     @property
     def correlation_factor(self) -> Array | None:
-        """(D, D) factor by which independent standard normals become correlated; None: none are."""
+        """(D, D) factor that correlates independent standard normals; None: no correlations."""
         if not any(each.weights for each in self.dispersions):
             return None
         rows = (each.weights or {each.name: 1.0} for each in self.dispersions)
@@ -115,7 +115,7 @@ class Campaign:
 
     @property
     def description_lines(self) -> list[str]:
-        """Lines for the terminal: the range of the drawn numbers, those of one range together."""
+        """Lines for the terminal: ranges of the drawn numbers, grouped by range."""
         together: dict[str, list[str]] = {}
         for each in self.dispersions:
             if not each.distribution.choices:
@@ -135,7 +135,7 @@ class Campaign:
 
     @property
     def own_metrics(self) -> list[str]:
-        """The named metrics that users have defined."""
+        """Named metrics that users have defined."""
         return [name for name in self.named_metrics if name in OWN_METRICS]
 
     @property
@@ -154,7 +154,7 @@ class _UniqueKeyLoader(yaml.SafeLoader):
                 continue  # An unhashable key is refused elsewhere with its own message.
             if key.value in known:
                 raise yaml.constructor.ConstructorError(
-                    None, None, f"the key '{key.value}' is there twice", key.start_mark
+                    None, None, f"the key '{key.value}' occurs twice", key.start_mark
                 )
             known.add(key.value)
         return super().construct_mapping(node, deep)
@@ -166,7 +166,7 @@ def load_campaign(path: Path, flights: int | None = None) -> Campaign:
     Raises
     ------
     ParameterError
-        It cannot be read, or a value in it is refused; the message names the place.
+        The file cannot be read, or a value in it is invalid; the message names the place.
     """
     try:
         content = load_yaml(read_regular(path).decode("utf-8"), _UniqueKeyLoader)
@@ -188,7 +188,7 @@ def load_campaign(path: Path, flights: int | None = None) -> Campaign:
 def parse_campaign(
     name: str, section: Mapping[str, Any], folder: Path = Path(), scenario: Scenario | None = None
 ) -> Campaign:
-    """Return a campaign from the content of its file.
+    """Return the campaign described by the content of a file.
 
     Parameters
     ----------
@@ -197,14 +197,14 @@ def parse_campaign(
     section
         Content of ``campaign:``.
     folder
-        Folder in which the file of a scenario is looked for.
+        Folder in which the scenario's file is searched.
     scenario
-        Scenario with the parameters under ``set``; None: the one that the section names.
+        Scenario with the parameters under ``set``; None: the scenario that the section names.
 
     Raises
     ------
     ParameterError
-        A key or value is refused.
+        A key or value is invalid.
     """
     for key in section:
         _require_known("key", key, _CAMPAIGN_KEYS)
@@ -227,7 +227,7 @@ def parse_campaign(
         raise ParameterError("the sampler 'saltelli' needs at least one dispersion.")
     if sampler == "saltelli" and not all(each.is_independent for each in dispersions):
         raise ParameterError(
-            "the sampler 'saltelli' is for independent values: take another one with a table or "
+            "the sampler 'saltelli' requires independent values: use another one with a table or "
             "multivariate_normal."
         )
     return Campaign(
@@ -269,7 +269,7 @@ def scenario_of_section(scenario: Scenario, section: Mapping[str, Any]) -> Scena
     Raises
     ------
     ParameterError
-        It has no goal, a parameter is refused, or campaigns do not fly it.
+        The scenario has no goal, a parameter is invalid, or campaigns do not support the scenario.
     """
     scenario.require_goal()
     for key, value in _read_mapping(section, "set").items():
@@ -285,7 +285,7 @@ def scenario_of_section(scenario: Scenario, section: Mapping[str, Any]) -> Scena
     for node in ("plant", *scenario.commanders):
         scenario.config(node)  # Invalid parameters are refused before the first flight.
     if not scenario.lockstep:
-        raise ParameterError("campaigns are flown in lockstep: leave plant.time_mode out.")
+        raise ParameterError("campaigns run in lockstep: leave plant.time_mode out.")
     return scenario
 
 
@@ -293,7 +293,7 @@ def _read_mapping(section: Mapping[str, Any], key: str) -> Mapping[str, Any]:
     value = section.get(key)
     value = {} if value is None else value
     if not isinstance(value, dict):
-        raise ParameterError(f"'{key}' must have names with values under it.")
+        raise ParameterError(f"'{key}' must contain names with values.")
     return value
 
 
@@ -338,8 +338,8 @@ def _require_metric(name: str, scenario: Scenario) -> None:
     known = [*metric_names(description_of(scenario).joint_names), *OWN_METRICS]
     if name not in known:
         raise ParameterError(
-            f"there is no metric '{name}'; there are {', '.join([*METRICS, *OWN_METRICS])}, those "
-            f"of joints also for one, and yours by --plugin.{suggestion(name, known)}"
+            f"there is no metric '{name}'; there are {', '.join([*METRICS, *OWN_METRICS])}, joint "
+            f"metrics of a single joint, and metrics from --plugin.{suggestion(name, known)}"
         )
 
 

@@ -38,12 +38,12 @@ _ABOUT_FILE, _CAMPAIGN_FILE, _SCENARIO_FILE = "about.json", "campaign.yaml", "sc
 _FLIGHTS_FOLDER = "flights"
 
 _FLUSH_PERIOD, _FLUSH_ROWS = 5.0, 2000
-"""Wall time (s) and number of rows after which rows are written: a kill loses at most as much."""
+"""Wall time (s) and number of rows after which rows are written; a kill loses at most these."""
 
 
 @lru_cache(maxsize=1)
 def versions_json() -> str:
-    """Return the versions of the flying software, with the hash of this package's code."""
+    """Return the software versions, with the hash of this package's code."""
     return json.dumps(
         {
             "spacerobot_ros": __version__,
@@ -57,8 +57,8 @@ def versions_json() -> str:
 class Dataset:
     """The folder of a campaign.
 
-    ``campaign.yaml`` and ``scenario.yaml`` describe the flights, ``flights/*.parquet`` have a row
-    for each.
+    ``campaign.yaml`` and ``scenario.yaml`` describe the flights; ``flights/*.parquet`` contain one
+    row per flight.
 
     Parameters
     ----------
@@ -78,14 +78,14 @@ class Dataset:
     # -- description --------------------------------------------------------------------------
 
     def begin(self, campaign: Campaign) -> set[int]:
-        """Make the folder or resume it; return the numbers of the flights that it has.
+        """Create or resume the folder; return the numbers of its flights.
 
         Raises
         ------
         ParameterError
-            It holds another campaign, another process writes into it, or a file in it is damaged.
+            The folder holds another campaign, another process writes into it, or a file is damaged.
         RecordingError
-            It cannot be written.
+            The folder cannot be written.
         SpaceRobotError
             pyarrow is not installed.
         """
@@ -123,7 +123,7 @@ class Dataset:
         known, wanted = _settings_of_draws(self.campaign()), _settings_of_draws(campaign)
         differing = [key for key in {**known, **wanted} if known.get(key) != wanted.get(key)]
         difference = " and ".join(f"another '{key}'" for key in differing)
-        difference = difference or "another scenario, or other parameters of it"
+        difference = difference or "another scenario or other parameters"
         raise ParameterError(
             f"The folder {self.folder} holds another campaign: '{facts['name']}', with "
             f"{difference}. Name another folder, or remove it."
@@ -133,8 +133,8 @@ class Dataset:
         flown_by = json.loads((self.folder / _ABOUT_FILE).read_text("utf-8")).get("versions", "")
         if flown_by != versions_json():
             warn_once(
-                f"The flights in {self.folder} were flown by other software ({flown_by}): those "
-                "that follow may differ."
+                f"The flights in {self.folder} were flown with other software ({flown_by}): "
+                "further flights may differ."
             )
 
     def _require_no_other_files(self) -> None:
@@ -146,7 +146,7 @@ class Dataset:
         others = [path for path in self.folder.iterdir() if path.name.lstrip(".") not in own]
         if others or self._row_files():
             raise ParameterError(
-                f"The folder {self.folder} is not empty and holds no campaign: name another one."
+                f"The folder {self.folder} is not empty and holds no campaign: use another one."
             )
 
     def _write_description(self, campaign: Campaign, flights: int) -> None:
@@ -186,7 +186,7 @@ class Dataset:
         self._descriptor = descriptor
 
     def close(self) -> None:
-        """Write the rows that are not written yet, and unlock the folder for other processes."""
+        """Write the remaining rows, and unlock the folder for other processes."""
         try:
             self.flush()
         finally:
@@ -246,12 +246,12 @@ class Dataset:
             self.flush()
 
     def flush(self) -> None:
-        """Write the rows that were added into a new file, which is complete or does not exist.
+        """Write the added rows atomically into a new file.
 
         Raises
         ------
         RecordingError
-            The disk refuses it.
+            The file cannot be written.
         """
         self._written = time.monotonic()
         if not self._rows:
@@ -269,15 +269,15 @@ class Dataset:
         except OSError as error:
             raise RecordingError(
                 f"The last {len(self._rows)} flights cannot be written to {path}: {reason(error)}. "
-                "The same command continues from those before them."
+                "The same command continues from the earlier flights."
             ) from error
         self._rows.clear()
 
     def table(self, columns: Sequence[str] | None = None) -> Any:
-        """Return the rows as a pyarrow table, by the number of the flight; one row a flight.
+        """Return the rows as a pyarrow table, ordered by flight number, one row per flight.
 
-        If a file was copied into the folder, the first row of a flight counts, with a warning.
-        Columns that are not among ``columns`` are not read; those that no file has are omitted.
+        If rows repeat a flight because a file was copied into the folder, the first row is used,
+        with a warning. Only ``columns`` are read; columns that no file has are omitted.
 
         Raises
         ------
@@ -295,7 +295,7 @@ class Dataset:
         if repeated := len(table) - len(first):
             warn_once(
                 f"{repeated} of the rows in {self.folder} repeat a flight: the first row of each "
-                "flight counts. Remove files that were copied there."
+                "flight is used. Remove files that were copied there."
             )
         table = table.take(first)
         return (
@@ -318,8 +318,7 @@ def _read_row_file(part: Path, columns: Collection[str] | None = None) -> Any:
     except (OSError, arrow.ArrowException) as error:
         reason = str(error).splitlines()[0].rstrip(".")
         raise ParameterError(
-            f"The file {part} is damaged ({reason}): remove it, and the flights in it are flown "
-            "again."
+            f"The file {part} is damaged ({reason}): remove it, and its flights are flown again."
         ) from error
 
 
@@ -389,10 +388,10 @@ def _settings_of_draws(campaign: Campaign) -> dict[str, Any]:
 
 
 def self_contained(campaign: Campaign) -> Campaign:
-    """Return the campaign with the texts of its robots instead of files, for other machines.
+    """Return the campaign with the texts of its robots instead of files, for use on other machines.
 
-    Texts are canonical XML: files that differ in layout, comments or order of attributes are one
-    robot.
+    Texts are canonical XML: files that differ only in layout, comments or attribute order are the
+    same robot.
     """
     scenario = campaign.scenario
     for node in ("plant", *scenario.commanders):

@@ -1,4 +1,4 @@
-"""Distributions of what a campaign draws: of scipy, choices, covariances, and rows of a table."""
+"""Distributions of drawn values: from scipy, choices, covariances, and rows of a table."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ _TABLE, _CORRELATED = "table", "multivariate_normal"
 
 @dataclass(frozen=True)
 class Distribution:
-    """Probability distribution of a value: one of scipy.stats, a choice, or the rows of a table.
+    """Probability distribution of a value: from scipy.stats, a choice, or the rows of a table.
 
     Attributes
     ----------
     name
         Name in ``scipy.stats``, ``choice``, or ``table``.
     arguments
-        Arguments by name, as ``scipy.stats`` takes them.
+        Arguments by name, as in ``scipy.stats``.
     choices
         Equally likely values of a ``choice``, or the values of a ``table`` flight by flight.
     """
@@ -71,8 +71,9 @@ class Distribution:
 class Dispersion:
     """A quantity that varies from flight to flight, and its distribution.
 
-    ``weights`` are those of the independent standard normals, by the name of their dispersion,
-    whose sum is the standard normal of a correlated quantity; empty: it is independent.
+    For a correlated quantity, ``weights`` are the weights of independent standard normals, by name
+    of their dispersion; the weighted sum is its standard normal. Empty: the quantity is
+    independent.
     """
 
     target: DispersionTarget
@@ -86,7 +87,7 @@ class Dispersion:
 
     @property
     def is_independent(self) -> bool:
-        """Whether it is drawn by itself."""
+        """Whether the quantity is drawn independently."""
         return not self.weights and self.distribution.name != _TABLE
 
     def __str__(self) -> str:
@@ -95,7 +96,7 @@ class Dispersion:
 
 
 def read_real_number(key: str, value: Any, least: float = -math.inf) -> float:
-    """Return a finite number of at least ``least``; else raise ParameterError."""
+    """Return a finite number of at least ``least``, or raise ParameterError."""
     try:
         number = math.nan if isinstance(value, bool) else float(value)
     except (TypeError, ValueError):
@@ -112,7 +113,7 @@ def read_distributions(section: Mapping[str, Any], scenario: Scenario) -> Iterat
     Raises
     ------
     ParameterError
-        A name, a distribution, or an argument of one is refused.
+        A name, a distribution, or one of its arguments is invalid.
     """
     for names, given in section.items():
         targets = [
@@ -165,7 +166,7 @@ def _read_correlated(
 
 
 def read_table_text(given: Any, folder: Path) -> str:
-    """Return the CSV text of a table: of a file, or as it is in the campaign's file.
+    """Return the CSV text of a table, from a file or from the campaign's file itself.
 
     Raises
     ------
@@ -183,16 +184,16 @@ def read_table_text(given: Any, folder: Path) -> str:
 
 
 def read_table(text: str, scenario: Scenario) -> list[Dispersion]:
-    """Return the columns of a table, a row a flight.
+    """Return the columns of a table with one row per flight.
 
     Raises
     ------
     ParameterError
-        A name or a value is refused.
+        A name or a value is invalid.
     """
     names, *rows = [row for row in csv.reader(text.splitlines(), skipinitialspace=True) if row]
     if not rows:
-        raise ParameterError("the table needs a line of names, and a line for each flight.")
+        raise ParameterError("the table needs one line of names and one line per flight.")
     for number, row in enumerate(rows, 1):
         if len(row) != len(names):
             raise ParameterError(
@@ -216,7 +217,7 @@ def checked_dispersions(drawn: Sequence[Dispersion]) -> tuple[Dispersion, ...]:
     Raises
     ------
     ParameterError
-        Two of them set the same number.
+        Two dispersions set the same number.
     """
     found: dict[str, Dispersion] = {}
     for each in drawn:
@@ -235,7 +236,7 @@ _SCIPY_NAMES = {"normal": "norm", "gauss": "norm", "gaussian": "norm", "exponent
 
 _ARGUMENT_HELP = {
     "norm": "loc is its mean and scale its standard deviation",
-    "uniform": "loc is its least value and scale its width; [a, b] is from a to b",
+    "uniform": "loc is its smallest value and scale its width; [a, b] is from a to b",
 }
 
 
@@ -271,7 +272,7 @@ def _read_distribution(target: DispersionTarget, given: Any) -> Distribution:
             )
         arguments = dict(zip(words, arguments, strict=False))
     if not isinstance(arguments, dict):
-        raise ParameterError(f"'{name}': {kind} must have its arguments: {', '.join(words)}.")
+        raise ParameterError(f"'{name}': {kind} must have arguments: {', '.join(words)}.")
     for word in arguments:
         if word not in words:
             raise ParameterError(
@@ -287,7 +288,7 @@ def _read_distribution(target: DispersionTarget, given: Any) -> Distribution:
         middle = float(distribution.ppf(0.5, **values))
     if not math.isfinite(middle):
         raise ParameterError(
-            f"'{name}': {kind} takes no such arguments: "
+            f"'{name}': {kind} is not defined for these arguments: "
             f"{', '.join(f'{word} {value:g}' for word, value in values.items())}."
         )
     return Distribution(str(kind), values)

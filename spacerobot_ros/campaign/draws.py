@@ -1,8 +1,8 @@
 """Draws of a campaign: the random values of each flight.
 
-A draw is known by its number alone: it depends neither on the number of workers nor on the order in
-which flights end, and with the samplers ``random``, ``sobol`` and ``halton`` not on the number of
-flights.
+A draw is determined by its number: it depends neither on the number of workers nor on the order in
+which flights end. With the samplers ``random``, ``sobol`` and ``halton`` it does not depend on the
+number of flights either.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from spacerobot_ros.lazy import optional_module
 from spacerobot_ros.model.description import Array
 
 _MIN_PROBABILITY = 1e-12
-"""Least distance of cumulative probabilities from 0 and 1, at which many distributions are
+"""Smallest distance of cumulative probabilities from 0 and 1, where many distributions are
 infinite."""
 
 _BLOCK_SIZE = 256
@@ -34,16 +34,16 @@ _SEED = "plant.sensors.seed"
 
 @dataclass(frozen=True)
 class Draw:
-    """The values that are drawn for one flight.
+    """The drawn values of one flight.
 
     Attributes
     ----------
     number
         The number of the flight.
     seed
-        The seed of the noise of its sensors and actuators.
+        The seed of sensor and actuator noise.
     values
-        The values by the names of the dispersions.
+        The values by name of the dispersion.
     """
 
     number: int
@@ -63,10 +63,10 @@ class Draws:
     def __init__(self, campaign: Campaign) -> None:
         self._campaign = campaign
         self._block, self._made = -1, list[Draw]()
-        """The block of draws computed last."""
+        """The last computed block of draws."""
         self.shares = self._sampler_shares()
-        """(N, D) cumulative probabilities of the values; None with the sampler ``random``, with
-        which each flight draws from a generator of its own."""
+        """(N, D) cumulative probabilities of the values; None with the sampler ``random``, which
+        uses a separate generator for each flight."""
 
     def __len__(self) -> int:
         return self._campaign.flights if self.shares is None else len(self.shares)
@@ -149,9 +149,9 @@ def drawn_flight(campaign: Campaign, draw: Draw, common: DrawnFlight | None = No
     Raises
     ------
     ParameterError
-        A parameter refuses its value.
+        The value of a parameter is invalid.
     RobotDescriptionError
-        A drawn mass or inertia is not that of a body.
+        A drawn mass or inertia is not physical.
     """
     ((_, flight),) = drawn_flights(campaign, [draw], common or DrawnFlight.of(campaign.scenario))
     if isinstance(flight, Exception):
@@ -164,7 +164,7 @@ def drawn_flights(
 ) -> Iterator[tuple[Draw, DrawnFlight | Exception]]:
     """Yield draws with their flights, or with the error that :func:`drawn_flight` raises.
 
-    Mass properties are computed for many draws together.
+    Mass properties are computed for many draws at once.
     """
     of_masses = [each for each in campaign.dispersions if each.target.changes_masses_only]
     has_own_seed = _SEED not in campaign.names
@@ -210,7 +210,7 @@ def import_salib(module: str) -> Any:
 
 
 def sobol_problem(names: Sequence[str]) -> dict[str, Any]:
-    """Return the problem definition of SALib: quantities of these names, from 0 to 1."""
+    """Return SALib's problem definition for quantities from 0 to 1 with these names."""
     # The names are an array, because pandas 3 accepts no list from SALib 1.5.
     listed = np.array(list(names), dtype=object)
     return {"num_vars": len(listed), "names": listed, "bounds": [[0, 1]] * len(listed)}

@@ -1,4 +1,4 @@
-"""The engines by name: behind one interface, the same draw is the same flight in each."""
+"""The engines by name; each flies the same flight for the same draw."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ ENGINE_FACTORIES: Mapping[str, Callable[[], Engine]] = {
     "lanes": LanesEngine,
     "flights": FlightsEngine,
 }
-"""The engines by name, the preferred ones first."""
+"""The engines by name, in order of preference."""
 
 
 def select_engine(campaign: Campaign, engine_name: str) -> Engine:
-    """Return the engine ``engine_name``; for ``auto`` the first one that can fly a campaign.
+    """Return the engine ``engine_name``; for ``auto``, the first engine that can fly the campaign.
 
     Raises
     ------
     SpaceRobotError
-        The engine cannot fly it, or none can; the message says why.
+        The engine cannot fly the campaign, or no engine can; the message states the reason.
     """
     if engine_name != "auto":
         engine = ENGINE_FACTORIES[engine_name]()
@@ -46,14 +46,14 @@ def select_engine(campaign: Campaign, engine_name: str) -> Engine:
 
 @cache
 def engine_by_name(name: str) -> Engine:
-    """Return an engine by its name, one per process: it reuses the models that it has built."""
+    """Return an engine by name, one instance per process, which reuses its models."""
     return ENGINE_FACTORIES[name]()
 
 
 def fly_all(
     engine: Engine, campaign: Campaign, draws: Iterable[Draw], stopped: Callable[[], bool]
 ) -> Iterator[Row]:
-    """Yield a row for each draw; fallbacks are flown after the others."""
+    """Yield a row for each draw; fallbacks are flown last."""
     fallbacks: list[Fallback] = []
     for made in engine.fly(campaign, draws, stopped):
         if isinstance(made, Fallback):

@@ -1,8 +1,8 @@
-"""Draws of a campaign flown in SIMD lanes: along a schedule of the planner, or under control.
+"""Draws of a campaign in SIMD lanes, along schedules of the planner or under control.
 
-A lane can follow one schedule to its end and evaluate the goal, or fly coordinated control to the
-decision of the goal monitor. A draw that needs more (a correction, a joint at a limit, control that
-is lost) is a :class:`.Fallback`, which the engine ``flights`` flies: the rows are the same.
+A lane can follow one schedule to its end and evaluate the goal, or fly coordinated control until
+the goal is decided. A draw that needs more (a correction, a joint at a limit, a loss of control)
+becomes a :class:`.Fallback` for the engine ``flights``; the rows are the same.
 """
 
 from __future__ import annotations
@@ -53,14 +53,14 @@ from spacerobot_ros.simulation.plant import InitialState
 from spacerobot_ros.times import SECOND
 
 _STATES_PER_FLIGHT = 40
-"""Largest number of evaluated states of a flight along a schedule, besides its last state."""
+"""Largest number of evaluated states of a flight along a schedule, before its last state."""
 
 _MAX_BATCH_TICKS = 4_000_000
 """Largest number of ticks of one batch, whose schedules are in memory."""
 
 _MAX_BATCH_PREPARATION_TIME = 4.0
-"""Wall time, s, after which a batch is flown with the draws that are ready; an interruption of the
-campaign loses no more."""
+"""Wall time, s, after which a batch is flown with the draws that are ready; it bounds the loss if
+the campaign is interrupted."""
 
 _END_POSITION_TOLERANCE = 1e-6
 """Largest distance of a joint from its last position at the end of a schedule, m or rad."""
@@ -68,7 +68,7 @@ _END_POSITION_TOLERANCE = 1e-6
 _EXTERNAL_LOAD_PREFIXES = "plant.disturbances", "plant.orbit.", "plant.table."
 
 _GAIN_PREFIX = "coordinated_control.gains."
-"""Prefix of the controller's parameters that may differ from lane to lane."""
+"""Prefix of the controller parameters that may differ between lanes."""
 
 _PARAMETERS_COMMON_TO_LANES = (
     "plant.tick_rate",
@@ -147,23 +147,25 @@ class LanesEngine:
         if plant.target.given:
             return "it has a target"
         if plant.engine != "exact":
-            return f"its plant has the engine '{plant.engine}', which engine 'flights' flies"
+            return f"its plant has the engine '{plant.engine}'; use engine 'flights'"
         loads = plant.disturbances, plant.orbit, plant.table
         dispersed = any(
             each.name.startswith(_EXTERNAL_LOAD_PREFIXES) for each in campaign.dispersions
         )
         if dispersed or loads != ((), OrbitConfig(), TableConfig()):
-            return "it has disturbances, an orbit or a table, which engine 'flights' flies"
+            return "it has disturbances, an orbit or a table; use engine 'flights'"
         if campaign.measures_clearance:
             return "it names the metric clearance_m, and lanes measure no distances between links"
         if campaign.own_metrics:
-            return f"lanes keep no whole flights, of which '{campaign.own_metrics[0]}' is computed"
+            return (
+                f"the metric '{campaign.own_metrics[0]}' needs whole flights; use engine 'flights'"
+            )
         match scenario.commanders, plant.actuation:
             case ("planner",), "velocity":
                 return self._scheduled.refusal(campaign)
             case ("coordinated_control",), "effort":
                 return self._controlled.refusal(campaign)
-        return "lanes have velocities of a planner, or efforts of coordinated control"
+        return "lanes support only velocities of a planner, or efforts of coordinated control"
 
     def fly(
         self, campaign: Campaign, draws: Iterable[Draw], stopped: Callable[[], bool]
@@ -231,7 +233,7 @@ class _ScheduledLanes:
         self._extremes: tuple[GaitSchedule, Array, Array] | None = None
         """The last schedule, and the lowest and highest positions (n,) of its joints, m or rad."""
         self._planned_values: _PlannedValues | None = None
-        """The values that determine the plans of the last scenario, which many draws share."""
+        """The values that determine the plans of the last scenario, common to many draws."""
         self._last_plan: tuple[Any, _Plan | None] | None = None
         """The last plan from a state measured without noise, and the values that determine it."""
 
@@ -239,11 +241,11 @@ class _ScheduledLanes:
         """Return the reason why lanes cannot fly a campaign, as a clause; empty if they can."""
         planner, sensors = campaign.scenario.planner, campaign.scenario.plant.sensors
         if planner.averaging > 1 or planner.drift_position or planner.drift_attitude:
-            return "the planner averages states, or watches the path"
+            return "the planner averages states, or monitors the path"
         if campaign.scenario.goal.end_effectors:
             return "the goal is for end-effectors"
         if planner.replanning or planner.output != "commands":
-            return "the planner plans again on the way"
+            return "the planner replans during the motion"
         dispersed = [each.name for each in campaign.dispersions]
         for name in dispersed:
             if name.startswith(_PARAMETERS_COMMON_TO_SCHEDULES):
@@ -261,7 +263,7 @@ class _ScheduledLanes:
         if plan is None:
             return Fallback(draw, "had no schedule at the first state")
         if plan.schedule.controls & (POSE - goal.asked):
-            return Fallback(draw, "keeps a part of the pose that its goal does not ask for")
+            return Fallback(draw, "keeps a part of the pose that its goal does not request")
         return _PreparedDraw(draw, flight, plan, time.perf_counter() - began)
 
     def _plan_first_state(self, flight: DrawnFlight) -> _Plan | None:
@@ -310,8 +312,8 @@ class _ScheduledLanes:
         flights: Flights,
         taken: float,
     ) -> Iterator[Measures | str]:
-        """Yield the measures of each flight whose goal is decided at the end of its schedule, or
-        the reason for a fallback; ``taken`` is the wall time of a flight in the batch, s.
+        """Yield the measures of each flight with a decision at the end of its schedule, or the
+        reason for a fallback; ``taken`` is the wall time per flight of the batch, s.
         """
         rows = np.arange(len(batch))
         instants = {tick: place for place, tick in enumerate(flights.report_ticks)}
@@ -379,20 +381,20 @@ class _ControlledLanes:
         if scenario.goal.end_effectors:
             return "the goal is for end-effectors"
         if scenario.goal.asked != POSE:
-            return "the goal asks for a part of the pose of the base alone"
+            return "the goal requests only a part of the base pose"
         if plant.thrusters:
-            return "its thrusters are on or off, which engine 'flights' flies"
+            return "it has on/off thrusters; use engine 'flights'"
         if plant.beyond_limits != "clip":
             return "the plant refuses commands beyond limits"
         robots = nominal_robots(scenario)
         if robots.plant.description.world is not None:
-            return "it has obstacles, and lanes notice no contacts"
+            return "it has obstacles, and lanes detect no contacts"
         if robots.controller.description.wheel_names:
-            return "the robot has reaction wheels, which engine 'flights' flies"
+            return "the robot has reaction wheels; use engine 'flights'"
         if scenario.controller.profile == PlannedReference.name:
-            return "its references are planned, which engine 'flights' does"
+            return "its references are planned; use engine 'flights'"
         if scenario.controller.tasks:
-            return "its controller has tasks before goals, which engine 'flights' does"
+            return "its controller has tasks before goals; use engine 'flights'"
         for dispersion in campaign.dispersions:
             name = dispersion.name
             own = name.startswith("coordinated_control.") and not name.startswith(_GAIN_PREFIX)
@@ -406,22 +408,22 @@ class _ControlledLanes:
             each.name.startswith(_GAIN_PREFIX) and each.name.endswith(".ki")
             for each in campaign.dispersions
         ):
-            return "its controller has integral gains, which engine 'flights' flies"
+            return "its controller has integral gains; use engine 'flights'"
         if law.couples:
-            return "its gains are matrices, which engine 'flights' flies"
+            return "its gains are matrices; use engine 'flights'"
         if law.fixed_inputs is None:
-            return f"the law '{law.name}' with these options is more than one function"
+            return f"the law '{law.name}' with these options is not a single function"
         for key, goal in _goals_by_frame(scenario).items():
             if goal is not None and not getattr(law.outputs.selection, key):
                 return f"the law '{law.name}' does not control the {key.replace('_', '-')}"
         if controlled_parts(law.outputs.selection.base) != POSE:
-            return f"the law '{law.name}' controls a part of the pose of the base alone"
+            return f"the law '{law.name}' controls only a part of the base pose"
         return ""
 
     def prepare_draw(
         self, campaign: Campaign, draw: Draw, flight: DrawnFlight
     ) -> _PreparedDraw | Fallback:
-        """Check that a draw can be in a batch, whose other flights its error would end."""
+        """Check that a draw can be in a batch, because its error would end the other flights."""
         ready = _PreparedDraw(draw, flight)
         try:
             self.flights(campaign, [ready])
@@ -430,7 +432,8 @@ class _ControlledLanes:
         return ready
 
     def flights(self, campaign: Campaign, batch: Sequence[_PreparedDraw]) -> Flights:
-        """Return the batch of draws; SpaceRobotError if a parameter, start or goal is refused."""
+        """Return the batch of draws; raise SpaceRobotError if a parameter, start or goal is
+        invalid."""
         scenario = campaign.scenario
         drawn = [each.flight for each in batch]
         goals = [_goals_by_frame(each.scenario) for each in drawn]
@@ -459,7 +462,7 @@ class _ControlledLanes:
         taken: float,
     ) -> Iterator[Measures | str]:
         """Yield the measures of each flight, or the reason for a fallback; ``taken`` is the wall
-        time of a flight in the batch, s.
+        time per flight of the batch, s.
         """
         for row, ready in enumerate(batch):
             if row in result.failures:

@@ -1,4 +1,4 @@
-"""Metrics of campaigns by name: those of every flight, and those of users."""
+"""Metrics of campaigns by name: built-in and user-defined metrics."""
 
 from __future__ import annotations
 
@@ -15,44 +15,44 @@ if TYPE_CHECKING:
 
 
 class FlightMetric(ABC):
-    """A metric of your own, computed for each flight of a campaign that names it.
+    """A user-defined metric, computed for each flight of a campaign that names it.
 
-    A class that is derived from it becomes known as the control laws do: by ``--plugin``, by an
-    entry point ``spacerobot_ros.metrics``, or by :meth:`.Registry.register` of ``OWN_METRICS``.
+    Derived classes are registered like control laws: with ``--plugin``, an entry point
+    ``spacerobot_ros.metrics``, or :meth:`.Registry.register` of ``OWN_METRICS``.
     """
 
     name: ClassVar[str]
-    """Name of its column, and under ``metrics`` or ``criteria``."""
+    """Name of the column, used under ``metrics`` or ``criteria``."""
 
     unit: ClassVar[str] = ""
     """SI unit, for people."""
 
     yes_or_no: ClassVar[bool] = False
-    """Whether it is 1 for yes and 0 for no, so that reports have no distribution of it."""
+    """Whether the value is 1 for yes and 0 for no; reports then show no distribution."""
 
     @abstractmethod
     def evaluate(self, flight: Flight) -> float:
-        """Return the value for a flight; NaN if it has none."""
+        """Return the value for a flight; NaN if there is none."""
 
 
 OWN_METRICS: Registry[FlightMetric] = Registry(
     "metric", "spacerobot_ros.metrics", FlightMetric, (), reserved=METRICS
 )
-"""The metrics of users by name."""
+"""User-defined metrics by name."""
 
 
 def metric_of(name: str) -> Metric | type[FlightMetric]:
-    """Return a metric by its name, which may be that of one of its joints."""
+    """Return a metric by name; the name may include a joint."""
     return OWN_METRICS.get(name) or METRICS[name.partition(".")[0]]
 
 
 def own_metrics_of(flight: Flight, names: Iterable[str]) -> dict[str, float]:
-    """Return the metrics of users for a flight.
+    """Return the user-defined metrics of a flight.
 
     Raises
     ------
     SpaceRobotError
-        One of them raises an exception, or is no number.
+        A metric raises an exception or is not a number.
     """
     found: dict[str, float] = {}
     for name in names:

@@ -1,4 +1,4 @@
-"""Draws flown one after the other, without ROS."""
+"""Draws flown one by one, without ROS."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from spacerobot_ros.scenario import Scenario
 
 
 class FlightsEngine:
-    """Engine that flies one draw after the other; one that cannot be flown does not end others."""
+    """Engine that flies draws one by one; an invalid draw does not affect the others."""
 
     name = "flights"
     efficient_flights = 1
@@ -56,7 +56,7 @@ class FlightsEngine:
     def fly_draw(
         self, campaign: Campaign, flight: DrawnFlight, stopped: Callable[[], bool] = lambda: False
     ) -> Flight:
-        """Fly one draw; a refused draw raises a :class:`.SpaceRobotError`."""
+        """Fly one draw; raise :class:`.SpaceRobotError` if it is refused."""
         return fly_scenario(
             flight.seeded_scenario,
             robots=robots_of(flight),
@@ -66,7 +66,7 @@ class FlightsEngine:
 
 
 def robots_of(flight: DrawnFlight) -> Robots:
-    """Return the models of a flight, which all draws that differ in masses alone share."""
+    """Return the models of a flight; draws that differ only in masses share them."""
     scenario = flight.scenario
     robots = nominal_robots(scenario)
     if "planner" in scenario.commanders:
@@ -83,7 +83,7 @@ def robots_of(flight: DrawnFlight) -> Robots:
 
 
 def nominal_robots(scenario: Scenario) -> Robots:
-    """Return the models of a scenario without dispersions of masses, the same objects each time."""
+    """Return the models of a scenario without mass dispersions, always the same objects."""
     plant = description_of(scenario).urdf
 
     def build(node: str, config: RobotConfig) -> SpaceRobot | None:
@@ -99,8 +99,8 @@ def nominal_robots(scenario: Scenario) -> Robots:
 
 
 _last_planner_method: tuple[SpaceRobot, PlannerConfig, GaitMethod] | None = None
-"""Robot, configuration and gait method of the last planner: the solvers of a method serve all
-flights, and no plan depends on another."""
+"""Robot, configuration and gait method of the last planner; all flights share the method's solvers,
+and no plan depends on another."""
 
 
 def _method_of_planner(robot: SpaceRobot, config: PlannerConfig) -> GaitMethod:
@@ -120,7 +120,7 @@ def _method_of_planner(robot: SpaceRobot, config: PlannerConfig) -> GaitMethod:
 
 
 def plant_robot(flight: DrawnFlight) -> SpaceRobot:
-    """Return the robot of the plant without dispersions of its masses."""
+    """Return the robot of the plant without mass dispersions."""
     robot = _build_robot("plant", flight.nominal.urdf, "", "", 0.0, 0)
     assert robot is not None
     return robot

@@ -1,4 +1,4 @@
-"""The report of a campaign: one HTML file that needs nothing besides itself."""
+"""The report of a campaign: one self-contained HTML file."""
 
 from __future__ import annotations
 
@@ -42,14 +42,14 @@ FOOTER_TEXT = f"Made by spacerobot_ros {__version__}."
 """Footer of the pages of campaigns."""
 
 _MAX_HISTOGRAMS, _MAX_SCATTER_PLOTS = 9, 6
-"""Largest numbers of metrics with a histogram and of drivers with a plot."""
+"""Largest number of histograms of metrics and of scatter plots of drivers."""
 
-NO_INFLUENCES_TEXT = "no correlation is beyond chance (p < 0.05, corrected for all of them)."
+NO_INFLUENCES_TEXT = "no correlation is significant (p < 0.05, corrected for multiple tests)."
 
 _QUANTILES_SHOWN = (0.01, 0.5, 0.99)
 _MAX_CURVE_STEPS = 2000
 _PART_OF_METRIC = {"position_error_m": "position", "attitude_error_rad": "attitude"}
-"""Part of the goal of the base whose error a metric is."""
+"""Part of the base goal whose error is the metric."""
 
 
 def write_campaign_report(folder: Path, path: Path) -> list[str]:
@@ -94,7 +94,7 @@ def picture_part(drawn: Figure, name: str, caption: str) -> str:
 
 
 def figure_with_axes(count: int, across: int, height: float = 2.2) -> tuple[Figure, list[Any]]:
-    """Return a figure and its axes, ``across`` in a row."""
+    """Return a figure and its axes, ``across`` per row."""
     rows = -(-count // across)
     figure = Figure(figsize=(9.6, height * rows + 0.2), layout="constrained", facecolor="white")
     FigureCanvasAgg(figure)
@@ -105,8 +105,8 @@ def figure_with_axes(count: int, across: int, height: float = 2.2) -> tuple[Figu
 
 
 def metric_label(metric: str, not_controlled: Sequence[str] = ()) -> str:
-    """Return the name of a metric with its unit, unless the name has it, and whether it is the
-    error of a part of the goal that is not controlled.
+    """Return the name of a metric with its unit, unless the name includes it; errors of
+    uncontrolled parts of the goal are marked.
     """
     unit = metric_of(metric).unit
     named = metric.endswith(("_m", "_rad", "_s", "_kg", "_N", "_Nm", "_Ns", "_Nms"))
@@ -274,9 +274,9 @@ def _sensitivity_section(found: Sequence[Influence]) -> str:
         rows.append(cells)
     head = ["drawn", "metric", "rank correlation", "p", "of its distance from the median", "p"]
     head += ["Sobol, first order", "Sobol, total"] if sobol else []
-    note = "Spearman's rank correlations, those of passing and then the strongest first; p: "
-    note += "probability by chance, corrected for all of them (Benjamini-Hochberg). A metric "
-    note += "that grows to both sides correlates with the distance of the draw from its median."
+    note = "Spearman's rank correlations, first of passing, then in order of strength; p: p-value "
+    note += "corrected for multiple tests (Benjamini-Hochberg). A metric that grows to both sides "
+    note += "of the median correlates with the distance of the draw from the median."
     if not sobol:
         note += " The sampler 'saltelli' adds Sobol indices."
     if not any(each.is_significant for each in found):
@@ -325,7 +325,7 @@ def _success_by_bins_section(results: Results, found: Sequence[Influence]) -> st
         panel.set_xlabel(name)
         panel.set_ylabel("success")
         panel.tick_params(axis="x", labelsize=7)
-    caption = "Success over what was drawn, in bins of about equally many flights; 95 % intervals."
+    caption = "Success over drawn values, in bins of about equally many flights; 95 % intervals."
     return picture_part(figure, "success", caption)
 
 
@@ -374,7 +374,7 @@ def _convergence_section(results: Results) -> list[str]:
         panel.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
         panel.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
         panel.xaxis.set_minor_formatter(NullFormatter())
-    caption = "Convergence of the numbers with the number of flights."
+    caption = "Convergence of the results with the number of flights."
     return ["<h2>Convergence</h2>", picture_part(figure, "convergence", caption)]
 
 
@@ -388,7 +388,7 @@ def _dispersions_section(campaign: Campaign) -> str:
             ]
         rows.append([each.name, str(each), each.target.unit or "", *numbers])
     if not rows:
-        return '<p class="missing">No dispersions: flights differ in their noise only.</p>'
+        return '<p class="missing">No dispersions: flights differ only in noise.</p>'
     head = [
         "parameter",
         "distribution",

@@ -1,4 +1,4 @@
-"""The rows of a campaign as columns, and what its report shows of them."""
+"""The rows of a campaign as columns, and the data of its report."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ from spacerobot_ros.measures import METRICS
 from spacerobot_ros.model.description import Array
 
 PASSING = "passing"
-"""Name, among the metrics, of whether a flight passed."""
+"""Name of the pseudo-metric for whether a flight passed."""
 
 _WORST_FLIGHTS_SHOWN = 10
 _MESSAGES_SHOWN = 4
 _MAX_BOUND_DISTANCE = 100.0
-"""Distance from a bound at which the order of the worst flights saturates, standard deviations."""
+"""Distance from a bound, in standard deviations, at which the order of flights saturates."""
 
 _REASON = "reason"
 _TEXT_COLUMNS = ("outcome", _REASON, "engine", "fallback")
@@ -49,14 +49,14 @@ _MAIN_METRICS = (
 )
 
 _NOT_CONTROLLED = re.compile(r"[(; ]([a-z]+(?: and [a-z]+)*) not controlled\)")
-"""The parts of the goal in the message of a flight that does not control them."""
+"""Uncontrolled parts of the goal in the message of a flight."""
 
 
 class Columns(Mapping[str, Any]):
-    """The columns of a dataset by name, in the order of the flights, read when they are needed.
+    """The columns of a dataset by name, in the order of the flights, read on demand.
 
-    Numbers are arrays (N,), in which missing ones are NaN; texts are lists, in which missing ones
-    are None.
+    Numbers are arrays (N,) with NaN for missing values; texts are lists with None for missing
+    values.
 
     Parameters
     ----------
@@ -75,7 +75,7 @@ class Columns(Mapping[str, Any]):
         self._known["flight"] = dataset.table(["flight"])["flight"].to_numpy().astype(float)
 
     def read(self, names: Iterable[str]) -> None:
-        """Read columns together: each file is opened once."""
+        """Read columns together, opening each file once."""
         left = [name for name in names if name not in self._known]
         table = self._dataset.table(left)
         text = require_module("pyarrow").string()
@@ -169,8 +169,8 @@ class Results:
             return ""
         draws = "1 draw is" if missing == 1 else f"{missing} draws are"
         return (
-            f"{draws} not flown yet although later ones are, mostly because they take longer: "
-            "the shares and distributions may change."
+            f"{draws} not flown yet although later ones are, usually because they take longer: "
+            "shares and distributions may change."
         )
 
     @property
@@ -191,7 +191,7 @@ class Results:
 
     @property
     def shown_metrics(self) -> list[str]:
-        """Metrics of the report that have values: those that are named, and the main ones."""
+        """Metrics of the report that have values: named metrics and the main metrics."""
         names = self.campaign.named_metrics
         names += [name for name in _MAIN_METRICS if name not in names]
         return [name for name in names if np.isfinite(self.columns.get(name, np.nan)).any()]
@@ -203,8 +203,8 @@ class Results:
 
     @cached_property
     def messages(self) -> tuple[list[str], dict[str, str]]:
-        """The message of each flight without its numbers, and for each of these messages the form
-        with numbers, if all flights have the same.
+        """The message of each flight without numbers, and for each such message the form with
+        numbers, if it is the same for all flights.
         """
         found: list[str] = []
         forms: dict[str, str] = {}
@@ -219,19 +219,19 @@ class Results:
 
     @property
     def not_controlled(self) -> list[str]:
-        """Parts of the goal that a successful flight did not control, by its message."""
+        """Parts of the goal that successful flights did not control, from their messages."""
         notes = [_NOT_CONTROLLED.search(text) for text in self.messages[1]]
         named = {part for note in notes if note for part in note[1].split(" and ")}
         return sorted(named)
 
     @property
     def distributed_metrics(self) -> list[str]:
-        """Metrics of the report that are not just yes or no."""
+        """Metrics of the report other than yes-or-no metrics."""
         return [name for name in self.shown_metrics if not metric_of(name).yes_or_no]
 
     @property
     def sampler_shares(self) -> dict[str, Share]:
-        """Shares of the flights with a yes, by name of the metric."""
+        """Shares of flights with a yes, by name of the metric."""
         found = {}
         for name, metric in METRICS.items():
             values = self.columns.get(name)
@@ -240,7 +240,7 @@ class Results:
         return found
 
     def metrics(self) -> dict[str, Array]:
-        """Return the columns of the metrics of the report."""
+        """Return the columns of the report's metrics."""
         return {name: self.columns[name] for name in self.shown_metrics}
 
     def share_meeting(self, criterion: Criterion) -> Share:
@@ -267,18 +267,19 @@ class Results:
         return sorted(found, key=lambda each: -each.strength)
 
     def drawn_by_influence(self, found: Sequence[Influence]) -> list[str]:
-        """Return the names of drawn values: texts, then numbers by their influence on passing."""
+        """Return the names of drawn values: texts first, then numbers by influence on passing."""
         causes = [each.cause for each in found if each.metric == PASSING]
         return [*(name for name in self.campaign.names if name not in self.drawn_numbers), *causes]
 
     def success_by_bins(self, name: str) -> list[Bin]:
-        """Return the shares of flights that passed over the drawn values of a name."""
+        """Return the shares of flights that passed, over the drawn values of a name."""
         return success_by_bins(np.asarray(self.columns[f"{DRAW_PREFIX}{name}"]), self.passed)
 
     def worst_rows(self) -> list[int]:
-        """Return the rows of the worst flights: first those that failed, then those that missed.
+        """Return the rows of the worst flights: first flights that failed, then flights that missed
+        a criterion.
 
-        Flights that passed are ordered by their distance from a bound, in standard deviations.
+        Flights that passed are ordered by distance from a bound, in standard deviations.
         """
         badness = np.full(len(self), -_MAX_BOUND_DISTANCE)
         for criterion in self.campaign.criteria:
@@ -303,9 +304,9 @@ class Results:
 
 
 def messages_of(results: Results) -> list[tuple[str, int, str]]:
-    """Return outcomes with the numbers of flights and their most frequent messages.
+    """Return outcomes with their most frequent messages and numbers of flights.
 
-    Messages that differ in their numbers only are one, without the numbers.
+    Messages that differ only in numbers are merged, without the numbers.
     """
     messages, forms = results.messages
     kinds: dict[str, Counter[str]] = {}

@@ -21,7 +21,7 @@ LANES = "lanes"
 """Name of the engine that flies many draws at once in SIMD lanes."""
 
 FLIGHTS = "flights"
-"""Name of the engine that flies draws one by one, to which other engines fall back."""
+"""Name of the engine that flies draws one by one, the fallback of other engines."""
 
 ERROR = "error"
 """The outcome of a draw that could not be flown."""
@@ -34,17 +34,17 @@ class Row:
     Attributes
     ----------
     draw
-        The numbers that were drawn.
+        The drawn values.
     outcome, reason
-        The end of the goal, or ``error``; and the message about it.
+        Outcome of the goal, or ``error``, and its message.
     metrics
-        Metrics by name; empty where nothing was flown.
+        Metrics by name; empty if nothing was flown.
     passed
         Whether the goal was reached and every criterion met.
     engine
-        Name of the engine that flew it.
+        Name of the engine that flew the draw.
     fallback
-        Why the engine ``flights`` flew it instead of the campaign's; empty if it did not.
+        Reason why the engine ``flights`` replaced the campaign's engine; empty: it did not.
     wall_time, plan_time
         Wall time of the flight, and of planning in it, s.
     """
@@ -61,7 +61,7 @@ class Row:
 
     @classmethod
     def of(cls, campaign: Campaign, draw: Draw, flight: Flight, engine: str) -> Row:
-        """Return the row of a flight, with the metrics of users that the campaign names."""
+        """Return the row of a flight, with the user-defined metrics of the campaign."""
         measures = flight.measured(clearance=campaign.measures_clearance)
         (row,) = cls.of_each(campaign, [(draw, measures)], engine)
         if not campaign.own_metrics:
@@ -104,7 +104,7 @@ class Row:
 class Fallback:
     """A draw that an engine passes on to the engine ``flights``.
 
-    ``reason`` completes "the flight ..." ("needed corrections"), or is the sentence of an error.
+    ``reason`` completes "the flight ..." ("needed corrections"), or is an error message.
     """
 
     draw: Draw
@@ -112,15 +112,15 @@ class Fallback:
 
 
 class Engine(Protocol):
-    """Flies the draws of a campaign; fewer flights than ``efficient_flights`` take as long."""
+    """Flies the draws of a campaign; fewer than ``efficient_flights`` flights take as long."""
 
     name: str
     efficient_flights: int
 
     def refusal(self, campaign: Campaign) -> str:
-        """Return why this engine does not fly a campaign, as a clause; empty if it does."""
+        """Return the reason why this engine cannot fly a campaign, as a clause; empty if it can."""
 
     def fly(
         self, campaign: Campaign, draws: Iterable[Draw], stopped: Callable[[], bool]
     ) -> Iterator[Row | Fallback]:
-        """Yield a row or a fallback for each draw; fewer if it is stopped."""
+        """Yield a row or a fallback for each draw, until stopped."""

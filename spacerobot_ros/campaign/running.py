@@ -1,6 +1,6 @@
-"""Runs a campaign into its dataset, and flies single flights of it again, into bags.
+"""Runs a campaign into its dataset, and repeats single flights, with a bag.
 
-:func:`sweep` is a small campaign from Python: one function, in the words of ``fly``.
+:func:`sweep` runs a small campaign from Python, with the arguments of ``fly``.
 """
 
 from __future__ import annotations
@@ -48,12 +48,12 @@ class Progress:
     flown, total
         Flights.
     flights_per_second
-        Flights a second of wall time, in this process.
+        Flights per second of wall time, in this process.
     seconds
         Wall time so far.
     unflown
-        Flights of the dataset whose draw or goal was refused or that ended by an error, counted at
-        the end.
+        Flights of the dataset whose draw or goal was refused or that ended with an error, counted
+        at the end.
     """
 
     flown: int
@@ -94,19 +94,20 @@ def run_campaign(
     cluster
         The workers that fly.
     show
-        Receives the progress after each task, and a few times a second.
+        Receives the progress after each task and a few times per second.
     stopped
-        Returns whether to end; called a few times a second. Finished flights are kept.
+        Returns whether to stop; called a few times per second. Finished flights are kept.
 
     Returns
     -------
     Progress
-        The progress at the end.
+        The final progress.
 
     Raises
     ------
     SpaceRobotError
-        The engine cannot fly it, the folder holds another campaign, or a package is missing.
+        The engine cannot fly the campaign, the folder holds another campaign, or a package is
+        missing.
     """
     draws, dataset = Draws(campaign), Dataset(folder)
     chosen = select_engine(campaign, campaign.engine if engine == "auto" else engine)
@@ -179,7 +180,7 @@ class Rerun:
     bag
         Path of the bag.
     note
-        Reason why the metrics may differ from the dataset; empty: they must not.
+        Reason why the metrics may differ from the dataset; empty: they must agree.
     """
 
     row: Row
@@ -218,14 +219,14 @@ class Rerun:
 
 
 def rerun_flight(folder: Path, number: int, bag: Path) -> Rerun:
-    """Fly one draw of a campaign again, into a bag.
+    """Repeat one flight of a campaign and record a bag.
 
     Raises
     ------
     ParameterError
         The folder holds no campaign, or it has no such flight.
     SpaceRobotError
-        The drawn values are refused, or the bag cannot be written.
+        The drawn values are invalid, or the bag cannot be written.
     """
     dataset = Dataset(folder)
     campaign = dataset.campaign()
@@ -249,14 +250,14 @@ def rerun_flight(folder: Path, number: int, bag: Path) -> Rerun:
     note = ""
     if campaign.scenario.plant.thrusters and flight.inertial is not None:
         note = (
-            "Its masses are drawn: the plants of the campaign and of this flight differ in "
+            "The masses are drawn: the plants of the campaign and of this flight differ in "
             "rounding, which on/off thrusters amplify."
         )
     return Rerun(row, deviation, at, outcome, bag, note)
 
 
 def stored_flight(dataset: Dataset, number: int) -> tuple[str, str, dict[str, float]] | None:
-    """Return outcome, engine and metrics of a flight in a dataset; None: it is not there."""
+    """Return outcome, engine and metrics of a flight in a dataset; None: not in the dataset."""
     if number not in dataset.flown_numbers():
         return None
     record = next(row for row in dataset.table().to_pylist() if row["flight"] == number)
@@ -304,34 +305,34 @@ def sweep(
     folder: Path | None = None,
     **section: Any,
 ) -> Any:
-    """Fly a small campaign, and return a row for each flight.
+    """Fly a small campaign, and return one row per flight.
 
     ``sweep("coordinated_control", {"plant.sensors.position_noise": {"uniform": [0, 0.01]}})``.
 
     Parameters
     ----------
     what, goal, position, rotvec, method, parameters
-        As for :func:`~spacerobot_ros.flight.api.fly`.
+        See :func:`~spacerobot_ros.flight.api.fly`.
     end_effector_position, end_effector_pose, end_effector
         The same.
     disperse
-        Distributions by the name of the quantity, as in a file of a campaign.
+        Distributions by name of the quantity, as in a campaign file.
     seed, flights
         Seed of the draws, and their number.
     folder
-        Folder of the dataset, which a later call continues; None: none.
+        Folder of the dataset, which a later call resumes; None: no folder.
     section
-        Other keys of a file of a campaign: ``sampler``, ``criteria``, ``engine``, ``longest``;
+        Other keys of a campaign file: ``sampler``, ``criteria``, ``engine``, ``longest``;
         ``set`` means the same as ``parameters``.
 
     Returns
     -------
-    A table of pyarrow, whose ``to_pandas`` makes a data frame: the columns of a dataset.
+    A pyarrow table with the columns of a dataset; ``to_pandas`` converts it to a data frame.
 
     Raises
     ------
     SpaceRobotError
-        A key or value is refused, or pyarrow or scipy is not installed.
+        A key or value is invalid, or pyarrow or scipy is not installed.
     """
     hands = end_effector_goals(end_effector_position, end_effector_pose, end_effector)
     scenario = scenario_to_fly(what, goal, position, rotvec, hands)

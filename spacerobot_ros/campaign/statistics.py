@@ -22,15 +22,15 @@ CONFIDENCE = 0.95
 PERCENTILES = (5.0, 50.0, 95.0, 99.0)
 
 _MAX_PERMUTED_VALUES = 8
-"""Largest number of samples whose permutations are counted."""
+"""Largest number of samples for which permutations are counted."""
 
 
 @dataclass(frozen=True)
 class Share:
     """A share of flights with its confidence intervals.
 
-    ``interval_low`` to ``interval_high`` is the interval of Wilson, ``exact_interval`` that
-    Clopper and Pearson.
+    ``interval_low`` to ``interval_high`` is the Wilson interval, ``exact_interval`` the
+    Clopper-Pearson interval.
     """
 
     count: int
@@ -52,7 +52,7 @@ class Share:
 
 
 def share(count: int, total: int) -> Share:
-    """Return a share with its intervals, which are 0 to 1 without flights."""
+    """Return a share with its intervals; without flights they are 0 to 1."""
     if not total:
         return Share(0, 0, 0.0, 1.0, (0.0, 1.0))
     from scipy.stats import binomtest
@@ -66,12 +66,12 @@ def share(count: int, total: int) -> Share:
 
 
 _MAX_BINS, _FLIGHTS_OF_BIN = 8, 10
-"""Largest number of bins, and the flights that a bin should have."""
+"""Largest number of bins, and desired number of flights per bin."""
 
 
 @dataclass(frozen=True)
 class Bin:
-    """The flights whose drawn value is from ``low`` to ``high``, and the share that passed."""
+    """The flights with drawn values from ``low`` to ``high``, and the share that passed."""
 
     low: Any
     high: Any
@@ -81,8 +81,8 @@ class Bin:
 def success_by_bins(drawn: npt.NDArray[Any], passed: Flags) -> list[Bin]:
     """Return the shares of flights that passed, (N,), in bins of the drawn values (N,).
 
-    A text, or one of few numbers, has a bin of its own; many numbers are in bins of about equally
-    many flights.
+    Each text, or each of a few numbers, has its own bin; many numbers are binned with about equally
+    many flights per bin.
     """
     if drawn.dtype.kind == "f":
         finite = np.isfinite(drawn)
@@ -103,7 +103,7 @@ def success_by_bins(drawn: npt.NDArray[Any], passed: Flags) -> list[Bin]:
 
 
 _SIGNIFICANCE = 0.05
-"""Largest probability of a significant influence, after the correction for many tests."""
+"""Largest p-value of a significant influence, after correction for multiple tests."""
 
 
 @dataclass(frozen=True)
@@ -117,10 +117,10 @@ class Influence:
     correlation
         Spearman's rank correlation.
     p_value
-        Probability of a correlation at least as large by chance.
+        Probability that a correlation at least as large arises by chance.
     distance_correlation, distance_p_value
-        The same for the distance of the drawn value from its median, with which a metric correlates
-        that grows to both sides.
+        The same for the distance of the drawn value from its median; it reveals metrics that grow
+        to both sides.
     first_order_index, total_order_index
         Sobol indices with the half widths of their intervals, if the sampler provides them.
     """
@@ -136,7 +136,7 @@ class Influence:
 
     @property
     def is_significant(self) -> bool:
-        """Whether the total index, or else the larger correlation, is unlikely to be by chance."""
+        """Whether the total index, or else the larger correlation, is significant."""
         if self.total_order_index is not None:
             return self.total_order_index[0] > self.total_order_index[1]
         p = (
@@ -165,7 +165,7 @@ class Influence:
 def influences(causes: Mapping[str, Array], metrics: Mapping[str, Array]) -> list[Influence]:
     """Return the sensitivity of each metric (N,) to each dispersion (N,).
 
-    Flights without the metric are omitted, and so are pairs of which one does not vary.
+    Flights without the metric are omitted, and so are pairs without variation.
     """
     found = []
     for metric, values in metrics.items():
@@ -187,10 +187,10 @@ def influences(causes: Mapping[str, Array], metrics: Mapping[str, Array]) -> lis
 
 
 def rank_correlation(x: Array, y: Array) -> tuple[float, float]:
-    """Return Spearman's correlation of samples (N,) that vary, and its probability by chance.
+    """Return Spearman's correlation of varying samples (N,), and its p-value.
 
-    Of few samples the probability counts permutations: the approximation by Student's t, which
-    serves many, gives a perfect order of three samples a probability of zero instead of one third.
+    For few samples the p-value is computed by counting permutations: the approximation by Student's
+    t, used for many samples, is zero instead of one third for a perfect order of three samples.
     """
     from scipy.stats import rankdata, spearmanr
 
@@ -211,10 +211,10 @@ def _permutations(count: int) -> npt.NDArray[np.int64]:
 
 
 def corrected_for_multiple_tests(found: Sequence[Influence]) -> list[Influence]:
-    """Return sensitivities whose probabilities are corrected for their number.
+    """Return sensitivities with p-values corrected for their number.
 
-    All of both kinds together, by the procedure of Benjamini and Hochberg: of those at most p a
-    share of no more than p is by chance.
+    Both kinds are corrected together by the procedure of Benjamini and Hochberg: among the p-values
+    of at most p, a share of at most p is expected by chance.
     """
     if not found:
         return []
@@ -233,8 +233,8 @@ def sobol_indices(
 ) -> dict[str, tuple[float, float, float, float]]:
     """Return first-order and total Sobol indices with their intervals, by name of the dispersion.
 
-    ``values`` (N,) are those of a Saltelli sample, in its order. The result is empty if a flight
-    lacks the metric.
+    ``values`` (N,) are in the order of a Saltelli sample. The result is empty if a flight lacks the
+    metric.
     """
     if not np.all(np.isfinite(values)) or np.ptp(values) == 0.0:
         return {}
@@ -255,7 +255,7 @@ def percentiles(values: Array) -> list[float]:
 
 @dataclass(frozen=True)
 class PairedDifference:
-    """Paired difference of a metric between two campaigns: its mean, and the interval of that."""
+    """Mean paired difference of a metric between two campaigns, with its interval."""
 
     metric: str
     count: int
@@ -272,9 +272,9 @@ class PairedDifference:
 
 
 def paired_difference(metric: str, first: Array, second: Array) -> PairedDifference | None:
-    """Return the paired difference of a metric (N,) of a second campaign from a first one.
+    """Return the paired difference of a metric (N,), second campaign minus first.
 
-    The interval is that of Student for the mean of the differences; None for fewer than two pairs.
+    The interval is Student's, for the mean of the differences. None for fewer than two pairs.
     """
     there = np.isfinite(first) & np.isfinite(second)
     count = int(there.sum())

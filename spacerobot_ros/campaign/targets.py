@@ -1,4 +1,4 @@
-"""The quantities that a campaign can disperse, by name, and how a drawn value changes a flight."""
+"""The quantities that a campaign can disperse, by name, and their effect on a flight."""
 
 from __future__ import annotations
 
@@ -41,28 +41,28 @@ _PARAMETERS_EQUAL_IN_ALL_FLIGHTS = (
     *("planner.resume_file", "coordinated_control.resume_file"),
 )
 _MIN_FACTOR = 1e-6
-"""Factors of masses and inertias between this and its inverse need no check of every body."""
+"""For factors of masses and inertias between this and its inverse, bodies need no check."""
 
 _FACTORS = ("mass", "inertia", "com")
-"""Attributes of :class:`DrawnFlight` that have numbers for each flight."""
+"""Attributes of :class:`DrawnFlight` with numbers for each flight."""
 
 _POSE_TARGET_NAMES = ("goal", "end_effector_goal", "initial")
 
 TARGET_KINDS = (
-    ("NODE.PARAMETER", "a parameter of a node; NODE.PARAMETER[i] a number of a list, by joint too"),
-    ("mass, mass.BODY, mass.*", "factor on mass and inertia of all bodies alike, of one, of each"),
-    ("inertia, inertia.BODY, inertia.*", "factor on the inertia, likewise"),
+    ("NODE.PARAMETER", "a parameter of a node; NODE.PARAMETER[i] or [JOINT]: one of a list"),
+    ("mass, mass.BODY, mass.*", "factor on mass and inertia of all bodies, one body, each body"),
+    ("inertia, inertia.BODY, inertia.*", "factor on the inertia, in the same way"),
     ("com.BODY.AXIS, com.*", "offset of a centre of mass in the frame of its body, m"),
     ("target.mass, target.inertia", "factor on mass and inertia of the target, on its inertia"),
     ("target.com.AXIS", "offset of its centre of mass in the frame of its root link, m"),
-    ("goal.position.AXIS, goal.rotvec.AXIS", "offset of the goal, m; turn of it in its frame, rad"),
-    ("end_effector_goal. ...", "likewise, of the end-effector"),
-    ("initial.position.AXIS, initial.rotvec.AXIS", "likewise, of the base at the start"),
+    ("goal.position.AXIS, goal.rotvec.AXIS", "offset of the goal, m; rotation in its frame, rad"),
+    ("end_effector_goal. ...", "the same for the end-effector"),
+    ("initial.position.AXIS, initial.rotvec.AXIS", "the same for the base at the start"),
     ("initial.joints.JOINT", "offset of a joint at the start, m or rad"),
     ("faults[i].at, .until, .value, .kind, .target", "of the i-th fault of plant.faults"),
     ("faults[i].present", "1 or 0: whether that fault takes place"),
 )  # fmt: skip
-"""The kinds of names, with their meanings for people."""
+"""The kinds of names, with descriptions for users."""
 
 
 @dataclass(frozen=True)
@@ -78,14 +78,14 @@ class DispersionTarget:
     unit
         Unit, for people.
     is_text
-        Whether its values are texts.
+        Whether the values are texts.
     assigned_parameters
-        Names of the numbers that it sets; two targets that set the same number share one.
+        Names of the numbers that the target sets; targets that set the same number share a name.
     changes_masses_only
-        Whether it changes mass properties of the robot and leaves the scenario: ``apply`` then
-        takes N flights with drawn values (N,), too.
+        Whether the target changes only mass properties of the robot, not the scenario; ``apply``
+        then also accepts N flights with drawn values (N,).
     order
-        Targets of a larger order are applied after those of a smaller one.
+        Targets are applied in ascending order.
     """
 
     name: str
@@ -101,27 +101,26 @@ class DispersionTarget:
 class DrawnFlight:
     """One flight of a campaign, or several that share a scenario and differ in masses.
 
-    Leading dimensions (...) are the flights: none is one, (N,) are N.
+    Leading dimensions (...) are the flights: none for one flight, (N,) for N flights.
 
     Attributes
     ----------
     scenario
-        The scenario; the plant's masses and the seed are not in it before
-        :meth:`with_draws_in_scenario`. Flights whose draws leave the scenario have the same object.
+        The scenario, without the plant's masses and the seed until :meth:`with_draws_in_scenario`.
+        Flights whose draws do not change the scenario share one object.
     nominal
         The robot without dispersions.
     mass, inertia
-        (..., B) factors of the bodies; the inertia goes with the mass, and with a factor of its
-        own.
+        (..., B) factors of the bodies; the inertia scales with the mass and with its own factor.
     com
         (..., B, 3) offsets of the centres of mass, m.
     parameters, is_physical
-        Masses, centres and inertias of the nominal robot, and whether they are those of bodies
-        without slack for rounding.
+        Masses, centres and inertias of the nominal robot, and whether they are physical without
+        slack for rounding.
     has_target_masses
         Whether the mass properties of the target are drawn.
     seed
-        Seed of the noise of sensors and actuators; None: that of the scenario.
+        Seed of sensor and actuator noise; None: the scenario's.
     """
 
     scenario: Scenario
@@ -165,7 +164,7 @@ class DrawnFlight:
 
     @cached_property
     def inertial(self) -> InertialParameters | None:
-        """Masses, centres and inertias of the bodies; None: those of the robot's description."""
+        """Masses, centres and inertias of the bodies; None: as in the robot's description."""
         return self._scaled_parameters if self._has_other_masses.any() else None
 
     @property
@@ -184,7 +183,7 @@ class DrawnFlight:
         return scaled.shifted(np.where(moved[..., np.newaxis, np.newaxis], self.com, -0.0))
 
     def repeated(self, count: int) -> DrawnFlight:
-        """Return a flight as ``count`` equal ones."""
+        """Return ``count`` copies of a flight."""
         numbers: dict[str, Any] = {
             name: np.repeat(getattr(self, name)[np.newaxis], count, axis=0) for name in _FACTORS
         }
@@ -203,9 +202,9 @@ class DrawnFlight:
         return flights
 
     def surely_physical(self) -> npt.NDArray[np.bool_]:
-        """Return whether flights (...) need no check of every body by :meth:`require_physical`.
+        """Return whether :meth:`require_physical` can skip the check of bodies for flights (...).
 
-        Positive factors leave the ratios of principal moments.
+        Positive factors preserve the ratios of principal moments.
         """
         factors = np.concatenate([self.mass, self.inertia], axis=-1)
         mild = (factors > _MIN_FACTOR) & (factors < 1.0 / _MIN_FACTOR)
@@ -213,7 +212,7 @@ class DrawnFlight:
         return np.asarray(self.is_physical & mild.all(axis=-1) & finite)
 
     def require_physical(self) -> None:
-        """Check that drawn masses and inertias are those of bodies.
+        """Check that drawn masses and inertias are physical.
 
         Raises
         ------
@@ -226,10 +225,10 @@ class DrawnFlight:
     def with_draws_in_scenario(self) -> DrawnFlight:
         """Return the flight with its seed in the scenario and its masses in the plant's URDF.
 
-        The commanders continue to believe in the robot as it was, unless they have one of their
-        own.
+        Commanders keep the nominal robot, unless they have their own.
 
-        To build one takes milliseconds: engines without ROS take :attr:`inertial` as it is.
+        Building such a robot takes milliseconds, so engines without ROS use :attr:`inertial`
+        directly.
         """
         scenario, parameters = self.seeded_scenario, self.inertial
         if parameters is not None:
@@ -358,7 +357,7 @@ def _list_entry_target(
     else:
         known = f", nor one of the joints {', '.join(joints)}" if joints else ""
         raise ParameterError(
-            f"'{name}': '{index}' is none of the places 0 to {len(values) - 1} of the list{known}."
+            f"'{name}': '{index}' is not an index from 0 to {len(values) - 1} of the list{known}."
             f"{suggestion(index, joints)}"
         )
 
@@ -377,7 +376,7 @@ def _list_values(name: str, node: str, declaration: Parameter, scenario: Scenari
     assert isinstance(values, tuple)
     if any(isinstance(each, str) for each in values):
         raise ParameterError(
-            f"'{name}': the list has texts NAME:VALUE: give a number for each joint under 'set'."
+            f"'{name}': the list has texts NAME:VALUE; set a number for each joint under 'set'."
         )
     if values:
         return [float(x) for x in values]
@@ -385,7 +384,7 @@ def _list_values(name: str, node: str, declaration: Parameter, scenario: Scenari
         start = _start_positions(scenario)
         return start if "positions" in name else [0.0] * len(start)
     raise ParameterError(
-        f"'{name}': the list is empty, which has a meaning of its own: give all of it under 'set'."
+        f"'{name}': the list is empty, which has a special meaning: set all of it under 'set'."
     )
 
 
@@ -588,9 +587,9 @@ def _require_fault(line: str, scenario: Scenario) -> Fault:
 
 
 def urdf_with(robot: RobotDescription, parameters: InertialParameters) -> str:
-    """Return the URDF of a robot with other masses, centres of mass and inertias.
+    """Return the URDF of a robot with different masses, centres of mass and inertias.
 
-    The first link of each body has the inertia of the body; links that fixed joints weld to it have
+    The first link of each body has the inertia of the body; links attached by fixed joints have
     none.
     """
     root = ET.fromstring(robot.urdf)

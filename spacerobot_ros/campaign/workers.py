@@ -1,7 +1,7 @@
-"""Workers of a campaign: processes of this machine behind pipes, or a cluster of dask.distributed.
+"""Workers of a campaign: local processes behind pipes, or a dask.distributed cluster.
 
-:meth:`TaskDistributor.rows` gives the draws to the workers in tasks of about
-:data:`TARGET_TASK_TIME`, and yields the rows as tasks end.
+:meth:`TaskDistributor.rows` distributes the draws in tasks of about :data:`TARGET_TASK_TIME`, and
+yields the rows as tasks end.
 """
 
 from __future__ import annotations
@@ -37,13 +37,13 @@ from spacerobot_ros.termination import end_with_parent
 from spacerobot_ros.version import __version__, source_hash
 
 TARGET_TASK_TIME = 2.0
-"""Wall time that a task should take, s: the overhead of its distribution is small beside it."""
+"""Desired wall time of a task, s; the overhead of its distribution is then small."""
 
 _MIN_FIRST_TASK_FLIGHTS, _MAX_TASK_FLIGHTS = 4, 2000
 """Smallest number of flights in the first tasks, and largest number in any task."""
 
 _MAX_WORKER_DEATHS = 2
-"""Workers that may die during a flight; then it is reported as killed and not repeated."""
+"""Worker deaths after which a flight is reported as killed and not repeated."""
 
 _PACKAGE_NAME = "spacerobot_ros"
 
@@ -66,9 +66,9 @@ class Cluster:
     Attributes
     ----------
     workers
-        Number of processes on this machine; 0: this process alone.
+        Number of processes on this machine; 0: only this process.
     scheduler
-        Address of a scheduler of dask.distributed whose workers fly; empty: this machine.
+        Address of the dask.distributed scheduler; empty: this machine.
     """
 
     workers: int = 0
@@ -82,7 +82,7 @@ THIS_PROCESS = Cluster()
 
 
 def serialise_campaign(campaign: Campaign) -> bytes:
-    """Return a campaign as it is sent to workers: the content of its file, and its scenario."""
+    """Return a campaign serialised for workers: the content of its file, and its scenario."""
     campaign = self_contained(campaign)
     return pickle.dumps((campaign.name, dict(campaign.section), Path(), campaign.scenario))
 
@@ -109,17 +109,17 @@ def fly_task(
     draws, engine
         Draws, and name of the engine.
     include_fallbacks
-        Fly the fallbacks of the engine in this task, too.
+        Whether this task also flies the engine's fallbacks.
 
     Raises
     ------
     SpaceRobotError
-        The worker has other code of this package.
+        The worker has a different version of this package.
     """
     if code != this_code():
         raise SpaceRobotError(
-            f"A worker has {_PACKAGE_NAME} {this_code()}, and this process {code}: all need the "
-            "same code."
+            f"A worker has {_PACKAGE_NAME} {this_code()}, and this process has {code}: all need "
+            "the same code."
         )
     flying, campaign = engine_by_name(engine), _deserialise_campaign(packed)
     fly = partial(fly_all, flying) if include_fallbacks else flying.fly
@@ -165,9 +165,9 @@ class _LocalWorker:
 
 
 class LocalWorkers:
-    """Processes on this machine, each behind an anonymous pipe: nobody else can reach them.
+    """Processes on this machine, each behind an anonymous pipe that no other process can reach.
 
-    Each has one task at a time, so a death has one cause; the busy worker stands for its task.
+    Each has one task at a time, so a death has one cause; a busy worker represents its task.
 
     Parameters
     ----------
@@ -236,10 +236,10 @@ def _run_worker(connection: Connection) -> None:
 
 
 class DaskWorkers:
-    """Workers of a scheduler of dask.distributed.
+    """Workers of a dask.distributed scheduler.
 
-    A scheduler runs the code of anyone who reaches its port: only a private network or TLS
-    protects it.
+    A scheduler runs code from anyone who can reach its port: protect it with a private network or
+    TLS.
 
     Parameters
     ----------
@@ -253,10 +253,10 @@ class DaskWorkers:
         self._client = client
         self._checked: set[str] = set()
         self._empty_since = math.inf
-        """Monotonic time since which the scheduler has no worker; infinite while it has."""
+        """Monotonic time since which the scheduler has no worker; infinite if it has one."""
 
     def count(self) -> int:
-        """Return the number of workers, at least 1: others may join later.
+        """Return the number of workers, at least 1, because others may join later.
 
         Raises
         ------
@@ -407,12 +407,11 @@ class _SubmittedTask:
 class TaskDistributor:
     """Distributes draws to workers.
 
-    Fallbacks of an engine are distributed again, in tasks of fewer flights for the engine
-    ``flights``.
+    Fallbacks of an engine are redistributed to the engine ``flights``, in tasks of fewer flights.
 
-    When a worker dies, each flight of its task is flown again alone, in a task of its own, one such
-    task at a time. If a worker dies again, that flight has killed two workers and is reported. (A
-    scheduler of dask reports all tasks of a worker that died, not only the one that ran.)
+    If a worker dies, each flight of its task is repeated in a separate task, one such task at a
+    time. If a worker dies again, the flight has killed two workers and is reported. (A dask
+    scheduler reports all tasks of a dead worker, not only the running one.)
 
     Parameters
     ----------
@@ -421,7 +420,7 @@ class TaskDistributor:
     campaign, draws, engine
         The campaign, its draws, and the name of the engine.
     stopped
-        Returns whether to end; called a few times a second.
+        Returns whether to stop; called a few times per second.
     """
 
     def __init__(
@@ -438,17 +437,17 @@ class TaskDistributor:
             name: float(max(_MIN_FIRST_TASK_FLIGHTS, engine_by_name(name).efficient_flights))
             for name in (engine, FLIGHTS)
         }
-        """Flights of a task, by the engine."""
+        """Number of flights per task, by engine."""
         self._fallbacks: deque[int] = deque()
         """Draws that the engine passes on to the engine ``flights``."""
         self._reasons: dict[int, str] = {}
         self._running: dict[Any, _SubmittedTask] = {}
         self._retry_alone: deque[int] = deque()
-        """Draws of tasks whose worker died."""
+        """Draws of tasks whose worker has died."""
         self._deaths: Counter[int] = Counter()
 
     def rows(self, numbers: list[int]) -> Iterator[list[Row]]:
-        """Yield the rows of these draws as their tasks end, and empty lists in between."""
+        """Yield the rows of the draws as their tasks end, and empty lists in between."""
         waiting = deque(numbers)
         while (
             waiting or self._fallbacks or self._retry_alone or self._running
@@ -513,7 +512,7 @@ class TaskDistributor:
             if task.runs_alone or not self._deaths[number]:
                 self._deaths[number] += 1
             if self._deaths[number] >= _MAX_WORKER_DEATHS:
-                reason = f"The process that flew it died {_MAX_WORKER_DEATHS} times."
+                reason = f"Its process died {_MAX_WORKER_DEATHS} times."
                 given_up.append(Row(self._draws[number], KILLED, reason, engine=self._engine))
             else:
                 self._retry_alone.append(number)

@@ -201,7 +201,7 @@ def test_a_flight_that_kills_its_worker_twice_is_reported(tmp_path: Path) -> Non
     assert {row["flight"]: row["outcome"] for row in found if row["outcome"] != "reached"} == {
         7: "killed"
     }
-    assert found[7]["reason"] == "The process that flew it died 2 times."
+    assert found[7]["reason"] == "Its process died 2 times."
 
 
 def test_workers_of_this_machine_listen_nowhere() -> None:

@@ -43,12 +43,12 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     ({"scenario": "faults/stuck_slidr"}, "Did you mean"),
     ({"set": {"plant.tick_rat": 1}}, "no parameter 'tick_rat'"),
     ({"set": {"tick_rate": 1}}, "'tick_rate' under 'set' is not a parameter"),
-    ({"set": {"plant.time_mode": "realtime"}}, "campaigns are flown in lockstep"),
+    ({"set": {"plant.time_mode": "realtime"}}, "campaigns run in lockstep"),
     ({"disperse": {"mas": NORM}}, "'mas' cannot be dispersed.*Did you mean 'mass'"),
     ({"disperse": {"mass.mass_7": NORM}}, "no body 'mass_7'.*Did you mean 'mass_"),
     ({"disperse": {"mass": {"nrom": {}}}}, "no distribution 'nrom'.*Did you mean 'norm'"),
     ({"disperse": {"mass": {"norm": {"scal": 1}}}}, "no argument 'scal'.*Did you mean 'scale'"),
-    ({"disperse": {"mass": {"norm": {"scale": -1}}}}, "norm takes no such arguments"),
+    ({"disperse": {"mass": {"norm": {"scale": -1}}}}, "norm is not defined for these"),
     ({"disperse": {"mass": {"norm": {"loc": "one"}}}}, "'mass: loc' is 'one'"),
     ({"disperse": {"mass": {"beta": {"a": 1}}}}, "beta needs its argument 'b'"),
     ({"disperse": {"mass": {"norm": [1, 2, 3]}}}, "norm takes loc, scale, not 3 numbers"),
@@ -61,21 +61,24 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     ({"disperse": {"mass": NORM, "mass.mass_1": NORM}}, "set the same numbers"),
     ({"disperse": {"mass.mass_1": NORM, "mass": NORM}}, "'mass.mass_1' and 'mass' set the same"),
     ({"disperse": {"mass.": NORM}}, "the robot has no body ''"),
-    ({"disperse": 0}, "'disperse' must have names"),
-    ({"criteria": []}, "'criteria' must have names"),
+    ({"disperse": 0}, "'disperse' must contain names"),
+    ({"criteria": []}, "'criteria' must contain names"),
     ({"disperse": {"mass": {"gaussian": {}}}}, "Did you mean 'norm'"),
     ({"disperse": {"mass": {"norm": {"mean": 1}}}}, "loc is its mean and scale its standard"),
-    ({"disperse": {"mass": {"uniform": {"max": 1}}}}, "loc is its least value and scale its width"),
+    (
+        {"disperse": {"mass": {"uniform": {"max": 1}}}},
+        "loc is its smallest value and scale its width",
+    ),
     ({"table": "none.csv"}, "the table 'none.csv' cannot be read: No such file"),
     ({"table": "/dev/zero"}, "the table '/dev/zero' cannot be read: it is a device"),
     ({"table": 3}, "'table' must be the name of a CSV file, or its lines"),
-    ({"table": "mass\n"}, "needs a line of names, and a line for each flight"),
+    ({"table": "mass\n"}, "needs one line of names and one line per flight"),
     ({"table": "mass\n1,2\n"}, "row 1 of the table has 2 values for 1 names"),
     ({"table": "mass.*\n1\n"}, r"'mass.\*' in the table names 4 values: name one"),
     ({"table": "mass\nx\n"}, "'mass: table' is 'x'; it must be a finite number"),
     ({"table": "mass\n1\n", "disperse": {"mass.mass_1": NORM}}, "set the same numbers"),
     ({"table": "planner.method\noptima\n"}, "must be one of lie_bracket"),
-    ({"table": "mass\n1\n", "sampler": "saltelli"}, "'saltelli' is for independent values"),
+    ({"table": "mass\n1\n", "sampler": "saltelli"}, "'saltelli' requires independent values"),
     (joint(cov=[[1, 2], [2.5, 8]]), "cov must be symmetric"),
     (joint(cov=[[1, 2], [2, 1]]), "positive semidefinite"),
     (joint(cov=[1, 2]), "mean must have 2 numbers, cov 2 x 2"),
@@ -83,7 +86,7 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     (joint(cov=[[1, 0], [0, 0]]), "means must be finite and variances positive"),
     (joint(mean=[1, 2]), "multivariate_normal must have 'cov' and may have 'mean'"),
     (joint("mass, planner.method", cov=[[1, 0], [0, 1]]), "has a text"),
-    ({"disperse": {"mass": {"norm": {"loc": 1, "scale": 0}}}}, "norm takes no such arguments"),
+    ({"disperse": {"mass": {"norm": {"loc": 1, "scale": 0}}}}, "norm is not defined for these"),
     ({"disperse": {"mass": {"choice": [1, None]}}}, "'mass: choice' is None"),
     ({"disperse": {"mass": {"choice": [True, 1]}}}, "'mass: choice' is True"),
     ({"disperse": {"mass": {"choice": [[1], 2]}}}, r"'mass: choice' is \[1\]"),
@@ -91,8 +94,8 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     ({"disperse": {"planner.method": {"choice": ["optimal", 3]}}}, "is a text; the choice has 3"),
     ({"disperse": {"planner.method": {"choice": ["optimall"]}}}, "must be one of lie_bracket"),
     ({"disperse": {"plant.sensors.position_noise": {"choice": [-1]}}}, "must be a number from 0"),
-    ({"disperse": {"plant.sensors.position_bias[3]": NORM}}, "none of the places 0 to 2"),
-    ({"disperse": {"plant.sensors.position_bias[slider_1]": NORM}}, "none of the places 0 to 2"),
+    ({"disperse": {"plant.sensors.position_bias[3]": NORM}}, "not an index from 0 to 2"),
+    ({"disperse": {"plant.sensors.position_bias[slider_1]": NORM}}, "not an index from 0 to 2"),
     ({"disperse": {"plant.sensors.joint_bias[3]": NORM}}, "nor one of the joints slider_1"),
     ({"disperse": {"planner.optimal.max_velocity[0]": NORM}}, "the list is empty, which has"),
     ({"disperse": {"plant.robot": {"choice": ["dual_arm"]}}}, "the same in all flights"),
@@ -152,7 +155,7 @@ def test_what_is_wrong_is_said(given: dict[str, Any], sentence: str) -> None:
 @pytest.mark.filterwarnings("error")
 def test_what_is_wrong_is_said_in_one_sentence_without_a_warning() -> None:
     for given in ({"norm": {"scale": 0}}, {"triang": {"c": 3}}):
-        with pytest.raises(ParameterError, match="takes no such arguments"):
+        with pytest.raises(ParameterError, match="is not defined for these arguments"):
             campaign(disperse={"mass": given})
     made = campaign(disperse={"mass": {"pareto": {"b": 0.001}}}, flights=9)
     assert any(np.isinf(draw.values["mass"]) for draw in Draws(made))
@@ -174,7 +177,7 @@ def test_a_key_that_is_there_twice_is_refused(tmp_path: Path) -> None:
     file.write_text(text)
     assert load_campaign(file).names == ("mass",)
     file.write_text(text.replace("disperse:\n", "disperse:\n    mass: {norm: {}}\n"))
-    with pytest.raises(ParameterError, match=r"the key 'mass' is there twice.*line 4"):
+    with pytest.raises(ParameterError, match=r"the key 'mass' occurs twice.*line 4"):
         load_campaign(file)
     file.write_text("campaign:\n  ? [1, 2]\n  : 3\n")
     with pytest.raises(ParameterError, match=r"found unhashable key.*line 2"):

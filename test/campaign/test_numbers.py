@@ -222,7 +222,7 @@ def test_criteria_include_their_bounds() -> None:
         ),
         (
             {"disperse": {"mass": {"norm": 3}}},
-            "'mass': norm must have its arguments: loc, scale.",
+            "'mass': norm must have arguments: loc, scale.",
         ),
         ({"disperse": {"mass": {"poisson": [1, 2, 3]}}}, "'mass': poisson takes mu, loc, not 3"),
         ({"longest": -1}, "'longest' is -1; it must be a finite number of at least 0."),

@@ -94,7 +94,7 @@ def test_only_correlations_beyond_chance_are_called_drivers(driven: bool, tmp_pa
     page = tmp_path / "page.html"
     lines = write_campaign_report(filled(tmp_path / "made", made, error), page)
     told = [line for line in lines if line.startswith("driver")]
-    sentence = "no correlation is beyond chance (p < 0.05, corrected for all of them)."
+    sentence = "no correlation is significant (p < 0.05, corrected for multiple tests)."
     assert (sentence in unescape(page.read_text("utf-8"))) is not driven
     if driven:
         assert told == ["driver      mass.mass_1 of position_error_m: +1.00"]
@@ -220,7 +220,7 @@ def test_success_is_counted_over_bins_of_what_was_drawn(tmp_path: Path) -> None:
     assert results.drawn_by_influence(results.influences())[:2] == ["planner.method", "mass.mass_1"]
     page = tmp_path / "page.html"
     write_campaign_report(tmp_path, page)
-    assert "Success over what was drawn" in page.read_text("utf-8")
+    assert "Success over drawn values" in page.read_text("utf-8")
 
 
 def test_the_worst_flights_that_pass_are_those_next_to_their_bounds(tmp_path: Path) -> None:
@@ -283,14 +283,14 @@ def test_two_designs_are_compared_draw_by_draw(tmp_path: Path) -> None:
     reordered = campaign(
         disperse=dict(reversed(MASSES.items())), flights=120, seed=8, criteria=CRITERIA
     )
-    with pytest.raises(ParameterError, match=r"'disperse' is mass.mass_1: .* mass.mass_3"):
+    with pytest.raises(ParameterError, match=r"'disperse' has mass.mass_1: .* mass.mass_3"):
         write_comparison((one, filled(tmp_path / "b", reordered, bowl)), page)
     # Flights whose goal was refused have not moved: their numbers are no result.
     barred = filled(tmp_path / "barred", made, lambda draw: 0.0, refuses=lambda number: True)
     lines = write_comparison((one, barred), tmp_path / "barred.html")
     assert lines[-2:] == [
         "Of short, 120 of 120 flights have the outcome refused: Too far.",
-        "Differences are those of draws whose goals neither campaign refused.",
+        "Differences exclude draws whose goal one of the campaigns refused.",
     ]
     assert not any(line.startswith("position_error_m") for line in lines)
     half = filled(tmp_path / "half", made, better, refuses=lambda number: number < 60)

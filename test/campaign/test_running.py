@@ -119,7 +119,7 @@ def test_the_folder_of_another_campaign_is_refused(tmp_path: Path) -> None:
             run_campaign(other, tmp_path / "one")
     with pytest.raises(ParameterError, match=r"'short', with another 'seed'. Name another"):
         run_campaign(small(flights=1, seed=3), tmp_path / "one")
-    with pytest.raises(ParameterError, match="with another scenario, or other parameters of it"):
+    with pytest.raises(ParameterError, match="with another scenario or other parameters"):
         run_campaign(small(flights=1, method="optimal"), tmp_path / "one")
     (tmp_path / "file").touch()
     with pytest.raises(ParameterError, match="is a file: name a folder"):
@@ -304,7 +304,7 @@ def test_rows_of_other_software_are_named(tmp_path: Path, caplog: pytest.LogCapt
     about = tmp_path / "about.json"
     about.write_text(about.read_text("utf-8").replace(source_hash(), "0123456789ab"))
     run_campaign(small(flights=2), tmp_path)
-    assert any("were flown by other software" in line for line in caplog.messages)
+    assert any("were flown with other software" in line for line in caplog.messages)
 
 
 def test_a_task_of_lanes_leaves_what_others_fly_unless_all_of_it_is_asked_for() -> None:

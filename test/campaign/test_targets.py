@@ -292,7 +292,7 @@ def test_masses_go_into_the_description_of_the_plant_alone(scenario: Scenario) -
         ("plant.initial_orientation[0]", "disperse initial.rotvec.x, y and z"),
         ("plant.initial_position", "say which number of the list: plant.initial_position[0]"),
         ("plant.tick_rate[0]", "it is not a list"),
-        ("plant.initial_position[3]", "'3' is none of the places 0 to 2 of the list."),
+        ("plant.initial_position[3]", "'3' is not an index from 0 to 2 of the list."),
         ("plant.initial_joint_positions[3]", "nor one of the joints slider_1, slider_2, slider_3"),
         ("mass.mass_9", "the robot has no body 'mass_9'; it has base_link, mass_1"),
         ("com.mass_1", "'com.mass_1' must be com.BODY.x, y, z or *, or com.*; the bodies are base"),

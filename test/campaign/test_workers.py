@@ -82,7 +82,7 @@ def test_workers_have_as_many_tasks_as_they_take_and_deaths_are_flown_one_at_a_t
     queue.answers[5] = WorkerDeath()
     (killed,) = next(found)
     assert (killed.draw.number, killed.outcome, killed.engine) == (5, "killed", "flights")
-    assert killed.reason == "The process that flew it died 2 times."
+    assert killed.reason == "Its process died 2 times."
     next(found)
     assert queue.open[6:] == [([6], "flights", True)]
     stopped[0] = True
@@ -236,7 +236,7 @@ def test_a_flight_that_kills_two_workers_is_reported_and_the_others_are_flown() 
     workers, rows = distributed("flights", 12, 0.25, deadly=(5,))
     killed = [row for row in rows if row.outcome == "killed"]
     assert [row.draw.number for row in killed] == [5]
-    assert killed[0].reason == "The process that flew it died 2 times."
+    assert killed[0].reason == "Its process died 2 times."
     assert killed[0].engine == "flights"
     assert len(rows) == 12
     assert sum(count for _, count, alone in workers.dealt if alone) >= 4

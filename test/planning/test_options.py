@@ -298,7 +298,7 @@ def test_options_by_name_are_not_dispersed() -> None:
     )
     assert values_of(scenario.planner)["optimal.max_velocity"] == ("slider_2:0.1",)
     declaration = Parameter("optimal.max_velocity", ())
-    with pytest.raises(ParameterError, match="the list has texts NAME:VALUE: give a number for ea"):
+    with pytest.raises(ParameterError, match="the list has texts NAME:VALUE; set a number for ea"):
         _list_values("n", "planner", declaration, scenario)
 
 
