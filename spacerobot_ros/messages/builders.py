@@ -58,7 +58,7 @@ class TransformTemplate:
         ]
 
     def serialised(self, time_ns: int, poses: Array) -> bytes:
-        """Return the message with the poses (k, 7), all of one time."""
+        """Return the message with the poses (k, 7) at one time."""
         for numbers, pose in zip(self._numbers, poses, strict=True):
             numbers[:] = pose
         return self._template.serialised(stamp_bytes(time_ns))
@@ -74,9 +74,9 @@ class RobotTransforms:
     world_frame
         Name of the inertial frame.
     prefix
-        Goes before the names of the links, as robot_state_publisher's ``frame_prefix``.
+        Prefix of the names of the links, like robot_state_publisher's ``frame_prefix``.
     links
-        Whether the transforms of all links are included, or of the base link alone.
+        Whether to include the transforms of all links, or only of the base link.
     """
 
     def __init__(
@@ -90,7 +90,7 @@ class RobotTransforms:
         self._fixed = _prefix_frames(fixed, prefix)
 
     def message(self, time_ns: int, pose: Array, q: Array) -> bytes:
-        """Return the message of a pose (7,) of the base link and positions (n,) of the joints."""
+        """Return the message for a pose (7,) of the base link and positions (n,) of the joints."""
         self._poses[0] = pose
         if self._links is not None:
             self._links.update(q)
@@ -98,7 +98,7 @@ class RobotTransforms:
         return self._template.serialised(time_ns, self._poses)
 
     def messages(self, times_ns: NDArray[np.int64], poses: Array, q: Array) -> list[bytes]:
-        """Return the messages of some times (m,), base poses (m, 7) and joint positions (m, n)."""
+        """Return the messages for times (m,), base poses (m, 7) and joint positions (m, n)."""
         every = poses[:, np.newaxis]
         if self._links is not None:
             every = np.concatenate([every, self._links.transforms_at(q)], axis=1)
@@ -127,7 +127,7 @@ class StateFrames:
         self._joints = JointReader(description.joint_names, ["position"], measured=True)
 
     def accept(self, odom: bytes, joint_states: bytes) -> None:
-        """Take the serialised messages as the new state.
+        """Use the serialised messages as the new state.
 
         Raises
         ------
@@ -154,7 +154,7 @@ class StateFrames:
 
 
 def robot_frames(description: RobotDescription, state: StateFrames) -> dict[str, tuple[str, Array]]:
-    """Return the parent of each link and the pose (7,) in it, by link name, in a measured state."""
+    """Return each link's parent and pose (7,) in the parent, by link name, in a measured state."""
     links, prefix = ForwardKinematics(description), state.prefix
     links.update(state.q)
     frames = {prefix + description.base_link: (state.world, state.pose)}
@@ -179,7 +179,7 @@ def state_message(
     names
         Joints or thrusters that its arrays have entries for.
     world, base
-        Names of the inertial frame and of that of the base link.
+        Names of the inertial frame and of the base link's frame.
     target
         Name of the frame of the target's root link.
     """
@@ -201,7 +201,7 @@ def state_message(
 
 
 def goal_message(goal: Goal, frame: str, stamp_ns: int = 0) -> bytes:
-    """Return the pose of a goal as geometry_msgs/PoseStamped; NaN: a part is not asked for."""
+    """Return the pose of a goal as geometry_msgs/PoseStamped; parts not required are NaN."""
     r, quaternion = (
         values if part in goal.asked else np.full(len(values), np.nan)
         for part, values in (("position", goal.position), ("attitude", goal.quaternion))
@@ -220,7 +220,7 @@ def goal_message(goal: Goal, frame: str, stamp_ns: int = 0) -> bytes:
 def given_path_message(poses: Array, frame: str, stamp_ns: int) -> bytes:
     """Return a path of poses (K, 7), or of positions (K, 3), as nav_msgs/Path.
 
-    Positions alone have quaternions of zeros, which mean any attitude.
+    Positions have quaternions of zeros, which mean any attitude.
     """
     numbers = np.zeros((len(poses), 7))
     numbers[:, : poses.shape[1]] = poses
@@ -232,7 +232,7 @@ def given_path_message(poses: Array, frame: str, stamp_ns: int) -> bytes:
 def trajectory_message(schedule: GaitSchedule, stamp_ns: int, frame: str) -> bytes:
     """Return a schedule as trajectory_msgs/JointTrajectory.
 
-    Point k has the joint positions at tick k and the velocities until tick k+1 (at the end zero).
+    Point k has the joint positions at tick k and the velocities until tick k+1 (zero at the end).
     Long gaits have a hundred thousand points.
     """
     n, count = len(schedule.joint_names), len(schedule.positions)

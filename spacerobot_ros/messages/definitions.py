@@ -1,8 +1,8 @@
 """Definitions of message types: of installed packages, and of schemas in bags.
 
-``rosbags`` writes Python code for every type that it decodes, a line for each element of an array
-of messages, and follows types that contain themselves forever. The definitions of a bag may be
-anybody's, so names, lengths, nesting and the number of fields are limited.
+``rosbags`` generates Python code for every type that it decodes, with one line per element of a
+message array, and never ends if a type contains itself. The definitions of a bag are untrusted, so
+names, lengths, nesting and the number of fields are limited.
 """
 
 from __future__ import annotations
@@ -59,10 +59,10 @@ _PARTS: dict[str, tuple[str, int | str]] = {
     "_Response": ("srv", 1),
     "_Event": ("srv", _EVENT),
 }
-"""Messages that rosidl makes of a service or an action, by the ending of their names.
+"""Messages that rosidl generates from a service or an action, by the suffix of their names.
 
-Each has the suffix of the file that declares it, and its section there, or else its text, in which
-the name of the service or action replaces the braces. Names in interface files have no underscore.
+Each has the suffix of the declaring file, and either the section there or a text in which the name
+of the service or action replaces the braces. Names in interface files have no underscore.
 """
 
 _SECTION_END = re.compile(r"^---[ \t]*\r?\n?", re.MULTILINE)
@@ -75,15 +75,15 @@ _PRIMITIVES = {"bool", "byte", "char", "float32", "float64", "string", "wstring"
 def message_definition(type_name: str) -> str:
     """Return the full definition of a message type as rosbag2 writes it into a schema.
 
-    That is the text of the ``.msg`` file, then for every type it uses, depth first, in alphabetical
-    order and each once, a separator line, ``MSG: package/Type`` and its text (``ros2msg``). Types
-    of ROS 2 Jazzy that are not installed are defined without comments.
+    It is the text of the ``.msg`` file, followed by a separator line, ``MSG: package/Type`` and the
+    text of every type it uses, depth first, in alphabetical order and each once (``ros2msg``).
+    Types of ROS 2 Jazzy that are not installed are defined without comments.
 
     Raises
     ------
     RecordingError
-        The name is not one of a message type, or a package that it needs is neither installed nor
-        one of Jazzy's.
+        The name is not a message type, or a required package is neither installed nor part of
+        Jazzy.
     """
     return _of_installed_or_jazzy(
         type_name,
@@ -147,11 +147,10 @@ def type_hash(type_name: str) -> str:
 
 
 def message_module(type_name: str) -> tuple[str, str, str]:
-    """Return the Python module of an installed message type, and the names of two classes in it.
-
-    Those are of the interface that the module exports, in whose own module the other one is, and of
-    the message itself: they differ for parts of services and actions. RecordingError: the name is
-    not one of a message type, or the package is not installed.
+    """Return the Python module of an installed message type, and two class names. The first is the
+    interface that the module exports. The second is the message itself, in the interface's own
+    module; it differs for parts of services and actions. RecordingError: the name is not a message
+    type, or the package is not installed.
     """
     name = _InterfaceName.of(type_name)
     name.file()
@@ -200,7 +199,7 @@ class _InterfaceName:
         return path
 
     def text(self) -> str:
-        """Return the definition of the message without those of the types that it uses."""
+        """Return the definition of the message without the definitions of its field types."""
         text = self.file().read_bytes().decode()
         if self.kind == "msg":
             return text
@@ -241,13 +240,13 @@ _TYPE_NAME = re.compile(r"[A-Za-z]\w*/(msg|srv|action)/[A-Za-z]\w*", re.ASCII)
 _MAX_TEXT_BYTES = 262_144
 _MAX_LINES = 5_000
 _MAX_FIELDS = 1_000
-"""Largest number of fields; in arrays of messages and strings every element counts."""
+"""Largest number of fields; in arrays of messages and strings every element is counted."""
 
 _MAX_NESTING = 32
 
 
 class MessageType:
-    """A message type by the text of its schema in a bag.
+    """A message type defined by the text of its schema in a bag.
 
     Attributes
     ----------
@@ -321,7 +320,7 @@ def _count_fields(types: Fields, name: str, counts: dict[str, int], depth: int =
     if name not in types:
         raise ValueError(f"it does not define {name}")
     if depth > _MAX_NESTING:
-        raise ValueError(f"its types are nested more than {_MAX_NESTING} deep, or in themselves")
+        raise ValueError(f"its types are nested more than {_MAX_NESTING} deep, or recursive")
     count = 0
     for field, (kind, detail) in types[name][1]:
         length = 1

@@ -28,7 +28,7 @@ _OK, _WARN, _ERROR = 0, 1, 2
 def diagnostic_name(node: str, part: str) -> str:
     """Return the name of a part of a node in /diagnostics, as diagnostic_updater forms it.
 
-    Aggregators match the beginning of names, and make folders of them: no slash comes first.
+    Aggregators match prefixes of names and build a tree of them: there is no leading slash.
     """
     return f"{node.removeprefix('/')}: {part}"
 
@@ -51,7 +51,7 @@ def state_diagnostics(
     warning: str = "",
     missing: str = "",
 ) -> list[StatusRecord]:
-    """Return the diagnostics of a commander: how it answers states, and the state of its goal.
+    """Return the diagnostics of a commander: its responses to states, and the state of its goal.
 
     Parameters
     ----------
@@ -60,14 +60,14 @@ def state_diagnostics(
     ignored
         Numbers of ignored states, or parts of states, by key.
     last
-        The status that was published last; None: none was.
+        The last published status; None: none yet.
     warning
         A warning, which is published instead of the status; empty: none.
     missing
         What the commander waits for, as a clause; empty: nothing.
     """
     level = _WARN if warning or missing else _OK
-    message = warning or (f"waiting for {missing}" if missing else "states are answered")
+    message = warning or (f"waiting for {missing}" if missing else "responding to states")
     records = [_record(diagnostic_name(node, "states"), level, message, ignored, robot)]
     if last is not None and not warning:
         name = diagnostic_name(node, "goal")
@@ -85,7 +85,7 @@ def _record(
 class PlantDiagnostics:
     """The diagnostics of one plant.
 
-    A level is a warning when its counters have moved since the last diagnostics.
+    A level is a warning if its counters have changed since the last diagnostics.
 
     Parameters
     ----------
@@ -107,7 +107,7 @@ class PlantDiagnostics:
         self._node, self._real_time = node, real_time
         self.observe(commands, plant)
         self.command_timeouts = 0
-        """How often commands have ceased, counted by the owner."""
+        """Number of command timeouts, counted by the owner."""
         self._last_refusal = ""
         self._reported = self._counters()
         self._unmet_reported = 0
@@ -117,12 +117,12 @@ class PlantDiagnostics:
         self._commands, self._plant, self._thrusters = commands, plant, thrusters_in(plant)
 
     def note_refusal(self, source: CommandSource, refusal: Refusal) -> str:
-        """Take note of a refused command, which its validator has counted; return a sentence."""
+        """Note a refused command, which its validator has counted; return a sentence."""
         self._last_refusal = f"A command on '{source.topic}' was refused: {refusal.clause}."
         return self._last_refusal
 
     def records(self) -> list[StatusRecord]:
-        """Return the present diagnostics."""
+        """Return the current diagnostics."""
         before, self._reported = self._reported, self._counters()
         refused, limited = (now != then for now, then in zip(self._reported, before, strict=True))
         found = [
@@ -199,7 +199,7 @@ class PlantDiagnostics:
         return self._record(
             "strokes",
             _OK,
-            "how far each joint is from the nearer of its limits, m or rad",
+            "distance of each joint from its nearer limit, m or rad",
             {
                 joint: f"{margin:.6g}"
                 for joint, margin in zip(robot.joint_names, margins, strict=True)
@@ -243,14 +243,14 @@ class PlantDiagnostics:
         """Return propellant, pulses and unmet wrenches; a warning for new unmet wrenches."""
         unmet = thrusters.unmet_ticks > self._unmet_reported
         self._unmet_reported = thrusters.unmet_ticks
-        sentences = [f"they cannot give {thrusters.missing}"] if thrusters.missing else []
+        sentences = [f"they cannot produce {thrusters.missing}"] if thrusters.missing else []
         if unmet:
-            sentences.append("the wanted wrench is beyond them")
+            sentences.append("the requested wrench is beyond them")
         force, torque = np.linalg.norm(thrusters.unmet[:3]), np.linalg.norm(thrusters.unmet[3:])
         return self._record(
             "thrusters",
             _WARN if sentences else _OK,
-            "; ".join(sentences) or "the wanted wrench is given",
+            "; ".join(sentences) or "the requested wrench is produced",
             {
                 PROPELLANT_KEY: f"{thrusters.propellant:.9g}",
                 "pulses": int(thrusters.pulses.sum()),
@@ -266,7 +266,7 @@ class PlantDiagnostics:
 
 
 def timing_record(node: str, robot: str, real_time: RealTime) -> StatusRecord:
-    """Return the delays of a plant's ticks and of its commander's answers."""
+    """Return the delays of a plant's ticks and of its commander's commands."""
     timing = real_time.report()
     return _record(
         diagnostic_name(node, "timing"),

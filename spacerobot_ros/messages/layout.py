@@ -1,8 +1,8 @@
-"""Places of fields in serialised messages: little-endian CDR, as ROS 2 exchanges it.
+"""Positions of fields in serialised messages: little-endian CDR, as ROS 2 exchanges it.
 
-Most topics repeat one layout: the same frame names, the same number of joints. Then a field has the
-same place in every message: it can be patched or read in place, and a column of it over many
-messages is a slice of one matrix of bytes, some hundred times faster than decoding each message.
+Most topics repeat one layout: the same frame names, the same number of joints. A field then has the
+same position in every message, where it can be read or overwritten. Its column over many messages
+is a slice of one matrix of bytes, about a hundred times faster than decoding each message.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ DTYPES = {
 """Number types in serialised messages, by their names in definitions."""
 
 ENCAPSULATION = 4
-"""Length of the CDR header, bytes; alignment counts from its end."""
+"""Length of the CDR header, bytes; alignment is relative to its end."""
 
 BIG_ENDIAN, LITTLE_ENDIAN = b"\x00\x00", b"\x00\x01"
 """First two bytes of a message in CDR of either byte order."""
@@ -52,12 +52,12 @@ class TooLongError(Exception):
 
 @dataclass(frozen=True)
 class Leaf:
-    """Place of a number, an array of numbers or a text in a message.
+    """Position of a number, an array of numbers or a text in a message.
 
     Attributes
     ----------
     offset, size
-        First byte and number of bytes; of a text without the zero at its end.
+        First byte and number of bytes; for a text, without the terminating zero.
     dtype
         Type of the numbers; None for a text.
     shape
@@ -71,10 +71,10 @@ class Leaf:
 
 
 class Layout:
-    """Places of the fields of one serialised message.
+    """Positions of the fields of one serialised message.
 
     Another message of the type has the same layout if its size and its bytes in ``lengths`` are
-    equal, and the same texts if those in ``fixed`` are.
+    equal, and the same texts if its bytes in ``fixed`` are equal.
 
     Parameters
     ----------
@@ -96,17 +96,17 @@ class Layout:
     counts
         Number of texts or messages in each list.
     starts
-        First byte behind the length of each such list.
+        First byte after the length of each such list.
     texts
         Span of each list of texts.
     ends
-        First byte behind each element of such a list, with ``elements``.
+        First byte after each element of such a list, if ``elements``.
     lengths
         First bytes of the lengths (uint32) of texts and lists.
     fixed
         Spans of these lengths and of all texts, in the order of the message.
     end
-        First byte behind the last field.
+        First byte after the last field.
 
     Raises
     ------
@@ -341,9 +341,9 @@ def stamped_copies(
     Parameters
     ----------
     prototype, type_name
-        The message, every list of which has its final length.
+        The message; its lists must have their final lengths.
     stamps_ns
-        (N,) stamps of the headers, or of a clock, ns; a message without either has none.
+        (N,) stamps of the headers or of a clock, ns; ignored if the message has neither.
     columns
         Numbers (N, size) by the path at which they begin.
     """
@@ -369,7 +369,7 @@ def seconds_and_nanoseconds(times_ns: NDArray[np.int64]) -> NDArray[np.uint32]:
 
 
 class Columns:
-    """Fields at the same place in all messages of a list, as arrays over the messages."""
+    """Fields at the same position in all messages of a list, as arrays over the messages."""
 
     def __init__(
         self, matrix: NDArray[np.uint8], leaves: dict[str, Leaf], texts: dict[str, slice]
@@ -407,7 +407,7 @@ def column_dtype(dtype: np.dtype[Any]) -> np.dtype[Any]:
 
 
 def read_columns(messages: Sequence[bytes], type_name: str, fields: Fields) -> Columns | None:
-    """Return the fields that have the same place in every message of one type.
+    """Return the fields that have the same position in every message of one type.
 
     Fields in lists of messages and of texts are omitted. None if the layouts differ.
     """

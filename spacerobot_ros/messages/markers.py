@@ -43,7 +43,7 @@ _NO_TURN = {"orientation": {"w": 1.0}}
 
 
 def shape_marker(shape: Shape, frame: str, namespace: str, number: int) -> dict[str, Any]:
-    """Return the fields of the marker of a URDF visual, its pose left open."""
+    """Return the marker fields of a URDF visual, with an identity pose."""
     size, points = shape.size, []
     if shape.kind == "cylinder":
         size = (2 * size[0], 2 * size[0], size[1])
@@ -87,10 +87,10 @@ def _line(namespace: str, number: int, places: Array, frame: str) -> dict[str, A
 
 
 def goal_markers(goal: Goal, path: BasePath, robot: RobotDescription, frame: str) -> bytes:
-    """Return markers of the base at its goal, of the planned path of the base as a line, and of
-    the path that an end-effector is given.
+    """Return markers of the base at its goal, of the planned path of the base as a line, and of an
+    end-effector's goal path.
 
-    The ghost has the visuals of the base link and of the links that are fixed to it.
+    The base at its goal has the visuals of the base link and of the links fixed to it.
     """
     markers: list[dict[str, Any]] = []
     base = Pose(matrix_from_quaternion(goal.quaternion), goal.position)
@@ -116,7 +116,7 @@ class RobotMarkers:
     Parameters
     ----------
     robot, target
-        The robot and the body beside it; None: there is none.
+        The robot and the target; None: there is none.
     frame
         Name of the world frame.
     """

@@ -2,7 +2,7 @@
 
 rclpy spends most of a tick turning Python objects into bytes and back. A state message has the
 same layout every tick, so it is serialised once and its numbers are written into the bytes; a
-command is read the same way. The reader learns a new layout where a message has another one.
+command is read the same way. If a message has another layout, the reader learns it.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ ODOMETRY = "nav_msgs/msg/Odometry"
 WRENCH = "geometry_msgs/msg/WrenchStamped"
 
 _OTHER_JOINTS_BYTES = 65536
-"""Size allowed for joints of a measured state that the robot does not have, bytes."""
+"""Size allowed for unknown joints of a measured state, bytes."""
 
 _NOT_FINITE_RATES = "velocities are not finite"
 
@@ -77,7 +77,7 @@ def read_text(raw: bytes, type_name: str, path: str) -> str:
 
 
 class MessageTemplate:
-    """A serialised message whose numbers are then written in place.
+    """A serialised message whose numbers are overwritten in place.
 
     Parameters
     ----------
@@ -99,7 +99,7 @@ class MessageTemplate:
         ]
 
     def floats(self, path: str, count: int) -> Array:
-        """Return a writable view of the ``count`` float64 values from ``path`` on."""
+        """Return a writable view of the ``count`` float64 values beginning at ``path``."""
         return np.frombuffer(self._buffer, np.float64, count, self._leaves[path].offset)
 
     def feed(self, path: str, source: Array) -> None:
@@ -108,7 +108,7 @@ class MessageTemplate:
         self._feeds[path] = slice(begin, begin + len(data)), data
 
     def serialised(self, stamp: bytes) -> bytes:
-        """Return the message as it is now, with ``stamp`` (:func:`stamp_bytes`) in every header."""
+        """Return the current message, with ``stamp`` (:func:`stamp_bytes`) in every header."""
         for place, source in self._feeds.values():
             self._buffer[place] = source
         for place in self._stamps:
@@ -117,7 +117,7 @@ class MessageTemplate:
 
 
 def joint_template(joint_names: Sequence[str]) -> MessageTemplate:
-    """Return the template of a JointState with all quantities of some joints, zero."""
+    """Return the template of a JointState with zeros for all quantities of some joints."""
     zeros = np.zeros(len(joint_names))
     values = {"name": joint_names, "position": zeros, "velocity": zeros, "effort": zeros}
     return MessageTemplate(JOINT_STATE, encode(JOINT_STATE, values))
@@ -134,7 +134,7 @@ class TemplateReader:
         Paths to read, and how many float64 follow each: ``{"pose.pose.position.x": 7}``; None for
         an array of any length.
     max_size
-        Messages of another layout that are longer are refused unread, bytes.
+        Largest size of messages with another layout, bytes; longer ones are refused unread.
     """
 
     def __init__(
@@ -194,9 +194,7 @@ class TemplateReader:
 
     def _learn_layout(self, raw: bytes) -> None:
         if len(raw) > self._max_size:
-            raise UnreadableError(
-                f"it has {len(raw)} bytes, of which at most {self._max_size} can be meant"
-            )
+            raise UnreadableError(f"it has {len(raw)} bytes; at most {self._max_size} are expected")
         name = self._type_name
         try:
             if raw[:2] == BIG_ENDIAN:
@@ -234,10 +232,10 @@ def _as_little_endian(raw: bytes, type_name: str) -> bytes:
 
 
 class JointReader:
-    """Takes quantities of JointState messages into the order of the model's joints.
+    """Reads quantities of JointState messages in the order of the model's joints.
 
-    A command names all joints, in any order. A measured state may name other joints too, as those
-    of a broadcaster for a whole machine do: they are ignored. Measured joints may come in several
+    A command names all joints, in any order. A measured state may also name other joints, as a
+    broadcaster for a whole machine does: they are ignored. Measured joints may arrive in several
     messages (:meth:`joined`).
 
     Parameters
@@ -245,11 +243,11 @@ class JointReader:
     joint_names
         The model's joints.
     quantities
-        What to read; the first is required in every message.
+        Quantities to read; the first is required in every message.
     measured
         Whether messages are measured states, whose stamp and size are bounded.
     followers
-        Names of joints that follow those of the model, and are no coordinates of their own.
+        Names of joints that mimic joints of the model, and are not coordinates of the model.
     """
 
     def __init__(
@@ -263,7 +261,7 @@ class JointReader:
         self._measured, self._joints, self._quantities = measured, list(joint_names), quantities
         self._followers = followers
         self.ignored: Counter[str] = Counter()
-        """Number of ignored parts of accepted messages, by what they are."""
+        """Number of ignored parts of accepted messages, by their description."""
         max_size = math.inf
         if measured:
             # Every joint adds a name with its length and three numbers; a machine has other joints.
@@ -280,7 +278,7 @@ class JointReader:
         self._missing = ""
         """A joint that measured states of this layout lack; empty: none."""
         self._seen = np.zeros(len(joint_names), dtype=np.bool_)
-        """Joints that have come since the last whole state, with their values in ``values``."""
+        """Joints received since the last complete state, with their values in ``values``."""
 
     def accept(self, raw: bytes) -> int:
         """Read a message into ``values`` and return its stamp in ns.
@@ -288,8 +286,8 @@ class JointReader:
         Raises
         ------
         CommandError
-            A joint is unknown or named twice, or a length is wrong; of a measured state, its
-            stamp is beyond what that of an answer can carry.
+            A joint is unknown or named twice, or a length is wrong; or the stamp of a measured
+            state is too late for a command to carry it.
         """
         self.require(raw)
         stamp = self._reader.stamp_ns
@@ -312,9 +310,9 @@ class JointReader:
                 self.ignored[_NOT_FINITE_RATES] += 1
 
     def joined(self, raw: bytes) -> bytes | None:
-        """Return a measured state of all joints: this message, or one joined of several.
+        """Return a measured state of all joints: this message, or one merged from several.
 
-        None: joints have not come yet since the last whole state.
+        None: some joints are missing since the last complete state.
 
         Raises
         ------
@@ -339,7 +337,7 @@ class JointReader:
 
     @property
     def incomplete(self) -> str:
-        """Clause on the joints that have not come since the last whole state."""
+        """Clause about the joints that are missing since the last complete state."""
         absent = [n for n, seen in zip(self._joints, self._seen, strict=True) if not seen]
         return f"no message names {', '.join(absent)}"
 
@@ -393,19 +391,19 @@ class JointReader:
 
 
 class MissingJointError(CommandError):
-    """A measured state lacks a joint, which another message may bring."""
+    """A measured state lacks a joint, which another message may contain."""
 
 
 @dataclass(frozen=True)
 class JointOrder:
-    """Places of the joints of a message among those of a model.
+    """Assignment of the joints of a message to the joints of a model.
 
     Attributes
     ----------
     of_message, of_model
         Indices of the joints that both have, in the message and in the model.
     ignored
-        What the joints of the message are that the model does not have.
+        Descriptions of the joints of the message that the model does not have.
     """
 
     of_message: npt.NDArray[np.intp]
@@ -421,13 +419,13 @@ class JointOrder:
         *,
         partial: bool = False,
     ) -> JointOrder:
-        """Return the places of named joints; ``partial`` messages may lack joints and name others.
+        """Return the order of named joints; ``partial`` messages may lack joints and name others.
 
         Raises
         ------
         CommandError
-            A joint is named twice; or one is unknown or missing, which partial messages may have,
-            unless they name no joint of the model.
+            A joint is named twice, or is unknown or missing. Partial messages may have unknown and
+            missing joints if they name a joint of the model.
         """
         known = [name for name in named if name in joints] if partial else list(named)
         if not partial or (joints and not known):
@@ -457,14 +455,14 @@ class MessageDecoder:
     joint_names
         Joints of the robot, in its order.
     followers
-        Names of joints that follow others.
+        Names of joints that mimic others.
     """
 
     def __init__(self, joint_names: Sequence[str], followers: Collection[str] = ()) -> None:
         quantities: list[Quantity] = ["position", "velocity"]
         self._joints = JointReader(joint_names, quantities, measured=True, followers=followers)
         self.ignored, self.joined = self._joints.ignored, self._joints.joined
-        """Ignored parts of joint states, and the function that joins joint states."""
+        """Ignored parts of joint states, and the function that merges joint states."""
         self._references = JointReader(joint_names, ["position", "velocity"])
         self._measured = {_POSE_PATH: np.zeros(7), _TWIST_PATH: np.zeros(6)}
         spans = {path: len(array) for path, array in self._measured.items()}
@@ -475,7 +473,7 @@ class MessageDecoder:
 
     @property
     def incomplete(self) -> str:
-        """Clause on joints that have not come yet in joint states."""
+        """Clause about joints that are still missing in joint states."""
         return self._joints.incomplete
 
     def decode_base(self, odom: bytes) -> tuple[Array, Array]:

@@ -53,14 +53,14 @@ class StatusRecord:
 
 
 def key_values(pairs: Iterable[Any]) -> dict[str, str]:
-    """Return diagnostic_msgs/KeyValue messages as a dictionary, printable."""
+    """Return diagnostic_msgs/KeyValue messages as a dictionary of printable texts."""
     return {printable(pair.key): printable(pair.value) for pair in pairs}
 
 
 def read_status(message: Any) -> StatusRecord:
     """Return the content of a received or recorded DiagnosticStatus, printable.
 
-    Of several pairs with one key the last counts.
+    If several pairs have one key, the last one takes precedence.
     """
     level = message.level if isinstance(message.level, int) else message.level[0]
     return StatusRecord(

@@ -50,11 +50,11 @@ from spacerobot_ros.times import first_time_ns, stamp_bytes
 class CoordinatedControlNode(CommanderNode):
     """Closes the loop over spacecraft and arm (paper 4): one command for every measured state.
 
-    ``goal_pose`` is where the base is to be, ``end_effector/goal_pose`` where the end-effector is.
-    If a planner publishes ``joint_reference`` (or ``base_reference``), those are tracked. Until
-    there is a goal, the robot holds the pose of its first state. The node converts messages; what
-    becomes of goals is decided by a :class:`ControllerCommander` and its
-    :class:`~spacerobot_ros.control.executive.ControlExecutive`.
+    ``goal_pose`` is the goal of the base, ``end_effector/goal_pose`` the goal of the end-effector.
+    If a planner publishes ``joint_reference`` (or ``base_reference``), the node tracks it. Until
+    there is a goal, the robot holds the pose of its first state. The node converts messages; a
+    :class:`ControllerCommander` and its :class:`~spacerobot_ros.control.executive.ControlExecutive`
+    decide on goals.
     """
 
     Config: ClassVar = ControllerConfig
@@ -71,11 +71,11 @@ class CoordinatedControlNode(CommanderNode):
         self._published: Any = None
         """State and goal of the last status."""
         self._busy: set[str] = set()
-        """Nodes that plan or compile, by their heartbeats."""
+        """Nodes that plan or compile, according to their heartbeats."""
         return ControllerCommander(self.config, self, partner_is_busy=lambda: bool(self._busy))
 
     def configure(self) -> None:
-        """Create the topics; without a robot of its own the node waits for robot_description."""
+        """Create the topics; if no robot is configured, the node waits for robot_description."""
         self._joint_commands = self.create_publisher(JointState, "joint_commands", STREAM)
         self._base_wrench = self.create_publisher(WrenchStamped, "base_wrench", STREAM)
         self.listen("controller/status")
@@ -102,7 +102,7 @@ class CoordinatedControlNode(CommanderNode):
         """Return a log message with robot, law and goal topic."""
         config, topic = self.config, self.resolve_topic_name("goal_pose")
         return (
-            f"Controls {described_robot(self.commander.robot)} by '{config.law}'; goals on "
+            f"Controls {described_robot(self.commander.robot)} with law '{config.law}'; goals on "
             f"'{topic}' in '{config.world_frame}'."
         )
 
@@ -147,7 +147,7 @@ class CoordinatedControlNode(CommanderNode):
     def read_goal(self, key: str, message: PoseStamped) -> Goal:
         """Return the goal of a message for the base or the end-effector.
 
-        An orientation of zeros asks for the position of an end-effector alone.
+        If the orientation of an end-effector is all zeros, any attitude is accepted.
         """
         if key == BASE_GOAL_KEY:
             return super().read_goal(key, message)
@@ -157,7 +157,7 @@ class CoordinatedControlNode(CommanderNode):
     # -- outputs ------------------------------------------------------------------------------
 
     def send_command(self, stamp_ns: int) -> None:
-        """Publish wrench and efforts as the answer to the state of this stamp."""
+        """Publish wrench and efforts for the state with this stamp."""
         stamp = stamp_bytes(stamp_ns)
         self._base_wrench.publish(self._wrench_message.serialised(stamp))
         self._joint_commands.publish(self._joint_message.serialised(stamp))

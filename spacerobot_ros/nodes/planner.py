@@ -51,14 +51,14 @@ from spacerobot_ros.topics import goal_topic, path_topic, twist_topic
 class PlannerNode(CommanderNode):
     """Turns goal poses into gaits and publishes their velocities, one command for every state.
 
-    A goal is planned from the next measured state. When its schedule has ended the measured pose
+    A goal is planned from the next measured state. When its schedule has ended, the measured pose
     is compared with the goal, and the remaining motion is planned again until the goal is reached
-    within tolerance or ``max_corrections`` are used up; the pieces of a gait that its method plans
-    one by one (a *partial* schedule) do not count. A new goal replaces the present one. When a
+    within tolerance or ``max_corrections`` are used up. The pieces of a gait that is planned piece
+    by piece (*partial* schedules) are not corrections. A new goal replaces the current one. If a
     joint does not follow, the remaining motion is planned with the other joints.
 
-    All this is decided by a :class:`PlannerCommander` and its
-    :class:`~spacerobot_ros.planning.execution.executive.Executive`.
+    A :class:`PlannerCommander` and its
+    :class:`~spacerobot_ros.planning.execution.executive.Executive` make these decisions.
     """
 
     Config: ClassVar = PlannerConfig
@@ -84,7 +84,7 @@ class PlannerNode(CommanderNode):
         return PlannerCommander(self.config, self, long_work=self.long_work)
 
     def configure(self) -> None:
-        """Create the topics; without a robot of its own the planner waits for robot_description."""
+        """Create the topics; if no robot is configured, the planner waits for robot_description."""
         self._shape: Array | None = None
         self._commands: Publisher | None = None
         if self.config.output != "trajectory":
@@ -114,7 +114,7 @@ class PlannerNode(CommanderNode):
         )
 
     def deactivate(self) -> None:
-        """Drop the present goal and stop sending commands; the goal file stays."""
+        """Drop the current goal and stop sending commands; the goal file stays."""
         super().deactivate()
         self._await_announcement()
 
@@ -123,7 +123,7 @@ class PlannerNode(CommanderNode):
             self._announcement.join(MAX_THREAD_END_TIME)
 
     def destroy_node(self) -> None:
-        """Destroy the node with its clients of trajectories, in any state."""
+        """Destroy the node and its trajectory clients, in any state."""
         self._await_announcement()
         if self._trajectories is not None:
             self._trajectories.destroy()
@@ -147,7 +147,7 @@ class PlannerNode(CommanderNode):
         self.commander.use_robot(robot, self.decoder_of(robot))
         self._message = joint_template(robot.joint_names)
         self._setpoint: Setpoint | None = None
-        """The setpoint whose arrays the message has."""
+        """The setpoint whose arrays feed the message."""
 
     # -- inputs -------------------------------------------------------------------------------
 
@@ -178,7 +178,7 @@ class PlannerNode(CommanderNode):
     def read_goal(self, key: str, message: PoseStamped) -> Goal:
         """Return the goal of a message for the base or an end-effector.
 
-        An orientation of zeros asks for the position of an end-effector alone.
+        If the orientation of an end-effector is all zeros, any attitude is accepted.
         """
         if key == BASE_GOAL_KEY:
             return super().read_goal(key, message)
@@ -189,7 +189,7 @@ class PlannerNode(CommanderNode):
         return Goal.of_end_effectors([aim], joint_positions=self.goal_shape())
 
     def goal_shape(self) -> Array | None:
-        """Return the joint positions (n,) of the last message about them; None: any."""
+        """Return the joint positions (n,) of the last goal_joint_states message; None: any."""
         return self._shape
 
     def _on_goal_shape(self, message: JointState) -> None:
@@ -205,7 +205,7 @@ class PlannerNode(CommanderNode):
     # -- outputs ------------------------------------------------------------------------------
 
     def send_command(self, stamp_ns: int) -> None:
-        """Publish the setpoint as the answer to the state of this stamp."""
+        """Publish the setpoint for the state with this stamp."""
         if self._commands is not None:
             setpoint = self.commander.setpoint
             if setpoint is not self._setpoint and len(setpoint.position):

@@ -1,4 +1,4 @@
-"""The recorder node: every topic as it was published, into an MCAP bag."""
+"""The recorder node: writes every topic as published to an MCAP bag."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ _PARAMETER_RECORD_BY_TOPIC = {
 A node that publishes them is configured: its parameters keep their values."""
 
 _UNKNOWN_NODE = "_NODE_NAME_UNKNOWN_"
-"""What rmw_dds_common calls the node of a publisher that is discovered before its node."""
+"""Node name in rmw_dds_common of a publisher that is discovered before its node."""
 
 _QUEUE_DEPTH = 2000
 """Queue depth of subscriptions; above 5000 the events executor stops responding."""
@@ -93,27 +93,28 @@ _LOSS_LOG_PERIOD = 5.0
 
 
 class RecorderNode(FlightNode):
-    """Records topics as raw bytes, as rosbag2 would; :class:`Recording` says with which time."""
+    """Records topics as raw bytes, as rosbag2 does; :class:`Recording` determines the times."""
 
     Config: ClassVar = RecorderConfig
     role = Role.RECORDER
     depends_on = (Role.PLANT,)
     config: RecorderConfig
     recording: Recording | None = None
-    """The present recording, or the last one."""
+    """The current recording, or the last one."""
 
     def __init__(self, name: str = "recorder", **kwargs: Any) -> None:
         self._stamps = _StampReader()
         self._parameter_requests: dict[str, RemoteParameters | None] = {}
         """Names of the parameter records that are in the bag or requested from nodes."""
         self._topics_without_owner: set[str] = set()
-        """Topics whose publisher is known before its node, whose parameters are to be requested."""
+        """Topics whose publisher was discovered before its node; its parameters are still to be
+        requested."""
         super().__init__(name, **kwargs)
 
     # -- life ---------------------------------------------------------------------------------
 
     def configure(self) -> None:
-        """Open the bag and look for topics; they are subscribed, and recorded once active."""
+        """Open the bag and subscribe to topics, which are recorded once active."""
         config = self.config
         # What may be refused comes before the bag, which would stay open.
         descriptions = _read_descriptions(config.describe)
@@ -154,7 +155,7 @@ class RecorderNode(FlightNode):
         asked = Path(config.bag).name
         if asked and not writer.path.name.startswith((f"{Path(asked).stem}_", asked)):
             self.get_logger().warning(
-                f"The bag {config.bag} already exists: this flight goes into {writer.path}."
+                f"The bag {config.bag} already exists: this flight is recorded in {writer.path}."
             )
         if config.diagnostics_period:
             self.create_timer(config.diagnostics_period, self._publish_state, clock=steady)
@@ -185,7 +186,7 @@ class RecorderNode(FlightNode):
                 self.report_event(Event(EventKind.RECORDING_PAUSED, "Recording is paused."))
 
     def drain(self, executor: EventsExecutor) -> None:
-        """Record messages on their way, until none has come for 0.3 s of wall time."""
+        """Record messages in transit until none has arrived for 0.3 s of wall time."""
         began = last = time.monotonic()
         recording = self.recording
         while recording is not None and recording.running and last - began < _LONGEST_DRAIN:
@@ -229,13 +230,13 @@ class RecorderNode(FlightNode):
         return self.recording.failure if self.recording is not None else None
 
     def describe(self, name: str, values: dict[str, str]) -> None:
-        """Put named values into the bag (parameters, seed, version)."""
+        """Write named values into the bag (parameters, seed, version)."""
         if self.recording is not None:
             self._parameter_requests[name] = None
             self.recording.describe(name, values)
 
     def scan(self) -> None:
-        """Subscribe to topics that have appeared."""
+        """Subscribe to newly discovered topics."""
         recording = self.recording
         if recording is None or recording.state is RecordingState.CLOSED:
             return
@@ -270,8 +271,8 @@ class RecorderNode(FlightNode):
             self._steps_back_of_one_clock = recording.clock_steps_back
         elif recording.clock_steps_back - self._steps_back_of_one_clock >= publishers:
             self.get_logger().warning(
-                f"More than one clock is published on '{self._clock_topic}': the times of the bag "
-                "jump from one to the other. Give each stack its own namespace and clock "
+                f"More than one clock is published on '{self._clock_topic}': times in the bag jump "
+                "between them. Give each stack its own namespace and clock "
                 "(--ros-args -r __ns:=/NAME -r /clock:=clock).",
                 throttle_duration_sec=_LOSS_LOG_PERIOD,
             )
@@ -567,8 +568,8 @@ def _record_and_listen(record: RawCallback, listener: RawCallback | None) -> Raw
 def loss_events(recording: Recording, topic: str) -> SubscriptionEventCallbacks:
     """Return event callbacks of a subscription that count lost messages.
 
-    The middleware reports messages that their publisher no longer kept when they should have been
-    sent again; it does not report the overflow of the subscription's own queue (Fast DDS).
+    The middleware reports messages that the publisher had dropped before it could resend them; it
+    does not report overflows of the subscription's own queue (Fast DDS).
     """
 
     def on_loss(info: Any) -> None:

@@ -53,13 +53,13 @@ _BAD_BAG_EXIT_CODE = 2
 class ReplayNode(FlightNode):
     """Publishes the messages of a bag as bytes, with the recorded quality of service.
 
-    It waits for readers to be matched, keeps the spacing of the log times divided by ``rate``, and
-    has its process end with the bag. Meshes of ``robot_description`` that are not on this machine
-    are written from the bag into files that are deleted at the end.
+    It waits until readers are matched, divides the intervals of the log times by ``rate``, and ends
+    its process at the end of the bag. Meshes of ``robot_description`` that are not on this machine
+    are written from the bag to temporary files.
 
-    Services: ``~/pause`` (SetBool), ``~/resume`` and, while paused, ``~/step`` (Trigger): the next
-    message. A time on ``replay/seek`` is where it continues, and ``replay/status`` says where it
-    is.
+    Services: ``~/pause`` (SetBool), ``~/resume`` and, while paused, ``~/step`` (Trigger), which
+    sends the next message. A time on ``replay/seek`` sets the position, and ``replay/status``
+    reports it.
     """
 
     Config: ClassVar = ReplayConfig
@@ -76,7 +76,7 @@ class ReplayNode(FlightNode):
     # -- life ---------------------------------------------------------------------------------
 
     def configure(self) -> None:
-        """Open the bag and make its publishers and the services."""
+        """Open the bag and create its publishers and the services."""
         # A failed configuration leaves its bag and files open.
         self.cleanup()
         config = self.config
@@ -293,7 +293,7 @@ class ReplayNode(FlightNode):
 
     def _on_seek(self, message: Float64) -> None:
         if not math.isfinite(message.data):
-            self.get_logger().warning(f"A replay cannot go to {message.data} s.")
+            self.get_logger().warning(f"A replay cannot seek to {message.data} s.")
             return
         if not self._begun:
             return
@@ -325,7 +325,7 @@ class ReplayNode(FlightNode):
 
     def _step(self) -> str:
         if not (self._paused and self._begun):
-            raise CommandError("Only a paused replay goes step by step; call ~/pause first.")
+            raise CommandError("Only a paused replay can be stepped; call ~/pause first.")
         try:
             message = self._playback.step(self._now())
         except RecordingError as error:

@@ -411,7 +411,7 @@ def chain(depth: int) -> str:
 
 def test_types_are_nested_at_most_32_deep_and_never_in_themselves() -> None:
     assert MessageType(NAME, chain(32).encode())
-    deep = "its types are nested more than 32 deep, or in themselves"
+    deep = "its types are nested more than 32 deep, or recursive"
     assert refused(chain(33)) == refused("B x\n") == deep
     assert refused("C x\n") == "it does not define a/msg/C"
 
@@ -441,7 +441,7 @@ def test_a_measured_state_may_be_as_long_as_that_of_a_machine_with_other_joints(
     longer = state(["arms", "ü"], frame="f" * (longest - len(short) + 9))
     with pytest.raises(UnreadableError) as caught:
         reader.accept(longer)
-    said = f"it has {len(longer)} bytes, of which at most {longest} can be meant"
+    said = f"it has {len(longer)} bytes; at most {longest} are expected"
     assert str(caught.value) == said
     assert JointReader(["arms", "ü"], ["position"]).accept(longer) == 0
 

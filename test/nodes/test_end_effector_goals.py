@@ -200,7 +200,10 @@ def test_a_path_on_a_topic_is_followed_and_another_takes_its_place(harness: Harn
     for message, said in (
         (path_through([]), "The path of 'end_effector' has no poses."),
         (path_through([start, start * np.nan]), "Pose 2 of the path of 'end_effector' is [nan"),
-        (path_through(start + WAY, frame="moon"), "is in frame 'moon'; goals are taken in 'world'"),
+        (
+            path_through(start + WAY, frame="moon"),
+            "is in frame 'moon'; goals are accepted in 'world'",
+        ),
     ):
         flight.probe.messages["planner/status"].clear()
         sender.publish(message)
@@ -280,7 +283,9 @@ def test_stamps_may_be_left_out_and_go_on_but_not_back() -> None:
         "stamps out, or put the poses in order.",
     )
     far = path_through([[1, 2, 3]], frame="moon")
-    with pytest.raises(PlanningError, match=r"^It is in frame .moon.; goals are taken in .world."):
+    with pytest.raises(
+        PlanningError, match=r"^It is in frame .moon.; goals are accepted in .world."
+    ):
         path_poses(far, "world", "It")
 
 

@@ -185,7 +185,7 @@ def test_a_goal_pose_is_taken_in_its_frame() -> None:
         assert goal.joint_positions is not None
         assert goal.joint_positions.tolist() == [1.0, 2.0]
     message.header.frame_id = "world"
-    with pytest.raises(PlanningError, match="is in frame 'world'; goals are taken in 'map'"):
+    with pytest.raises(PlanningError, match="is in frame 'world'; goals are accepted in 'map'"):
         goal_of(message, "map")
 
 
@@ -281,7 +281,7 @@ def test_what_thrusters_could_not_give_is_a_warning_once(monkeypatch: pytest.Mon
     for _ in range(3):
         diagnosed.plant.step(none, np.array([1e3, 0.0, 0.0, 0.0, 0.0, 1e2]))
     level, message, values = diagnosed.status("thrusters")
-    assert (level, message) == (WARN, "the wanted wrench is beyond them")
+    assert (level, message) == (WARN, "the requested wrench is beyond them")
     assert float(values["propellant_kg"]) == pytest.approx(thrusters.propellant) != 0.0
     counts = [int(values[f"pulses.{name}"]) for name in thrusters.table.names]
     assert max(counts) > 1
@@ -289,7 +289,7 @@ def test_what_thrusters_could_not_give_is_a_warning_once(monkeypatch: pytest.Mon
     assert int(values["unmet_ticks"]) == 3
     assert float(values["unmet_force_N"]) == pytest.approx(1e3, rel=0.2)
     assert float(values["unmet_torque_Nm"]) == pytest.approx(1e2, rel=0.2)
-    assert diagnosed.status("thrusters")[:2] == (OK, "the wanted wrench is given")
+    assert diagnosed.status("thrusters")[:2] == (OK, "the requested wrench is produced")
 
 
 def test_faults_are_listed(diagnosed: Diagnosed) -> None:

@@ -362,7 +362,7 @@ def test_a_message_of_a_million_joints_is_refused_unread() -> None:
     message = JointState(name=[""] * many, position=zeros)
     read = reader()
     read.accept(raw(joints(["a", "b"])))
-    with pytest.raises(UnreadableError, match=r"has \d+ bytes, of which at most"):
+    with pytest.raises(UnreadableError, match=r"has \d+ bytes; at most"):
         read.accept(raw(message))
     assert read.values["position"].tolist() == [0.5, 0.5]
 

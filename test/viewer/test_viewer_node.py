@@ -361,7 +361,7 @@ def test_an_address_that_others_reach_is_warned_of_and_a_wrong_one_is_refused(
         node("no.such.host.invalid")
     harness.add(node("0.0.0.0"))
     said = capfd.readouterr()
-    assert "whoever reaches this machine there can steer the robot" in said.err
+    assert "anyone who can reach this machine there can steer the robot" in said.err
     assert said.out.startswith("viewer      http://127.0.0.1:")
 
 
@@ -493,7 +493,7 @@ def test_a_commander_that_is_busy_is_waited_for(harness: Harness) -> None:
     viewer._send_goals(state, 137.0)
     assert "answered" not in stack.log(), "it may just have planned"
     viewer._send_goals(state, 142.0)
-    assert "No planner or controller has answered the goal: send it again." in stack.log()
+    assert "No planner or controller has responded to the goal: send it again." in stack.log()
     # Heartbeats of a plant that is busy are of no commander.
     heart = stack.probe.create_publisher(DiagnosticStatus, "/heartbeat", 20)
     harness.connect()

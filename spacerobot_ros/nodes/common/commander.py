@@ -54,13 +54,13 @@ _LONGEST_DIAGNOSTICS_PERIOD = 1.0
 _STATUS_QOS = QoSProfile(
     depth=20, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
 )
-"""QoS of plant/status: every status counts, so the queue holds more than the latched ones."""
+"""QoS of plant/status: no status may be lost, so the queue is deeper than for latched topics."""
 
 
 class CommanderNode(FlightNode):
     """A node around a :class:`Commander`: it converts messages and owns topics, services, timers.
 
-    Without a robot of its own it takes that of robot_description, and every later one.
+    If no robot is configured, it uses the latest robot_description.
     """
 
     role = Role.COMMANDER
@@ -77,16 +77,16 @@ class CommanderNode(FlightNode):
     # -- life ---------------------------------------------------------------------------------
 
     def prepare(self) -> None:
-        """Create an inactive commander, and the servers of actions."""
+        """Create an inactive commander and the action servers."""
         self.commander = self.make_commander()
         self._goal_actions = GoalActions(self)
 
     @abstractmethod
     def make_commander(self) -> Commander:
-        """Return a commander with the present parameters; this node is its host."""
+        """Return a commander with the current parameters; this node is its host."""
 
     def listen(self, status_topic: str) -> None:
-        """Subscribe to the topics of every commander, and use the robot of the parameters.
+        """Subscribe to the topics that all commanders have, and use the configured robot.
 
         Raises
         ------
@@ -104,7 +104,7 @@ class CommanderNode(FlightNode):
         self._subscribe_plant_status()
         self._best_effort = config.state_reliability == "best_effort"
         self._unheard = ""
-        """Name of a state topic with a publisher whose QoS the subscription does not match."""
+        """Name of a state topic with a publisher of incompatible QoS."""
         self.inputs: dict[str, Subscription] = {}
         self._subscribe_states()
         self.create_timer(
@@ -127,7 +127,7 @@ class CommanderNode(FlightNode):
         )
 
     def listen_to_obstacles(self) -> None:
-        """Have plans avoid the obstacles of the topic."""
+        """Subscribe to the obstacles that plans avoid."""
         self.create_subscription(
             String,
             "obstacles",
@@ -140,14 +140,14 @@ class CommanderNode(FlightNode):
         """Use this robot from now on."""
 
     def decoder_of(self, robot: SpaceRobot) -> MessageDecoder:
-        """Return the decoder of a robot, which joins its joint states from now on."""
+        """Return a decoder for a robot; it also merges the robot's partial joint states."""
         joints = robot.description.moving_joints
         followers = [joint.name for joint in joints if joint.mimic is not None]
         self._decoder = MessageDecoder(robot.joint_names, followers)
         return self._decoder
 
     def activate(self) -> None:
-        """Start answering states with commands."""
+        """Start sending a command for each state."""
         self.commander.activate()
 
     def deactivate(self) -> None:
@@ -155,7 +155,7 @@ class CommanderNode(FlightNode):
         self.commander.deactivate(self._failure)
 
     def interrupt(self) -> None:
-        """Cancel the plan that is being made."""
+        """Cancel the plan in progress."""
         self.commander.interrupt()
 
     def destroy_node(self) -> None:
@@ -166,11 +166,11 @@ class CommanderNode(FlightNode):
 
     @property
     def takes_goals(self) -> bool:
-        """Whether goals of actions are accepted or refused: the node is configured."""
+        """Whether action goals are accepted, because the node is configured."""
         return self._has_entities
 
     def surroundings(self) -> Surroundings:
-        """Return the frames and joints that goals of actions are read with."""
+        """Return the frames and joints needed to read action goals."""
         robot = self.commander.robot
         names = None if robot is None else robot.joint_names
         return Surroundings(self.config.world_frame, names, self._pose_of)
@@ -210,13 +210,13 @@ class CommanderNode(FlightNode):
                 logger.error(message)
 
     def has_publisher(self, topic: str) -> bool:
-        """Whether a publisher of a topic of the state, or of a reference, is connected."""
+        """Whether a publisher of this state or reference topic is connected."""
         return bool(self.inputs[topic].get_publisher_count())
 
     def waiting_states(self) -> tuple[list[Stamped], list[Stamped]]:
-        """Return the messages that wait in the subscriptions of odom and joint_states.
+        """Return the messages queued in the subscriptions to odom and joint_states.
 
-        If no joints wait, nor are skipped, odom comes in its own order.
+        If no joint state is queued, odom messages stay queued.
         """
         joints = [*map(self._joined, self._waiting("joint_states"))]
         odoms = self._waiting("odom") if joints else []
@@ -241,7 +241,7 @@ class CommanderNode(FlightNode):
         if message.data == self._description:
             return
         self._description = message.data
-        self.commander.drop_robot("robot_description describes another robot now.")
+        self.commander.drop_robot("robot_description now describes another robot.")
         try:
             with self.long_work():
                 self.use(robot_from_text(message.data, self.config))
@@ -254,7 +254,7 @@ class CommanderNode(FlightNode):
         self.receive(key, message, lambda: self.read_goal(key, message))
 
     def receive(self, key: str, message: PoseStamped | Path, read: Callable[[], Goal]) -> None:
-        """Have the commander receive the goal that ``read`` returns; log it if it is accepted."""
+        """Pass the goal that ``read`` returns to the commander; log it if it is accepted."""
         stamp, part = message.header.stamp, key.replace("_", "-")
         accepted = self.commander.receive_goal(key, stamp.sec, stamp.nanosec, read)
         if accepted is not None:
@@ -300,7 +300,7 @@ class CommanderNode(FlightNode):
         if self._statuses is not None:
             self.destroy_subscription(self._statuses)
         self._doubted = False
-        """Whether a publisher of statuses that may not have been the plant has been heard."""
+        """Whether a status may have come from a node other than the plant."""
         self._statuses = self.create_subscription(
             DiagnosticStatus,
             "plant/status",
@@ -318,8 +318,8 @@ class CommanderNode(FlightNode):
         if self._has_foreign_statuses():
             self._doubted = True
             self.get_logger().warning(
-                "plant/status: more nodes publish it than odom; it is ignored until only the "
-                "plant publishes it.",
+                "plant/status: more nodes publish it than odom. It is ignored until only the plant "
+                "publishes it.",
                 throttle_duration_sec=_STATUS_LOG_PERIOD,
             )
             return
@@ -388,7 +388,7 @@ class CommanderNode(FlightNode):
     def _resubscribe_best_effort(self) -> None:
         """Subscribe to the state with best-effort QoS, as sensor drivers publish it."""
         self.get_logger().info(
-            f"A publisher of '{self._unheard}' offers best effort: it is subscribed that way."
+            f"A publisher of '{self._unheard}' uses best effort; so does the subscription now."
         )
         self._unheard, self._best_effort = "", True
         for topic in ("odom", "joint_states"):

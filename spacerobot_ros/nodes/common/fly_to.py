@@ -1,7 +1,7 @@
 """Goals as actions: the servers of a commander node, and the conversion of their messages.
 
-The types are found at run time: ``spacerobot_msgs/action/FlyTo`` of this project's own package of
-interfaces, and ``nav2_msgs/action/NavigateToPose``, each where it is installed.
+The types are imported at run time if installed: ``spacerobot_msgs/action/FlyTo`` of this project
+and ``nav2_msgs/action/NavigateToPose``.
 """
 
 from __future__ import annotations
@@ -38,14 +38,14 @@ Each kept goal makes the next ones slower.
 """
 
 _NAV2_FAILURE = 9000
-"""NavigateToPose's error code of an unknown error, which says no more than that it has failed."""
+"""NavigateToPose's error code for an unknown error."""
 
 _BASE_GOAL_NAME = "The goal of the base"
 
 
 @dataclass(frozen=True)
 class Surroundings:
-    """Facts about a node that the reader of a goal needs.
+    """Facts about a node that are needed to read a goal.
 
     Attributes
     ----------
@@ -54,7 +54,7 @@ class Surroundings:
     joint_names
         Joints of the robot; None: there is no robot yet.
     pose_of
-        Returns the pose (7,) of another frame in that of goals, None if it is not known.
+        Returns the pose (7,) of another frame in the frame of goals; None if unknown.
     """
 
     world_frame: str
@@ -63,7 +63,7 @@ class Surroundings:
 
 
 class GoalAction(ABC):
-    """A type of action by which goals come: its name, and the conversion of its messages.
+    """An action type for goals: its name and the conversion of its messages.
 
     Parameters
     ----------
@@ -99,7 +99,7 @@ class GoalAction(ABC):
 
 
 class FlyToAction(GoalAction):
-    """``spacerobot_msgs/action/FlyTo``: all that a goal may have."""
+    """``spacerobot_msgs/action/FlyTo``: goals of any kind."""
 
     package, type_name, name = "spacerobot_msgs", "FlyTo", "~/fly_to"
 
@@ -108,25 +108,23 @@ class FlyToAction(GoalAction):
         links, poses = list(request.end_effectors), list(request.end_effector_poses)
         if len(links) != len(poses):
             raise PlanningError(
-                f"The goal has {len(links)} end-effector(s) and {len(poses)} pose(s) for them: "
-                "give each its pose."
+                f"The goal has {len(links)} end-effector(s) and {len(poses)} pose(s): give each "
+                "end-effector one pose."
             )
         joints = request.joint_positions
         if len(joints.name) != len(joints.position):
             raise PlanningError(
-                f"The joint positions of the goal are {len(joints.name)} name(s) and "
-                f"{len(joints.position)} position(s): give each joint its position."
+                f"The goal has {len(joints.name)} joint name(s) and {len(joints.position)} joint "
+                "position(s): give each joint one position."
             )
         if not links and not request.base_pose:
-            alone = "has joint positions alone" if joints.name else "is empty"
-            raise PlanningError(
-                f"The goal {alone}: give it a pose of the base, or poses of end-effectors."
-            )
+            alone = "has only joint positions" if joints.name else "is empty"
+            raise PlanningError(f"The goal {alone}: add a base pose or end-effector poses.")
         shape = None
         if joints.name:
             if surroundings.joint_names is None:
                 raise PlanningError(
-                    "The goal has joint positions, and there is no robot on robot_description yet."
+                    "The goal has joint positions, but no robot_description was received yet."
                 )
             shape = shape_of(joints, surroundings.joint_names)
         goal, frame, pose_of = None, surroundings.world_frame, surroundings.pose_of
@@ -166,7 +164,7 @@ class FlyToAction(GoalAction):
 
 
 class NavigateToPoseAction(GoalAction):
-    """``nav2_msgs/action/NavigateToPose``: a pose of the base alone."""
+    """``nav2_msgs/action/NavigateToPose``: base poses only."""
 
     package, type_name, name = "nav2_msgs", "NavigateToPose", "~/navigate_to_pose"
 
@@ -174,7 +172,7 @@ class NavigateToPoseAction(GoalAction):
         """Return the goal of a request; see :meth:`GoalAction.read`."""
         if request.behavior_tree:
             raise PlanningError(
-                f"The goal names the behavior tree '{request.behavior_tree}': there are none here; "
+                f"The goal names the behavior tree '{request.behavior_tree}': none are supported; "
                 "leave it empty."
             )
         return FlyTo(
@@ -213,7 +211,7 @@ class _Server(ActionServer):
     """An action server whose goals end when the commander decides, not when a callback returns."""
 
     def notify_execute(self, goal_handle: ServerGoalHandle, execute_callback: Any) -> None:
-        """Run nothing: states of the plant move the goal."""
+        """Do nothing: states of the plant advance the goal."""
 
     def end(self, handle: ServerGoalHandle, result: Any) -> None:
         """Send the result of a goal in a final state to its client."""
@@ -244,11 +242,11 @@ class GoalClient:
         self._world_frame = world_frame
 
     def feedback(self, progress: Progress) -> None:
-        """Publish the course of the goal."""
+        """Publish the progress of the goal."""
         self._handle.publish_feedback(self._action.feedback(progress, self._world_frame))
 
     def end(self, result: FlyToResult) -> None:
-        """Send the result, with the final state that ROS 2 has for it."""
+        """Send the result with the matching final state of ROS 2."""
         handle = self._handle
         if result.outcome == "reached":
             handle.succeed()
@@ -260,9 +258,9 @@ class GoalClient:
 
 
 class GoalActions:
-    """The action servers of a commander node, which are there as long as the node.
+    """The action servers of a commander node; they exist as long as the node.
 
-    So a client hears the result of a goal that the node has ended while it is cleaned up.
+    A client therefore receives the result of a goal that a cleanup of the node has ended.
 
     Parameters
     ----------
@@ -325,7 +323,7 @@ class GoalActions:
         timer = self._node.create_timer(0.0, once, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def destroy(self) -> None:
-        """Destroy the servers, with the node."""
+        """Destroy the servers when the node is destroyed."""
         servers, self._servers = self._servers, []
         for server in servers:
             server.destroy()
@@ -337,7 +335,7 @@ def _goal_id(handle: ServerGoalHandle) -> str:
 
 
 def action_class(package: str, name: str) -> Any | None:
-    """Return the class of an action; None if its package is not installed whole."""
+    """Return the class of an action; None if its package is not fully installed."""
     return interface_class(f"{package}.action", name)
 
 

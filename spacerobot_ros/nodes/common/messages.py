@@ -33,10 +33,10 @@ if TYPE_CHECKING:
     from spacerobot_ros.planning.core.goal import EndEffectorGoal
 
 _MAX_KEPT_TRANSFORMS, _MAX_KEPT_STATIC_TRANSFORMS = 200, 100
-"""Numbers of kept messages of /tf and of /tf_static: some seconds of several publishers."""
+"""Numbers of stored messages of /tf and of /tf_static: a few seconds of several publishers."""
 
 _MAX_CHAINED_FRAMES = 1000
-"""Largest number of frames between a frame and the world; received frames may form a circle."""
+"""Largest number of frames between a frame and the world; received frames may form a cycle."""
 
 _SHORTEST_QUATERNION = 1e-6
 """Least norm of a quaternion in a message."""
@@ -45,7 +45,7 @@ _SHORTEST_QUATERNION = 1e-6
 def message_class(type_name: str) -> Any:
     """Return the class of a type such as ``nav_msgs/msg/Odometry``.
 
-    Names come from bags, too: nothing is imported but packages whose definitions are installed.
+    Names also come from bags, so only packages with installed definitions are imported.
 
     Raises
     ------
@@ -66,7 +66,7 @@ def message_class(type_name: str) -> Any:
 
 
 def interface_class(module: str, name: str) -> Any | None:
-    """Return the class of an interface; None if its package is not installed whole."""
+    """Return the class of an interface; None if its package is not fully installed."""
     try:
         kind = getattr(importlib.import_module(module), name)
         check_for_type_support(kind)
@@ -89,7 +89,7 @@ def diagnostic_status(
 
 
 def shape_message(goal: Goal, joint_names: Sequence[str]) -> JointState:
-    """Return a message of the joint positions required at a goal; empty without a requirement."""
+    """Return a message with the joint positions required at a goal; empty if none are."""
     positions = goal.joint_positions
     if positions is None:
         return JointState()
@@ -97,7 +97,7 @@ def shape_message(goal: Goal, joint_names: Sequence[str]) -> JointState:
 
 
 def pose_array(position: Any, orientation: Any) -> Array | None:
-    """Return the pose (7,) of a point or vector and a quaternion message, which is scaled to 1.
+    """Return the pose (7,) of a point or vector and a quaternion message, normalised.
 
     None if a number is not finite, or the quaternion zero.
     """
@@ -117,16 +117,16 @@ def goal_of(
     shape: Array | None = None,
     pose_of: Callable[[str], Array | None] = lambda frame: None,
 ) -> Goal:
-    """Return the goal of a pose message in ``frame``; ``shape`` goes with it.
+    """Return the goal of a pose message in ``frame``, with joint positions ``shape``.
 
-    A position or an orientation of nothing but NaN is not asked for.
+    A position or an orientation with only NaN is not required.
 
-    ``pose_of`` returns the pose (7,) of another frame in that one, None for one that is not known.
+    ``pose_of`` returns the pose (7,) of another frame in ``frame``; None if unknown.
 
     Raises
     ------
     PlanningError
-        It is in another frame, or no pose; ``what`` names it.
+        Its frame is unknown, or it is not a pose; ``what`` names it.
     """
     from spacerobot_ros.planning import Goal  # A plant takes no goals.
 
@@ -146,12 +146,12 @@ def end_effector_goal(
     what: str,
     pose_of: Callable[[str], Array | None] = lambda frame: None,
 ) -> EndEffectorGoal:
-    """Return the goal of a link; an orientation of zeros asks for the position alone.
+    """Return the goal of a link; if the orientation is all zeros, any attitude is accepted.
 
     Raises
     ------
     PlanningError
-        It is not a pose, or in a frame that is not known; ``what`` names it.
+        It is not a pose, or its frame is unknown; ``what`` names it.
     """
     from spacerobot_ros.planning.core.goal import EndEffectorGoal
 
@@ -175,8 +175,8 @@ def _pose_of_frame(
     pose = pose_of(given)
     if pose is None:
         raise PlanningError(
-            f"{what} is in frame '{given}'; goals are taken in '{frame}', in frames of the "
-            "robot once its state is known, and in those that /tf connects with them."
+            f"{what} is in frame '{given}'; goals are accepted in '{frame}', in frames of the "
+            "robot once its state is known, and in frames that /tf connects to these."
         )
     return pose
 
@@ -189,13 +189,13 @@ def path_poses(
 ) -> Array:
     """Return the poses (K, 7) of a path message in ``frame``, or their positions (K, 3).
 
-    Positions alone where all orientations are zeros. ``pose_of`` is as for :func:`goal_of`. A pose
-    without a frame is in that of the path.
+    Only positions are returned if all orientations are zeros. ``pose_of``: see :func:`goal_of`. A
+    pose without a frame is in the frame of the path.
 
     Raises
     ------
     PlanningError
-        A frame is not known, or the stamps of the poses go back; ``what`` names the path.
+        A frame is unknown, or the stamps of the poses decrease; ``what`` names the path.
     """
     given = [each.header.frame_id or message.header.frame_id for each in message.poses]
     poses, times = np.zeros((len(given), 7)), np.zeros(len(given), dtype=np.int64)
@@ -245,9 +245,11 @@ def shape_of(message: JointState, joint_names: Sequence[str]) -> Array:
     values = dict(zip(message.name, message.position, strict=False))
     missing = set(joint_names) - set(values)
     if missing:
-        raise PlanningError(f"The goal shape is refused: joint '{min(missing)}' is missing.")
+        raise PlanningError(
+            f"The goal joint positions are refused: joint '{min(missing)}' is missing."
+        )
     if not np.all(np.isfinite(list(values.values()))):
-        raise PlanningError("The goal shape is refused: a position is not finite.")
+        raise PlanningError("The goal joint positions are refused: a position is not finite.")
     return np.array([values[name] for name in joint_names])
 
 
@@ -260,9 +262,9 @@ def transform_class() -> Any | None:
 
 
 class KnownFrames:
-    """The frames that a node knows: those of its robot's state, and those of /tf if available.
+    """The frames known to a node: those of its robot's state, and those of /tf if available.
 
-    Messages of /tf are kept as they are received, and read when a frame is asked for.
+    Messages of /tf are stored serialised and read when a frame is requested.
 
     Parameters
     ----------
@@ -289,10 +291,10 @@ class KnownFrames:
             node.create_subscription(self._kind, topic, kept.append, qos, raw=True)
 
     def pose(self, frame: str, world: str, own: dict[str, tuple[str, Array]]) -> Array | None:
-        """Return the pose (7,) of a frame in the world, as it was last known.
+        """Return the last known pose (7,) of a frame in the world.
 
-        ``own`` has parent and pose in it by frame, and overrides /tf. None: the frames are not
-        connected.
+        ``own`` maps frames to their parent and their pose in it, and overrides /tf. None: the
+        frames are not connected.
         """
         parents = {**self._received_parents(), **own}
         pose = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])

@@ -67,13 +67,13 @@ _STATES_THAT_CAN_SHUT_DOWN = (
 
 
 class FlightNode(LifecycleNode):
-    """A managed node whose parameters are declared, checked and named in every refusal.
+    """A managed node with declared and checked parameters; every refusal names its parameter.
 
-    Subclasses give ``Config``, the declaration of their parameters, and the four hooks
+    Subclasses define ``Config``, the declaration of their parameters, and the four hooks
     :meth:`configure`, :meth:`activate`, :meth:`deactivate` and :meth:`cleanup`, which raise
-    :class:`SpaceRobotError` when they cannot.
+    :class:`SpaceRobotError` on failure.
 
-    An exception of a callback (subscription, timer, service) ends neither the process nor the
+    An exception in a callback (subscription, timer, service) ends neither the process nor the
     executor: the node is deactivated, calls :meth:`on_failure`, and sends an event; a supervisor
     may activate or configure it again.
 
@@ -172,14 +172,14 @@ class FlightNode(LifecycleNode):
     def create_subscription(
         self, msg_type: Any, topic: str, callback: Callable[..., Any], *args: Any, **kwargs: Any
     ) -> Subscription:
-        """Subscribe with a callback whose exceptions end in :meth:`on_failure`."""
+        """Subscribe with a callback whose exceptions call :meth:`on_failure`."""
         guarded = self.guarded(callback, f"a message on '{topic}'")
         return super().create_subscription(msg_type, topic, guarded, *args, **kwargs)
 
     def create_timer(
         self, timer_period_sec: float, callback: Callable[[], Any], *args: Any, **kwargs: Any
     ) -> Timer:
-        """Create a timer with a callback whose exceptions end in :meth:`on_failure`."""
+        """Create a timer with a callback whose exceptions call :meth:`on_failure`."""
         guarded = self.guarded(callback, "a timer")
 
         def fire() -> None:
@@ -193,7 +193,7 @@ class FlightNode(LifecycleNode):
     def create_service(
         self, srv_type: Any, srv_name: str, callback: Callable[..., Any], *args: Any, **kwargs: Any
     ) -> Service:
-        """Create a service with a callback whose exceptions end in :meth:`on_failure`."""
+        """Create a service with a callback whose exceptions call :meth:`on_failure`."""
 
         def answer(request: Any, response: Any) -> Any:
             try:
@@ -207,9 +207,9 @@ class FlightNode(LifecycleNode):
         return super().create_service(srv_type, srv_name, answer, *args, **kwargs)
 
     def offer(self, name: str, act: Callable[[], str]) -> None:
-        """Create a service without arguments that answers with the message of a function.
+        """Create a service without arguments that responds with the text a function returns.
 
-        The answer to a CommandError is its message, without success.
+        If the function raises CommandError, the response has its message and ``success`` false.
         """
 
         def answer(_: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
@@ -222,7 +222,7 @@ class FlightNode(LifecycleNode):
         self.create_service(Trigger, name, answer)
 
     def guarded(self, callback: Callable[..., Any], what: str) -> Callable[..., None]:
-        """Return a callback whose exceptions end in :meth:`on_failure`."""
+        """Return a callback whose exceptions call :meth:`on_failure`."""
 
         def guarded(*given: Any) -> None:
             try:
@@ -267,11 +267,10 @@ class FlightNode(LifecycleNode):
         return [self.set_parameters_atomically([each]) for each in parameter_list]
 
     def set_parameters_atomically(self, parameter_list: list[RosParameter]) -> SetParametersResult:
-        """Set parameters together, or none: most of them only while the node is not configured.
+        """Set all parameters or none; most can be set only while the node is not configured.
 
-        Values are taken in the types of the declarations where they can be: a whole number for a
-        real one. A value that a parameter has already is accepted at any time, as a dump that is
-        loaded again sets every one.
+        Values are converted to the declared types if possible: a whole number to a real one. An
+        unchanged value is always accepted, because loading a dump sets every parameter.
         """
         try:
             given = typed(self._parameters_declared, parameter_list)
@@ -294,7 +293,7 @@ class FlightNode(LifecycleNode):
 
     @property
     def lifecycle_state(self) -> int:
-        """The present state, a constant of lifecycle_msgs/State."""
+        """The current state, a constant of lifecycle_msgs/State."""
         machine = self._state_machine
         return machine.current_state[0] if machine else State.PRIMARY_STATE_UNKNOWN
 
@@ -313,7 +312,7 @@ class FlightNode(LifecycleNode):
             self.trigger_shutdown()
 
     def destroy_node(self) -> None:
-        """Destroy the node and let go of its state machine, which would keep it in the graph."""
+        """Destroy the node and release its state machine, which would keep it in the graph."""
         self._liveness.end()
         self._destroyed = True
         super().destroy_node()
@@ -516,8 +515,8 @@ class FlightNode(LifecycleNode):
 
 
 def described_robot(robot: SpaceRobot | None) -> str:
-    """Return name, joints and mass of a robot, for one line."""
+    """Return name, number of joints and mass of a robot as a phrase."""
     if robot is None:
-        return "the robot that robot_description will bring"
+        return "the robot expected on robot_description"
     mass = robot.description.total_mass
     return f"'{robot.description.name}' ({robot.n} joint(s), {mass:.4g} kg)"

@@ -1,4 +1,4 @@
-"""A node in a process of its own; discovery and transport of every process of the stack."""
+"""A node in its own process; discovery and transport for every process of the stack."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ FASTDDS_FILE_VARIABLES = ("FASTDDS_DEFAULT_PROFILES_FILE", "FASTRTPS_DEFAULT_PRO
 _TRANSPORT_CHOICES = ("FASTDDS_BUILTIN_TRANSPORTS", *FASTDDS_FILE_VARIABLES)
 
 _turn = itertools.count(os.getpid())
-"""Two tests of one process do not follow each other in one domain."""
+"""Consecutive tests of one process use different domains."""
 
 _SHARED_MEMORY = Path("/dev/shm")
 
@@ -71,8 +71,8 @@ def _use_sockets_without_shared_memory() -> None:
     if free < _REQUIRED_SHARED_MEMORY:
         os.environ["FASTDDS_BUILTIN_TRANSPORTS"] = "UDPv4"
         _LOG.warning(
-            "%s has %d kB that can be used: messages go through sockets "
-            "(FASTDDS_BUILTIN_TRANSPORTS=UDPv4). Files of killed processes there, "
+            "%s has %d kB of usable space: messages go through sockets "
+            "(FASTDDS_BUILTIN_TRANSPORTS=UDPv4). Files that killed processes left there, "
             "fastrtps_*, may be deleted while nothing runs.",
             _SHARED_MEMORY,
             free // 1024,
@@ -81,7 +81,7 @@ def _use_sockets_without_shared_memory() -> None:
 
 @contextmanager
 def free_domain() -> Iterator[int]:
-    """Hold a ROS domain that nobody else on this machine holds so; yield its number.
+    """Lock a ROS domain that no other process has locked this way; yield its number.
 
     Raises
     ------
@@ -106,14 +106,14 @@ def free_domain() -> Iterator[int]:
 def run_node(factory: Callable[[], FlightNode], arguments: list[str] | None = None) -> int:
     """Run one node in its own process until SIGINT, SIGTERM, SIGHUP, or the end of its parent.
 
-    A parent counts only if it has started this process to end with it: not a shell or ``ros2 run``.
+    The parent's end is ignored unless it requested this, which a shell or ``ros2 run`` does not.
     Returns the exit code: 0 after a signal, 2 when the node cannot start (the message is on
     standard error), the node's own when it ends by itself.
 
     Raises
     ------
     Terminated
-        A signal has come before the node was there, and the caller is guarded itself.
+        A signal arrived before the node existed, and the caller has its own guard.
     """
     use_loopback_discovery()
     with guarded() as alone:
@@ -203,7 +203,7 @@ def _await_delivery(node: FlightNode) -> None:
 def spin_until(executor: EventsExecutor, done: rclpy.task.Future) -> None:
     """Spin until the future is done, letting Python's signal handlers run.
 
-    The events executor is deaf to signals in a spin without a time limit.
+    The events executor ignores signals while it spins without a time limit.
     """
     while not done.done():
         executor.spin_until_future_complete(done, timeout_sec=0.5)

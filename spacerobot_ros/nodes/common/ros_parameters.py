@@ -1,4 +1,4 @@
-"""Parameters of a node as ROS parameters, and those of other nodes through their services."""
+"""Parameters of a node as ROS parameters, and parameters of other nodes via their services."""
 
 from __future__ import annotations
 
@@ -19,31 +19,31 @@ from rclpy.parameter import parameter_value_to_python
 from spacerobot_ros.parameters import Parameter, Value
 
 _MAX_CHECKS_FOR_ANSWER = 200
-"""Number of checks after which a node without an answer counts as one without services."""
+"""Number of checks after which a silent node is assumed to have no parameter services."""
 
 _CHECKS_UNTIL_CONNECTED = 3
-"""Number of checks before a request, in which the node discovers the client. Before that, an answer
-would hold up the node for 0.1 s, and be lost."""
+"""Number of checks before a request, while the node discovers the client. An earlier answer would
+block the node for 0.1 s and be lost."""
 
 _CHECKS_UNTIL_LOST = 50
-"""Number of checks after which an answer counts as lost by the middleware."""
+"""Number of checks after which an answer is considered lost by the middleware."""
 
 
 class RemoteParameters:
-    """All parameters of another node; :meth:`look` is called until it has answered.
+    """All parameters of another node; call :meth:`look` until it returns true.
 
     Parameters
     ----------
     node
-        The node that asks.
+        The node that sends the request.
     name
-        Full name of the node that is asked.
+        Full name of the other node.
     """
 
     def __init__(self, node: Node, name: str) -> None:
         self._node, self.name = node, name
         self.values: dict[str, str] | None = None
-        """Every set parameter as a JSON text by its full name; None before the answer."""
+        """JSON text of every set parameter, by its full name; None before the answer."""
         self._steps = self._request_values()
 
     def look(self) -> bool:
@@ -89,7 +89,7 @@ def _json_value(value: Any) -> Any:
 
 
 _QOS_OVERRIDES = "qos_overrides."
-"""Beginning of the parameters that rclpy declares with some publishers and subscriptions."""
+"""Prefix of the parameters that rclpy declares with some publishers and subscriptions."""
 
 _LARGEST_FLOAT = sys.float_info.max
 _INTEGER_BOUNDS = -(2**63), 2**63 - 1
@@ -122,7 +122,7 @@ def _descriptor(parameter: Parameter) -> ParameterDescriptor:
 def declare(node: Node, parameters: Sequence[Parameter]) -> dict[str, Value]:
     """Declare parameters on a node and return their checked values.
 
-    A whole number is accepted where a real one is wanted (``rate: 20``).
+    A whole number is accepted for a real parameter (``rate: 20``).
 
     Raises
     ------
@@ -158,9 +158,9 @@ def _given_value(node: Node, name: str) -> Any:
 
 
 def unknown_parameters(node: Node) -> str:
-    """Return a sentence about values that were given for parameters that a node does not have.
+    """Return a sentence about the parameters that were set but do not exist on a node.
 
-    Each is named with the nearest name that exists; empty: all are known.
+    It suggests the nearest existing name for each; empty if all are known.
     """
     given = getattr(node, "_parameter_overrides", {})
     unknown = [
@@ -174,7 +174,7 @@ def unknown_parameters(node: Node) -> str:
     nearest = [difflib.get_close_matches(name, known, 1) for name in unknown]
     hints = [f" (did you mean '{each[0]}'?)" if each else "" for each in nearest]
     listed = ", ".join(f"'{name}'{hint}" for name, hint in zip(unknown, hints, strict=True))
-    return f"Node '{node.get_name()}' has no parameter {listed}: what is given for it is ignored."
+    return f"Node '{node.get_name()}' has no parameter {listed}: given values are ignored."
 
 
 def fix(node: Node, parameters: Iterable[Parameter], *, fixed: bool) -> None:
@@ -189,8 +189,8 @@ def typed(
 ) -> list[RosParameter]:
     """Return parameter changes converted to the declared types; undeclared ones unchanged.
 
-    So a whole number does for a real one (``ros2 param set /plant tick_rate 50``), and an empty
-    list for any.
+    A whole number is accepted for a real parameter (``ros2 param set /plant tick_rate 50``), and an
+    empty list for a list of any type.
 
     Raises
     ------

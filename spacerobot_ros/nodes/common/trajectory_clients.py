@@ -1,6 +1,6 @@
-"""Clients of FollowJointTrajectory, the action by which a robot's own controller takes schedules.
+"""Clients of FollowJointTrajectory, the action that sends schedules to a robot's own controller.
 
-Its type ``control_msgs/action/FollowJointTrajectory`` is found at run time.
+Its type ``control_msgs/action/FollowJointTrajectory`` is imported at run time.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ _OUTCOMES = {
 
 
 class TrajectoryClients:
-    """The clients of FollowJointTrajectory of a planner node, which are there as long as the node.
+    """The FollowJointTrajectory clients of a planner node; they exist as long as the node.
 
-    An executor may hold an answer for a client that a cleanup of the node would destroy.
+    If a cleanup of the node destroyed them, an executor might still hold an answer for one.
 
     Parameters
     ----------
@@ -54,7 +54,7 @@ class TrajectoryClients:
         self._clients: dict[str, ActionClient] = {}
 
     def connect(self, name: str, on_end: Callable[[TrajectoryEnd], None]) -> TrajectoryOutput:
-        """Return an output to the server of an action, which reports ends to `on_end`."""
+        """Return an output to an action server; it calls `on_end` when a schedule ends."""
         if name not in self._clients:
             self._clients[name] = ActionClient(self._node, self._kind, name)
         connection = _Connection(self._kind, self._clients[name])
@@ -63,7 +63,7 @@ class TrajectoryClients:
         return output
 
     def destroy(self) -> None:
-        """Destroy the clients, with the node."""
+        """Destroy the clients when the node is destroyed."""
         for client in self._clients.values():
             client.destroy()
         self._clients.clear()
@@ -91,7 +91,7 @@ class _Connection:
         answer.add_done_callback(lambda future: self._on_answer(number, future.result()))
 
     def cancel(self, number: int) -> None:
-        """Have a schedule cancelled; one that is not accepted yet, when it is."""
+        """Cancel a schedule, or cancel it once it is accepted."""
         handle = self._handles.get(number)
         if handle is None:
             self._cancelled.add(number)
@@ -122,8 +122,8 @@ class _Connection:
 def joint_trajectory(schedule: GaitSchedule) -> JointTrajectory:
     """Return a schedule as a trajectory that begins when it arrives.
 
-    Its points have positions alone: between two of them a controller then interpolates linearly,
-    which is the schedule, whose velocities are constant over a tick.
+    Its points have positions only, so that controllers interpolate linearly. This reproduces the
+    schedule, whose velocities are constant over a tick.
     """
     message = deserialize_message(trajectory_message(schedule, 0, ""), JointTrajectory)
     for point in message.points:

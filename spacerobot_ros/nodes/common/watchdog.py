@@ -28,14 +28,14 @@ HEARTBEAT_PERIOD = 0.2
 _SILENCE_CHECK_PERIOD = 0.1  # wall s
 
 _SUSPENSION_TIME = 0.3
-"""Wall time between two checks beyond which this node itself was suspended, s."""
+"""Longest wall time between two checks unless this node itself was suspended, s."""
 
 _REPORT_PERIOD = 1.0  # wall s, while a node is silent
 HEARTBEAT_QOS = QoSProfile(depth=20, reliability=ReliabilityPolicy.RELIABLE)
 
 
 class Role(str, Enum):
-    """The part of a node in the stack; the value is the ``hardware_id`` of its heartbeats."""
+    """The role of a node in the stack; the value is the ``hardware_id`` of its heartbeats."""
 
     PLANT = "plant"
     COMMANDER = "commander"
@@ -50,7 +50,7 @@ class HeartbeatState(str, Enum):
     BUSY = "busy"
     """The node plans or compiles, and sends no heartbeat until it is done."""
     INACTIVE = "inactive"
-    """The node was deactivated or shut down in order, and sends no heartbeat."""
+    """The node was deactivated or shut down cleanly, and sends no heartbeat."""
 
 
 @dataclass(frozen=True)
@@ -82,9 +82,8 @@ class SilenceReport:
 class Watchdog:
     """Finds nodes whose heartbeats cease.
 
-    A node is watched from its first heartbeat on until it says that it is inactive. While it is
-    busy nothing is expected of it. If this node itself stood still, all are given their time
-    again.
+    A node is watched from its first heartbeat until it reports that it is inactive. While it is
+    busy, no heartbeat is expected. If this node itself was suspended, all timeouts start again.
 
     Parameters
     ----------
@@ -97,9 +96,9 @@ class Watchdog:
     def __init__(self, timeout: float, clock: Callable[[], float] = time.monotonic) -> None:
         self._timeout, self._clock = timeout, clock
         self._heard: dict[str, float] = {}
-        """Time of the last received or excused heartbeat by node, s; infinite: it is busy."""
+        """Time of each node's last received or excused heartbeat, s; infinite if busy."""
         self.silent: dict[str, float] = {}
-        """Time of the last heartbeat by silent node, s."""
+        """Time of the last heartbeat of each silent node, s."""
         self._looked = clock()
 
     def hear(self, name: str, pulse: str) -> SilenceReport | None:
@@ -135,7 +134,7 @@ class Liveness:
     Parameters
     ----------
     node
-        The node that sends them; its timers run no more once they are destroyed.
+        The node that sends them; its timers stop once they are destroyed.
     role
         Its role.
     depends_on
@@ -159,10 +158,10 @@ class Liveness:
         self._watchdog: Watchdog | None = None
         self._timeout = 0.0
         self._busy = 0
-        """Number of computations under way that may take long."""
+        """Number of running computations that may take long."""
 
     def configure(self, timeout: float) -> None:
-        """Subscribe to heartbeats and create the publisher of diagnostics; a cleanup ends both.
+        """Subscribe to heartbeats and create the publisher of diagnostics; a cleanup destroys both.
 
         ``timeout``: see :class:`Watchdog`; 0: nothing is watched.
         """

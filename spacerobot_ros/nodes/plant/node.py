@@ -59,14 +59,14 @@ if TYPE_CHECKING:
 _READER_CHECK_PERIOD = 0.1  # wall s
 
 _MAX_UNCONFIRMED_TICKS = STREAM.depth // 2
-"""Ticks that a lockstep plant takes at most before all readers confirm that they have their states:
-a reader that has fallen further behind than what publishers keep would lose some."""
+"""Largest number of lockstep ticks until all readers must confirm their states: a reader that is
+further behind than the publishers' queue would lose some."""
 
 _MAX_RATE_AT_REST = 1e-3  # m/s or rad/s
 _LONGEST_REST = 0.8  # wall s, before the process ends
 
 _REPORT_PERIOD_NS = 950_000_000
-"""Wall time after the last diagnostics at which new ones are due, ns: about one a second."""
+"""Wall time after which new diagnostics are due, ns: about once a second."""
 
 _LONGEST_MARKER_PERIOD, _LONGEST_FRAME_PERIOD, _LONGEST_CLEARANCE_PERIOD = 0.5, 0.1, 0.5
 """Longest wall time between two publications in real time, s: of markers, of /tf, of clearances."""
@@ -79,8 +79,8 @@ class PlantNode(FlightNode):
     """Integrates the momentum-conserving model and publishes the topics of a real robot.
 
     In ``lockstep`` it publishes the state of tick k and steps when the command stamped with that
-    tick is there. In ``realtime`` it runs on the wall clock times ``real_time_factor``, holds the
-    last command, and brings the joints to rest when that is older than ``command_timeout``.
+    tick has arrived. In ``realtime`` it runs on the wall clock times ``real_time_factor``, holds
+    the last command, and brings the joints to rest when that is older than ``command_timeout``.
     """
 
     Config: ClassVar = PlantConfig
@@ -143,7 +143,7 @@ class PlantNode(FlightNode):
         # Joints that move, and thrusters, are there for efforts alone.
         self._undecided = config.actuation == "auto" and decided.actuation == "velocity"
         self._under_efforts: PlantWithFaults | None = None
-        """The plant as efforts move it from its initial state, as long as it may be needed."""
+        """The plant under efforts, in its initial state, as long as it may be needed."""
         if self._undecided:
             under_efforts = config.decided("effort")
             self._under_efforts = build_plant(robot, under_efforts)
@@ -187,7 +187,7 @@ class PlantNode(FlightNode):
                 self, self.plant, robot.description, has_contact_forces=config.engine == "mujoco"
             )
         self._obstacles: str | None = None
-        """The text on the topic obstacles; None: the robot has its own."""
+        """The last text on the topic obstacles; None: the robot's own obstacles are used."""
         self.create_subscription(String, "obstacles", self._on_obstacles, LATCHED)
         for topic in (*self._readers, *(["base_wrench"] if self._undecided else [])):
             kind = message_class(TOPICS[topic].type)
@@ -251,7 +251,9 @@ class PlantNode(FlightNode):
             # Time stands still meanwhile: this command, and the wrench beside it, answer its state.
             self._real_time.start(self._steady.now().nanoseconds, self._tick)
         self._monitor.observe(self._commands, self.plant, config)
-        self.get_logger().info(f"Commands carry {_CARRIED[actuation]}, which the plant takes.")
+        self.get_logger().info(
+            f"Commands carry {_CARRIED[actuation]}: the plant uses this actuation."
+        )
         self._publish_changed_status()
 
     def _plant_now(self, robot: SpaceRobot, config: PlantConfig) -> PlantWithFaults:
@@ -281,7 +283,7 @@ class PlantNode(FlightNode):
         return self._resumed_plant(robot, config, state)
 
     def activate(self) -> None:
-        """Publish the robot and its present state, and start stepping."""
+        """Publish the robot and its current state, and start stepping."""
         self._active = self._when_active
         self._commands.revoke_before(self.time_ns)
         self._publisher.publish_description()
@@ -305,7 +307,7 @@ class PlantNode(FlightNode):
         self._publish()
 
     def deactivate(self) -> None:
-        """Stop simulated time and drop the present commands."""
+        """Stop simulated time and drop the current commands."""
         self._stop_timers()
         if self._active in (PlantState.INACTIVE, PlantState.FAILED):
             return
@@ -318,7 +320,7 @@ class PlantNode(FlightNode):
         config = self.config
         pace = "in lockstep"
         if self._real_time is not None:
-            pace = f"in real time times {config.real_time_factor:g}"
+            pace = f"at {config.real_time_factor:g} times real time"
         actuation = "effort" if self.plant.takes_wrench else "velocity"
         carried = _CARRIED["auto" if self._undecided else actuation]
         return (
@@ -327,7 +329,8 @@ class PlantNode(FlightNode):
         )
 
     def on_failure(self, message: str, error: Exception) -> None:
-        """Report the failure, and drop the present commands: none is in force after a restart."""
+        """Report the failure and drop the current commands, so that none is in force after a
+        restart."""
         self._stop_timers()
         self._active = PlantState.FAILED
         reason = "model" if isinstance(error, SpaceRobotError) else "exception"
@@ -565,7 +568,7 @@ class PlantNode(FlightNode):
         try:
             world = obstacles_from_topic(message.data)
         except RobotDescriptionError as refusal:
-            kept = "The obstacles so far stay."
+            kept = "The previous obstacles are kept."
             self.get_logger().error(printable(f"obstacles: {refusal} {kept}"))
             return
         self._obstacles = message.data

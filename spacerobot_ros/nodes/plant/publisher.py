@@ -49,7 +49,7 @@ if TYPE_CHECKING:
 _LOG_PERIOD = 5.0  # wall s, of lines of one kind
 
 _RESTING_SHARE = 0.01
-"""Share of its effort limit that a joint which rests on its stop may push."""
+"""Largest effort of a joint that rests on its stop, as a share of its effort limit."""
 
 
 class PlantReport:
@@ -78,7 +78,7 @@ class PlantReport:
         self._stream = node.create_publisher(DiagnosticArray, "/diagnostics", STREAM)
         thrusters = thrusters_in(plant)
         if thrusters is not None and thrusters.missing:
-            node.get_logger().warning(f"The thrusters cannot give {thrusters.missing}.")
+            node.get_logger().warning(f"The thrusters cannot produce {thrusters.missing}.")
 
     def observe(self, commands: CommandValidator, plant: PlantWithFaults) -> None:
         """Report on these from now on."""
@@ -124,7 +124,7 @@ class PlantReport:
         if not texts:
             return
         self._node.get_logger().warning(
-            f"Limits of the URDF held joints back so far: {'; '.join(texts)}.",
+            f"Limits of the URDF have held joints back: {'; '.join(texts)}.",
             throttle_duration_sec=_LOG_PERIOD,
         )
 
@@ -150,7 +150,7 @@ class StatePublisher:
     state
         The reported quantities.
     config
-        Configuration of the plant: the names of the frames.
+        Configuration of the plant, with the names of the frames.
     """
 
     def __init__(
@@ -176,7 +176,7 @@ class StatePublisher:
         self.rebuild()
 
     def rebuild(self) -> None:
-        """Create the messages of the quantities that the state has now."""
+        """Create the messages for the current quantities of the state."""
         clock = TOPICS["/clock"]
         streams = [
             (topic, self._output(topic), self._template(topic))
@@ -199,7 +199,7 @@ class StatePublisher:
     def publish(self, time_ns: int, *, all_topics: bool) -> None:
         """Publish the state, stamped ``time_ns``.
 
-        ``all_topics``: those too that are not published in every tick.
+        ``all_topics``: include the topics that are not published in every tick.
         """
         lost = self._of_measured_pose if self._state.sensors.dropout else []
         if self._state.misses_target:
@@ -210,10 +210,10 @@ class StatePublisher:
                 output.publish(template.serialised(stamp))
 
     def has_new_readers(self) -> bool:
-        """Whether the state has a subscriber that it did not have at the last call.
+        """Whether the state has gained a subscriber since the last call.
 
-        The check takes 1 ms. A subscription that is replaced by another leaves their number; one
-        that is known of may be matched later.
+        The check takes 1 ms. If one subscription replaces another, their number stays the same; a
+        discovered one may be matched later.
         """
         outputs = self._outputs.values()
         readers = frozenset(
@@ -227,7 +227,7 @@ class StatePublisher:
         return new
 
     def await_readers(self) -> None:
-        """Wait until all readers have received the states, or the time limit is over."""
+        """Wait until all readers have received the states, or the time limit has passed."""
         end = time.monotonic() + _LONGEST_WAIT
         for output in self._outputs.values():
             if not output.get_subscription_count():
@@ -263,7 +263,7 @@ class StatePublisher:
 class TransformPublisher:
     """Publishes the measured frames of a robot on /tf, and its fixed frames on /tf_static.
 
-    Without the package ``tf2_msgs`` nothing is published; bags have the transforms anyway.
+    If the package ``tf2_msgs`` is missing, nothing is published; bags have the transforms anyway.
     """
 
     def __init__(
@@ -341,8 +341,8 @@ class ClearancePublisher:
     ) -> ClearancePublisher | None:
         """Return the publisher of a plant among obstacles; None if no links could touch.
 
-        ``before`` is the publisher among the obstacles so far, whose topic continues;
-        ``has_contact_forces`` is that of :class:`.ClearanceMonitor`.
+        ``before`` is the publisher for the previous obstacles, whose topic is reused;
+        ``has_contact_forces``: see :class:`.ClearanceMonitor`.
         """
         # Not every plant measures distances.
         from spacerobot_ros.simulation.clearance import ClearanceMonitor
@@ -363,9 +363,9 @@ class ClearancePublisher:
         self._plant = plant
 
     def look(self, time_ns: int, *, publishes: bool) -> tuple[str, ...] | None:
-        """Report contacts that have begun or ended, and return those there are; None: as before.
+        """Report contacts that have begun or ended; return the current ones, or None if unchanged.
 
-        ``publishes``: the present clearance is published, too.
+        ``publishes``: also publish the current clearance.
         """
         plant = self._plant
         status, events = self._monitor.measure(
@@ -398,7 +398,7 @@ class LinkMarkers:
         self._plant = plant
 
     def publish(self, time_ns: int) -> None:
-        """Publish the markers of all visuals at their present poses."""
+        """Publish the markers of all visuals at their current poses."""
         if not self._markers.draws_anything:
             return
         plant = self._plant

@@ -1,1 +1,1 @@
-"""The node of the page on which a robot is watched and steered."""
+"""The node that serves the page for watching and steering a robot."""

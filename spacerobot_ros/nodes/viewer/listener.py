@@ -1,9 +1,9 @@
 """Collects topics of the stack into one :class:`~spacerobot_ros.viewer.state.StackState`.
 
 The plant publishes its state hundreds or thousands of times a second; a page is drawn twenty times
-a second. Streams are therefore subscribed by a node that is not spun: the middleware keeps the last
-message of each, which alone is taken and read when the page is drawn. Subscriptions are best
-effort, so that no publisher waits for the viewer.
+a second. A node that is not spun therefore subscribes to the streams: the middleware keeps only the
+last message of each, which is read when the page is drawn. Subscriptions are best effort, so that
+no publisher waits for the viewer.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ LATEST_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 """QoS of streams: only the last message is kept, without acknowledgement."""
 
 _MAX_CALL_INTERVAL = 1.5
-"""Wall time between two calls after which this process counts as suspended meanwhile, s."""
+"""Longest wall time between two calls unless this process was suspended, s."""
 
 _TIME_UNTIL_SILENT_NODE_IS_HIDDEN = 60.0
 """Wall time after which a silent node and its last reports are no longer shown, s."""
@@ -56,15 +56,15 @@ _JITTER_NS = 200_000
 """Jitter of the time between two messages published in one tick, wall ns."""
 
 _LONGEST_EXPECTED_DELAY_NS = SECOND
-"""Wall time after which a plant counts as one that publishes no expected momenta, ns."""
+"""Wall time after which a plant is assumed to publish no expected momenta, ns."""
 
 _REFUSED = " A later goal is refused: "
-"""Between the message about the goal that is pursued and the reason of a refusal."""
+"""Text between the message about the pursued goal and the reason for a refusal."""
 
 _MAX_PATH_POINTS = 1000
 
 _MAX_MOTION_POINTS = 200
-"""Largest number of poses and shapes of a planned motion: links are placed at each."""
+"""Largest number of configurations of a planned motion: links are placed at each."""
 
 M = TypeVar("M")
 
@@ -111,14 +111,14 @@ class Listener:
     streams
         A node that is not spun, for streams of states.
     node
-        The viewer node, whose callbacks take statuses, goals and heartbeats.
+        The viewer node, whose callbacks receive statuses, goals and heartbeats.
     frame
         Frame of the goals.
     on_status
         Called for every status with ``plant``, ``planner``, ``controller`` or ``replay`` and the
         full name of the node that published it.
     silent_after
-        Wall time without a heartbeat after which an active node counts as silent, s; 0: none does.
+        Wall time without a heartbeat after which an active node is silent, s; 0: never.
     """
 
     def __init__(
@@ -150,14 +150,14 @@ class Listener:
         self._planned: Array | None = None
         self._path: _PlannedPath | None = None
         self._last_schedule: JointTrajectory | None = None
-        """Latched, it may come before the robot whose joints it moves."""
+        """It is latched, so it may arrive before the robot whose joints it moves."""
         self._schedule: _Schedule | None = None
         self._motion: Array | None = None
         self._goals: dict[Part, Goal] = {}
         self._pursued_goals: dict[Part, Goal] = {}
-        """Goals when the one that is pursued was begun."""
+        """Goals at the start of the pursued goal."""
         self._pursued: dict[str, Any] = {}
-        """The last status of a goal that is pursued, by kind of status."""
+        """The last status of the pursued goal, by kind of status."""
         self.forget_state()
         for topic, key, read in (
             ("plant/status", "plant", PlantStatus.from_values),
@@ -246,7 +246,7 @@ class Listener:
         )
 
     def time_ns(self) -> int:
-        """Return the simulated time of the last state, ns; the wall's before the first."""
+        """Return the simulated time of the last state, ns; wall time before the first state."""
         if self._measured is None:
             return time.time_ns()
         return round(self._measured.time_s * SECOND)
@@ -501,7 +501,7 @@ class _Heartbeat:
     role: str
 
     def is_alive(self, now: float, silent_after: float) -> bool:
-        """Whether the node is active and not silent: for less than ``silent_after`` s."""
+        """Whether the node is busy, or active and silent for at most ``silent_after`` s."""
         return self.pulse is HeartbeatState.BUSY or (
             self.pulse is HeartbeatState.ACTIVE and now - self.at <= silent_after
         )

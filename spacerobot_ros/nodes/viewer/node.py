@@ -1,4 +1,4 @@
-"""The viewer node: topics to the state of the page, actions of its users to topics and services."""
+"""The viewer node: converts topics to the page's state, and user actions to topics and services."""
 
 from __future__ import annotations
 
@@ -132,8 +132,8 @@ class ViewerNode(FlightNode):
         self.url = url_of(self._server)
         if not is_loopback(config.host):
             self.get_logger().warning(
-                f"The page is served at '{config.host}': whoever reaches this machine there can "
-                "steer the robot."
+                f"The page is served at '{config.host}': anyone who can reach this machine there "
+                "can steer the robot."
             )
         self._page = Page(self._server, config)
         self._page.show_robot(None)
@@ -204,7 +204,7 @@ class ViewerNode(FlightNode):
             streams.destroy_node()
 
     def destroy_node(self) -> None:
-        """Close the page, whatever state the node is in."""
+        """Close the page, in any state of the node."""
         self.cleanup()
         super().destroy_node()
 
@@ -448,7 +448,9 @@ class ViewerNode(FlightNode):
                 self._unanswered_goal = goal_id, now + _LONGEST_GOAL_ANSWER_WAIT
             elif now >= until:
                 self._unanswered_goal = None
-                self._answer("No planner or controller has answered the goal: send it again.", 2)
+                self._answer(
+                    "No planner or controller has responded to the goal: send it again.", 2
+                )
 
     def _count_readers(self, goals: Mapping[Part, Goal]) -> int:
         """Return how many planners and controllers hear a goal, at most."""
@@ -470,7 +472,7 @@ class ViewerNode(FlightNode):
             aim = goal.end_effectors[0].as_goal() if goal.end_effectors else goal
             self._goal_topics[part].publish(goal_message(aim, self.config.world_frame, time_ns))
         if not self._count_readers(goals):
-            self._answer("No planner or controller takes the goal: none is running.", 2)
+            self._answer("No planner or controller receives the goal: none is running.", 2)
         else:
             self._answer("Goal sent.")
             goal_id = GoalIds().of(*divmod(min(time_ns, LATEST_NS), SECOND))
