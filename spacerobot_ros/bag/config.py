@@ -21,7 +21,9 @@ class RecorderConfig(WatchdogConfig):
     )
     topics: str = parameter("", "names to record, separated by spaces; '': all of the stack")
     compression: str = parameter("zstd", "compression of chunks", choices=("zstd", "lz4", "none"))
-    clock_wait: float = parameter(2.0, "wall time to wait for a clock before using the wall's", "s")
+    clock_wait: float = parameter(
+        2.0, "wall time to wait for a clock before wall time is used", "s"
+    )
     describe: str = parameter("", "JSON file of named objects to put into the bag as metadata")
     diagnostics_period: float = nonnegative(
         0.0, "wall time between diagnostics; 0: losses only", "s"
@@ -32,7 +34,7 @@ class RecorderConfig(WatchdogConfig):
         "s",
     )
     flush_period: float = parameter(
-        0.5, "longest wall time of messages that a killed recorder can lose", "s", minimum=0.01
+        0.5, "longest wall time for which a killed recorder loses messages", "s", minimum=0.01
     )
     max_size: float = nonnegative(
         0.0, "file size after which the next file (NAME_0, NAME_1, ...) begins; 0: never", "MB"
@@ -52,7 +54,7 @@ class ReplayConfig:
     duration: float = nonnegative(0.0, "how much of the bag to replay; 0: all", "s")
     loop: bool = parameter(False, "repeat the replay when it ends")
     topics: str = parameter("", "names to replay, separated by spaces; '': all")
-    remap: str = parameter("", "other names for topics: 'old:=new', separated by spaces")
+    remap: str = parameter("", "new names of topics: 'old:=new', separated by spaces")
     clock: float = nonnegative(
         0.0, "publish bag time on /clock at this rate; 0: as recorded", "Hz", maximum=10000.0
     )

@@ -1,7 +1,7 @@
 """The file of a bag: MCAP with the metadata of rosbag2.
 
-``mcap.writer.Writer`` makes the records. Here is what it leaves to its caller: a file that is
-locked, never written over, and whole up to its last record after any kill or on a full disk.
+``mcap.writer.Writer`` makes the records. This module adds a file that is locked, never overwritten,
+and complete up to its last record after any kill or on a full disk.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class QosProfile:
     history
         ``keep_last``, ``keep_all``, ``system_default`` or ``unknown``.
     depth
-        How many messages ``keep_last`` keeps.
+        Number of messages that ``keep_last`` keeps.
     reliability
         ``reliable``, ``best_effort``, ``system_default``, ``best_available`` or ``unknown``.
     durability
@@ -58,7 +58,7 @@ class QosProfile:
     liveliness
         ``automatic``, ``manual_by_topic``, or as above.
     liveliness_lease_duration_ns
-        How long a silent publisher counts as alive, in nanoseconds.
+        Time for which a silent publisher is considered alive, in nanoseconds.
     avoid_ros_namespace_conventions
         Whether the topic is a bare DDS topic.
     """
@@ -197,7 +197,7 @@ def _rosbag2_metadata(
 # -- the file ---------------------------------------------------------------------------------
 
 _MESSAGE_HEAD_SIZE = 31
-"""Length of what precedes the data of a message in a chunk, bytes."""
+"""Length of the header before the data of a message in a chunk, bytes."""
 
 
 class BagExistsError(RecordingError):
@@ -248,21 +248,21 @@ class _Tail:
         return self.start + len(self.data)
 
     def flush(self) -> None:
-        """Do nothing: the library calls it."""
+        """Do nothing; the library calls this method."""
 
 
 class McapFile:
     """An MCAP file that grows by whole chunks.
 
-    Every chunk, attachment and metadata record goes to the operating system at once, and one that
-    fails is undone, so that the file of a process that dies is whole but for the record that it was
-    appending. While it is open it is locked: no second one can be opened on the same path. A call
-    that adds something raises RecordingError where the disk refuses it; the file is then as it was,
-    and has to be closed.
+    Every chunk, attachment and metadata record goes to the operating system at once, and a failed
+    one is undone. If the process dies, the file is complete except for the record being appended.
+    An open file is locked: no second one can be opened on the same path. If the disk is full or
+    fails, calls that add records raise RecordingError; the file is then unchanged and must be
+    closed.
 
-    The folders of ``path`` are made; ``compression``, ``chunk_size`` and ``overwrite`` are those of
-    :class:`~spacerobot_ros.bag.BagWriter`, ``profile`` is that of the MCAP header. RecordingError
-    if the file cannot be made; BagExistsError if it is there, or is being written.
+    The folders of ``path`` are created. For ``compression``, ``chunk_size`` and ``overwrite`` see
+    :class:`~spacerobot_ros.bag.BagWriter`; ``profile`` is the profile in the MCAP header. Raises
+    RecordingError if the file cannot be created, BagExistsError if it exists or is being written.
     """
 
     def __init__(
@@ -276,7 +276,7 @@ class McapFile:
     ) -> None:
         self.path = path
         self.message_counts: Counter[int] = Counter()
-        """Number of messages by channel, those in the chunk in progress too."""
+        """Number of messages by channel, including the chunk in progress."""
         self.start_ns: int | None = None
         self.end_ns: int | None = None
         """Log times of the earliest and the latest message, ns."""
@@ -304,16 +304,16 @@ class McapFile:
 
     @property
     def size(self) -> int:
-        """Number of bytes that the operating system has."""
+        """Number of bytes handed to the operating system."""
         return self._tail.start
 
     def check(self) -> None:
-        """Check that the path still names this file, uncut; else raise RecordingError."""
+        """Raise RecordingError unless the path still names this file with its full size."""
         problem = ""
         try:
             ours, theirs = os.fstat(self._raw.fileno()), os.stat(self.path)
             if (ours.st_dev, ours.st_ino) != (theirs.st_dev, theirs.st_ino):
-                problem = "another file is in its place"
+                problem = "another file replaced it"
             elif ours.st_size != self.size:
                 problem = f"it has {ours.st_size} bytes, and {self.size} were written"
         except FileNotFoundError:
@@ -324,7 +324,7 @@ class McapFile:
             raise RecordingError(f"The bag {self.path} is lost while it is written: {problem}.")
 
     def add_schema(self, name: str, encoding: str, data: bytes) -> int:
-        """Add the definition of a type, and return its number."""
+        """Add the definition of a type; return its number."""
         number = self._library.register_schema(name, encoding, data)
         self._commit_full_chunk()
         return number

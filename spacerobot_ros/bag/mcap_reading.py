@@ -1,9 +1,9 @@
-"""Reads records, summary and messages of MCAP files that anybody may have written.
+"""Reads records, summary and messages of MCAP files from untrusted sources.
 
-The records are parsed by ``mcap``. Values are checked before use: a record lies inside of its file,
-a chunk holds as much as it claims to, and all chunks of a bag together inflate to no more than a
-limit. A violation is a ``ValueError`` that names the byte; :class:`BagFile` turns it into a message
-for users.
+The records are parsed by ``mcap``. Values are checked before use: records end within the file,
+chunks have the size they claim, and all chunks of a bag together inflate to no more than a limit. A
+violation is a ``ValueError`` that names the byte; :class:`BagFile` turns it into a message for
+users.
 """
 
 from __future__ import annotations
@@ -48,19 +48,19 @@ from spacerobot_ros.files import irregular_kind
 RecordT = TypeVar("RecordT", bound=McapRecord)
 
 INFLATED_SIZE_VARIABLE = "SPACEROBOT_BAG_LIMIT"
-"""Environment variable: how many MB a bag may inflate to, however small its file is."""
+"""Environment variable: number of MB to which even a small bag may inflate."""
 
 _DEFAULT_LIMIT_MB = 32.0
 """Default limit of the inflated size of a bag, MB."""
 
 _MAX_INFLATION_RATIO = 200
-"""Largest ratio of inflated size to file size of a bag above the limit in MB. Telemetry has
-3 to 40, bags made to fill the memory 1000 and more."""
+"""Largest ratio of inflated size to file size of a bag above the limit in MB. Telemetry has ratios
+of 3 to 40, malicious bags 1000 and more."""
 
 _UNPACKED_AT_ONCE = 1 << 20  # bytes
 
 _SQLITE_MAGIC = b"SQLite f"
-"""First eight bytes of the files of rosbag2's other storage."""
+"""First eight bytes of files of rosbag2's SQLite storage."""
 
 _RECORD_HEAD = struct.Struct("<BQ")
 """Head of a record: opcode and length of the body in bytes."""
@@ -95,8 +95,8 @@ def open_file(path: Path, content: Path | None = None) -> Iterator[BinaryIO]:
     Raises
     ------
     RecordingError
-        There is no such file, it is not a regular file, or it cannot be read, or a record turns out
-        damaged, while the context lasts.
+        There is no such file, it is not a regular file, it cannot be read, or a damaged record is
+        found within the context.
     """
     content = content or path
     try:
@@ -113,12 +113,12 @@ def open_file(path: Path, content: Path | None = None) -> Iterator[BinaryIO]:
 
 
 class RecordedChannel(NamedTuple):
-    """A channel of a file: a topic as one publisher offered it."""
+    """A channel of a file: a topic of one publisher."""
 
     number: int
     topic: str
     encodings: tuple[str, str]
-    """Of the messages, and of their definition."""
+    """Encodings of the messages and of their definition."""
     type_name: str
     definition: bytes
     offered_qos: str
@@ -129,7 +129,7 @@ class RecordedChannel(NamedTuple):
 class BagFile:
     """One MCAP file of a bag, and its summary.
 
-    A file that was compressed as a whole, as ``NAME.mcap.zstd`` of rosbag2, is unpacked into a
+    A file that was compressed as a whole, such as ``NAME.mcap.zstd`` of rosbag2, is unpacked to a
     temporary file, which is deleted with this object.
 
     Parameters
@@ -174,12 +174,12 @@ class BagFile:
 
     @contextmanager
     def open(self) -> Iterator[BinaryIO]:
-        """Open the file; turn every defect of it into an error of one sentence.
+        """Open the file; convert every defect into an error of one sentence.
 
         Raises
         ------
         RecordingError
-            As of the class, or a record turns out damaged while the context lasts.
+            See the class; also raised if a damaged record is found within the context.
         """
         with open_file(self.path, self._content) as file:
             _require_magic_bytes(self.path, file)
@@ -242,7 +242,7 @@ def file_size(file: BinaryIO) -> int:
 
 
 def records(file: BinaryIO, start: int) -> Iterator[tuple[int, int, bytes]]:
-    """Iterate over the records from a byte on: where each begins, its opcode, all of its bytes."""
+    """Iterate over the records from a byte offset: start, opcode and bytes of each."""
     end = file_size(file)
     while start < end:
         file.seek(start)
@@ -253,7 +253,7 @@ def records(file: BinaryIO, start: int) -> Iterator[tuple[int, int, bytes]]:
         left = end - start - len(head)
         if length > left:
             raise ValueError(
-                f"the record at byte {start} claims {length} bytes, where {left} are left"
+                f"the record at byte {start} claims {length} bytes, but only {left} are left"
             )
         yield start, opcode, head + file.read(length)
         start += len(head) + length
@@ -344,7 +344,7 @@ _DECOMPRESSORS: dict[str, Callable[[bytes, int], bytes]] = {
     "lz4": lambda data, most: lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=most),
     "": lambda data, _: data,
 }
-"""Decompressor by name: it takes the data and how many bytes it returns at most."""
+"""Decompressor by name, a function of the data and the largest number of bytes to return."""
 
 
 # -- summary ----------------------------------------------------------------------------------
@@ -425,7 +425,7 @@ class _Wanted:
         self.start_ns, self.end_ns = min(start_ns, _LATEST_TIME_NS), min(end_ns, _LATEST_TIME_NS)
 
     def may_be_in(self, index: ChunkIndex) -> bool:
-        """Whether a chunk may hold such messages."""
+        """Whether a chunk may contain wanted messages."""
         channels = list(index.message_index_offsets)
         return (
             index.message_start_time <= self.end_ns
@@ -437,7 +437,7 @@ class _Wanted:
 def blocks_in_file_order(file: BagFile, topics: Sequence[str]) -> Iterator[MessageBlock]:
     """Iterate over messages of a file in the order they were written, chunk by chunk.
 
-    ``topics`` are those to read; errors are those of :meth:`BagFile.open`.
+    ``topics``: the topics to read. Errors: see :meth:`BagFile.open`.
     """
     with file.open() as opened:
         yield from _blocks_of_records(opened, _Wanted(file, topics))
@@ -481,7 +481,7 @@ class _Section(NamedTuple):
 
     start_ns: int
     written: tuple[int, int]
-    """Number of the file, and byte in it."""
+    """Number of the file, and byte offset in it."""
     end_ns: int
     chunk: ChunkIndex | None
 
@@ -492,11 +492,11 @@ def blocks_in_time_order(
     start_ns: int = 0,
     end_ns: int = _LATEST_TIME_NS,
 ) -> Iterator[MessageBlock]:
-    """Iterate over messages of a bag by log time, those of one time in the order they were written.
+    """Iterate over messages of a bag by log time, then by the order in which they were written.
 
-    The messages are those of a bag's files on some topics, with log times in a span (ns). Each
-    block has those of chunks whose times overlap; only these are in memory together. Errors are
-    those of :meth:`BagFile.open`.
+    Only messages on these topics with log times in the span (ns) are returned. A block has the
+    messages of chunks with overlapping times; only these are in memory together. Errors: see
+    :meth:`BagFile.open`.
     """
     wanted = [_Wanted(file, topics, start_ns, end_ns) for file in files]
     sections = [

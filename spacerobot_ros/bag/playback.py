@@ -1,4 +1,4 @@
-"""Times at which messages of a replay are due, without a clock or a publisher."""
+"""Determines when messages of a replay are due, without a clock or a publisher."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class ReplayTopic:
 
 @dataclass(frozen=True)
 class ReplayStatus:
-    """State of a replay, as replay/status carries it.
+    """State of a replay, as published on replay/status.
 
     Attributes
     ----------
@@ -45,7 +45,7 @@ class ReplayStatus:
     paused, ended
         Whether the replay is paused, and whether all messages have been published.
     rate
-        Seconds of the bag in a second of the wall clock.
+        Seconds of bag time per second of the wall clock.
     """
 
     position_s: float
@@ -61,7 +61,7 @@ class ReplayStatus:
 
     @classmethod
     def from_values(cls, values: Mapping[str, str]) -> ReplayStatus:
-        """Return the status that :meth:`to_values` has turned into these pairs.
+        """Return the status from the pairs of :meth:`to_values`.
 
         Raises
         ------
@@ -92,16 +92,16 @@ class ReplayMessage:
 
 
 class SubscriberWait:
-    """Decides when a replay may begin: when all known readers are matched and no more come.
+    """Decides when a replay may begin: once all known readers are matched and no more appear.
 
     Parameters
     ----------
     period
         Time between two checks, s.
     longest
-        When to begin in any case, s.
+        Longest wait, s.
     settled
-        Time without a new reader after which all are taken to be there, s.
+        Time without a new reader after which no more are expected, s.
     """
 
     def __init__(self, period: float, longest: float, settled: float = 0.3) -> None:
@@ -149,7 +149,7 @@ class Playback:
     """The messages of a bag, due by their log times.
 
     The last messages of latched topics before the start are due at once:
-    a subscriber of such a topic expects its last message whenever it subscribes.
+    a subscriber of a latched topic always expects its last message.
 
     Parameters
     ----------
@@ -158,18 +158,18 @@ class Playback:
     topics
         Names to play; empty for all.
     rate
-        Seconds of the bag in a second of the clock.
+        Seconds of bag time per second of the clock.
     start
         Start, in seconds from the first message.
     duration
-        How much to play, in seconds of the bag; 0 for all.
+        Duration to play, in seconds of the bag; 0 for all.
     loop
         Whether to begin again at the end.
 
     Raises
     ------
     RecordingError
-        The bag has no such topic, or no message there.
+        The bag has no such topic, or no message to replay.
     """
 
     def __init__(
@@ -200,11 +200,11 @@ class Playback:
         self._rate = rate
         self._bag_ns = self._start_ns
         self._clock_ns: int | None = None
-        """Time of the clock when that of the bag was `_bag_ns`; None: time stands still there."""
+        """Clock time at bag time `_bag_ns`; None: bag time is stopped there."""
         self._begin()
         if self._next_message is None:
             raise RecordingError(
-                f"The bag {bag.path} has no message to replay from {start:g} s on"
+                f"The bag {bag.path} has no message to replay from {start:g} s"
                 + (f" for {duration:g} s" if duration else "")
                 + f": it lasts {(bag.end_time_ns - bag.start_time_ns) / SECOND:g} s."
             )
@@ -223,7 +223,7 @@ class Playback:
         return min(now, max(self._next_message.log_time_ns, self._start_ns))
 
     def run(self, clock_ns: int) -> None:
-        """Let time advance; ``clock_ns`` is the present time of the clock."""
+        """Let time advance; ``clock_ns`` is the current time of the clock."""
         if self._clock_ns is None:
             self._clock_ns = clock_ns
 
@@ -237,7 +237,7 @@ class Playback:
         Raises
         ------
         RecordingError
-            The bag turns out damaged.
+            The bag is damaged.
         """
         taken: list[ReplayMessage] = []
         while self._next_message is not None and self._clock_ns is not None:
@@ -261,16 +261,16 @@ class Playback:
         return self._take_next_message()
 
     def seek(self, bag_ns: int, clock_ns: int) -> list[ReplayMessage]:
-        """Jump to ``bag_ns`` in the bag, or to its nearer end; a pause continues.
+        """Jump to ``bag_ns``, limited to the replayed part of the bag; a pause continues.
 
-        Returns the messages that a subscriber would have by then: of each topic the last one, if
-        it is latched or no older than a second. In a pause at the beginning these are the first
+        Returns the messages that a subscriber would have by then: the last one of each topic if it
+        is latched or at most a second old. During a pause at the beginning, these are the first
         messages, which are published again when time continues.
 
         Raises
         ------
         RecordingError
-            The bag turns out damaged.
+            The bag is damaged.
         """
         at = min(max(bag_ns, self._start_ns), self._last_ns)
         recent = max(at - _MAX_AGE_REPUBLISHED_AFTER_SEEK_NS, self._start_ns)

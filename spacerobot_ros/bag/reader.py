@@ -47,14 +47,14 @@ Array = NDArray[np.float64]
 _STRING_TYPE = "std_msgs/msg/String"
 
 _MAX_DECODED_BYTES, _MAX_DECODED_TO_FILE_RATIO = 16_000_000, 50
-"""Largest size of a decoded topic, whose objects take ten times as much: bytes, or how many times
-the size of the file."""
+"""Largest size of a topic to decode, in bytes or relative to the file's size. Its objects take ten
+times as much."""
 
 
 def read_bag(path: str | os.PathLike[str]) -> Bag:
-    """Open a bag for reading; nothing but its summary is read until asked for.
+    """Open a bag for reading; at first, only its summary is read.
 
-    ``path`` is an MCAP file, a folder of one bag, as ``ros2 bag record`` makes it, or the name
+    ``path`` is an MCAP file, a folder with one bag, as ``ros2 bag record`` makes it, or the name
     ``NAME.mcap`` of a recording that was split into ``NAME_0.mcap``, ``NAME_1.mcap``, ... All files
     of a folder or a recording are one bag.
 
@@ -77,7 +77,7 @@ def iterate_raw(path: str | os.PathLike[str]) -> Iterator[tuple[str, str, int, i
     Raises
     ------
     RecordingError
-        As of :func:`read_bag`, when the first message or a damaged one is asked for.
+        See :func:`read_bag`; raised when the first message or a damaged one is requested.
     """
     for file in map(BagFile, bag_files(Path(path))):
         types = {channel.topic: channel.type_name for channel in file.channels}
@@ -98,7 +98,7 @@ def salvaged_copy(path: Path) -> Path:
 def bag_files(path: Path) -> list[Path]:
     """Return the files of a bag in order: all of a folder or a split recording, or one file.
 
-    Of several files, salvaged copies take the place of those that were cut.
+    If there are several files, salvaged copies replace truncated ones.
 
     Raises
     ------
@@ -159,14 +159,14 @@ def _listed_files(folder: Path) -> list[str]:
 class Bag(Mapping[str, TopicSeries]):
     """A bag as time series: ``bag["odom"].field("pose.pose.position.x")``.
 
-    It is a mapping from the names of its topics, with the slash before them or without, to their
-    messages. A topic is read on first access and kept. The file is not held open.
+    It maps the names of its topics, with or without the leading slash, to their messages. A topic
+    is read on first access and cached. The file is not kept open.
 
     Raises
     ------
     RecordingError
-        From the constructor, as :func:`read_bag`; from methods, if there is no such topic, the bag
-        is damaged, or pandas or xarray is not installed.
+        In the constructor, see :func:`read_bag`; in methods, if there is no such topic, the bag is
+        damaged, or pandas or xarray is not installed.
     """
 
     def __init__(self, path: Path, files: Sequence[Path] | None = None) -> None:
@@ -242,18 +242,19 @@ class Bag(Mapping[str, TopicSeries]):
     def _recorded_name(self, topic: str) -> str:
         """Return the recorded name of a topic, which may be given without its leading slash."""
         if not isinstance(topic, str):
-            raise TypeError(f"The name of a topic is a text, such as 'odom', and not {topic!r}.")
+            raise TypeError(f"The name of a topic is a text, such as 'odom', not {topic!r}.")
         other = topic[1:] if topic.startswith("/") else f"/{topic}"
         return other if topic not in self.topics and other in self.topics else topic
 
     @cached_property
     def metadata(self) -> dict[str, dict[str, str]]:
-        """Keys and values of every metadata record by its name; the last of equal names counts."""
+        """Keys and values of every metadata record by name; the last of equal names takes
+        precedence."""
         return {each.name: each.metadata for each in self._records(Metadata)}
 
     @cached_property
     def attachments(self) -> dict[str, bytes]:
-        """Content of every attachment by its name; the last of equal names counts."""
+        """Content of every attachment by name; the last of equal names takes precedence."""
         return {each.name: each.data for each in self._records(Attachment)}
 
     def _records(self, kind: type[RecordT]) -> Iterator[RecordT]:
@@ -340,12 +341,12 @@ class Bag(Mapping[str, TopicSeries]):
     def to_pandas(
         self, topic: str | None = None, *, euler: bool = False
     ) -> pandas.DataFrame | dict[str, pandas.DataFrame]:
-        """Return a topic as a table of pandas, or every topic that can be read by its name.
+        """Return a topic as a pandas DataFrame, or all readable topics by name.
 
         The index is the log time in seconds, ``attrs["units"]`` has the units of the columns; see
-        :func:`~spacerobot_ros.bag.tables.table_of` for the columns. With ``euler`` the columns
-        ``roll``, ``pitch`` and ``yaw`` have the rotations of each attitude about the fixed axes x,
-        y, z (rad).
+        :func:`~spacerobot_ros.bag.tables.table_of` for the columns. If ``euler`` is set, the
+        columns ``roll``, ``pitch`` and ``yaw`` have the rotations of each attitude about the fixed
+        axes x, y, z (rad).
         """
         if topic is not None:
             return to_pandas(self.table(topic, euler=euler))
@@ -360,10 +361,10 @@ class Bag(Mapping[str, TopicSeries]):
     def to_xarray(
         self, topic: str | None = None, *, euler: bool = False
     ) -> xarray.Dataset | dict[str, xarray.Dataset]:
-        """Return a topic as a dataset of xarray, or every topic that can be read by its name.
+        """Return a topic as an xarray Dataset, or all readable topics by name.
 
-        Arrays stay arrays, over ``time`` and ``joint`` for joint states; every variable has its
-        ``units``. ``euler`` is that of :meth:`to_pandas`.
+        Arrays remain arrays, over ``time`` and ``joint`` for joint states; every variable has its
+        ``units``. ``euler``: see :meth:`to_pandas`.
         """
         if topic is not None:
             return to_xarray(self.table(topic, euler=euler))
@@ -372,16 +373,16 @@ class Bag(Mapping[str, TopicSeries]):
     def table(self, topic: str, *, euler: bool = False) -> TopicTable:
         """Return a topic as a table; the units of joints follow the URDF in the bag.
 
-        ``euler``: whether attitudes have ``roll``, ``pitch`` and ``yaw`` as well.
+        ``euler``: whether to add ``roll``, ``pitch`` and ``yaw`` of attitudes.
         """
         series = self[topic]
         found = table_of(series, self._prismatic_joints(series.topic.rpartition("/")[0]))
         return with_euler_angles(found) if euler else found
 
     def tables(self, *, euler: bool = False) -> dict[str, TopicTable]:
-        """Return every topic that can be read as a table; a warning names the others.
+        """Return all readable topics as tables; a warning names the others.
 
-        ``euler`` is that of :meth:`table`.
+        ``euler``: see :meth:`table`.
 
         Raises
         ------
@@ -403,16 +404,16 @@ class Bag(Mapping[str, TopicSeries]):
             if not found:
                 raise reason
             warn_once(
-                f"{len(refused)} topic(s) of the bag {self.path} are left out: "
+                f"{len(refused)} topic(s) of the bag {self.path} are omitted: "
                 f"{_format_list(list(refused))}. {reason}"
             )
         return found
 
     def robot_descriptions(self, namespace: str = "", *, others: bool = True) -> list[bytes]:
-        """Return texts that may be the URDF of the robot in a namespace, the likeliest first.
+        """Return candidates for the URDF of the robot in a namespace, the likeliest first.
 
-        The file attached for the robot comes first, then its last robot_description, then, unless
-        they are not wanted, ``others`` that are attached.
+        The file attached for the robot comes first, then its last robot_description, then, if
+        ``others`` is set, the other attached ones.
         """
         topic = f"{namespace}/robot_description"
         attached = {n: text for n, text in self.attachments.items() if n.endswith(".urdf")}
@@ -443,9 +444,9 @@ class Bag(Mapping[str, TopicSeries]):
         return self._series_by_topic[topic]
 
     def load(self, topics: Iterable[str]) -> None:
-        """Read topics together, in one pass over the file; those that cannot be read are omitted.
+        """Read topics together, in one pass over the file; unreadable ones are omitted.
 
-        Each is in memory from then on.
+        They stay in memory.
         """
         types = {}
         wanted = {self._recorded_name(topic) for topic in topics}
@@ -550,7 +551,7 @@ class RecordedRobot:
         return self.get(name) is not None
 
     def load(self, names: Iterable[str]) -> None:
-        """Read topics of the stack together, as far as the bag has them: see :meth:`Bag.load`."""
+        """Read the topics of the stack that the bag has, together: see :meth:`Bag.load`."""
         types = {f"{self.namespace}/{name}": topic_named(name).type for name in names}
         self.bag.load(topic for topic, kind in types.items() if self.bag.topics.get(topic) == kind)
 
@@ -570,7 +571,7 @@ class RecordedRobot:
 
     @property
     def metadata(self) -> dict[str, dict[str, str]]:
-        """Metadata records of the bag by name, those of this robot's nodes as ``parameters/NODE``.
+        """Metadata records of the bag by name; this robot's nodes have ``parameters/NODE``.
 
         A recorder in the namespace of the robot uses these names.
         """
@@ -596,5 +597,5 @@ class RecordedRobot:
 
     @property
     def urdf(self) -> bytes | None:
-        """The description of the robot: the attached file, or else the last message about it."""
+        """The description of the robot: the attached file, or else the last robot_description."""
         return next(iter(self.bag.robot_descriptions(self.namespace, others=False)), None)

@@ -30,7 +30,7 @@ class RecordingState(Enum):
     """Messages are written with the wall time of their arrival."""
 
     FAILED = "failed"
-    """Messages are dropped because the disk is full or gone; messages written before stay."""
+    """Messages are dropped because the disk is full or lost; earlier messages are kept."""
 
     CLOSED = "closed"
     """Messages are dropped because the bag is complete."""
@@ -51,8 +51,8 @@ class _EarlyMessage(NamedTuple):
 class Recording:
     """Writes messages with one time base for the whole bag; begins paused.
 
-    Messages carry the time of the clock; those before its first message carry the time of that
-    message. If no clock is published for ``clock_wait``, all carry the wall time of their arrival.
+    Messages get the time of the clock; messages before its first message get the time of that
+    message. If no clock is published for ``clock_wait``, all get the wall time of their arrival.
     The choice is final, because a bag has one time base.
 
     Parameters
@@ -60,7 +60,7 @@ class Recording:
     writer
         The bag, which is closed with the recording.
     clock_wait
-        How long the first message waits for a clock, wall time in s.
+        Longest wait of the first message for a clock, wall time in s.
     on_failure
         Called once, with the reason, if writing fails.
     wall_time
@@ -81,7 +81,7 @@ class Recording:
         self.messages = 0
         """Number of messages written to the bag."""
         self.clock_steps_back = 0
-        """How often the clock has gone back: once by a restart, again and again by two clocks."""
+        """Number of times the clock went back: once at a restart, repeatedly with two clocks."""
         self.lost: Counter[str] = Counter()
         """Number of messages of each topic that were published but never received."""
         self.attached: set[str] = set()
@@ -93,7 +93,7 @@ class Recording:
         self._on_failure = on_failure
         self._wall_time = wall_time
         self.early_messages: list[_EarlyMessage] = []
-        """Messages that wait for the time base of the bag."""
+        """Messages that wait until the time base of the bag is chosen."""
         self._time_base: RecordingState | None = None
         self._write = writer.write
 
@@ -165,11 +165,11 @@ class Recording:
         self._fail_on_error(self.writer.check)
 
     def describe(self, name: str, values: dict[str, str]) -> None:
-        """Put named values into the bag."""
+        """Write named values into the bag."""
         self._fail_on_error(lambda: self.writer.add_metadata(name, values))
 
     def attach_robot(self, name: str, urdf: bytes) -> None:
-        """Attach a robot description, and those of its meshes that exist on this machine."""
+        """Attach a robot description and its meshes, if they exist on this machine."""
         # Importing the robot model doubles the import time of this module.
         from spacerobot_ros.model.urdf import parse_robot
         from spacerobot_ros.model.visuals import meshes_for_bag
@@ -181,12 +181,13 @@ class Recording:
                     self.attach(mesh, data, "model/stl")
 
     def attach(self, name: str, data: bytes, media_type: str) -> None:
-        """Put a whole file into the bag."""
+        """Attach a file to the bag."""
         self.attached.add(name)
         self._fail_on_error(lambda: self.writer.add_attachment(name, data, media_type, self.now_ns))
 
     def close(self) -> None:
-        """Write the remaining data and the counts of messages, and complete the bag; once.
+        """Write the remaining data and the message counts, and complete the bag, unless done
+        already.
 
         Raises
         ------

@@ -50,7 +50,7 @@ from spacerobot_ros.times import SECOND
 
 _STATE_TOPICS = ("odom", "joint_states", "momentum")
 _WITHOUT_STATES = ("inactive", "failed")
-"""States of a plant that publishes no states of the robot."""
+"""Plant states without published robot states."""
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ class Salvaged:
     loss_reason
         Why the first lost chunk could not be read; empty if no chunk is lost.
     lost_bytes
-        Bytes after the last complete record, which only the old bag has.
+        Bytes after the last complete record, which are not in the new bag.
     """
 
     path: Path
@@ -82,16 +82,16 @@ class Salvaged:
 def salvage_bag(
     path: str | os.PathLike[str], out: str | os.PathLike[str] | None = None
 ) -> Salvaged:
-    """Write the readable records of a bag into a new, complete one; the old one stays as it is.
+    """Write the readable records of a bag into a new, complete one; the old one is unchanged.
 
-    ``out`` is the new file, which must not exist; by default ``NAME-salvaged.mcap`` beside the old
-    one. Of a bag of several files the first that needs it is salvaged.
+    ``out`` is the new file, which must not exist; by default ``NAME-salvaged.mcap`` next to the old
+    one. If a bag has several files, the first incomplete one is salvaged.
 
     Raises
     ------
     RecordingError
-        There is no such bag, it is not MCAP, it is complete already, nothing in it
-        can be read, or the new one cannot be written.
+        There is no such bag, it is not MCAP, it is already complete, nothing in it can be read, or
+        the new one cannot be written.
     """
     source = next((file for file in bag_files(Path(path)) if not is_complete(file)), None)
     if source is None:
@@ -147,12 +147,12 @@ class _Copy:
         self.loss_reason = ""
         self._file = file
         self._schemas: dict[int, tuple[int, str]] = {}
-        """New number and name by the number in the old file."""
+        """New number and name, by number in the old file."""
         self._channels: dict[int, tuple[int, Channel]] = {}
-        """New number and old record by the number in the old file."""
+        """New number and old record, by number in the old file."""
 
     def add_readable_records(self, old: BinaryIO) -> None:
-        """Add what can be read of a file, up to the first record that is cut."""
+        """Add the readable content of a file, up to the first truncated record."""
         size, whole = file_size(old), MAGIC_SIZE
         chunks = ChunkUnpacker(size)
         # A ValueError ends the iteration: none comes from what is done with a record.
@@ -204,7 +204,7 @@ class _Copy:
                 self._file.add_metadata(metadata.name, metadata.metadata)
 
     def topics(self) -> list[RecordedTopic]:
-        """Return all topics for rosbag2's record; those without a message are in the file too."""
+        """Return all topics for rosbag2's record, including topics without messages."""
         topics = []
         for number, channel in self._channels.values():
             count, words = self._file.message_counts[number], channel.metadata
@@ -233,10 +233,10 @@ class LastState:
     joint_names, joints, rates
         Names, positions and velocities (n,) of the joints.
     momenta
-        Linear over angular momentum in the world (6,); of robot and held body together.
+        Linear, then angular momentum in the world (6,), of robot and held body together.
     target
-        Pose (7,) of the root link of the target in the world, over its twist (6,) in T; None:
-        there is no target.
+        Pose (7,) of the target's root link in the world, then its twist (6,) in T; None: there is
+        no target.
     payload
         The body that the robot holds, as the text of ``plant/status``; empty: none.
     """
@@ -277,7 +277,7 @@ def _last_state(robot: RecordedRobot) -> LastState:
     # momenta k.
     common = np.intersect1d(odom.stamp_ns, joints.stamp_ns)
     if not len(common):
-        raise RecordingError(f"The bag {robot.bag.path} holds no state with all its parts.")
+        raise RecordingError(f"The bag {robot.bag.path} holds no complete state.")
     k, j = (int(np.flatnonzero(series.stamp_ns == common[-1])[-1]) for series in (odom, joints))
     pose = odom.table(columns("odom", "pose.pose"))[k]
     names = robot.joint_names

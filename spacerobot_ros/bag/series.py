@@ -23,7 +23,7 @@ from spacerobot_ros.times import SECOND
 JOINT_STATE = "sensor_msgs/msg/JointState"
 _BY_JOINT = ("name", "position", "velocity", "effort")
 _MAX_JOINTS = 50
-"""Largest number of joints that are named on a topic, in lengths of its longest message."""
+"""Largest number of joint names on a topic, as a multiple of those in its longest message."""
 
 _HEADER = (Nodetype.NAME, "std_msgs/msg/Header")
 
@@ -131,8 +131,8 @@ class TopicSeries:
         An array of shape (N,) for a number, of shape (N, k) for k numbers in each message, with
         whole numbers as 64-bit integers and others as float64. A list of N values
         for everything else: strings, lists, messages, arrays that differ in length. Arrays of joint
-        states, and their names, follow :attr:`joint_names` in every message; a joint that a message
-        lacks is nan there.
+        states and their names are in the order of :attr:`joint_names`; joints missing in a message
+        are nan.
 
         Raises
         ------
@@ -163,8 +163,8 @@ class TopicSeries:
     def joint_names(self) -> list[str]:
         """Names of the joints or thrusters of joint states, in the order of their first messages.
 
-        Positions, velocities and efforts have a column for each. Empty for messages of other types,
-        and where names are missing or repeated.
+        Positions, velocities and efforts have one column for each. Empty for messages of other
+        types, and if names are missing or repeated.
         """
         if self.type_name != JOINT_STATE or not len(self):
             return []
@@ -183,7 +183,8 @@ class TopicSeries:
     def of_joints(self, path: str, names: Sequence[str]) -> NDArray[np.float64]:
         """Return an array of joint states by joints: shape (N, n); nan if a joint is missing.
 
-        ``path`` is ``position``, ``velocity`` or ``effort``, and ``names`` are those of n joints.
+        ``path`` is ``position``, ``velocity`` or ``effort``, and ``names`` are the names of n
+        joints.
         """
         found = _field_matrix(self.field(path), len(self.joint_names))
         places = {name: k for k, name in enumerate(self.joint_names)}
@@ -219,7 +220,7 @@ class TopicSeries:
 
         Returns
         -------
-        Shape (N, width). If a message has another number of values in a field, they are nan.
+        Shape (N, width). If a message has another number of values in a field, the values are nan.
 
         Raises
         ------
@@ -232,7 +233,7 @@ class TopicSeries:
         return np.column_stack([_field_matrix(self.field(path), each) for path in fields])
 
     def messages(self) -> Iterator[tuple[int, Any]]:
-        """Iterate over the messages, without keeping them.
+        """Iterate over the messages without caching them.
 
         Yields
         ------

@@ -1,7 +1,7 @@
 """Messages of a topic as a table, and tables for pandas, xarray, CSV, Parquet and MATLAB.
 
-A row is a message, a column a number or a text. A table knows the units of its numbers, and the
-joints that the entries of an array stand for.
+A row is a message, a column a number or a text. A table has the units of its numbers and the joint
+names of array entries.
 """
 
 from __future__ import annotations
@@ -35,10 +35,10 @@ if TYPE_CHECKING:
 _KEY_VALUES = "diagnostic_msgs/msg/KeyValue"
 _HEADER_STAMP = ("header.stamp.sec", "header.stamp.nanosec")
 _TIME_COLUMNS = ("time", "time_ns", "stamp", "stamp_ns")
-"""Time columns of every table; a message field of such a name is put below ``message``."""
+"""Time columns of every table; a message field of the same name gets the prefix ``message``."""
 
 _MAX_ARRAY_COLUMNS = 1000
-"""Largest number of entries of an array that becomes columns; images, for example, do not."""
+"""Largest array that becomes columns; images, for example, do not."""
 
 _JOINT_UNITS = {
     "position": ("m", "rad"),
@@ -61,7 +61,7 @@ _UNITS_BY_PATH_ENDING = tuple(
         (r"torque\.[xyz]", "N m"),
     )
 )
-"""SI unit (REP 103) of a field by the end of its path, because messages have no units."""
+"""SI unit (REP 103) of a field by the suffix of its path, because messages have no units."""
 
 
 @dataclass(frozen=True)
@@ -122,7 +122,7 @@ class TopicTable:
 
     @property
     def columns(self) -> dict[str, NDArray[Any]]:
-        """Every column (N,) by its name; ``time`` is none of them."""
+        """Every column (N,) by name, without ``time``."""
         found: dict[str, NDArray[Any]] = {}
         for field in self.fields:
             parts = [field.values] if field.values.ndim == 1 else field.values.T
@@ -140,23 +140,23 @@ def table_of(series: TopicSeries, prismatic: Mapping[str, bool] | None = None) -
     """Return the messages of a topic as a table.
 
     Numbers and texts become columns; an array that has the same length in every message, of at most
-    a thousand entries, becomes a column for each, called by the joint or thruster where the
-    messages name them; keys and values of a status become a column for each key, empty where a
-    message lacks it. All else, such as the points of a path, is JSON in one column of texts.
+    a thousand entries, becomes one column per entry, named after the joint or thruster if the
+    messages have names. The keys of a status become one column each, empty if a message lacks the
+    key. All else, such as the points of a path, is JSON in one column of texts.
 
-    Seconds are float64, which lose the last digits of wall time; nanoseconds are whole numbers.
+    Seconds are float64, which loses the last digits of wall time; nanoseconds are integers.
 
     Parameters
     ----------
     series
         The topic.
     prismatic
-        Whether each joint is prismatic, which decides on units; a joint that is missing has none.
+        Whether each joint is prismatic, which determines its units; missing joints have no units.
 
     Raises
     ------
     RecordingError
-        A message is damaged, or there is more than can be decoded.
+        A message is damaged, or the topic is too large to decode.
     """
     names = series.joint_names
     found = [Field("time_ns", series.time_ns, ("ns",))]
@@ -228,10 +228,10 @@ def number_field(path: str, values: NDArray[Any]) -> Field:
 
 
 def with_euler_angles(table: TopicTable) -> TopicTable:
-    """Return a table that also gives each attitude as turns about the fixed axes x, y, z.
+    """Return a table that also has each attitude as rotations about the fixed axes x, y, z.
 
-    The fields ``roll``, ``pitch`` and ``yaw`` (rad) stand where ``orientation`` does:
-    ``pose.pose.yaw`` beside ``pose.pose.orientation.z``.
+    The fields ``roll``, ``pitch`` and ``yaw`` (rad) are siblings of ``orientation``:
+    ``pose.pose.yaw`` and ``pose.pose.orientation.z``.
     """
     values = {field.path: field.values for field in table.fields}
     found = list(table.fields)
@@ -289,7 +289,7 @@ def _json_value(value: Any) -> Any:
 
 
 COLUMNS = "_columns.csv"
-"""File beside tables in CSV: topic, file, column and unit of every column."""
+"""File next to CSV tables: topic, file, column and unit of every column."""
 
 _UNSAFE_CHARACTERS = re.compile(r"[^A-Za-z0-9_.-]+")
 _MAX_VARIABLE_NAME = 63
@@ -354,16 +354,16 @@ def to_xarray(table: TopicTable) -> xarray.Dataset:
 def export(
     tables: Iterable[TopicTable], path: str | os.PathLike[str], format: ExportFormat
 ) -> dict[str, int]:
-    """Write tables for other programs; return the number of rows of each topic that is written.
+    """Write tables for other programs; return the number of rows of each written topic.
 
-    CSV, tree and Parquet make a folder with a file for each topic that has messages
-    (``odom.csv``, ``planner.status.csv``); MAT makes one file with a struct for each. Nothing is
-    ever written over, and what cannot be finished is removed.
+    CSV, tree and Parquet make a folder with a file for each topic that has messages (``odom.csv``,
+    ``planner.status.csv``); MAT makes one file with a struct for each. Nothing is overwritten, and
+    incomplete output is removed.
 
     Parameters
     ----------
     tables
-        What to write; :meth:`Bag.table` makes them.
+        The tables, from :meth:`Bag.table`.
     path
         The folder, or the file.
     format
@@ -372,7 +372,7 @@ def export(
     Raises
     ------
     SpaceRobotError
-        There is something at ``path``, its name is that of another format, a file cannot be
+        ``path`` exists, its suffix belongs to another format, a file cannot be
         written, or a library is not installed.
     """
     target = Path(path)
@@ -402,7 +402,7 @@ def _require_suffix(target: Path, format: ExportFormat) -> None:
     if format is ExportFormat.MAT:
         if suffix not in ("", ".mat"):
             raise RecordingError(
-                f"The name of a file for MATLAB ends in .mat; '{target.name}' does not."
+                f"The name of a file for MATLAB must end in .mat; '{target.name}' does not."
             )
     elif suffix in {f".{each.value}" for each in ExportFormat}:
         raise RecordingError(

@@ -27,13 +27,13 @@ def free_name(path: Path, first: int = 0) -> Path:
 class BagWriter(AbstractContextManager["BagWriter"]):
     """Writes serialised ROS 2 messages into a bag that any ROS 2 tool opens.
 
-    Messages gather in a chunk in memory. A chunk that is full goes to the operating system as one
-    piece: a process that is killed loses the chunk in progress and nothing before it (a computer
-    that loses power may lose more). A bag is complete, with its summary, once it is closed; use the
-    writer as a context manager. One thread at a time may use it.
+    Messages are collected in a chunk in memory. A full chunk goes to the operating system in one
+    piece: a killed process loses only the chunk in progress (a power failure may lose more). A bag
+    is complete, with its summary, once it is closed; use the writer as a context manager. Only one
+    thread at a time may use it.
 
-    If writing a chunk fails, the chunk is lost, this call and every later one that would add
-    something raise RecordingError, and closing still completes the file if there is room.
+    If writing a chunk fails, the chunk is lost, and this call and all later ones that add data
+    raise RecordingError. Closing still completes the file if there is space.
 
     Parameters
     ----------
@@ -42,19 +42,19 @@ class BagWriter(AbstractContextManager["BagWriter"]):
     compression
         Of the chunks: ``zstd``, ``lz4`` or ``none``.
     chunk_size
-        How large a chunk grows, in bytes before compression.
+        Size of a chunk, in bytes before compression.
     overwrite
         Whether an existing file is replaced, unless it is being written.
     next_free
-        Whether the bag takes the next free name if the name exists: ``NAME-1.mcap``,
+        Whether to use the next free name if the name exists: ``NAME-1.mcap``,
         ``NAME-2.mcap``, ...
     max_size
-        How large a file grows, in bytes, before the next one is begun; 0: without bound. The files
+        File size, in bytes, after which the next file begins; 0: unlimited. The files
         of a bag that may be split are ``NAME_0.mcap``, ``NAME_1.mcap``, ..., each complete, with
         all attachments and metadata.
     max_duration_ns
-        How much log time a file spans, in nanoseconds; 0: any. Both are checked after every
-        chunk.
+        Log time of a file, in nanoseconds, after which the next one begins; 0: unlimited. Both are
+        checked after every chunk.
 
     Raises
     ------
@@ -83,12 +83,12 @@ class BagWriter(AbstractContextManager["BagWriter"]):
         """Number of files begun after the first one."""
         self._earlier_counts: Counter[int] = Counter()
         self._repeated: list[Callable[[McapFile], None]] = []
-        """Puts an attachment or metadata record into a file, for each of them."""
+        """One function for each attachment or metadata record, which adds it to a file."""
         self._topics: dict[str, tuple[int, str, QosProfile]] = {}
         self._schema_ids: dict[str, int] = {}
         self._channel_ids: set[int] = set()
         self._refusal: str | None = None
-        """Why nothing more can be written; None: it can."""
+        """Why nothing more can be written; None: more can be written."""
         self._closed = False
         self._file = self._open_first_file()
         try:
@@ -106,13 +106,13 @@ class BagWriter(AbstractContextManager["BagWriter"]):
 
     @property
     def message_counts(self) -> dict[str, int]:
-        """Number of messages of each topic in the bag, with the chunk in progress."""
+        """Number of messages of each topic in the bag, including the chunk in progress."""
         counts = self._earlier_counts + self._file.message_counts
         return {name: counts[channel] for name, (channel, _, _) in self._topics.items()}
 
     @property
     def bytes_written(self) -> int:
-        """Size of the present file after compression, bytes."""
+        """Size of the current file after compression, bytes."""
         return self._file.size
 
     @property
@@ -122,7 +122,7 @@ class BagWriter(AbstractContextManager["BagWriter"]):
 
     @property
     def messages_written(self) -> int:
-        """Number of messages in the bag, with the chunk in progress."""
+        """Number of messages in the bag, including the chunk in progress."""
         return sum(self.message_counts.values())
 
     def add_topic(self, name: str, type_name: str, qos: QosProfile | None = None) -> int:
@@ -139,7 +139,7 @@ class BagWriter(AbstractContextManager["BagWriter"]):
 
         Returns
         -------
-        The channel that ``write`` takes. A topic that is known already keeps its channel and QoS.
+        The channel for ``write``. A topic that was added before keeps its channel and QoS.
 
         Raises
         ------
@@ -185,10 +185,10 @@ class BagWriter(AbstractContextManager["BagWriter"]):
         if self._refusal is not None or channel_id not in self._channel_ids:
             raise RecordingError(
                 self._refusal
-                or f"The bag {self.path} has no channel {channel_id}: add_topic gives the channels."
+                or f"The bag {self.path} has no channel {channel_id}: add_topic returns channels."
             )
         if log_time_ns < 0 or publish_time_ns < 0:
-            raise RecordingError(f"The bag {self.path} takes no times before zero.")
+            raise RecordingError(f"The bag {self.path} cannot store times before zero.")
         try:
             completed_chunk = self._file.write(channel_id, data, log_time_ns, publish_time_ns)
         except RecordingError as error:
@@ -206,7 +206,7 @@ class BagWriter(AbstractContextManager["BagWriter"]):
         self._add(lambda file: file.add_attachment(name, data, media_type, log_time_ns))
 
     def add_metadata(self, name: str, data: dict[str, str]) -> None:
-        """Put a record of keys and values into the bag."""
+        """Add a record of keys and values to the bag."""
         self._add(lambda file: file.add_metadata(name, data))
 
     def _add(self, record: Callable[[McapFile], None]) -> None:
@@ -215,7 +215,7 @@ class BagWriter(AbstractContextManager["BagWriter"]):
             record(self._file)
 
     def flush(self) -> None:
-        """Write the chunk in progress to the operating system, where a kill cannot lose it."""
+        """Hand the chunk in progress to the operating system, so that a kill cannot lose it."""
         with self._adding():
             if self._file.flush() and self._is_full():
                 self._begin_next_file()
@@ -223,7 +223,7 @@ class BagWriter(AbstractContextManager["BagWriter"]):
     def close(self) -> None:
         """Write pending messages and the summary, and close the file; a second call does nothing.
 
-        After a failure the file is closed as it is: `spacerobot salvage` completes it.
+        After a failure the file is closed incomplete: `spacerobot salvage` completes it.
 
         Raises
         ------

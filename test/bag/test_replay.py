@@ -220,9 +220,9 @@ def test_what_cannot_be_played_is_refused(path: Path, tmp_path: Path) -> None:
     bag = read_bag(path)
     with pytest.raises(RecordingError, match="has no topic /c: it has /a"):
         Playback(bag, topics=["/c"])
-    with pytest.raises(RecordingError, match=r"no message to replay from 1.5 s on: it lasts 1 s"):
+    with pytest.raises(RecordingError, match=r"no message to replay from 1.5 s: it lasts 1 s"):
         Playback(bag, start=1.5)
-    with pytest.raises(RecordingError, match=r"from 0.01 s on for 0.05 s: it lasts 1 s"):
+    with pytest.raises(RecordingError, match=r"from 0.01 s for 0.05 s: it lasts 1 s"):
         Playback(bag, topics=["/a"], start=0.01, duration=0.05)
     with pytest.raises(RecordingError, match="has no messages"):
         Playback(read_bag(bag_of(tmp_path / "empty.mcap", [])))

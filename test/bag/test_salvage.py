@@ -348,7 +348,7 @@ def test_states_that_never_meet_are_none(tmp_path: Path) -> None:
         say_momentum(say, 0.0, 0)
         say_odom(say, 0.0, 0)
         say_joints(say, 0.5, 0)
-    with pytest.raises(RecordingError, match="no state with all its parts"):
+    with pytest.raises(RecordingError, match="no complete state"):
         last_state(tmp_path / "a.mcap")
 
 

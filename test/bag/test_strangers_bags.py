@@ -256,7 +256,7 @@ def test_topics_that_cannot_be_read_are_named_and_the_rest_is_written(
     assert tables["joint_states"]["position[j2]"].tolist() == [201.0]
     (said,) = caplog.messages
     assert said == (
-        f"3 topic(s) of the bag {mixed} are left out: /cfg, /proto, /chatter. The topic /cfg of "
+        f"3 topic(s) of the bag {mixed} are omitted: /cfg, /proto, /chatter. The topic /cfg of "
         f"the bag {mixed} is not in ROS 2's encoding ('cdr' defined by 'ros2msg'), but in 'json' "
         "defined by 'jsonschema'."
     )

@@ -284,8 +284,8 @@ def test_what_cannot_be_exported_leaves_nothing_behind(tmp_path: Path, bag: Bag)
         export([], bag.path / "below", ExportFormat.CSV)
 
     for name, kind, mention in (
-        ("flight.csv", ExportFormat.MAT, "ends in .mat; 'flight.csv' does not."),
-        ("flight.xlsx", ExportFormat.MAT, "ends in .mat"),
+        ("flight.csv", ExportFormat.MAT, "must end in .mat; 'flight.csv' does not."),
+        ("flight.xlsx", ExportFormat.MAT, "must end in .mat"),
         ("flight.CSV", ExportFormat.CSV, "in csv are a folder"),
         ("flight.mat", ExportFormat.PARQUET, "in parquet are a folder"),
     ):
@@ -530,7 +530,7 @@ def test_the_command_names_what_it_leaves_out_and_a_topic_once(tmp_path: Path) -
     result = CliRunner().invoke(main, ["export", source])
     lines = [line.split(maxsplit=1) for line in result.stdout.splitlines()]
     made = folder / "ein Flug_csv"
-    left_out = "no messages, left out"
+    left_out = "no messages, omitted"
     lines.sort()
     assert lines == [["/said", "1 rows"], ["/silent", left_out], ["tables", str(made)]]
     assert {each.name for each in made.iterdir()} == {"_columns.csv", "said.csv"}

@@ -104,8 +104,8 @@ def test_a_type_that_is_not_installed_leaves_no_trace(tmp_path: Path) -> None:
     [
         ((99, b"", 1, 1), "has no channel 99"),
         ((70000, b"", 1, 1), "has no channel 70000"),
-        ((1, b"", -1, 1), "no times before zero"),
-        ((1, b"", 1, -1), "no times before zero"),
+        ((1, b"", -1, 1), "cannot store times before zero"),
+        ((1, b"", 1, -1), "cannot store times before zero"),
     ],
 )
 def test_what_no_bag_can_hold_is_refused(
