@@ -1,6 +1,6 @@
 """``python -m spacerobot_ros.session.child MODULE ...``: a node that ends with its supervisor.
 
-Signals are guarded first, because importing the module of a node takes a second.
+Signal handlers are set first, because importing the module of a node takes a second.
 """
 
 from __future__ import annotations

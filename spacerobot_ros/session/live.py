@@ -1,4 +1,4 @@
-"""Flights by the nodes: to the goal of a scenario, or until they are stopped; goals to stacks."""
+"""Flights by nodes, to the goal of a scenario or until stopped; sending goals to running stacks."""
 
 from __future__ import annotations
 
@@ -61,10 +61,10 @@ def ros() -> Iterator[None]:
 def fly_by_nodes(
     scenario: Scenario, bag: Path, progress: Callable[[float, float], None], longest: float
 ) -> dict[str, Any]:
-    """Fly a scenario by its nodes, a process each; return the object that ``--json`` writes.
+    """Fly a scenario with one process per node; return the object that ``--json`` writes.
 
-    Parameters are those of :func:`~spacerobot_ros.session.run.run_scenario`. The flight is looked
-    at five times a second of wall time.
+    Parameters are those of :func:`~spacerobot_ros.session.run.run_scenario`. The flight is checked
+    five times per second of wall time.
 
     Raises
     ------
@@ -119,13 +119,13 @@ def _summary(stack: MultiProcessStack, wall_time: float) -> dict[str, Any]:
 _LONGEST_DISCOVERY = 10.0  # wall s
 
 _LONGEST_STATUS_WAIT = 1.0
-"""Wall time to wait for the status of earlier goals, which is no answer to the new one, s."""
+"""Wall time to wait for the status of earlier goals, before a new one is sent, s."""
 
 _CHECK_PERIOD = 0.1
 
 
 _NUMBER = re.compile(r"(< )?\d[\d.]* [mµ]?(m|rad)\b")
-"""A quantity in the message of a status, which changes all the time."""
+"""A quantity in the message of a status, which changes continually."""
 
 
 class _StatusPrinter:
@@ -153,10 +153,10 @@ def run_until_stopped(
 ) -> Path | None:
     """Run the nodes of a scenario in real time until SIGINT, SIGTERM or SIGHUP; goals by topic.
 
-    Planner and controller are started again when they die, each at most ``restarts`` times a
-    minute. ``supervise`` is called five times a second.
+    If planner or controller die, they are restarted, each at most ``restarts`` times a minute.
+    ``supervise`` is called five times a second.
 
-    Returns the bag, whose name is another one where that was taken and ``when_exists`` is next.
+    Returns the bag, which has a new name if the name was taken and ``when_exists`` is next.
 
     Raises
     ------
@@ -190,13 +190,13 @@ def send_goal(
 ) -> Outcome:
     """Send one goal pose, show its statuses, and return its outcome.
 
-    ``timeout`` is wall time in s, 0: forever. A commander is looked for no longer than that, and
-    for ten seconds at most.
+    ``timeout`` is wall time in s, 0: forever. The search for a commander ends after ``timeout``, or
+    after ten seconds.
 
     Raises
     ------
     SpaceRobotError
-        No commander takes goals, or ROS takes no such namespace.
+        No commander accepts goals, or the namespace is not valid in ROS.
     """
     namespace = checked_namespace(namespace)
     with ros():
@@ -272,7 +272,7 @@ def _find_goal_commander(
     topics = " and ".join(f"'{topic}'" for topic in ("goal_pose", *links))
     listed = "; the planner's parameter end_effectors lists other links" if links else ""
     raise SpaceRobotError(
-        f"No commander takes goals on {topics} after {patience:g} s: start a planner or a "
+        f"No commander accepts goals on {topics} after {patience:g} s: start a planner or a "
         f"controller, `spacerobot up SCENARIO`, in the same ROS domain and namespace{listed}."
     )
 

@@ -1,4 +1,4 @@
-"""Client that sends the goals of a flight and follows their status until they are decided."""
+"""Client that sends the goals of a flight and follows their status to their outcome."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ _LONGEST_DELIVERY = 5.0  # wall s
 
 
 class MissionClient:
-    """A node that sends the goals of one flight and listens until they are decided.
+    """A node that sends the goals of one flight and waits for their outcome.
 
     Parameters
     ----------
@@ -46,14 +46,14 @@ class MissionClient:
     world_frame
         Frame of the goals.
     now
-        Returns the time that goals are stamped with, ns: the simulated time where there is one.
+        Returns the time for the stamps of goals, ns: the simulated time if available.
     joint_names
-        Returns the robot's joints, where goals may end in joint positions of their own, or where
-        those of an earlier goal may be in force; None: no goal of this stack has any.
+        Returns the robot's joints if a goal may require joint positions, or an earlier goal may
+        have; None: no goal of this stack does.
     end_effectors
-        Links that there will be goals for; empty name: the default end-effector.
+        Links with goals; empty name: the default end-effector.
     paths
-        Those of them whose goals are paths.
+        The end-effectors whose goals are paths.
     name, namespace, context
         Name, namespace and rclpy context of the node.
     """
@@ -75,9 +75,9 @@ class MissionClient:
         self.status: Status | None = None
         """Last status of the commander that decides the goal."""
         self.message = ""
-        """Message of the last status that another goal is not the subject of; empty before."""
+        """Message of the last status, except those about another goal; empty before."""
         self.on_message: Callable[[str], None] = lambda message: None
-        """Called with each such message as it comes: the next may come before anybody looks."""
+        """Called with each such message on arrival, since the next may replace it soon."""
         self.decider = decider
         """The commander that decides."""
         self._done = rclpy.task.Future(executor=None)
@@ -112,7 +112,7 @@ class MissionClient:
 
     @property
     def goal_id(self) -> str | None:
-        """Id of the goal that was sent last; None before the first."""
+        """Id of the last goal sent; None before the first."""
         return self._follower.goal_id
 
     @property
@@ -127,14 +127,14 @@ class MissionClient:
 
     @property
     def ends_at(self) -> float:
-        """Simulated time at which the present schedule of the planner ends, s; else 0."""
+        """Simulated time at which the planner's current schedule ends, s; 0 without one."""
         return self.status.ends_at_s if isinstance(self.status, PlannerStatus) else 0.0
 
     def is_connected(self, readers: int = 1) -> bool:
         """Whether goals have ``readers`` subscribers, and all known subscribers are matched.
 
-        A commander may be known and not met yet, while a viewer or a recorder is. Planners of
-        others need not take joint positions.
+        A commander may be known but not matched yet, while a viewer or a recorder is. Third-party
+        planners need not accept joint positions.
         """
         return all(
             publisher.get_subscription_count()
@@ -146,7 +146,7 @@ class MissionClient:
         )
 
     def has_goal_commander(self) -> bool:
-        """Whether a commander is connected, with its status and its subscription of goals.
+        """Whether a commander that publishes its status and subscribes to goals is connected.
 
         A recorder also subscribes to goals, and may be discovered first.
         """
@@ -164,9 +164,9 @@ class MissionClient:
     def send(self, goal: Goal, end_effector: Goal | None = None) -> None:
         """Publish goal poses of the base and of end-effectors, if there are any.
 
-        All have the same stamp, which is no other goal's: the status names them by it. A planner
-        keeps the joint positions that a goal is to end in for the goals after it: so each goal is
-        sent with its own, and one without any is sent with none.
+        All share one stamp, unique to this goal; the status identifies the goal by it. A planner
+        keeps required joint positions for later goals, so every goal is sent with its joint
+        positions, or with an empty message.
         """
         self._sent += 1
         time_ns = self._now() + self._sent
@@ -201,7 +201,7 @@ class MissionClient:
     ) -> Outcome:
         """Spin until the goal is decided, or until ``look``, called every ``period`` s, is true.
 
-        A busy events executor does not heed the time limit of a spin: the look is a timer's.
+        A busy events executor ignores the time limit of a spin, so a timer calls ``look``.
 
         Raises
         ------

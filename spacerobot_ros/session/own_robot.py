@@ -28,7 +28,7 @@ _LARGEST_SHARE_OF_DISTANCE_TO_LIMIT = 0.5
 """Largest share of the distance to its limits that a joint uses in the first rotation."""
 
 _LARGEST_COUNTED_DISTANCE_TO_LIMIT = 1.0
-"""Largest distance to a joint limit that counts, m or rad: linearisation fails beyond it."""
+"""Largest distance to a joint limit that is used, m or rad: linearisation fails beyond it."""
 
 _LEAST_ROTATION_WITHOUT_LOOPS = math.radians(0.2)
 """Smallest first rotation without loops of the joints, rad."""
@@ -45,14 +45,14 @@ _LEAST_USUAL_SPEED, _LARGEST_USUAL_SPEED = 1e-3, 50.0
 def urdf_remarks(robot: RobotDescription) -> Iterator[str]:
     """Yield notes on unusual values of a URDF, each with a remedy.
 
-    The robot flies all the same; errors are refused when the file is read.
+    The robot can still fly; errors are refused when the file is read.
     """
     carried = robot.total_mass - robot.bodies[0].inertia.mass
     base = robot.bodies[0].inertia
     if carried > 0 and base.mass < _LEAST_BASE_MASS_RATIO * carried:
         yield (
             f"The base '{robot.base_link}' has {base.mass:.4g} kg and carries {carried:.4g} kg: it "
-            "moves more than its load. If it stands for a mount, give it the mass and "
+            "moves more than its load. If it represents a mount, give it the mass and "
             "inertia of the spacecraft."
         )
     if carried > 0 and base.mass > _LARGEST_BASE_MASS_RATIO * carried:
@@ -93,7 +93,7 @@ def _immovable_joint_remark(joint: Joint) -> str:
     if joint.limits.velocity != 0:
         return ""
     return (
-        f"The joint '{joint.name}' has the velocity limit 0, so that it cannot move: give "
+        f"The joint '{joint.name}' has the velocity limit 0, so it cannot move: give "
         f'<limit velocity="..."/> in {joint.unit}/s.'
     )
 
@@ -155,7 +155,7 @@ def _visual_remarks(robot: RobotDescription) -> Iterator[str]:
         yield "No link has a <visual>: the robot is drawn as lines between its joints."
     if not robot.end_effector():
         yield (
-            "No link is called 'end_effector': for coordinated control name one by the parameter "
+            "No link is called 'end_effector': for coordinated control, set the parameter "
             "end_effector_frame."
         )
 
@@ -163,8 +163,8 @@ def _visual_remarks(robot: RobotDescription) -> Iterator[str]:
 def first_shape(robot: SpaceRobot) -> Array:
     """Return joint positions (n,), m or rad, far from all limits: the middle of narrow ranges.
 
-    Joints that reach both ways from zero by a third of their range stay at zero, where a URDF is
-    usually drawn.
+    Joints that can move by a third of their range in both directions from zero stay at zero, the
+    position in which URDFs are usually drawn.
     """
     lower, upper = robot.lower, robot.upper
     bounded = np.isfinite(lower) & np.isfinite(upper)
@@ -178,21 +178,25 @@ def first_shape(robot: SpaceRobot) -> Array:
 def first_problem(
     name: str, robot: SpaceRobot, file: Path, *, clear: bool = True
 ) -> PlanningProblem:
-    """Return the problem of a small base rotation about an axis that the joints allow.
+    """Return the problem of a small base rotation about an axis that the joints can achieve.
 
-    ``clear`` is whether links are kept clear of each other, for which their meshes are needed.
+    ``clear``: whether the plan avoids contacts between links, which needs their meshes.
 
     Raises
     ------
     PlanningError
-        The joints do not turn the base.
+        The joints cannot rotate the base.
     """
     turning = BaseRotations.of(robot)
     if not len(turning.axes):
-        how = "only to and fro along one curve of attitudes" if turning.turns_base else "not at all"
+        how = (
+            "only back and forth along one curve of attitudes"
+            if turning.turns_base
+            else "not at all"
+        )
         raise PlanningError(
-            f"The joints of '{robot.description.name}' turn its base {how}: there is no attitude "
-            "to fly to, and so no scenario is written. `spacerobot analyze` says more."
+            f"The joints of '{robot.description.name}' rotate its base {how}: there is no attitude "
+            "to fly to, so no scenario is written. `spacerobot analyze` says more."
         )
     shape = first_shape(robot)
     turn = first_turn(robot, shape, turning.axes)
@@ -207,11 +211,11 @@ def first_problem(
 
 
 def first_turn(robot: SpaceRobot, shape: Array, axes: Array) -> Array:
-    """Return a turn (3,) of the base, rad, that its joints bring about without loops.
+    """Return a rotation (3,) of the base, rad, that its joints produce without loops.
 
-    It is by 5 degrees about z, y or x, or about the only axis of ``axes`` (m, 3), if the joints
-    turn the base so within half of their room from a shape (n,), to first order. Where light arms
-    turn it less, it is smaller, about the axis that they turn it most about.
+    It is 5 degrees about z, y or x, or about the only axis of ``axes`` (m, 3), if to first order
+    half of the joints' range around a configuration (n,) suffices. If light arms rotate the base
+    less, it is smaller, about the axis with the largest rotation.
     """
     room = np.minimum(robot.upper - shape, shape - robot.lower)
     F = robot.connection(shape)[3:] * np.minimum(room, _LARGEST_COUNTED_DISTANCE_TO_LIMIT)
@@ -244,20 +248,20 @@ def scenario_text(problem: PlanningProblem, method: str, robot_path: str) -> str
     axis = ", ".join(f"{each:.3g}" for each in turn / np.linalg.norm(turn) + 0.0)
     name = problem.robot.description.name
     unclear = (
-        "    clearance: 0.0   # m; contacts are not noticed: meshes of <collision> are missing\n"
+        "    clearance: 0.0   # m; contacts are not detected: meshes of <collision> are missing\n"
     )
     clearance = "" if config.clearance else unclear
     start = f"    initial_joint_positions: [{shape}]   # {joints}\n" if problem.robot.n else ""
     return f"""\
-# The first flight of {name}: its joints turn its base.
+# The first flight of {name}: its joints rotate its base.
 
 scenario:
   ros__parameters:
-    description: The joints of {name} turn its base
+    description: The joints of {name} rotate its base
     # {angle:.3g} deg about ({axis})
     goal_orientation: [{x!r}, {y!r}, {z!r}, {w!r}]   # x y z w; or goal_rotvec, rad
     # goal_position: [0.0, 0.0, 0.0]         # m
-    # goal_joint_positions: [{shape}]   # the shape to end in
+    # goal_joint_positions: [{shape}]   # final joint positions
 
 /**/plant:
   ros__parameters:
@@ -274,14 +278,14 @@ scenario:
 
 
 def thruster_scenario_text(robot: SpaceRobot, robot_path: str) -> str:
-    """Return a parameter file that moves and turns a robot without joints by its thrusters."""
+    """Return a parameter file that moves and rotates a robot without joints by its thrusters."""
     name = robot.description.name
     return f"""\
-# The first flight of {name}, which has no joints: thrusters move and turn it.
+# The first flight of {name}, which has no joints: thrusters move and rotate it.
 
 scenario:
   ros__parameters:
-    description: Thrusters move {name} by 0.2 m and turn it by 10 deg
+    description: Thrusters move {name} by 0.2 m and rotate it by 10 deg
     goal_position: [0.2, 0.0, 0.0]   # m
     goal_rotvec: [0.0, 0.0, {math.radians(10.0):.4g}]   # rad
 

@@ -1,4 +1,4 @@
-"""A stack with a process for each node, as users run nodes, without ros2 launch."""
+"""A stack with one process per node, as users run nodes, without ros2 launch."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ _FASTDDS_SETTINGS = """<?xml version="1.0" encoding="UTF-8"?>
   </profiles>
 </dds>
 """
-"""Fast DDS settings with which writers repeat lost messages after 10 ms.
+"""Fast DDS settings that make writers resend lost messages after 10 ms.
 
 With the default of 3 s a lockstep plant would wait, and others would lose messages."""
 
@@ -94,7 +94,7 @@ def checked_namespace(name: str) -> str:
     Raises
     ------
     ParameterError
-        ROS takes no such name.
+        The name is not valid in ROS.
     """
     namespace = f"/{name.strip('/')}" if name.strip("/") else ""
     try:
@@ -107,8 +107,9 @@ def checked_namespace(name: str) -> str:
 class MultiProcessStack:
     """The node processes of a scenario, and the client of their mission in this process.
 
-    The node processes end with this process, even if it is killed. In lockstep every run is equal:
-    nothing begins before all nodes have met, and the goal is there before the first state.
+    The node processes end with this process, even if it is killed. In lockstep all runs are
+    identical: nothing begins until all nodes are connected, and the goal arrives before the first
+    state.
 
     Parameters
     ----------
@@ -117,9 +118,9 @@ class MultiProcessStack:
     bag
         File to record into; None records nothing.
     namespace
-        Of all nodes and topics, the clock and the frames among them; empty for none.
+        Of all nodes and topics, including the clock and the frames; empty for none.
     restarts
-        How often a minute each planner or controller that dies is started again; it then continues
+        Largest number of restarts per minute of a planner or controller that dies; it continues
         with its goal.
     show
         Shows a line about each restart to the user.
@@ -252,7 +253,7 @@ class MultiProcessStack:
         return self._statistics
 
     def start(self, goal: Goal | None) -> None:
-        """Activate everything and send the goal, if there is one; the plant begins last."""
+        """Activate all nodes and send the goal, if there is one; the plant begins last."""
         for name in reversed(self.names[1:]):
             self._change_states(Transition.TRANSITION_ACTIVATE, [name])
         if goal is not None:
@@ -294,7 +295,7 @@ class MultiProcessStack:
         Raises
         ------
         SpaceRobotError
-            A node did not end well.
+            A node ended with an error.
         """
         interrupted = self.client.outcome is Outcome.INTERRUPTED
         present = [name for name in self.names if name not in self._timeline.away]
@@ -445,7 +446,7 @@ class MultiProcessStack:
             return not waiting
 
         self._wait_for(sent, f"the {names}", patience)
-        what = f"an answer of the {names}"
+        what = f"a response from the {names}"
         self._wait_for(lambda: all(each.done() for each in answers.values()), what, patience)
         return {name: answer.result() for name, answer in answers.items()}
 
@@ -469,19 +470,19 @@ def _require_flyable(scenario: Scenario) -> None:
     """Raise ParameterError if the scenario kills nodes in lockstep, or its goals cannot be sent."""
     if scenario.kills and scenario.lockstep:
         raise ParameterError(
-            f"The scenario '{scenario.name}' kills nodes on the way: fly it with --nodes and "
+            f"The scenario '{scenario.name}' kills nodes in flight: fly it with --nodes and "
             "--realtime."
         )
     goal = scenario.goal
     if goal.end_effectors and goal.base not in (frozenset(), POSE):
         raise ParameterError(
-            "Goals of end-effectors are sent with the whole pose of the base or with none: "
-            "give --goal, or leave the attitude of the base out."
+            "Goals of end-effectors need the whole pose of the base or none: give --goal, or omit "
+            "the attitude of the base."
         )
 
 
 _NO_ERROR_TEXT = (
-    "it wrote no error. If another stack is up in this ROS domain, its nodes answer instead: set "
+    "it wrote no error. If another stack is up in this ROS domain, its nodes respond instead: set "
     "ROS_DOMAIN_ID to another number."
 )
 
@@ -532,7 +533,7 @@ class RestartLimit:
         self._restarted: dict[str, list[float]] = {}
 
     def allows_restart(self, name: str, now: float) -> bool:
-        """Return whether a process may be started again at a wall time, s; it then counts."""
+        """Return whether a process may be restarted at a wall time, s; if so, count the restart."""
         recent = [each for each in self._restarted.get(name, ()) if now - each < _RESTART_PERIOD]
         allowed = len(recent) < self.most
         self._restarted[name] = [*recent, now] if allowed else recent
@@ -550,7 +551,7 @@ class RestartLimit:
 def node_arguments(
     name: str, module: str, parameters: Mapping[str, Any], folder: Path, namespace: str
 ) -> list[str]:
-    """Return the arguments of Python that run a node; its parameter file is written to a folder."""
+    """Return the Python arguments that run a node; write its parameter file to a folder."""
     file = folder / f"{name}.yaml"
     own = f"{namespace}/{name}" if namespace else name
     file.write_text(yaml.safe_dump({own: {"ros__parameters": dict(parameters)}}), "utf-8")
@@ -563,7 +564,7 @@ class _ServiceTimeoutError(SpaceRobotError):
 
 
 class KillTimeline:
-    """Schedule of the nodes that are killed and started again.
+    """Schedule for killing and restarting nodes.
 
     Parameters
     ----------

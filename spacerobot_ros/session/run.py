@@ -1,4 +1,4 @@
-"""Flies scenarios to their goals and records bags: by the loop without ROS, or by nodes."""
+"""Flies scenarios to their goals and records bags, by the loop without ROS or by nodes."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from spacerobot_ros.scenario import Scenario
 from spacerobot_ros.termination import graceful_shutdown
 
 Progress = Callable[[float, float], None]
-"""Function called with simulated time and the end time of the present schedule, s."""
+"""Function called with simulated time and the end time of the current schedule, s."""
 
 
 @dataclass(frozen=True)
@@ -51,11 +51,11 @@ def run_scenario(
 ) -> RunResult:
     """Fly a scenario from its initial state to its goal, and record a bag.
 
-    It is flown by the loop without ROS, or with ``nodes`` by the nodes, a process each. A flight of
-    ``longest`` s of simulated time is interrupted.
+    The loop without ROS flies it, or, if ``nodes`` is set, the nodes in one process each. A flight
+    of ``longest`` s of simulated time is interrupted.
 
-    SIGINT, SIGTERM and SIGHUP end the flight early; the flight until then is recorded and summed
-    up. Before the flight they act as in any other program.
+    SIGINT, SIGTERM and SIGHUP end the flight early; the flight until then is recorded and
+    summarised. Before the flight they act as usual.
 
     Raises
     ------

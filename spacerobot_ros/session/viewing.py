@@ -1,4 +1,4 @@
-"""A viewer process beside a command, at lower priority so that it does not delay the plant."""
+"""A viewer process next to a command, at lower priority so that it does not delay the plant."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ _NICENESS = 5
 
 
 class Viewer:
-    """A viewer process, which is started again when it dies.
+    """A viewer process, restarted if it dies.
 
     Parameters
     ----------
@@ -89,11 +89,11 @@ class Viewer:
             self._parameters["port"] = port
 
     def restart_within(self, restarts: int) -> None:
-        """Allow so many restarts a minute."""
+        """Allow this number of restarts per minute."""
         self._restarts = RestartLimit(restarts)
 
     def supervise(self) -> None:
-        """Start the viewer again if it has died, as long as the limit allows it."""
+        """Restart the viewer if it has died and the limit allows it."""
         if self.process.poll() is None or not self._restarts.allows_restart(
             "viewer", time.monotonic()
         ):
@@ -122,7 +122,7 @@ def viewing(
 ) -> Iterator[Viewer]:
     """Run a viewer while the block lasts; ``show`` receives the line with its address.
 
-    If the viewer ends early, the block continues and a line at its end reports it.
+    If the viewer ends early, the block continues, and a line at the end of the block reports it.
 
     Parameters
     ----------

@@ -341,8 +341,8 @@ def test_another_end_effector_is_heard_by_the_planner_without_being_listed() -> 
     [
         ("{link_7: [1.0, 2.0]}", "needs 3, a position, or 7"),
         ("{link_7: [0, 0, 1, 0, 0, 0, 0]}", "zero quaternion"),
-        ("[1.0, 2.0, 3.0]", r"has no poses by name: \[1.0, 2.0, 3.0\]\.$"),
-        ("1.5", r"has no poses by name: 1.5\.$"),
+        ("[1.0, 2.0, 3.0]", r"must map names to poses, not \[1.0, 2.0, 3.0\]\.$"),
+        ("1.5", r"must map names to poses, not 1.5\.$"),
         ("{link_7: far}", "is not a list of numbers"),
         ("{link_7: [[0, 0, 1], [0, 0, 1, 0]]}", "is not a list of numbers"),
         ("{link_7: [[0, 0, 1, 0], [0, 0, 1, 0]]}", "each of its poses has 3 numbers"),
@@ -364,5 +364,5 @@ def test_goals_of_a_file_that_are_none_are_refused(
 def test_a_part_of_the_base_is_not_sent_with_an_end_effector(tmp_path: Path) -> None:
     aim = EndEffectorGoal.checked("link_7", [0.4, 0.1, 0.8])
     scenario = load_scenario("reach").with_end_effectors([aim], frozenset({"attitude"}))
-    with pytest.raises(ParameterError, match="whole pose of the base or with none"):
+    with pytest.raises(ParameterError, match="whole pose of the base or none"):
         run_scenario(scenario, tmp_path / "run.mcap", nodes=True)
