@@ -1,1 +1,1 @@
-"""Flights: scenarios, and how a commander answers the states of its plant, without ROS."""
+"""Flights of scenarios without ROS, in which commanders respond to the states of a plant."""

@@ -37,7 +37,7 @@ from spacerobot_ros.scenario import (
 )
 
 _ORIGIN = [0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]
-"""The pose of a base that is nowhere else."""
+"""The default pose of a base."""
 
 
 def fly(
@@ -63,8 +63,9 @@ def fly(
     Parameters
     ----------
     what
-        A scenario: its name, its file, or :func:`~spacerobot_ros.scenario.load_scenario`'s;
-        or a robot: its name, its URDF file, or its model. A name that is both is the scenario.
+        A scenario: its name, its file, or the result of
+        :func:`~spacerobot_ros.scenario.load_scenario`; or a robot: its name, its URDF file, or its
+        model. A name of both means the scenario.
     goal
         Goal pose of the base; or its position (3,), m, or position and quaternion (7,). None: the
         goal of the scenario.
@@ -74,7 +75,7 @@ def fly(
     end_effector_position, end_effector_pose, end_effector
         Goal of an end-effector, as for :func:`plan`.
     method
-        A gait method or a control law; None: that of the scenario.
+        A gait method or a control law; None: as in the scenario.
     law, law_options
         A class of your own control law, and its options by name. The scenario must have a
         controller, whose gains it uses.
@@ -86,11 +87,11 @@ def fly(
     Raises
     ------
     ParameterError
-        There is no such scenario, robot, method or parameter, or only the nodes can fly it.
+        There is no such scenario, robot, method or parameter, or only nodes can fly the scenario.
     GoalError
         The goal is not a pose.
     PlanningError
-        The goal is refused, as by :func:`plan`, or by the controller.
+        The goal is refused, as in :func:`plan`, or by the controller.
     """
     hands = end_effector_goals(end_effector_position, end_effector_pose, end_effector)
     scenario = scenario_to_fly(what, goal, position, rotvec, hands)
@@ -102,7 +103,7 @@ def fly(
         scenario = scenario.with_method(law.name)
         scenario = scenario.with_overrides("coordinated_control", options)
     elif law_options is not None:
-        raise ParameterError("law_options are those of a law: give it as law=MyLaw.")
+        raise ParameterError("law_options needs a law: give it as law=MyLaw.")
     if method is not None:
         scenario = scenario.with_method(method)
     scenario = _with_parameters(scenario, {} if parameters is None else parameters)
@@ -140,11 +141,11 @@ def plan(
 ) -> GaitSchedule:
     """Plan a gait for a scenario or for a robot.
 
-    A scenario gives the start, the limits, the tolerances, the control period, the method and,
-    if none is given, the goal: ``plan("arm_attitude")``, or for another goal
-    ``plan(load_scenario("sliding_masses"), rotvec=(0, 0, 0.1))``.
-    For a robot these are the defaults of :func:`spacerobot_ros.planning.plan`, which takes more
-    arguments: ``plan("sliding_masses", rotvec=(0.5, 0, 0), start=(0, 1, 0))``.
+    A scenario defines the start, the limits, the tolerances, the control period, the method and the
+    default goal: ``plan("arm_attitude")``, or for another goal
+    ``plan(load_scenario("sliding_masses"), rotvec=(0, 0, 0.1))``. A robot uses the defaults of
+    :func:`spacerobot_ros.planning.plan`, which has more arguments: ``plan("sliding_masses",
+    rotvec=(0.5, 0, 0), start=(0, 1, 0))``.
 
     Parameters
     ----------
@@ -157,17 +158,17 @@ def plan(
         Position (3,), m, and attitude (3,), rad, as exponential coordinates; they replace those of
         ``goal``.
     end_effector_position, end_effector_pose, end_effector
-        Goal of an end-effector, with the base free except for given parts of its pose: its position
-        (3,), m, or position and quaternion (7,), and the name of its link; or positions or poses
-        of several, by name.
+        Goal of an end-effector: its position (3,), m, or position and quaternion (7,), and the name
+        of its link; or positions or poses of several, by name. Only given parts of the base pose
+        are constrained.
     method
-        Name of a gait method; None: that of the scenario, or for a robot ``auto``, or ``optimal``
-        if there are options of a method.
+        Name of a gait method; None: as in the scenario. For a robot it is ``auto``, or ``optimal``
+        if method options are given.
     parameters
         Parameters of the nodes by name, as for :func:`fly`, such as
-        ``{"planner.attitude_tolerance": 0.001}``; a robot is then taken as :func:`fly` takes it.
+        ``{"planner.attitude_tolerance": 0.001}``; a robot is then handled as in :func:`fly`.
     options
-        Options of the method by name, and for a robot the other arguments of
+        Options of the method by name; for a robot, also other arguments of
         :func:`spacerobot_ros.planning.plan`.
 
     Raises
@@ -236,7 +237,7 @@ def scenario_to_fly(
     rotvec: npt.ArrayLike | None = None,
     hands: Sequence[EndEffectorGoal] = (),
 ) -> Scenario:
-    """Return the scenario to fly, with the given goals; a robot alone is one without a goal.
+    """Return the scenario to fly, with the given goals; a robot alone becomes one without a goal.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""The body that a robot held in a flight: when, its parameters, and the momentum budget."""
+"""The body that a robot held in a flight: times, parameters, and momentum budget."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class HeldTarget:
     start, end
         Times of the capture and of the release, s; the end is infinite without a release.
     payload
-        The body, by the target's description.
+        The body, according to the target's description.
     """
 
     start: float
@@ -60,7 +60,7 @@ class HeldTarget:
 
 @dataclass(frozen=True)
 class States:
-    """States of the robot in which base and joints are known.
+    """States of the robot with known base and joints.
 
     Attributes
     ----------
@@ -80,9 +80,9 @@ class States:
 
     @classmethod
     def of(cls, flight: Flight, robot: RobotDescription, prefix: str = "") -> States:
-        """Return the states of a flight; none if its joints are not those of the robot.
+        """Return the states of a flight; empty if its joints differ from the robot's.
 
-        With the prefix ``measured_`` they are those that the sensors measured.
+        With the prefix ``measured_``, they are the measured states.
         """
         pose, q = flight.signal(f"{prefix}pose"), flight.signal(f"{prefix}q")
         names = list(flight.joint_names)
@@ -115,14 +115,14 @@ class States:
         return self.at(np.flatnonzero(inside))
 
     def sample_rows(self, most: int) -> npt.NDArray[np.int64]:
-        """Return the rows of at most so many states, at about equal intervals."""
+        """Return the rows of at most ``most`` states, at about equal intervals."""
         return np.unique(np.linspace(0, len(self) - 1, most).round().astype(np.int64))
 
 
 def held_bodies(flight: Flight) -> tuple[HeldTarget, ...]:
     """Return the bodies that the robot of a flight held, one for each capture.
 
-    Where the grasp is follows from the poses of robot and target after the capture.
+    The grasp pose follows from the poses of robot and target after the capture.
     """
     robot, target = flight.robot, flight.target
     if robot is None or target is None:
@@ -160,15 +160,15 @@ def momentum_budget_over_time(flight: Flight, most: int) -> Signal:
     """Return the angular momentum of base, arm, wheels and all about the centre of mass, N m s.
 
     The columns are :data:`BUDGET_PARTS`: norms of the parts of
-    :func:`~spacerobot_ros.control.wheels.momentum_budget`, as controller/status has them, here from
-    the true states. A body that the robot holds counts as a part of the link that holds it.
+    :func:`~spacerobot_ros.control.wheels.momentum_budget`, as in controller/status, but from the
+    true states. A held body is part of the link that holds it.
 
     Parameters
     ----------
     flight
         The flight; without a description of its robot, or without states, the signal is empty.
     most
-        Largest number of states at which they are evaluated.
+        Largest number of states to evaluate.
 
     Raises
     ------
@@ -199,21 +199,21 @@ def momentum_budget_over_time(flight: Flight, most: int) -> Signal:
 def payload_estimates(flight: Flight, most: int = 600) -> tuple[PayloadEstimate, ...]:
     """Return the estimated parameters of each body that the robot held.
 
-    They follow from the measured motion of base and joints, from the masses of the robot alone and
-    from the thrust, by the conservation of momentum (:mod:`.model.payload_estimation`): nothing is
-    taken from the target's description.
+    Conservation of momentum (:mod:`.model.payload_estimation`) determines them from the measured
+    motion of base and joints, the robot's masses and the thrust; the target's description is not
+    used.
 
     Parameters
     ----------
     flight
         The flight.
     most
-        Largest number of states of each body that are used.
+        Largest number of states used for each body.
 
     Raises
     ------
     SpaceRobotError
-        Loads whose impulse is not known acted on the robot.
+        Loads with unknown impulse acted on the robot.
     RobotDescriptionError
         The described robot has no positive inertia.
     """

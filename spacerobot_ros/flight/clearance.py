@@ -1,7 +1,6 @@
-"""The clearance of a flight: the smallest distance between links, and to obstacles, in its true
-states.
+"""The clearance of a flight: the smallest distance between links, and to obstacles, in true states.
 
-A flight without ROS reports clearances as the plant's node does: :meth:`FlightClearance.statuses`.
+A flight without ROS reports clearances like the plant's node: :meth:`FlightClearance.statuses`.
 """
 
 from __future__ import annotations
@@ -32,7 +31,7 @@ class FlightClearance:
     shapes
         (N, n) true positions of the robot's joints, m or rad.
     base
-        The true poses (N,) of the base; None: obstacles do not count.
+        The true poses (N,) of the base; None: there are no obstacles.
     """
 
     geometry: CollisionGeometry
@@ -49,7 +48,7 @@ class FlightClearance:
         pose: tuple[Array, Array],
         mesh_of: Callable[[Shape], TriangleMesh] = shape_mesh,
     ) -> FlightClearance | None:
-        """Return the clearance of a flight; None without states, or if no pair of links counts.
+        """Return the clearance of a flight; None without states, or if no pair of links is checked.
 
         Parameters
         ----------
@@ -59,7 +58,7 @@ class FlightClearance:
             The names of the columns of ``q``.
         q, pose
             Times (N,), s, and joint positions (N, n), m or rad; times (M,) and poses (M, 7) of the
-            base, which count among obstacles alone, and then the states of equal times.
+            base. If there are obstacles, only states with equal times are used.
         mesh_of
             As for :class:`~spacerobot_ros.collision.geometry.CollisionGeometry`.
         """
@@ -84,7 +83,7 @@ class FlightClearance:
         return found
 
     def statuses(self, every: int) -> list[ClearanceStatus]:
-        """Return the clearances of one state in ``every``, as the plant publishes them."""
+        """Return the clearance of every ``every``-th state, as the plant publishes it."""
         distances, pairs = self._nearest_at(slice(None, None, every))
         return [
             ClearanceStatus(distance, self.geometry.links_of(pair), time)

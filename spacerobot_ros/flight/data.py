@@ -1,4 +1,4 @@
-"""The data of one flight: its arrays over time, the reports about it, its measures and verdict.
+"""The data of one flight: arrays over time, reports, measures and verdict.
 
 A bag need not hold everything: parts are optional. A commander judges its goal by the measured
 state, at the moment of its decision. The verdict judges by the true state at the end, with the
@@ -76,20 +76,20 @@ _PARTS: frozenset[Controlled] = frozenset(("position", "attitude", "shape", "end
 
 @dataclass(frozen=True)
 class Verdict:
-    """The end of a flight for people, by its last true state.
+    """The outcome of a flight for people, according to its last true state.
 
     Attributes
     ----------
     word
-        The outcome in some words, such as ``Reached, but for the position``.
+        The outcome in a few words, such as ``Reached, but for the position``.
     sentence
-        The message of the commander; of a goal that is reached, or not in time, the true errors
-        with their tolerances.
+        The message of the commander. If the goal is reached, or not in time, the true errors with
+        their tolerances.
     succeeded
-        Whether the goal is reached in truth, in the parts that are controlled, and the target
-        captured where that was to be automatic.
+        Whether the true state reaches the goal in all controlled parts, and an automatic capture
+        has happened.
     complete
-        Whether in addition every part of the goal was controlled.
+        Whether also every part of the goal was controlled.
     """
 
     word: str
@@ -102,16 +102,16 @@ class Verdict:
 class FlightData:
     """The data of a flight, from :func:`spacerobot_ros.fly` or from a bag.
 
-    All arrays are copies; those of a missing part have no rows.
+    All arrays are copies; arrays of missing parts have no rows.
 
     Attributes
     ----------
     scenario
         The scenario that was flown.
     robot
-        The robot of the plant; None where a bag holds no description of it.
+        The robot of the plant; None if a bag has no description of it.
     joint_names
-        The joints, in the order of columns.
+        The joints, in the order of the columns.
     series
         All quantities of the plant by name, each with its times (s). The true ones are ``pose``
         (N, 7), position (m) and quaternion (x, y, z, w) of the base in the world; ``twist`` (N, 6),
@@ -122,30 +122,31 @@ class FlightData:
     commands
         The commands by topic.
     statuses
-        Statuses of the commanders, with the stamp of the state that they answered, ns.
+        Statuses of the commanders, each with the stamp of the state it responds to, ns.
     events
         Events of the nodes.
     outcome, message
-        The end of the goal, and the same for people.
+        The outcome of the goal, and a sentence about it.
     goal, end_effector_goal
-        The goals that count at the end; None: there is none.
+        The goals in force at the end; None: there is none.
     goals, end_effector_goals
         All goals that were sent.
     schedules
-        The gaits that were flown, each with the stamp of its beginning, ns; none of a bag.
+        The gaits that were flown, each with the stamp of its beginning, ns; empty for a bag.
     plant_statuses, diagnostics, covariances
         Statuses of the plant, diagnostics of plant and commanders, and covariances (72,) of
-        measured pose and twist, each with the time from which on it is published, ns; none of a
-        bag, nor covariances of sensors without errors.
+        measured pose and twist, each with the time of its first publication, ns. Empty for a bag;
+        no covariances if sensors have no errors.
     status, gait
-        The last status of the commander that decides, and the planner's when its first gait began.
+        The last status of the deciding commander, and the planner's status when its first gait
+        began.
     plan_time, wall_time
-        Wall time of planning, and of the whole flight, s; NaN if it is not known.
+        Wall time of planning, and of the whole flight, s; NaN if unknown.
     refusals
         Commands that were refused: time (s), topic, reason.
     measures_clearance
-        Whether the distances between links are measured: false where ``plant.clearance_period`` is
-        0, and of bags without the topic ``clearance``.
+        Whether the distances between links are measured: false if ``plant.clearance_period`` is 0,
+        and for bags without the topic ``clearance``.
     """
 
     scenario: Scenario
@@ -176,7 +177,7 @@ class FlightData:
     # -- arrays -------------------------------------------------------------------------------
 
     def signal(self, name: str) -> Signal:
-        """Return a quantity over time; without samples if the flight does not have it."""
+        """Return a quantity over time; empty if the flight does not have it."""
         found = self.series.get(name)
         if found is not None:
             return found
@@ -220,10 +221,10 @@ class FlightData:
 
     @property
     def quantities(self) -> dict[str, Array]:
-        """The quantities without an attribute of their own, (N, size) each.
+        """The quantities without their own attribute, (N, size) each.
 
-        Names are those of :class:`~spacerobot_ros.simulation.sensors.ReportedState`:
-        measured states (only where sensors err), the end-effector, thrusters, expected momenta.
+        For names see :class:`~spacerobot_ros.simulation.sensors.ReportedState`: measured states
+        (only if sensors have errors), the end-effector, thrusters, expected momenta.
         """
         return {
             name: self.series[name].values for name in self.series if name not in _TRUE_QUANTITIES
@@ -245,16 +246,16 @@ class FlightData:
 
     @cached_property
     def target(self) -> RobotDescription | None:
-        """The body that floats beside the robot; None: there is none."""
+        """The second floating body; None: there is none."""
         return load_target(self.scenario.plant.target)
 
     @cached_property
     def capture(self) -> dict[str, Any]:
-        """The first capture of the target, by the keys of ``spacerobot run --json``.
+        """The first capture of the target, with the keys of ``spacerobot run --json``.
 
         Without a capture, ``captured`` is false; empty if there is no target. After a planned
-        approach, ``detumble`` and ``planned_momentum_Nms`` are what was asked for and planned, and
-        ``angular_momentum_Nms`` is left.
+        approach, ``detumble`` is the request, ``planned_momentum_Nms`` the plan and
+        ``angular_momentum_Nms`` the result.
         """
         planned: dict[str, Any] = {}
         for event in self.events:
@@ -268,7 +269,7 @@ class FlightData:
 
     @cached_property
     def detumbling(self) -> dict[str, float]:
-        """The first detumbling after a capture, by the keys of ``spacerobot run --json``; empty:
+        """The first detumbling after a capture, with the keys of ``spacerobot run --json``; empty:
         there was none.
         """
         for event in self.events:
@@ -279,7 +280,7 @@ class FlightData:
 
     @cached_property
     def capture_measures(self) -> CaptureMeasures:
-        """The measures of the flight to the target; all are NaN if there is none."""
+        """The measures of the capture; all are NaN if there is no target."""
         capture, detumbling = self.capture, self.detumbling
         if not capture:
             return CaptureMeasures()
@@ -331,12 +332,13 @@ class FlightData:
 
     @property
     def succeeded(self) -> bool:
-        """Whether the goal was reached, by the true state and by the capture if there is one."""
+        """Whether the goal was reached, according to the true state and the capture, if there is
+        one."""
         return self.verdict.succeeded
 
     @property
     def succeeded_by_measurement(self) -> bool:
-        """Whether the goal was reached within tolerance by the measured state."""
+        """Whether the goal was reached within tolerance, according to the measured state."""
         return self.outcome is Outcome.REACHED
 
     @property
@@ -351,8 +353,8 @@ class FlightData:
 
     @property
     def manoeuvre_time(self) -> float:
-        """Time flown for the goal, s, see :func:`~spacerobot_ros.measures.flown_time`; where no
-        status reports it, the duration of the flight.
+        """Time flown for the goal, s, see :func:`~spacerobot_ros.measures.flown_time`; if no status
+        reports it, the duration of the flight.
         """
         reports = [(stamp_ns / SECOND, status) for stamp_ns, status in self.statuses]
         last = self.status.manoeuvre_time_s if isinstance(self.status, PlannerStatus) else 0.0
@@ -361,7 +363,7 @@ class FlightData:
 
     @property
     def corrections(self) -> int:
-        """Number of new plans that count as corrections."""
+        """Number of corrections, which are new plans for the same goal."""
         return self.status.corrections if isinstance(self.status, PlannerStatus) else 0
 
     @property
@@ -378,8 +380,8 @@ class FlightData:
         return scenario.controller.law
 
     def tolerance(self, part: Literal["position", "attitude", "joint"]) -> float | None:
-        """Return the largest error of a part of a reached goal, m or rad; None if a bag has no
-        parameters of the commander.
+        """Return the tolerance for a part of the goal, m or rad; None if a bag has no parameters of
+        the commander.
         """
         scenario, name = self.scenario, f"{part}_tolerance"
         node = "planner" if "planner" in scenario.commanders else "coordinated_control"
@@ -391,7 +393,7 @@ class FlightData:
 
     @cached_property
     def not_controlled(self) -> tuple[Controlled, ...]:
-        """Parts of the goal's base and shape that the method or the law does not control."""
+        """Parts of the goal (base pose and shape) that the method or the law does not control."""
         if self.goal is None:
             return ()
         match self.status:
@@ -411,26 +413,27 @@ class FlightData:
 
     @property
     def turns_end_effector(self) -> bool:
-        """Whether a controller turns the end-effector to an attitude."""
+        """Whether a controller controls the attitude of the end-effector."""
         command = self.status.command if isinstance(self.status, ControllerStatus) else None
         return command is not None and "attitude" in command.controls("end_effector")
 
     @property
     def has_thrust(self) -> bool:
-        """Whether forces or torques of thrusters were commanded."""
+        """Whether thruster forces or torques were commanded."""
         wrench = self.commands.get("base_wrench")
         return wrench is not None and bool(wrench.values.any())
 
     @property
     def error(self) -> PoseError | None:
-        """Error of the last true pose to the goal; None without a pose or a goal of the base."""
+        """Error of the last true pose relative to the goal; None without a pose or a goal of the
+        base."""
         goal = self.goal
         return None if goal is None or not goal.base else pose_error(self.signal("pose"), goal)
 
     @property
     def errors(self) -> Array:
-        """(N, 2) distances (m) and angles (rad) of the true poses from the goal that counts at the
-        end; without rows if there is no goal of the base.
+        """(N, 2) distances (m) and angles (rad) of the true poses from the final goal; no rows if
+        there is no goal of the base.
         """
         if self.goal is None or not self.goal.base:
             return np.empty((0, 2))
@@ -441,9 +444,10 @@ class FlightData:
 
     @property
     def end_effector_error(self) -> PoseError | None:
-        """Error of the end-effector's last pose to its goal; None without a pose or a goal.
+        """Error of the end-effector's last pose relative to its goal; None without a pose or a
+        goal.
 
-        Of several it is that of the farthest.
+        If there are several, the one with the largest distance is used.
         """
         if errors := self.end_effector_errors:
             return max(errors.values(), key=lambda error: error.distance)
@@ -451,7 +455,7 @@ class FlightData:
 
     @property
     def end_effector_errors(self) -> dict[str, PoseError]:
-        """Errors of the last true poses of the end-effectors that the planner's goal names."""
+        """Errors of the last true poses of the end-effectors in the planner's goal."""
         goal, robot = self.goal, self.robot
         if goal is None or not goal.end_effectors or not len(self.q) or not len(self.pose):
             return {}
@@ -485,8 +489,8 @@ class FlightData:
 
     @cached_property
     def clearance(self) -> FlightClearance | None:
-        """The smallest distance between links over time; None if it is not measured, without
-        joint states, or of a robot without links that could touch.
+        """The smallest distance between links over time; None if it is not measured, there are no
+        joint states, or no links could touch.
         """
         if self.robot is None or not self.measures_clearance:
             return None
@@ -511,13 +515,13 @@ class FlightData:
 
     @cached_property
     def measures(self) -> Measures:
-        """The measures of the flight, which has states."""
+        """The measures of the flight, which must have states."""
         return self.measured()
 
     def measured(self, *, clearance: bool = True) -> Measures:
-        """Return the measures of the flight, which has states.
+        """Return the measures of the flight, which must have states.
 
-        ``clearance``: whether the smallest distance between links is measured, which takes a while.
+        ``clearance``: whether to measure the smallest distance between links, which is slow.
         """
         wrench = self.commands.get("base_wrench")
         distance, angle = self._largest_end_effector_errors
@@ -571,7 +575,8 @@ class FlightData:
 
     @cached_property
     def verdict(self) -> Verdict:
-        """The end of the flight in a word and a sentence, by its last true state."""
+        """The outcome of the flight in a few words and a sentence, according to its last true
+        state."""
         late = self.outcome is Outcome.FAILED and isinstance(self.status, ControllerStatus)
         reached = self.outcome in (Outcome.REACHED, Outcome.REACHED_PARTLY)
         if not (reached or late):

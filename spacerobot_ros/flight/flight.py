@@ -1,7 +1,7 @@
 """One flight: its data, its summary, and its views and files.
 
-A flight is made by the loop without ROS (:mod:`~spacerobot_ros.flight.lockstep`) or by reading a
-bag (:mod:`~spacerobot_ros.flight.reading`).
+A flight comes from the loop without ROS (:mod:`~spacerobot_ros.flight.lockstep`) or from a bag
+(:mod:`~spacerobot_ros.flight.reading`).
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Flight(FlightData):
-    """A flight, from :func:`spacerobot_ros.fly` or from a bag; its data as of the base class."""
+    """A flight, from :func:`spacerobot_ros.fly` or from a bag; see the base class for its data."""
 
     def __repr__(self) -> str:
         error, left = self.error, ""
@@ -42,9 +42,9 @@ class Flight(FlightData):
         )
 
     def summary(self) -> dict[str, Any]:
-        """Return the measures by the keys of ``spacerobot run --json``.
+        """Return the measures with the keys of ``spacerobot run --json``.
 
-        The flight has states and a goal.
+        The flight must have states and a goal.
         """
         goal, measures = self.goal, self.measures
         assert goal is not None
@@ -121,11 +121,11 @@ class Flight(FlightData):
     def to_pandas(self, *, euler: bool = False) -> pd.DataFrame:
         """Return a table with a row for each state, indexed by time (s).
 
-        Columns and their units, ``attrs["units"]``, are those of the tables of bags: of ``odom``
-        and ``joint_states`` as there, with the true state, of other topics with the topic before
-        them, as ``momentum.data[linear_x]``; ``measured`` stands before measured states that
-        differ from the true ones. With ``euler`` the columns ``roll``, ``pitch`` and ``yaw`` have
-        the rotations of each attitude about the fixed axes x, y, z (rad).
+        Columns and their units, ``attrs["units"]``, are as in the tables of bags. Columns of
+        ``odom`` and ``joint_states`` have the true state; other columns have their topic as a
+        prefix, such as ``momentum.data[linear_x]``. Measured states that differ from the true ones
+        have the prefix ``measured``. If ``euler`` is set, the columns ``roll``, ``pitch`` and
+        ``yaw`` have the rotations of each attitude about the fixed axes x, y, z (rad).
 
         Raises
         ------
@@ -142,7 +142,7 @@ class Flight(FlightData):
     def to_xarray(self, *, euler: bool = False) -> xr.Dataset:
         """Return the columns of :meth:`to_pandas` as variables over ``time``, with their units.
 
-        Arrays stay arrays, over ``time`` and ``joint`` for joint states, as with those of bags.
+        Arrays remain arrays, over ``time`` and ``joint`` for joint states, as for bags.
 
         Raises
         ------
@@ -197,7 +197,7 @@ class Flight(FlightData):
         Raises
         ------
         RecordingError
-            The file exists and is not to be replaced, or cannot be written; or the flight has no
+            The file exists and may not be replaced, or cannot be written; or the flight has no
             description of its robot.
         """
         from spacerobot_ros.flight.saved import save_flight

@@ -4,12 +4,11 @@ Nodes in lockstep pass messages to each other in the order of publication. The
 loop makes the same calls in the same order:
 
 1. The plant reports the state of tick k.
-2. The planner answers it as soon as its joints are there, the controller when its pose is, too, and
-   the planner's reference, if there is one.
-3. The first command of the tick counts; the plant steps when it has every command it waits for.
+2. The planner responds as soon as the joint state arrives, the controller once the pose arrives,
+   too, and the planner's reference, if there is one.
+3. The first command of the tick is used; the plant steps when it has every command it waits for.
 4. The flight ends with the decision about the goal. The planner reports it before its command, so
-   that the state of tick k is the last one; the controller after its commands, so that the state of
-   tick k + 1 is.
+   the last state is that of tick k; the controller after its commands, so it is that of tick k + 1.
 
 Planner and controller are the same :class:`~spacerobot_ros.commanding.commander.Commander` objects
 as in the nodes, given arrays instead of messages.
@@ -62,8 +61,8 @@ _FIRST_GOAL_STAMP = 0, 1
 """Stamp of the first goal that a mission client sends at time zero: seconds and nanoseconds."""
 
 Progress = Callable[[float, float], bool]
-"""Called now and then with simulated time and the time the present schedule ends, s; returns
-whether the flight is to end."""
+"""Called regularly with simulated time and the end time of the current schedule, s; returns whether
+to end the flight."""
 
 _PROGRESS_PERIOD = 0.2  # wall s
 _TICKS_PER_CLOCK_READ = 64
@@ -71,13 +70,13 @@ _TICKS_PER_CLOCK_READ = 64
 
 @dataclass(frozen=True)
 class Robots:
-    """The models of a flight: that of the plant, and those that its commanders assume."""
+    """The models of a flight: the plant's model, and the models that its commanders assume."""
 
     plant: SpaceRobot
     planner: SpaceRobot
     controller: SpaceRobot
     description: RobotDescription | None = None
-    """Of the plant, with the URDF that is recorded; None: as its model has it."""
+    """Description of the plant, with the URDF to record; None: the description in its model."""
     method: GaitMethod | None = None
     """Gait method for the planner's robot and configuration; None: it is built for this flight."""
 
@@ -89,9 +88,9 @@ class Robots:
             config
         ),
     ) -> Robots:
-        """Build the models that a scenario names; a commander that names none has the plant's URDF.
+        """Build the models that a scenario names; a commander without one uses the plant's URDF.
 
-        ``built`` returns the robot of a node's configuration, None where that names none.
+        ``built`` returns the robot of a node's configuration; None if it names none.
 
         Raises
         ------
@@ -113,19 +112,18 @@ class Robots:
 
 
 def require_flyable(scenario: Scenario) -> None:
-    """Refuse a scenario that only nodes can fly: wall time, other processes, files to continue
-    from.
+    """Refuse a scenario that only nodes can fly: wall time, other processes, resumed flights.
 
     Raises
     ------
     ParameterError
-        The scenario asks for it; the message says how it is flown.
+        Only nodes can fly the scenario; the message says how.
     """
     why = ""
     if not scenario.lockstep:
         why = "plant.time_mode is realtime"
     elif scenario.kills:
-        why = "it kills nodes on the way"
+        why = "it kills nodes in flight"
     elif scenario.plant.resume_bag:
         why = "plant.resume_bag is set"
     elif any(scenario.config(name).resume_file for name in scenario.commanders):
@@ -149,14 +147,14 @@ def fly_scenario(
     progress: Progress = lambda now, end: False,
     longest: float = math.inf,
 ) -> Flight:
-    """Fly a scenario from its initial state to its goal, without ROS: as ``spacerobot run`` does.
+    """Fly a scenario from its initial state to its goal, without ROS, like ``spacerobot run``.
 
     Parameters
     ----------
     scenario
         What to fly, in lockstep.
     robots
-        The models; None: those that the scenario names.
+        The models; None: the models that the scenario names.
     progress
         Called with the progress of the flight; it may end it.
     longest
@@ -165,9 +163,9 @@ def fly_scenario(
     Raises
     ------
     ParameterError
-        A parameter or the robot is refused, or only the nodes can fly this.
+        A parameter or the robot is refused, or only nodes can fly this scenario.
     GoalError
-        The shape of the goal is of another robot.
+        The joint positions of the goal belong to another robot.
     """
     require_flyable(scenario)
     flight = LockstepFlight(scenario, robots or Robots.of(scenario))
@@ -218,7 +216,7 @@ class LockstepFlight:
     Parameters
     ----------
     scenario
-        What to fly; :func:`require_flyable` accepts it.
+        What to fly; :func:`require_flyable` must accept it.
     robots
         The models.
 
@@ -227,7 +225,7 @@ class LockstepFlight:
     ParameterError
         A parameter or the robot is refused.
     GoalError
-        The shape of the goal is of another robot.
+        The joint positions of the goal belong to another robot.
     """
 
     def __init__(self, scenario: Scenario, robots: Robots) -> None:
@@ -253,7 +251,7 @@ class LockstepFlight:
                 has_contact_forces=config.engine == "mujoco",
             )
         self._diagnosed_ns: dict[str, int] = {}
-        """When the diagnostics of each commander were published last, ns."""
+        """Time of the last diagnostics of each commander, ns."""
         self._statuses: dict[str, StatusRecord] = {}
         self.log = FlightLog(self._plant, self._reported, self._commands, self._period_ns)
         self._follower = GoalFollower(GoalIds().of(*_FIRST_GOAL_STAMP))
@@ -289,13 +287,13 @@ class LockstepFlight:
         progress: Progress = lambda now, end: False,
         longest: float = math.inf,
     ) -> Flight:
-        """Fly to the decision about the goal; parameters are those of :func:`fly_scenario`."""
+        """Fly until the goal is decided; for parameters see :func:`fly_scenario`."""
         began = time.perf_counter()
         interrupted = self._fly(progress, longest)
         return self.until_now(time.perf_counter() - began, interrupted)
 
     def interrupt(self) -> None:
-        """End the flight, and the plan that is being made; called from another thread."""
+        """End the flight and the plan in progress; called from another thread."""
         self._interrupted = True
         for commander in (self._planner, self._controller):
             if commander is not None:
@@ -520,7 +518,7 @@ class LockstepFlight:
                 )
 
     def take_status(self, status: Status) -> None:
-        """Follow the status as the client of a mission does."""
+        """Follow the status like the client of a mission."""
         self.log.statuses.append((self._now_ns, status))
         name = "planner" if isinstance(status, PlannerStatus) else "coordinated_control"
         self._statuses[name] = StatusRecord(
@@ -535,7 +533,7 @@ class LockstepFlight:
             self._decided = self._moment
 
     def take_event(self, node: str, event: Event) -> None:
-        """Take an event of a commander; its time is now unless it has one."""
+        """Store an event of a commander; its time is the current one unless it has one."""
         time = self.time if event.time_s is None else event.time_s
         self.log.events.append(replace(event, time_s=time, node=node))
 

@@ -97,7 +97,7 @@ class FlightLog:
     def add_command(
         self, topic: str, tick: int, values: Array, setpoint: tuple[Array, Array] | None = None
     ) -> None:
-        """Add a command; a planner's has its setpoint, joint positions and rates."""
+        """Add a command; commands of a planner include its setpoint, joint positions and rates."""
         if topic not in self._commands:
             self._commands[topic] = array("q"), _GrowingTable(len(values))
         ticks, rows = self._commands[topic]
@@ -171,7 +171,7 @@ class _GrowingTable:
         self._count = 0
 
     def next_row(self) -> Array:
-        """Return one more row, which the caller fills."""
+        """Return a new row, to be filled by the caller."""
         if self._count == len(self._table):
             self._table = np.concatenate([self._table, np.empty_like(self._table)])
         self._count += 1

@@ -1,7 +1,7 @@
-"""Reads a flight from its bag: all that the bag holds; other parts stay empty.
+"""Reads a flight from its bag; parts that are not in the bag stay empty.
 
-:func:`read_flight` reads any bag, of whatever stack; :func:`read_run` one of ``spacerobot run``,
-which must be complete.
+:func:`read_flight` reads bags of any stack; :func:`read_run` reads complete bags of ``spacerobot
+run``.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ from spacerobot_ros.times import SECOND
 from spacerobot_ros.topics import TOPICS, StateField, Topic, goal_topic, path_topic, topic_named
 
 _SAME_CLOCK_TOLERANCE = 1.0
-"""Stamps this near to the log times, in s, come from the same clock."""
+"""Stamps that differ less from the log times, in s, come from the same clock."""
 
 _COMMAND_TOPICS = ("joint_commands", "base_wrench", "joint_reference")
 
@@ -52,7 +52,7 @@ _QUANTITY_TOPICS = (
     *("momentum", "end_effector_pose", "momentum_expected"),
     *("base_wrench_realised", "thrusters", "target/odom", "target/odom_true"),
 )
-"""Topics whose fields are quantities of a flight, beside those with a true and a measured one."""
+"""Topics whose fields are quantities of a flight, except those with true and measured variants."""
 
 _FLIGHT_TOPICS = (
     *("odom", "odom_true", "joint_states", "joint_states_true"),
@@ -61,22 +61,22 @@ _FLIGHT_TOPICS = (
     *(topic for topic, _ in STATUS_TOPICS.values()),
     *("events", "clearance"),
 )
-"""Topics that every flight is read from, together: one pass over a bag unpacks it once."""
+"""Topics that are read for every flight, together: one pass unpacks the bag only once."""
 
 _NO_GOAL = Goal.checked([0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0])
-"""Goal of the base where a bag has none, or leaves it free."""
+"""Goal of the base if a bag has none, or leaves it free."""
 
 _ABSENT_MEANS_ZERO = (("planner", "clearance"), ("plant", "clearance_period"))
-"""Parameters by node that bags of earlier versions lack: their flights were without them."""
+"""Parameters that are missing in bags of earlier versions, by node: they were not in effect."""
 
 WRENCH_COLUMNS = TOPICS["base_wrench_realised"].state[0].columns
-"""Paths of force and torque in a message of a wrench."""
+"""Paths of force and torque in a wrench message."""
 
 
 class FlightBag(RecordedRobot):
     """The topics of one robot in a bag as signals over time.
 
-    Times are stamps (s), or log times where stamps are of another clock.
+    Times are stamps (s), or log times if stamps come from another clock.
 
     Parameters
     ----------
@@ -98,7 +98,7 @@ class FlightBag(RecordedRobot):
         """Time of the first state, s."""
 
     def messages(self, name: str) -> Iterator[tuple[int, Any]]:
-        """Go through the messages of a topic, each with its log time in ns."""
+        """Iterate over the messages of a topic, each with its log time in ns."""
         series = self.get(name)
         return iter(()) if series is None else series.messages()
 
@@ -109,8 +109,8 @@ class FlightBag(RecordedRobot):
 
     @property
     def description(self) -> RobotDescription | None:
-        """The first readable description of the robot, among the obstacles that came last; None
-        if there is none.
+        """The first readable description of the robot, with the obstacles received last; None if
+        there is none.
         """
         for text in self.bag.robot_descriptions(self.namespace):
             try:
@@ -123,8 +123,8 @@ class FlightBag(RecordedRobot):
 
     @cached_property
     def obstacles(self) -> list[tuple[int, RobotDescription | None]]:
-        """The obstacles that came on the topic obstacles, with their log times, ns; None: that
-        there are none. Texts that nodes refuse are omitted.
+        """The messages on the topic obstacles, with their log times, ns; None: no obstacles. Texts
+        that nodes refuse are omitted.
         """
         came = []
         for time_ns, message in self.messages("obstacles"):
@@ -134,7 +134,7 @@ class FlightBag(RecordedRobot):
 
     @property
     def obstacles_change(self) -> bool:
-        """Whether obstacles came after the first state."""
+        """Whether obstacles were published after the first state."""
         states = self.get("odom")
         return states is not None and any(t / SECOND > states.time[0] for t, _ in self.obstacles)
 
@@ -148,8 +148,8 @@ class FlightBag(RecordedRobot):
         name
             The topic.
         fields
-            Paths of numbers, or of one array; joints and thrusters are put into the order of their
-            names in the first message.
+            Paths of numbers, or of one array; joints and thrusters are ordered by their names in
+            the first message.
         width
             Number of columns.
         """
@@ -172,10 +172,10 @@ class FlightBag(RecordedRobot):
         return self.signal(name, field.columns, width)
 
     def true_signal(self, name: str, number: int) -> Signal:
-        """Return a field of ``odom`` or ``joint_states`` as with perfect sensors.
+        """Return the true values of a field of ``odom`` or ``joint_states``.
 
-        That is ``<name>_true``, which a plant publishes while its sensors err, and ``name`` before
-        and after that.
+        They are on ``<name>_true`` while the sensors have errors, and on ``name`` before and after
+        that.
         """
         measured = self.quantity(name, TOPICS[name].state[number])
         true = self.quantity(f"{name}_true", TOPICS[f"{name}_true"].state[number])
@@ -192,7 +192,7 @@ class FlightBag(RecordedRobot):
         return Signal(*map(np.concatenate, zip(*parts, strict=True)))
 
     def measured_signal(self, name: str, number: int) -> Signal:
-        """Return a field of ``odom`` or ``joint_states`` while sensors err."""
+        """Return a field of ``odom`` or ``joint_states`` while sensors have errors."""
         began, *_, ended = self._times(self[f"{name}_true"])[[0, -1]]
         return self.quantity(name, TOPICS[name].state[number]).between(began, ended)
 
@@ -229,7 +229,7 @@ class FlightBag(RecordedRobot):
     def statuses(self, commander: str) -> Iterator[tuple[int, Status | str]]:
         """Yield the statuses of a commander with their log times, ns.
 
-        A status of another package is its message alone.
+        For a status of another package, only the message is returned.
         """
         topic, read = STATUS_TOPICS[commander]
         for time_ns, recorded in self.messages(topic):
@@ -250,9 +250,7 @@ class FlightBag(RecordedRobot):
             yield time_ns, message.name, event
 
     def goals(self, topic: str) -> tuple[SentGoal, ...]:
-        """Return the goal poses, and the last poses of paths, that are poses in the frame of the
-        odometry.
-        """
+        """Return valid goal poses, and last poses of paths, in the frame of the odometry."""
         odom = next(self.messages("odom"), None)
         world = odom[1].header.frame_id if odom is not None else ""
         goals, ids = [], GoalIds()
@@ -325,8 +323,8 @@ def open_flight_bag(path: str | os.PathLike[str], namespace: str | None = None) 
     path
         As for :func:`~spacerobot_ros.bag.read_bag`.
     namespace
-        Namespace of the robot's topics, with or without the slash before it; None: the first in
-        alphabetical order of those that the bag has an ``odom`` of.
+        Namespace of the robot's topics, with or without the leading slash; None: the first
+        namespace with an ``odom``, in alphabetical order.
 
     Raises
     ------
@@ -347,7 +345,7 @@ def open_flight_bag(path: str | os.PathLike[str], namespace: str | None = None) 
 
 
 def namespaces(bag: Bag) -> list[str]:
-    """Return the namespaces in which a bag has an ``odom`` of a robot, in alphabetical order."""
+    """Return the namespaces with an ``odom`` in a bag, in alphabetical order."""
     found = {
         topic.rpartition("/")[0]
         for topic, kind in bag.topics.items()
@@ -430,12 +428,11 @@ def with_propellant(flight: Flight, thrusters: str, names: Sequence[str]) -> Fli
     Parameters
     ----------
     flight
-        A flight; one without thrusters, or with that quantity, is returned as it is.
+        A flight; it is returned unchanged if it has no thrusters, or has that quantity.
     thrusters
         Source of their table, as in the plant's parameters.
     names
-        Names of the thrusters in the flight; with others than those of the table it has no
-        propellant.
+        Names of the thrusters in the flight; if they differ from the table, there is no propellant.
     """
     robot, series = flight.robot, flight.series
     if robot is None or "thruster_force" not in series or "propellant" in series:
@@ -473,7 +470,7 @@ def since(flight: Flight, start: float) -> Flight:
 
 
 def impulse(thrust: Signal, weights: Array) -> Signal:
-    """Return the sum over time (N, 1) of thrusts (N, m), N, each times its weight (m,)."""
+    """Return the integral over time (N, 1) of thrusts (N, m), N, weighted by (m,)."""
     ticks = np.diff(thrust.time, prepend=thrust.time[:1])
     total = np.cumsum(ticks * (thrust.values @ weights))
     return Signal(thrust.time, total[:, np.newaxis])
@@ -542,9 +539,10 @@ def _scenario_in_bag(bag: FlightBag) -> Scenario:
 
 
 def recorded_actuation(robot: RecordedRobot) -> str:
-    """Return what the commands of a robot in a bag carry: ``velocity``, ``effort``, or nothing.
+    """Return the quantity in the commands of a robot in a bag: ``velocity``, ``effort``, or
+    nothing.
 
-    The plant's status says so; bags without one have wrenches only beside efforts.
+    The plant's status reports it. In bags without a status, wrenches imply efforts.
     """
     series = robot.get("plant/status")
     for _, message in reversed(list(series.messages() if series is not None else ())):
@@ -566,7 +564,7 @@ def _recorded_values(kind: type[Any], texts: Mapping[str, str]) -> dict[str, Any
 
 
 def recorded_target(robot: RecordedRobot) -> str:
-    """Return the URDF text of the target of a robot in a bag; empty: it has none."""
+    """Return the URDF text of a robot's target in a bag; empty: there is none."""
     series = robot.get("target/robot_description")
     return "" if series is None else str(next(series.messages())[1].data)
 
@@ -583,7 +581,7 @@ def _parse_json(text: str) -> Any:
 
 
 def recorded_scenario(bag: Bag) -> Scenario:
-    """Return the scenario of a flight: parameters, goals and robot as its bag has them.
+    """Return the scenario of a flight: parameters, goals and robot from its bag.
 
     Raises
     ------
@@ -617,7 +615,8 @@ def _sent_goal(about: Mapping[str, str], name: str) -> Goal | None:
 
 
 def read_run(path: str | os.PathLike[str]) -> Flight:
-    """Return the flight in a bag of ``spacerobot run``, with the same arrays as without ROS.
+    """Return the flight in a bag of ``spacerobot run``, with the same arrays as a flight without
+    ROS.
 
     Raises
     ------
@@ -643,7 +642,7 @@ def read_run(path: str | os.PathLike[str]) -> Flight:
     if len(flight.pose) != len(flight.q):
         raise RecordingError(
             f"The bag {bag.path} has {len(flight.pose)} poses of the base and {len(flight.q)} "
-            "states of the joints: its flight is not whole."
+            "states of the joints: its flight is incomplete."
         )
     if not flight.goals and not scenario.goal.end_effectors:
         raise RecordingError(f"The bag {bag.path} holds no goal pose.")

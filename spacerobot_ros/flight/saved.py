@@ -1,6 +1,6 @@
 """A flight as a bag, as the nodes would have published it, and as a table.
 
-A table has the columns and units of the tables of the bag.
+A table has the same columns and units as the tables of the bag.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ _GOAL_STAMP_NS = 1
 
 
 _BLOCK_NS = 60 * SECOND
-"""Time whose messages are made at once, ns: those of a long flight would fill the memory."""
+"""Time span of messages made at once, ns: a whole long flight would fill the memory."""
 
 _CHUNK_SIZE = 262_144
 """Chunk size before compression, bytes: larger chunks have lower fixed costs, but slow seeking."""
@@ -86,7 +86,7 @@ class _Stream:
     def of(
         cls, topic: Topic, messages: Iterable[tuple[int, bytes]], stamp_ns: int | None = None
     ) -> _Stream:
-        """Return the stream of messages with their times, in any order."""
+        """Return the stream for messages with their times, given in any order."""
         ordered = sorted(messages, key=lambda each: each[0])
         times = np.array([time for time, _ in ordered], dtype=np.int64)
         found = [message for _, message in ordered]
@@ -96,12 +96,12 @@ class _Stream:
 def save_flight(
     flight: FlightData, path: str | os.PathLike[str], *, overwrite: bool = False
 ) -> None:
-    """Write a bag that ``spacerobot verify`` and ``spacerobot report`` take.
+    """Write a bag for ``spacerobot verify`` and ``spacerobot report``.
 
     Raises
     ------
     RecordingError
-        The file is there and is not to be replaced, or cannot be written; a type of message is not
+        The file exists and may not be replaced, or cannot be written; or a message type is not
         installed.
     """
     flight.required_robot()
@@ -117,7 +117,7 @@ def open_bag(
     Raises
     ------
     RecordingError
-        The file is there and is not to be replaced, or cannot be made.
+        The file exists and may not be replaced, or cannot be created.
     """
     config = scenario.config("recorder")
     return BagWriter(
@@ -136,7 +136,7 @@ def write_flight(flight: FlightData, writer: BagWriter) -> None:
     Raises
     ------
     RecordingError
-        The bag cannot be written, or a type of message is not installed.
+        The bag cannot be written, or a message type is not installed.
     """
     scenario = flight.scenario
     chosen = {f"/{name.lstrip('/')}" for name in scenario.config("recorder").topics.split()}
@@ -432,7 +432,7 @@ def _status_fields(status: Status) -> tuple[int, str, dict[str, str]]:
 
 
 _MEASURED_STATE_TOPICS = ("odom", "joint_states")
-"""Topics of a measured state; the truth beside it has the ending ``_true``."""
+"""Topics of a measured state; topics of the true state have the suffix ``_true``."""
 
 _UNITS = {"propellant": "kg"}
 """Units of quantities that are in no topic."""
@@ -441,10 +441,10 @@ _UNITS = {"propellant": "kg"}
 def table_of_flight(flight: FlightData, *, euler: bool = False) -> TopicTable:
     """Return a row for each state: the true state by the columns of ``odom`` and ``joint_states``.
 
-    The columns of other topics have the topic before them, as ``momentum.data[linear_x]``. Where
-    sensors err, ``measured`` stands before those of the measured state.
+    Columns of other topics have the topic as a prefix, such as ``momentum.data[linear_x]``. If
+    sensors have errors, columns of the measured state have the prefix ``measured``.
 
-    ``euler``: whether attitudes have ``roll``, ``pitch`` and ``yaw`` as well.
+    ``euler``: whether to add ``roll``, ``pitch`` and ``yaw`` of attitudes.
     """
     quantities, seen = topic_quantities(flight), set(flight.quantities)
     truth: list[Field] = []

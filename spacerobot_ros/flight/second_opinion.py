@@ -1,8 +1,8 @@
-"""Comparison of a recorded flight with another engine: its commands flown by another engine.
+"""Comparison of a recorded flight with another engine that flies the same commands.
 
-The engine gets the joint rates, or the efforts and the wrench, that the plant's actuators have
-realised in each tick, after limits and faults, and the external loads of the tick; its states are
-compared with those in the bag.
+In each tick, the engine gets the external loads and the joint rates, or efforts and wrench, that
+the plant's actuators have realised after limits and faults; its states are compared with those in
+the bag.
 """
 
 from __future__ import annotations
@@ -42,9 +42,9 @@ class EngineComparison:
         Largest differences of the base's position, m, and attitude, rad, and of joint positions, m
         or rad.
     time
-        Simulated time of the largest one, s.
+        Simulated time of the largest difference, s.
     stop_reason
-        Reason why the engine flew no further; empty: it flew to the end.
+        Reason why the engine stopped early; empty: it flew to the end.
     """
 
     engine: str
@@ -63,7 +63,7 @@ class EngineComparison:
 
 
 class EngineFlight:
-    """Flies a robot in MuJoCo beside a plant, tick by tick.
+    """Flies a robot in MuJoCo alongside a plant, tick by tick.
 
     Parameters
     ----------
@@ -96,7 +96,7 @@ class EngineFlight:
         self._until = ""
 
     def fly_next_tick(self) -> None:
-        """Fly the tick that the plant has just taken."""
+        """Fly the tick that the plant has just flown."""
         if self._until:
             return
         plant, loads = self._effort_plant, self._plant.loads

@@ -60,11 +60,11 @@ class Commands:
     Attributes
     ----------
     tick
-        (N,) tick that each answers.
+        (N,) tick of the state that each responds to.
     values
-        (N, size) numbers that the plant, or the controller, takes from them.
+        (N, size) numbers that the plant or the controller uses.
     setpoints
-        (N, 2 n) joint positions and rates in the messages of a planner; None: not known.
+        (N, 2 n) joint positions and rates in a planner's messages; None: not known.
     """
 
     tick: npt.NDArray[np.int64]
@@ -82,14 +82,14 @@ class SentGoal:
 
 
 def pose_error(poses: Signal, goal: Goal | None) -> PoseError | None:
-    """Return the error of the last pose to a goal; None without a pose or a goal."""
+    """Return the error of the last pose relative to a goal; None without a pose or a goal."""
     if goal is None or not len(poses):
         return None
     return PoseError.between(poses.values[-1, :3], poses.values[-1, 3:], goal)
 
 
 def reported_goal(status: Status, goals: Sequence[SentGoal]) -> Goal | None:
-    """Return the goal of a status: that of the base as it was sent, and those of links.
+    """Return the goal of a status: the base goal as sent, and the goals of links.
 
     None for a status without a goal.
     """
@@ -123,7 +123,7 @@ def _reported_base_goal(status: Status, goals: Sequence[SentGoal]) -> Goal | Non
 
 
 def goal_at_end(statuses: Iterable[Status], goals: Sequence[SentGoal]) -> Goal | None:
-    """Return the last goal of the flight, or otherwise the last one that was sent or reported."""
+    """Return the last goal that was flown to, else the last one that was sent or reported."""
     reported = [(each, reported_goal(each, goals)) for each in statuses]
     for status, goal in reversed(reported):
         if status.state.value in _FLOWN_STATES and goal is not None:

@@ -1,4 +1,4 @@
-"""Plans evaluated in the plant without ROS: of one goal, by all methods, or of random goals."""
+"""Plans evaluated in the plant without ROS: for one goal by all methods, or for random goals."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ class PlanningProblem:
         ParameterError
             The scenario names no robot, or a parameter is refused.
         GoalError
-            The shape of the goal is of another robot.
+            The joint positions of the goal belong to another robot.
         """
         plant, planner = scenario.plant, scenario.planner
         name = planner.robot or plant.robot
@@ -115,9 +115,9 @@ class PlanEvaluation:
     pieces
         Successive schedules; only one, unless the method plans in stages.
     error
-        Error of ``pose`` and joints at the end.
+        Final error of ``pose`` and joints.
     pose
-        (7,) of the base in W at the end: position (m) and quaternion.
+        (7,) final pose of the base in W: position (m) and quaternion.
     limited
         Number of ticks in which the plant limited a joint.
     plan_time
@@ -150,7 +150,7 @@ class PlanEvaluation:
 
     @property
     def path(self) -> BasePath:
-        """The predicted path of the base, its time from the start of the first schedule."""
+        """The predicted path of the base, with times from the start of the first schedule."""
         paths = [piece.path for piece in self.pieces]
         starts = np.cumsum([0.0, *(piece.duration for piece in self.pieces[:-1])])
         return BasePath(
@@ -215,9 +215,9 @@ def try_method(
 
 
 def compare(problem: PlanningProblem) -> dict[str, PlanEvaluation | SpaceRobotError]:
-    """Return the evaluation of every method by its name, or the reason of its refusal.
+    """Return the evaluation, or the reason for the refusal, of every method by name.
 
-    Methods that plan for end-effectors alone are omitted of goals of the base.
+    Methods for end-effectors only are omitted for goals of the base.
     """
     found: dict[str, PlanEvaluation | SpaceRobotError] = {}
     for name, method in METHODS.items():
@@ -242,7 +242,7 @@ def fastest(plans: Mapping[str, PlanEvaluation | SpaceRobotError]) -> PlanEvalua
 def random_goals(problem: PlanningProblem, count: int, distance: float, angle: float) -> list[Goal]:
     """Return goals within ``distance`` (m) and ``angle`` (rad) of the start, with a fixed seed.
 
-    Axes of rotation are uniform; those of planar robots are their axis.
+    Axes of rotation are uniformly distributed; planar robots rotate about their axis.
 
     Raises
     ------
@@ -252,7 +252,7 @@ def random_goals(problem: PlanningProblem, count: int, distance: float, angle: f
     if not (0.0 <= distance < math.inf and 0.0 <= angle < math.inf):
         raise ParameterError(
             f"Random goals lie within {distance:g} m and {math.degrees(angle):g} deg of the start; "
-            "both must be finite numbers from 0."
+            "both must be finite and not negative."
         )
     rng = np.random.default_rng(0)
     start = problem.plant().pose
@@ -278,7 +278,7 @@ def try_goals(
 ) -> dict[str, list[PlanEvaluation | PlanningError]]:
     """Plan every goal by every method, and return the results by method, in the order of the goals.
 
-    ``show`` takes a line about each.
+    ``show`` receives a line about each.
     """
     tight = replace(
         problem.config,

@@ -31,11 +31,11 @@ from spacerobot_ros.times import SECOND
 from spacerobot_ros.topics import Topic, state_topics
 
 TOLERANCE = 1e-9
-"""Deviation that is no difference, absolute below 1 (SI units) and relative above."""
+"""Accepted deviation, absolute below 1 (SI units) and relative above."""
 
 
 _MAX_TICKS_PER_STATE, _MAX_SILENT_TICKS = 10, 20_000
-"""A recorder that was paused for a while leaves a gap; stamps of no flight leave a larger one."""
+"""A paused recorder leaves a gap; stamps that do not belong to a flight leave a larger one."""
 
 _TOPICS_COMPARED_FIRST = ("joint_states", "odom")
 """Topics to compare first: their differences explain differences in other topics."""
@@ -45,7 +45,7 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Difference:
-    """A number in the bag that does not follow from the commands, or deviates most.
+    """A number in the bag that does not follow from the commands, or has the largest deviation.
 
     Attributes
     ----------
@@ -82,14 +82,14 @@ class Verification:
     ticks, duration
         The part that was re-simulated; the duration in s of simulated time.
     messages, topics
-        Number of messages that were compared, and the topics that they are on.
+        Number of compared messages, and their topics.
     missing
-        Message about states that the bag lacks, by its own counts; empty: it lacks none.
+        Message about states missing according to the bag's own counts; empty: none are missing.
     second_opinion
-        The differences to another engine under the same commands, if it was asked.
+        The differences to another engine under the same commands, if requested.
     largest, largest_at
         The largest deviation before the first difference, as a share of max(1, expected value), and
-        where it is.
+        its location.
     difference
         The first difference, if there is one.
     """
@@ -115,9 +115,9 @@ def verify_bag(
     path
         As for :func:`~spacerobot_ros.bag.read_bag`.
     tolerance
-        Deviation that is no difference, absolute below 1 (SI units) and relative above.
+        Accepted deviation, absolute below 1 (SI units) and relative above.
     mujoco
-        Whether MuJoCo flies the commands, too, which the plant's actuators realise.
+        Whether MuJoCo also flies the commands that the plant's actuators realise.
 
     Raises
     ------
@@ -272,7 +272,7 @@ def _plant_config(recorded: RecordedRobot) -> PlantConfig:
     bag, texts = recorded.bag, recorded.metadata.get("parameters/plant")
     if texts is None:
         raise RecordingError(
-            f"The bag {bag.path} does not say what its plant was: bags of 'spacerobot run' hold "
+            f"The bag {bag.path} has no parameters of its plant: bags of 'spacerobot run' hold "
             "the plant's parameters."
         )
     try:
@@ -306,7 +306,7 @@ class _PublishedTopic:
     labels: list[str]
 
     def after(self, tick: int) -> _PublishedTopic:
-        """Leave out the messages until a tick, from which on-times of thrusters count."""
+        """Omit the messages until a tick; on-times of thrusters are counted from there."""
         kept = self.ticks > tick
         values = self.values[kept]
         if self.topic.array_entries_of == "thrusters" and not kept.all():
@@ -322,7 +322,8 @@ class _PublishedTopic:
         return sum(states[name].shape[1] for name in names) == self.values.shape[1]
 
     def expected(self, states: dict[str, Floats], rows: NDArray[np.int64]) -> Floats:
-        """Return the values of the re-simulation for each message, shaped as those of the bag."""
+        """Return the values of the re-simulation for each message, in the shape of the bag's
+        values."""
         expected = np.hstack([states[each.quantity][rows] for each in self.topic.state])
         start = 0
         for each in self.topic.state:
@@ -377,13 +378,13 @@ def _missing_states(
     written, lost = (_parse_count(counts.get(name)) for name in ("messages", "messages_lost"))
     held = recorded.bag.message_count()
     if resimulation.first == 0 and written > held:
-        return f"its recorder wrote {written} messages, and it holds {held}."
+        return f"its recorder wrote {written} messages, but it holds {held}."
     states = {int(t) for p in published if p.topic.name == "joint_states" for t in p.ticks}
     lacking = {tick for tick in resimulation.commanded_ticks if tick >= resimulation.first} - states
     if len(lacking) > lost:
         time = min(lacking) * flight.config.period_ns / SECOND
         return (
-            f"it holds commands for {len(lacking)} states that are not in it, the first at "
+            f"it has commands for {len(lacking)} states that are missing, the first at "
             f"{time:.9g} s."
         )
     return ""

@@ -1,4 +1,4 @@
-"""A flight to look at: a figure, an animation. matplotlib is loaded here."""
+"""Views of a flight: a figure, an animation. matplotlib is loaded here."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class Animation:
         return f"<Animation, {size:.1f} MB of HTML: show it in a notebook, or save(PATH)>"
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the animation as a page of its own; an older file is replaced.
+        """Write the animation as a separate page; an existing file is replaced.
 
         Raises
         ------
@@ -66,7 +66,7 @@ class Animation:
 
 
 def figure(flight: FlightData) -> Picture:
-    """Draw the pose of the base beside its goal, the joints, and their efforts or rates."""
+    """Draw the pose of the base and its goal, the joints, and their efforts or rates."""
     efforts = flight.scenario.plant.actuation == "effort"
     wrench = flight.commands.get("base_wrench")
     thrust = wrench is not None and bool(np.any(wrench.values))
@@ -115,9 +115,9 @@ def animation(flight: FlightData, seconds: float, frames: int) -> Animation:
     from matplotlib.animation import FuncAnimation
 
     if not isinstance(frames, int) or not 1 <= frames <= _MAX_FRAMES:
-        raise ParameterError(f"An animation has 1 to {_MAX_FRAMES} frames, and not {frames!r}.")
+        raise ParameterError(f"An animation has 1 to {_MAX_FRAMES} frames, not {frames!r}.")
     if not (isinstance(seconds, int | float) and 0 < seconds < math.inf):
-        raise ParameterError(f"An animation lasts more than 0 s, and not {seconds!r}.")
+        raise ParameterError(f"An animation lasts more than 0 s, not {seconds!r}.")
     rows = np.unique(np.linspace(0, len(flight.time) - 1, frames).round().astype(int))
     skeleton = _Skeleton(flight.required_robot())
     shapes = skeleton.points(flight.pose[rows], flight.q[rows])

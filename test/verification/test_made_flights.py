@@ -375,7 +375,7 @@ def test_a_bag_whose_states_were_removed_is_not_verified(tmp_path: Path, kept: i
     assert result.difference is None
     assert result.ticks == kept - 1
     first = f"the first at {kept * TICK:g} s."
-    assert result.missing == f"it holds commands for {10 - kept} states that are not in it, {first}"
+    assert result.missing == f"it has commands for {10 - kept} states that are missing, {first}"
 
 
 def without_states(bag: Path, out: Path, since: int) -> Path:
@@ -407,7 +407,7 @@ def test_a_bag_with_fewer_messages_than_its_recorder_wrote_is_not_whole(
         Made([RATES] * 10).add(bag, say)
         bag.add_metadata("recorder", {"messages": str(held + 1), "messages_lost": str(lost)})
     missing = verify_bag(tmp_path / "b.mcap").missing
-    assert missing == f"its recorder wrote {held + 1} messages, and it holds {held}."
+    assert missing == f"its recorder wrote {held + 1} messages, but it holds {held}."
 
 
 def test_a_state_that_was_lost_on_its_way_to_the_recorder_is_counted(tmp_path: Path) -> None:
