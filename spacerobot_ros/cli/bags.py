@@ -34,7 +34,7 @@ from spacerobot_ros.errors import printable
     "whose columns PlotJuggler shows as a tree.",
 )
 @out_option("Folder or file to write [BAG_csv, BAG_parquet, BAG_tree or BAG.mat].")
-@topic_option("Export only this topic, with or without the slash before it [all].")
+@topic_option("Export only this topic, with or without the leading slash [all].")
 def export_command(bag: Path, format_name: str, out: Path | None, topics: tuple[str, ...]) -> None:
     """Write the topics of a BAG as tables for other programs.
 
@@ -51,7 +51,7 @@ def export_command(bag: Path, format_name: str, out: Path | None, topics: tuple[
     for topic in tables:
         rows = rows_by_topic.get(topic)
         click.echo(
-            f"{printable(topic):<27} {'no messages, left out' if rows is None else f'{rows} rows'}"
+            f"{printable(topic):<27} {'no messages, omitted' if rows is None else f'{rows} rows'}"
         )
     click.echo(f"{'tables':<27} {out}")
 
@@ -73,9 +73,9 @@ def _parse_length(context: click.Context, option: click.Parameter, text: str) ->
     "--only",
     metavar="NAME,NAME",
     default="",
-    help="Draw only these figures, such as pose,joints. There are robot, pose, position, attitude, "
-    "cycles, joints, velocities, loops, errors, link_errors, sensors, efforts, thrusters, twist, "
-    "clearance, momentum, momentum_budget and path.",
+    help="Draw only these figures, such as pose,joints. Available: robot, pose, position, "
+    "attitude, cycles, joints, velocities, loops, errors, link_errors, sensors, efforts, "
+    "thrusters, twist, clearance, momentum, momentum_budget and path.",
 )
 @format_option(
     ("pdf", "svg", "png"), "Format of the files; text in PDF and SVG can be searched and edited."
@@ -213,7 +213,7 @@ def report_command(
 @bag_argument
 @out_option("Bag to write [BAG-salvaged.mcap].")
 def salvage_command(bag: Path, out: Path | None) -> None:
-    """Make a complete bag of a BAG that was cut off or is damaged.
+    """Make a complete bag from a BAG that was cut off or is damaged.
 
     The damaged BAG is not changed.
     """
@@ -222,7 +222,7 @@ def salvage_command(bag: Path, out: Path | None) -> None:
     saved = salvage_bag(bag, out)
     click.echo(f"saved       {saved.messages} messages over {saved.duration:.9g} s")
     click.echo(
-        f"lost        {saved.lost_bytes} bytes behind the last whole record, "
+        f"lost        {saved.lost_bytes} bytes after the last whole record, "
         f"{saved.lost_chunks} damaged chunk(s)"
         + (f"; the first: {saved.loss_reason}" if saved.loss_reason else "")
     )
@@ -236,7 +236,7 @@ def salvage_command(bag: Path, out: Path | None) -> None:
     default=1e-9,
     show_default=True,
     type=NumberRange(min=0.0),
-    help="Largest deviation that counts as equal (SI units; relative above 1).",
+    help="Largest deviation considered equal (SI units; relative above 1).",
 )
 @click.option(
     "--engine",
@@ -246,8 +246,8 @@ def salvage_command(bag: Path, out: Path | None) -> None:
 def verify_command(bag: Path, tolerance: float, engine: str | None) -> None:
     """Re-simulate a BAG from its commands, and compare the states.
 
-    Exit code 0: every recorded state follows from the commands; 1: one does not, the bag lacks
-    states by its own counts, or the other engine differs; 2: bad input.
+    Exit code 0: every recorded state follows from the commands; 1: one does not, states are
+    missing, or the other engine differs; 2: bad input.
     """
     from spacerobot_ros.flight.second_opinion import AGREEMENT_TOLERANCE
     from spacerobot_ros.flight.verification import verify_bag
@@ -261,7 +261,7 @@ def verify_command(bag: Path, tolerance: float, engine: str | None) -> None:
     if result.difference is not None:
         fail(f"The bag differs: {result.difference}")
     if result.missing:
-        fail(f"The bag is not whole: {result.missing}")
+        fail(f"The bag is incomplete: {result.missing}")
     click.echo("verified    every published state follows from the commands")
     if (other := result.second_opinion) is not None:
         click.echo(f"engine      {other.engine}, {other.integrator}")

@@ -57,7 +57,7 @@ def campaign_command() -> None:
     "--scheduler",
     default="",
     metavar="tcp://HOST:PORT",
-    help="Address of a dask scheduler whose workers fly.",
+    help="Address of a dask scheduler whose workers fly the draws.",
 )
 @out_option("Folder of the results [out/NAME].")
 @report_option("Report to write [OUT/report.html].")
@@ -93,11 +93,11 @@ def fly(
         criteria:
           position_error_m: {max: 0.02}
 
-    A second file with another `method: lie_bracket` beside the scenario is the second design of
-    --compare. More are in examples/campaigns.
+    For --compare, a second file holds the second design, for example with `method: lie_bracket`
+    after the scenario. More are in examples/campaigns.
 
-    A campaign that was interrupted is continued. Exit code 0: all flights were flown; 1: every
-    flight was refused or ended by an error; 2: bad input; 130: Ctrl-C, the flights so far are kept.
+    An interrupted campaign is continued. Exit code 0: all flights were flown; 1: every
+    flight was refused or ended by an error; 2: bad input; 130: Ctrl-C, finished flights are kept.
     """
     from spacerobot_ros.campaign.workers import Cluster
 
@@ -129,7 +129,7 @@ def report(folder: Path, report: Path | None) -> None:
 def rerun(folder: Path, number: int, bag: Path | None) -> None:
     """Fly flight N of DIR again, and record a bag.
 
-    Exit code 0: it is the flight of the dataset; 1: it is another one; 2: bad input.
+    Exit code 0: the flight equals the one in the dataset; 1: it differs; 2: bad input.
     """
     from spacerobot_ros.bag import free_name
     from spacerobot_ros.campaign.running import rerun_flight

@@ -91,9 +91,8 @@ def run_command(
 ) -> None:
     """Fly a SCENARIO or a ROBOT to its goal, and record a bag.
 
-    A SCENARIO is a name or a parameter file, a ROBOT a name or a URDF file. The flight needs no ROS
-    2, unless --nodes or --realtime has it flown by the nodes: with equal states and commands in
-    lockstep.
+    A SCENARIO is a name or a parameter file, a ROBOT a name or a URDF file. The flight needs ROS 2
+    only with --nodes or --realtime. In lockstep, the nodes produce equal states and commands.
 
     Exit code 0: the goal was reached within tolerance; 1: it was not; 2: bad input. A signal ends
     the flight early: the bag and the summary cover it until then, and the exit code is 128 plus the
@@ -104,7 +103,7 @@ def run_command(
     from spacerobot_ros.session.run import run_scenario
 
     if view and realtime is None:
-        raise click.UsageError("--view needs --realtime: a flight in lockstep is over soon.")
+        raise click.UsageError("--view needs --realtime: a flight in lockstep ends too soon.")
     usual = bag or Path("out") / f"{chosen.name}.mcap"
     taken, path = os.path.lexists(usual), bag or free_name(usual)
     page = viewer_if_requested(view, chosen.parameters("viewer"), settings=settings)
@@ -289,7 +288,7 @@ def _published_lines(scenario: Scenario, summary: dict[str, Any]) -> list[str]:
     is_flag=True,
     hidden=True,
     expose_value=False,
-    help="Accepted as in `run`: the nodes always have processes of their own.",
+    help="Accepted as in `run`: each node always has its own process.",
 )
 @click.option(
     "--restarts",

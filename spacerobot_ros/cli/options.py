@@ -1,4 +1,4 @@
-"""Arguments and options that several commands take."""
+"""Arguments and options of several commands."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class _TextPath(click.Path):
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         if str(value) == "-" and not (param and "--json" in param.opts):
-            self.fail("'-' stands for no file here: name one.", param, ctx)
+            self.fail("'-' is not a file here: name a file.", param, ctx)
         try:
             str(value).encode()
         except UnicodeEncodeError:
@@ -262,7 +262,7 @@ class GoalOptions:
 
 @dataclass(frozen=True)
 class EndEffectorOptions:
-    """Goals of end-effectors as the command line gives them.
+    """Goals of end-effectors from the command line.
 
     Attributes
     ----------
@@ -310,8 +310,8 @@ def _read_path(file: Path) -> list[list[float]]:
         rows = [list(map(float, line.replace(",", " ").split())) for line in lines]
     except (OSError, ValueError) as error:
         raise click.BadParameter(
-            f"The path {file} cannot be read: {reason(error)}. Each of its lines has 3 numbers, a "
-            "position, or 7, a position and a quaternion."
+            f"The path {file} cannot be read: {reason(error)}. Each line needs 3 numbers (a "
+            "position) or 7 (a position and a quaternion)."
         ) from error
     found = [row for row in rows if row]
     if not found or len({len(row) for row in found}) > 1:
@@ -348,7 +348,7 @@ def goal_options(command: Callable[..., None]) -> Callable[..., None]:
 
 
 def end_effector_options(command: Callable[..., None]) -> Callable[..., None]:
-    """Add the options of end-effectors to those of a goal."""
+    """Add end-effector options to the options of a goal."""
     for option in (
         click.option(
             "--end-effector",
@@ -392,18 +392,18 @@ def end_effector_options(command: Callable[..., None]) -> Callable[..., None]:
 
 
 def warn_of_large_angles(rotvec: Sequence[float], option_in_degrees: str) -> None:
-    """Report a rotation of more than a turn, which may have been meant in degrees."""
+    """Report a rotation of more than one revolution, which may be in degrees."""
     angle = math.hypot(*rotvec)
     if 2 * math.pi < angle < math.inf:
         click.echo(
-            f"The goal turns by {angle:.5g} rad, which is {angle / (2 * math.pi):.3g} revolutions: "
-            f"only the final attitude counts. For degrees there is {option_in_degrees}.",
+            f"The goal rotates by {angle:.5g} rad, which is {angle / (2 * math.pi):.3g} "
+            f"revolutions: only the final attitude matters. For degrees, use {option_in_degrees}.",
             err=True,
         )
 
 
 class RegisteredName(_Choice):
-    """A choice of the names in registries, which are imported when the names are needed.
+    """A choice of the names in registries, which are imported on demand.
 
     Parameters
     ----------
@@ -437,7 +437,7 @@ class RegisteredOption(click.Option):
 
 
 def registered_option(*names: str, registries: Sequence[str], help: str) -> Any:
-    """Return an option that takes a name in registries."""
+    """Return an option whose value is a name in registries."""
     kind = RegisteredName(*registries)
     return click.option(*names, type=kind, cls=RegisteredOption, metavar="NAME", help=help)
 
@@ -481,14 +481,14 @@ def picture_option(help: str) -> Any:
 
 
 def beside(bag: Path, ending: str) -> Path:
-    """Return a path beside a bag (a file or a folder): its name without suffix, plus an ending."""
+    """Return a path next to a bag (a file or a folder): its name without suffix, plus an ending."""
     # The path ``.`` has no name before it is resolved.
     named = bag if bag.name not in ("", "..") else bag.resolve()
     return named.with_name(f"{named.name if bag.is_dir() else named.stem}{ending}")
 
 
 def write_json(path: Path, content: Any, indent: int | None = 2) -> None:
-    """Write a JSON file and the folders that it is in; ``-`` is standard output."""
+    """Write a JSON file and create its folders; ``-`` is standard output."""
     text = json.dumps(content, indent=indent) + "\n"
     if path == Path("-"):
         output = click.get_current_context().meta[_STANDARD_OUTPUT]

@@ -54,11 +54,11 @@ _NO_GOAL = GoalOptions(None, None, None)
     "count",
     type=click.IntRange(min=1),
     metavar="N",
-    help="Instead: plan N random goals, and print figures of all.",
+    help="Plan N random goals instead, and print statistics.",
 )
 @within_option((0.3, 180.0), "With --random: largest")
 @registered_option(
-    "--beside", registries=(METHODS,), help="With --random: plan them by this method too."
+    "--beside", registries=(METHODS,), help="With --random: plan them also by this method."
 )
 def plan_command(
     scenario: str,
@@ -150,7 +150,7 @@ def _clearance_line(problem: PlanningProblem, trial: PlanEvaluation) -> str:
         return f"clearance   {nearest}"
     reasons = Counter(geometry.ignored_pairs.values())
     listed = ", ".join(f"{count} {reason}" for reason, count in reasons.items())
-    return f"clearance   no pair of links is looked at{listed and f' ({listed})'}"
+    return f"clearance   no pair of links is checked{listed and f' ({listed})'}"
 
 
 def problem_of_scenario(

@@ -31,12 +31,12 @@ _MAX_PLAUSIBLE_RADIANS = 20.0
 """Limit of a joint beyond which it is likely to be in degrees."""
 
 _MAX_PLAUSIBLE_SPEED = 25.0
-"""Speed of a joint, rad/s, beyond which it is likely to be in degrees; that of fast legs is 21."""
+"""Speed of a joint, rad/s, beyond which it is likely to be in degrees; fast legs reach 21."""
 
 _MAX_LISTED_DISTANCES = 3
 
 _MAX_LISTED_INTERVALS = 4
-"""Intervals of distances that are listed; of more, the number and the length are."""
+"""Largest number of listed intervals of distances; of more, only number and length are listed."""
 
 
 @click.command("analyze")
@@ -62,7 +62,7 @@ def analyze_command(
 ) -> None:
     """Analyse the loops, dynamic singularities and workspaces of ROBOT.
 
-    ROBOT is a name or a URDF file. The methods that suit it are listed.
+    ROBOT is a name or a URDF file. Suitable methods are listed.
     """
     from spacerobot_ros.model import SpaceRobot
     from spacerobot_ros.planning.analysis import analyze
@@ -262,13 +262,14 @@ def _degree_warnings(robot: RobotDescription) -> list[str]:
     if wide:
         warnings.append(
             f"warning: the limits of {_listed(wide)} are beyond {_MAX_PLAUSIBLE_RADIANS:g} rad, "
-            "several turns. Those of a URDF are in radians: if these are degrees, divide them by "
+            "several revolutions. URDF limits are in radians: if these are degrees, divide them by "
             "57.2958."
         )
     if fast:
         warnings.append(
-            f"warning: the speed of {_listed(fast)} is beyond {_MAX_PLAUSIBLE_SPEED:g} rad/s, some "
-            "four turns a second. That of a URDF is in rad/s: if it is in deg/s, divide it by "
+            f"warning: the speed of {_listed(fast)} is beyond {_MAX_PLAUSIBLE_SPEED:g} rad/s, "
+            "about four revolutions per second. URDF speeds are in rad/s: if it is in deg/s, "
+            "divide it by "
             "57.2958."
         )
     return warnings

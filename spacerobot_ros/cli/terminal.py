@@ -54,7 +54,7 @@ def end(ending: Terminated) -> NoReturn:
 
 
 def exit_if_terminated() -> None:
-    """End a command whose work a signal has cut short, after its output is written."""
+    """End a command that a signal has interrupted, after its output is written."""
     ending = termination()
     if ending is not None:
         end(ending)
@@ -64,7 +64,7 @@ def exit_if_terminated() -> None:
 def sentences() -> Iterator[None]:
     """Turn exceptions of this package into one sentence and an exit code.
 
-    An unreachable goal is no bad input; every other refusal is. A signal
+    An unreachable goal is not bad input; every other refusal is. A signal
     ends it with one line and 128 plus its number, even if a library has replaced its exception.
     """
     try:
@@ -103,18 +103,18 @@ _PERIOD, _PERIOD_WITHOUT_TERMINAL = 1.0, 10.0
 
 
 class Display:
-    """A line on long work: what is done, for how long, and the best result so far.
+    """A progress line for long work: the task, its duration, and the best result so far.
 
-    On a terminal each line replaces the one before. Searches report in threads of their own, and
-    may be silent for long: the line is written by a thread.
+    On a terminal each line replaces the one before. Searches report from other threads and may be
+    silent for long, so a thread writes the line.
 
     Parameters
     ----------
     label
         Name of the scenario or robot.
     period
-        Wall time between two lines, and before the first, s; None: one second, and ten if standard
-        error is no terminal.
+        Wall time between two lines, and before the first, s; None: one second, or ten if standard
+        error is not a terminal.
     """
 
     def __init__(self, label: str, period: float | None = None) -> None:
@@ -139,7 +139,7 @@ class Display:
             self._work, self._course = "flying", f": {now:.1f}{of_end} s"
 
     def show_line(self, message: str) -> None:
-        """Print a line that stays, if standard error is a terminal."""
+        """Print a permanent line, if standard error is a terminal."""
         with self._lock:
             if self._terminal:
                 click.echo(f"{_CLEAR}{message}", err=True)

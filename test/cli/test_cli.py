@@ -187,7 +187,7 @@ def test_the_same_code_by_both(
 @pytest.mark.parametrize(
     ("section", "values", "sentence"),
     [
-        ("scenario", {"goal_joint_positions": [0.1, 0.2]}, "The goal shape has 2 joint position"),
+        ("scenario", {"goal_joint_positions": [0.1, 0.2]}, "The goal has 2 joint position"),
         ("planner", {"tick_rte": 20.0}, "Node 'planner' has no parameter 'tick_rte'"),
         ("planner", {"lie_bracket": {"t2": 1.0}}, "no parameter 'lie_bracket.t2'"),
         ("plant", {"tick_rate": "fast"}, "Parameter 'tick_rate' is 'fast'"),
@@ -415,7 +415,7 @@ def test_a_domain_that_is_none_is_one_sentence(words: tuple[str, ...], domain: s
 def test_a_dash_is_no_file_to_write(option: str) -> None:
     ended = started("run", "sliding_masses", option, "-")
     assert ended.returncode == 2
-    assert f"Invalid value for '{option}': '-' stands for no file" in ended.stderr
+    assert f"Invalid value for '{option}': '-' is not a file" in ended.stderr
     assert not Path("-").exists()
 
 
@@ -435,7 +435,7 @@ def test_a_path_that_is_no_text_is_refused(option: str) -> None:
     [
         (
             ["run", "sliding_masses", "--view"],
-            "--view needs --realtime: a flight in lockstep is over soon.",
+            "--view needs --realtime: a flight in lockstep ends too soon.",
         ),
         (
             ["goal", "1", "2", "3", "--goal-rotvec", *"001", "--goal-rpy-deg", *"001"],

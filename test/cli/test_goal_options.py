@@ -124,13 +124,13 @@ def test_end_effectors_with_more_or_fewer_names_are_refused(
         ((math.nan, 0.0, 0.0), ""),
         (
             (0.0, -30.0, 40.0),
-            "The goal turns by 50 rad, which is 7.96 revolutions: only the final attitude counts. "
-            "For degrees there is --here.\n",
+            "The goal rotates by 50 rad, which is 7.96 revolutions: only the final attitude "
+            "matters. For degrees, use --here.\n",
         ),
         (
             (6.5, 0.0, 0.0),
-            "The goal turns by 6.5 rad, which is 1.03 revolutions: only the final attitude counts. "
-            "For degrees there is --here.\n",
+            "The goal rotates by 6.5 rad, which is 1.03 revolutions: only the final attitude "
+            "matters. For degrees, use --here.\n",
         ),
     ],
 )

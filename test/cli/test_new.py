@@ -98,7 +98,7 @@ def test_a_robot_whose_collision_meshes_are_missing_flies_without_them(
         caplog.clear()
     result = CliRunner().invoke(main, ["new", robot.name])
     assert result.exit_code == 0, result.output
-    assert "clearance: 0.0   # m; contacts are not noticed" in Path("mine.yaml").read_text("utf-8")
+    assert "clearance: 0.0   # m; contacts are not detected" in Path("mine.yaml").read_text("utf-8")
     scenario = load_scenario("mine.yaml")
     assert try_method(PlanningProblem.of(scenario), scenario.planner.method).reached
 
@@ -147,7 +147,7 @@ def test_a_robot_that_cannot_turn_its_base_is_told_so(robot: Path) -> None:
     )
     result = CliRunner().invoke(main, ["new", str(robot)])
     assert result.exit_code == 1, result.output
-    assert "turn its base not at all" in result.output
+    assert "rotate its base not at all" in result.output
     assert not Path("mine.yaml").exists()
 
 

@@ -280,15 +280,15 @@ def test_limits_that_look_like_degrees_are_pointed_out() -> None:
         'lower="-20.1" upper="1" velocity="0.5" effort="3"',
     )
     assert _degree_warnings(robot.description) == [
-        "warning: the limits of 'joint_0', 'joint_2' are beyond 20 rad, several turns. Those of a "
-        "URDF are in radians: if these are degrees, divide them by 57.2958."
+        "warning: the limits of 'joint_0', 'joint_2' are beyond 20 rad, several revolutions. URDF "
+        "limits are in radians: if these are degrees, divide them by 57.2958."
     ]
     fast = jointed(
         'lower="-1" upper="1" velocity="30" effort="3"',
         'lower="-1" upper="1" velocity="24" effort="3"',
     )
     (warning,) = _degree_warnings(fast.description)
-    assert warning.startswith("warning: the speed of 'joint_0' is beyond 25 rad/s, some four turns")
+    assert warning.startswith("warning: the speed of 'joint_0' is beyond 25 rad/s, about four rev")
     # Reaction wheels turn faster.
     assert _degree_warnings(SpaceRobot.from_file(robot_file("tender")).description) == []
 

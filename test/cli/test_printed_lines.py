@@ -385,7 +385,7 @@ def test_the_lines_of_a_plan(monkeypatch: pytest.MonkeyPatch) -> None:
     assert result.stdout == (
         "planar_chain, square_path: 0.06 s, ends 45.6 mrad and 12.3 mm from the goal\n"
         "planned in 0.679 s\n"
-        "clearance   no pair of links is looked at (1 disabled by the SRDF)\n"
+        "clearance   no pair of links is checked (1 disabled by the SRDF)\n"
     )
     silent = plan(monkeypatch, True, *PLANAR, "--set", "planner.clearance=0").stdout
     assert silent == "".join(result.stdout.splitlines(keepends=True)[:2])
@@ -597,7 +597,7 @@ def test_a_difference_is_exit_1_and_a_sentence(monkeypatch: pytest.MonkeyPatch) 
 
 def test_states_that_a_bag_lacks_are_exit_1_and_a_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
     result = verified(monkeypatch, missing="it holds less.")
-    assert (result.exit_code, result.stderr) == (1, "The bag is not whole: it holds less.\n")
+    assert (result.exit_code, result.stderr) == (1, "The bag is incomplete: it holds less.\n")
     assert "verified" not in result.stdout
 
 
@@ -615,7 +615,7 @@ def test_the_lines_of_a_salvage(monkeypatch: pytest.MonkeyPatch) -> None:
     assert result.exit_code == 0
     assert result.stdout == (
         "saved       123 messages over 4.5 s\n"
-        "lost        789 bytes behind the last whole record, 6 damaged chunk(s)\n"
+        "lost        789 bytes after the last whole record, 6 damaged chunk(s)\n"
         "bag         b.mcap\n"
     )
     assert given == [Path("a.mcap"), None]
