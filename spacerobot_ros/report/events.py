@@ -29,7 +29,7 @@ _MAX_MARKS = 2000
 """Largest number of marks in a strip: more would merge."""
 
 _STRIP_DISTANCE = 0.44
-"""Distance of the strip's upper edge from the axis, inches: labels are between."""
+"""Distance of the strip's upper edge from the axis, inches, with space for labels."""
 
 _STRIP_HEIGHT = 0.24
 _GOOD, _BAD, _WARN, _PLAIN = PALETTE[2], "#c62f2f", PALETTE[1], PALETTE[0]
@@ -120,7 +120,7 @@ _MARKS = {
     EventKind.NODE_BACK: _Mark("node back", "h", _GOOD, 1, hollow=True),
     EventKind.NODE_RESTARTED: _Mark("node restarted", "h", _WARN, 1),
 }
-"""Marks of events by kind; other kinds, of nodes that start and stop, are not drawn."""
+"""Marks of events by kind; other kinds, such as starts and stops of nodes, are not drawn."""
 
 
 _GLYPHS = {
@@ -157,11 +157,11 @@ _PROMINENT_KINDS = _FAULT_KINDS | {
     EventKind.WHEEL_FAILED,
     EventKind.CAPTURED,
 }
-"""Kinds that are marked over the whole height of a chart."""
+"""Kinds marked over the full height of a chart."""
 
 
 def event_style(kind: EventKind) -> dict[str, Any]:
-    """Return how events of a kind look on a page."""
+    """Return the appearance of events of a kind on a page."""
     mark = _MARKS[kind]
     return {
         "kind": kind.value,
@@ -185,7 +185,8 @@ def timed_events(
     began
         Time of the first state, s.
     stamped
-        Whether that is a simulated time, as the events' own is; otherwise log times count.
+        Whether ``began`` is simulated time, like the events' own time; otherwise log times are
+        used.
     """
     found = []
     for time_ns, node, event in events:

@@ -35,7 +35,7 @@ TEXT_COLOUR, SECONDARY_COLOUR, LINE_COLOUR = "#1f2328", "#667085", "#c3c8d0"
 _OKABE_ITO = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 _TOL = ("#332288", "#882255", "#999933", "#44AA99")
 PALETTE = (*_OKABE_ITO, *_TOL)
-"""Colours that people with any colour vision tell apart."""
+"""Colours that can be distinguished with any kind of colour vision."""
 
 BASE_COLOUR, HAND_COLOUR, PLANNED_COLOUR, GHOST_COLOUR = (PALETTE[i] for i in (0, 3, 4, 2))
 """Colours of the paths of base and end-effector, of plans, and of goals in space: blue, pink,
@@ -45,13 +45,13 @@ WIDTH = 9.6
 """Width of a figure of a page, inches."""
 
 _NARROW_WIDTH = 6.0
-"""Width of a figure below which it is drawn for one column of a paper, inches."""
+"""Figures narrower than this are drawn for one column of a paper, inches."""
 
 TRACE_TIME_SLICES = 960
-"""Slices of time across a figure in which a dense trace is summed up."""
+"""Number of time slices across a figure that summarise a dense trace."""
 
 LARGEST_VALUE_SLICES = 240
-"""Slices of time of a trace drawn by the largest value of each."""
+"""Number of time slices of a trace that is drawn as the largest value of each slice."""
 
 _INVISIBLE_ERROR = 5e-4
 """Largest error of a simplified line, as a share of the height of its panel."""
@@ -60,7 +60,7 @@ _PATH_DATA = re.compile(rb' d="[^"]*"')
 _DECIMALS = re.compile(rb"(\.\d\d)\d+")
 
 _FONT_SIZE = 8.5
-"""Font size that the distances of these modules are made for, points."""
+"""Font size for which the distances in these modules are designed, points."""
 
 _FONT_SIZE_RANGE = (3.0, 30.0)
 """Least and largest font size of a style file, points."""
@@ -97,7 +97,7 @@ def drawing(
     degrees: bool = False,
     lettered: bool = False,
 ) -> Iterator[None]:
-    """Draw in the style of these figures while the block lasts.
+    """Use the style of these figures within the block.
 
     Parameters
     ----------
@@ -109,9 +109,9 @@ def drawing(
         Style file of the user, or name of a style of this package or of matplotlib; it overrides
         ``style``.
     degrees
-        Whether angles over time are in degrees, and not in rad.
+        Whether angles over time are in degrees instead of rad.
     lettered
-        Whether the panels of a figure that has several are called (a), (b) and so on.
+        Whether multiple panels of a figure are labelled (a), (b) and so on.
 
     Raises
     ------
@@ -165,20 +165,20 @@ def _require_fonts(path: Path) -> None:
     size = float(mpl.rcParams["font.size"])
     if not _FONT_SIZE_RANGE[0] <= size <= _FONT_SIZE_RANGE[1]:
         raise SpaceRobotError(
-            f"The style file {path} is refused: font.size is {size:g}, and letters have "
+            f"The style file {path} is refused: font.size is {size:g}, but must be "
             f"{_FONT_SIZE_RANGE[0]:g} to {_FONT_SIZE_RANGE[1]:g} points."
         )
     if mpl.rcParams["text.usetex"]:
         raise SpaceRobotError(
-            f"The style file {path} is refused: text.usetex makes TeX of the names of joints, and "
-            "leaves no text that can be edited."
+            f"The style file {path} is refused: text.usetex would read the names of joints as TeX, "
+            "and leave no editable text."
         )
     families = mpl.rcParams["font.family"]
     found = [family for family in families if _is_font_installed(family)]
     if not found:
         raise SpaceRobotError(
-            f"The style file {path} is refused: of the fonts that it names "
-            f"({', '.join(families)}) none is installed."
+            f"The style file {path} is refused: none of its fonts ({', '.join(families)}) is "
+            "installed."
         )
     # DejaVu Sans comes with matplotlib and has signs that many fonts lack: 10⁻¹⁵, p₀.
     mpl.rcParams["font.family"] = list(dict.fromkeys([*found, "DejaVu Sans"]))
@@ -254,9 +254,9 @@ def sheet(
 ) -> tuple[Figure, list[list[Axes]]]:
     """Return a figure of panels, row by row.
 
-    Each row gives the relative widths of its panels, ``heights`` those of the rows in inches;
-    there is room for labels ``left`` and ``right`` of the panels, at the ``bottom``, and for titles
-    at the ``top``, in the ``gap`` between the rows, and for a ``lane`` below every row.
+    Each row has the relative widths of its panels; ``heights`` are the heights of the rows in
+    inches. ``left``, ``right`` and ``bottom`` are the space for labels of the panels, ``top`` the
+    space for titles, ``gap`` the space between rows, and ``lane`` the space below every row.
     """
     scale = _look.get().scale
     if narrow() and left > 0.5:
@@ -292,10 +292,10 @@ def sheet(
 
 
 _LETTER_WIDTH = 0.32
-"""Room for the letter of a panel left of it, inches."""
+"""Space for the letter to the left of a panel, inches."""
 
 _LETTER = "letter"
-"""Group of the letters of panels."""
+"""Group of the panel letters."""
 
 
 def _letter_panels(panels: Sequence[Axes], left: float) -> None:
@@ -315,11 +315,11 @@ def _letter_panels(panels: Sequence[Axes], left: float) -> None:
 
 
 _LEFT_EDGE = 0.03
-"""Distance of the labels from the left edge of a figure whose panels are widened, inches."""
+"""Distance of the labels from the left edge of a figure with widened panels, inches."""
 
 
 def widen_panels(figure: Figure) -> None:
-    """Widen panels in one column to the left, as far as their labels leave room."""
+    """Widen panels in one column to the left, as far as their labels permit."""
     places = [axes.get_position() for axes in figure.axes]
     if len({round(place.x0, 6) for place in places}) != 1:
         return
@@ -353,7 +353,7 @@ def panel(figure: Figure, x: float, y: float, width: float, height: float) -> Ax
 
 
 def room_for(names: Sequence[str]) -> float:
-    """Return the width of the longest name, for the margin right of a panel, inches."""
+    """Return the width of the longest name, for the margin to the right of a panel, inches."""
     return 0.15 + 0.075 * max(map(len, names), default=0)
 
 
@@ -371,20 +371,20 @@ class PictureFormat(str, Enum):
         Raises
         ------
         SpaceRobotError
-            The suffix is of no such format.
+            The suffix is not one of these formats.
         """
         try:
             return cls(path.suffix[1:].lower())
         except ValueError:
             raise SpaceRobotError(
-                f"Pictures are written as .png, .svg or .pdf, and not as '{path.name}'."
+                f"Pictures are written as .png, .svg or .pdf, not as '{path.name}'."
             ) from None
 
 
 def picture_of(figure: Figure, format: PictureFormat, pixels: int = 1600) -> bytes:
     """Return a figure as a file, the same bytes for the same figure.
 
-    ``pixels`` is the width of a PNG; images in SVG and PDF have 200 pixels an inch.
+    ``pixels`` is the width of a PNG; images in SVG and PDF have 200 pixels per inch.
     """
     across = float(figure.get_size_inches()[0])
     about = {
@@ -414,7 +414,7 @@ _FLIGHT_DASHES = ((), (4.5, 1.2, 1.2, 1.2), (2.0, 1.0), (6.0, 1.2, 1.2, 1.2, 1.2
 
 
 def flight_dashes(number: int) -> tuple[float, ...]:
-    """Return the dashes of one of several flights in a panel; of the first, a solid line."""
+    """Return the dashes for one of several flights in a panel; the first has a solid line."""
     return _FLIGHT_DASHES[number % len(_FLIGHT_DASHES)]
 
 
@@ -428,9 +428,9 @@ def draw_traces(
 ) -> bool:
     """Draw every column of a signal; return whether any is drawn as a band.
 
-    A line leaves out samples that make no visible difference. If more samples are left than the
-    panel, ``share`` of a figure's width, can show, a band spans the smallest and the largest value
-    in each slice of time.
+    A line omits samples that make no visible difference. If more samples remain than the panel,
+    with ``share`` of a figure's width, can show, a band spans the smallest and the largest value in
+    each slice of time.
     """
     if not len(signal):
         # A close-up without samples.
@@ -466,7 +466,7 @@ def draw_traces(
 
 
 def largest_over_time(signal: Signal, column: int) -> tuple[Array, Array]:
-    """Return times and values of a column; of a dense one the largest in each slice of time."""
+    """Return times and values of a column; only the largest of each time slice if it is dense."""
     if len(signal) <= 2 * LARGEST_VALUE_SLICES:
         return signal.time, signal.values[:, column]
     time, _, high = envelope(signal, column, LARGEST_VALUE_SLICES)
@@ -499,7 +499,7 @@ def set_range(
 
 
 def log_range(values: Array, decades: int) -> tuple[float, float]:
-    """Return both ends of a logarithmic axis: so many powers of ten up to the largest value."""
+    """Return both ends of a logarithmic axis: ``decades`` powers of ten up to the largest value."""
     largest = float(np.nanmax(values, initial=0.0))
     top = float(np.ceil(np.log10(largest))) if largest > 0 else -15.0
     return 10.0 ** (top - decades), 10.0**top
@@ -516,7 +516,8 @@ def set_time(axes: Axes, start: float, end: float, label: bool = True) -> None:
 
 
 def end_labels(axes: Axes, labels: Sequence[tuple[float, str, str]]) -> None:
-    """Write (value, text, colour) right of the axes at their values, without overlaps."""
+    """Write the texts of (value, text, colour) to the right of the axes at their values, without
+    overlaps."""
     low, high = axes.get_ylim()
     ordered = sorted(labels)
     wanted = np.clip([(value - low) / (high - low) for value, _, _ in ordered], 0.0, 1.0)
@@ -576,7 +577,7 @@ def legend_above(axes: Axes, keys: Sequence[Line2D]) -> None:
 
 
 def fit_legend(legend: Legend, room: float) -> None:
-    """Make the letters of a legend smaller if it is wider than ``room``, pixels."""
+    """Reduce the font size of a legend if it is wider than ``room``, pixels."""
     share = room / legend.get_window_extent().width
     for text in legend.get_texts() if share < 1.0 else ():
         text.set_fontsize(share * float(text.get_fontsize()))
@@ -590,7 +591,7 @@ def scaled(unit: str, largest: float) -> tuple[float, str]:
 
 
 LIMIT = "limit (URDF)"
-"""Name of a limit of a joint in keys."""
+"""Name of a joint limit in legends."""
 
 
 @dataclass(frozen=True)
@@ -608,15 +609,15 @@ class TraceGroup:
     limits
         (trace, value) of each limit.
     limit_name
-        Name of the limits in the key of the picture.
+        Name of the limits in the legend of the picture.
     window
-        Lower and upper end of the axis, if high peaks are left out; None: all values are shown.
+        Lower and upper end of the axis, if high peaks are cut off; None: all values are shown.
     decades
         Powers of ten shown below the largest value, on a logarithmic axis; 0: a linear axis.
     rows
-        Whether each trace has a row of its own of height one, for duty cycles from 0 to 1.
+        Whether each trace has its own row of height one, for duty cycles from 0 to 1.
     beside
-        The same traces of other flights; empty signals of those that lack them.
+        The same traces of other flights; empty signals if a flight lacks them.
     """
 
     signal: Signal
@@ -643,8 +644,8 @@ class TraceGroup:
         return np.concatenate([np.empty(0), *(each.values.ravel() for each in self.signals)])
 
     def in_unit_of_angles(self) -> TraceGroup:
-        """Return the traces in the unit of angles that is drawn: in degrees instead of rad, if
-        that is wanted.
+        """Return the traces in the unit selected for angles: in degrees instead of rad, if
+        requested.
         """
         if not _look.get().degrees or not self.unit.startswith("rad"):
             return self
@@ -663,7 +664,7 @@ class TraceGroup:
 
 @dataclass(frozen=True)
 class ReportFigure:
-    """A figure of a report, as a picture and, if it is over time, as data of charts.
+    """A figure of a report, as a picture and, if it is over time, as chart data.
 
     Attributes
     ----------

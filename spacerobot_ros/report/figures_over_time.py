@@ -1,8 +1,8 @@
 """Figures over the time of a flight: motion, efforts, thrusters, momentum, errors.
 
-Traces of one unit share a panel; events stand below the time axes; gaits of equal cycles get
+Traces of one unit share a panel; events are below the time axes; gaits of equal cycles get
 close-ups. A function named after a figure returns it, or one sentence on why the bag has no such
-figure, or None where the flight is of another kind.
+figure, or None if it does not apply to the flight.
 """
 
 from __future__ import annotations
@@ -57,17 +57,17 @@ SHOWN_CYCLES = 3
 DASHES, DOTS = (5.0, 2.5), (1.0, 1.5)
 
 _MAX_MARKED_SCHEDULES = 10
-"""Schedules that are marked by lines; more of them would be a hatching."""
+"""Largest number of schedules marked by lines; more would look like hatching."""
 
 _LABEL_HEIGHT = 0.17
 """Height of the label of one of several flights, inches."""
 
 _DUTY_ROW_HEIGHT = 0.8
-"""Height of a duty cycle of one, in its row."""
+"""Height of a duty cycle of 1, in its row."""
 
 BAND_CAPTION = (
-    "Where a trace has more samples than the picture has columns, the band spans the smallest and "
-    "the largest value in each slice of time."
+    "If a trace has more samples than the picture has columns, the band spans the smallest and the "
+    "largest value in each slice of time."
 )
 
 EVENTS_CAPTION = (
@@ -172,7 +172,7 @@ def time_figure(
     flights: Sequence[str] = (),
 ) -> ReportFigure | str:
     """Return a figure with a panel for each group, and close-ups of a gait of equal cycles; a
-    sentence where nothing was recorded over time.
+    sentence if nothing was recorded over time.
 
     ``caption`` is its beginning. ``flights``: labels of several flights, whose traces the groups
     have.
@@ -209,14 +209,13 @@ def time_figure(
     if any(group.goals for group in groups):
         caption += "; dashed, the goal"
     if any(group.limits and group.limit_name == LIMIT for group in groups):
-        caption += "; dotted, the limits of the URDF, where they are in range"
+        caption += "; dotted, the limits of the URDF, if they are in range"
     caption += "."
     aside = ""
     if cycles is not None:
         aside += (
             f" The flight ends with {cycles.count} equal cycles of {cycles.period:.4g} s; below, "
-            f"the part before them, and the last {SHOWN_CYCLES} of them, as change since the first "
-            "instant shown."
+            f"the part before them, and the change during the last {SHOWN_CYCLES} cycles."
         )
     aside += f" {BAND_CAPTION}" if any(dense) else ""
     aside += f" {EVENTS_CAPTION}" if flight.timed_events else ""
@@ -227,11 +226,11 @@ def time_figure(
 def figure_of_flights(
     flights: Sequence[FlightReport], draw: Callable[[FlightReport], ReportFigure | str | None]
 ) -> ReportFigure | str | None:
-    """Return a figure over time with the traces of several flights; a sentence where no flight has
+    """Return a figure over time with the traces of several flights; a sentence if no flight has
     one, or it is not over time.
 
-    Traces of one label, unit and name share a panel. Events, cycles and duty cycles are of single
-    flights, and left out.
+    Traces with the same label, unit and name share a panel. Events, cycles and duty cycles, which
+    apply to single flights, are omitted.
     """
     drawn = [draw(each) for each in flights]
     figures = [each for each in drawn if isinstance(each, ReportFigure)]
@@ -263,7 +262,7 @@ def figure_of_flights(
             )
         )
     if not merged:
-        return "It is of one flight: name one bag."
+        return "It shows a single flight: name one bag."
     first, labels = figures[0], [each.label for each in flights]
     only = replace(flights[0], timed_events=[])
     return time_figure(only, first.name, first.heading, first.heading, merged, flights=labels)
@@ -372,7 +371,7 @@ def attitude_group(flight: FlightReport) -> TraceGroup:
 
 def shape_groups(flight: FlightReport) -> list[TraceGroup]:
     """Return the joint positions, in groups of one unit and at most six joints, and the rates of
-    reaction wheels, whose angles mean nothing.
+    reaction wheels, whose angles are irrelevant.
     """
 
     def bounds(joint: Joint) -> list[float]:
@@ -399,9 +398,10 @@ def joint_groups(
     most: int,
     columns: Sequence[int] | None = None,
 ) -> list[TraceGroup]:
-    """Group the columns (N, n) of a signal by unit; ``units`` maps a position's unit to its own.
+    """Group the columns (N, n) of a signal by unit; ``units`` maps a position's unit to the
+    signal's.
 
-    ``columns``: those of these joints alone.
+    ``columns``: only the columns of these joints.
     """
     unknown = " or ".join(units.values())
     each = [units.get(joint_unit(flight, name), unknown) for name in flight.joint_names]
@@ -457,11 +457,11 @@ def attitude_figure(flight: FlightReport) -> ReportFigure | str:
     if not len(flight.attitude):
         return NO_POSES_TEXT
     caption = (
-        "Attitude of the base link as exponential coordinates: the rotation vector, of the length "
-        "of the angle turned, about the axis of rotation"
+        "Attitude of the base link as exponential coordinates: the rotation vector, along the axis "
+        "of rotation, with the angle as its length"
     )
     if np.linalg.norm(flight.attitude.values, axis=1).max() > np.pi:
-        caption += ", counted on continuously beyond half a turn"
+        caption += ", continuous beyond half a revolution"
     return time_figure(flight, "attitude", "Base attitude", caption, [attitude_group(flight)])
 
 
@@ -479,7 +479,7 @@ def _why_no_joints(flight: FlightReport) -> str:
 
 
 def rates_figure(flight: FlightReport) -> ReportFigure | str | None:
-    """Joint velocities; None if all joints are wheels, whose rates are in the shape's figure."""
+    """Joint velocities; None if all joints are wheels: shape figures have their rates."""
     if not flight.joint_names:
         return _why_no_joints(flight)
     if not len(flight.rates):
@@ -500,7 +500,7 @@ def _rate_bounds(joint: Joint) -> list[float]:
 def twist_figure(flight: FlightReport) -> ReportFigure | str | None:
     """Velocity and angular velocity of the base link.
 
-    None if it rests, and for a gait of many equal cycles, in which it oscillates.
+    None if it is at rest, or if it oscillates in a gait of many equal cycles.
     """
     if flight.cycles is not None or not flight.signal("twist").values.any():
         return None
@@ -514,16 +514,16 @@ def twist_figure(flight: FlightReport) -> ReportFigure | str | None:
 _MOMENTUM_DECADES = 4
 
 _MAX_PEAK_SHARE = 0.02
-"""Largest share of the samples that may be beyond the axis, as peaks."""
+"""Largest share of the samples that may be cut off as peaks."""
 
 _PEAK_RATIOS = (3.0, 1e4)
-"""Least and largest ratio of the span of all samples to that without peaks for which the axis
-leaves the peaks out. Below the first, both can be read together; above the second, the robot rests
-but for the peaks.
+"""Least and largest ratio of the range of all samples to the range without peaks for which peaks
+are cut off. Below the first, both are readable together; above the second, the robot is at rest
+except for the peaks.
 """
 
 _EFFORT_ROUNDING = 1e-9
-"""Forces and torques up to this one are rounding errors, N or N m."""
+"""Forces and torques up to this value are rounding errors, N or N m."""
 
 
 def efforts_figure(flight: FlightReport) -> ReportFigure | str | None:
@@ -552,12 +552,12 @@ def efforts_figure(flight: FlightReport) -> ReportFigure | str | None:
     if not wrench:
         caption = "Commanded joint efforts; no thrust was commanded"
     if any(group.window is not None for group in groups):
-        caption += ". Axes leave out short peaks, so that the rest can be read"
+        caption += ". Axes cut off short peaks, so that the rest is readable"
     return time_figure(flight, "efforts", "Wrench and efforts", caption, groups)
 
 
 def range_without_peaks(signal: Signal) -> tuple[float, float] | None:
-    """Return the range of a signal without its few highest peaks; None if it has no such peaks."""
+    """Return the range of a signal without its highest peaks; None if it has no such peaks."""
     if not len(signal):
         return None
     low, high = (float(np.min(signal.values)), float(np.max(signal.values)))
@@ -582,11 +582,11 @@ def thrusters_figure(flight: FlightReport) -> ReportFigure | str | None:
     groups = [TraceGroup(duty, [shortened(names[k]) for k in used], label, unit, tints, rows=True)]
     impulse, propellant = flight.impulse, flight.series.get("propellant")
     groups.append(TraceGroup(impulse, ["impulse"], "impulse given", "N s", [PALETTE[0]]))
-    caption = "Share of each tick that each thruster was on; below, the impulse of all of them"
+    caption = "Share of each tick that each thruster was on; below, their total impulse"
     if propellant is not None:
         grams = Signal(propellant.time, 1e3 * propellant.values)
         groups.append(TraceGroup(grams, ["propellant"], "propellant", "g", [PALETTE[1]]))
-        caption += " and the propellant consumed, by their specific impulse"
+        caption += " and the propellant consumed, according to their specific impulse"
     if len(used) < len(names):
         caption += f". {len(names) - len(used)} of {len(names)} thrusters were never on"
     return time_figure(flight, "thrusters", "Thruster firings", caption, groups)
@@ -618,7 +618,7 @@ def momentum_figure(flight: FlightReport) -> ReportFigure | str:
     caption = (
         "The momentum balance of the whole system. Top: change of the linear momentum p and of the "
         "angular momentum L about the centre of mass since the start, less the impulse of the "
-        "thrusters, on a logarithmic axis; smaller changes and zero lie on its lower edge. Bottom: "
+        "thrusters, on a logarithmic axis; smaller changes and zero are at its lower edge. Bottom: "
         "kinetic energy"
     )
     return time_figure(flight, "momentum", "Momentum balance", caption, groups)
@@ -642,11 +642,11 @@ def momentum_budget_figure(flight: FlightReport) -> ReportFigure | str | None:
     tints = [colour(column) for column in columns]
     group = TraceGroup(signal, parts, "angular momentum", "N m s", tints)
     caption = (
-        "Angular momentum about the centre of mass: of the base turning with its joints at rest; "
-        "of the arm, its joints relative to the base, with a body that it holds; "
+        "Angular momentum about the centre of mass: of the base, if it rotated with its joints at "
+        "rest; of the arm, from joint motion relative to the base, with a held body; "
     )
     caption += "of the wheels about their axes; " if "wheels" in parts else ""
-    caption += "and of all, which only loads from outside change (norms; vectors add up)"
+    caption += "and in total, which only external loads change (norms; vectors add up)"
     return time_figure(flight, "momentum_budget", "Momentum budget", caption, [group])
 
 
@@ -654,7 +654,7 @@ _MAX_CLEARANCE_SAMPLES = 2000
 
 
 def clearance_figure(flight: FlightReport) -> ReportFigure | str | None:
-    """Smallest distance between two links; None where no links of the robot could touch."""
+    """Smallest distance between two links; None if no links of the robot could touch."""
     clearance = flight.clearance
     if clearance is None:
         return None
@@ -674,7 +674,7 @@ def clearance_figure(flight: FlightReport) -> ReportFigure | str | None:
     sentence = f"{sentence_case(str(nearest))} at {clearance.nearest_time:.6g} s"
     caption = f"Smallest distance between two links that no joint connects. {sentence}"
     if touching:
-        caption += "; below the dotted line links touch, by the shapes in the URDF"
+        caption += "; below the dotted line links touch, according to the shapes in the URDF"
     if not clearance.geometry.exact:
         caption += "; distances are lower bounds, since the package coal is not installed"
     return time_figure(flight, "clearance", "Clearance", caption, [group])
@@ -687,7 +687,7 @@ def power_of_ten(value: float) -> str:
 
 
 _SENSOR_ROUNDING = 1e-12
-"""Sensor errors up to this one are rounding errors, m or rad."""
+"""Sensor errors up to this value are rounding errors, m or rad."""
 
 
 _MAX_DECADES = 8
@@ -696,7 +696,7 @@ _ERROR_PARTS: tuple[tuple[Literal["position", "attitude"], str, str], ...] = (
     ("position", "distance", "m"),
     ("attitude", "angle", "rad"),
 )
-"""Parts of a goal, the norms of their errors and the units of those."""
+"""Parts of a goal, names of the norms of their errors, and units of these norms."""
 
 
 def errors_figure(flight: FlightReport) -> ReportFigure | str | None:
@@ -719,7 +719,7 @@ def errors_figure(flight: FlightReport) -> ReportFigure | str | None:
         return None
     caption = (
         "Distance and angle from the goal, in the components under control, on logarithmic axes; "
-        "smaller values lie on the lower edge; dotted, the tolerance"
+        "smaller values are at the lower edge; dotted, the tolerance"
     )
     if left_out := [part for part, *_ in _ERROR_PARTS if part in flight.not_controlled]:
         caption += f"; the {' and '.join(left_out)} of the base is not controlled"
@@ -749,7 +749,7 @@ def _error_group(
 
 
 def link_errors_figure(flight: FlightReport) -> ReportFigure | str | None:
-    """Distance and angle of each link to its goals; None where no link had a goal."""
+    """Distance and angle of each link to its goals; None if no link had a goal."""
     if not flight.link_errors:
         return flight.hidden_links_text or None if flight.link_goals else None
     groups: list[TraceGroup] = []
@@ -758,9 +758,8 @@ def link_errors_figure(flight: FlightReport) -> ReportFigure | str | None:
             if len(signal):
                 groups.append(_error_group(flight, signal, part, shortened(link), colour(number)))
     caption = (
-        "Distance of each link from the position of its goal, and angle from its attitude where "
-        "that counts, on logarithmic axes; smaller values lie on the lower edge; dotted, the "
-        "tolerance"
+        "Distance of each link from the position of its goal, and angle from its goal attitude if "
+        "required, on logarithmic axes; smaller values are at the lower edge; dotted, the tolerance"
     )
     if flight.base_goal is None:
         caption += "; the base is not controlled"

@@ -58,11 +58,11 @@ PIXELS = 420
 """Width of the picture of a robot, pixels."""
 _MAX_SHOWN_POSES = 6
 _FOOT_SHARE = 0.1
-"""Share of the height of a picture of a robot that is left for the scale bar."""
+"""Share of the height of a picture of a robot that is reserved for the scale bar."""
 
 _NEAR = 2.0
-"""Largest extent of the robot and its goal, or obstacles, with which these are shown whole, in
-robot extents.
+"""Largest extent, in robot extents, of the robot and its goal or obstacles, up to which these are
+fully shown.
 """
 
 
@@ -95,21 +95,21 @@ def configurations_figure(flight: FlightReport) -> ReportFigure | str:
     if not narrow():
         legend_above(places[-1], keys)
     caption = (
-        "The robot at instants from the first recorded state to the last, to one scale, from the "
-        "shapes of its URDF; each moving link in the color that its joint has in the other figures."
+        "The robot at instants from the first recorded state to the last, at the same scale, with "
+        "the shapes of its URDF. Each moving link has the color of its joint in the other figures."
     )
     if flight.target is not None:
         caption += " The target is drawn where it is, free or held."
     if flight.obstacles:
-        caption += " Obstacles have the shapes by which distances are measured."
+        caption += " Obstacles have the shapes used to measure distances."
     if flight.base_goal is not None:
-        caption += " Dashed in the last, the base link at the goal."
+        caption += " In the last picture, the base link at the goal is dashed."
     caption += flight.missing_meshes
     return ReportFigure("configurations", "Configurations", caption, figure)
 
 
 def with_near(points: Array, more: Array, view: View) -> Array:
-    """Return points (k, 3) of a robot, and those of other things unless these are far away, m."""
+    """Return points (k, 3) of a robot, and of other objects unless they are far away, m."""
     both = np.concatenate([points, more])
     shown = np.ptp(view(both), axis=0).max() < _NEAR * np.ptp(view(points), axis=0).max()
     return both if shown else points
@@ -184,7 +184,7 @@ def draw_robot(axes: Axes, solids: Sequence[PlacedSolid], points: Array, view: V
 
 
 def draw_goal_and_path(axes: Axes, flight: FlightReport, view: View) -> list[Line2D]:
-    """Draw the ghost of the base at the goal and the path of the base; return legend entries."""
+    """Draw the base at the goal as a ghost, and the path of the base; return legend entries."""
     keys = []
     path = flight.position.values
     limits = axes.axis()
@@ -278,7 +278,7 @@ def path_figure(flight: FlightReport, beside: Sequence[FlightReport] = ()) -> Re
         "Path of the base origin"
         + (" and of the end-effector" if shows_tool else "")
         + (" and of links with goals" if flight.link_poses else "")
-        + f" in the world frame{', three views to one scale' if len(views) > 1 else ''}: open "
+        + f" in the world frame{', three views at the same scale' if len(views) > 1 else ''}: open "
         "circle, start; full circle, end"
         + ("; cross, goal" if goals else "")
         + ("; dashed, the planned path of the base" if flight.planned else "")
@@ -318,7 +318,7 @@ def loops_figure(flight: FlightReport) -> ReportFigure | str:
     columns = flight.shape_columns[:_LOOP_JOINTS]
     names = [flight.joint_names[i] for i in columns]
     if len(names) < 2:
-        return "A loop in shape space takes two joints or more."
+        return "A loop in shape space needs two joints or more."
     if not len(flight.shape):
         return NO_JOINTS_TEXT
     if len(flight.shape) < 2:
@@ -360,7 +360,7 @@ def loops_figure(flight: FlightReport) -> ReportFigure | str:
         caption = (
             f"The last {SHOWN_CYCLES} of {cycles.count} cycles in shape space. Each begins and "
             "ends at the circle and, to first order, displaces the base in proportion to the areas "
-            "it encloses: those of one cycle are given, positive where it runs counter-clockwise."
+            "it encloses: the areas of one cycle are given, positive if counter-clockwise."
         )
     if len(flight.shape_columns) > _LOOP_JOINTS:
         caption += f" The first three of {len(flight.shape_columns)} joints are shown."
@@ -386,7 +386,7 @@ def _draw_direction(axes: Axes, x: Array, y: Array) -> None:
 
 
 _CLOSED_LOOP_DISTANCE = 0.02
-"""Distance from its first shape below which a loop is closed, as a share of its size."""
+"""Distance from its first shape up to which a loop is considered closed, as a share of its size."""
 
 _MIN_LOOPS = 4
 _LOG_AXIS_RATIO = 10.0
@@ -424,8 +424,8 @@ def cycles_figure(flight: FlightReport) -> ReportFigure | None:
     above.set_ylabel(f"rotation vector ({unit})")
     end_labels(above, list(zip(attitude[-1].tolist(), "xyz", PALETTE[:3], strict=True)))
     caption = (
-        f"Attitude of the base link at the {len(ends)} instants at which the shape is back where "
-        "its loops begin, number 0 before the first of them"
+        f"Attitude of the base link at the {len(ends)} instants at which the shape returns to the "
+        "start of its loops; number 0 is before the first loop"
     )
     if goal is not None:
         below = panels[1][0]
@@ -448,9 +448,9 @@ def cycles_figure(flight: FlightReport) -> ReportFigure | None:
 
 
 def loop_ends(shape: Signal) -> Indices:
-    """Return the samples at which the shape returns to the last one, where its loops are closed.
+    """Return the samples at which the shape returns to the last shape, which closes its loops.
 
-    A rest there counts once, with its last sample; a rest at the end of the flight with its first.
+    A rest there is represented by its last sample, a rest at the end of the flight by its first.
     """
     values = shape.values
     moving = np.flatnonzero((np.abs(np.diff(values, axis=0)) > 0).any(axis=1))

@@ -61,7 +61,7 @@ _MAX_LINK_ERROR_STATES = 2000
 
 @dataclass(frozen=True)
 class GoalSpan:
-    """A goal and when it was flown to, ``start`` to ``end`` in s."""
+    """A goal and the time during which it was flown to, ``start`` to ``end`` in s."""
 
     start: float
     end: float
@@ -79,7 +79,7 @@ class FlightReport(Flight):
     timed_events
         The events that figures show; none in bags of earlier versions.
     meshes
-        Triangles of the meshes that the bag carries, by their URIs.
+        Triangles of the meshes in the bag, by their URIs.
     """
 
     bag: FlightBag
@@ -88,7 +88,7 @@ class FlightReport(Flight):
 
     @classmethod
     def of(cls, bag: FlightBag, flight: Flight | None = None) -> FlightReport:
-        """Return the report of a bag, whose flight is read unless it is given.
+        """Return the report of a bag; its flight is read unless given.
 
         Raises
         ------
@@ -118,7 +118,8 @@ class FlightReport(Flight):
 
     @cached_property
     def attitude(self) -> Signal:
-        """Attitude of the base as exponential coordinates (N, 3), rad, beyond half turns."""
+        """Attitude of the base as exponential coordinates (N, 3), rad, continuous beyond half
+        revolutions."""
         return Signal(self.position.time, rotvecs(self.quaternion))
 
     @cached_property
@@ -133,7 +134,7 @@ class FlightReport(Flight):
 
     @cached_property
     def unexplained_momentum(self) -> Signal:
-        """Momenta and energy (N, 7), without the momenta that the thrusters have put in."""
+        """Momenta and energy (N, 7), without the momenta produced by thrusters."""
         balance, expected = self.signal("momentum"), self.signal("expected_momenta")
         if len(expected) != len(balance) or not len(balance):
             return balance
@@ -200,9 +201,9 @@ class FlightReport(Flight):
         return [name or "/" for name in others if name != self.bag.namespace]
 
     def mesh_of(self, shape: Shape) -> TriangleMesh:
-        """Return a mesh that the bag carries; files that a bag names are not read."""
+        """Return a mesh from the bag; files named in a bag are not read."""
         if shape.resource not in self.meshes:
-            raise MeshError(f"The bag does not carry the mesh '{shape.resource}'.")
+            raise MeshError(f"The bag does not contain the mesh '{shape.resource}'.")
         return self.meshes[shape.resource].moved(shape.pose, shape.size)
 
     @cached_property
@@ -221,13 +222,13 @@ class FlightReport(Flight):
 
     @property
     def label(self) -> str:
-        """Short name among several flights: that of the file and of the method."""
+        """Short name to distinguish several flights: names of the file and the method."""
         path, method = self.bag.path, self.flown_method
         return f"{path.stem} ({method})" if method else path.name
 
     @property
     def flown_method(self) -> str:
-        """Gait method: of the first schedule, or the planner's parameter; else the control law."""
+        """Gait method of the first schedule, or the planner's parameter, or the control law."""
         named = (method for _, status in self.reports if (method := _method_of(status)))
         return next(named, str(self.parameter("planner", "method") or ""))
 
@@ -246,9 +247,8 @@ class FlightReport(Flight):
 
     @cached_property
     def timed_statuses(self) -> list[tuple[float, Status | str]]:
-        """Statuses of the planner, or else of the controller, with their times, s.
-
-        A status of another package is its message alone.
+        """Statuses of the planner, or else of the controller, with their times, s. For a status of
+        another package, only the message is returned.
         """
         for commander in COMMANDERS:
             found = [
@@ -266,7 +266,7 @@ class FlightReport(Flight):
 
     @property
     def executing(self) -> list[tuple[float, PlannerStatus]]:
-        """The report of the start of each schedule that was flown."""
+        """The status at the start of each flown schedule."""
         return [
             (time, each)
             for time, each in self.reports
@@ -275,13 +275,13 @@ class FlightReport(Flight):
 
     @cached_property
     def outputs(self) -> frozenset[str]:
-        """Names of the controller's outputs; none where a planner has the goals."""
+        """Names of the controller's outputs; none if a planner has the goals."""
         reports = (each for _, each in self.reports if isinstance(each, ControllerStatus))
         return frozenset(name for each in reports if each.command for name in each.command.errors)
 
     @cached_property
     def targets(self) -> list[GoalSpan]:
-        """Goals of the base, of the schedules; without any schedule, those that were sent."""
+        """Goals of the base in the schedules; without schedules, the goals that were sent."""
         return [target for target in self._all_targets if target.goal.base]
 
     @cached_property
@@ -295,12 +295,12 @@ class FlightReport(Flight):
 
     @property
     def base_goal(self) -> Goal | None:
-        """The goal of the base that counts at the end; None: there is none, or the base is free."""
+        """The goal of the base in force at the end; None: there is none, or the base is free."""
         return self.goal if self.goal is not None and self.goal.base else None
 
     @property
     def other_goal(self) -> bool:
-        """Whether the base was sent to another goal than that of its scenario."""
+        """Whether the base was sent to a goal other than its scenario's."""
         own = self.scenario.goal
         return self.scenario.has_goal and any(
             not np.allclose(sent.goal.position, own.position)
@@ -311,7 +311,7 @@ class FlightReport(Flight):
 
     @cached_property
     def link_goals(self) -> dict[str, EndEffectorGoal]:
-        """The goals of links that count at the end, of a planner."""
+        """The planner's goals of links in force at the end."""
         return {} if self.goal is None else {each.link: each for each in self.goal.end_effectors}
 
     @cached_property
@@ -369,7 +369,7 @@ class FlightReport(Flight):
     def controls(self, part: str) -> list[int]:
         """Components x, y, z, rx, ry, rz (0..5) of ``base`` or ``end_effector`` under control.
 
-        All six where no controller has named its outputs.
+        All six if no controller has named its outputs.
         """
         if not self.outputs:
             return list(range(6))
@@ -377,7 +377,8 @@ class FlightReport(Flight):
         return [i for i, axis in enumerate(axes) if f"{part}.{axis}" in self.outputs]
 
     def goal_rotvec(self, goal: Goal) -> Array:
-        """Attitude of a goal (3,), rad, with the number of turns nearest to the last attitude."""
+        """Attitude of a goal as the rotation vector (3,), rad, that is nearest to the last
+        attitude."""
         rotvec = rotvec_from_quaternion(goal.quaternion)
         return nearest_rotvec(rotvec, self.attitude.values[-1]) if len(self.attitude) else rotvec
 
@@ -388,8 +389,8 @@ class FlightReport(Flight):
 
     @property
     def time_to_end(self) -> float | None:
-        """Time from the first schedule for the last goal to its end, s, with the waits in between;
-        None where no schedule was flown.
+        """Time from the first schedule for the last goal to its end, s, including waits; None if no
+        schedule was flown.
         """
         planned = [(time, each) for time, each in self.reports if isinstance(each, PlannerStatus)]
         return time_to_end(planned, self.end)
@@ -413,7 +414,7 @@ class FlightReport(Flight):
 
     @property
     def missing_meshes(self) -> str:
-        """A sentence for captions about meshes that are not in the bag; empty: all are."""
+        """A sentence for captions about meshes missing in the bag; empty: none are."""
         shapes: list[Shape] = []
         if self.robot is not None:
             shapes += [each for link in self.robot.links for each in link.shapes]
@@ -424,10 +425,10 @@ class FlightReport(Flight):
         if not missing:
             return ""
         count = f"{len(missing)} of {len(named)} meshes" if self.meshes else "Meshes"
-        return f" {count} are not drawn. The bag does not carry them."
+        return f" {count} are not drawn. The bag does not contain them."
 
     def samples(self, count: int) -> list[int]:
-        """Recorded states at about equal intervals, the first and the last among them."""
+        """Recorded states at about equal intervals, including the first and the last."""
         last = len(self.position) - 1
         return np.unique(np.linspace(0, last, count).astype(int)).tolist()
 
@@ -435,7 +436,7 @@ class FlightReport(Flight):
     def joints(self) -> Array:
         """Joint positions (N, n), in the order of the robot description, at the base poses.
 
-        Those of reaction wheels are 0: a body of revolution looks the same at any angle.
+        Angles of reaction wheels are 0: a body of revolution looks the same at any angle.
         """
         assert self.robot is not None
         time, found = self.position.time, []
@@ -449,7 +450,7 @@ class FlightReport(Flight):
 
     @property
     def repeats_cycles(self) -> bool:
-        """Whether a method flew that repeats cycles, or one that is not known; no law does."""
+        """Whether the flown method repeats cycles, or is unknown; false for control laws."""
         if any(isinstance(status, ControllerStatus) for _, status in self.reports):
             return False
         flown = {status.method for _, status in self.executing if status.method}
@@ -459,7 +460,7 @@ class FlightReport(Flight):
 
     @cached_property
     def cycles(self) -> Cycles | None:
-        """The equal cycles with which the longest schedule ends; None: there are none."""
+        """The equal cycles at the end of the longest schedule; None: there are none."""
         if not self.repeats_cycles:
             return None
         starts = [0.0, *(time for time, _ in self.executing)]
@@ -474,7 +475,7 @@ class FlightReport(Flight):
 
     @cached_property
     def impulse(self) -> Signal:
-        """Impulse that all thrusters together have given (N, 1), N s."""
+        """Total impulse of all thrusters (N, 1), N s."""
         thrust = self.signal("thruster_force")
         return impulse(thrust, np.ones(thrust.width))
 
@@ -512,7 +513,7 @@ def _shift_time(signal: Signal, start: float) -> Signal:
 
 
 def pose_errors(pose: Signal, targets: Sequence[GoalSpan]) -> Signal:
-    """Return the goal minus poses (N, 7) while there is one: position, rotation vector (M, 6)."""
+    """Return goal minus pose (N, 7) while there is a goal: position, rotation vector (M, 6)."""
     times, values = [np.empty(0)], [np.empty((0, 6))]
     for target in targets:
         part = pose.between(target.start, target.end)

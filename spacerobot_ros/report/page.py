@@ -37,16 +37,16 @@ from spacerobot_ros.report.tables import (
 from spacerobot_ros.scenario import different_parameters
 
 _CHART_HELP = (
-    '<p class="facts" id="use">Drag across a chart to look at a part of the time in all of them, '
-    "click twice for the whole flight. Click once to see the robot at that instant above; the "
-    "upright line is the instant that is shown there. Click a name to hide its trace.</p>"
+    '<p class="facts" id="use">Drag across a chart to zoom all charts, double-click for the '
+    "whole flight. Click once to see the robot at that instant above; the vertical line marks the "
+    "instant shown there. Click a name to hide its trace.</p>"
 )
 _MAX_EVENT_ROWS, _MAX_UNFOLDED_ROWS = 200, 20
-"""Events in the table of the page; longer tables than the second are folded up."""
+"""Largest numbers of events in the table of the page, and in a table that is not collapsed."""
 
 _MAX_SAMPLES = 2000
 _MAX_SLICED_SAMPLES = 5000
-"""Samples of a chart: where the omitted ones lie on lines, and where they do not."""
+"""Largest number of samples of a chart, if omitted ones lie on lines, and if they do not."""
 
 _LINE_TOLERANCE = 5e-4
 """Largest distance of an omitted sample from its line, as a share of the trace's extent."""
@@ -54,7 +54,7 @@ _LINE_TOLERANCE = 5e-4
 _MAX_CHART_EVENTS = 500
 
 _FOLDED = ("velocities", "efforts", "twist")
-"""Names of the figures that are folded up."""
+"""Names of the collapsed figures."""
 
 Figures = Sequence[ReportFigure | str | None]
 """Figures of a page; a text says why a figure is missing."""
@@ -66,7 +66,7 @@ def page(
     figures: Figures,
     beside: Sequence[FlightReport] = (),
 ) -> str:
-    """Return the whole page; flights ``beside`` this one get a row in a table."""
+    """Return the whole page; the flights ``beside`` get a row in a table."""
     charts = charts_of(flight, figures)
     scenario = flight.scenario.described_for_other_goal() if flight.other_goal else flight.scenario
     name, description = scenario.name, scenario.description
@@ -238,7 +238,7 @@ def _footer_text(flight: FlightReport) -> str:
 def charts_of(flight: FlightReport, figures: Figures) -> PagePart:
     """Return the charts of all figures over time.
 
-    The element of a figure names its charts by their numbers, in ``data-charts``
+    The element of a figure lists the numbers of its charts in ``data-charts``
     (:func:`chart_numbers`).
     """
     groups = [group for each in figures if isinstance(each, ReportFigure) for group in each.groups]
@@ -271,7 +271,7 @@ def _chart_events(flight: FlightReport) -> list[dict[str, Any]]:
 
 
 def chart_numbers(figures: Figures) -> dict[str, str]:
-    """Return the numbers of the charts of each figure, by its name."""
+    """Return the numbers of the charts of each figure, by name."""
     found, first = {}, 0
     for each in figures:
         if isinstance(each, ReportFigure) and each.groups:
@@ -318,10 +318,10 @@ def _limit_range(group: TraceGroup) -> tuple[float, float]:
 
 
 def thin_out(signal: Signal) -> Signal:
-    """Return fewer samples of a signal for a chart that looks the same.
+    """Return a signal with fewer samples for a chart that looks the same.
 
-    Kept are the samples off the lines between others or, where these would be too many, the
-    smallest and the largest of every trace in each slice of time.
+    It keeps samples that are not on lines between others. If there are too many, it keeps the
+    smallest and the largest value of every trace in each slice of time.
     """
     if len(signal) <= _MAX_SAMPLES:
         return signal

@@ -1,8 +1,8 @@
 """Parts of HTML pages: shell and security policy, tables, figures, and the scripts of a page.
 
-Reports of flights and of campaigns are made of these. A page stands alone: its
-Content-Security-Policy lets it load nothing, and run its own scripts only, by their hashes. Text
-from a bag, which a stranger may have written, therefore never runs.
+Reports of flights and of campaigns consist of these. A page is self-contained: its
+Content-Security-Policy forbids loading anything, and allows only its own scripts, by their hashes.
+Untrusted text from a bag therefore never runs.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _SECURITY_POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'
 
 @dataclass(frozen=True)
 class PagePart:
-    """A part of a page that scripts bring to life.
+    """A part of a page with scripts.
 
     Attributes
     ----------
@@ -53,16 +53,16 @@ def package_file(name: str) -> str:
 
 
 def html_page(title: str, body: Sequence[str], footer: str, parts: Sequence[PagePart] = ()) -> str:
-    """Return a whole page, with a button for light or dark.
+    """Return a whole page, with a button for the light or dark theme.
 
     Parameters
     ----------
     title, footer
         Plain text.
     body
-        HTML of the elements; empty texts are left out.
+        HTML of the elements; empty texts are omitted.
     parts
-        Their scripts, styles and licences go into the page; their markup stands in ``body``.
+        Their scripts, styles and licences are added to the page; their markup is in ``body``.
     """
     parts = (*parts, PagePart(programs=(package_file("page.js"),)))
     policy = f"{_SECURITY_POLICY}; {_script_policy(parts)}"
@@ -113,13 +113,13 @@ def unbroken(text: str) -> str:
 
 
 def facts(texts: Sequence[str]) -> str:
-    """Return short facts in one line; empty if there are none."""
+    """Return short facts on one line; empty if there are none."""
     spans = "".join(f"<span>{escape(fact)}</span>" for fact in texts)
     return f'<p class="facts">{spans}</p>' if texts else ""
 
 
 def tiles(rows: Sequence[tuple[str, str, str]]) -> str:
-    """Return the main numbers as tiles, from label, value and note of each."""
+    """Return the main numbers as tiles, each with label, value and note."""
     made = []
     for label, value, note in rows:
         small = f"<small>{unbroken(note)}</small>" if note else ""
@@ -137,7 +137,7 @@ def table(
 ) -> str:
     """Return a table; the first cell of a row is its header, ``numeric`` columns align right.
 
-    Without a ``head`` it has rows alone.
+    Without a ``head`` it has only rows.
     """
 
     def row(cells: Sequence[str], tag: str) -> str:

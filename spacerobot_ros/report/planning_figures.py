@@ -1,8 +1,7 @@
 """Pictures of the commands ``analyze`` and ``plan``: curvature maps and workspaces of a robot, and
 one plan.
 
-Curvature maps over the shape space are those of paper 3, figures 2 and 3, and paper 2, figures 6
-to 8.
+Curvature maps over the shape space are as in paper 3, figures 2 and 3, and paper 2, figures 6 to 8.
 """
 
 from __future__ import annotations
@@ -46,19 +45,19 @@ from spacerobot_ros.report.figures import (
 from spacerobot_ros.report.figures_over_time import draw_group
 
 _FINE_GRID, _COARSE_GRID = 61, 37
-"""Points a side of a map, of robots with up to three joints and with more."""
+"""Points per side of a map, for robots with up to three joints and with more."""
 
 _COLOUR_LEVELS = 16
 _CONDITION_LEVELS = (1.0, 1.5, 2.0, 3.0, 5.0, 7.0, 10.0, 20.0, 50.0, 100.0)
 _MAX_CONDITION = 300.0
-"""Condition numbers above are drawn as this one: singular shapes are lines between grid points."""
+"""Larger condition numbers are drawn as this one: singular shapes are lines between grid points."""
 
 _MIN_LIMIT_DISTANCE = 0.25
-"""Squares are drawn round a centre that is as far from the joint limits, rad."""
+"""Least distance of the centre of squares from the joint limits, rad."""
 
 _SQUARE_COUNT = 60
 _COLOUR_BAR_X = WIDTH - 0.86
-"""Where a bar of colours stands, inches."""
+"""Horizontal position of a colour bar, inches."""
 
 _RING_STYLES: dict[str, dict[str, Any]] = {
     "path-independent": {"facecolor": (PALETTE[0], 0.25), "edgecolor": PALETTE[0], "lw": 0.6},
@@ -74,7 +73,7 @@ _AXIS_NAMES = ("x", "y", "z")
 
 
 def draw_analysis(found: Analysis, format: PictureFormat = PictureFormat.PNG) -> bytes | None:
-    """Return the curvature maps of a robot as a picture; None where no loop turns its base."""
+    """Return the curvature maps of a robot as a picture; None if no loop rotates its base."""
     with drawing():
         if found.planar.controllable:
             figure = _planar_figure(found)
@@ -89,7 +88,7 @@ def draw_analysis(found: Analysis, format: PictureFormat = PictureFormat.PNG) ->
 
 
 def draw_workspaces(found: Analysis, format: PictureFormat = PictureFormat.PNG) -> bytes:
-    """Return the workspaces of the end-effector as a picture, round the centre of mass."""
+    """Return the workspaces of the end-effector, around the centre of mass, as a picture."""
     with drawing():
         high, gap = 3.3, 0.75
         figure = new_figure(high + 1.35)
@@ -107,7 +106,7 @@ def draw_workspaces(found: Analysis, format: PictureFormat = PictureFormat.PNG) 
 
 
 def draw_rings(axes: Axes, workspaces: Workspaces) -> None:
-    """Draw path-dependent and path-independent distances as rings round the centre of mass."""
+    """Draw path-dependent and path-independent distances as rings around the centre of mass."""
     for kind, intervals in (
         ("path-independent", workspaces.path_independent),
         ("path-dependent", workspaces.path_dependent),
@@ -143,7 +142,7 @@ def _planar_figure(found: Analysis) -> Figure:
     left.set_ylim(lower[1], upper[1])
     left.set_xlabel(f"{robot.joint_names[i]} (rad)")
     left.set_ylabel(f"{robot.joint_names[j]} (rad)")
-    left.set_title("H: turn by small clockwise loops over area (1/rad)")
+    left.set_title("H: rotation by small clockwise loops per area (1/rad)")
     _draw_colour_bar(figure, bar, norm, "RdBu_r", "H (1/rad)")
     right = panel(figure, 5.9, 0.6, WIDTH - 6.2, 3.55)
 
@@ -169,7 +168,7 @@ def _draw_square_turns(axes: Axes, plane: PhasePlane, centre: Array, room: float
         sides, small, color=SECONDARY_COLOUR, dashes=(4, 3), lw=0.9, label="|H| z², small squares"
     )
     axes.set_xlabel("side z of the square (rad)")
-    axes.set_title("turn of the base by one square loop")
+    axes.set_title("rotation of the base by one square loop")
     axes.set_ylabel("turn (rad)")
     axes.set_xlim(0.0, None)
     axes.set_ylim(0.0, 1.35 * turns.max())
@@ -201,7 +200,7 @@ def _spatial_figure(found: Analysis) -> Figure:
             _draw_map(axes, x, y, values, norm)
             _mark_shape(axes, found, pair)
             first, second = (_joint_symbol(pair, k) for k in (0, 1))
-            axes.set_title(f"turn about {_AXIS_NAMES[column]} by loops of {first}, {second}")
+            axes.set_title(f"rotation about {_AXIS_NAMES[column]} by loops of {first}, {second}")
         # A turn in rad for an area in the plane of the two joints.
         first, second = (movable[joints[k]].unit for k in pair)
         area = f"{first}²" if first == second else f"({first} {second})"
@@ -265,7 +264,7 @@ def _draw_condition_shares(axes: Axes, conditions: Array) -> None:
     axes.set_xlim(1.0, None)
     axes.set_ylim(0.0, 1.05)
     axes.set_xlabel("condition number of the best three brackets (1)")
-    axes.set_title(f"share of {len(conditions)} shapes all over the shape space that are as good")
+    axes.set_title(f"share of {len(conditions)} shapes across the shape space that are as good")
 
 
 # -- parts --------------------------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""The 3D view of a flight on its page: its scene as the commands that MeshCat's viewer takes."""
+"""The 3D view of a flight on its page: its scene as commands for MeshCat's viewer."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ Command = dict[str, Any]
 
 @dataclass(frozen=True)
 class View3D:
-    """Commands of the viewer, spans of time to choose from (name, start, end), and a caption."""
+    """Commands for the viewer, selectable spans of time (name, start, end), and a caption."""
 
     commands: list[Command]
     parts: list[tuple[str, float, float]]
@@ -44,7 +44,7 @@ class View3D:
 
 
 def viewer_script() -> str | None:
-    """Return MeshCat's viewer; None where the package ``meshcat`` is not installed."""
+    """Return MeshCat's viewer; None if the package ``meshcat`` is not installed."""
     spec = find_spec("meshcat")
     for folder in (spec.submodule_search_locations or ()) if spec is not None else ():
         path = Path(folder) / "viewer" / "dist" / "main.min.js"
@@ -66,7 +66,7 @@ _MARKUP = """<section id="animation" class="loading">
 do not.</p>
 <noscript><p class="missing">The 3D view needs JavaScript; the figures below do not.</p>\
 </noscript>
-<p class="caption"><b>The flight.</b> {caption} Drag to turn the view, with the right button to \
+<p class="caption"><b>The flight.</b> {caption} Drag to rotate the view, with the right button to \
 move it; click it first to zoom with the wheel.</p>
 </section>
 """
@@ -109,11 +109,11 @@ def _licence_notices() -> tuple[tuple[str, str], ...]:
 # -- key frames ---------------------------------------------------------------------------------
 
 FULL_CYCLES = 3
-"""Cycles at the beginning and at the end of a gait that are shown in full."""
+"""Number of cycles shown in full at the beginning and at the end of a gait."""
 
 _MAX_KEY_FRAMES = 1000
 _MAX_CYCLE_INSTANTS = 300
-"""Instants of equal phase between the cycles that are shown in full."""
+"""Largest number of instants of equal phase between the cycles shown in full."""
 
 
 @dataclass(frozen=True)
@@ -127,8 +127,8 @@ class KeyFrames:
     error
         Largest distance of an omitted state from the interpolation, in tolerances.
     every
-        Between the cycles shown in full, one state is shown per so many cycles, always at the same
-        phase; 0: all cycles are shown in full.
+        Number of cycles per shown state, always at the same phase, between the cycles shown in
+        full; 0: all cycles are shown in full.
     """
 
     indices: Indices
@@ -144,8 +144,8 @@ def key_frames(motion: Signal, cycles: Cycles | None) -> KeyFrames:
     motion
         The visible motion, (N, k), each column divided by its tolerance.
     cycles
-        Its equal cycles. All but the first and the last few are sampled at equal phase: otherwise
-        fast loops would look like slow ones (aliasing).
+        Its equal cycles. All except the first and the last few are sampled at equal phase:
+        otherwise fast loops would look like slow ones (aliasing).
     """
     shown, every = np.arange(len(motion)), 0
     if cycles is not None and cycles.count > 2 * FULL_CYCLES:
@@ -274,7 +274,7 @@ _POSITION_TOLERANCE = 0.001
 _ANGLE_TOLERANCE = 0.005  # rad
 _MAX_LINE_POINTS = 4000
 _MAX_MESH_FACES = 20_000
-"""Largest number of faces of all meshes together: some 0.6 MB."""
+"""Largest number of faces of all meshes together: about 0.6 MB."""
 
 _BACKGROUND = [246 / 255, 247 / 255, 249 / 255]
 _FIELD_OF_VIEW = 30.0
@@ -284,7 +284,7 @@ _MIN_ASPECT = 1.3
 """Width of the picture over its height, on narrow screens."""
 
 _MARGIN = 1.06
-"""Distance of the camera over the least from which the whole scene is seen."""
+"""Distance of the camera, relative to the least distance at which the whole scene is visible."""
 
 _AXIS_COLOURS = ("#d55e00", "#009e73", "#0072b2")
 WORLD = "/flight"
@@ -458,7 +458,7 @@ def _time_spans(flight: FlightReport) -> list[tuple[str, float, float]]:
 
 def _caption_text(flight: FlightReport, frames: KeyFrames, radius: float, ghosts: bool) -> str:
     text = (
-        "The robot from the shapes of its URDF, each moving link in the color of its joint in the "
+        "The robot has the shapes of its URDF; each moving link has the color of its joint in the "
         "figures below; lines are the paths of the base (blue)"
     )
     several = len(flight.link_poses) > 1
@@ -468,8 +468,8 @@ def _caption_text(flight: FlightReport, frames: KeyFrames, radius: float, ghosts
         text += " and of the end-effector (pink)"
     text += " and what was planned (orange)" * bool(flight.planned)
     text += "; the green ghost is the goal" if ghosts else ""
-    text += "; obstacles have the shapes by which distances are measured" * bool(flight.obstacles)
-    text += "; the target moves as target/odom says" * (flight.target is not None)
+    text += "; obstacles have the shapes used to measure distances" * bool(flight.obstacles)
+    text += "; the target moves according to target/odom" * (flight.target is not None)
     if len(flight.position) < 2:
         return f"{text}.{flight.missing_meshes}"
     text += (
@@ -484,8 +484,8 @@ def _caption_text(flight: FlightReport, frames: KeyFrames, radius: float, ghosts
     if frames.every:
         which = "every cycle" if frames.every == 1 else f"every {frames.every}th cycle"
         text += (
-            f" The first and the last {FULL_CYCLES} cycles are shown in full; of those "
-            f"between, one instant of {which}, always at the same phase, so that fast loops do not "
+            f" The first and the last {FULL_CYCLES} cycles are shown in full; between them, one "
+            f"instant of {which} is shown, always at the same phase, so that fast loops do not "
             "look like slow ones."
         )
     return text + flight.missing_meshes

@@ -23,7 +23,7 @@ from spacerobot_ros.report.signals import continuous, link_poses
 _BASE_COLOUR = "#c4c9d2"
 
 _FLATNESS_STATES = 25
-"""States at which a robot is checked for links that leave a horizontal plane."""
+"""Number of states at which links are checked for leaving a horizontal plane."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,12 +33,12 @@ class Body:
     Attributes
     ----------
     name
-        Its name; no other body has the same.
+        Its unique name.
     visuals
         Its solids, in its frame.
     poses
-        Its poses in the world (K, 7) at the instants of the scene, m and quaternion; (1, 7): it
-        stands still.
+        Its poses in the world (K, 7) at the instants of the scene, m and quaternion; (1, 7): it is
+        at rest.
     color
         ``#rrggbb``; empty: each solid has the color of its shape.
     """
@@ -106,7 +106,7 @@ def bodies_of(flight: FlightReport, rows: Sequence[int], most: int) -> list[Body
 
 
 def obstacles_of(flight: FlightReport) -> list[Body]:
-    """Return the obstacles around a robot, as distances are measured to them."""
+    """Return the obstacles around a robot, with the shapes used to measure distances."""
     return [
         Body(f"obstacle {number} {visual.link}", (visual,), _as_values(pose))
         for number, (visual, pose) in enumerate(flight.obstacles)
@@ -116,7 +116,7 @@ def obstacles_of(flight: FlightReport) -> list[Body]:
 def goal_of_base(flight: FlightReport, most: int) -> Body | None:
     """Return the base of a robot at its goal; None: it has none.
 
-    If only attitude is a goal, it is at the last position.
+    If only the attitude has a goal, it is at the last position.
     """
     goal, robot = flight.base_goal, flight.robot
     if goal is None or robot is None or not flight.controls("base"):

@@ -18,15 +18,15 @@ Indices = npt.NDArray[np.int64]
 
 _MIN_CYCLES = 12
 _INITIAL_STRETCHES = 64
-"""Stretches a long recording is first cut into before it is simplified, which bounds the work."""
+"""Number of parts into which a recording is cut before simplification, to bound the work."""
 
 _MAX_PERIOD_SAMPLES = 1 << 14
-"""Samples at the end of a gait in which a period is looked for."""
+"""Number of samples at the end of a gait in which a period is searched."""
 
 
 @dataclass(frozen=True)
 class Cycles:
-    """A part of a flight, ``start`` to ``end`` in s, that repeats itself every ``period`` s."""
+    """A part of a flight, ``start`` to ``end`` in s, that repeats every ``period`` s."""
 
     start: float
     end: float
@@ -43,7 +43,7 @@ class Cycles:
 
 
 def envelope(signal: Signal, column: int, columns: int) -> tuple[Array, Array, Array]:
-    """Return times and the smallest and largest value of one column in so many slices of time.
+    """Return times and the smallest and largest value of one column in each slice of time.
 
     A slice reaches to the first sample of the next one, so that the band is connected.
     """
@@ -59,14 +59,14 @@ def envelope(signal: Signal, column: int, columns: int) -> tuple[Array, Array, A
 
 
 def simplified(motion: Signal, most: int) -> tuple[Indices, float]:
-    """Drop samples that lie on the line between others (Douglas and Peucker), the worst kept first.
+    """Drop samples on the line between others (Douglas and Peucker), keeping the farthest first.
 
     Parameters
     ----------
     motion
         Each column divided by its tolerance.
     most
-        Samples to keep at most, and some dozens that are kept anyhow.
+        Largest number of samples to keep, plus some dozens that are always kept.
 
     Returns
     -------
@@ -99,10 +99,10 @@ def _farthest_sample(motion: Signal, a: int, b: int) -> tuple[float, int, int, i
 
 
 def rotvecs(quaternions: Array) -> Array:
-    """Return attitudes (N, 4) as rotation vectors (N, 3), continuous beyond half turns.
+    """Return attitudes (N, 4) as rotation vectors (N, 3), continuous beyond half revolutions.
 
-    The first has a length of at most pi; each other one is the vector of the same attitude that
-    is nearest to the one before.
+    The first has a length of at most pi; each later one is the equivalent vector nearest to the
+    previous one.
     """
     wrapped = rotvecs_from_quaternions(quaternions)
     jumps = np.linalg.norm(np.diff(wrapped, axis=0), axis=1) > np.pi
@@ -132,7 +132,7 @@ def nearest_rotvec(rotvec: Array, near: Array) -> Array:
 
 
 def continuous(poses: Array) -> Array:
-    """Return poses (N, 7) whose quaternions keep their sign from one to the next."""
+    """Return poses (N, 7) with quaternions of continuous sign."""
     flips = np.cumsum((poses[1:, 3:] * poses[:-1, 3:]).sum(axis=1) < 0) % 2
     signs = np.append(1, 1 - 2 * flips)[: len(poses), np.newaxis]
     return np.hstack([poses[:, :3], poses[:, 3:] * signs])
@@ -160,7 +160,7 @@ def link_poses(robot: RobotDescription, base: Array, q: Array) -> dict[str, Arra
 
 
 def find_cycles(rates: Signal) -> Cycles | None:
-    """Find out whether a gait ends with many equal cycles, from its joint velocities.
+    """Return the equal cycles at the end of a gait, from its joint velocities.
 
     None unless there are at least twelve cycles, equal within a tenth of the peak velocity.
     """

@@ -20,7 +20,7 @@ Floats = npt.NDArray[np.floating[Any]]
 
 EDGE_COLOUR = "#3d4450"
 MAX_MESH_FACES = 1500
-"""Largest number of faces of a mesh: each is filled by itself."""
+"""Largest number of faces of a mesh, which are filled one by one."""
 
 _OVERSAMPLING = 2
 _EDGE_WIDTH = 3
@@ -38,8 +38,8 @@ class PlacedSolid:
     corners, normals
         (F, 3, 3) corners of its triangles, and their outward normals (F, 3).
     edges, edge_normals
-        (E, 2, 3) ends of its sharp edges, and the normals (E, 2, 3) of the faces beside each; an
-        edge is visible if one of them is.
+        (E, 2, 3) ends of its sharp edges, and the normals (E, 2, 3) of the two adjacent faces; an
+        edge is visible if one of these faces is.
     fill
         (3,) color, shares of red, green and blue.
     """
@@ -52,7 +52,7 @@ class PlacedSolid:
 
 
 def placed_solids(bodies: Iterable[Body], instant: int) -> list[PlacedSolid]:
-    """Return the solids of bodies in the world at an instant, by its number."""
+    """Return the solids of bodies in the world at the instant with this number."""
     found = []
     for body in bodies:
         pose = body.poses[min(instant, len(body.poses) - 1)]
@@ -81,7 +81,7 @@ def corner_points(solids: Iterable[PlacedSolid]) -> Array:
 
 
 class View:
-    """A parallel projection from azimuth and elevation (deg): world points to the paper."""
+    """A parallel projection of world points to the paper, from azimuth and elevation (deg)."""
 
     def __init__(self, azimuth: float = -58.0, elevation: float = 24.0) -> None:
         a, e = math.radians(azimuth), math.radians(elevation)
@@ -125,7 +125,7 @@ class Canvas:
         self._pixels = np.zeros((*size, 4), np.float32)
 
     def draw(self, solids: Sequence[PlacedSolid]) -> None:
-        """Draw the faces of solids, and over them the edges that no face hides."""
+        """Draw the faces of solids, then the edges that no face hides."""
         for solid in solids:
             for corners, normal in zip(solid.corners, solid.normals, strict=True):
                 if normal @ self._view.viewing_direction > _MIN_FACING_COSINE:

@@ -24,7 +24,7 @@ from spacerobot_ros.scenario import Published
 _NO_VALUE = "–"
 _LEAST_ANGLE_IN_DEGREES = 1e-4  # rad
 _EQUAL_TIME_TICKS = 1.5
-"""Largest difference of times that count as equal, control periods."""
+"""Largest difference between times considered equal, control periods."""
 
 
 @dataclass(frozen=True)
@@ -170,7 +170,7 @@ def _link_goal_text(goal: EndEffectorGoal) -> str:
 
 
 def different_goals(flights: Sequence[FlightReport]) -> list[tuple[str, ...]]:
-    """Return a row for each part of the goals that differs between flights: name, and texts."""
+    """Return a row for each part of the goals that differs between flights: name and texts."""
     goals = [
         _base_goal_texts(flight)
         | {f"of {link}": _link_goal_text(goal) for link, goal in flight.link_goals.items()}
@@ -190,7 +190,7 @@ def _payload_rows(flight: FlightReport) -> list[tuple[str, ...]]:
 
 
 def payload_text(estimate: PayloadEstimate) -> str:
-    """Return the estimated parameters of a held body that its motion determines."""
+    """Return the parameters of a held body that its motion determines."""
     parts = []
     mass, spread = estimate.parameters[0], estimate.deviations[0]
     if not math.isnan(mass):
@@ -203,9 +203,9 @@ def payload_text(estimate: PayloadEstimate) -> str:
         moments = ", ".join(f"{inertia[i, j]:.4g}" for i, j in INERTIA_ENTRIES)
         parts.append(f"inertia about it ({moments}) kg m² (xx, yy, zz, xy, xz, yz)")
     if estimate.undetermined:
-        parts.append(f"not shown by its motion: {', '.join(estimate.undetermined)}")
+        parts.append(f"not determined by its motion: {', '.join(estimate.undetermined)}")
     if estimate.corrected:
-        parts.append("corrected to the nearest parameters of a body")
+        parts.append("corrected to the nearest physical parameters")
     return "; ".join(parts)
 
 
@@ -238,7 +238,7 @@ def joint_table(flight: FlightReport) -> Table | None:
 
 
 def published_table(flight: FlightReport) -> Table | None:
-    """Return published figures beside those of this flight; None if the scenario has none."""
+    """Return published figures next to those of this flight; None if the scenario has none."""
     if not flight.scenario.published:
         return None
     rows = []

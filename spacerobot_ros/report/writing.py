@@ -62,13 +62,13 @@ FIGURES: dict[str, Callable[[FlightReport], ReportFigure | str | None]] = {
 """The figures of :func:`write_figures`, by name."""
 
 _REPORT_FIGURES = tuple(draw for name, draw in FIGURES.items() if name not in ("pose", "path"))
-"""Figures of a report, which has position and attitude apart, and a figure of all paths."""
+"""Figures of a report, with separate position and attitude, and a figure of all paths."""
 
 
 def write_report(
     bag: Path, html: Path, beside: Sequence[Path] = (), *, namespace: str | None = None
 ) -> None:
-    """Write the report of a bag as one HTML file, which needs nothing besides itself.
+    """Write the report of a bag as one self-contained HTML file.
 
     Any bag makes a page: parts that it lacks are left out, and the page says so. Bags
     ``beside`` it, of other methods to the same goal for one, get a column in a table and their
@@ -100,33 +100,33 @@ def write_figures(
     degrees: bool = False,
     namespace: str | None = None,
 ) -> dict[str, Path | str]:
-    """Write figures of a flight for a paper, each a file of its own.
+    """Write figures of a flight for a paper, one file each.
 
     Parameters
     ----------
     bag
         The flight.
     folder
-        Where the files go, ``pose.pdf`` and so on; older ones of these names are replaced.
+        Folder of the files, ``pose.pdf`` and so on; existing files are replaced.
     only
-        Names of :data:`FIGURES`; none for all that the bag has something for, position and
-        attitude together.
+        Names of :data:`FIGURES`; empty for all that the bag has data for, with position and
+        attitude in one figure.
     beside
-        Other flights, whose traces are drawn into the same panels, and their paths into that of
-        paths; figures that are of one flight are left out.
+        Other flights, whose traces and paths are added to the same panels; figures of single
+        flights are omitted.
     format
-        Of the files. Text in PDF and SVG stays text.
+        Format of the files. Text in PDF and SVG remains text.
     width
-        Of a figure, mm.
+        Width of a figure, mm.
     style
-        A style file of matplotlib's, for fonts, sizes and colours of lines and axes, or the name
-        of one of its own styles, or ``serif``.
+        A matplotlib style file for fonts, sizes and colours of lines and axes, or the name of a
+        matplotlib style, or ``serif``.
     events
-        Whether what happened is shown below time axes.
+        Whether events are shown below time axes.
     degrees
-        Whether angles over time are in degrees, and not in rad.
+        Whether angles over time are in degrees instead of rad.
     namespace
-        Of the robot, where the bag has several.
+        Namespace of the robot, if the bag has several.
 
     Returns
     -------
@@ -140,13 +140,14 @@ def write_figures(
     unknown = [name for name in only if name not in FIGURES]
     if unknown:
         known, meant = ", ".join(FIGURES), suggestion(unknown[0], FIGURES)
-        raise SpaceRobotError(f"There is no figure '{unknown[0]}': there are {known}.{meant}")
+        raise SpaceRobotError(f"There is no figure '{unknown[0]}': the figures are {known}.{meant}")
     if not _PAPER_WIDTHS[0] <= width <= _PAPER_WIDTHS[1]:
         least, most = _PAPER_WIDTHS
-        raise SpaceRobotError(f"A figure is {least:g} to {most:g} mm wide, and not {width:g} mm.")
+        raise SpaceRobotError(f"A figure is {least:g} to {most:g} mm wide, not {width:g} mm.")
     if folder.suffix.lower() in {f".{each.value}" for each in PictureFormat}:
         raise SpaceRobotError(
-            f"Figures are a folder with a file for each, which is not called '{folder.name}'."
+            f"Figures are written to a folder with a file for each; '{folder.name}' is the name of "
+            "a file."
         )
     flight, *others = (read_report(each, namespace) for each in (bag, *beside))
     if not events:
@@ -171,7 +172,7 @@ def write_figures(
                     raise
                 # Of the settings in a style file matplotlib refuses some only when it draws.
                 raise SpaceRobotError(
-                    f"With the style file {style} nothing can be drawn: {error}."
+                    f"Nothing can be drawn with the style file {style}: {error}."
                 ) from error
             if isinstance(figure, ReportFigure):
                 made[name] = path = folder / f"{name}.{format.value}"
@@ -184,7 +185,7 @@ def write_figures(
 def write_picture(bag: Path, picture: Path, *, namespace: str | None = None) -> None:
     """Write one picture of a flight: pose and shape over time, and the robot.
 
-    It is a PNG 1000 pixels wide, or SVG or PDF, as the name of the file ends.
+    It is a PNG 1000 pixels wide, or an SVG or PDF, depending on the suffix of the file.
 
     Raises
     ------

@@ -252,7 +252,7 @@ def test_obstacles_stand_in_the_3d_view_where_the_world_has_them(strut: FlightRe
     corners = np.reshape(cylinder["data"]["attributes"]["position"]["array"], (-1, 3))
     np.testing.assert_allclose(np.ptp(corners, axis=0), [0.12, 0.12, 0.8], atol=1e-5)
     assert drawn["object"]["materials"][0]["color"] == 0x9999A6, "the color of its shape"
-    assert "obstacles have the shapes by which distances are measured" in scene.caption
+    assert "obstacles have the shapes used to measure distances" in scene.caption
 
 
 def test_a_flight_without_obstacles_says_nothing_of_them(hands: FlightReport) -> None:
@@ -282,7 +282,7 @@ def test_pictures_of_configurations_have_the_obstacles(strut: FlightReport) -> N
     np.testing.assert_allclose(fills - [0.6, 0.6, 0.65], 0.0, atol=0.003)
     figure = configurations_figure(strut)
     assert isinstance(figure, ReportFigure)
-    assert "Obstacles have the shapes by which distances are measured." in figure.caption
+    assert "Obstacles have the shapes used to measure distances." in figure.caption
 
 
 def test_meshes_of_obstacles_are_those_that_a_bag_carries(strut: FlightReport) -> None:
@@ -306,7 +306,7 @@ def test_meshes_of_obstacles_are_those_that_a_bag_carries(strut: FlightReport) -
     assert strut.robot is not None
     blind = replace(strut, robot=replace(strut.robot, world=world))
     assert blind.obstacles == ()
-    assert blind.missing_meshes == " Meshes are not drawn. The bag does not carry them."
+    assert blind.missing_meshes == " Meshes are not drawn. The bag does not contain them."
     (carried,) = replace(blind, meshes={world.links[1].collisions[0].resource: rock}).obstacles
     assert len(carried[0].mesh.faces) == 4
 

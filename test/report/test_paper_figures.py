@@ -120,7 +120,7 @@ def test_figures_of_several_bags_by_the_command(bag: Path, tmp_path: Path) -> No
     words = ["figures", str(bag), str(other), "--format", "svg", "--only", names]
     result = CliRunner().invoke(main, [*words, "--out", str(tmp_path / "out")])
     assert result.exit_code == 1
-    assert_one_sentence(result.stderr, "robot", "none: It is of one flight: name one bag")
+    assert_one_sentence(result.stderr, "robot", "none: It shows a single flight: name one bag")
     for name in ("pose", "path", "momentum"):
         text = (tmp_path / "out" / f"{name}.svg").read_text("utf-8")
         for label in ("flight.mcap", "other.mcap"):
@@ -130,7 +130,7 @@ def test_figures_of_several_bags_by_the_command(bag: Path, tmp_path: Path) -> No
 def test_the_help_names_every_figure() -> None:
     text = " ".join(CliRunner().invoke(main, ["figures", "--help"]).stdout.split())
     known = list(FIGURES)
-    assert f"There are {', '.join(known[:-1])} and {known[-1]}." in text
+    assert f"Available: {', '.join(known[:-1])} and {known[-1]}." in text
 
 
 @pytest.mark.parametrize(
@@ -164,8 +164,8 @@ def test_what_is_refused_is_named(
         ("font.size: 0\n", "font.size is 0"),
         ("font.size: nan\n", "font.size is nan"),
         ("text.usetex: True\n", "text.usetex"),
-        ("font.family: Nowhere Sans\n", "(Nowhere Sans) none is installed"),
-        ("figure.subplot.left: 2\nlines.dashed_pattern: 0, 0\n", "nothing can be drawn"),
+        ("font.family: Nowhere Sans\n", "none of its fonts (Nowhere Sans) is installed"),
+        ("figure.subplot.left: 2\nlines.dashed_pattern: 0, 0\n", "Nothing can be drawn"),
     ],
 )
 def test_a_style_file_with_a_mistake_is_one_sentence(

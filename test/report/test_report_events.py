@@ -199,7 +199,7 @@ def test_the_table_has_the_estimated_body(monkeypatch: pytest.MonkeyPatch) -> No
     (text,) = (value for name, value in result_table(report).rows if name == "Held body, estimated")
     assert re.fullmatch(
         r"mass (10|9\.9999\d*) ± \de-\d\d kg; centre of mass \(0\.27\d+, -0\.1\d+, -?0[.0]*\) m in "
-        "end_effector; not shown by its motion: Ixx, Iyy, Ixy",
+        "end_effector; not determined by its motion: Ixx, Iyy, Ixy",
         text,
     ), text
 
@@ -219,15 +219,15 @@ def test_the_text_of_an_estimate_leaves_out_unknown_parameters() -> None:
     assert payload_text(whole) == (
         "mass 2 ± 0.03 kg; centre of mass (0.10000, -0.20000, 0.30000) m in hand; inertia about it "
         "(0.94, 1.2, 1.2, 0.01, -0.04, 0.08) kg m² (xx, yy, zz, xy, xz, yz); corrected "
-        "to the nearest parameters of a body"
+        "to the nearest physical parameters"
     )
     some = np.where(np.arange(10) == 2, np.nan, numbers)
     assert payload_text(PayloadEstimate("hand", some, spread, np.zeros((0, 10)), False)) == (
-        "mass 2 ± 0.03 kg; not shown by its motion: m cy"
+        "mass 2 ± 0.03 kg; not determined by its motion: m cy"
     )
     none = np.full(10, np.nan)
     assert payload_text(PayloadEstimate("hand", none, none, np.eye(10), False)).startswith(
-        "not shown by its motion: m, m cx"
+        "not determined by its motion: m, m cx"
     )
 
 
@@ -286,7 +286,7 @@ def test_the_target_has_the_solids_of_its_urdf(scene: View3D) -> None:
         if command.get("path", "").startswith(TARGET) and command["path"].endswith("/solid")
     ]
     assert len(drawn) == len(visuals) > 0
-    assert "the target moves as target/odom says" in scene.caption
+    assert "the target moves according to target/odom" in scene.caption
 
 
 def test_the_target_moves_as_its_odometry_says(scene: View3D, odometry: Any) -> None:
