@@ -38,10 +38,10 @@ _NEAR_LIMIT_SHARE = 0.05
 """Distance from a limit below which a joint is marked, as a share of its range."""
 
 _WARNING_WHEEL_SHARE, _SATURATED_WHEEL_SHARE = 0.8, 0.98
-"""Shares of the largest rate of a wheel from which it is marked amber, and red."""
+"""Shares of a wheel's largest rate above which it is marked amber, and red."""
 
 _NEAR_CONTACT = 0.02
-"""Distance between links below which the head of the page shows it, m."""
+"""Distance between links below which it is shown at the top of the page, m."""
 
 COLORS: Mapping[Verdict, Color] = {
     Verdict.UNCHECKED: (150, 150, 160),
@@ -61,7 +61,7 @@ _LEVEL_COLORS = (
 
 _FAINT_COLOR, _BAR_COLOR = "var(--faint-color,#8a8f98)", "#8a8f9855"
 
-_ENDED = "The stack has ended: none of its nodes answers."
+_ENDED = "The stack has ended: none of its nodes responds."
 
 
 # -- the head of the page -----------------------------------------------------------------------
@@ -81,9 +81,9 @@ def silence_message(state: StackState) -> str:
 
 
 def time_to_go(state: StackState) -> float | None:
-    """Return the time until the goal is to be reached, s; None if none is flown to.
+    """Return the expected time until the goal is reached, s; None if there is no such goal.
 
-    A planner says it, or else a controller.
+    A planner reports it, or else a controller.
     """
     planner, controller, measured = state.planner, state.controller, state.measured
     if measured is None:
@@ -109,7 +109,7 @@ def _to_go_text(left: float | None) -> str:
 
 
 def progress(state: StackState) -> float | None:
-    """Return the flown share of the planned manoeuvre, 0 to 1; None if none is flown."""
+    """Return the completed share of the planned manoeuvre, 0 to 1; None if there is none."""
     left, planner = time_to_go(state), state.planner
     if left is None or planner is None or planner.manoeuvre_time_s <= 0.0:
         return None
@@ -125,8 +125,8 @@ def status_html(
 ) -> str:
     """Return the state of the stack; ``described``: whether a robot is known.
 
-    ``errors`` are those of :func:`goal_errors`, ``tolerance`` is that of the planner or else of the
-    controller, if known.
+    ``errors``: see :func:`goal_errors`. ``tolerance``: of the planner or else of the controller, if
+    known.
     """
     lines = []
     silence = silence_message(state)
@@ -176,7 +176,7 @@ def status_html(
         word, level = control.state.value, control.state.level
         lines.append(_node_html(state, "controller", word, control.message, level))
     if task := _task_before_goals(state):
-        lines.append(_line_html(f"The goal is pursued after the task '{task}'.", None))
+        lines.append(_line_html(f"The goal is pursued once the task '{task}' has ended.", None))
     lines.extend(_distance_lines(state, errors or {}, tolerance))
     return padded("".join(lines))
 
@@ -202,7 +202,7 @@ def _distance_lines(
 
 
 def not_controlled(state: StackState, part: Part) -> tuple[Controlled, ...]:
-    """Return the parts of a goal that planner or controller do not control, as far as known."""
+    """Return the known parts of a goal that planner or controller do not control."""
     goal = state.goals.get(part)
     if goal is None or goal.end_effectors:
         return ()
@@ -215,11 +215,11 @@ def not_controlled(state: StackState, part: Part) -> tuple[Controlled, ...]:
 
 
 def look_back_html(shown: StackState, live: StackState) -> str:
-    """Return the lines above an earlier state: how long ago it was, and whether the stack ended."""
+    """Return the lines above an earlier state: its age, and whether the stack has ended."""
     assert shown.measured is not None
     assert live.measured is not None
     ago = live.measured.time_s - shown.measured.time_s
-    text = f"Looking back {ago:.1f} s. The robot is at t = {live.measured.time_s:.2f} s now."
+    text = f"Looking back {ago:.1f} s. The robot is now at t = {live.measured.time_s:.2f} s."
     lines = [_line_html(text, 1)]
     if has_stack_ended(live):
         lines.append(_line_html(_ENDED, 2))
@@ -280,7 +280,7 @@ def check_html(check: GoalCheck) -> str:
 
 
 def joints_html(robot: RobotDescription, q: Array, qdot: Array, effort: Array) -> str:
-    """Return a table of the joints (n,) and their limits, with a bar of each one's range."""
+    """Return a table of the joints (n,) and their limits, with a bar for each range."""
     rows = []
     lower, upper = robot.limits("lower"), robot.limits("upper")
     fastest, strongest = robot.limits("velocity"), robot.limits("effort")
@@ -353,7 +353,8 @@ def log_html(notices: Iterable[Notice]) -> str:
 
 @dataclass(frozen=True)
 class GoalDistance:
-    """How far a part is from its goal: ``distance``, m, and ``angle``, rad; None: any attitude."""
+    """Error of a part relative to its goal: ``distance``, m, and ``angle``, rad; None: any
+    attitude."""
 
     distance: float
     angle: float | None
@@ -378,7 +379,7 @@ class GoalDistance:
 
     @property
     def numbers(self) -> tuple[float, ...]:
-        """The distance, and the angle where the attitude counts."""
+        """The distance, and the angle if the attitude is required."""
         return (self.distance,) if self.angle is None else (self.distance, self.angle)
 
 
@@ -389,9 +390,8 @@ def _task_before_goals(state: StackState) -> str:
 
 
 def goal_errors(state: StackState, kinematics: ForwardKinematics) -> dict[Part, GoalDistance]:
-    """Return how far each part with a goal is from it, as far as poses are known.
-
-    Goals that a controller pursues after a task, such as an approach, are left out.
+    """Return the error of each part with a goal and a known pose. Goals that a controller pursues
+    after a task, such as an approach, are omitted.
     """
     measured, errors = state.measured, {}
     if _task_before_goals(state):
@@ -425,7 +425,7 @@ def _measured_pose(
 def end_effector_positions(state: StackState, kinematics: ForwardKinematics) -> dict[Part, Array]:
     """Return the positions (3,) in the world of the end-effectors whose paths are drawn, m.
 
-    They are that of the plant, if it publishes one, and the links with goals.
+    They are the end-effector of the plant, if it publishes one, and the links with goals.
     """
     found = {} if state.tool is None else {DEFAULT_END_EFFECTOR: state.tool[:3]}
     for goal in state.goals.values():
@@ -441,7 +441,7 @@ def planned_positions(
 ) -> dict[Part, Array]:
     """Return the planned positions (k, 3) in the world of end-effectors, m.
 
-    They are those of :func:`end_effector_positions`, as far as they are links of the robot.
+    The end-effectors are as in :func:`end_effector_positions`, if they are links of the robot.
     """
     motion = state.planned_motion
     n = len(robot.joint_names)
@@ -456,10 +456,9 @@ def planned_positions(
 
 
 def flown_check(state: StackState) -> GoalCheck | None:
-    """Return where the plan ends that is flown, as the check of its goal; None: none is flown.
+    """Return the end of the plan being flown, as the check of its goal; None: there is none.
 
-    Parts of the goal that the method controls are taken as met: later plans go on with what one
-    leaves.
+    Controlled parts of the goal are assumed to be reached: later plans correct what one leaves.
     """
     planner, motion = state.planner, state.planned_motion
     if planner is None or motion is None or "planner" in state.absent:
@@ -473,7 +472,7 @@ def flown_check(state: StackState) -> GoalCheck | None:
     if goal is not None and "attitude" in goal.base - {*left_out}:
         base[3:] = goal.quaternion
     verdict = Verdict.PARTLY if left_out else Verdict.REACHABLE
-    message = "The robot flies to where the ghost is."
+    message = "The robot flies to the ghost."
     if left_out:
         message += f" Not controlled: {' and '.join(left_out)}."
     return GoalCheck(verdict, message, shape=motion[-1, 7:], base=base, source=motion)
@@ -494,8 +493,8 @@ MOMENTUM_PARTS = ("base", "arm", "wheels", "sum")
 
 
 def momentum_budget(state: StackState) -> dict[str, float]:
-    """Return the angular momentum of each part as controller/status has it, N m s; empty: it has
-    none, or its controller is offline.
+    """Return the angular momentum of each part from controller/status, N m s; empty: it has none,
+    or the controller is offline.
     """
     control = state.controller
     if control is None or control.command is None or "controller" in state.absent:
@@ -506,7 +505,7 @@ def momentum_budget(state: StackState) -> dict[str, float]:
 
 
 def momentum_html(state: StackState) -> str:
-    """Return the momentum budget, and the rate of each wheel as a share of its largest one."""
+    """Return the momentum budget, and the rate of each wheel as a share of its largest rate."""
     budget = momentum_budget(state)
     control = state.controller
     if not budget or control is None or control.command is None:
@@ -524,7 +523,7 @@ def momentum_html(state: StackState) -> str:
 
 
 def has_tool(state: StackState) -> bool:
-    """Whether the end-effector takes goals: a controller runs, and its pose is known."""
+    """Whether the end-effector accepts goals: a controller runs, and its pose is known."""
     return state.controller is not None and state.tool is not None
 
 
@@ -532,7 +531,7 @@ def has_tool(state: StackState) -> bool:
 
 
 def fault_kinds(targets: FaultTargets) -> dict[str, list[str]]:
-    """Return the possible targets of each kind of fault that has any."""
+    """Return the possible targets of each kind of fault, if it has any."""
     found = {name: targets.of(kind) for name, kind in FAULT_KINDS.items()}
     return {name: names for name, names in found.items() if names}
 
@@ -548,7 +547,9 @@ def fault_line(
         There is no such fault, or a number is not finite.
     """
     if not (math.isfinite(lasts_s) and lasts_s >= 0.0):
-        raise ParameterError(f"The duration of the fault is {lasts_s:g} s; it must be 0 or more.")
+        raise ParameterError(
+            f"The duration of the fault is {lasts_s:g} s; it must not be negative."
+        )
     words = [kind, target]
     if kind in FAULT_KINDS and FAULT_KINDS[kind].value:
         words.append(f"{value:.9g}")
@@ -578,14 +579,14 @@ T = TypeVar("T")
 
 
 class RecentItems(Generic[T]):
-    """Items of the last minutes of simulated time, the oldest first, at least a step apart.
+    """Items of the last minutes of simulated time, the oldest first, separated by at least a step.
 
     Parameters
     ----------
     span_s
         Time from the oldest item to the latest, s of simulated time.
     most
-        Largest number of items; beyond it every other one is dropped and the step doubled.
+        Largest number of items; beyond it, every second one is dropped and the step doubled.
     """
 
     def __init__(self, span_s: float = 300.0, most: int = 1500) -> None:
@@ -594,7 +595,7 @@ class RecentItems(Generic[T]):
         self._items: list[T] = []
 
     def add(self, time_s: float, item: T) -> None:
-        """Add an item; those of this time or later are dropped first (time may run back)."""
+        """Add an item; items of this time or later are dropped first (time may jump back)."""
         times = self._times
         begin, end = (bisect_left(times, each) for each in (time_s - self._span, time_s))
         if end - begin > 1 and times[end - 1] - times[end - 2] < self._step:
@@ -616,19 +617,19 @@ class RecentItems(Generic[T]):
         return (self._times[0], self._times[-1]) if self._times else None
 
     def at(self, time_s: float) -> T:
-        """Return the last item until a time, or the first one of all."""
+        """Return the last item until a time, or the first of all items."""
         return self._items[max(bisect_right(self._times, time_s) - 1, 0)]
 
 
 class Trail:
-    """The flown path of the base, as points at least a step apart.
+    """The flown path of the base, as points separated by at least a step.
 
     Parameters
     ----------
     step
-        Least distance of neighbours, m.
+        Least distance between neighbours, m.
     most
-        Largest number of points; beyond it every other one is dropped and the step doubled.
+        Largest number of points; beyond it, every second one is dropped and the step doubled.
     """
 
     def __init__(self, step: float, most: int = 1500) -> None:
@@ -637,7 +638,7 @@ class Trail:
         self._times: list[float] = []
 
     def add(self, time_s: float, point: Array) -> None:
-        """Add a point; points of this time or later are dropped first (time may run back)."""
+        """Add a point; points of this time or later are dropped first (time may jump back)."""
         while self._times and self._times[-1] >= time_s:
             self._times.pop()
             self._points.pop()

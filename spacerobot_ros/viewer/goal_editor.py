@@ -66,14 +66,14 @@ _HIDDEN_GHOST_DISTANCE = 0.01
 _BASE_GIZMO, _TOOL_GIZMO = "/goal", "/end_effector_goal"
 
 _DECIMALS = 4, 2
-"""Decimals of the position (m) and of the angles (deg) of a goal that a user moves, and sees."""
+"""Decimals of the position (m) and of the angles (deg) of a goal that a user edits."""
 
 _MARK_SIZE = 0.15
 """Radius of the mark at the goal of an end-effector, as a share of the size of its gizmo."""
 
 
 class RequestedPart(Enum):
-    """Parts of the pose of a link that a goal is for."""
+    """Parts of a link's pose that a goal may require."""
 
     NOTHING = "free"
     POSITION = "position"
@@ -89,11 +89,11 @@ class Origin(Enum):
 
 
 class GoalEditor:
-    """Lets users choose a goal; it sends nothing itself.
+    """Lets users choose a goal; it does not send the goal.
 
-    A goal for a planner is for the base or for end-effectors, or for both, as users choose. A goal
-    for a controller is for the base and for the controller's end-effector: the gizmo of that one
-    moves along with that of the base, and can be moved alone.
+    A goal for a planner is for the base, for end-effectors, or for both, as users choose. A goal
+    for a controller is for the base and for the controller's end-effector: the end-effector's gizmo
+    follows the base's gizmo, and can be moved separately.
 
     Parameters
     ----------
@@ -123,8 +123,10 @@ class GoalEditor:
         """The goals that were last followed."""
         self._check = GoalCheck(Verdict.UNCHECKED)
         gui = server.gui
-        self._none_taken = gui.add_html(hint_html("A recording takes no goals."), visible=False)
-        self._hint = gui.add_html(hint_html("Drag the arrows, or type numbers; then press Fly."))
+        self._none_taken = gui.add_html(
+            hint_html("A recording does not accept goals."), visible=False
+        )
+        self._hint = gui.add_html(hint_html("Drag the arrows or type numbers, then press Fly."))
         self._verdict = gui.add_html(check_html(self._check))
         edit = self._defer_edit
         self._parts = _PartMenu(gui, defer, edit, on_note, self._on_parts_chosen)
@@ -204,9 +206,7 @@ class GoalEditor:
         self._origin = Origin.ROBOT
 
     def follow(self, goals: Mapping[Part, Goal], now: float) -> None:
-        """Show the goals that were sent last, by whomever, once.
-
-        A goal that a user is changing stays.
+        """Show the goals that anyone has sent last, once. A goal that a user is changing is kept.
 
         Parameters
         ----------
@@ -268,8 +268,8 @@ class GoalEditor:
     def update_robot(self, pose: Array, q: Array) -> None:
         """Update the pose (7,) of the robot's base and the positions (n,) of its joints.
 
-        The ghost takes these joint positions unless a plan or a user sets others, and is hidden
-        where it would only colour the robot.
+        The ghost takes these joint positions unless a plan or a user sets others, and is hidden if
+        it would coincide with the robot.
         """
         self._present = pose, q
         self._final.update_robot(q)
@@ -287,7 +287,7 @@ class GoalEditor:
         self._ghost.base.visible = self._ghost_shown and not hidden
 
     def show_ghost(self, *, visible: bool) -> None:
-        """Show or hide the ghost, wherever it is not hidden anyway."""
+        """Show or hide the ghost, unless it is hidden for other reasons."""
         self._ghost_shown = visible
         if self._present is not None:
             self.update_robot(*self._present)
@@ -310,7 +310,7 @@ class GoalEditor:
         )
 
     def show_flight(self, *, flies: bool) -> None:
-        """Hide the gizmos while the robot flies to the goal that is shown."""
+        """Hide the gizmos while the robot flies to the shown goal."""
         in_flight = flies and self.shows_sent_goal
         if in_flight != self._in_flight:
             self._in_flight = in_flight
@@ -328,7 +328,7 @@ class GoalEditor:
         self._final.show(visible=planned)
 
     def offer_end_effectors(self, links: Iterable[str]) -> None:
-        """Offer goals of the links for which the planner takes some."""
+        """Offer goals for the links for which the planner accepts goals."""
         offered = tuple(links)
         if offered == self._parts.links:
             return  # The choice of users stays.
@@ -339,7 +339,7 @@ class GoalEditor:
         self._on_parts_chosen(BASE_GOAL_KEY)
 
     def show(self, *, visible: bool) -> None:
-        """Show or hide all controls: a replay takes no goals."""
+        """Show or hide all controls: a replay does not accept goals."""
         self._hint.visible = visible and self._origin is Origin.ROBOT
         fields = (self._verdict, self._position, self._angles, self._to_robot)
         for handle in (*fields, *self._gizmos.values()):
@@ -349,12 +349,13 @@ class GoalEditor:
             self._show_parts()
 
     def goals(self) -> dict[Part, Goal]:
-        """Return the goals to send, by part; one of a link has it among its end-effectors.
+        """Return the goals to send, by part; a goal of a link contains the link in its
+        end-effectors.
 
         Raises
         ------
         GoalError
-            A pose is not finite or its quaternion not of unit length.
+            A pose is not finite, or its quaternion does not have unit length.
         """
         if not self.placed:
             return {}
@@ -375,7 +376,8 @@ class GoalEditor:
         return Goal.checked(pose[:3].tolist(), pose[3:].tolist(), shape)
 
     def settled_goals(self, now: float) -> dict[Part, Goal] | None:
-        """Return the goals once after every change, when they have come to rest; else None."""
+        """Return the goals once after every change, as soon as they are unchanged for a while; else
+        None."""
         if (
             self._changed_at is None
             or now - self._changed_at < GOAL_SETTLING_TIME_S
@@ -537,7 +539,7 @@ class _PartMenu:
         self._folder = gui.add_folder("Goal for", visible=False)
         self._menus: dict[Part, Any] = {}
         self._numbers: Any = gui.add_dropdown(
-            "Numbers of", (BASE_GOAL_KEY,), hint="The part that the numbers below are for."
+            "Numbers of", (BASE_GOAL_KEY,), hint="The part to which the numbers below apply."
         )
         self._numbers.visible = False
         self._there = False
@@ -552,7 +554,7 @@ class _PartMenu:
         return str(self._numbers.value)
 
     def asked(self, part: Part) -> RequestedPart:
-        """Return whether the goal is for the position or the pose of a part, or leaves it free."""
+        """Return whether the goal is for position or pose of a part, or leaves the part free."""
         if self._there and part in self._menus:
             return RequestedPart(self._menus[part].value)
         return RequestedPart.POSE if part == BASE_GOAL_KEY else RequestedPart.NOTHING
@@ -562,7 +564,7 @@ class _PartMenu:
         return {link: each for link, each in asked.items() if each is not RequestedPart.NOTHING}
 
     def offer(self, links: Iterable[str]) -> None:
-        """Offer goals of other links; the goal is for the base again."""
+        """Offer goals of other links; reset the goal to the base."""
         for menu in self._menus.values():
             menu.remove()
         self._menus = {}
@@ -573,7 +575,7 @@ class _PartMenu:
         self._update()
 
     def choose(self, asked: Mapping[Part, RequestedPart]) -> None:
-        """Choose the parts of a goal that somebody else has sent."""
+        """Choose the parts of a goal that someone else has sent."""
         for part, menu in self._menus.items():
             menu.value = asked.get(part, RequestedPart.NOTHING).value
         self._update()
@@ -631,7 +633,7 @@ class _FinalShape:
         self._enabled: Any = gui.add_checkbox(
             "Final joint positions",
             initial_value=False,
-            hint="The planner ends in these joint positions, not in any.",
+            hint="The planned motion ends in these joint positions, not in arbitrary ones.",
         )
         self._enabled.visible = False
         self._folder = gui.add_folder("At the end", visible=False)
@@ -719,5 +721,5 @@ def _gizmo_of(part: Part) -> str:
 
 
 def move_along(pose: Array, before: Array, after: Array) -> Array:
-    """Return a pose (7,) rigidly moved along with another one, from ``before`` to ``after``."""
+    """Return a pose (7,) moved rigidly with another pose, from ``before`` to ``after``."""
     return compose_poses(after, relative_pose(before, pose))

@@ -164,7 +164,7 @@
       notice = document.createElement("div");
       notice.setAttribute("role", "alert");
       notice.textContent =
-        "The viewer does not answer. This page shows its last state, and steers nothing.";
+        "The viewer does not respond. This page shows its last state and can no longer steer the robot.";
       notice.style.cssText =
         "position:fixed;top:0;left:0;right:0;z-index:10000;padding:.6em 1em;text-align:center;" +
         "background:#222;color:#fff;font:600 15px sans-serif;border-bottom:2px solid #fff";

@@ -1,7 +1,7 @@
 """The page: the scene and its panels, redrawn from the state of the stack.
 
-Everything is drawn in one thread, that of :meth:`Page.update`. Input of browsers arrives in threads
-of the server and waits in a queue for the next update.
+One thread, which calls :meth:`Page.update`, draws everything. Input from browsers arrives in
+threads of the server and is queued for the next update.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ if TYPE_CHECKING:
 
 
 RequestAction = Callable[[Action], None]
-"""Function that takes an action of a user of the page."""
+"""Function that receives an action of a user of the page."""
 
 _MAX_NOTICES = 200
 _MAX_SHOWN_NOTICES = 60
@@ -67,11 +67,11 @@ _LOOK_BACK_STEP_S = 0.1  # simulated s
 _MIN_LOOK_BACK_S = 1.0  # simulated s
 
 _SLIDER_HOLD_S = 1.5
-"""Wall time for which the page does not move the time slider after a user has, s."""
+"""Wall time for which the page does not move the time slider after a user moved it, s."""
 
 
 class ButtonPanel:
-    """Buttons whose requests the stack carries out at once."""
+    """Buttons for requests that the stack performs immediately."""
 
     def __init__(
         self,
@@ -81,18 +81,19 @@ class ButtonPanel:
         fly: Callable[[], None],
         scenario_goals: Mapping[Part, Goal],
     ) -> None:
-        self._fly = gui.add_button("Fly", color="green", hint="Send the goal that is shown.")
+        self._fly = gui.add_button("Fly", color="green", hint="Send the shown goal.")
         self._has_scenario_goals = bool(scenario_goals)
         self._fly_scenario = gui.add_button(
             "Fly the scenario's goal", color="teal", visible=self._has_scenario_goals
         )
         self._goal = gui.add_button_group(
-            "Goal", ("Abort goal",), hint="Give the goal up; the joints brake, the stack goes on."
+            "Goal", ("Abort goal",), hint="Abandon the goal; the joints brake, the stack continues."
         )
         self._plant = gui.add_button_group(
             "Plant",
             ("Stop all", "Rearm", "Reset"),
-            hint="Stop all: joints brake, thrusters are off until Rearm. Reset: back to the start.",
+            hint="Stop all: joints brake, thrusters are off until Rearm. "
+            "Reset: return to the initial state.",
         )
         self._time = gui.add_button_group("Time", ("Pause", "Resume"))
         react(self._fly.on_click, defer, lambda _: fly())
@@ -148,12 +149,12 @@ class TimeLine:
 
 
 class LookBack:
-    """Slider over the past of a flight, and the way back to the present.
+    """Slider over the past of a flight, and a button to return to the present.
 
     Attributes
     ----------
     time_s
-        Simulated time that a user looks at, s; None: the present.
+        Simulated time shown to the user, s; None: the present.
     """
 
     def __init__(self, gui: viser.GuiApi, defer: Defer) -> None:
@@ -166,7 +167,7 @@ class LookBack:
             _LOOK_BACK_STEP_S,
             0.0,
             visible=False,
-            hint="Show the state at an earlier time, of the last five minutes; the robot goes on.",
+            hint="Show an earlier state, from the last five minutes; the robot continues.",
         )
         self._live = gui.add_button("Back to the present", color="orange", visible=False)
         react(self._live.on_click, defer, lambda _: self._look(None, 0.0))
@@ -183,7 +184,7 @@ class LookBack:
         self.time_s, self._left_alone_until = time_s, left_alone_until
 
     def show(self, span: tuple[float, float] | None) -> None:
-        """Show the slider over a span of simulated time, s; None: there is no past."""
+        """Show the slider for a span of simulated time, s; None: there is no past."""
         if span is None or span[1] - span[0] < _MIN_LOOK_BACK_S:
             self.time_s = None
             self._slider.visible = self._live.visible = False
@@ -224,7 +225,7 @@ class FaultPanel:
         self._value = gui.add_number("Value", 0.0, step=0.01)
         self._value.visible = False
         self._meaning = gui.add_html("")
-        self._lasts = gui.add_number("For (s), 0: for good", 0.0, min=0.0, step=1.0)
+        self._lasts = gui.add_number("For (s), 0: permanently", 0.0, min=0.0, step=1.0)
         self._inject = gui.add_button("Inject", color="orange")
         self._clear = gui.add_button("Clear faults", color="gray")
         self._active = gui.add_html("")
@@ -233,7 +234,7 @@ class FaultPanel:
         react(self._clear.on_click, defer, lambda _: act(InjectAction("clear")))
 
     def offer(self, targets: FaultTargets) -> None:
-        """Offer the faults that the targets of a plant can have."""
+        """Offer the faults that are possible with a plant's targets."""
         if targets == self._targets:
             return
         self._targets, self._names = targets, content.fault_kinds(targets)
@@ -350,7 +351,7 @@ class Plots:
             self._shape.add(time_s, measured.q)
 
     def show_budget(self, state: StackState) -> None:
-        """Show the present momentum budget of a robot with wheels."""
+        """Show the current momentum budget of a robot with wheels."""
         text = content.momentum_html(state)
         if text != self._budget_text.content:
             self._budget_text.content = text
@@ -374,7 +375,7 @@ class Plots:
         self._no_errors.visible = not errors
 
     def draw(self, tolerance: Tolerance | None = None, time_s: float | None = None) -> None:
-        """Redraw the curves, with tolerances of errors, and a line at a time that is shown, s."""
+        """Redraw the curves, with tolerances of errors, and a line at the shown time, s."""
         limits = () if tolerance is None else (tolerance.position, tolerance.attitude)
         for plot in [each for each in self._errors.values() if each.handle.visible]:
             plot.set_logarithmic(enabled=bool(self._logarithmic.value))
@@ -445,7 +446,7 @@ class _Plot:
         )
 
     def set_logarithmic(self, *, enabled: bool) -> None:
-        """Have logarithmic axes, or linear ones."""
+        """Use logarithmic or linear axes."""
         self._least = _LEAST_ON_LOGARITHMIC_AXIS if enabled else -np.inf
         if (scales := self._logarithmic if enabled else self._linear) != self.handle.scales:
             self.handle.scales = scales
@@ -503,15 +504,15 @@ _ROBOT_PATH = "/robot"
 _OBSTACLES_PATH, _TARGET_PATH = "/obstacles", "/target"
 
 _TEXTS_S, _TABLES_S, _PLOTS_S, _PATHS_S = 0.2, 0.25, 0.5, 0.5
-"""Period of drawing of the slower parts, wall s."""
+"""Drawing periods of the slower parts, wall s."""
 
 _ANSWER_TIME_S = 10.0
-"""Wall time for which the head shows the answer to what a user has done, s."""
+"""Wall time for which the response to a user's action is shown at the top, s."""
 
 CAMERA = np.array([1.1, 1.4, 0.8])
 """Initial position of the camera relative to the robot, in robot lengths.
 
-An arm ahead of the base is then on the left: the panel is on the right.
+An arm in front of the base is then on the left, because the panel is on the right.
 """
 
 
@@ -520,7 +521,7 @@ _PRESETS = {
     "Side": np.array([0.0, 1.9, 0.3]),
     "Top": np.array([0.0, 0.01, 1.9]),
 }
-"""Positions of the camera relative to the robot by the names of buttons, in robot lengths."""
+"""Positions of the camera relative to the robot by button name, in robot lengths."""
 
 _THEME: Any = {"control_width": "large", "show_logo": False, "show_share_button": False}
 
@@ -529,27 +530,29 @@ _LAYERS = (
     ("Frames", False, "Axes of the world and of all links."),
     ("Ghost", True, "The robot at the goal."),
     ("Plumes", True, "Thrusters that are on."),
-    ("Collision shapes", False, "The shapes by which distances between links are measured."),
+    ("Collision shapes", False, "The shapes used to measure distances between links."),
     ("Names", False, "Names of the links."),
 )
-"""Layers of the scene: name, whether it is shown at first, and its explanation."""
+"""Layers of the scene: name, whether initially shown, and explanation."""
 
 
 _PORTRAIT, _PORTRAIT_DISTANCE, _PORTRAIT_SHIFT, _PANEL_SHIFT = 0.8, 1.75, 0.36, 0.32
-"""Width to height below which a window is a phone's; how much farther its camera is from the robot,
-and how far below it looks, else to its right, as shares of the distance.
+"""Aspect ratio (width to height) below which a window is a phone's; ratio of its camera distance to
+the desktop's; and offset of the view below the robot, or else to its right, as shares of the
+distance.
 """
 
 
 def view_beside_panel(at: Array, away: Array, aspect: float) -> tuple[Array, Array]:
-    """Return where a camera is and looks (3,), m, so that the panel does not cover the robot.
+    """Return position and target (3,) of a camera, m, such that the panel does not cover the robot.
 
     Parameters
     ----------
     at, away
-        Position (3,) of the robot, and that of the camera relative to it on a desktop, m.
+        Position (3,) of the robot, and desktop position of the camera relative to it, m.
     aspect
-        Width to height of the window. On a phone the panel is below, on a desktop on the right.
+        Aspect ratio (width to height) of the window. The panel is below on a phone, on the right on
+        a desktop.
     """
     right = np.cross([0.0, 0.0, 1.0], away)
     right /= np.linalg.norm(right)
@@ -588,7 +591,7 @@ class Page:
         self._target: RobotDescription | None = None
         self._target_drawing: scene.RobotDrawing | None = None
         self._obstacles: tuple[RobotDescription | None] | None = None
-        """The obstacles that were shown last; None: the robot carries its own."""
+        """The obstacles shown last; None: the robot's own obstacles are shown."""
         self._drawn_obstacles: list[viser.MeshHandle] = []
         self._table: ThrusterTable | None = None
         self._tolerance: Tolerance | None = None
@@ -596,7 +599,7 @@ class Page:
         self._due: dict[str, float] = {}
         self._now = 0.0
         self._last: Measured | None = None
-        """The last state that was received, in the past of which users look back."""
+        """The last received state, from which users look back."""
         self._drawn: Measured | None = None
         self._looked_back = False
         self._announced: tuple[Notice, float] | None = None
@@ -626,7 +629,7 @@ class Page:
             self._log = LogPanel(gui)
         self.editor.on_reset_goal(self._goal_to_robot)
         look = gui.add_button(
-            "Look at the robot", color="gray", hint="Turn the camera of this browser to the robot."
+            "Look at the robot", color="gray", hint="Point the camera of this browser at the robot."
         )
 
         @look.on_click
@@ -635,7 +638,7 @@ class Page:
                 defer(lambda: self._aim_camera(event.client.camera))
 
         presets = gui.add_button_group(
-            "View from", tuple(_PRESETS), hint="Turn the camera of this browser."
+            "View from", tuple(_PRESETS), hint="Rotate the camera of this browser."
         )
 
         @presets.on_click
@@ -699,7 +702,7 @@ class Page:
             self.show_target(self._target)
 
     def show_obstacles(self, world: RobotDescription | None) -> None:
-        """Draw other obstacles than those that the robot carries; None: there are none."""
+        """Draw other obstacles instead of the robot's own; None: there are none."""
         self._obstacles = (world,)
         for each in self._drawn_obstacles:
             each.remove()
@@ -719,7 +722,7 @@ class Page:
         return drawn
 
     def show_target(self, target: RobotDescription) -> None:
-        """Draw the body that floats beside the robot, from its first state on."""
+        """Draw the second floating body from its first state on."""
         if self._target_drawing is not None:
             self._target_drawing.base.remove()
         self._target = target
@@ -746,11 +749,11 @@ class Page:
         self._server.flush()
 
     def show_thrusters(self, table: ThrusterTable | None) -> None:
-        """Set the thrusters, which are known later than the robot."""
+        """Set the thrusters, which become known later than the robot."""
         self._table = table
 
     def show_tolerance(self, tolerance: Tolerance | None) -> None:
-        """Set the tolerance of goals, of the planner or controller; None: it is not known."""
+        """Set the goal tolerance of the planner or controller; None: unknown."""
         self._tolerance = tolerance
 
     def note(self, notice: Notice) -> None:
@@ -758,7 +761,7 @@ class Page:
         self._log.add(notice)
 
     def announce(self, notice: Notice, seconds: float = _ANSWER_TIME_S) -> None:
-        """Add a line to the log, and show it in the head for a wall time, s."""
+        """Add a line to the log, and show it at the top for a wall time, s."""
         self.note(notice)
         self._announced = (notice, self._now + seconds)
 

@@ -2,10 +2,10 @@
 
 The process has a lower priority, so that neither the page nor the plant waits for it. It works on
 one goal at a time: a newer one cancels the plan in progress. Numbered questions and answers are
-pickled on its standard input and output, which no other program can write to.
+pickled on its standard input and output, to which no other program can write.
 
-A controller flies to any pose and reports only in flight that the arm is too short: for it, joint
-positions are searched that bring the end-effector to its goal while the base is at its own.
+A controller flies to any pose and reports only in flight that the arm is too short. Its goals are
+checked by searching joint positions with both base and end-effector at their goals.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ _NICENESS = 10
 """Added to the niceness of the process, so that everything else runs first."""
 
 _MAX_CANCELLATION_S = 2.0
-"""Wall time after the cancellation of a plan at which the process is killed, s."""
+"""Wall time from the cancellation of a plan until the process is killed, s."""
 
 
 class Verdict(Enum):
@@ -68,7 +68,7 @@ class Verdict(Enum):
     PLANNING = "planning"
     REACHABLE = "reachable"
     PARTLY = "partly reachable"
-    """The goal asks for parts that the method does not control, and ends off in them."""
+    """The goal has parts that the method does not control, and that end outside the tolerance."""
     REFUSED = "refused"
 
 
@@ -86,7 +86,7 @@ class GoalCheck:
         (n,) joint positions at its end, m or rad, and (7,) pose of the base, as predicted; None if
         there is none.
     source
-        The planned motion that it was read from, if that is flown already.
+        The planned motion it comes from, if the motion is already being flown.
     """
 
     verdict: Verdict
@@ -98,7 +98,7 @@ class GoalCheck:
 
 @dataclass(frozen=True)
 class GoalQuestion:
-    """A goal to check, and the situation to check it in.
+    """A goal to check, and the situation for the check.
 
     Attributes
     ----------
@@ -109,10 +109,10 @@ class GoalQuestion:
     state, goal
         Start of the robot, and the goal of its base, of links, or of both.
     tool, link
-        Goal of a link, for a controller, which plans nothing: the check is then whether the arm can
-        reach it. None: a planner flies.
+        Goal of a link for a controller, which does not plan: the check is whether the arm can reach
+        it. None: a planner flies.
     axes
-        Axes of the link that the controller controls; other errors do not count.
+        Axes of the link that the controller controls; other errors are ignored.
     """
 
     urdf: str
@@ -130,7 +130,7 @@ def make_question(
     robot: RobotDescription | None,
     parameters: Mapping[str, Mapping[str, str]],
 ) -> GoalQuestion | str:
-    """Return the question whether goals are reachable, or the reason why none is asked.
+    """Return the question whether goals are reachable, or the reason why there is none.
 
     Parameters
     ----------
@@ -148,7 +148,7 @@ def make_question(
     if state.planner is None:
         goal, tool = goals.get(BASE_GOAL_KEY), goals.get(DEFAULT_END_EFFECTOR)
         if goal is None:
-            return "The goal is for a planner, and none is running."
+            return "The goal is for a planner, but none is running."
         if tool is None or tool.end_effectors:
             return "No planner is running: a controller flies the base to any pose."
         known = parameters.get("controller", {})
@@ -170,7 +170,7 @@ def make_question(
 
 
 def planned_goal(goals: Mapping[Part, Goal]) -> Goal:
-    """Return goals by part as the one goal of a planner, which that of a controller is not.
+    """Return goals by part as one goal for a planner, without goals of a controller.
 
     Raises
     ------
@@ -179,12 +179,12 @@ def planned_goal(goals: Mapping[Part, Goal]) -> Goal:
     """
     planned = [g for part, g in goals.items() if part == BASE_GOAL_KEY or g.end_effectors]
     if not planned:
-        raise GoalError("The goal is for the end-effector of a controller alone.")
+        raise GoalError("The goal is only for the end-effector of a controller.")
     return reduce(Goal.joined_with, planned)
 
 
 def planner_config(parameters: Mapping[str, str]) -> PlannerConfig:
-    """Return the parameters of a planner, given as JSON texts by name; others are left out.
+    """Return the parameters of a planner, given as JSON texts by name; others are omitted.
 
     Raises
     ------
@@ -215,7 +215,7 @@ def goal_tolerance(
 def planned_links(
     parameters: Mapping[str, str] | None, robot: RobotDescription | None
 ) -> tuple[str, ...]:
-    """Return the links of a robot for which a planner with such parameters takes goals."""
+    """Return the links of a robot for which a planner with these parameters accepts goals."""
     if parameters is None or robot is None:
         return ()
     try:
@@ -226,7 +226,7 @@ def planned_links(
 
 
 class GoalChecker:
-    """Checks goals in the background; a new question replaces the one before."""
+    """Checks goals in the background; a new question replaces the previous one."""
 
     def __init__(self) -> None:
         self._process: subprocess.Popen[bytes] | None = None
@@ -335,7 +335,7 @@ class GoalChecker:
 
 
 class Planner:
-    """Plans from rest as the planner of the stack would; keeps the model of the last robot."""
+    """Plans from rest like the planner of the stack; keeps the model of the last robot."""
 
     def __init__(self) -> None:
         self._built: tuple[str, Mapping[str, str]] | None = None

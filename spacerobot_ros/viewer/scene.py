@@ -1,8 +1,8 @@
 """The robot and its surroundings, as nodes of a viser scene.
 
-A tree of frames like that of the URDF hangs on the pose of the base: only transforms that a joint
-changes are sent again. Node paths are separated by slashes, so names of links, which may contain
-some, stay out of them.
+A tree of frames as in the URDF is attached to the pose of the base: only transforms that a joint
+changes are sent again. Node paths are separated by slashes, so they do not contain link names,
+which may have slashes.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ _STARS, _SKY = 1800, 40.0
 """Number of stars, and their distance in robot lengths."""
 
 _SPACE = np.full((1, 1, 3), 14, np.uint8)
-"""Picture of the space behind the stars: one pixel, red, green and blue."""
+"""Image of the space behind the stars: one pixel, red, green and blue."""
 
 _SUN = np.array([0.55, 0.65, 0.52]) / np.linalg.norm([0.55, 0.65, 0.52])
 _SUN_COLOR: Color = (255, 244, 214)
@@ -63,7 +63,7 @@ def wxyz(quaternion: Array) -> Array:
 
 
 def xyzw(quaternion: Array) -> Array:
-    """Return a quaternion of viser's order as (x, y, z, w)."""
+    """Return a quaternion in viser's order as (x, y, z, w)."""
     return np.asarray(quaternion, dtype=float)[[1, 2, 3, 0]]
 
 
@@ -218,8 +218,8 @@ def reach_of(robot: RobotDescription) -> float:
 class Lines:
     """Connected points in the scene, such as a path.
 
-    A node has a fixed capacity of segments and is replaced by a larger one: browsers do not redraw
-    a node whose number of segments changes.
+    A node has a fixed capacity of segments and is replaced by a larger one if necessary: browsers
+    do not redraw a node whose number of segments changes.
 
     Parameters
     ----------
@@ -242,11 +242,11 @@ class Lines:
             self._handle.visible = visible and not self._empty
 
     def draw(self, points: Array) -> None:
-        """Connect points (k, 3), m; fewer than two clear the line."""
+        """Connect points (k, 3), m; fewer than two points clear the line."""
         self.draw_segments(np.stack([points[:-1], points[1:]], axis=1))
 
     def draw_segments(self, segments: Array) -> None:
-        """Draw segments (k, 2, 3), m; none clear the line."""
+        """Draw segments (k, 2, 3), m; an empty array clears the line."""
         self._empty = not len(segments)
         if self._empty:
             if self._handle is not None:
@@ -275,7 +275,7 @@ def plume_lines(table: ThrusterTable, names: tuple[str, ...], duty: Array, lengt
     table
         The thrusters of the robot.
     names, duty
-        Names of thrusters, and the share of the time that each is on, 0 to 1.
+        Names of thrusters, and the share of the time for which each is on, 0 to 1.
     length
         Length of a plume at a duty of 1, m.
     """
@@ -300,11 +300,11 @@ class Surroundings:
     scene
         Scene to draw in.
     reach
-        Size of the robot, as of :func:`reach_of`, m.
+        Size of the robot, see :func:`reach_of`, m.
     robot_path
         Path of the node of the robot's base, which carries the plumes.
     center
-        (3,) point below which the grid lies, m.
+        (3,) point above the grid, m.
     """
 
     def __init__(self, scene: viser.SceneApi, reach: float, robot_path: str, center: Array) -> None:

@@ -1,8 +1,8 @@
 """The web server of the page, and the parameters of the viewer.
 
-viser accepts websockets from any page that a browser has open, and connects to a server of its
-makers when a client asks it to share the page. Both are prevented here, against pages of strangers
-in a user's browser: this page steers a robot. For the same reason no other page may frame it.
+viser accepts websockets from any page that is open in a browser, and connects to a server of its
+makers if a client requests to share the page. Both are prevented here, to keep foreign pages in a
+user's browser from steering the robot. For the same reason no other page may frame this page.
 """
 
 from __future__ import annotations
@@ -72,12 +72,12 @@ _NO_FRAMING_HEADERS = {
 }
 
 _ALIVE_PATH, _SERVER_ID = "/alive", secrets.token_hex(8)
-"""Path that open pages ask for, to learn whether the viewer still runs, and the answer: another one
-after each start.
+"""Path that open pages request to detect whether the viewer still runs, and the response, which
+changes with each start.
 """
 
 _server_start_lock = threading.Lock()
-"""Held while a server starts, when a function of websockets is replaced."""
+"""Held while a server starts, which replaces a function of websockets."""
 
 
 def require_viser() -> None:
@@ -135,14 +135,14 @@ def free_port(host: str, port: int) -> int:
 
 
 def is_own_page(origin: str | None, host: str | None, served: str) -> bool:
-    """Whether a websocket is opened by a page of this server, or by a program that is no browser.
+    """Whether a websocket is opened by a page of this server, or by a program other than a browser.
 
     Parameters
     ----------
     origin, host
         Headers of the request: the page that opens the websocket, and the server it addresses.
     served
-        The address that the page is served at.
+        The address of the page.
     """
     if origin is None:
         return True  # Browsers always send an origin: this is a program.
@@ -209,7 +209,7 @@ def start_server(host: str, port: int, title: str = "") -> viser.ViserServer:
     Raises
     ------
     SpaceRobotError
-        viser is not installed, or there is no such address or no free port.
+        viser is not installed, the address does not exist, or no port is free.
     """
     require_viser()
     import viser

@@ -35,9 +35,9 @@ class Measured:
     pose
         (7,) of the base link in the world: m, quaternion (x, y, z, w).
     q, qdot, effort
-        (n,) of the joints in the order of the description, m or rad, /s, N or N m.
+        (n,) of the joints in the order of the description: m or rad, m/s or rad/s, N or N m.
     twist
-        (6,) velocity of the base link and its rate, in its own axes, m/s and rad/s.
+        (6,) velocity and angular velocity of the base link, in its own axes, m/s and rad/s.
     """
 
     time_s: float
@@ -50,7 +50,7 @@ class Measured:
 
 @dataclass(frozen=True)
 class Momenta:
-    """Total momenta in the world: linear (kg m/s) over angular (kg m^2/s).
+    """Total momenta in the world: linear (kg m/s), then angular (kg m^2/s).
 
     Attributes
     ----------
@@ -67,7 +67,7 @@ class Momenta:
 
 @dataclass(frozen=True)
 class Firing:
-    """Thruster activity: ``names``, and the share of the last tick that each was on, 0 to 1."""
+    """Thruster activity: ``names``, and the on-time of each as a share of the last tick, 0 to 1."""
 
     names: tuple[str, ...]
     duty: Array
@@ -104,23 +104,23 @@ class StackState:
     Attributes
     ----------
     measured, age_s
-        The last state, and the wall time since it came, s; infinite before the first.
+        The last state, and the wall time since its arrival, s; infinite before the first.
     tool
         (7,) pose of the end-effector in the world.
     target
         (7,) pose of the target's root link in the world.
     momenta, firing, clearance
-        As the plant reports them.
+        As reported by the plant.
     plant, planner, controller, replay
         The last status of each node; None if there is no such node.
     planned_path
         (k, 3) positions of the base predicted by the planner, m.
     planned_motion
         (k, 7 + n) poses of the base along the planned path, and positions of the joints there;
-        None also if the planner has published no schedule that begins with the path.
+        None also if the planner has published no schedule that starts with the path.
     goals
-        The last goal sent by anyone, by part. A goal for a planner that is for a link has it among
-        its ``end_effectors``; one for the end-effector of a controller is a pose alone.
+        The last goal sent by anyone, by part. A planner's goal for a link has the link in its
+        ``end_effectors``; a goal for the end-effector of a controller is only a pose.
     silent
         Wall time since the last heartbeat of each node that has fallen silent, s, by name.
     inactive
@@ -129,7 +129,7 @@ class StackState:
         The statuses among ``plant``, ``planner``, ``controller``, ``replay`` whose nodes are silent
         or inactive: they may no longer be true.
     busy
-        Whether a planner or controller is planning or compiling, and answers only after that.
+        Whether a planner or controller is planning or compiling, which delays its response.
     """
 
     measured: Measured | None = None
@@ -163,7 +163,7 @@ class Notice:
 
 
 class Request(Enum):
-    """A request that a service of the stack carries out."""
+    """A request that a service of the stack performs."""
 
     ABORT = "abort"
     """Planner and controller drop their goals; the joints brake."""
@@ -188,14 +188,14 @@ class FlyAction:
 
 @dataclass(frozen=True)
 class InjectAction:
-    """Send fault descriptions to the plant, one a line, or ``clear``."""
+    """Send fault descriptions to the plant, one per line, or ``clear``."""
 
     text: str
 
 
 @dataclass(frozen=True)
 class SeekAction:
-    """Continue the replay at a time, s from its start."""
+    """Continue the replay from a time, s after its start."""
 
     seconds: float
 

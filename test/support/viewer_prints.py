@@ -92,7 +92,7 @@ def _planned() -> dict[str, Any]:
     gui.named("Fault").use(seen.server, "actuator_bias")
     seen.show(replace(flying, measured=seen.measured(4.25, 0.0625)), 0.0625)
     gui.named("Value").value = 0.75
-    gui.named("For (s), 0: for good").value = 2.5
+    gui.named("For (s), 0: permanently").value = 2.5
     gui.named("Inject").use(seen.server)
     gui.named("Clear faults").use(seen.server)
     gui.named("Look at the robot").use(seen.server)

@@ -176,7 +176,7 @@ def test_a_user_looks_back_at_the_last_five_minutes(server: Server, page: Page) 
     robot, status = server.scene.named("/robot"), page._status.content
     np.testing.assert_allclose(robot.position, [250.0, 0.0, 0.0])
     assert back.visible
-    assert "Looking back 149.5 s. The robot is at t = 399.50 s now." in status
+    assert "Looking back 149.5 s. The robot is now at t = 399.50 s." in status
     assert "t = 250.00 s" in status
     assert 245.0 < farthest_flown(server) <= 250.0
     # New states change nothing of it; the earliest ones go in time.
@@ -373,7 +373,7 @@ def test_nothing_has_ended_where_nothing_has_begun() -> None:
 def test_a_viewer_that_ends_says_so_on_its_page(server: Server, page: Page) -> None:
     page.update(FLYING, 1.0)
     page.end()
-    status = next(each for each in server.gui.elements if "steers nothing" in str(each.shown))
+    status = next(each for each in server.gui.elements if "can no longer steer" in str(each.shown))
     assert "The viewer has ended." in status.content
     assert "It flies." not in status.content
     assert server.flushed
@@ -398,7 +398,7 @@ def test_a_controller_has_the_distances_of_base_and_end_effector() -> None:
     kinematics = ForwardKinematics(ROBOT)
     assert set(content.goal_errors(due, kinematics)) == {"base"}
     assert content.goal_errors(approach, kinematics) == {}
-    assert "pursued after the task &#x27;approach&#x27;." in content.status_html(approach)
+    assert "pursued once the task &#x27;approach&#x27; has ended." in content.status_html(approach)
     gone = replace(due, absent=frozenset({"controller"}))
     assert "to go" not in content.status_html(gone, errors)
     assert content.progress(due) is None

@@ -136,7 +136,7 @@ def test_nodes_that_die_are_started_again_and_the_page_says_so(up: Up, tmp_path:
         up.kill_until("planner", "3 times within a minute, which is the limit (--restarts).")
         assert up.process.wait(PATIENCE) == 2
         # By the last words of the viewer, or because nobody answers.
-        page.wait_for_text("This page shows its last state, and steers nothing")
+        page.wait_for_text("This page shows its last state and can no longer steer the robot.")
         assert "Planner executing" not in page.text()
 
 
@@ -148,7 +148,8 @@ def test_the_page_of_a_viewer_that_is_killed_is_grey(ros_domain: int, tmp_path: 
             page.wait_for_text("Waiting for a goal pose.")
             up.kill("viewer")
             page.wait_for_text(
-                "The viewer does not answer. This page shows its last state, and steers nothing."
+                "The viewer does not respond. This page shows its last state and can no longer "
+                "steer the robot."
             )
             style = "getComputedStyle(document.documentElement).filter"
             assert window.evaluate(style) == "grayscale(1)"

@@ -165,7 +165,7 @@ def test_layers_settings_and_views_of_a_flight_of_an_end_effector(
         page.wait_for_text("Waiting for a goal pose.")
         up.goal("--end-effector-position", "1.0", "0.6", "0.7", "--end-effector", "link_7")
         # The page shows the goal of others, and where the plan ends.
-        page.wait_for_text("The robot flies to where the ghost is.", "link_7 is")
+        page.wait_for_text("The robot flies to the ghost.", "link_7 is")
         assert page.numbers("Goal (m)") == [1.0, 0.6, 0.7]
         page.wait_for_text("reached")
         looked.keep("end-effector")
@@ -306,7 +306,7 @@ def test_nodes_that_die_and_the_end_of_the_stack(tmp_path: Path, ros_domain: int
         looked.keep("restarted")
         up.kill_until("planner", "3 times within a minute, which is the limit (--restarts).")
         assert up.process.wait(PATIENCE) == 2
-        page.wait_for_text("This page shows its last state, and steers nothing")
+        page.wait_for_text("This page shows its last state and can no longer steer the robot.")
         # Buttons do nothing any more: one picture.
         keep_picture(looked.window, "ended-light-desktop")
         ended: Any = looked.window.evaluate("document.body.innerText")

@@ -177,7 +177,7 @@ def test_goals_by_part_are_one_goal_of_a_planner() -> None:
     both = planned_goal({"base": base, "end_effector": tool, **hands})
     assert both.equals(replace(base, end_effectors=(place, pose)))
     assert planned_goal({"base": base, "end_effector": tool}).equals(base)
-    with pytest.raises(GoalError, match="of a controller alone"):
+    with pytest.raises(GoalError, match="only for the end-effector of a controller"):
         planned_goal({"end_effector": tool})
 
 
@@ -200,7 +200,7 @@ def test_a_goal_of_a_link_is_not_for_a_controller() -> None:
     hand = Goal.of_end_effectors([EndEffectorGoal("end_effector", np.ones(3))])
     base = Goal.checked(np.ones(3), [0, 0, 0, 1])
     answer = make_question(state, {"end_effector": hand}, servicer, {})
-    assert answer == "The goal is for a planner, and none is running."
+    assert answer == "The goal is for a planner, but none is running."
     answer = make_question(state, {"base": base, "end_effector": hand}, servicer, {})
     assert answer == "No planner is running: a controller flies the base to any pose."
     planning = replace(state, planner=PlannerStatus(PlannerState.IDLE))
