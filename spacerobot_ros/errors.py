@@ -11,8 +11,8 @@ _MAX_MESSAGE_LENGTH = 2000
 def printable(text: str) -> str:
     """Return a text as one line without control characters.
 
-    Terminals act on control characters: texts from topics and bags pass through here before they
-    are shown or logged.
+    Terminals interpret control characters, so texts from topics and bags are passed through this
+    function before they are shown or logged.
     """
     line = " ".join(text.splitlines())
     if line.isprintable():
@@ -21,7 +21,7 @@ def printable(text: str) -> str:
 
 
 def reason(error: Exception) -> str:
-    """Return why a file cannot be used, without the number of the error and without the path."""
+    """Return why a file cannot be used, without the error number and the path."""
     return getattr(error, "strerror", None) or str(error)
 
 
@@ -31,9 +31,9 @@ def sentence_case(text: str) -> str:
 
 
 def quantity(value: float, unit: str) -> str:
-    """Return a number for people: three digits; a rounding error is shown as a bound.
+    """Return a number as text for people: three digits; a rounding error is shown as a bound.
 
-    m and rad, also in m/s and rad/s, have prefixes: ``1.38 mm``, ``< 1 µrad``.
+    m, rad, m/s and rad/s get SI prefixes: ``1.38 mm``, ``< 1 µrad``.
     """
     size = abs(value)
     if not unit.startswith(("m", "rad")):
@@ -87,26 +87,26 @@ class PlanningError(SpaceRobotError):
 
 
 class Proof(Enum):
-    """Kinds of proofs that a goal cannot be reached."""
+    """Kinds of proof that a goal cannot be reached."""
 
     LIMITS = "joint limits"
-    """No joint positions within the joint limits put the robot at the goal."""
+    """No joint positions within the limits reach the goal."""
 
     MOMENTUM = "momentum"
-    """The goal needs the centre of mass to move, which it cannot do at zero momentum, or reaction
-    wheels to hold more angular momentum than they can."""
+    """The goal requires a motion of the centre of mass, which is impossible at zero momentum, or
+    more angular momentum than reaction wheels can store."""
 
     COLLISION = "collision"
-    """Links are in contact, or nearer than the clearance, in the shape of the goal."""
+    """In the configuration of the goal, links are in contact or closer than the clearance."""
 
     RANK = "rank"
     """No motion of the joints rotates the base as the goal requires."""
 
 
 class UnreachableError(PlanningError):
-    """A goal that the robot cannot reach; ``proof`` is the kind of the proof.
+    """A goal that the robot cannot reach; ``proof`` is the kind of proof.
 
-    A goal to which the search found no manoeuvre is a :class:`NotFoundError`.
+    If the search merely found no manoeuvre, the error is a :class:`NotFoundError`.
     """
 
     def __init__(self, message: str, proof: Proof) -> None:
@@ -126,9 +126,9 @@ class UnreadMeshError(PlanningError):
 
 
 def refusal_of_all(message: str, refusals: Iterable[Exception]) -> PlanningError:
-    """Return one refusal of a goal that several methods have refused.
+    """Return a single refusal for a goal that several methods have refused.
 
-    A proof by one method holds for all. Without a proof the result is a NotFoundError if one is
+    A proof by one method applies to all. Without a proof, the result is a NotFoundError if one is
     given.
     """
     refusals = list(refusals)
@@ -141,7 +141,7 @@ def refusal_of_all(message: str, refusals: Iterable[Exception]) -> PlanningError
 
 
 class GoalError(PlanningError):
-    """An invalid goal: not finite, no rotation, the wrong number of entries."""
+    """An invalid goal: not finite, not a rotation, or a wrong number of entries."""
 
 
 class RecordingError(SpaceRobotError):

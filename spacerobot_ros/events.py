@@ -1,7 +1,7 @@
-"""Events of a flight, and how events and statuses are written as key-value pairs.
+"""Events of a flight, and the conversion of events and statuses to key-value pairs.
 
 Every status and event is a diagnostic_msgs/DiagnosticStatus, whose content is pairs of texts. A
-:class:`KeyValueFormat` is the one description of the pairs of a class, for writing and for reading.
+:class:`KeyValueFormat` describes the pairs of a class for both writing and reading.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from spacerobot_ros.errors import SpaceRobotError
 
 @dataclass(frozen=True)
 class TextFormat:
-    """How a value is written as a text, and read from it."""
+    """Conversion of a value to text and back."""
 
     write: Callable[[Any], str]
     read: Callable[[str], Any]
@@ -56,16 +56,16 @@ class KeyValueField:
     attribute
         Name of the attribute.
     format
-        How its value is written.
+        Format of its value.
     key
         Key of the pair; empty: the name of the attribute.
     prefix
-        For a mapping, with a pair for each item: the beginning of their keys. Empty: all pairs that
-        no earlier field takes.
+        For a mapping, with a pair for each item: the prefix of their keys. Empty: all pairs that no
+        earlier field uses.
     always
-        Whether the attribute is written with its default, too.
+        Whether to write the attribute even if it has its default.
     present_with
-        The attribute without which this one is omitted; empty: none.
+        The attribute that must be written for this one to be written; empty: none.
     """
 
     attribute: str
@@ -111,14 +111,14 @@ class KeyValueFormat:
         return values
 
     def from_values(self, kind: type[_Record], values: Mapping[str, str], **given: Any) -> _Record:
-        """Return the status or event of a class that :meth:`to_values` has turned into pairs.
+        """Return the status or event of a class from the pairs of :meth:`to_values`.
 
-        Attributes that are not among the pairs are taken from ``given``, or have their defaults.
+        Attributes missing in the pairs are taken from ``given``, or have their defaults.
 
         Raises
         ------
         SpaceRobotError
-            The pairs are not those of the class: the message says which is missing or unreadable.
+            A pair is missing or unreadable; the message names it.
         """
         left, arguments = dict(values), dict(given)
         defaults = self._defaults(kind)
@@ -148,7 +148,7 @@ class KeyValueFormat:
 
     @contextmanager
     def reading(self) -> Iterator[None]:
-        """Turn errors of a missing key or an unreadable value into a message for the user."""
+        """Convert errors of a missing key or an unreadable value to a message for the user."""
         try:
             yield
         except (KeyError, ValueError) as error:
@@ -158,7 +158,7 @@ class KeyValueFormat:
 
 
 class EventKind(str, Enum):
-    """Kinds of events; the value is the word ``event`` of the message."""
+    """Kinds of events; the value is the ``event`` entry of the message."""
 
     CONFIGURED = "configured"
     ACTIVATED = "activated"
@@ -180,29 +180,29 @@ class EventKind(str, Enum):
     FAULT_ENDED = "fault_ended"
     FAULTS_CLEARED = "faults_cleared"
     DISTURBANCE = "disturbance"
-    """A wrench from outside begins to act."""
+    """An external wrench begins to act."""
     DISTURBANCE_ENDED = "disturbance_ended"
     CONTACT = "contact"
     """Two links of the robot touch; the exact plant continues through the contact."""
     CONTACT_ENDED = "contact_ended"
     CAPTURED = "captured"
-    """The robot has captured the target: from now on it is another robot."""
+    """The robot has captured the target; its model changes from now on."""
     RELEASED = "released"
     """The robot has released the target."""
 
     APPROACH_STARTED = "approach_started"
-    """The end-effector has a way to the target."""
+    """The end-effector has a trajectory to the target."""
     DETUMBLE_STARTED = "detumble_started"
-    """The robot is brought to rest with the target that it holds."""
+    """The robot is brought to rest together with the held target."""
     DETUMBLED = "detumbled"
 
     WHEEL_NEAR_LIMIT = "wheel_near_limit"
-    """A reaction wheel comes near its largest rate."""
+    """A reaction wheel approaches its largest rate."""
     WHEEL_SATURATED = "wheel_saturated"
     WHEEL_FAILED = "wheel_failed"
-    """A reaction wheel does not answer its torque; control continues without it."""
+    """A reaction wheel does not respond to its torque; control continues without it."""
     DUMP_STARTED = "dump_started"
-    """The momentum of reaction wheels is dumped to the thrusters."""
+    """The momentum of reaction wheels is dumped by thrusters."""
     DUMP_ENDED = "dump_ended"
 
     GOAL_ACCEPTED = "goal_accepted"
@@ -214,11 +214,11 @@ class EventKind(str, Enum):
     PLAN_STARTED = "plan_started"
     PLAN_READY = "plan_ready"
     PLAN_TAKEN_OVER = "plan_taken_over"
-    """A plan takes over from another one while the joints move."""
+    """A plan replaces another plan while the joints move."""
     PLAN_LATE = "plan_late"
     """A plan was not ready at the start time of its schedule."""
     PLAN_DISTURBED = "plan_disturbed"
-    """A wrench from outside changes the momenta that a plan takes as constant."""
+    """An external wrench changes the momenta, which a plan assumes to be constant."""
     CORRECTION = "correction"
     STUCK_JOINT = "stuck_joint"
 
@@ -230,11 +230,11 @@ class EventKind(str, Enum):
     NODE_SILENT = "node_silent"
     NODE_BACK = "node_back"
     NODE_RESTARTED = "node_restarted"
-    """A node has died, and the command that started it starts it again."""
+    """A node has died, and the command that started it restarts it."""
 
 
 CONTACTS = frozenset({EventKind.CONTACT, EventKind.CONTACT_ENDED})
-"""Kinds of events of contacts between links."""
+"""Kinds of events about contacts between links."""
 
 
 @dataclass(frozen=True)
@@ -248,15 +248,15 @@ class Event:
     message
         One sentence for people.
     level
-        Of diagnostic_msgs/DiagnosticStatus: 0 OK, 1 WARN, 2 ERROR.
+        Level of diagnostic_msgs/DiagnosticStatus: 0 OK, 1 WARN, 2 ERROR.
     time_s
-        Simulated time, s; None where the node does not know it.
+        Simulated time, s; None if the node does not know it.
     goal_id
         The goal that the event is about; empty: none.
     about
         Further facts by name.
     node
-        Name of the node that reports it; empty: it is not known.
+        Name of the node that reports it; empty: unknown.
     """
 
     kind: EventKind
@@ -273,7 +273,7 @@ class Event:
         Parameters
         ----------
         wall_time_s
-            Wall time of the publication, s since the epoch; None leaves the entry out.
+            Wall time of the publication, s since the epoch; None omits the entry.
         """
         values = _EVENT_FORMAT.to_values(self)
         times = {key: values.pop(key) for key in list(values) if key in ("event", "time")}
@@ -283,7 +283,7 @@ class Event:
 
     @classmethod
     def from_values(cls, values: Mapping[str, str], message: str = "", level: int = 0) -> Event:
-        """Return the event that :meth:`to_values` has turned into these pairs.
+        """Return the event from the pairs of :meth:`to_values`.
 
         Raises
         ------

@@ -1,9 +1,8 @@
-"""Whole files, files that only this user can have written, and the cache.
+"""Complete files, files that only this user can have written, and the cache.
 
-A file is replaced as a whole or not at all, because disks get full and processes are killed.
-
-Files that are executed, flown or resumed are read only if no other user of the machine can have
-written them. A :class:`Cache` keeps files that can be made again in a folder of this user alone; it
+A file is replaced completely or not at all, because disks get full and processes are killed. Files
+that are executed, flown or resumed are read only if no other user of the machine can have written
+them. A :class:`Cache` stores files that can be recreated in a private folder of this user; it
 treats a damaged file as missing, and warns once.
 """
 
@@ -26,13 +25,13 @@ _LOG = logging.getLogger(__name__)
 _OTHERS_MAY_WRITE = stat.S_IWGRP | stat.S_IWOTH
 
 _CACHE_MAGIC = b"spacerobot_ros cache 2"
-"""Beginning of the last line of a cache file, with the number of the file format."""
+"""Prefix of the last line of a cache file, with the number of the file format."""
 
 _MCAP_MAGIC = b"\x89MCAP"
 _MAX_YAML_CHARACTERS = 1_000_000
 
 _MAX_YAML_VALUES = 100_000
-"""Largest number of values of a YAML text, with those that aliases repeat."""
+"""Largest number of values of a YAML text, including values repeated by aliases."""
 
 _logged_warnings: set[str] = set()
 
@@ -42,7 +41,7 @@ class UntrustedFileError(SpaceRobotError):
 
 
 def warn_once(message: str) -> None:
-    """Log a warning, once in a process."""
+    """Log a warning, once per process."""
     if message not in _logged_warnings:
         _logged_warnings.add(message)
         _LOG.warning("%s", message)
@@ -52,7 +51,7 @@ def warn_once(message: str) -> None:
 
 
 def write_whole(path: Path, content: bytes, *, mode: int = 0o600) -> None:
-    """Replace a file as a whole or not at all.
+    """Replace a file completely or not at all.
 
     Parameters
     ----------
@@ -65,7 +64,7 @@ def write_whole(path: Path, content: bytes, *, mode: int = 0o600) -> None:
     Raises
     ------
     OSError
-        The file cannot be written; an older file stays.
+        The file cannot be written; an existing file is kept.
     """
     new_file = path.with_name(f".{path.name[:100]}.{secrets.token_hex(8)}.new")
     try:
@@ -79,16 +78,16 @@ def write_whole(path: Path, content: bytes, *, mode: int = 0o600) -> None:
 
 
 def write_output(path: Path, content: bytes | str, mode: int = 0o666) -> None:
-    """Write a report, picture or result, and the folders above it, as a whole or not at all.
+    """Write a report, picture or result and create its folders, completely or not at all.
 
-    ``mode`` are the permissions of a new file; an older file keeps its own. A bag is not replaced,
-    because it may be the only record of a flight. Devices and pipes are written to. A text is
-    written as UTF-8.
+    ``mode`` are the permissions of a new file; an existing file keeps its permissions. A bag is not
+    replaced, because it may be the only record of a flight. Devices and pipes are supported. Text
+    is written as UTF-8.
 
     Raises
     ------
     SpaceRobotError
-        The file cannot be written, or is a bag; an older file stays.
+        The file cannot be written, or is a bag; an existing file is kept.
     """
     data = content.encode() if isinstance(content, str) else content
     try:
@@ -122,7 +121,7 @@ def _write_output(path: Path, data: bytes, mode: int) -> None:
 
 
 def load_yaml(text: str, loader: Any = None) -> Any:
-    """Return the content of a YAML text of unknown origin, whose size is limited.
+    """Return the content of an untrusted YAML text, with limits on its size.
 
     Parameters
     ----------
@@ -134,8 +133,8 @@ def load_yaml(text: str, loader: Any = None) -> Any:
     Raises
     ------
     ValueError
-        The text is no YAML, or is too long or too deeply nested, or its aliases stand for too much:
-        a file of 1 kB may hold a thousand million values.
+        The text is not YAML, is too long or too deeply nested, or its aliases expand to too many
+        values: a file of 1 kB may expand to a thousand million values.
     """
     import yaml
 
@@ -164,7 +163,8 @@ def _limit_values(root: Any) -> None:
         count += 1
         if count > _MAX_YAML_VALUES:
             raise ValueError(
-                f"it has more than {_MAX_YAML_VALUES} values, with those that its aliases repeat"
+                f"it has more than {_MAX_YAML_VALUES} values, including those that its aliases "
+                "repeat"
             )
         value = nodes.pop().value
         for child in () if isinstance(value, str) else value:
@@ -184,7 +184,8 @@ _FILE_KINDS = (
 
 
 def irregular_kind(mode: int) -> str:
-    """Return the words for a file that is not regular, by its mode; empty: it is regular."""
+    """Return a phrase for the kind of a file that is not regular, by its mode; empty: it is
+    regular."""
     if stat.S_ISREG(mode):
         return ""
     return next((words for test, words in _FILE_KINDS if test(mode)), "no file")
@@ -196,7 +197,7 @@ def read_regular(path: str | os.PathLike[str]) -> bytes:
     Raises
     ------
     OSError
-        It cannot be read, or is no regular file.
+        It cannot be read, or is not a regular file.
     """
     if kind := irregular_kind(os.stat(path).st_mode):
         raise OSError(f"it is {kind}")
@@ -221,7 +222,7 @@ def _require_own(path: Path) -> None:
     """Refuse a file or folder that another user owns or may write."""
     facts = path.stat()
     if facts.st_uid not in (0, os.geteuid()):
-        raise UntrustedFileError(f"'{path}' belongs to user {facts.st_uid}; use one of your own.")
+        raise UntrustedFileError(f"'{path}' belongs to user {facts.st_uid}; use your own.")
     if facts.st_mode & _OTHERS_MAY_WRITE:
         raise UntrustedFileError(
             f"others may write '{path}' (mode {stat.S_IMODE(facts.st_mode):o}); make it yours "
@@ -232,14 +233,14 @@ def _require_own(path: Path) -> None:
 class Cache:
     """A folder of files that can be computed again. Its methods log warnings instead of raising.
 
-    The last line of a file holds its key, length and SHA-256, against disks that get full.
+    The last line of a file has its key, length and SHA-256, to detect truncated files.
     The folder must belong to this user, and no other user may write into it, because its files are
     executed and flown.
 
     Parameters
     ----------
     folder
-        Made with mode 0700 if it is missing.
+        Created with mode 0700 if missing.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -272,7 +273,7 @@ class Cache:
             self._warn_of_untrusted_cache(error)
         except OSError as error:
             reason = error.strerror or str(error)
-            warn_once(f"Nothing can be kept in the cache '{self.folder}': {reason}.")
+            warn_once(f"Nothing can be stored in the cache '{self.folder}': {reason}.")
         else:
             return path
         return None
@@ -286,13 +287,13 @@ class Cache:
 
     def _warn_of_untrusted_cache(self, error: UntrustedFileError) -> None:
         warn_once(
-            f"The cache '{self.folder}' is not used, for its files are executed and flown: {error} "
-            "(SPACEROBOT_CACHE_DIR chooses another folder.)"
+            f"The cache '{self.folder}' is not used, because its files are executed and flown: "
+            f"{error} (Set SPACEROBOT_CACHE_DIR to another folder.)"
         )
 
 
 def warn_first_time(logger: logging.Logger, folder: Path, name: str, message: str) -> None:
-    """Log a warning that is given once per installation; afterwards it is logged for debugging.
+    """Log a warning once per installation; afterwards it is logged as a debug message.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Names and packages that are imported when they are used first: importing this one is fast."""
+"""Names and packages that are imported on first use, so that importing this package is fast."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ def lazy_names(package: str, modules: Mapping[str, str]) -> Callable[[str], Any]
     Parameters
     ----------
     package
-        Its name, for the message about a name that it lacks.
+        Its name, for messages about missing names.
     modules
         Module of each name.
     """
@@ -31,7 +31,7 @@ def lazy_names(package: str, modules: Mapping[str, str]) -> Callable[[str], Any]
 def optional_module(
     name: str, extra: str, needed_by: str, error: type[SpaceRobotError] = SpaceRobotError
 ) -> Any:
-    """Return a module of a package that an extra of this one installs.
+    """Return a module of a package that is installed by an extra of this package.
 
     Parameters
     ----------

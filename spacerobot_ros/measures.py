@@ -1,8 +1,8 @@
-"""The measures of a flight: numbers of the flight as a whole, each defined once.
+"""The measures of a flight: numbers for the whole flight, each defined once.
 
-Campaigns, the summary of ``spacerobot run``, reports and the live page show them. A
+Campaigns, the summary of ``spacerobot run``, reports and the live page use them. A
 :class:`~spacerobot_ros.flight.flight.Flight` computes them from its arrays over time; SIMD lanes,
-which keep extremes and the last state alone, return them directly.
+which store only extremes and the last state, return them directly.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from spacerobot_ros.planning.execution.status import PlannerStatus, manoeuvre_ti
 
 
 class Outcome(str, Enum):
-    """Outcome of a goal; all values but the last also occur as ``state`` in a status message."""
+    """Outcome of a goal; all values except the last are also a ``state`` of status messages."""
 
     REACHED = "reached"
     REACHED_PARTLY = "reached_partly"
-    """But for a part of the base that was asked for, and is not controlled."""
+    """Reached except for a required part of the base pose that is not controlled."""
     FAILED = "failed"
     REFUSED = "refused"
     ABORTED = "aborted"
@@ -37,14 +37,14 @@ class Outcome(str, Enum):
 
 @dataclass(frozen=True)
 class CaptureMeasures:
-    """The measures of a flight to a target; NaN if there is none, or for events that did not occur.
+    """The measures of a capture; NaN without a target, or for events that did not occur.
 
     Attributes
     ----------
     captured
         Whether the target was captured.
     placed
-        Whether it was held when the goal was reached.
+        Whether the target was held when the goal was reached.
     time
         Time of the first capture, s.
     distance
@@ -53,9 +53,9 @@ class CaptureMeasures:
     impulse, angular_impulse
         Norms of the impulse, N s, and of its moment at the end-effector, N m s.
     joint_impulse
-        Largest impulse of the grasp along the coordinate of a joint, N m s or N s.
+        Largest impulse of the grasp along a joint coordinate, N m s or N s.
     detumbling_time, detumbling_bound
-        Time in which the robot with the target came to rest, and the shortest possible, s.
+        Time until the robot with the target came to rest, and the shortest possible time, s.
     """
 
     captured: float = math.nan
@@ -71,7 +71,7 @@ class CaptureMeasures:
 
 @dataclass(frozen=True, eq=False)
 class Measures:
-    """The measures of one flight; poses, joints and momenta are the true ones.
+    """The measures of one flight; poses, joints and momenta are true values.
 
     Attributes
     ----------
@@ -83,10 +83,11 @@ class Measures:
         Duration of the schedules that were flown for the goal, or of the tracking by a controller,
         s; see :func:`flown_time`.
     error
-        Error of the last pose of the base to its goal; None without a goal or a pose.
+        Error of the last pose of the base relative to its goal; None without a goal or a pose.
     end_effector_distance, end_effector_angle
-        Last distance (m) and angle (rad) of the end-effector from its goal, of several the largest;
-        NaN without a goal or a pose, the angle also where the attitude is free or not controlled.
+        Last distance (m) and angle (rad) of the end-effector from its goal, the largest if there
+        are several; NaN without a goal or a pose. The angle is also NaN if the attitude is free or
+        not controlled.
     peak_rate, peak_effort
         (n,) largest absolute rates (m/s or rad/s) and actuator efforts (N or N m) of the joints.
     peak_wrench
@@ -96,16 +97,16 @@ class Measures:
     momentum_drift
         (2,) see :func:`momentum_drift`, kg m/s and kg m^2/s.
     corrections
-        Plans after the first that count as corrections.
+        Number of plans after the first that are corrections.
     propellant
         Propellant used by the thrusters, kg; NaN without thrusters.
     plan_time, wall_time
-        Wall time of planning and of the whole flight, s; NaN if it is not known.
+        Wall time of planning and of the whole flight, s; NaN if unknown.
     clearance
-        Smallest distance between two links, m, negative where they touch: the depth. Infinite of a
-        robot without pairs that could touch, NaN where it was not measured.
+        Smallest distance between two links, m; a negative value is the penetration depth. Infinite
+        for a robot without pairs that could touch, NaN if not measured.
     capture
-        Measures of the flight to a target.
+        Measures of the capture.
     """
 
     outcome: Outcome
@@ -135,7 +136,7 @@ def momentum_change(momenta: Array, reference: Array) -> Array:
     Parameters
     ----------
     momenta, reference
-        (..., 6) linear (kg m/s) over angular momentum (kg m^2/s).
+        (..., 6) linear (kg m/s), then angular momentum (kg m^2/s).
     """
     difference = momenta - reference
     return np.asarray(np.linalg.norm(difference.reshape(*difference.shape[:-1], 2, 3), axis=-1))
@@ -145,17 +146,17 @@ def momentum_drift(momenta: Array, expected: Array | None = None) -> Array:
     """Return the largest change (..., 2) of linear and angular momentum that thrust does not
     explain.
 
-    That is ``max |m(t) - m(0)|`` over each flight, with the momenta ``m`` less those that the
-    thrusters have put in.
+    It is ``max |m(t) - m(0)|`` over each flight, with the momenta ``m`` minus those produced by
+    thrusters.
 
     Parameters
     ----------
     momenta
         (..., N, 6) or more columns, the momenta first: kg m/s and kg m^2/s. Rows that are not
-        finite do not count.
+        finite are ignored.
     expected
-        (N, 6) momenta at the start and those that the thrusters have put in since; None, or of
-        another number of rows: no thrust.
+        (N, 6) initial momenta plus those produced by thrusters; None, or another number of rows: no
+        thrust.
     """
     m = momenta[..., :6]
     if expected is not None and len(expected) == len(m):
@@ -184,9 +185,9 @@ def flown_time(
 ) -> float | None:
     """Return the time, s, that was flown for the last goal.
 
-    With a planner it is the duration of the schedules that were flown
+    With a planner it is the duration of the flown schedules
     (:func:`~spacerobot_ros.planning.execution.status.manoeuvre_time`); otherwise the time from the
-    first state that a controller tracked for the last goal it decided to that decision.
+    first state that a controller tracked for its last decided goal until that decision.
 
     Parameters
     ----------
@@ -198,7 +199,7 @@ def flown_time(
     Returns
     -------
     float | None
-        None where neither is reported.
+        None if neither is reported.
     """
     all_statuses = list(statuses)
     planner = [(time, each) for time, each in all_statuses if isinstance(each, PlannerStatus)]
@@ -226,10 +227,10 @@ class Metric:
     unit, description
         SI unit (empty: none) and a short description, as texts for the user.
     evaluate
-        Function of the measures and the robot: a number, NaN where a flight has none; or a number
-        for each joint, (..., n) for measures of joints (..., n) of several flights.
+        Function of the measures and the robot. It returns a number, NaN if a flight has none; or a
+        number for each joint, (..., n) for joint measures (..., n) of several flights.
     by_joint
-        Whether ``<name>.<joint>`` is the number of a joint, and the name itself the worst of all.
+        Whether ``<name>.<joint>`` is the number of a joint, and ``<name>`` the worst of them.
     smallest_is_worst
         Whether the smallest number is the worst.
     yes_or_no
@@ -273,7 +274,7 @@ _OF_JOINTS = ("peak_rate", "peak_effort", "lowest", "highest")
 """Fields of :class:`Measures` that have a number for each joint."""
 
 CLEARANCE = "clearance_m"
-"""Name of the metric that campaigns measure only if they name it."""
+"""Name of the metric that campaigns measure only on request."""
 
 METRICS: dict[str, Metric] = {
     "position_error_m": _error_metric(
@@ -284,12 +285,13 @@ METRICS: dict[str, Metric] = {
     ),
     "end_effector_position_error_m": Metric(
         "m",
-        "last distance of the end-effector from its goal, of several the largest",
+        "last distance of the end-effector from its goal, the largest if there are several",
         lambda m, _: m.end_effector_distance,
     ),
     "end_effector_attitude_error_rad": Metric(
         "rad",
-        "last angle of the end-effector from its goal likewise, where its attitude is controlled",
+        "last angle of the end-effector from its goal, the largest if there are several, if its "
+        "attitude is controlled",
         lambda m, _: m.end_effector_angle,
     ),
     "duration_s": Metric("s", "simulated time of the flight", lambda m, _: m.duration),
@@ -303,10 +305,10 @@ METRICS: dict[str, Metric] = {
         "N or N m", "largest effort of a joint", lambda m, _: m.peak_effort, by_joint=True
     ),
     "peak_force_N": Metric(
-        "N", "largest force commanded of the thrusters", lambda m, _: float(m.peak_wrench[0])
+        "N", "largest commanded thruster force", lambda m, _: float(m.peak_wrench[0])
     ),
     "peak_torque_Nm": Metric(
-        "N m", "largest torque likewise", lambda m, _: float(m.peak_wrench[1])
+        "N m", "largest commanded thruster torque", lambda m, _: float(m.peak_wrench[1])
     ),
     "joint_margin": Metric(
         "m or rad",
@@ -319,7 +321,7 @@ METRICS: dict[str, Metric] = {
     "effort_margin": _margin_metric("effort", "effort", lambda m: m.peak_effort),
     "momentum_drift": Metric(
         "kg m/s, kg m^2/s",
-        "largest change of a momentum that thrust does not explain",
+        "largest change of a momentum not explained by thrust",
         lambda m, _: float(m.momentum_drift.max()),
     ),
     CLEARANCE: Metric(
@@ -339,30 +341,32 @@ METRICS: dict[str, Metric] = {
     "capture_distance_m": _capture_metric(
         "distance",
         "m",
-        "distance of the end-effector from the grapple frame at the capture; without one, the "
-        "smallest",
+        "distance of the end-effector from the grapple frame at the capture; without a capture, "
+        "the smallest",
     ),
     "capture_impulse_Ns": _capture_metric("impulse", "N s", "impulse of the capture"),
     "capture_angular_impulse_Nms": _capture_metric(
-        "angular_impulse", "N m s", "its moment at the end-effector"
+        "angular_impulse", "N m s", "moment of the capture impulse at the end-effector"
     ),
     "capture_joint_impulse": _capture_metric(
-        "joint_impulse", "N m s or N s", "its largest part along the coordinate of a joint"
+        "joint_impulse",
+        "N m s or N s",
+        "largest part of the capture impulse along a joint coordinate",
     ),
     "detumbling_time_s": _capture_metric(
-        "detumbling_time", "s", "time in which robot and target came to rest"
+        "detumbling_time", "s", "time until robot and target came to rest"
     ),
     "detumbling_bound_s": _capture_metric(
-        "detumbling_bound", "s", "shortest time that the torques allow for it"
+        "detumbling_bound", "s", "shortest time until rest that the torques permit"
     ),
 }
-"""Every metric by its name."""
+"""Every metric by name."""
 
 
 def metrics_of_each(
     measures: Sequence[Measures], robot: RobotDescription
 ) -> list[dict[str, float]]:
-    """Return every metric by name, those of joints too, of flights of one robot; NaN: none."""
+    """Return every metric by name, including joint metrics, for flights of one robot; NaN: none."""
     if not measures:
         return []
     joints: dict[str, Any] = {
@@ -386,7 +390,7 @@ def metrics_of_each(
 
 
 def metric_names(joints: Sequence[str]) -> list[str]:
-    """Return the names that :func:`metrics_of_each` gives for these joints, in order."""
+    """Return the names that :func:`metrics_of_each` returns for these joints, in order."""
     names: list[str] = []
     for name, metric in METRICS.items():
         names.append(name)

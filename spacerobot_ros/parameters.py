@@ -1,4 +1,4 @@
-"""Parameters: declared once, as the fields of a configuration, and checked where they arrive.
+"""Parameters: declared once, as the fields of a configuration, and checked on input.
 
 A configuration is a frozen dataclass whose fields are made by :func:`parameter`, :func:`group` and
 :func:`registered`. Everything else follows from it: ROS parameters, the checks of the command line
@@ -33,7 +33,7 @@ def is_of_every_node(name: str) -> bool:
     """Whether a parameter belongs to every node, besides those of the node's configuration.
 
     rclpy declares them, as `ros2 param dump` and the parameters in a bag show; ``autostart`` is
-    this package's. They say nothing about a flight.
+    this package's. They are irrelevant to a flight.
     """
     return name in _OF_EVERY_NODE or name.startswith(_GROUP_OF_EVERY_NODE)
 
@@ -46,7 +46,7 @@ def as_numbers(
     Raises
     ------
     SpaceRobotError
-        They are not real numbers; of the type ``error``, whose subject is ``name``.
+        They are not real numbers. Its type is ``error``; its message begins with ``name``.
     """
     try:
         numbers = np.asarray(given)
@@ -58,7 +58,7 @@ def as_numbers(
 
 
 _PARAMETER, _GROUP, _REGISTERED = "parameter", "group", "registered"
-"""Metadata keys of dataclass fields: one for each function that makes a field."""
+"""Metadata keys of dataclass fields: one for each function that creates a field."""
 
 
 @dataclass(frozen=True)
@@ -68,9 +68,9 @@ class Parameter:
     Attributes
     ----------
     name
-        Full name, with the groups that it is in: ``sensors.joint_noise``.
+        Full name, including its groups: ``sensors.joint_noise``.
     default
-        Value when none is set.
+        Value if none is set.
     unit, description
         SI unit and a short description, as texts for the user.
     minimum, maximum
@@ -80,15 +80,15 @@ class Parameter:
     length
         Entries of an array that is not empty; None: any number of them.
     read_only
-        Whether it keeps its value as long as the node is configured.
+        Whether its value is fixed while the node is configured.
     texts
-        Whether the array consists of texts; one text with parts on separate lines, or between
-        semicolons, is accepted as well.
+        Whether the array consists of texts; a single text with entries separated by line breaks or
+        semicolons is also accepted.
     of_joints
-        Whether the array has an entry for each joint of the robot, or the text names joints.
+        Whether the array has an entry for each joint of the robot, or the text lists joints.
     by_name
-        Whether entries of such an array may be given for some joints alone, by their names: as a
-        mapping, or as texts ``NAME:VALUE``, which the value then has.
+        Whether entries of such an array may be given for only some joints, by name: as a mapping,
+        or as texts ``NAME:VALUE``. The value then consists of such texts.
     """
 
     name: str
@@ -130,7 +130,7 @@ class Parameter:
         return self._check_lines(value) if self.texts else self._check_numbers(value)
 
     def excludes(self, text: str) -> bool:
-        """Whether a text is none of the choices, if there are any."""
+        """Whether there are choices and the text is not among them."""
         return bool(self.choices) and text not in self.choices
 
     def _check_number(self, value: Any, whole: bool) -> int | float:
@@ -211,13 +211,14 @@ def _named_entries(value: Any) -> dict[str, Any] | None:
 
 
 def parameter(default: Value, description: str, unit: str = "", **attributes: Any) -> Any:
-    """Return a field of a configuration; ``attributes`` are further ones of :class:`Parameter`."""
+    """Return a field of a configuration; ``attributes`` are further attributes of
+    :class:`Parameter`."""
     declaration = Parameter("", default, unit, description, **attributes)
     return field(default=default, metadata={_PARAMETER: declaration})
 
 
 def nonnegative(default: Value, description: str, unit: str = "", **attributes: Any) -> Any:
-    """Return a :func:`parameter` whose number, or every entry, is at least 0."""
+    """Return a :func:`parameter` whose value, or every entry, is at least 0."""
     return parameter(default, description, unit, minimum=0.0, **attributes)
 
 
@@ -272,9 +273,9 @@ def _declared_in_class(
 
 
 def configured(kind: type[C], values: Mapping[str, Any]) -> C:
-    """Return a configuration with ``values`` by full name; those left out have their defaults.
+    """Return a configuration with ``values`` by full name; omitted ones have their defaults.
 
-    Values of other names are left alone; see :func:`require_known`.
+    Values with other names are ignored; see :func:`require_known`.
 
     Raises
     ------
@@ -296,7 +297,7 @@ def known_values(kind: type[Any], values: Mapping[str, V]) -> dict[str, V]:
 
 
 def require_known(owner: str, config: type[Any], names: Iterable[str]) -> None:
-    """Raise an error for names that are no parameter of a configuration.
+    """Raise an error for names that are not parameters of a configuration.
 
     Raises
     ------

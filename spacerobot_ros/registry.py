@@ -1,10 +1,10 @@
 """Registries of control laws, gait methods and metrics: the package's own, and those of users.
 
-A class of a user comes into a registry in one of three ways:
+A user's class is added to a registry in one of three ways:
 
-- an installed package names it as an entry point of the registry's group;
+- an installed package declares it as an entry point of the registry's group;
 - the environment variable ``SPACEROBOT_PLUGINS`` (or ``--plugin``) names the Python file that
-  defines it; processes that are started inherit the variable;
+  defines it; child processes inherit the variable;
 - a script calls :meth:`Registry.register`.
 """
 
@@ -38,15 +38,15 @@ class Registry(dict[str, type[T]]):
     Parameters
     ----------
     kind
-        What the classes are, for messages: ``control law``.
+        Kind of the classes, for messages: ``control law``.
     group
         Group of entry points by which installed packages add classes.
     base
-        Class that all of them are derived from.
+        Base class of all of them.
     own
-        The classes of this package, which no other class replaces.
+        The classes of this package, which cannot be replaced.
     reserved
-        Other names that no class may have.
+        Other reserved names.
     """
 
     def __init__(
@@ -65,13 +65,13 @@ class Registry(dict[str, type[T]]):
         self._own = frozenset([*self, *reserved])
 
     def register(self, entry: type[T]) -> type[T]:
-        """Add a class in place of an earlier one with its name and file; usable as a decorator.
+        """Add a class, replacing an earlier one with its name and file; usable as a decorator.
 
         Raises
         ------
         ParameterError
-            It is not derived from the base class or leaves out something abstract, it has no name,
-            or the name is one of the package's own, or one of another file.
+            It is not derived from the base class or lacks an abstract member, it has no name, or
+            the name is used by the package or by a class in another file.
         """
         name = self._usable_name(entry)
         self[name] = entry
@@ -80,8 +80,8 @@ class Registry(dict[str, type[T]]):
     def load(self) -> None:
         """Add the classes of installed packages and of the files in ``SPACEROBOT_PLUGINS``.
 
-        An entry point that is refused is omitted with a warning: it must not end the flights of
-        those who do not use it.
+        A refused entry point is omitted with a warning, because it must not affect users who do not
+        use it.
 
         Raises
         ------
@@ -92,7 +92,7 @@ class Registry(dict[str, type[T]]):
             try:
                 self.register(_loaded(point))
             except ParameterError as error:
-                logging.getLogger(__name__).warning("%s It is left out.", error)
+                logging.getLogger(__name__).warning("%s It is omitted.", error)
         _LOADED.append(self)
         self._load_files()
 
@@ -130,13 +130,13 @@ class Registry(dict[str, type[T]]):
             )
         if name in self._own and self.get(name) is not entry:
             raise ParameterError(
-                f"{named} has the name of the package's own '{name}': give it another one."
+                f"{named} has the name of the package's own '{name}': choose another name."
             )
         if name in self and _origin(self[name]) != _origin(entry):
             raise ParameterError(
                 f"Two classes are the {self.kind} '{name}': '{self[name].__name__}' of "
-                f"{_origin(self[name])} and '{entry.__name__}' of {_origin(entry)}. Give one of "
-                "them another name, or leave its file out."
+                f"{_origin(self[name])} and '{entry.__name__}' of {_origin(entry)}. Rename one of "
+                "them, or omit its file."
             )
         return name
 
@@ -150,8 +150,8 @@ def _origin(entry: type[Any]) -> str:
 def import_plugins() -> None:
     """Import the files in ``SPACEROBOT_PLUGINS`` before anything else of this package.
 
-    They may import all of it, which is half imported when a registry is. A file that cannot be
-    imported is named by the registries.
+    They may import the whole package, which is only partly imported when a registry is. The
+    registries report files that cannot be imported.
     """
     for file in _plugin_files():
         with suppress(ParameterError):
@@ -164,17 +164,17 @@ def _plugin_files() -> list[Path]:
 
 
 _LOADED: list[Registry[Any]] = []
-"""Registries of this process, to which later plugins are added."""
+"""Registries of this process, which also receive later plugins."""
 
 
 def add_plugin(file: Path) -> None:
-    """Add a Python file to ``SPACEROBOT_PLUGINS`` of this process and of those that it starts.
+    """Add a Python file to ``SPACEROBOT_PLUGINS`` of this process and its child processes.
 
     Raises
     ------
     ParameterError
-        The file cannot be imported, or a class in it is refused. Registries that are not imported
-        yet raise the error when they are.
+        The file cannot be imported, or a class in it is refused. Registries that are imported later
+        raise the error then.
     """
     files = dict.fromkeys([*_plugin_files(), file.resolve()])
     os.environ[PLUGINS_VARIABLE] = os.pathsep.join(map(str, files))

@@ -13,12 +13,12 @@ from spacerobot_ros.errors import ParameterError, SpaceRobotError
 _PACKAGE = "spacerobot_ros"
 
 _ROBOT_SUFFIXES = (".urdf", ".xacro", ".xml", ".sdf", ".world", ".mjcf")
-"""Suffixes of robot descriptions, with those of unsupported formats."""
+"""Suffixes of robot descriptions, including unsupported formats."""
 
 
 @lru_cache(maxsize=1)
 def share_directory() -> Path:
-    """Return the folder that holds ``urdf/`` and ``config/``: the checkout's, or the installed one.
+    """Return the folder with ``urdf/`` and ``config/``: the checkout's, or the installed one.
 
     Raises
     ------
@@ -50,7 +50,7 @@ def resource_names(folder: str, suffix: str) -> list[str]:
 
 
 def robot_file(name: str) -> Path:
-    """Return the file of a robot by a path (URDF or xacro), or by the name of one of this package.
+    """Return the file of a robot, by path (URDF or xacro) or by name of a robot of this package.
 
     Raises
     ------
@@ -63,7 +63,7 @@ def robot_file(name: str) -> Path:
             return path
         known = resource_names("urdf", ".urdf")
         raise ParameterError(
-            f"There is no robot '{name}': there is no such URDF file, nor a robot of that name "
+            f"There is no robot '{name}': there is no such URDF file and no robot of that name "
             f"(known: {', '.join(known)}).{suggestion(name, known)}"
         )
     if Path(name).is_file():

@@ -56,7 +56,7 @@ CONFIGS: Mapping[str, type[Any]] = {
     "recorder": RecorderConfig,
     "viewer": ViewerConfig,
 }
-"""Configuration class of each node whose parameters a scenario may set."""
+"""Configuration class of each node that a scenario may configure."""
 
 NODES = tuple(CONFIGS)
 
@@ -82,7 +82,7 @@ _OTHER_GOAL = "Flown to another goal than the scenario's"
 
 @dataclass(frozen=True)
 class Published:
-    """A figure of a publication on this scenario, to compare with the measured one.
+    """A published figure for this scenario, to compare with the measured one.
 
     ``quantity`` is a key of the run's summary, or a note of the gait in the planner's status;
     ``note`` comments on the printed figure (a misprint, an integration error).
@@ -95,7 +95,7 @@ class Published:
 
 @dataclass(frozen=True)
 class Kill:
-    """A node that is killed ``at`` a simulated time and started again ``until`` another, s."""
+    """A node that is killed ``at`` a simulated time and offline ``until`` another, s."""
 
     node: str
     at: float
@@ -108,7 +108,7 @@ _KEYS_OF_PARTS: Mapping[Controlled, frozenset[str]] = {
     "position": frozenset({"goal_position"}),
     "attitude": frozenset({"goal_orientation", "goal_rotvec"}),
 }
-"""Keys of a scenario's section that ask for a part of the pose of the base."""
+"""Keys of a scenario's section that require a part of the pose of the base."""
 
 
 @dataclass(frozen=True)
@@ -124,13 +124,13 @@ class Scenario:
     commanders
         Nodes that command the robot to the goals.
     published, published_method
-        Figures of a publication, and the gait method that they hold for; empty: any.
+        Published figures, and the gait method to which they apply; empty: any.
     kills
         The nodes that are killed during the flight, by time.
     in_file, overrides
         Parameters by node and full name; overrides take precedence over the file.
     has_goal
-        Whether a goal was given; without one ``goal`` is the start.
+        Whether a goal was given; otherwise ``goal`` is the start.
     """
 
     name: str
@@ -229,7 +229,7 @@ class Scenario:
 
     @property
     def comparable(self) -> tuple[Published, ...]:
-        """The published figures, if they hold for the method that is flown."""
+        """The published figures, if they apply to the flown method."""
         return self.published if self.published_method in ("", self.planner.method) else ()
 
     def parameters(self, node: str) -> dict[str, Value]:
@@ -276,7 +276,7 @@ class Scenario:
 
     @property
     def goal_links(self) -> tuple[str, ...]:
-        """Names of the links of :attr:`end_effectors`, as their topics have them."""
+        """Names of the links of :attr:`end_effectors`, as in their topics."""
         return tuple(link or DEFAULT_END_EFFECTOR for link in self.end_effectors)
 
     def _goal_poses(self) -> dict[str, list[float]]:
@@ -300,7 +300,7 @@ class Scenario:
         shape = self.goal.joint_positions
         if shape is not None and len(shape) != robot.n:
             raise GoalError(
-                f"The goal shape has {len(shape)} joint position(s); robot "
+                f"The goal has {len(shape)} joint position(s); robot "
                 f"'{robot.description.name}' has {robot.n} joints."
             )
 
@@ -322,7 +322,7 @@ class Scenario:
         return made
 
     def in_real_time(self, factor: float) -> Scenario:
-        """Return the scenario in real time times a factor."""
+        """Return the scenario at ``factor`` times real time."""
         pace = {"time_mode": "realtime", "real_time_factor": factor}
         scenario = self.with_overrides("plant", pace)
         # Viewers follow wall time, which limits the period of recorded transforms; the plant limits
@@ -336,7 +336,7 @@ class Scenario:
     def with_method(self, method: str) -> Scenario:
         """Return the scenario with another gait method, or another control law.
 
-        A robot alone has a controller instead of its planner, if it is a law.
+        If it is a law, a robot without a scenario uses a controller instead of a planner.
 
         Raises
         ------
@@ -370,12 +370,12 @@ class Scenario:
         return self.in_file == _nodes_of(dict(sections[0])) and len(sections[0]) == 1
 
     def with_settings(self, texts: Sequence[str]) -> Scenario:
-        """Return the scenario with ``node.parameter=value`` set, each as :func:`parse_setting`.
+        """Return the scenario with each ``node.parameter=value`` set; see :func:`parse_setting`.
 
         Raises
         ------
         ParameterError
-            A text has another form, or names no node, or a commander that does not fly.
+            A text has another form, names no node, or names a commander that does not fly.
         """
         scenario = self
         for text in texts:
@@ -427,22 +427,22 @@ class Scenario:
         return self.with_other_goal(replace(goal, end_effectors=(), base=POSE, asked=asked))
 
     def with_other_goal(self, goal: Goal) -> Scenario:
-        """Return the scenario with another goal, as the description says then.
+        """Return the scenario with another goal and a description that reports this.
 
-        The published figures, which hold for the published goal, are dropped.
+        The published figures, which apply to the published goal, are dropped.
         """
         made = replace(self, goal=goal, published=(), has_goal=True)
         return made.described_for_other_goal() if self.has_goal else made
 
     def described_for_other_goal(self) -> Scenario:
-        """Return the scenario with the description that another goal was flown to."""
+        """Return the scenario with a description that reports another goal."""
         return replace(self, description=self.description and _OTHER_GOAL)
 
     def with_end_effectors(
         self, goals: Sequence[EndEffectorGoal], base: frozenset[Controlled] = frozenset()
     ) -> Scenario:
-        """Return the scenario with goals of end-effectors in place of its own, and its goal in
-        parts of the base alone.
+        """Return the scenario with other goals of end-effectors, and with its base goal limited to
+        ``base``.
 
         Raises
         ------
@@ -471,7 +471,8 @@ class Scenario:
         return heard.with_overrides("plant", {"end_effectors": [*published, *more]})
 
     def require_goal(self) -> None:
-        """Raise an error if the scenario has no goal, such as one of a robot file or of a dump.
+        """Raise an error if the scenario has no goal, for example if it is from a robot file or a
+        dump.
 
         Raises
         ------
@@ -481,7 +482,7 @@ class Scenario:
         if not self.has_goal:
             raise ParameterError(
                 f"'{self.name}' has no goal: give one, for instance --goal-rpy-deg 0 0 10, or "
-                "write a scenario with one (`spacerobot new` writes that of a robot)."
+                "write a scenario with a goal (`spacerobot new` writes one for a robot)."
             )
 
 
@@ -500,9 +501,8 @@ def _changed(file: Path) -> float:
 
 
 def scenario_text(scenario: Scenario) -> str:
-    """Return the text of a parameter file of the scenario, with its overrides.
-
-    Published figures and kills of nodes are not in it.
+    """Return the text of a parameter file of the scenario, with its overrides, but without
+    published figures and kills of nodes.
     """
     about: dict[str, Any] = {"description": scenario.description, **scenario._goal_poses()}
     for part, keys in _KEYS_OF_PARTS.items():
@@ -531,8 +531,8 @@ def _end_effector_values(goal: Goal) -> dict[str, list[float] | list[list[float]
 def load_scenario(name: str) -> Scenario:
     """Return a scenario of this package by name, or of any parameter file by path.
 
-    A file whose plant has a robot needs no section ``scenario``, as those of ``ros2 param dump``;
-    the scenario has no goal then.
+    A file whose plant has a robot, such as a file from ``ros2 param dump``, needs no section
+    ``scenario``; the scenario then has no goal.
 
     Raises
     ------
@@ -568,7 +568,7 @@ def load_scenario(name: str) -> Scenario:
     if unknown:
         raise ParameterError(
             f"The scenario file {path} has an unknown key '{unknown[0]}' in its scenario section; "
-            f"it takes {', '.join(_SCENARIO_KEYS)}."
+            f"the keys are {', '.join(_SCENARIO_KEYS)}."
         )
     return Scenario(
         name=path.stem,
@@ -623,7 +623,7 @@ def _with_world(
 def scenario_or_robot(name: str) -> Scenario:
     """Return a scenario by name, or one without a goal for a robot (its name or URDF file).
 
-    The planner of a robot alone chooses its method.
+    For a robot, the planner chooses the method.
 
     Raises
     ------
@@ -645,7 +645,7 @@ def scenario_or_robot(name: str) -> Scenario:
 
 
 def scenario_of(robot: RobotDescription) -> Scenario:
-    """Return a scenario without a goal of a robot alone, as :func:`scenario_or_robot` does."""
+    """Return a scenario without a goal for a robot, like :func:`scenario_or_robot`."""
     nodes = _nodes_of({"robot_description": robot.urdf})
     return _scenario_without_goal(robot.name, Path(), nodes)
 
@@ -668,7 +668,7 @@ def _scenario_without_goal(
 
 
 def scenario_names() -> list[str]:
-    """Return the names of the scenarios that come with the package, those with faults last."""
+    """Return the names of the scenarios of the package; scenarios with faults are last."""
     faults = resource_names("config/faults", ".yaml")
     return [*resource_names("config", ".yaml"), *(f"faults/{name}" for name in faults)]
 
@@ -697,7 +697,7 @@ def _parse_kill(line: object, where: str) -> Kill:
         raise refusal("it must be NODE at SECONDS [until SECONDS]")
     at, until = parse_times(words, node, 0.0, refusal)
     if at < 0.0:
-        raise refusal(f"it is at {at:g} s, before the flight begins")
+        raise refusal(f"it is at {at:g} s, before the start of the flight")
     return Kill(node, at, until)
 
 
@@ -729,7 +729,7 @@ def _parse_goal(name: str, values: Mapping[str, Any], path: Path) -> Goal:
         if not links:
             return goal
         if not isinstance(links, Mapping):
-            raise TypeError(f"end_effector_goals has no poses by name: {links!r}.")
+            raise TypeError(f"end_effector_goals must map names to poses, not {links!r}.")
         of_base = any(f"{name}_{part}" in values for part in ("position", "orientation", "rotvec"))
         goals = [EndEffectorGoal.of_numbers(str(link), pose) for link, pose in links.items()]
         hands = Goal.of_end_effectors(goals).end_effectors
@@ -742,11 +742,11 @@ def _parse_goal(name: str, values: Mapping[str, Any], path: Path) -> Goal:
 
 
 def read_sections(path: Path) -> dict[str, dict[str, Any]]:
-    """Return the parameters by node and full name that a parameter file has.
+    """Return the parameters in a parameter file, by node and full name.
 
     A section is for a node in any namespace (``/**/plant``), in one (``/robot_1/plant``), in none
-    (``plant``), or for all nodes (``/**``); of two that set a parameter the later one counts, and
-    the one for all nodes counts least.
+    (``plant``), or for all nodes (``/**``); if two sections set the same parameter, the later one
+    takes precedence; a section for all nodes has the lowest precedence.
 
     Raises
     ------
@@ -757,10 +757,10 @@ def read_sections(path: Path) -> dict[str, dict[str, Any]]:
 
 
 def different_parameters(scenarios: Sequence[Scenario]) -> list[tuple[str, ...]]:
-    """Return each parameter that is not the same in all scenarios, with its unit, and its values.
+    """Return each parameter that differs between the scenarios, with its unit and its values.
 
-    Values are texts; ``–`` if a scenario does not give the parameter, which has its default
-    then. Texts of robots are omitted.
+    Values are texts; ``–`` if a scenario does not set the parameter and uses its default. Robot
+    descriptions are omitted.
     """
     given = [{(n, p): v for n in CONFIGS for p, v in s.parameters(n).items()} for s in scenarios]
     known = {(n, each.name): each for n in CONFIGS for each in declared(CONFIGS[n])}
@@ -854,7 +854,7 @@ def parse_setting(text: str) -> tuple[str, str, Any]:
 
 
 def number_in(text: str) -> float | str:
-    """Return the number that a text states, else the text; unlike YAML, 1e-3 counts as a number."""
+    """Return a text as a number if it is one; unlike in YAML, 1e-3 is a number."""
     try:
         return float(text)
     except ValueError:

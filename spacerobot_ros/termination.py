@@ -1,10 +1,10 @@
 """Signals that end a process, and child processes that end with it.
 
-A process is guarded from its first import on (:func:`guarded`). SIGINT, SIGTERM and SIGHUP then
+A process installs its guard at its first import (:func:`guarded`). SIGINT, SIGTERM and SIGHUP then
 raise :class:`Terminated` in the main thread; work that must be completed, such as a flight or a
-bag, receives a request instead (:func:`graceful_shutdown`). A second signal, a second later or
-more, ends the process at once, and so does a timer where a library swallows the exception. Python
-handles signals as soon as a call of C code has returned.
+bag, receives a request instead (:func:`graceful_shutdown`). A second signal, at least a second
+later, ends the process at once. So does a timer if a library swallows the exception. Python handles
+signals once a call of C code has returned.
 
 On Linux the kernel signals the end of a process to the children of :func:`start_child`.
 """
@@ -35,10 +35,10 @@ _LONGEST_UNWINDING_TIME = 1.2
 """Wall time within which the main thread must end after a signal's exception, s."""
 
 _SAME_SIGNAL_TIME = 1.0
-"""Wall time between signals that count as one, s: launcher and terminal both send a signal."""
+"""Wall time within which signals count as one, s: launcher and terminal both send one."""
 
 _TIME_AFTER_PARENT_END = 1.5
-"""Wall time after the end of the parent at which the kernel kills this process, s."""
+"""Wall time from the end of the parent until the kernel kills this process, s."""
 
 _PARENT_VARIABLE = "SPACEROBOT_PARENT"
 """Environment variable of a child: process id of its parent."""
@@ -49,7 +49,7 @@ _PR_SET_PDEATHSIG = 1
 
 
 class Terminated(KeyboardInterrupt):
-    """A signal that ends the process. As an interrupt it passes ``except Exception``.
+    """A signal that ends the process. Like an interrupt it passes ``except Exception``.
 
     Parameters
     ----------
@@ -95,7 +95,7 @@ class _Guard:
             self._errors, sys.stderr = None, self._errors
 
     def watch_parent(self) -> None:
-        """Have the kernel (Linux) signal the end of the parent, which may have ended before."""
+        """Make the kernel (Linux) signal the parent's end, which may be in the past."""
         if not self._parent:
             return
         with suppress(ImportError, OSError, AttributeError):
@@ -142,10 +142,10 @@ _guard: _Guard | None = None
 
 @contextmanager
 def guarded() -> Iterator[bool]:
-    """Have signals, and the end of the parent, end the process in this context.
+    """End the process on signals and on the end of the parent, within this context.
 
-    Yields whether the guard is new: inside another one nothing changes. Outside the main thread,
-    which alone has signals, nothing is done.
+    Yields whether the guard is new: inside another guard nothing changes. Outside the main thread,
+    which alone receives signals, it has no effect.
 
     Raises
     ------
@@ -169,9 +169,9 @@ def guarded() -> Iterator[bool]:
 def graceful_shutdown(
     on_request: Callable[[], None] = lambda: None,
 ) -> Iterator[Callable[[], bool]]:
-    """Turn signals into a request while work is completed.
+    """Convert signals to a request while work is completed.
 
-    Yields a function that returns whether the end was requested; the work calls it now and then.
+    Yields a function that returns whether the end was requested; the work calls it regularly.
 
     Parameters
     ----------
@@ -181,7 +181,7 @@ def graceful_shutdown(
     Raises
     ------
     Terminated
-        A signal has come before.
+        A signal arrived earlier.
     """
     with guarded():
         if (ending := termination()) is not None:
@@ -223,8 +223,8 @@ def start_child(
 ) -> subprocess.Popen[bytes]:
     """Start Python with arguments ``words`` as a new session, which ends with this process.
 
-    The child has to be guarded. ``environment`` is its own, else that of this process; ``options``
-    are those of ``subprocess.Popen``.
+    The child must be guarded. ``environment`` is its environment, by default a copy of this
+    process's; for ``options`` see ``subprocess.Popen``.
     """
     import subprocess
 
@@ -257,8 +257,8 @@ def end_child(process: subprocess.Popen[bytes], signals: Mapping[int, float]) ->
     process
         The child.
     signals
-        Signals to send one after the other, each with the longest wait for the end, wall s; signal
-        0 only waits. Then the child is killed with all of its session.
+        Signals to send one after the other, each with the longest wait for the end, s of wall time;
+        signal 0 only waits. Then the child is killed with its whole session.
     """
     import subprocess
 
@@ -281,8 +281,8 @@ def end_child(process: subprocess.Popen[bytes], signals: Mapping[int, float]) ->
 def tool(words: Sequence[str], **options: Any) -> Iterator[subprocess.Popen[bytes]]:
     """Start a program, such as a compiler, and kill it with its children at the end of the context.
 
-    It is in a session of its own, and has no input. A signal raises :class:`Terminated` in this
-    context, whatever else it would request.
+    It runs in its own session, without input. A signal raises :class:`Terminated` in this context,
+    even within :func:`graceful_shutdown`.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Nodes of this package, and your own, in one executor: for a pytest of your own."""
+"""Nodes of this package and your own nodes in one executor, for your own pytest tests."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ __all__ = ["Arrival", "Stack"]
 
 
 class Arrival(NamedTuple):
-    """The end of a goal: its outcome, and the commander's sentence about it."""
+    """The end of a goal: its outcome, and the commander's message."""
 
     outcome: Outcome
     message: str
@@ -40,17 +40,18 @@ class Arrival(NamedTuple):
 
 
 class Stack:
-    """Nodes in one executor, in lockstep, in a ROS domain of their own; a context manager.
+    """Nodes in one executor, in lockstep, in their own ROS domain; a context manager.
 
-    The plant starts with the first goal, when all nodes have met. Time continues while nodes spin.
+    The plant starts with the first goal, once all nodes are connected. Time continues while nodes
+    spin.
 
     Parameters
     ----------
     robot
-        Robot or scenario (a name or a file) whose parameters the nodes have.
+        Robot or scenario (a name or a file) that configures the nodes.
     nodes
-        Names of nodes of this package, and functions or classes that return a node of your own in
-        the rclpy context that they are given.
+        Names of nodes of this package, and functions or classes that take an rclpy context and
+        return your own node.
     parameters
         Further parameters by node: ``{"planner": {"method": "lie_bracket"}}``.
     timeout
@@ -59,7 +60,7 @@ class Stack:
     Attributes
     ----------
     nodes
-        The nodes by their names; ``executor``, ``context`` and ``domain`` are those of all.
+        The nodes by name. ``executor``, ``context`` and ``domain`` are common to all nodes.
     """
 
     def __init__(
@@ -115,12 +116,11 @@ class Stack:
         z: float | None = None,
         rotvec: npt.ArrayLike | None = None,
     ) -> Arrival:
-        """Send a goal and spin until the planner, or else the controller, has decided it.
+        """Send a goal and spin until the planner, or else the controller, decides on it.
 
         ``goal`` is any goal; None: the base at ``x``, ``y``, ``z`` (m), rotated by ``rotvec``
-        (rad), 0 unless given; without a coordinate any position will do, without ``rotvec`` any
-        attitude.
-        Raises :class:`.SpaceRobotError` if a node fails, or time is up.
+        (rad), 0 unless given; without coordinates any position is accepted, without ``rotvec`` any
+        attitude. Raises :class:`.SpaceRobotError` if a node fails, or time is up.
         """
         if goal is None:
             place = [x or 0.0, y or 0.0, z or 0.0]

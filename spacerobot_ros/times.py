@@ -1,4 +1,4 @@
-"""Times as stamps and clocks carry them: whole nanoseconds, split into seconds and the rest."""
+"""Times of stamps and clocks: whole nanoseconds, split into seconds and remainder."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
-"""Table of all topics, from which publishers, reports and documents are made.
+"""Table of all topics, from which publishers, reports and documents are generated.
 
 For the plant's state topics the table also lists the numbers in their messages:
-the plant's publisher and the re-simulation of a bag read it. A new one is an entry here and a
-quantity in :mod:`spacerobot_ros.simulation.sensors`.
+the plant's publisher and the re-simulation of a bag read it. A new state topic needs an entry here
+and a quantity in :mod:`spacerobot_ros.simulation.sensors`.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ _MOMENTUM_LABELS = ("linear_x", "linear_y", "linear_z", "angular_x", "angular_y"
 
 @dataclass(frozen=True)
 class StateField:
-    """Numbers of a state topic that lie side by side in the message.
+    """Adjacent numbers in the message of a state topic.
 
     Attributes
     ----------
@@ -31,8 +31,7 @@ class StateField:
     members
         The numbers of the part at ``path``, in their order; empty for an array.
     array_entry_names
-        Names of the entries of an array; empty: it has one for each joint, or whatever the topic
-        is about.
+        Names of the entries of an array; empty: one for each joint or other object of the topic.
     """
 
     path: str
@@ -46,7 +45,7 @@ class StateField:
         return [f"{self.path}.{member}" for member in self.members] or [self.path]
 
     def labels(self, names: Sequence[str]) -> list[str]:
-        """Return a label for each number; ``names`` are of the joints or thrusters."""
+        """Return a label for each number; ``names`` are the joints or thrusters."""
         if self.members:
             return self.columns
         return [entry.replace("_", " ") for entry in self.array_entry_names] or [
@@ -71,11 +70,11 @@ class Topic:
     type
         Name of the message type, such as ``nav_msgs/msg/Odometry``.
     publishers
-        The nodes that publish it; ``user`` for what comes from outside the stack.
+        The nodes that publish it; ``user`` for topics from outside the stack.
     meaning
         Description of the content.
     condition
-        Under which condition it is there; empty: always.
+        Condition under which it exists; empty: always.
     latched
         Whether a late subscriber gets the last message (reliable, transient local, depth 1).
     state
@@ -83,7 +82,7 @@ class Topic:
     frame
         The frame of the header of a state topic: ``world`` or ``base``.
     array_entries_of
-        Objects that the entries of its arrays belong to: ``joints`` or ``thrusters``.
+        Objects to which the entries of its arrays belong: ``joints`` or ``thrusters``.
     every_tick
         Whether a state topic is published in every tick, or every ``base_pose_period``.
     """
@@ -101,7 +100,7 @@ class Topic:
 
     @property
     def short_type(self) -> str:
-        """The type as ROS documents print it: ``nav_msgs/Odometry``."""
+        """The type as in ROS documents: ``nav_msgs/Odometry``."""
         return self.type.replace("/msg/", "/")
 
 
@@ -311,20 +310,20 @@ _TOPIC_TABLE = (
         "fault_injection",
         _STRING_TYPE,
         _PUBLISHED_BY_USER,
-        "faults for the plant, one a line, or `clear`",
+        "faults for the plant, one per line, or `clear`",
     ),
     Topic(
         "disturbance_injection",
         _STRING_TYPE,
         _PUBLISHED_BY_USER,
-        "disturbances of the plant, one a line, or `clear`",
+        "disturbances of the plant, one per line, or `clear`",
     ),
     Topic(
         "obstacles",
         _STRING_TYPE,
         _PUBLISHED_BY_USER,
-        "URDF of all fixed obstacles, which replaces the earlier ones, for the planner, a "
-        "controller that plans, the plant and viewers; empty: none",
+        "URDF of all fixed obstacles, for the planner, a controller that plans, the plant and "
+        "viewers; it replaces earlier ones; empty: none",
         latched=True,
     ),
     Topic(
@@ -357,8 +356,8 @@ _TOPIC_TABLE = (
         _POSE_STAMPED_TYPE,
         _PUBLISHED_BY_USER,
         "goal pose of the end-effector in the world; also `NAME/goal_pose` of links in the "
-        "planner's `end_effectors`. For the planner an orientation of zeros means any attitude, "
-        "and poses with one stamp, also of the base, are one goal",
+        "planner's `end_effectors`. For the planner, an orientation of zeros means any attitude, "
+        "and poses with the same stamp, including the base's, are one goal",
     ),
     Topic(
         "end_effector/twist",
@@ -372,8 +371,8 @@ _TOPIC_TABLE = (
         "end_effector/path",
         _PATH_TYPE,
         _PUBLISHED_BY_USER,
-        "path of the end-effector in the world, straight from pose to pose, to the goal at its "
-        "last pose, with the base free; also `NAME/path` of links in the planner's "
+        "path of the end-effector in the world, straight from pose to pose; the last pose is the "
+        "goal, and the base is free; also `NAME/path` of links in the planner's "
         "`end_effectors`. Orientations of zeros in all poses mean any attitude",
     ),
     Topic(
@@ -387,7 +386,7 @@ _TOPIC_TABLE = (
         "base_reference",
         _ODOMETRY_TYPE,
         _PUBLISHED_BY_USER,
-        "a moving reference of the base for coordinated control, one for every state",
+        "a moving reference for the base for coordinated control, one message per state",
     ),
     Topic(
         "gait_schedule",
@@ -439,7 +438,7 @@ _TOPIC_TABLE = (
         "replay/seek",
         "std_msgs/msg/Float64",
         _PUBLISHED_BY_USER,
-        "time at which a replay continues, s from its beginning",
+        "time from which a replay continues, s after its beginning",
         condition="a bag is replayed",
     ),
     Topic(
@@ -459,17 +458,17 @@ _TOPIC_TABLE = (
 )
 
 TOPICS: dict[str, Topic] = {topic.name: topic for topic in _TOPIC_TABLE}
-"""Every topic of the stack by its name; those of the plant in the order of publication."""
+"""Every topic of the stack by name; topics of the plant are in the order of publication."""
 
 GLOBAL_TOPICS = ("/clock", "/tf", "/tf_static")
 """Topics with absolute names; a stack in a namespace remaps them into the namespace."""
 
 TOPICS_NOT_RECORDED = ("/rosout", "/parameter_events", "/transition_event", "/heartbeat")
-"""Endings of topics that are recorded only on request."""
+"""Suffixes of topics that are recorded only on request."""
 
 
 def goal_topic(end_effector: str) -> str:
-    """Return the topic of the goals of an end-effector: its name, in letters of topics."""
+    """Return the topic of the goals of an end-effector, with its name converted for topics."""
     return _name_in_topics(end_effector) + "/goal_pose"
 
 
@@ -484,7 +483,7 @@ def path_topic(end_effector: str) -> str:
 
 
 def pose_topic(end_effector: str) -> Topic:
-    """Return the entry of the poses of an end-effector, by its name in letters of topics."""
+    """Return the entry for the poses of an end-effector, with its name converted for topics."""
     name = _name_in_topics(end_effector)
     state = StateField("pose", f"pose_of_{name}", _POSE_MEMBERS)
     return replace(TOPICS["end_effector/pose"], name=f"{name}/pose", state=(state,))
@@ -495,7 +494,7 @@ def _name_in_topics(link: str) -> str:
 
 
 def topic_named(name: str) -> Topic:
-    """Return the entry of a topic; goals, twists, paths and poses of any end-effector have that
+    """Return the entry of a topic; goals, twists, paths and poses of any end-effector use the entry
     of ``end_effector``.
 
     Raises
@@ -515,8 +514,8 @@ def topic_named(name: str) -> Topic:
 
 
 def state_topics(end_effectors: Iterable[str] = ()) -> list[Topic]:
-    """Return the topics that carry the state of a plant that publishes the poses of some
-    end-effectors, in the order of publication.
+    """Return the state topics of a plant, including the poses of these end-effectors, in the order
+    of publication.
     """
     poses = {topic.name: topic for topic in map(pose_topic, end_effectors)}
     return [topic for topic in {**poses, **TOPICS}.values() if topic.state]

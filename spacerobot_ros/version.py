@@ -9,7 +9,7 @@ __version__ = "0.2.0"
 
 @lru_cache(maxsize=1)
 def source_hash() -> str:
-    """Return a hash of the code of the package; checkouts of one version may differ in it."""
+    """Return a hash of the code of the package, which distinguishes checkouts of one version."""
     found, package = hashlib.sha256(), Path(__file__).parent
     for path in sorted(each for each in package.rglob("*") if each.suffix in (".py", ".hpp")):
         found.update(f"{path.relative_to(package)}\n".encode() + path.read_bytes())

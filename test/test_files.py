@@ -165,7 +165,7 @@ def test_a_private_file_is_of_this_user_alone(
         os.chown(path, 4_000_001, -1)
     else:
         monkeypatch.setattr(os, "geteuid", lambda: owner + 1)
-    with pytest.raises(UntrustedFileError, match=r"belongs to user \d+; use one of your own\.$"):
+    with pytest.raises(UntrustedFileError, match=r"belongs to user \d+; use your own\.$"):
         read_private(path)
 
 

@@ -100,7 +100,7 @@ def test_a_law_of_an_installed_package_flies_by_its_name(tmp_path: Path, install
     goal = [0.3, -0.2, 0.0, 0.0, 0.0, 0.3826834323650898, 0.9238795325112867]
     flown = _run([*words, "--goal", *map(str, goal), "--json", "-"], tmp_path, PYTHONPATH=path)
     assert flown.returncode == 0, flown.stderr
-    assert flown.stderr.count("It is left out.") == 2
+    assert flown.stderr.count("It is omitted.") == 2
     assert "'lost = strangers.nowhere:Law' of the package 'strangers' cannot be" in flown.stderr
     assert "has the name of the package's own 'transposed_jacobian'" in flown.stderr
     result = json.loads(flown.stdout)

@@ -170,7 +170,7 @@ def test_robots_that_are_no_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     with pytest.raises(ParameterError) as refused:
         resources.robot_file("servicr")
     assert str(refused.value).startswith(
-        "There is no robot 'servicr': there is no such URDF file, nor a robot of that name (known: "
+        "There is no robot 'servicr': there is no such URDF file and no robot of that name (known: "
     )
     assert str(refused.value).endswith("Did you mean 'servicer'?")
 
@@ -292,7 +292,7 @@ def test_kills_of_nodes(line: str, kills: tuple[Kill, ...]) -> None:
                 "plant at x": "'x' is not a finite number",
                 "plant at inf": "'inf' is not a finite number",
                 "plant at nan": "'nan' is not a finite number",
-                "plant at -1": "it is at -1 s, before the flight begins",
+                "plant at -1": "it is at -1 s, before the start of the flight",
                 "plant at 2 until 2": "it ends at 2 s and begins at 2 s",
                 "plant at 2 until 1": "it ends at 1 s and begins at 2 s",
             }.items()
@@ -466,7 +466,7 @@ def test_what_a_scenario_needs_is_said(tmp_path: Path) -> None:
             robot.require_goal()
         assert str(refused.value) == (
             "'planar_manipulator' has no goal: give one, for instance --goal-rpy-deg 0 0 10, or "
-            "write a scenario with one (`spacerobot new` writes that of a robot)."
+            "write a scenario with a goal (`spacerobot new` writes one for a robot)."
         )
 
 
@@ -479,7 +479,7 @@ def test_a_robot_alone_is_a_scenario_without_a_goal() -> None:
     with pytest.raises(GoalError) as refused:
         replace(found, goal=shape).require_shape_of(SpaceRobot(description))
     assert str(refused.value) == (
-        f"The goal shape has 1 joint position(s); robot '{description.name}' has 3 joints."
+        f"The goal has 1 joint position(s); robot '{description.name}' has 3 joints."
     )
 
 
