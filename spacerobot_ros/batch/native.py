@@ -131,7 +131,7 @@ class CompiledTick:
     def of(
         cls, flights: Flights, model: ModelFunctions, target: Target, link: str = ""
     ) -> CompiledTick:
-        """Compile the tick of flights, or return it from an earlier compilation.
+        """Compile the tick of flights, or return an earlier compilation.
 
         With ``link``, reports end with the pose in B of that link: the rotation by columns (9) and
         the position (3), m.

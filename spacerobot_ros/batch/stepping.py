@@ -68,8 +68,9 @@ class SteppedFlights:
         Whether the flights are in SIMD lanes; if not, or if lanes cannot be compiled, each flight
         has a plant. Both compute the same states up to rounding.
     plants
-        Configurations of plants with thrusters, faults or external loads, which lanes do not have,
-        for each flight; a reset makes a plant of the one that is then in the list. Empty: none.
+        Configurations of plants for each flight, with thrusters, faults or external loads, which
+        lanes do not support; a reset builds a plant from the present configuration in the list.
+        Empty: none.
     target
         What lanes run on; None: the widest registers of this processor.
 

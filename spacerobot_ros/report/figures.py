@@ -232,12 +232,12 @@ def narrow() -> bool:
 
 
 def inches(length: float) -> float:
-    """Return a length made for letters of 8.5 points, scaled to the font size, inches."""
+    """Return a length designed for a font size of 8.5 points, scaled to the current one, inches."""
     return length * _look.get().scale
 
 
 def angle_unit() -> tuple[float, str]:
-    """Return the unit that angles are drawn in, and its number in one rad."""
+    """Return the unit for angles, and the number of these units in one rad."""
     return (180.0 / np.pi, "deg") if _look.get().degrees else (1.0, "rad")
 
 

@@ -427,7 +427,7 @@ def joint_groups(
 
 
 def axis_groups(signal: Signal, parts: Sequence[tuple[str, str]]) -> list[TraceGroup]:
-    """Return a group of x, y and z for each label and unit; they are columns side by side."""
+    """Return a group of x, y and z, which are adjacent columns, for each label and unit."""
     columns = [signal.values[:, 3 * k : 3 * k + 3] for k in range(len(parts))]
     return [
         TraceGroup(Signal(signal.time, values), list("xyz"), label, unit, PALETTE[:3])

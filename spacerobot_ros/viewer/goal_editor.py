@@ -118,7 +118,7 @@ class GoalEditor:
         self._changed_at: float | None = None
         self._origin = Origin.ROBOT
         self._in_flight = False
-        """Whether the robot flies to the goal that is shown, whose gizmos are hidden then."""
+        """Whether the robot flies to the shown goal, which hides the gizmos."""
         self._followed: Mapping[Part, Goal] = {}
         """The goals that were last followed."""
         self._check = GoalCheck(Verdict.UNCHECKED)
@@ -164,7 +164,7 @@ class GoalEditor:
             self.touch(time.monotonic())
 
     def on_reset_goal(self, act: Callable[[], None]) -> None:
-        """Call a function when the button that moves the goal to the robot is pressed."""
+        """Call a function if the button that moves the goal to the robot is pressed."""
         react(self._to_robot.on_click, self._defer, lambda _: act())
 
     def show_robot(self, robot: RobotDescription | None, reach: float) -> None:

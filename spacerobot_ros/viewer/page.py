@@ -603,7 +603,7 @@ class Page:
         self._drawn: Measured | None = None
         self._looked_back = False
         self._announced: tuple[Notice, float] | None = None
-        """The line in the head, and the wall time until which it is shown, s."""
+        """The line at the top, and the wall time until which it is shown, s."""
         self._build()
 
     def _build(self) -> None:
@@ -742,7 +742,7 @@ class Page:
             self._around.show_backdrop(str(self._setting.value))
 
     def end(self) -> None:
-        """Say that the viewer has ended, in browsers that go on showing the page."""
+        """Report that the viewer has ended, in browsers that still show the page."""
         text = "The viewer has ended. This page shows its last state, and steers nothing any more."
         self._status.content = content.line_html(text, 2)
         self._bar.visible = False

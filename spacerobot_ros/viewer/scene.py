@@ -124,7 +124,7 @@ class RobotDrawing:
         return paths
 
     def show_collision_shapes(self, *, visible: bool) -> None:
-        """Show or hide the shapes by which distances between links are measured."""
+        """Show or hide the shapes used to measure distances between links."""
         scene, paths = self._scene, self._paths
         self._show("collision", visible, lambda: [
             _draw_solid(scene, f"{paths[visual.link]}/collision{number}", visual, _COLLISION)
@@ -364,7 +364,7 @@ class Surroundings:
         return [stars, sun, light, fill]
 
     def show_backdrop(self, setting: str) -> None:
-        """Show the sky, lit by the Sun alone, or the grid."""
+        """Show the sky, lit only by the Sun, or the grid."""
         indoors = setting == "Grid"
         self._scene.configure_default_lights(enabled=indoors)
         self._scene.configure_environment_map("city" if indoors else None)

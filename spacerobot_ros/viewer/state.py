@@ -57,8 +57,7 @@ class Momenta:
     actual
         (6,) summed over the bodies.
     expected
-        (6,) the momenta that follow from thrust and other forces from outside; None: they are
-        constant.
+        (6,) momenta expected from thrust and other external forces; None: they are constant.
     """
 
     actual: Array
@@ -93,7 +92,7 @@ def goals_to_text(goal: Goal, of_controller: Goal | None = None) -> str:
 
 
 def goals_from_text(text: str) -> dict[Part, Goal]:
-    """Return the goals by part of a text of :func:`goals_to_text`; none of an empty text."""
+    """Return the goals by part from a text of :func:`goals_to_text`; empty for an empty text."""
     return {part: decode_goal(entry) for part, entry in json.loads(text or "{}").items()}
 
 

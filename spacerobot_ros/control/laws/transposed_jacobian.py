@@ -57,7 +57,7 @@ class TransposedJacobianLaw(ControlLaw):
 
     @override
     def inputs(self) -> Mapping[str, npt.ArrayLike]:
-        """Return arguments of the law's own; see :meth:`ControlLaw.inputs`."""
+        """Return the law's additional arguments; see :meth:`ControlLaw.inputs`."""
         return {"joint_damping": self.joint_damping}
 
     @override

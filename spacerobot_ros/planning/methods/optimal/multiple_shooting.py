@@ -192,8 +192,8 @@ class MultipleShooting:
     ) -> Trajectory | None:
         """Return the fastest trajectory near ``guess``; None if none.
 
-        In a fixed time it is the one of least effort: of the least mean square of the
-        accelerations, over the joints' speeds.
+        For a fixed time it is the one of least effort: of the least mean square of the
+        accelerations, divided by the joints' speeds.
 
         Parameters
         ----------

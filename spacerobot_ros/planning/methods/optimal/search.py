@@ -161,7 +161,7 @@ as a multiple of their penetration depth."""
 
 _MAX_WORK_PER_ITERATION, _WORK_FACTOR_WITHOUT_PATH = 8e4, 3.0
 """Largest work on clear paths, in nonzeros of Jacobians over all steps of the solver, for each step
-that ``optimal.iterations`` allows from one guess, and its factor where there is no clear path yet:
+that ``optimal.iterations`` allows from one guess, and its factor if there is no clear path yet:
 12 and 36 s of an idle core (0.5 us a nonzero). With 1.25e5 two arms took 40 s for the same plan."""
 
 _MIN_SHORTENING_ROUNDS = 3

@@ -32,7 +32,7 @@ from spacerobot_ros.planning.methods.thrust.solver import ThrustKnots
 from spacerobot_ros.planning.methods.thrust.transcription import INSTANTS, KeptPlaces, pair_block
 
 _NO_DISTANCE = 1e3
-"""m; rows of a plane that is as far away hold always."""
+"""m; rows of a plane this far away are always satisfied."""
 
 
 class _Samples(NamedTuple):
@@ -134,7 +134,7 @@ class Bodies:
         return np.array([solids[i].body == hand for i, _ in around.geometry.pairs], dtype=bool)
 
     def require_end(self, shape: Array, pose: Array) -> None:
-        """Refuse a goal, a shape (n,) and a pose (7,) of the base, where links are too near."""
+        """Refuse a goal, a shape (n,) and a pose (7,) of the base, at which links are too near."""
         for each, required in zip(self._around, self._by_surroundings(), strict=True):
             each.clearance.require_shape(shape, required, _poses(pose))
 
@@ -149,7 +149,7 @@ class Bodies:
     # -- rows of the program ------------------------------------------------------------------
 
     def row_key(self, number: int) -> tuple[int, int]:
-        """Return what the rows of a pair depend on: both solids, or that before any obstacle."""
+        """Return what the rows of a pair depend on: both solids, or the first and any obstacle."""
         around, pair = self._pair(number)
         first, second = around.geometry.pairs[pair].tolist()
         return first, -1 if around.geometry.with_obstacles[pair] else second

@@ -50,7 +50,7 @@ class Grapple:
     horizon
         Time within which it is met, s.
     detumbles
-        Whether robot and target together have no angular momentum then, or the least possible.
+        Whether the total angular momentum of robot and target at the grasp must be zero or minimal.
     standoff
         (3,) a position in the grapple frame from which the end-effector would come straight, m.
     """
@@ -82,7 +82,7 @@ class ThrustGoal:
     ``base`` and ``end_effector`` are poses (7,), position and quaternion in W, or None;
     ``shape`` are joint positions (n,), NaN for joints that are free, None for all free;
     ``keeps_shape``: joints that are not free keep the positions of the start all the way;
-    ``grapple`` is a target in place of the others.
+    ``grapple`` is a target instead of the others.
     """
 
     base: Array | None = None

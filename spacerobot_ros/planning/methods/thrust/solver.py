@@ -121,7 +121,7 @@ class ThrustBoundary:
     state, shape, velocity
         ``[X; L; r; V]`` (13,), positions and velocities (n,) of the joints at the start.
     goals
-        Numbers of what is given at the end (:class:`.EndKind`).
+        Values that are given at the end (:class:`.EndKind`).
     shapes, final_shapes
         (2, n) least and largest joint positions on the way and at the end; infinite for joints that
         are free.
@@ -181,7 +181,7 @@ class ThrustSolver:
         self.stages, self.intervals = stages, intervals
         self.iterations, self.converged = 0, False
         self.lack = 0.0
-        """Distance by which pairs are nearer in the last solution than they ought to be, m."""
+        """Distance by which pairs are nearer in the last solution than required, m."""
         self._layout, self._program = thrust_program(stages, intervals, rows, places)
         program = self._program
         self._rows_of_pairs = sum(map(len, places))
@@ -224,7 +224,7 @@ class ThrustSolver:
         center
             Controls whose differences are squared; None: zero.
         rough
-            Whether another solve begins at the solution.
+            Whether another solve starts from the solution.
         corrected
             Whether the guess is a solution with other defects.
         """
