@@ -743,7 +743,7 @@ class Page:
 
     def end(self) -> None:
         """Report that the viewer has ended, in browsers that still show the page."""
-        text = "The viewer has ended. This page shows its last state, and steers nothing any more."
+        text = "The viewer has ended. This page shows its last state and cannot steer the robot."
         self._status.content = content.line_html(text, 2)
         self._bar.visible = False
         self._server.flush()

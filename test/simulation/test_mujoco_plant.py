@@ -201,7 +201,7 @@ def test_a_grasp_is_a_weld_and_a_release_ends_it() -> None:
     assert held.payload is None
     assert held.present_robot is ours.robot
     assert relative_change(total_momentum(ours), momentum) < 1e-6
-    with pytest.raises(CommandError, match="holds nothing"):
+    with pytest.raises(CommandError, match="holds no target"):
         held.release()
     ours.plant.reset()
     np.testing.assert_allclose(total_momentum(ours), before, rtol=1e-12)

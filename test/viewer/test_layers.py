@@ -373,7 +373,7 @@ def test_nothing_has_ended_where_nothing_has_begun() -> None:
 def test_a_viewer_that_ends_says_so_on_its_page(server: Server, page: Page) -> None:
     page.update(FLYING, 1.0)
     page.end()
-    status = next(each for each in server.gui.elements if "can no longer steer" in str(each.shown))
+    status = next(each for each in server.gui.elements if "cannot steer" in str(each.shown))
     assert "The viewer has ended." in status.content
     assert "It flies." not in status.content
     assert server.flushed
