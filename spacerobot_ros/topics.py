@@ -24,7 +24,7 @@ class StateField:
     Attributes
     ----------
     path
-        Path in the message: a part with numbers in it, or an array.
+        Path in the message: a number, a part that has numbers, or an array.
     quantity
         Name of the numbers in :attr:`~spacerobot_ros.simulation.sensors.ReportedState.
         quantities`.

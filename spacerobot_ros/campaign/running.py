@@ -250,8 +250,8 @@ def rerun_flight(folder: Path, number: int, bag: Path) -> Rerun:
     note = ""
     if campaign.scenario.plant.thrusters and flight.inertial is not None:
         note = (
-            "The masses are drawn: the plants of the campaign and of this flight differ in "
-            "rounding, which on/off thrusters amplify."
+            "The masses are random, so the plants of the campaign and of this flight round "
+            "differently, and on/off thrusters amplify the difference."
         )
     return Rerun(row, deviation, at, outcome, bag, note)
 

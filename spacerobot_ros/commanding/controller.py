@@ -40,7 +40,8 @@ TARGET_ODOMETRY = "target/odom"
 """Topic of the measured motion of the target."""
 
 _LONGEST_CHECK_PERIOD = 0.2
-"""Longest wall time counted between two checks of waiting states, s; this process may sleep."""
+"""Longest wall time that counts between two checks of waiting states, s: after a longer gap this
+process was suspended."""
 
 
 class ControllerCommander(Commander):

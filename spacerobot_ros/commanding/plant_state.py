@@ -152,7 +152,7 @@ class StampFilter:
         return False
 
     def accepted_jump(self) -> tuple[Stamped | None, Stamped] | None:
-        """Return set-aside odom (or None) and joints once their time is accepted.
+        """Return the deferred odom (or None) and joints once their time is accepted.
 
         Call this several times per second; None: no jump is accepted.
         """

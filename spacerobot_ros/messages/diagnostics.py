@@ -245,7 +245,7 @@ class PlantDiagnostics:
         self._unmet_reported = thrusters.unmet_ticks
         sentences = [f"they cannot produce {thrusters.missing}"] if thrusters.missing else []
         if unmet:
-            sentences.append("the requested wrench is beyond them")
+            sentences.append("the requested wrench exceeds their thrust")
         force, torque = np.linalg.norm(thrusters.unmet[:3]), np.linalg.norm(thrusters.unmet[3:])
         return self._record(
             "thrusters",

@@ -56,7 +56,7 @@ _ACHIEVED_TOLERANCE = 1e-9
 """Largest relative error of a wrench that counts as achieved."""
 
 _WRENCH_WEIGHT = 1e4
-"""Weight of the achieved part of a wrench beyond the thrust, relative to its cost."""
+"""Weight of the achieved part of a wrench that exceeds the thrust, relative to the cost."""
 
 _ROUNDING = 1e-9
 """Parts of a time below this share of it count as zero."""
@@ -260,8 +260,8 @@ def _pose_of_link(link: str, robot: RobotDescription, where: str) -> Pose:
     body, pose = robot.frames[link]
     if body:
         raise ParameterError(
-            f"The {where} is on link '{link}', which joints move; thrusters must be fixed to "
-            f"the base '{robot.base_link}'."
+            f"The {where} is on link '{link}', which moves with the joints; thrusters must be "
+            f"fixed to the base '{robot.base_link}'."
         )
     return pose
 

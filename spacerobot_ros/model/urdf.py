@@ -272,8 +272,8 @@ def parse_world(text: str) -> RobotDescription:
     if world.moving_joints:
         joint = world.moving_joints[0]
         raise RobotDescriptionError(
-            f"Obstacles are fixed in the world, and joint '{joint.name}' is {joint.kind.value}: "
-            'give it type="fixed".'
+            f"Obstacles must be fixed in the world, but joint '{joint.name}' is "
+            f'{joint.kind.value}: give it type="fixed".'
         )
     if not any(link.collisions or link.shapes for link in world.links):
         raise RobotDescriptionError(

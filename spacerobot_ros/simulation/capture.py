@@ -280,7 +280,7 @@ class ReleaseReport:
 
 
 def capture_values(about: Mapping[str, str]) -> dict[str, Any]:
-    """Return :meth:`CaptureReport.to_values` from the data of its event; empty: of another event.
+    """Return the values of :meth:`CaptureReport.to_values` from its event; empty for other events.
 
     Numbers are restored exactly.
     """

@@ -31,7 +31,7 @@ NO_STAMP = -math.inf
 
 
 _START_TIME = 1.0
-"""Time after the start in which a zero stamp means the first state, if there is no timeout, s."""
+"""Time after the start in which a zero stamp means the first state, without a timeout, s."""
 
 _STAMP_ROUNDING = 1_000
 """Allowed rounding error of stamps, from commanders with floating-point time, ns."""

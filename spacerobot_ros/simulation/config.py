@@ -147,7 +147,7 @@ class CaptureConfig:
     speed: float = nonnegative(
         0.1, "largest speed of the grapple frame relative to the link", "m/s"
     )
-    rate: float = nonnegative(0.1, "largest rate of rotation of one relative to the other", "rad/s")
+    rate: float = nonnegative(0.1, "largest relative angular rate of the two frames", "rad/s")
     joint_impulse_limit: float = nonnegative(
         0.0,
         "joint impulse of the capture beyond which its event is a warning; 0: none",

@@ -179,7 +179,9 @@ def planned_goal(goals: Mapping[Part, Goal]) -> Goal:
     """
     planned = [g for part, g in goals.items() if part == BASE_GOAL_KEY or g.end_effectors]
     if not planned:
-        raise GoalError("The goal is only for the end-effector of a controller.")
+        raise GoalError(
+            "The goal is for a controller's end-effector only: there is nothing to plan."
+        )
     return reduce(Goal.joined_with, planned)
 
 

@@ -253,7 +253,7 @@ def test_defaults_are_what_a_thruster_does_not_say(tmp_path: Path) -> None:
         ({"direction": [0, 0, 0]}, "The direction of thruster 'a' is zero"),
         ({"position": [1, 2]}, "must be three finite numbers"),
         ({"link": "wing"}, "The link of thruster 'a' is 'wing', but there is no such link."),
-        ({"link": "arm"}, "on link 'arm', which joints move"),
+        ({"link": "arm"}, "on link 'arm', which moves with the joints"),
         ({"name": ""}, "The name of a thruster is missing."),
         ({"colour": "red"}, "The thruster 'a' has 'colour'; known keys"),
     ],

@@ -281,7 +281,7 @@ def test_what_thrusters_could_not_give_is_a_warning_once(monkeypatch: pytest.Mon
     for _ in range(3):
         diagnosed.plant.step(none, np.array([1e3, 0.0, 0.0, 0.0, 0.0, 1e2]))
     level, message, values = diagnosed.status("thrusters")
-    assert (level, message) == (WARN, "the requested wrench is beyond them")
+    assert (level, message) == (WARN, "the requested wrench exceeds their thrust")
     assert float(values["propellant_kg"]) == pytest.approx(thrusters.propellant) != 0.0
     counts = [int(values[f"pulses.{name}"]) for name in thrusters.table.names]
     assert max(counts) > 1

@@ -177,7 +177,7 @@ def test_goals_by_part_are_one_goal_of_a_planner() -> None:
     both = planned_goal({"base": base, "end_effector": tool, **hands})
     assert both.equals(replace(base, end_effectors=(place, pose)))
     assert planned_goal({"base": base, "end_effector": tool}).equals(base)
-    with pytest.raises(GoalError, match="only for the end-effector of a controller"):
+    with pytest.raises(GoalError, match="for a controller's end-effector only"):
         planned_goal({"end_effector": tool})
 
 

@@ -426,7 +426,7 @@ class ControlLaw(ABC):
         self.couples = any(coupling.any() for coupling in couplings)
         """Whether a gain matrix has off-diagonal elements."""
         if self.couples and not self.takes_matrices:
-            raise ParameterError(f"The law '{self.name}' takes no matrices of gains.")
+            raise ParameterError(f"The law '{self.name}' does not accept gain matrices.")
         self._couplings = couplings
         self._in["kp"][:], self._in["kd"][:] = self.gain_arguments(gains)
         self._integral[self._ki == 0.0] = 0.0

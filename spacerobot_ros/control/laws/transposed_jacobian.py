@@ -20,7 +20,7 @@ class TransposedJacobianOptions(LawOptions):
 
     joint_damping: float = nonnegative(
         0.0,
-        "viscous friction by joint efforts; damps motion that moves no output",
+        "viscous friction applied by joint efforts; damps motion that affects no output",
         "N m s/rad",
         maximum=1000000000.0,
     )

@@ -38,7 +38,7 @@ class SearchProgress:
     ----------
     starts, max_starts
         Number of initial guesses tried so far, and the largest number: a search ends sooner if
-        enough solutions agree.
+        enough solutions agree. 0 and 0: the search does not count them.
     best_s
         Duration of the best manoeuvre so far, s; infinite before the first.
     phase
@@ -58,7 +58,8 @@ class SearchProgress:
         """The progress as a message, without a full stop."""
         best = f"best {self.best_s:.4g} s" if math.isfinite(self.best_s) else "none found yet"
         starts = f"start {self.starts} of at most {self.max_starts}, "
-        return f"{self.phase.value}, {starts * (self.phase is SearchPhase.SEARCHING)}{best}"
+        counted = self.phase is SearchPhase.SEARCHING and self.max_starts > 0
+        return f"{self.phase.value}, {starts * counted}{best}"
 
 
 def log_progress(logger: logging.Logger, progress: SearchProgress, line: str) -> None:

@@ -130,8 +130,8 @@ def straight_motion(
     Every leg is a straight line of the shape, from rest to rest (paper 3, section III): under
     ``u = (2 pi D / T^2) sin(2 pi t / T)``, eqs (12) to (18), a leg D is travelled as
     ``D (t/T - sin(2 pi t/T) / (2 pi))``, whose peak speed is twice the mean. The ends are shapes
-    (n,) with the durations of the legs to them, s. A leg takes a whole number of ticks, longer if a
-    joint is slow, and no time if nothing moves.
+    (n,) with the durations of the legs to them, s. A leg takes a whole number of ticks, more if a
+    joint is slow, none if nothing moves.
 
     Raises
     ------

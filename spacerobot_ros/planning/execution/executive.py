@@ -453,7 +453,9 @@ class Executive:
         config
             Configuration with the present rate of the plant; None: as it was.
         """
-        what = "The robot has another mass" if config is None else "The plant has another rate"
+        what = (
+            "The robot has a different mass" if config is None else "The plant has a different rate"
+        )
         self._plan_again(f"{what} now: the motion is planned again.")
         self._worker.close()
         self._robot, self._worker = robot, worker

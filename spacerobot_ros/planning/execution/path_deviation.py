@@ -54,7 +54,7 @@ cause, such as a jump of the measurements."""
 _NEAR_SHARES, _AIM_SHARES = (0.6, 0.8), (0.4, 0.6)
 """Two shares of the tolerances each, for early and late in a motion: the remaining motion is
 planned again if its expected error exceeds the first, and the new plan may end within the second.
-Rotations of the base that are left until late take long."""
+Base rotations that are left until late in a motion take a long time."""
 
 
 @dataclass(frozen=True)

@@ -138,8 +138,8 @@ class NominalShapeChooser:
         self._repeating = turning & np.isinf(robot.lower) & np.isinf(robot.upper)
 
     def prepare(self) -> None:
-        """Choose the nominal shape beforehand if it does not depend on the present shape: for
-        robots with three joints."""
+        """Choose the nominal shape of a robot with three joints, which does not depend on the
+        present shape."""
         if self._robot.n == 3:
             with suppress(PlanningError):
                 self._only_choice = self._choose_nominal(np.zeros(3))

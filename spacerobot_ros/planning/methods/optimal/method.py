@@ -71,7 +71,7 @@ from spacerobot_ros.version import __version__
 _MAX_CORRECTION_INTERVALS = 40
 
 _MAX_STARTS_IN_MOTION = 12
-"""Largest number of guesses for a manoeuvre from moving joints: the robot flies on meanwhile."""
+"""Largest number of guesses for a manoeuvre from moving joints, which do not stop meanwhile."""
 
 _ZERO_ERROR = 1e-10
 """Largest error that counts as zero: the robot is at the goal; rad, m and joint coordinates."""
@@ -92,7 +92,7 @@ _STARTS_AFTER_COASTING = 3
 """Guesses without a solution after which the next pass of the goal is tried."""
 
 _MAX_ANGLE_WITHOUT_COASTING = math.radians(40.0)
-"""Angle by which the base rotates in the longest manoeuvre that begins at once."""
+"""Largest angle by which the drifting base may rotate during a manoeuvre that begins at once."""
 
 _COASTING_ANGLE = math.radians(5.0)
 """Angle between attitudes at which to check whether the base passes the goal."""

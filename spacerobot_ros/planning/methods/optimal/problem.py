@@ -134,7 +134,7 @@ class OptimalOptions(MotionOptions):
     starts: int = parameter(24, "largest number of guesses", minimum=1, maximum=10000)
     answers: int = parameter(
         16,
-        "solutions to find, unless starts agree before; several are computed on a coarse grid, "
+        "solutions to find, unless enough starts agree; several are computed on a coarse grid, "
         "and the best is refined",
         minimum=1,
         maximum=10000,

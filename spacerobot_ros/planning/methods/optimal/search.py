@@ -88,7 +88,7 @@ _BUDGET_FACTOR_WITHOUT_SOLUTION = 5.0
 """As ``optimal.time_budget`` is documented."""
 
 _COARSE_GRID_RATIO, _COARSE_GRID_RATIO_IN_MOTION = 5, 4
-"""Ratio of the full grid to the coarse one: in motion, what remains may be planned on it alone."""
+"""Ratio of the full grid to the coarse one: in motion, a plan may stay on the coarse grid."""
 
 _MIN_COARSE_INTERVALS, _MIN_COARSE_INTERVALS_IN_MOTION = 8, 10
 """Smallest number of intervals of a coarse grid; with fewer there is none."""
@@ -97,7 +97,7 @@ _COARSE_TOLERANCE = 1e-4
 """Tolerance on a coarse grid from rest, whose solutions differ more from later ones."""
 
 _MAX_REFINED_SOLUTIONS, _MAX_REFINED_SOLUTIONS_IN_MOTION = 2, 1
-"""Largest number of solutions that are refined: in motion, the robot flies on meanwhile."""
+"""Largest number of solutions that are refined: few in motion, because the robot keeps moving."""
 
 _MAX_REFINED_COST_RATIO = 1.1
 """Largest ratio of the cost of a coarse solution to the best one at which it is refined, too: the
@@ -342,7 +342,7 @@ class _SearchState:
     clock: SearchClock
     coarse: _Grid
     full: _Grid
-    phase: SearchPhase = SearchPhase.SEARCHING
+    phase: SearchPhase | None = None
     starts: int = 0
     rejection: str = ""
     best: float = math.inf
@@ -375,14 +375,21 @@ class _SearchState:
         if elapsed >= self._reported + _REPORT_PERIOD:
             self.report("going on")
 
+    def begin(self, phase: SearchPhase) -> None:
+        """Begin a phase, and report it."""
+        if phase is not self.phase:
+            self.phase = phase
+            self.report("begun")
+
     def report(self, result: str, duration: float = math.inf) -> None:
         """Report a result; ``duration``, s, is that of a path which may be the best."""
         self.best = min(self.best, duration)
         self._reported = elapsed = self.clock.elapsed
         # Without a coarse solution, some guesses are tried on the full grid as well.
         most = max(self.problem.options.starts, self.starts)
-        progress = SearchProgress(self.starts, most, self.best, self.phase, elapsed)
-        log_progress(_LOG, progress, f"{self.phase.value}: {result} after {elapsed:.2f} s")
+        phase = self.phase or SearchPhase.SEARCHING
+        progress = SearchProgress(self.starts, most, self.best, phase, elapsed)
+        log_progress(_LOG, progress, f"{phase.value}: {result} after {elapsed:.2f} s")
 
     @contextmanager
     def attempt(self) -> Iterator[None]:
@@ -549,7 +556,7 @@ class ManoeuvreSearch:
         self, state: _SearchState, grid: MultipleShooting, guess: Trajectory, *, found: bool = False
     ) -> Trajectory | None:
         """Return the solution from the next guess; None: none was found."""
-        state.phase = SearchPhase.SEARCHING
+        state.begin(SearchPhase.SEARCHING)
         solution = self._solve_from_guess(state, grid, guess, found=found)
         state.starts += 1
         if solution is None:
@@ -615,7 +622,7 @@ class ManoeuvreSearch:
         """
         problem, in_motion = state.problem, state.problem.motion is not None
         most = _MAX_REFINED_SOLUTIONS_IN_MOTION if in_motion else _MAX_REFINED_SOLUTIONS
-        state.phase = SearchPhase.REFINING
+        state.begin(SearchPhase.REFINING)
         found: list[Manoeuvre] = []
         costs: list[float] = []
         solutions_agree = problem.solutions_agree(solutions)
@@ -862,7 +869,7 @@ class ManoeuvreSearch:
         Planes separate links along a path on which they do not touch. So if a path without contacts
         leads to one with some, the latter's pairs are kept apart near to the former.
         """
-        state.phase = SearchPhase.CLEARING
+        state.begin(SearchPhase.CLEARING)
         kept, limits, lacks = apart.kept, state.problem.limits, [math.inf, math.inf]
         near, made = kept.approaches_of(path), None
         is_free = not _touch(near)
@@ -898,7 +905,7 @@ class ManoeuvreSearch:
         self, state: _SearchState, apart: _Apart, path: Trajectory, made: Manoeuvre | None
     ) -> tuple[Trajectory, Manoeuvre | None]:
         """Return a faster path near to a clear one, and its held commands; else that one itself."""
-        state.phase = SearchPhase.SHORTENING
+        state.begin(SearchPhase.SHORTENING)
         reach, limits, begin = 1.0, state.problem.limits, path
         for number in range(_MAX_SHORTENING_ROUNDS):
             state.report("clear path", path.duration)

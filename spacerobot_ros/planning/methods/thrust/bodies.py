@@ -1,8 +1,8 @@
 """What may come too near in a motion under thrust: links, obstacles, and a tumbling target.
 
-Relative to a target, its body is an obstacle at rest. So the exact check is that of obstacles, with
-the base relative to the target; a plane between a link and the target is transformed to W by the
-pose of the target at that time.
+Relative to a target, its body is an obstacle at rest. So the exact check is the one for obstacles,
+with the pose of the base relative to the target; a plane between a link and the target is
+transformed to W by the pose of the target at that time.
 """
 
 from __future__ import annotations

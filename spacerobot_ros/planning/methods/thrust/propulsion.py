@@ -76,7 +76,7 @@ class Propulsion:
             if not (value > 0 and math.isfinite(value)):
                 raise ParameterError(
                     f"The {name} limit of the thrusters is {value:g}; a motion under thrust is "
-                    f"planned within a finite one: set max_{name}."
+                    f"planned within a finite limit: set max_{name}."
                 )
         limits = (1.0 - reserve) * np.repeat([force, torque], 3)
         return cls(np.diag(limits), limits, ((0, 1, 2), (3, 4, 5)))

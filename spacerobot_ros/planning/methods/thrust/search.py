@@ -10,6 +10,7 @@ from obstacles.
 from __future__ import annotations
 
 import itertools
+import logging
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -40,6 +41,7 @@ from spacerobot_ros.model.world import with_world
 from spacerobot_ros.parameters import parameter
 from spacerobot_ros.planning.core.cancellation import NEVER, Cancellation, PlanningCancelled
 from spacerobot_ros.planning.core.clearance import DEFAULT_CLEARANCE, Clearance
+from spacerobot_ros.planning.core.progress import SearchPhase, SearchProgress, log_progress
 from spacerobot_ros.planning.methods.optimal.end_effectors import reach_of_end_effector
 from spacerobot_ros.planning.methods.optimal.multiple_shooting import DurationBounds, StopRule
 from spacerobot_ros.planning.methods.optimal.problem import MotionLimits, MotionOptions
@@ -65,6 +67,8 @@ from spacerobot_ros.planning.methods.thrust.transcription import (
     KeptPlaces,
     ThrustStages,
 )
+
+_LOG = logging.getLogger(__name__)
 
 _REGULARISATION = 1e-3
 """Weight of the squares of levels, which makes solutions unique. 1e-2 costs 1 % of propellant, 1e-4
@@ -501,6 +505,7 @@ class _Search:
         self._is_timed = options.duration > 0 or options.time_factor > 1
         """Whether the duration is given, or follows from the shortest one."""
         self._meets_any_time = grapple is not None
+        self._phase: SearchPhase | None = None
         self._earliest = self._latest = 0.0
         """When a target is met, s."""
         self._effort_limit = (1.0 - options.reserve) * planner.robot.effort_limit
@@ -631,10 +636,14 @@ class _Search:
         planes: Array | None = None,
         center: ThrustKnots | None = None,
         *,
+        phase: SearchPhase = SearchPhase.REFINING,
         rough: bool = False,
         corrected: bool = False,
     ) -> ThrustKnots | None:
         self.stop.cancellation.raise_if_requested()
+        if phase is not self._phase:
+            self._phase, best = phase, self._earliest or math.inf
+            log_progress(_LOG, SearchProgress(0, 0, best, phase), f"{phase.value} a motion")
         boundary = replace(self.boundary, goals=self._goals(guess.duration))
         limits, args = self.planner.limits, (self.stop, duration, planes, center)
         return self._solver.solve(
@@ -646,7 +655,8 @@ class _Search:
         return self.planner.solver(self.kind, self.bodies, self._kept)
 
     def _fastest(self, guess: ThrustKnots) -> ThrustKnots | None:
-        return self._solve(guess, self._fast(guess), _FREE_TIME, rough=self._is_timed)
+        weights, phase = self._fast(guess), SearchPhase.SEARCHING
+        return self._solve(guess, weights, _FREE_TIME, phase=phase, rough=self._is_timed)
 
     def _fast(self, guess: ThrustKnots) -> Weights:
         """Return the weights of least time, in units of the guess."""
@@ -746,7 +756,7 @@ class _Search:
             planes = self._planes(at)
             weights = self._cheap(at, _ROUNDINGS[0]) if self._is_timed else self._fast(at)
             duration = self._span(at) if self._is_timed else _FREE_TIME
-            solved = self._solve(at, weights, duration, planes)
+            solved = self._solve(at, weights, duration, planes, phase=SearchPhase.CLEARING)
             if solved is None:
                 return None
             if self._solver.lack > _LARGEST_LACK:

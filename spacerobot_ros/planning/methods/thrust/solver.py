@@ -130,7 +130,7 @@ class ThrustBoundary:
         end, where the centre of mass rests: zero, except for wheels that keep spinning. None: the
         momenta are free, too.
     keeps_shape
-        Whether the joints that have a position at the end have it all the way.
+        Whether joints with a given final position hold it throughout the motion.
     """
 
     state: Array
