@@ -273,7 +273,7 @@ def test_a_search_reports_every_start_and_the_best_so_far() -> None:
             answers=3, agreeing=0, intervals=16, control_period=0.1, cache=0,
         )  # fmt: skip
     starts = [each.starts for each in seen]
-    assert starts[:3] == [1, 2, 3]
+    assert starts[:4] == [0, 1, 2, 3]
     assert starts == sorted(starts)
     assert all(each.max_starts >= each.starts for each in seen)
     best = [each.best_s for each in seen]
