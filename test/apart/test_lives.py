@@ -99,7 +99,7 @@ def test_a_node_that_is_killed_and_started_again_flies_on(
     else:
         apart.start("recorder")
     apart.fly(commander, NEW[commander])
-    assert apart.status("plant")["state"] == "running"
+    apart.wait_state("plant", "running")
     apart.end()
     assert not any("Traceback" in line for line in apart.complaints), apart.said
 
