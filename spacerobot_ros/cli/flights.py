@@ -235,7 +235,7 @@ def _end_effector_errors(summary: dict[str, Any], distance: float, angle: float 
 
 def _propellant_line(summary: dict[str, Any]) -> list[str]:
     used, planned = summary.get("propellant_kg"), summary.get("planned_propellant_kg")
-    beside = "" if planned is None else f" (planned {1e3 * planned:.1f} g)"
+    beside = "" if planned is None else f" (planned {max(0.0, 1e3 * planned):.1f} g)"
     return [] if used is None else [f"propellant  {1e3 * used:.1f} g{beside}"]
 
 

@@ -26,7 +26,7 @@ from support.odometry import pose_of, twist_of
 from support.oracles import PinocchioOracle
 from support.planner_flight import NEAR, Flight
 from support.plant_rig import SLIDERS, STATE, TICK, TICK_NS, Rig
-from support.ros_harness import Harness, nanoseconds
+from support.ros_harness import LATCHED, Harness, nanoseconds
 from visualization_msgs.msg import Marker, MarkerArray
 
 from spacerobot_ros.errors import CommandError, SpaceRobotError
@@ -276,6 +276,31 @@ def test_clearances_are_published_with_events_of_contacts(harness: Harness) -> N
     events = [{p.key: p.value for p in m.values} for m in rig.probe.messages["events"]]
     contacts = {e["event"]: float(e["time"]) for e in events if e["event"].startswith("contact")}
     assert contacts == pytest.approx({"contact": 2 * TICK, "contact_ended": 6 * TICK})
+
+
+CRATE = """<robot name="crate"><link name="world"/><link name="crate"><collision><geometry>
+  <box size="0.2 0.3 0.4"/></geometry></collision></link><joint name="held" type="fixed">
+  <parent link="world"/><child link="crate"/><origin xyz="0.1 0 0"/></joint></robot>"""
+
+
+def test_a_contact_ends_with_its_obstacle(harness: Harness) -> None:
+    """The robot has no pair of links that may touch: without the crate nothing is measured."""
+    parameters = {"clearance_period": 2 * TICK}
+    rig = Rig(harness, parameters, topics={"plant/status": DiagnosticStatus})
+    obstacles = rig.probe.create_publisher(String, "obstacles", LATCHED)
+    harness.connect()
+
+    def contacts() -> str:
+        last = rig.probe.messages["plant/status"][-1]
+        return next((pair.value for pair in last.values if pair.key == "contacts"), "")
+
+    obstacles.publish(String(data=CRATE))
+    harness.settle(rig.probe)
+    for _ in range(4):
+        rig.step([0.01, 0.02, -0.01])
+    harness.spin_until(lambda: "crate" in contacts(), "a contact")
+    obstacles.publish(String(data=""))
+    harness.spin_until(lambda: not contacts(), "its end")
 
 
 @pytest.mark.parametrize(

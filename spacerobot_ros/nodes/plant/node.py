@@ -580,6 +580,10 @@ class PlantNode(FlightNode):
                 self._clearance = ClearancePublisher.of(
                     self, self.plant, described, self._clearance
                 )
+            if self._clearance is None and self._monitor is not None and self._monitor.contacts:
+                # Nothing is left that could touch.
+                self._monitor.contacts = ()
+                self._publish_changed_status()
 
     def on_silence(self, silence: SilenceReport) -> None:
         """Bring all joints to rest if a commander is silent and the parameters request it."""

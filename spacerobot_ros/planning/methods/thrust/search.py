@@ -19,7 +19,7 @@ from functools import cached_property
 import numpy as np
 
 from spacerobot_ros.collision import Approach
-from spacerobot_ros.errors import PlanningError, Proof, UnreachableError
+from spacerobot_ros.errors import NotFoundError, PlanningError, Proof, UnreachableError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array, Pose, RobotDescription
 from spacerobot_ros.model.inverse_kinematics import (
@@ -370,10 +370,9 @@ class ThrustPlanner:
         if distance > REACHED_DISTANCE:
             found, distance, angle = arm.search_shape(q, poses[1])
             if not is_reached(distance, angle):
-                raise UnreachableError(
-                    f"The goal of '{self.link}' is out of reach from that of the base: "
-                    f"{distance:.3g} m and {angle:.3g} rad remain.",
-                    Proof.LIMITS,
+                raise NotFoundError(
+                    f"No joint positions were found that put '{self.link}' at its goal while the "
+                    f"base is at its own: {distance:.3g} m and {angle:.3g} rad remain.",
                 )
         return found
 
@@ -602,7 +601,7 @@ class _Search:
         if 0 < options.duration < fastest.duration:
             raise UnreachableError(
                 f"The motion takes {fastest.duration:.4g} s at least, and plan.duration is "
-                f"{options.duration:g} s.",
+                f"{options.duration:g} s: set it to more, or to 0.",
                 Proof.LIMITS,
             )
         time = options.duration or options.time_factor * fastest.duration
