@@ -11,7 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from support.thrust_flights import beyond, flown_by_pinocchio
 
-from spacerobot_ros.errors import ParameterError, PlanningError, UnreachableError
+from spacerobot_ros.errors import NotFoundError, ParameterError, PlanningError, UnreachableError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.thrusters import ThrusterTable, thrusters_of_urdf
 from spacerobot_ros.model.urdf import parse_world
@@ -199,7 +199,7 @@ def test_what_cannot_be_planned_is_refused_in_a_sentence() -> None:
     with pytest.raises(ParameterError, match="set max_force"):
         Propulsion.within(np.inf, 1.0)
     far = np.array([9.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
-    with pytest.raises(PlanningError, match="out of reach from that of the base"):
+    with pytest.raises(NotFoundError, match="No joint positions were found that put"):
         servicer().plan(ThrustStart.at_rest(START, FOLDED), ThrustGoal(START, far))
 
 
