@@ -365,7 +365,7 @@ def test_the_pages_open_without_a_complaint_and_need_nothing_else(tmp_path: Path
     share = sum(bowl(draw) <= 0.03 for draw in Draws(made))
     assert f"({share} of 120;" in lines[0]
     with browser(tmp_path / "profile") as window:
-        for each, tables, figures in ((page, 6, 3), (comparison, 1, 1)):
+        for each, tables, figures in ((page, 6, 4), (comparison, 1, 1)):
             for width in (1280, 390):
                 window.complaints.clear()
                 window.requests.clear()

@@ -51,8 +51,10 @@ def test_an_example_is_short_and_says_what_it_is(example: Path) -> None:
     some_fast(
         {each.stem: each for each in EXAMPLES},
         *(each.stem for each in EXAMPLES if not each.stem.startswith(LONG)),
-        # A busy machine does not keep the real time that hardware would have.
-        slow=[each.stem for each in EXAMPLES if each.stem != "fly_own_robot"],
+        # The one plans for minutes; for the other a busy machine does not keep real time.
+        slow=[
+            each.stem for each in EXAMPLES if each.stem not in ("compare_policy", "fly_own_robot")
+        ],
     ),
 )
 def test_an_example_runs(example: Path, tmp_path: Path, warm_python: WarmPython) -> None:

@@ -110,6 +110,8 @@ def flown(rate: float, draws: int, seed: int, profile: str, detumble: str) -> st
                     "plant.target.angular_velocity": omega.tolist(),
                     "coordinated_control.profile": profile,
                     "coordinated_control.plan.thrusters": "urdf",
+                    "coordinated_control.target.horizon": 60.0,
+                    "coordinated_control.plan.duration": 60.0,
                     "coordinated_control.target.detumble": detumble,
                     # Flights end soon after the grasp: the time for detumbling is over.
                     "coordinated_control.time_limit": 0.1,
