@@ -490,7 +490,12 @@ _LOG_PREFIX = re.compile(r"^\[(DEBUG|INFO|WARN|ERROR|FATAL)\] \[[\d.]+\] \[[^\]]
 """Level, time and name before a message in the log of a node."""
 
 
-_CRASH = "Fatal Python error: "
+_CRASH = re.compile(
+    r"^(?P<error>Fatal Python error: .*)$"
+    r"(?:.*?^Current thread [^\n]*\n  File \"(?P<frame>[^\n]*))?",
+    re.MULTILINE | re.DOTALL,
+)
+"""What Python writes of a crash, and the line that its thread was at."""
 
 
 def last_error(log: str) -> str:
@@ -513,9 +518,12 @@ def end_message(name: str, code: int, log: str) -> str:
     """Return a sentence about the end of a node: a signal and its crash, or exit code and error."""
     if code < 0:
         # Of a signal Python logs a crash alone: other errors in the log are not its cause.
-        crash = next((line for line in log.splitlines() if line.startswith(_CRASH)), "")
         how = f"Node '{name}' was ended by {signal.Signals(-code).name}"
-        return f"{how}: {crash}." if crash else f"{how}."
+        crash = _CRASH.search(log)
+        if crash is None:
+            return f"{how}."
+        where = f" at \"{crash['frame']}" if crash["frame"] else ""
+        return f"{how}: {crash['error']}{where}."
     return f"Node '{name}' has ended with exit code {code}: {last_error(log) or _NO_ERROR_TEXT}"
 
 
