@@ -115,6 +115,19 @@ def pytest_unconfigure() -> None:
     atexit.register(os.dup2, os.open(os.devnull, os.O_WRONLY), 2)
 
 
+@pytest.fixture(scope="session", autouse=True)
+def worker_domain() -> Iterator[None]:
+    """Keep what a worker's tests start without a domain apart from what other workers start."""
+    try:
+        from spacerobot_ros.nodes.common.process import free_domain
+    except ImportError:
+        yield
+        return
+    with free_domain() as domain, pytest.MonkeyPatch.context() as patch:
+        patch.setenv("ROS_DOMAIN_ID", str(domain))
+        yield
+
+
 @pytest.fixture
 def ros_domain() -> Iterator[int]:
     """Return the number of a ROS domain that is this test's own."""

@@ -37,6 +37,7 @@ from spacerobot_ros.nodes.common.messages import diagnostic_status
 from spacerobot_ros.nodes.common.node import STREAM
 from spacerobot_ros.nodes.common.process import FASTDDS_FILE_VARIABLES
 from spacerobot_ros.nodes.common.streams import MatchedEndpoints, topics_without_all_matches
+from spacerobot_ros.nodes.common.watchdog import HEARTBEAT_QOS, TOPIC, HeartbeatState
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.core.goal import POSE
 from spacerobot_ros.planning.execution.status import PlannerStatistics
@@ -130,7 +131,8 @@ class MultiProcessStack:
     ParameterError
         A parameter or the namespace is refused, or the scenario kills nodes in lockstep.
     SpaceRobotError
-        A node ended at its start; the message is the last error that it wrote.
+        A node ended at its start (the message is the last error that it wrote), or another stack
+        is active in this ROS domain and namespace.
     """
 
     def __init__(
@@ -181,6 +183,11 @@ class MultiProcessStack:
         if restarts:
             self._events = node.create_publisher(DiagnosticStatus, "events", STREAM)
         node.create_subscription(Clock, f"{self.namespace}/clock", self._on_clock, 10)
+        self._active_elsewhere = ""
+        """Name of a node that was active before this stack was."""
+        self._heartbeats = node.create_subscription(
+            DiagnosticStatus, TOPIC, self._on_heartbeat, HEARTBEAT_QOS
+        )
         self._change_state = {
             name: node.create_client(ChangeState, f"{name}/change_state") for name in self.names
         }
@@ -254,6 +261,7 @@ class MultiProcessStack:
 
     def start(self, goal: Goal | None) -> None:
         """Activate all nodes and send the goal, if there is one; the plant begins last."""
+        self.client.node.destroy_subscription(self._heartbeats)
         for name in reversed(self.names[1:]):
             self._change_states(Transition.TRANSITION_ACTIVATE, [name])
         if goal is not None:
@@ -329,8 +337,14 @@ class MultiProcessStack:
         Raises
         ------
         SpaceRobotError
-            A node has ended.
+            A node has ended, or another stack was active before this one.
         """
+        if self._active_elsewhere:
+            domain = os.environ.get("ROS_DOMAIN_ID") or "0"
+            raise SpaceRobotError(
+                f"Node '{self._active_elsewhere}' already runs in ROS domain {domain}: end its "
+                "stack, or set ROS_DOMAIN_ID to another number."
+            )
         for name, process in self.processes.items():
             if process.poll() is not None and name not in self._timeline.away:
                 raise SpaceRobotError(
@@ -380,6 +394,11 @@ class MultiProcessStack:
         # SIGABRT makes a hanging node print a traceback.
         waits = {0: _LONGEST_END, signal.SIGABRT: 1.0}
         return {name: end_child(self.processes[name], waits) for name in names}
+
+    def _on_heartbeat(self, message: DiagnosticStatus) -> None:
+        # Nodes of this stack send heartbeats once they are active, not before.
+        if message.message != HeartbeatState.INACTIVE.value:
+            self._active_elsewhere = message.name
 
     def _on_clock(self, message: Clock) -> None:
         self._time_ns = stamp_to_ns(message.clock)
@@ -490,12 +509,8 @@ _LOG_PREFIX = re.compile(r"^\[(DEBUG|INFO|WARN|ERROR|FATAL)\] \[[\d.]+\] \[[^\]]
 """Level, time and name before a message in the log of a node."""
 
 
-_CRASH = re.compile(
-    r"^(?P<error>Fatal Python error: .*)$"
-    r"(?:.*?^Current thread [^\n]*\n  File \"(?P<frame>[^\n]*))?",
-    re.MULTILINE | re.DOTALL,
-)
-"""What Python writes of a crash, and the line that its thread was at."""
+_CRASH = re.compile(r"^Fatal Python error: .*$", re.MULTILINE)
+_CRASHED_AT = re.compile(r"^Current thread .*\n  File (.*)$", re.MULTILINE)
 
 
 def last_error(log: str) -> str:
@@ -519,11 +534,10 @@ def end_message(name: str, code: int, log: str) -> str:
     if code < 0:
         # Of a signal Python logs a crash alone: other errors in the log are not its cause.
         how = f"Node '{name}' was ended by {signal.Signals(-code).name}"
-        crash = _CRASH.search(log)
+        crash, at = _CRASH.search(log), _CRASHED_AT.search(log)
         if crash is None:
             return f"{how}."
-        where = f" at \"{crash['frame']}" if crash["frame"] else ""
-        return f"{how}: {crash['error']}{where}."
+        return f"{how}: {crash[0]} at {at[1]}." if at else f"{how}: {crash[0]}."
     return f"Node '{name}' has ended with exit code {code}: {last_error(log) or _NO_ERROR_TEXT}"
 
 

@@ -149,9 +149,11 @@ def test_kills_come_in_their_order() -> None:
 def test_a_node_that_is_killed_has_no_cause_in_its_log_but_one_that_crashes_has() -> None:
     log = "[ERROR] [1.5] [plant]: Node '/coordinated_control' is silent\n"
     assert end_message("plant", -9, log) == "Node 'plant' was ended by SIGKILL."
-    crash = f"{log}Fatal Python error: Segmentation fault\n"
+    thread = 'Current thread 0x1 (most recent call first):\n  File "stops.py", line 7 in hold\n'
+    crash = f"{log}Fatal Python error: Segmentation fault\n\n{thread}"
     assert end_message("plant", -11, crash) == (
-        "Node 'plant' was ended by SIGSEGV: Fatal Python error: Segmentation fault."
+        "Node 'plant' was ended by SIGSEGV: Fatal Python error: Segmentation fault at "
+        '"stops.py", line 7 in hold.'
     )
     assert end_message("plant", 1, log).endswith("code 1: Node '/coordinated_control' is silent")
 

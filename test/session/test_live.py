@@ -18,12 +18,15 @@ from typing import Any
 import numpy as np
 import pytest
 import rclpy
+from diagnostic_msgs.msg import DiagnosticStatus
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from nav_msgs.msg import Odometry
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
+from support.nodes_apart import NodeProcess
+from support.ros_harness import Harness
 from support.warm_python import WarmProcess, WarmPython
 
 from spacerobot_ros.bag import iterate_raw, read_bag
@@ -220,6 +223,25 @@ def test_bad_words_are_refused(spacerobot: Command, words: tuple[str, ...], ment
     assert run.returncode == 2, run.stdout + run.stderr
     assert mention in run.stderr
     assert "Traceback" not in run.stderr
+
+
+def test_a_second_stack_in_a_domain_leaves_the_first_one_alone(
+    spacerobot: Command, harness: Harness, ros_domain: int, tmp_path: Path
+) -> None:
+    probe = harness.probe({"heartbeat": DiagnosticStatus})
+    plant = NodeProcess(tmp_path, ros_domain, "plant", {"robot": "sliding_masses"})
+    try:
+        harness.spin_until(lambda: probe.count("heartbeat") > 0)
+        run = spacerobot("run", "planar_chain", "--nodes")
+        assert run.returncode == 2
+        assert run.stderr.splitlines()[-1] == (
+            f"Node '/plant' already runs in ROS domain {ros_domain}: end its stack, or set "
+            "ROS_DOMAIN_ID to another number."
+        )
+        plant.signal(signal.SIGINT)
+        assert plant.end() == 0, plant.said
+    finally:
+        plant.kill()
 
 
 # -- stacks in namespaces ----------------------------------------------------------------------

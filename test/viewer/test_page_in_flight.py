@@ -130,7 +130,7 @@ def test_nodes_that_die_are_started_again_and_the_page_says_so(up: Up, tmp_path:
 
         # A crash has its cause on the terminal; a fourth death within a minute is the end.
         up.kill("planner", signal.SIGSEGV)
-        up.wait_for("'planner' was ended by SIGSEGV: Fatal Python error: Segmentation fault.")
+        up.wait_for("'planner' was ended by SIGSEGV: Fatal Python error: Segmentation fault")
         page.wait_for_text("was ended by SIGSEGV")
         page.wait_for_text("Waiting for a goal pose.", without="has been silent")
         up.kill_until("planner", "3 times within a minute, which is the limit (--restarts).")
