@@ -243,10 +243,22 @@ def _capture_line(summary: dict[str, Any]) -> list[str]:
     if "capture" not in summary:
         return []
     capture = summary["capture"]
-    done = f"at {capture['time_s']:.6g} s" if capture["captured"] else "the target is not captured"
-    if capture["captured"] and "planned_momentum_Nms" in capture:
-        done += f", planned to leave {capture['planned_momentum_Nms']:.3g} N m s"
-    return [f"capture     {done}"]
+    if capture["captured"]:
+        done = f"at {capture['time_s']:.6g} s"
+        if "planned_momentum_Nms" in capture:
+            done += f", planned to leave {capture['planned_momentum_Nms']:.3g} N m s"
+        return [f"capture     {done}"]
+    missed = "the target is not captured"
+    if "nearest_m" in capture:
+        nearest, limit = capture["nearest_m"], quantity(capture["distance_limit_m"], "m")
+        beyond = f"'capture.distance' is {limit}"
+        if nearest <= capture["distance_limit_m"]:
+            beyond = "its angle, speed or rate was beyond the limits of 'capture'"
+        missed += (
+            f": its grapple frame came within {quantity(nearest, 'm')} of the end-effector at "
+            f"{capture['nearest_time_s']:.6g} s, and {beyond}"
+        )
+    return [f"capture     {missed}"]
 
 
 def _clearance_line(summary: dict[str, Any]) -> list[str]:

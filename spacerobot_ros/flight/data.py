@@ -253,9 +253,11 @@ class FlightData:
     def capture(self) -> dict[str, Any]:
         """The first capture of the target, with the keys of ``spacerobot run --json``.
 
-        Without a capture, ``captured`` is false; empty if there is no target. After a planned
-        approach, ``detumble`` is the request, ``planned_momentum_Nms`` the plan and
-        ``angular_momentum_Nms`` the result.
+        Without a capture, ``captured`` is false, and ``nearest_m`` and ``nearest_time_s`` are the
+        smallest distance of the end-effector from the grapple frame, and its time; empty if there
+        is no target.
+        After a planned approach, ``detumble`` is the request, ``planned_momentum_Nms`` the plan
+        and ``angular_momentum_Nms`` the result.
         """
         planned: dict[str, Any] = {}
         for event in self.events:
@@ -265,7 +267,18 @@ class FlightData:
                 planned = {"detumble": about["detumble"], "planned_momentum_Nms": left}
             if event.kind is EventKind.CAPTURED:
                 return {"time_s": event.time_s, **capture_values(about), **planned}
-        return {} if self.target is None else {"captured": False}
+        if self.target is None:
+            return {}
+        time, distances = self._grapple_distances
+        if not len(time):
+            return {"captured": False}
+        nearest = int(distances.argmin())
+        return {
+            "captured": False,
+            "nearest_m": float(distances[nearest]),
+            "nearest_time_s": float(time[nearest]),
+            "distance_limit_m": self.scenario.plant.capture.distance,
+        }
 
     @cached_property
     def detumbling(self) -> dict[str, float]:
@@ -291,7 +304,7 @@ class FlightData:
             captured=float(capture["captured"]),
             placed=float(self.succeeded and self._holds_target),
             time=time,
-            distance=self._capture_distance(time),
+            distance=self._capture_distance(capture),
             impulse=float(np.linalg.norm(impulse[:3])),
             angular_impulse=float(np.linalg.norm(impulse[3:])),
             joint_impulse=float(joints.max()) if joints.size else math.nan,
@@ -305,23 +318,30 @@ class FlightData:
         last = [event.kind for event in self.events if event.kind in changes][-1:]
         return last == [EventKind.CAPTURED]
 
-    def _capture_distance(self, capture: float) -> float:
-        """Return the distance of the end-effector from the grapple frame at the time of a capture,
-        s; the smallest of the flight, where that is NaN. NaN where the flight does not have it.
+    @property
+    def _grapple_distances(self) -> tuple[Array, Array]:
+        """Times (N,), s, and distances (N,) of the end-effector from the grapple frame, m; empty if
+        the flight does not have them.
         """
         config = self.scenario.plant
         hand, body = self.signal("end_effector_pose"), self.signal("true_target_pose")
         body = body or self.signal("target_pose")
         of_link = config.capture.end_effector in ("", config.end_effector_frame)
-        if self.target is None or not of_link or not len(hand) or len(hand) != len(body):
-            return math.nan
+        if self.target is None or not of_link or len(hand) != len(body):
+            return np.zeros(0), np.zeros(0)
         grapple = self.target.frames[config.target.grapple_frame][1].r
         R_WT = matrices_from_quaternions(body.values[:, 3:])
         gaps = body.values[:, :3] + R_WT @ grapple - hand.values[:, :3]
-        distances = np.linalg.norm(gaps, axis=1)
-        if math.isnan(capture):
-            return float(distances.min())
-        return float(distances[int(np.searchsorted(hand.time, capture - 1e-9))])
+        return hand.time, np.linalg.norm(gaps, axis=1)
+
+    def _capture_distance(self, capture: dict[str, Any]) -> float:
+        """Return the distance at a capture, or the flight's smallest, m; NaN: unknown."""
+        if not capture["captured"]:
+            return float(capture.get("nearest_m", math.nan))
+        time, distances = self._grapple_distances
+        if not len(time):
+            return math.nan
+        return float(distances[int(np.searchsorted(time, capture["time_s"] - 1e-9))])
 
     @property
     def control_period(self) -> float:
@@ -628,7 +648,7 @@ class FlightData:
     @property
     def _automatic_capture_is_missing(self) -> bool:
         automatic = self.scenario.plant.capture.mode == "automatic"
-        return automatic and self.capture == {"captured": False}
+        return automatic and not self.capture.get("captured", True)
 
     @property
     def _last_error(self) -> PoseError | None:

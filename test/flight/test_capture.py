@@ -184,7 +184,10 @@ def test_mujoco_does_not_capture(bag: Path) -> None:
 def test_a_block_that_passes_is_missed() -> None:
     flight = fly_scenario(load_scenario("faults/missed_capture"))
     summary = flight.summary()
-    assert summary["capture"] == {"captured": False}
+    capture = summary["capture"]
+    assert (capture["captured"], capture["distance_limit_m"]) == (False, 0.02)
+    # As the file of the scenario says.
+    assert capture["nearest_m"] == pytest.approx(0.04, abs=1e-5)
     assert (summary["succeeded"], summary["succeeded_by_measurement"]) == (False, True)
     assert summary["verdict"].startswith("The goal is reached, but the target is not captured: ")
     assert EventKind.CAPTURED not in {each.kind for each in flight.events}
