@@ -749,7 +749,11 @@ class Page:
         self._server.flush()
 
     def show_thrusters(self, table: ThrusterTable | None) -> None:
-        """Set the thrusters, which become known later than the robot."""
+        """Set the thrusters, which become known later than the robot; cameras follow a robot that
+        has some, because it flies out of sight.
+        """
+        if table is not None and self._table is None:
+            self._follow.value = True
         self._table = table
 
     def show_tolerance(self, tolerance: Tolerance | None) -> None:

@@ -14,6 +14,7 @@ from spacerobot_ros.control.status import ControllerState, ControllerStatus
 from spacerobot_ros.model import load_robot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.kinematics import ForwardKinematics
+from spacerobot_ros.model.thrusters import find_thrusters
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.core.goal import EndEffectorGoal
 from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus
@@ -297,6 +298,26 @@ def test_cameras_follow_the_robot_if_asked(server: Server, page: Page) -> None:
     way = [1.0, -0.25, 0.25]
     np.testing.assert_allclose(server.camera.position, before[0] + way)
     np.testing.assert_allclose(server.camera.look_at, before[1] + way)
+
+
+def test_cameras_follow_a_robot_with_thrusters_until_a_user_says_otherwise(
+    server: Server, page: Page
+) -> None:
+    table = find_thrusters("urdf", load_robot(robot_file("jet_cube")))
+    page.show_thrusters(table)
+    page.update(FIRST, 1.0)
+    page.update(FIRST, 1.1)
+    before = np.array(server.camera.look_at)
+    page.update(LATER, 2.0)
+    assert LATER.measured is not None
+    assert FIRST.measured is not None
+    way = LATER.measured.pose[:3] - FIRST.measured.pose[:3]
+    assert np.linalg.norm(way) > 0.0
+    np.testing.assert_allclose(server.camera.look_at, before + way)
+    server.gui.named("Follow the robot").use(server, False)
+    page.show_thrusters(table)
+    page.update(FIRST, 3.0)
+    np.testing.assert_allclose(server.camera.look_at, before + way)
 
 
 @pytest.mark.parametrize(("aspect", "phone"), [(0.46, True), (0.8, False), (1.5, False)])
