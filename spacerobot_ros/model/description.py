@@ -253,7 +253,7 @@ class RobotDescription:
         for joint in self.moving_joints:
             if joint.mimic is not None and kind != "effort":
                 i = self.joint_names.index(joint.mimic.joint)
-                bound = _leading_limit(joint.limits, joint.mimic, kind)
+                bound = leading_limit(joint.limits, joint.mimic, kind)
                 values[i] = (max if kind == "lower" else min)(values[i], bound)
         return np.array(values, dtype=float)
 
@@ -320,7 +320,7 @@ class RobotDescription:
         return replace(self, links=links, joints=joints, bodies=tuple(bodies), frames=frames)
 
 
-def _leading_limit(limits: JointLimits, mimic: Mimic, kind: str) -> float:
+def leading_limit(limits: JointLimits, mimic: Mimic, kind: str) -> float:
     """Return the limit of a leading joint that follows from a limit of its mimic joint."""
     k = mimic.multiplier
     if kind == "velocity":

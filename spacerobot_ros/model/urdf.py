@@ -37,6 +37,7 @@ from spacerobot_ros.model.description import (
     RobotDescription,
     Shape,
     editable_root,
+    leading_limit,
     weld_links,
 )
 from spacerobot_ros.model.inertial_parameters import INERTIA_ENTRIES, TRIANGLE_SLACK
@@ -209,7 +210,6 @@ def parse_robot(text: str) -> RobotDescription:
                 [link for link in description.links if description.frames[link.name][0] == number]
             )
     _require_mass(description)
-    _require_common_range(description)
     require_reaction_wheels(description)
     return description
 
@@ -571,18 +571,28 @@ def _with_leaders(joints: list[Joint]) -> list[Joint]:
             found.append(joint.locked(offset))
         else:
             found.append(replace(joint, mimic=Mimic(leader.name, multiplier, offset)))
+    return _without_contradicting_limits(found)
+
+
+def _without_contradicting_limits(joints: list[Joint]) -> list[Joint]:
+    """Drop the position limits of a mimic joint that would leave the joint it follows no range."""
+    ranges = {each.name: (each.limits.lower, each.limits.upper) for each in joints}
+    found = []
+    for joint in joints:
+        if joint.mimic is not None:
+            leader, limits = joint.mimic.joint, joint.limits
+            lower = max(ranges[leader][0], leading_limit(limits, joint.mimic, "lower"))
+            upper = min(ranges[leader][1], leading_limit(limits, joint.mimic, "upper"))
+            if lower < upper:
+                ranges[leader] = lower, upper
+            else:
+                warn_once(
+                    f"The position limits of joint '{joint.name}' are ignored: they would leave "
+                    f"'{leader}', which it mimics, no range. Check multiplier, offset and limits."
+                )
+                joint = replace(joint, limits=replace(limits, lower=-np.inf, upper=np.inf))
+        found.append(joint)
     return found
-
-
-def _require_common_range(robot: RobotDescription) -> None:
-    """Refuse a joint whose limits have no common range with the limits of its mimic joints."""
-    lower, upper = robot.limits("lower"), robot.limits("upper")
-    for name, low, high in zip(robot.joint_names, lower, upper, strict=True):
-        if low >= high:
-            raise RobotDescriptionError(
-                f"The joint '{name}' and those that mimic it have no position in common: their "
-                f"limits leave it [{low:.4g}, {high:.4g}]. Check multiplier, offset and limits."
-            )
 
 
 _NO_LIMIT = 1e4

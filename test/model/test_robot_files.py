@@ -373,10 +373,6 @@ BROKEN = {
         more(TOOL, joint("wrist", "arm", "tool", '<mimic joint="elbow" multiplier="0"/>')),
         r"'wrist' mimics 'elbow' with the multiplier 0: it does not move; make it fixed",
     ),
-    "a follower without a range": (
-        more(TOOL, joint("wrist", "arm", "tool", '<mimic joint="elbow" offset="7"/>')),
-        r"'elbow' and those that mimic it have no position in common: .* Check multiplier, offset",
-    ),
     "a follower without a leader": (
         more(TOOL, joint("wrist", "arm", "tool", "<mimic/>")),
         r"<mimic> of joint 'wrist' has no 'joint'; write <mimic joint=.*the joint that it follows",
@@ -447,6 +443,22 @@ def test_limits_that_motions_do_not_keep_are_named_once(
         load_robot(file)
     (line,) = caplog.messages
     assert line.startswith("The limits of acceleration and jerk in the URDF of 'jerky' are ignored")
+
+
+def test_limits_of_a_follower_that_leave_its_leader_no_range_are_ignored(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    # Grippers whose fingers turn towards each other are often written with the limits of one.
+    follower = joint("wrist", "arm", "tool", '<mimic joint="elbow" multiplier="-1" offset="-7"/>')
+    robot = parse_robot(more(TOOL, follower))
+    alone = parse_robot(urdf())
+    assert robot.limits("lower") == alone.limits("lower")
+    assert robot.limits("upper") == alone.limits("upper")
+    (line,) = caplog.messages
+    assert line == (
+        "The position limits of joint 'wrist' are ignored: they would leave 'elbow', which it "
+        "mimics, no range. Check multiplier, offset and limits."
+    )
 
 
 def test_what_a_link_is_welded_to_makes_up_for_its_inertia(tmp_path: Path) -> None:
