@@ -122,7 +122,30 @@ def read(scenario: str) -> float:
     return of_process(run)
 
 
-_MEASUREMENTS = (tick, run, first_plan, next_plan, campaign, read)
+def steps(environments: str) -> float:
+    """Return the time of a step of one of N environments ("N NAME"), restarts among it."""
+    import gymnasium
+    import numpy as np
+
+    import spacerobot_ros.environments  # noqa: F401 - registers the environments
+
+    count, name = environments.split()
+    if environments not in _memory:
+        settings = {"autoreset_mode": "SameStep", "hold": 5, "time_limit": 5.0}
+        _memory[environments] = gymnasium.make_vec(f"spacerobot/{name}", int(count), **settings)
+        _memory[environments].reset(seed=1)
+    vector, rng, number = _memory[environments], np.random.default_rng(2), 40
+    shape = (number, *vector.action_space.shape)
+    actions = rng.uniform(-1.0, 1.0, shape)
+
+    def run() -> None:
+        for each in actions:
+            vector.step(each)
+
+    return of_process(run) / (number * int(count))
+
+
+_MEASUREMENTS = (tick, run, first_plan, next_plan, campaign, read, steps)
 
 if __name__ == "__main__":
     by_name = {each.__name__: each for each in _MEASUREMENTS}

@@ -56,6 +56,13 @@ def test_ten_thousand_flights_in_open_loop(measure: Measure) -> None:
     measure("campaign", rounds=3, flights=10_000)
 
 
+@pytest.mark.parametrize("count", [256, 4096])
+@pytest.mark.parametrize("name", ["ReorientArm-v0", "Reach-v0"])
+def test_step_of_many_environments(measure: Measure, name: str, count: int) -> None:
+    """A step of one of many robots with random actions, each held for five ticks."""
+    measure("steps", environments=f"{count} {name}")
+
+
 def test_reading_a_bag(measure: Measure) -> None:
     """All topics of a flight as arrays."""
     measure("read", scenario="coordinated_control")

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
+from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -207,6 +208,22 @@ class SensorErrors:
         return np.asarray(
             self.noise.any(axis=1) | self.pose_bias.any(axis=1) | self.joint_bias.any(axis=1)
         )
+
+
+R = TypeVar("R", InitialStates, SensorErrors, InertialParameters)
+
+
+def joined_rows(each: Sequence[R]) -> R:
+    """Return the rows of several as one."""
+    names = [part.name for part in fields(each[0])]
+    parts = (np.concatenate([getattr(one, name) for one in each]) for name in names)
+    return type(each[0])(*parts)
+
+
+def assign_rows(to: R, rows: Counts, values: R) -> None:
+    """Replace some rows, in place."""
+    for part in fields(to):
+        getattr(to, part.name)[rows] = getattr(values, part.name)
 
 
 @dataclass(frozen=True)

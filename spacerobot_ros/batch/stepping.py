@@ -8,13 +8,20 @@ without them, in one plant per flight.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import fields, replace
+from dataclasses import replace
 from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
 
-from spacerobot_ros.batch.flights import BatchResult, Counts, Flights, HeldCommands, InitialStates
+from spacerobot_ros.batch.flights import (
+    BatchResult,
+    Counts,
+    Flights,
+    HeldCommands,
+    InitialStates,
+    assign_rows,
+)
 from spacerobot_ros.batch.lanes import LaneBlock, starts_accepted_by_plant, symbolic_model_of
 from spacerobot_ros.batch.native import CompiledTick
 from spacerobot_ros.batch.scalar import plant_of, pose_of_link
@@ -112,14 +119,12 @@ class SteppedFlights:
         count = len(starts)
         if inertial is None:
             inertial = robot.inertial.scaled(np.ones((count, 1)))
-        # Rows are replaced at resets: the arrays are copies.
+        every = np.arange(count)  # Rows are replaced at resets: the arrays are copies.
         self._flights = Flights(
             *(robot, actuation, control_period, 1),
-            InitialStates(*(getattr(starts, each.name).copy() for each in fields(starts))),
+            starts[every],
             HeldCommands(np.zeros((1, robot.n))),
-            InertialParameters(
-                inertial.masses.copy(), inertial.centers.copy(), inertial.inertias.copy()
-            ),
+            inertial[every],
             integration_step=integration_step,
         )
         self.robot, self.control_period, self._link = robot, control_period, link
@@ -136,7 +141,7 @@ class SteppedFlights:
         width = 2 * robot.n + 20 + (LINK_POSE_SIZE if link else 0)
         self._reports = np.zeros((count, width))
         self._attach_reports()
-        self._begin(np.arange(count))
+        self._begin(every)
 
     def __len__(self) -> int:
         return len(self.ticks)
@@ -189,11 +194,9 @@ class SteppedFlights:
         assert of_others[1] is not None
         # Checked as rows of their own: a refusal changes no flight.
         self.require_startable(starts, of_others[1][chosen] if inertial is None else inertial)
-        for each in fields(starts):
-            getattr(of_others[0], each.name)[chosen] = getattr(starts, each.name)
+        assign_rows(of_others[0], chosen, starts)
         if inertial is not None:
-            for part in fields(inertial):
-                getattr(of_others[1], part.name)[chosen] = getattr(inertial, part.name)
+            assign_rows(of_others[1], chosen, inertial)
         self._begin(chosen)
 
     def require_startable(self, starts: InitialStates, inertial: InertialParameters) -> None:

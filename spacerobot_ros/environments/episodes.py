@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from spacerobot_ros.batch import InitialStates, SensorErrors, SteppedFlights
+from spacerobot_ros.batch.flights import Counts, assign_rows, joined_rows
 from spacerobot_ros.campaign.config import Campaign, load_campaign
 from spacerobot_ros.campaign.draws import Draws, drawn_flight
 from spacerobot_ros.campaign.targets import DrawnFlight, description_of
@@ -28,7 +29,7 @@ from spacerobot_ros.files import warn_once
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.inertial_parameters import InertialParameters
-from spacerobot_ros.parameters import as_numbers
+from spacerobot_ros.parameters import as_numbers, configured, nonnegative, parameter
 from spacerobot_ros.scenario import Scenario, scenario_or_robot
 from spacerobot_ros.simulation.config import OrbitConfig, PlantConfig, TableConfig
 from spacerobot_ros.simulation.faults import FAULT_KINDS
@@ -47,56 +48,31 @@ _CHANGEABLE = ("reward", "spread", "time_limit", "tolerance")
 _BEYOND_LANES = "faults", "plant.thrusters", "plant.disturbances", "plant.orbit.", "plant.table."
 """Prefixes of dispersions for which each robot needs its own plant."""
 
-Counts = npt.NDArray[np.int64]
-
 
 @dataclass(frozen=True)
 class EpisodeConfig:
     """The configuration of episodes: the keyword arguments of the environments.
 
-    Attributes
-    ----------
-    task
-        Name in :data:`.TASKS`, such as ``reorient`` (the joints rotate the base) or ``reach`` (a
-        link reaches a position), or a class derived from :class:`.Task`.
-    scenario
-        Name or file of a scenario, or of a robot; empty: the task's own.
-    campaign
-        File of a campaign, whose draws determine the starts, masses and goals; empty: none.
-    hold
-        Ticks of the plant per step, during which the action is held.
-    time_limit
-        Simulated time after which an episode is truncated, s.
-    tolerance
-        Error within which the goal is reached, rad or m; 0: the task's own.
-    goals
-        ``random``: around the start; ``scenario``: the goal of the scenario or of the draw; empty:
-        random without a campaign.
-    spread
-        Size of random goals, rad or m; 0: the task's own.
-    link
-        Link of the goal; empty: the scenario's link, else the robot's end-effector.
-    max_force, max_torque
-        Force (N) and torque (N m) on the base for an action of 1 under efforts; 0: the limits of
-        the scenario's controller; without them actions have no wrench.
-    action_scale
-        Command for an action of ones; empty: limits of joints, force and torque.
-    reward
-        Changed weights of :class:`.RewardWeights`.
+    ``reward`` has changed weights of :class:`.RewardWeights`.
     """
 
-    task: str | type[Task] = ""
-    scenario: str = ""
-    campaign: str = ""
-    hold: int = 1
-    time_limit: float = 60.0
-    tolerance: float = 0.0
-    goals: str = ""
-    spread: float = 0.0
-    link: str = ""
-    max_force: float = 0.0
-    max_torque: float = 0.0
-    action_scale: Sequence[float] = ()
+    task: str = parameter("", "name in TASKS, such as 'reorient', or a class derived from Task")
+    scenario: str = parameter("", "name or file of a scenario or robot; empty: the task's own")
+    campaign: str = parameter("", "file of a campaign, which draws starts, masses and goals")
+    hold: int = parameter(1, "during which an action is held", "ticks", minimum=1)
+    time_limit: float = parameter(60.0, "after which episodes are truncated", "s", minimum=1e-6)
+    tolerance: float = nonnegative(0.0, "error of reached goals; 0: the task's own", "rad or m")
+    goals: str = parameter(
+        "",
+        "random: around the start; scenario: that of the scenario or draw; empty: random without a "
+        "campaign",
+        choices=_GOALS,
+    )
+    spread: float = nonnegative(0.0, "size of random goals; 0: the task's own", "rad or m")
+    link: str = parameter("", "link of the goal; empty: the scenario's, else the end-effector")
+    max_force: float = nonnegative(0.0, "on the base for 1; 0: the controller's limit", "N")
+    max_torque: float = nonnegative(0.0, "on the base for 1; 0: the controller's limit", "N m")
+    action_scale: Sequence[float] = parameter((), "command for an action of ones; empty: limits")
     reward: Mapping[str, float] | None = None
 
     @classmethod
@@ -114,47 +90,19 @@ class EpisodeConfig:
                 raise ParameterError(
                     f"There is no argument '{name}' of environments; there are {', '.join(known)}."
                 )
-        return cls(**arguments)
+        values, reward = dict(arguments), arguments.get("reward")
+        for name, value in arguments.items():
+            if isinstance(value, PathLike):
+                values[name] = fspath(value)
+        if isinstance(task := arguments.get("task"), type):
+            values["task"] = TASKS.register(task).name
+        if not isinstance(reward, Mapping | None):
+            raise ParameterError(
+                f"Argument 'reward' is {reward!r}; it must be a dictionary of weights."
+            )
+        return replace(configured(cls, values), reward=reward)
 
     def __post_init__(self) -> None:
-        if isinstance(self.task, type):
-            object.__setattr__(self, "task", TASKS.register(self.task).name)
-        for name in ("task", "scenario", "campaign", "goals", "link"):
-            value = getattr(self, name)
-            if not isinstance(value, str | PathLike):
-                raise ParameterError(f"Argument '{name}' is {value!r}; it must be a text.")
-            object.__setattr__(self, name, fspath(value))
-        for name, choices in (("task", tuple(TASKS)), ("goals", ("", *_GOALS))):
-            value = getattr(self, name)
-            if value not in choices:
-                raise ParameterError(
-                    f"Argument '{name}' is '{value}'; it may be {', '.join(filter(None, choices))}."
-                )
-        if not isinstance(self.hold, int | np.integer) or self.hold < 1:
-            raise ParameterError(
-                f"Argument 'hold' is {self.hold!r}; it must be a whole number of ticks above 0."
-            )
-        for name in ("time_limit", "tolerance", "spread", "max_force", "max_torque"):
-            value = getattr(self, name)
-            if not (
-                isinstance(value, int | float | np.integer | np.floating)
-                and np.isfinite(value)
-                and value >= 0.0
-            ):
-                raise ParameterError(
-                    f"Argument '{name}' is {value!r}; it must be finite, at least 0."
-                )
-        if not isinstance(self.reward, Mapping | None):
-            raise ParameterError(
-                f"Argument 'reward' is {self.reward!r}; it must be a dictionary of weights."
-            )
-        if not self.time_limit:
-            raise ParameterError("Argument 'time_limit' is 0; it must be above 0 s.")
-        if self.link and not self.kind.has_link:
-            raise ParameterError(
-                f"Argument 'link' is '{self.link}', but task '{self.task}' has no link: "
-                "leave it out, or use spacerobot/Reach-v0."
-            )
         if self.scenario and self.campaign:
             raise ParameterError(
                 "Arguments 'scenario' and 'campaign' are both given: a campaign names its scenario."
@@ -162,18 +110,26 @@ class EpisodeConfig:
 
     @property
     def kind(self) -> type[Task]:
-        """Class of the task."""
-        assert isinstance(self.task, str)
-        return TASKS[self.task]
+        """Class of the task; ParameterError if there is none or it has no link for ``link``."""
+        if self.task not in TASKS:
+            raise ParameterError(f"Argument 'task' is '{self.task}'; it may be {', '.join(TASKS)}.")
+        kind = TASKS[self.task]
+        if self.link and not kind.has_link:
+            raise ParameterError(
+                f"Argument 'link' is '{self.link}', but task '{self.task}' has no link: "
+                "leave it out, or use spacerobot/Reach-v0."
+            )
+        return kind
 
 
 @dataclass(frozen=True)
 class _Start:
-    """Start of an episode: its initial state, also as a row, masses, and its scenario."""
+    """Start of an episode; ``states`` and ``sensors`` are rows of one flight."""
 
     initial: InitialState
-    starts: InitialStates
-    inertial: InertialParameters | None
+    states: InitialStates
+    sensors: SensorErrors
+    inertial: InertialParameters
     scenario: Scenario
 
     @classmethod
@@ -181,7 +137,9 @@ class _Start:
         cls, robot: SpaceRobot, scenario: Scenario, inertial: InertialParameters | None = None
     ) -> _Start:
         initial = InitialState.of(scenario.plant)
-        return cls(initial, InitialStates.of(robot, [initial]), inertial, scenario)
+        states = InitialStates.of(robot, [initial])
+        sensors = SensorErrors.of(robot, [scenario.plant.sensors])
+        return cls(initial, states, sensors, inertial or robot.inertial, scenario)
 
 
 class EpisodeStarts:
@@ -196,14 +154,14 @@ class EpisodeStarts:
     """
 
     def __init__(self, config: EpisodeConfig) -> None:
-        self._campaign: Campaign | None = None
+        kind, self._campaign = config.kind, None
         if config.campaign:
             self._campaign = load_campaign(Path(config.campaign))
             self.scenario = self._campaign.scenario
             draws = Draws(self._campaign)
             self._draws = [draws[number] for number in range(min(len(draws), _MAX_DRAWS))]
         else:
-            self.scenario = scenario_or_robot(config.scenario or config.kind.scenario)
+            self.scenario = scenario_or_robot(config.scenario or kind.scenario)
         self.robot = SpaceRobot(description_of(self.scenario))
         _require_steppable(self.scenario)
         plant, dispersed = self.scenario.plant, self._campaign.names if self._campaign else ()
@@ -213,15 +171,17 @@ class EpisodeStarts:
             or any(name.startswith(_BEYOND_LANES) for name in dispersed)
         )
         """Whether each robot needs its own plant, for features that lanes lack."""
-        self.has_sensor_errors = bool(
-            SensorErrors.of(self.robot, [plant.sensors]).is_active[0]
-        ) or any(name.startswith("plant.sensors.") for name in dispersed)
         self.nominal = _Start.of(self.robot, self.scenario)
+        self.has_sensor_errors = bool(self.nominal.sensors.is_active[0]) or any(
+            name.startswith("plant.sensors.") for name in dispersed
+        )
         self._made: dict[int, _Start | str] = {}
         """Starts of the draws by number; texts are the reasons for refusals."""
 
-    def draw(self, rng: np.random.Generator, flights: SteppedFlights) -> _Start:
-        """Return the start of an episode: the scenario's, or a random draw's of the campaign.
+    def draw(
+        self, generators: Sequence[np.random.Generator], flights: SteppedFlights
+    ) -> tuple[list[_Start], Counts]:
+        """Draw the starts of episodes: the different ones, and which one each episode has.
 
         Raises
         ------
@@ -229,15 +189,23 @@ class EpisodeStarts:
             A draw has a part that environments do not support, or too many draws are refused.
         """
         if self._campaign is None:
-            return self.nominal
+            return [self.nominal], np.zeros(len(generators), np.int64)
+        drawn = [self._draw_number(self._campaign, rng, flights) for rng in generators]
+        numbers, which = np.unique(drawn, return_inverse=True)
+        made = (self._made[number] for number in numbers.tolist())
+        return [each for each in made if isinstance(each, _Start)], which
+
+    def _draw_number(
+        self, campaign: Campaign, rng: np.random.Generator, flights: SteppedFlights
+    ) -> int:
         start: _Start | str = ""
         for _ in range(_MAX_REFUSED_DRAWS):
             number = int(rng.integers(len(self._draws)))
             if number not in self._made:
-                self._made[number] = self._drawn(self._campaign, number, flights)
+                self._made[number] = self._drawn(campaign, number, flights)
             start = self._made[number]
             if isinstance(start, _Start):
-                return start
+                return number
         raise ParameterError(
             f"{_MAX_REFUSED_DRAWS} successive draws of the campaign are refused, the last one "
             f"because: {start} Restrict the dispersions to values that the robot permits."
@@ -247,9 +215,8 @@ class EpisodeStarts:
         """Return the start of a draw, or the reason why there is none."""
         try:
             flight = drawn_flight(campaign, self._draws[number], DrawnFlight.of(self.scenario))
-            masses = flight.inertial or self.robot.inertial
-            start = _Start.of(self.robot, flight.scenario, masses)
-            flights.require_startable(start.starts, InertialParameters.stacked([masses]))
+            start = _Start.of(self.robot, flight.scenario, flight.inertial)
+            flights.require_startable(start.states, InertialParameters.stacked([start.inertial]))
         except (ParameterError, RobotDescriptionError) as refusal:
             if not any(isinstance(each, str) for each in self._made.values()):
                 warn_once(
@@ -280,8 +247,9 @@ def _require_steppable(scenario: Scenario) -> None:
 class Episodes:
     """N episodes that are stepped together.
 
-    Attributes are arrays of N rows: ``observations``, and after :meth:`step` ``rewards``,
-    ``terminations`` and ``truncations``; ``errors`` are rad or m.
+    Attributes are arrays of N rows: ``observations``, ``goals``, and after :meth:`step`
+    ``rewards``, ``terminations`` and ``truncations``; ``errors`` are rad or m. ``flights`` has the
+    states of the robots, to be read only.
 
     Parameters
     ----------
@@ -296,61 +264,46 @@ class Episodes:
     def __init__(self, config: EpisodeConfig, count: int, *, in_lanes: bool) -> None:
         if not isinstance(count, int | np.integer) or count < 1:
             raise ParameterError(f"The number of environments is {count!r}; it must be at least 1.")
-        self._config = config
         self._source = EpisodeStarts(config)
         scenario, self.robot = self._source.scenario, self._source.robot
-        plant = scenario.plant
+        plant, every = scenario.plant, np.zeros(count, dtype=np.int64)
         self._goals_of_scenario = (config.goals or _GOALS[bool(config.campaign)]) == "scenario"
-        self._link = self._reaching_link(scenario) if config.kind.has_link else ""
+        self._link = self._reaching_link(config.link, scenario) if config.kind.has_link else ""
         self._plants = [plant] * count if self._source.needs_plants else []
-        self._flights = SteppedFlights(
+        self.flights = SteppedFlights(
             self.robot,
             plant.actuation,
             plant.control_period,
-            self._source.nominal.starts[np.zeros(count, dtype=np.int64)],
+            self._source.nominal.states[every],
             integration_step=plant.integration_step,
             link=self._link,
             in_lanes=in_lanes,
             plants=self._plants,
         )
-        self.scale, self.taken = self._action_scale(scenario)
+        self.engine = self.flights.engine
+        self.scale, self.taken = self._action_scale(config, scenario)
         wrench = self.taken[self.taken >= self.robot.n] - self.robot.n
         pushed = bool((wrench < 3).any()), bool((wrench >= 3).any())
         self._camera: Camera | None = None
         self.task: Task = config.kind(self.robot, self._link, pushed)
-        self._weights = self.task.weights.of(config.reward)
-        self._goals = np.zeros((count, self.task.goal_size))
-        self._goals[:, -1] = 1.0
-        self._sensors = SensorErrors.of(self.robot, [plant.sensors] * count)
+        self._apply(config)
+        self.goals = np.zeros((count, self.task.goal_size))
+        self.goals[:, -1] = 1.0
+        self._sensors = self._source.nominal.sensors[every]
         self._generators: Sequence[np.random.Generator] = ()
         self.step_duration = config.hold * plant.control_period
         self.rewards, self.errors = np.zeros(count), np.zeros(count)
         self.observations = np.zeros((count, len(self.task.observation_bounds()[0])))
-        self.terminations = np.zeros(count, dtype=np.bool_)
-        self.truncations = np.zeros(count, dtype=np.bool_)
-        self.reached = np.zeros(count, dtype=np.bool_)
+        self.terminations, self.truncations, self.reached = np.zeros((3, count), dtype=np.bool_)
         if not self._source.has_sensor_errors:
             self._observe()
 
-    @property
-    def spread(self) -> float:
-        """Size of random goals."""
-        return self._config.spread or self.task.spread
-
-    @property
-    def tolerance(self) -> float:
-        """Error within which the goal is reached."""
-        return self._config.tolerance or self.task.tolerance
-
-    @property
-    def time_limit(self) -> float:
-        """Simulated time after which an episode is truncated, s."""
-        return self._config.time_limit
-
-    @property
-    def reward(self) -> Mapping[str, float]:
-        """Weights of the reward."""
-        return vars(self._weights)
+    def _apply(self, config: EpisodeConfig) -> None:
+        """Set the attributes that may change from episode to episode."""
+        self._weights = self.task.weights.of(config.reward)
+        self._config, self.reward, self.time_limit = config, vars(self._weights), config.time_limit
+        self.spread = config.spread or self.task.spread
+        self.tolerance = config.tolerance or self.task.tolerance
 
     def has_attribute(self, name: str) -> bool:
         """Return whether :meth:`change` accepts a name."""
@@ -368,69 +321,45 @@ class Episodes:
         ParameterError
             There is no such attribute, or the value is invalid.
         """
-        if not self.has_attribute(name):
+        if name in _CHANGEABLE:
+            checked = getattr(EpisodeConfig.of({name: value}), name)
+            self._apply(replace(self._config, **{name: checked}))
+        elif self.has_attribute(name):
+            setattr(self.task, name, value)
+        else:
             raise ParameterError(
                 f"There is no attribute '{name}' to change; there are {', '.join(_CHANGEABLE)}, "
                 "and attributes of the task."
             )
-        if name not in _CHANGEABLE:
-            setattr(self.task, name, value)
-            return
-        config = replace(self._config, **{name: value})
-        self._weights = self.task.weights.of(config.reward)
-        self._config = config
 
-    def _reaching_link(self, scenario: Scenario) -> str:
-        link = self._config.link or scenario.plant.end_effector_frame
-        link = self.robot.description.end_effector(link)
+    def _reaching_link(self, link: str, scenario: Scenario) -> str:
+        link = self.robot.description.end_effector(link or scenario.plant.end_effector_frame)
         if not link:
             raise ParameterError(
                 f"Robot '{self.robot.description.name}' has no end-effector: give argument 'link'."
             )
         return link
 
-    def _action_scale(self, scenario: Scenario) -> tuple[Array, Counts]:
+    def _action_scale(self, config: EpisodeConfig, scenario: Scenario) -> tuple[Array, Counts]:
         """Return the command of an action of ones, and the entries that actions have."""
-        config, size, actuation = self._config, self._flights.command_size, scenario.plant.actuation
-        force, torque = config.max_force, config.max_torque
-        if "coordinated_control" in scenario.commanders:
-            force = force or scenario.controller.max_force
-            torque = torque or scenario.controller.max_torque
-        scale = as_numbers(config.action_scale, "Argument 'action_scale'")
-        if scale.shape != (0,):
-            if scale.shape != (size,) or not np.isfinite(scale).all():
-                raise ParameterError(
-                    f"Argument 'action_scale' is {config.action_scale!r}; robot "
-                    f"'{self.robot.description.name}' takes a list of {size} finite numbers."
-                )
-            if not scale.any():
-                raise ParameterError(
-                    "Argument 'action_scale' is all zeros, so no action moves the robot: use "
-                    "larger values."
-                )
-        else:
-            scale = action_scale(self.robot, actuation, force, torque)
-        return scale, np.flatnonzero(scale != 0.0)
-
-    @property
-    def action_size(self) -> int:
-        """Number of entries of an action."""
-        return len(self.taken)
-
-    @property
-    def engine(self) -> str:
-        """Name of the engine that steps the flights."""
-        return self._flights.engine
-
-    @property
-    def flights(self) -> SteppedFlights:
-        """The flights; read their states only."""
-        return self._flights
-
-    @property
-    def goals(self) -> Array:
-        """Goals (N, goal_size)."""
-        return self._goals
+        size, force, torque = self.flights.command_size, config.max_force, config.max_torque
+        scale = np.array(config.action_scale)
+        if not scale.size:
+            if "coordinated_control" in scenario.commanders:
+                force = force or scenario.controller.max_force
+                torque = torque or scenario.controller.max_torque
+            scale = action_scale(self.robot, scenario.plant.actuation, force, torque)
+        elif len(scale) != size:
+            raise ParameterError(
+                f"Argument 'action_scale' is {config.action_scale!r}; robot "
+                f"'{self.robot.description.name}' takes a list of {size} finite numbers."
+            )
+        elif not scale.any():
+            raise ParameterError(
+                "Argument 'action_scale' is all zeros, so no action moves the robot: use larger "
+                "values."
+            )
+        return scale, np.flatnonzero(scale)
 
     def begin(
         self,
@@ -449,80 +378,54 @@ class Episodes:
         ParameterError
             A draw, the goal or the start is invalid.
         """
-        chosen = np.asarray(rows, dtype=np.int64)
+        chosen, task = np.asarray(rows, dtype=np.int64), self.task
         goals = None if goal is None else self._checked_goals(goal)
         changes = None if start is None else self._checked_starts(start)
-        self._generators = generators
-        drawn = [self._source.draw(generators[row], self._flights) for row in chosen.tolist()]
-        starts = [
-            self._start(each, generators[row], changes[row] if changes else {})
-            for row, each in zip(chosen.tolist(), drawn, strict=True)
-        ]
-        masses = [each.inertial for each in drawn if each.inertial is not None]
-        for row, each in zip(chosen.tolist(), drawn, strict=True):
-            if self._plants:
-                self._plants[row] = _with_seed(each.scenario.plant, generators[row])
-            if self._source.has_sensor_errors:
-                errors = SensorErrors.of(self.robot, [each.scenario.plant.sensors])
-                for part in fields(errors):
-                    getattr(self._sensors, part.name)[row] = getattr(errors, part.name)[0]
-        self._flights.reset(
-            chosen,
-            InitialStates(
-                *(
-                    np.concatenate([getattr(each, part.name) for each in starts])
-                    for part in fields(InitialStates)
-                )
-            ),
-            InertialParameters.stacked(masses) if masses else None,
-        )
-        for row, each in zip(chosen.tolist(), drawn, strict=True):
-            if goals is not None:
-                self._goals[row] = goals[row]
-            elif self._goals_of_scenario:
-                self._goals[row] = self.task.goal_of(each.scenario)
-            else:
-                at = self._states(slice(row, row + 1))
-                self._goals[row] = self.task.random_goal(at, self.spread, generators[row])
+        self._generators, numbers = generators, chosen.tolist()
+        own = [generators[row] for row in numbers]
+        drawn, which = self._source.draw(own, self.flights)
+        states = joined_rows([each.states for each in drawn])[which]
+        if changes is not None or type(task).start is not Task.start:
+            each = zip(numbers, which.tolist(), own, strict=True)
+            initial = [
+                replace(task.start(drawn[k].initial, rng), **(changes[row] if changes else {}))
+                for row, k, rng in each
+            ]
+            states = InitialStates.of(self.robot, initial)
+        if self._plants:
+            for row, k, rng in zip(numbers, which.tolist(), own, strict=True):
+                self._plants[row] = _with_seed(drawn[k].scenario.plant, rng)
+        assign_rows(self._sensors, chosen, joined_rows([each.sensors for each in drawn])[which])
+        masses = InertialParameters.stacked([each.inertial for each in drawn])[which]
+        self.flights.reset(chosen, states, masses)
+        if goals is not None:
+            self.goals[chosen] = goals[chosen]
+        elif self._goals_of_scenario:
+            self.goals[chosen] = np.array([task.goal_of(each.scenario) for each in drawn])[which]
+        else:
+            self.goals[chosen] = task.random_goals(self._states(chosen), self.spread, own)
         self.terminations[chosen] = self.truncations[chosen] = False
         self.rewards[chosen] = 0.0
         self._observe(chosen)
 
-    def _start(
-        self, drawn: _Start, rng: np.random.Generator, changes: Mapping[str, Array]
-    ) -> InitialStates:
-        initial = self.task.start(drawn.initial, rng)
-        if initial is drawn.initial and not changes:
-            return drawn.starts
-        return InitialStates.of(self.robot, [replace(initial, **changes)])
-
     def _checked_starts(self, start: Any) -> list[dict[str, Array]]:
         """Return the given changes of the starts of all rows."""
-        count, n = len(self._goals), self.robot.n
+        count, n = len(self.goals), self.robot.n
         each = list(start) if isinstance(start, list | tuple) else [start] * count
         if len(each) != count or not all(isinstance(one, Mapping) for one in each):
             raise ParameterError(
                 f"The start is {start!r}: give a dictionary, or a list of {count} of them."
             )
-        known = {part.name: 3 for part in fields(InitialState)}
-        known |= {"quaternion": 4, "joint_positions": n, "joint_velocities": n}
-        made: list[dict[str, Array]] = []
-        for one in each:
-            made.append({})
-            for name, given in one.items():
-                if name not in known:
-                    raise ParameterError(f"A start has no '{name}'; it has {', '.join(known)}.")
-                values = as_numbers(given, f"The start's {name}")
-                if values.shape != (known[name],) or not np.isfinite(values).all():
-                    raise ParameterError(
-                        f"The start's {name} is {given!r}; it must be {known[name]} finite numbers."
-                    )
-                made[-1][name] = values
-        return made
+        sizes = {part.name: 3 for part in fields(InitialState)}
+        sizes |= {"quaternion": 4, "joint_positions": n, "joint_velocities": n}
+        return [
+            {name: _checked_start(name, given, sizes) for name, given in one.items()}
+            for one in each
+        ]
 
     def _checked_goals(self, goal: Any) -> Array:
         """Return the given goals (N, goal_size) of all rows."""
-        values, count, size = as_numbers(goal, "The goal"), len(self._goals), self.task.goal_size
+        values, (count, size) = as_numbers(goal, "The goal"), self.goals.shape
         if values.shape not in ((size,), (count, size)) or not np.isfinite(values).all():
             raise ParameterError(
                 f"The goal has shape {values.shape}; task '{self.task.name}' takes {size} finite "
@@ -539,47 +442,44 @@ class Episodes:
         if self._camera is None:
             self._camera = Camera(self.task)
         at = slice(row, row + 1)
-        return self._camera.picture(self._states(at), self._goals[at])
-
-    def end(self, rows: Counts) -> None:
-        """End episodes; they are not stepped until they are restarted."""
-        self._flights.end(rows)
+        return self._camera.picture(self._states(at), self.goals[at])
 
     def step(self, actions: Any) -> None:
         """Step all episodes that have not ended, for ``hold`` ticks.
 
-        ``actions`` (N, action_size) are shares of the largest command, clipped to -1 and 1.
+        ``actions`` (N, entries of an action) are shares of the largest command, clipped to -1 and
+        1.
 
         Raises
         ------
         CommandError
             The shape is wrong, or an action is not a finite number.
         """
-        count, size = len(self._flights), self.action_size
+        flights, task, wanted = self.flights, self.task, (len(self.goals), len(self.taken))
         shares = as_numbers(actions, "The array of actions", CommandError)
-        if shares.shape != (count, size):
-            raise CommandError(f"The actions are {shares.shape}, not ({count}, {size}).")
-        under_way, errors = self._flights.has_not_ended.copy(), self.errors.copy()
-        states = self._states(slice(None))  # Views, which have the states after the step, too.
-        before = states.copy()
-        self._flights.step(command_of(shares, self.scale, self.taken), self._config.hold)
+        if shares.shape != wanted:
+            raise CommandError(f"The actions are {shares.shape}, not {wanted}.")
+        under_way, errors = flights.has_not_ended.copy(), self.errors.copy()
+        before = self._states(np.arange(len(shares)))
+        flights.step(command_of(shares, self.scale, self.taken), self._config.hold)
         # Robots that stand still are not measured: they take no random numbers.
         self._observe(np.flatnonzero(under_way) if self._source.has_sensor_errors else slice(None))
-        task, alive, duration = self.task, self._flights.has_not_ended, self.step_duration
-        reached = alive & task.reached(states, self.errors, self.tolerance)
-        failed = (under_way & ~alive) | (alive & ~reached & task.failed(states, self._goals))
+        after, alive = self._states(slice(None)), flights.has_not_ended
+        reached = alive & task.reached(after, self.errors, self.tolerance)
+        failed = (under_way & ~alive) | (alive & ~reached & task.failed(after, self.goals))
         shares = np.clip(shares, -1.0, 1.0)
-        done = (before, states, self._goals, shares, errors, self.errors, reached, failed, duration)
-        self.rewards = np.where(under_way, task.reward(Step(*done), self._weights), 0.0)
+        done = (before, after, self.goals, shares, errors, self.errors, reached, failed)
+        step = Step(*done, self.step_duration)
+        self.rewards = np.where(under_way, task.reward(step, self._weights), 0.0)
         self.reached, self.terminations = reached, reached | failed
-        late = self._flights.time > self.time_limit - 0.5 * duration
+        late = flights.time > self.time_limit - 0.5 * self.step_duration
         self.truncations = alive & late & ~self.terminations
 
     def _observe(self, rows: Any = slice(None)) -> None:
-        states, goals = self._states(rows), self._goals[rows]
+        states, goals = self._states(rows), self.goals[rows]
         remaining = self.task.remaining(states, goals)
         self.errors[rows] = self.task.errors(remaining)
-        if self._source.has_sensor_errors:
+        if self._source.has_sensor_errors and len(rows):
             states = self._measured(states, rows)
             remaining = self.task.remaining(states, goals)
         self.observations[rows] = self.task.observe(states, remaining)
@@ -588,7 +488,7 @@ class Episodes:
         size = 12 + 2 * self.robot.n
         normals = [self._generators[row].standard_normal(size) for row in rows.tolist()]
         parts = states.pose, states.twist, states.q, states.qdot
-        measured = self._sensors[rows].measure(np.array(normals).reshape(-1, size), *parts)
+        measured = self._sensors[rows].measure(np.array(normals), *parts)
         if not self._link:
             return RobotStates(*measured)
         places = self.robot.function("link_poses")(measured[2].T)[1].full()
@@ -596,10 +496,23 @@ class Episodes:
         return RobotStates(*measured, places.reshape(3, len(rows), -1)[:, :, link].T)
 
     def _states(self, rows: Any) -> RobotStates:
-        flights = self._flights
+        """Return the states of some rows; a slice of rows has the states after later steps, too."""
+        flights = self.flights
         link_r = flights.link_r[rows] if self._link else None
         pose, twist = flights.pose[rows], flights.twist[rows]
         return RobotStates(pose, twist, flights.q[rows], flights.qdot[rows], link_r)
+
+
+def _checked_start(name: str, given: Any, sizes: Mapping[str, int]) -> Array:
+    """Return a given value of a start."""
+    if name not in sizes:
+        raise ParameterError(f"A start has no '{name}'; it has {', '.join(sizes)}.")
+    values = as_numbers(given, f"The start's {name}")
+    if values.shape != (sizes[name],) or not np.isfinite(values).all():
+        raise ParameterError(
+            f"The start's {name} is {given!r}; it must be {sizes[name]} finite numbers."
+        )
+    return values
 
 
 def _with_seed(plant: PlantConfig, rng: np.random.Generator) -> PlantConfig:

@@ -25,7 +25,7 @@ from gymnasium.vector.utils import batch_space  # noqa: E402
 
 def _spaces(episodes: Episodes) -> tuple[Any, Any]:
     low, high = episodes.task.observation_bounds()
-    size = (episodes.action_size,)
+    size = (len(episodes.taken),)
     return Box(low, high, dtype=np.float64), Box(-1.0, 1.0, size, dtype=np.float64)
 
 
@@ -236,24 +236,23 @@ class SpaceRobotVectorEnv(VectorEnv, EzPickle):
             )
         again = np.flatnonzero(self._ended)
         if again.size:
-            episodes.end(again)
+            episodes.flights.end(again)
         episodes.step(actions)
         if again.size:
             self._begin(again)
         terminations, truncations = episodes.terminations.copy(), episodes.truncations.copy()
-        rewards, self._ended = episodes.rewards.copy(), terminations | truncations
+        rewards, ended = episodes.rewards.copy(), terminations | truncations
         infos: dict[str, Any] = {}
-        ended = np.flatnonzero(self._ended)
-        if mode is AutoresetMode.SAME_STEP and ended.size:
-            last, errors = episodes.observations.copy(), episodes.errors.copy()
-            reached = episodes.reached.copy()
-            for row in ended.tolist():
-                info = {"error": float(errors[row]), "is_success": bool(reached[row])}
-                infos = self._add_info(infos, {"final_obs": last[row], "final_info": info}, row)
-            self._begin(ended)
-        elif ended.size:
-            infos["is_success"] = episodes.reached & self._ended
-            infos["_is_success"] = self._ended.copy()
+        if ended.any():
+            infos = {"is_success": episodes.reached & ended, "_is_success": ended.copy()}
+        self._ended = ended.copy()
+        if mode is AutoresetMode.SAME_STEP and ended.any():
+            last, rows = np.full(self.num_envs, None, dtype=object), np.flatnonzero(ended)
+            for row in rows.tolist():
+                last[row] = episodes.observations[row].copy()
+            infos = {"final_info": infos | self._info(ended), "_final_info": ended.copy()}
+            infos |= {"final_obs": last, "_final_obs": ended.copy()}
+            self._begin(rows)
         infos |= self._info(np.ones(self.num_envs, dtype=np.bool_))
         return episodes.observations.copy(), rewards, terminations, truncations, infos
 

@@ -22,9 +22,9 @@ from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.rotations import (
     matrices_from_quaternions,
-    quaternion_from_rotvec,
     quaternion_inverse,
     quaternion_multiply,
+    quaternions_from_rotvecs,
     rotvecs_from_quaternions,
 )
 from spacerobot_ros.planning.core.controllability import sample_shapes
@@ -66,11 +66,11 @@ class RobotStates:
     qdot: Array
     link_r: Array | None = None
 
-    def copy(self) -> RobotStates:
-        """Return a copy, which keeps these states when the arrays change."""
-        link_r = None if self.link_r is None else self.link_r.copy()
-        pose, twist, q, qdot = self.pose, self.twist, self.q, self.qdot
-        return RobotStates(pose.copy(), twist.copy(), q.copy(), qdot.copy(), link_r)
+    def row(self, index: int) -> RobotStates:
+        """Return the states of one robot, as arrays of one row."""
+        at = slice(index, index + 1)
+        link_r = None if self.link_r is None else self.link_r[at]
+        return RobotStates(self.pose[at], self.twist[at], self.q[at], self.qdot[at], link_r)
 
 
 @dataclass(frozen=True)
@@ -195,6 +195,13 @@ class Task(ABC):
     def random_goal(self, start: RobotStates, spread: float, rng: np.random.Generator) -> Array:
         """Return a random goal (goal_size,) for one robot at its start."""
 
+    def random_goals(
+        self, starts: RobotStates, spread: float, rngs: Sequence[np.random.Generator]
+    ) -> Array:
+        """Return random goals (N, goal_size) for N robots, each from its own generator."""
+        each = (self.random_goal(starts.row(i), spread, rng) for i, rng in enumerate(rngs))
+        return np.array(list(each))
+
     @abstractmethod
     def remaining(self, states: RobotStates, goals: Array) -> Array:
         """Return the remaining errors (N, error_size): rotation vectors (rad) or vectors (m)."""
@@ -265,7 +272,25 @@ class Task(ABC):
         return low, np.concatenate([error, np.minimum(robot.upper, most), rest])
 
 
-class Reorient(Task):
+class _DrawnTogether(Task):
+    """A task whose random goals are drawn for all robots at once."""
+
+    def random_goal(self, start: RobotStates, spread: float, rng: np.random.Generator) -> Array:
+        return np.asarray(self.random_goals(start.row(0), spread, [rng])[0])
+
+    @abstractmethod
+    def random_goals(
+        self, starts: RobotStates, spread: float, rngs: Sequence[np.random.Generator]
+    ) -> Array: ...
+
+
+def _directions_and_shares(rngs: Sequence[np.random.Generator]) -> tuple[Array, Array]:
+    """Return random vectors (N, 3), even in all directions, and numbers (N, 1) from 0 to 1."""
+    drawn = np.array([(*rng.standard_normal(3), rng.random()) for rng in rngs])
+    return drawn[:, :3], drawn[:, 3:]
+
+
+class Reorient(_DrawnTogether):
     """The joints rotate the base to a goal attitude, a quaternion (x, y, z, w) of R_WG."""
 
     name, goal_size, tolerance, spread = "reorient", 4, 0.01, 0.15
@@ -291,14 +316,16 @@ class Reorient(Task):
             )
         return np.eye(3)
 
-    def random_goal(self, start: RobotStates, spread: float, rng: np.random.Generator) -> Array:
-        """Return an attitude within ``spread`` rad of the start; planar robots rotate in their
+    def random_goals(
+        self, starts: RobotStates, spread: float, rngs: Sequence[np.random.Generator]
+    ) -> Array:
+        """Return attitudes within ``spread`` rad of the starts; planar robots rotate in their
         plane."""
-        axes, axis = self.directions, rng.normal(size=3)
+        axes, (turns, shares) = self.directions, _directions_and_shares(rngs)
         if len(axes) == 1:
-            axis = axes[0] * np.copysign(1.0, axis[0])
-        turn = spread * rng.uniform() * axis / np.linalg.norm(axis)
-        return quaternion_multiply(start.pose[0, 3:], quaternion_from_rotvec(turn))
+            turns = axes[0] * np.copysign(1.0, turns[:, :1])
+        turns = spread * shares * turns / np.linalg.norm(turns, axis=1, keepdims=True)
+        return quaternion_multiply(starts.pose[:, 3:], quaternions_from_rotvecs(turns))
 
     def remaining(self, states: RobotStates, goals: Array) -> Array:
         """Return the rotation vectors (N, 3) from the bases to the goals in B, rad."""
@@ -322,7 +349,7 @@ class Reorient(Task):
         return np.hstack([states.pose[:, :3], goals])
 
 
-class Reach(Task):
+class Reach(_DrawnTogether):
     """A link reaches a goal position (3,) in W, m."""
 
     name, goal_size, tolerance, spread = "reach", 3, 0.02, 0.3
@@ -351,14 +378,17 @@ class Reach(Task):
             )
         return np.eye(3) if len(found) == 3 else found
 
-    def random_goal(self, start: RobotStates, spread: float, rng: np.random.Generator) -> Array:
-        """Return a position within ``spread`` m of the link's start, in its free directions."""
-        ways, way = self.directions, rng.normal(size=3)
-        if len(ways) < 3:
-            R = matrices_from_quaternions(start.pose[:1, 3:])[0]
-            way = R @ (ways.T @ way[: len(ways)])
-        way *= spread * rng.uniform() ** (1 / len(ways)) / np.linalg.norm(way)
-        return np.asarray(self.link_positions(start)[0] + way)
+    def random_goals(
+        self, starts: RobotStates, spread: float, rngs: Sequence[np.random.Generator]
+    ) -> Array:
+        """Return positions within ``spread`` m of the links' starts, in their free directions."""
+        axes, (ways, shares) = self.directions, _directions_and_shares(rngs)
+        if len(axes) < 3:
+            R = matrices_from_quaternions(starts.pose[:, 3:])
+            ways = np.einsum("nij,nj->ni", R, ways[:, : len(axes)] @ axes)
+        distances = spread * shares ** (1 / len(axes))
+        ways *= distances / np.linalg.norm(ways, axis=1, keepdims=True)
+        return np.asarray(self.link_positions(starts) + ways)
 
     def remaining(self, states: RobotStates, goals: Array) -> Array:
         """Return the displacements (N, 3) from the links to the goals in B, m."""

@@ -28,7 +28,7 @@ def test_the_policy_of_the_examples_reaches_its_goals() -> None:
     for _ in range(120):
         episodes.step(policy(seen))
         reached |= episodes.reached
-        episodes.end(np.flatnonzero(reached))
+        episodes.flights.end(np.flatnonzero(reached))
         seen = episodes.observations
     # A policy that does nothing reaches the goals that are within the tolerance, 7 % of these.
     assert reached.mean() >= 0.98
