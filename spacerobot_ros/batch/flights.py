@@ -42,29 +42,21 @@ NOISES = (
 
 @dataclass(frozen=True)
 class InitialStates:
-    """Initial states, one row per flight; see :class:`.InitialState`.
-
-    Attributes
-    ----------
-    position
-        (N, 3) position of the base link, or, with ``position_is_of_center_of_mass``, of the
-        system's centre of mass, in W, m.
-    quaternion
-        (N, 4) unit quaternions (x, y, z, w) of ``R_WB``.
-    q, qdot
-        (N, n) joint positions and rates, m or rad (per second).
-    momenta
-        (N, 6) total linear (kg m/s) over angular momentum about the centre of mass (kg m^2/s), W.
-    position_is_of_center_of_mass
-        (N,) whether ``position`` is the position of the centre of mass.
-    """
+    """Initial states, one row per flight; see :class:`.InitialState`."""
 
     position: Array
+    """(N, 3) position of the base link, or, with ``position_is_of_center_of_mass``, of the system's
+    centre of mass, in W, m."""
     quaternion: Array
+    """(N, 4) unit quaternions (x, y, z, w) of ``R_WB``."""
     q: Array
+    """(N, n) joint positions, m or rad."""
     qdot: Array
+    """(N, n) joint rates, per second."""
     momenta: Array
+    """(N, 6) total linear (kg m/s) over angular momentum about the centre of mass (kg m^2/s), W."""
     position_is_of_center_of_mass: npt.NDArray[np.bool_]
+    """(N,) whether ``position`` is the position of the centre of mass."""
 
     @classmethod
     def of(cls, robot: SpaceRobot, initial: Sequence[InitialState]) -> InitialStates:
@@ -124,25 +116,17 @@ class InitialStates:
 
 @dataclass(frozen=True)
 class SensorErrors:
-    """Errors of sensors, one row per flight; see :class:`.SensorConfig`.
-
-    Attributes
-    ----------
-    noise
-        (N, 6) 1 sigma by group: position (m), attitude (rad), velocity (m/s), angular velocity
-        (rad/s), joints (m or rad), joint rates.
-    pose_bias
-        (N, 6) biases of the position in W (m) over a rotation vector in B (rad).
-    joint_bias
-        (N, n) biases of the joint positions, m or rad.
-    seeds
-        (N,) seeds of the noise, which equals that of :class:`.Sensors` with the same seed.
-    """
+    """Errors of sensors, one row per flight; see :class:`.SensorConfig`."""
 
     noise: Array
+    """(N, 6) 1 sigma by group: position (m), attitude (rad), velocity (m/s), angular velocity
+    (rad/s), joints (m or rad), joint rates."""
     pose_bias: Array
+    """(N, 6) biases of the position in W (m) over a rotation vector in B (rad)."""
     joint_bias: Array
+    """(N, n) biases of the joint positions, m or rad."""
     seeds: Counts
+    """(N,) seeds of the noise, which equals that of :class:`.Sensors` with the same seed."""
 
     @classmethod
     def none(cls, robot: SpaceRobot, count: int) -> SensorErrors:
@@ -228,69 +212,47 @@ def assign_rows(to: R, rows: Counts, values: R) -> None:
 
 @dataclass(frozen=True)
 class FollowedSchedule:
-    """Velocity commands of the planner's :class:`.ScheduleFollower` along a schedule.
-
-    Attributes
-    ----------
-    positions
-        (T + 1, n) shapes at the ticks, or (N, T + 1, n) for each flight; the last is held.
-    shape_gain
-        Feedback from measured shape errors to velocities, 1/s; 0: open loop.
-    deadband
-        Shape errors up to this value are not fed back, m or rad.
-    """
+    """Velocity commands of the planner's :class:`.ScheduleFollower` along a schedule."""
 
     positions: Array
+    """(T + 1, n) shapes at the ticks, or (N, T + 1, n) for each flight; the last is held."""
     shape_gain: float = 0.0
+    """Feedback from measured shape errors to velocities, 1/s; 0: open loop."""
     deadband: float = 0.0
+    """Shape errors up to this value are not fed back, m or rad."""
 
 
 @dataclass(frozen=True)
 class HeldCommands:
-    """Commands by tick, independent of measurements.
-
-    Attributes
-    ----------
-    joints
-        (T, n) or (N, T, n) joint velocities or efforts, depending on the actuation; zero after the
-        last.
-    wrench
-        (T, 6) or (N, T, 6) force (N) over torque (N m) on the base, base components; None: none.
-    """
+    """Commands by tick, independent of measurements."""
 
     joints: Array
+    """(T, n) or (N, T, n) joint velocities or efforts, depending on the actuation; zero after the
+    last."""
     wrench: Array | None = None
+    """(T, 6) or (N, T, 6) force (N) over torque (N m) on the base, base components; None: none."""
 
 
 @dataclass(frozen=True)
 class ControlledGoals:
-    """Commands of a :class:`.CoordinatedController` to goals that are set at the first state.
-
-    Attributes
-    ----------
-    config
-        Parameters of the controller, the same for all flights; its gains apply if ``gains`` is
-        empty.
-    base, end_effector
-        Goals in W, (7,) or (N, 7): position (m) and quaternion; None: the initial pose is held.
-    joints
-        Goal shapes, (n,) or (N, n); None: the initial shapes.
-    gains
-        Gains of each flight; empty: the configuration's.
-    robot
-        The controller's model of the robot; None: the nominal robot of the flights.
-    ends_when_decided
-        Whether a flight ends with the decision about its goal: one tick later, after the command
-        for that state. Otherwise it continues and holds the goal.
-    """
+    """Commands of a :class:`.CoordinatedController` to goals that are set at the first state."""
 
     config: ControllerConfig
+    """Parameters of the controller, the same for all flights; its gains apply if ``gains`` is
+    empty."""
     base: Array | None = None
+    """Goals in W, (7,) or (N, 7): position (m) and quaternion; None: the initial pose is held."""
     end_effector: Array | None = None
+    """Goals of the end-effector, as of the base."""
     joints: Array | None = None
+    """Goal shapes, (n,) or (N, n); None: the initial shapes."""
     gains: tuple[Gains, ...] = ()
+    """Gains of each flight; empty: the configuration's."""
     robot: SpaceRobot | None = None
+    """The controller's model of the robot; None: the nominal robot of the flights."""
     ends_when_decided: bool = False
+    """Whether a flight ends with the decision about its goal: one tick later, after the command for
+    that state. Otherwise it continues and holds the goal."""
 
 
 FlightProgram = FollowedSchedule | HeldCommands | ControlledGoals
@@ -299,29 +261,6 @@ FlightProgram = FollowedSchedule | HeldCommands | ControlledGoals
 @dataclass(frozen=True)
 class Flights:
     """N flights of one robot that differ only in numbers.
-
-    Attributes
-    ----------
-    robot
-        The robot.
-    actuation
-        ``velocity`` or ``effort``.
-    control_period
-        Duration of a tick, s.
-    ticks
-        Ticks of each flight.
-    initial_states
-        Initial states; the rows are the flights.
-    program
-        Source of the commands.
-    inertial
-        Masses, centres and inertias, (N, ...); None: the robot's.
-    sensors
-        Errors of sensors; None: none.
-    integration_step
-        Longest Runge-Kutta step, s; 0: the default of the actuation.
-    report_ticks
-        Ticks after which the state is reported, ascending; 0 is the start. Empty: only the end.
 
     Raises
     ------
@@ -332,15 +271,25 @@ class Flights:
     """
 
     robot: SpaceRobot
+    """The robot."""
     actuation: str
+    """``velocity`` or ``effort``."""
     control_period: float
+    """Duration of a tick, s."""
     ticks: int
+    """Ticks of each flight."""
     initial_states: InitialStates
+    """Initial states; the rows are the flights."""
     program: FlightProgram
+    """Source of the commands."""
     inertial: InertialParameters | None = None
+    """Masses, centres and inertias, (N, ...); None: the robot's."""
     sensors: SensorErrors | None = None
+    """Errors of sensors; None: none."""
     integration_step: float = 0.0
+    """Longest Runge-Kutta step, s; 0: the default of the actuation."""
     report_ticks: tuple[int, ...] = field(default=())
+    """Ticks after which the state is reported, ascending; 0 is the start. Empty: only the end."""
 
     def __post_init__(self) -> None:
         count, robot = len(self), self.robot
@@ -426,79 +375,58 @@ def _require_rows(name: str, array: Array | None, count: int, width: int) -> Non
 
 @dataclass(frozen=True)
 class BatchResult:
-    """Results of N flights, at I instants.
-
-    Attributes
-    ----------
-    engine
-        Name of the engine that flew the flights.
-    time
-        (I,) s.
-    pose
-        (N, I, 7) position ``r_WB`` (m) and quaternion ``R_WB`` of the base.
-    twist
-        (N, I, 6) ``v_WB_B`` (m/s) and ``omega_WB_B`` (rad/s).
-    q, qdot
-        (N, I, n) joint positions and rates.
-    momentum
-        (N, I, 7) linear and angular momentum in W, kinetic energy.
-    measured_pose, measured_q
-        (N, I, 7) and (N, I, n) measurements of the sensors.
-    peak_rate
-        (N, n) largest joint rate at the end of a tick, m/s or rad/s.
-    peak_effort
-        (N, n) largest effort of a joint in a tick, N or N m.
-    peak_wrench
-        (N, 2) largest force (N) and torque (N m) commanded on the base.
-    impulse
-        (N, 2) time integrals of the norms of force and torque, N s and N m s.
-    limited_ticks
-        (N, n) numbers of ticks in which each joint was limited, by kind of limit, as in the plant.
-    fallback_ticks
-        (N,) numbers of ticks with a step outside the lanes.
-    lowest, highest
-        (N, n) smallest and largest joint positions over all ticks.
-    decision
-        (N,) first :class:`.Decision` about the goal of a controller.
-    decision_tick
-        (N,) tick of the state of that decision; -1: there was none.
-    decision_distance
-        (N, 3) the :class:`.OutputDistance` to the goal at that state; NaN without a decision.
-    end_tick
-        (N,) number of flown ticks.
-    end_state
-        (N, 2 n + 20) the last state: q, qdot, pose, twist and momentum; NaN without a controller.
-    momentum_drift
-        (N, 2) largest change of linear and angular momentum that thrust does not explain; NaN
-        without a controller.
-    failures
-        Messages of failed flights, by row; the later numbers of these flights are NaN.
-    """
+    """Results of N flights, at I instants."""
 
     engine: str
+    """Name of the engine that flew the flights."""
     time: Array
+    """(I,) s."""
     pose: Array
+    """(N, I, 7) position ``r_WB`` (m) and quaternion ``R_WB`` of the base."""
     twist: Array
+    """(N, I, 6) ``v_WB_B`` (m/s) and ``omega_WB_B`` (rad/s)."""
     q: Array
+    """(N, I, n) joint positions."""
     qdot: Array
+    """(N, I, n) joint rates."""
     momentum: Array
+    """(N, I, 7) linear and angular momentum in W, kinetic energy."""
     measured_pose: Array
+    """(N, I, 7) measurements of ``pose`` by the sensors."""
     measured_q: Array
+    """(N, I, n) measurements of ``q`` by the sensors."""
     peak_rate: Array
+    """(N, n) largest joint rate at the end of a tick, m/s or rad/s."""
     peak_effort: Array
+    """(N, n) largest effort of a joint in a tick, N or N m."""
     peak_wrench: Array
+    """(N, 2) largest force (N) and torque (N m) commanded on the base."""
     impulse: Array
+    """(N, 2) time integrals of the norms of force and torque, N s and N m s."""
     limited_ticks: Mapping[str, Counts]
+    """(N, n) numbers of ticks in which each joint was limited, by kind of limit, as in the
+    plant."""
     fallback_ticks: Counts
+    """(N,) numbers of ticks with a step outside the lanes."""
     lowest: Array
+    """(N, n) smallest joint positions over all ticks."""
     highest: Array
+    """(N, n) largest joint positions over all ticks."""
     decision: Counts
+    """(N,) first :class:`.Decision` about the goal of a controller."""
     decision_tick: Counts
+    """(N,) tick of the state of that decision; -1: there was none."""
     decision_distance: Array
+    """(N, 3) the :class:`.OutputDistance` to the goal at that state; NaN without a decision."""
     end_tick: Counts
+    """(N,) number of flown ticks."""
     end_state: Array
+    """(N, 2 n + 20) the last state: q, qdot, pose, twist and momentum; NaN without a controller."""
     momentum_drift: Array
+    """(N, 2) largest change of linear and angular momentum that thrust does not explain; NaN
+    without a controller."""
     failures: Mapping[int, str]
+    """Messages of failed flights, by row; the later numbers of these flights are NaN."""
 
     @classmethod
     def empty(cls, flights: Flights) -> BatchResult:

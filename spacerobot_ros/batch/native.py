@@ -105,27 +105,18 @@ class RowLayout:
 
 @dataclass(frozen=True)
 class CompiledTick:
-    """The compiled tick of flights that differ only in numbers, and the rows of its memory.
-
-    Attributes
-    ----------
-    library
-        The functions of ``driver.hpp``, which take a :class:`Job`.
-    target
-        What they run on.
-    memory_layout
-        Memory of a group.
-    report_width
-        Numbers of a report.
-    controller
-        Source of the commands; None: tables.
-    """
+    """The compiled tick of flights that differ only in numbers, and the rows of its memory."""
 
     library: Any
+    """The functions of ``driver.hpp``, which take a :class:`Job`."""
     target: Target
+    """What they run on."""
     memory_layout: RowLayout
+    """Memory of a group."""
     report_width: int
+    """Numbers of a report."""
     controller: BatchController | None = None
+    """Source of the commands; None: tables."""
 
     @classmethod
     def of(

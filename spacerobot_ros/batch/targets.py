@@ -45,33 +45,23 @@ Entries = Mapping[str, Sequence[Any]]
 
 @dataclass(frozen=True)
 class Target:
-    """What flights run on, compiled by the C++ compiler of this machine.
-
-    Attributes
-    ----------
-    name
-        For people.
-    lanes
-        Numbers in a register.
-    flags
-        Options of the compiler.
-    libmvec
-        Letter of its functions in the vector library of the C library; empty: none.
-    threads
-        Whether each flight has a thread: the numbers of neighbours are then side by side in memory.
-    single
-        Whether numbers have 32 bits in place of 64.
-    block_bytes
-        Memory of the flights that are flown together, bytes.
-    """
+    """What flights run on, compiled by the C++ compiler of this machine."""
 
     name: str
+    """For people."""
     lanes: int
+    """Numbers in a register."""
     flags: tuple[str, ...] = ()
+    """Options of the compiler."""
     libmvec: str = ""
+    """Letter of its functions in the vector library of the C library; empty: none."""
     threads: bool = False
+    """Whether each flight has a thread: the numbers of neighbours are then side by side in
+    memory."""
     single: bool = False
+    """Whether numbers have 32 bits in place of 64."""
     block_bytes: int = 32 * 2**20
+    """Memory of the flights that are flown together, bytes."""
 
     @property
     def engine(self) -> str:

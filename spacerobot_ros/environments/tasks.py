@@ -46,25 +46,18 @@ LARGEST_OBSERVATION = 1e6
 
 @dataclass(frozen=True)
 class RobotStates:
-    """States of N robots.
-
-    Attributes
-    ----------
-    pose
-        (N, 7) position ``r_WB`` (m) and quaternion ``R_WB`` (x, y, z, w) of the base.
-    twist
-        (N, 6) ``v_WB_B`` (m/s) and ``omega_WB_B`` (rad/s).
-    q, qdot
-        (N, n) joint positions and velocities.
-    link_r
-        (N, 3) position in B of the task's link, m; None if the task has no link.
-    """
+    """States of N robots."""
 
     pose: Array
+    """(N, 7) position ``r_WB`` (m) and quaternion ``R_WB`` (x, y, z, w) of the base."""
     twist: Array
+    """(N, 6) ``v_WB_B`` (m/s) and ``omega_WB_B`` (rad/s)."""
     q: Array
+    """(N, n) joint positions."""
     qdot: Array
+    """(N, n) joint velocities."""
     link_r: Array | None = None
+    """(N, 3) position in B of the task's link, m; None if the task has no link."""
 
     def row(self, index: int) -> RobotStates:
         """Return the states of one robot, as arrays of one row."""
@@ -75,58 +68,42 @@ class RobotStates:
 
 @dataclass(frozen=True)
 class Step:
-    """A step of N robots.
-
-    Attributes
-    ----------
-    before, after
-        Their states.
-    goals
-        (N, goal_size) their goals.
-    actions
-        (N, entries) shares from -1 to 1 of the largest command.
-    errors_before, errors
-        (N,) errors before the step and after it; see :meth:`Task.errors`.
-    reached, failed
-        (N,) whether the goal is reached, and whether the episode ends without it.
-    duration
-        Simulated time, s.
-    """
+    """A step of N robots."""
 
     before: RobotStates
+    """States before the step."""
     after: RobotStates
+    """States after the step."""
     goals: Array
+    """(N, goal_size) their goals."""
     actions: Array
+    """(N, entries) shares from -1 to 1 of the largest command."""
     errors_before: Array
+    """(N,) errors before the step; see :meth:`Task.errors`."""
     errors: Array
+    """(N,) errors after the step."""
     reached: Flags
+    """(N,) whether the goal is reached."""
     failed: Flags
+    """(N,) whether the episode ends without reaching the goal."""
     duration: float
+    """Simulated time, s."""
 
 
 @dataclass(frozen=True)
 class RewardWeights:
-    """Weights of the terms of the reward of a step.
-
-    Attributes
-    ----------
-    progress
-        Reward per rad or m by which the error decreased.
-    time
-        Penalty per s.
-    action
-        Penalty per s, times the mean square of the action's entries.
-    reached
-        Reward, once, in the step in which the goal is reached.
-    failed
-        Penalty, once, if the flight cannot continue.
-    """
+    """Weights of the terms of the reward of a step."""
 
     progress: float = 10.0
+    """Reward per rad or m by which the error decreased."""
     time: float = 0.02
+    """Penalty per s."""
     action: float = 0.01
+    """Penalty per s, times the mean square of the action's entries."""
     reached: float = 5.0
+    """Reward, once, in the step in which the goal is reached."""
     failed: float = 5.0
+    """Penalty, once, if the flight cannot continue."""
 
     @classmethod
     def of(cls, changes: Mapping[str, float] | None) -> RewardWeights:
