@@ -12,7 +12,6 @@ from spacerobot_ros.batch.flights import ControlledGoals, Flights
 from spacerobot_ros.control.controller import CoordinatedController, build_controller
 from spacerobot_ros.control.goal_monitor import Decision, GoalMonitor
 from spacerobot_ros.control.laws.law import Gains
-from spacerobot_ros.control.limits import Saturated
 from spacerobot_ros.control.outputs import OutputDistance
 from spacerobot_ros.control.reference import (
     OutputErrors,
@@ -166,11 +165,12 @@ class BatchController:
 
     def exact_command(
         self, row: int, profile: ReferenceProfile, tick: int, state: ControlState
-    ) -> Saturated:
-        """Return a command that :meth:`function` cannot compute."""
+    ) -> Array:
+        """Return efforts and wrench (n + 6,) that :meth:`function` cannot compute."""
         self.law.set_gains(self._gains(row))
         commanded = self.law.command(state, profile.at(self.time_of_tick(tick)))
-        return self.controller.apply_limits(state, commanded)
+        realised = self.controller.apply_limits(state, commanded).realised
+        return np.concatenate([realised.tau, realised.wrench_B])
 
     def function(self) -> ca.Function:
         """Return the function from :data:`CONTROL_INPUTS` to :data:`CONTROL_OUTPUTS`.

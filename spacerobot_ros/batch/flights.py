@@ -24,10 +24,11 @@ from spacerobot_ros.model.integration import count_steps
 from spacerobot_ros.model.rotations import quaternion_multiply, quaternions_from_rotvecs
 from spacerobot_ros.simulation.actuators import PLANTS
 from spacerobot_ros.simulation.config import SensorConfig
-from spacerobot_ros.simulation.plant import InitialState
+from spacerobot_ros.simulation.plant import InitialState, Plant
 from spacerobot_ros.times import SECOND
 
 Counts = npt.NDArray[np.int64]
+Flags = npt.NDArray[np.bool_]
 
 NOISES = (
     "position_noise",
@@ -129,14 +130,6 @@ class SensorErrors:
     """(N,) seeds of the noise, which equals that of :class:`.Sensors` with the same seed."""
 
     @classmethod
-    def none(cls, robot: SpaceRobot, count: int) -> SensorErrors:
-        """Return perfect sensors."""
-        zeros = np.zeros
-        return cls(
-            zeros((count, 6)), zeros((count, 6)), zeros((count, robot.n)), zeros(count, np.int64)
-        )
-
-    @classmethod
     def of(cls, robot: SpaceRobot, each: Sequence[SensorConfig]) -> SensorErrors:
         """Return sensor configurations as rows."""
         zero = (0.0, 0.0, 0.0)
@@ -226,11 +219,9 @@ class FollowedSchedule:
 class HeldCommands:
     """Commands by tick, independent of measurements."""
 
-    joints: Array
-    """(T, n) or (N, T, n) joint velocities or efforts, depending on the actuation; zero after the
+    table: Array
+    """(T, command_size) or (N, T, command_size); see :attr:`Flights.command_size`. Zero after the
     last."""
-    wrench: Array | None = None
-    """(T, 6) or (N, T, 6) force (N) over torque (N m) on the base, base components; None: none."""
 
 
 @dataclass(frozen=True)
@@ -322,17 +313,14 @@ class Flights:
             raise ParameterError("Joints under velocity commands must start at rest.")
 
     def _require_program(self) -> None:
-        count, n = len(self), self.robot.n
+        count = len(self)
         match self.program:
             case FollowedSchedule(positions=positions):
                 if self.actuation != "velocity":
                     raise ParameterError("A schedule needs velocity actuation.")
-                _require_rows("joints", positions, count, n)
-            case HeldCommands(joints=joints, wrench=wrench):
-                if wrench is not None and self.actuation != "effort":
-                    raise ParameterError("A wrench on the base needs effort actuation.")
-                _require_rows("joints", joints, count, n)
-                _require_rows("wrench", wrench, count, 6)
+                _require_rows("positions", positions, count, self.robot.n)
+            case HeldCommands(table=table):
+                _require_rows("commands", table, count, self.command_size)
             case ControlledGoals(config=config, gains=gains):
                 if self.robot.description.wheel_names:
                     raise ParameterError(
@@ -350,6 +338,12 @@ class Flights:
         return len(self.initial_states)
 
     @property
+    def command_size(self) -> int:
+        """Numbers of a command: n joint velocities, or n efforts and a wrench (6) on the base,
+        force (N) over torque (N m), base components."""
+        return self.robot.n + (6 if PLANTS[self.actuation].wrench else 0)
+
+    @property
     def substeps(self) -> int:
         """Runge-Kutta steps in a tick."""
         step = self.integration_step or PLANTS[self.actuation].integration_step
@@ -362,15 +356,30 @@ class Flights:
         return self.robot.with_inertial(self.inertial[index])
 
 
-def _require_rows(name: str, array: Array | None, count: int, width: int) -> None:
-    if array is None:
-        return
+def _require_rows(name: str, array: Array, count: int, width: int) -> None:
     if array.ndim not in (2, 3) or array.shape[-1] != width or array.shape[-2] < 1:
         raise ParameterError(f"The {name} are {array.shape}, not (ticks, {width}).")
     if array.ndim == 3 and len(array) != count:
         raise ParameterError(f"There are {name} of {len(array)} flights, not {count}.")
     if not np.all(np.isfinite(array)):
         raise ParameterError(f"The {name} have a number that is not finite.")
+
+
+def state_size(n: int) -> int:
+    """Return the numbers of a state of a robot with n joints."""
+    return 2 * n + 20
+
+
+def state_parts(states: Array, n: int) -> dict[str, Array]:
+    """Return the parts of states (..., 2 n + 20) as views: q, qdot, pose, twist and momentum."""
+    names = ("q", "qdot", "pose", "twist", "momentum")
+    ends = np.cumsum([n, n, 7, 6, 7])
+    return dict(zip(names, np.split(states, ends, axis=-1), strict=False))
+
+
+def state_of(plant: Plant) -> Array:
+    """Return the state (2 n + 20,) of a plant."""
+    return np.concatenate([plant.q, plant.qdot, plant.pose, plant.twist, plant.momentum])
 
 
 @dataclass(frozen=True)
@@ -381,6 +390,9 @@ class BatchResult:
     """Name of the engine that flew the flights."""
     time: Array
     """(I,) s."""
+    states: Array
+    """(N, I, 2 n + 20) all of the following up to ``momentum``, in the order of
+    :func:`state_parts`."""
     pose: Array
     """(N, I, 7) position ``r_WB`` (m) and quaternion ``R_WB`` of the base."""
     twist: Array
@@ -425,28 +437,23 @@ class BatchResult:
     momentum_drift: Array
     """(N, 2) largest change of linear and angular momentum that thrust does not explain; NaN
     without a controller."""
-    failures: Mapping[int, str]
+    failures: dict[int, str]
     """Messages of failed flights, by row; the later numbers of these flights are NaN."""
 
     @classmethod
     def empty(cls, flights: Flights) -> BatchResult:
         """Return a result for the flights to fill."""
-        N, instants, n = len(flights), len(flights.report_ticks), flights.robot.n
+        N, n = len(flights), flights.robot.n
+        instants = N, len(flights.report_ticks)
+        states = np.full((*instants, state_size(n)), np.nan)
         first = {"velocity": "rate", "effort": "effort"}[flights.actuation]
-
-        def reported(width: int) -> Array:
-            return np.full((N, instants, width), np.nan)
-
         return cls(
             engine="",
             time=np.array(flights.report_ticks) * flights.control_period,
-            pose=reported(7),
-            twist=reported(6),
-            q=reported(n),
-            qdot=reported(n),
-            momentum=reported(7),
-            measured_pose=reported(7),
-            measured_q=reported(n),
+            states=states,
+            **state_parts(states, n),
+            measured_pose=np.full((*instants, 7), np.nan),
+            measured_q=np.full((*instants, n), np.nan),
             peak_rate=np.zeros((N, n)),
             peak_effort=np.zeros((N, n)),
             peak_wrench=np.zeros((N, 2)),
@@ -459,7 +466,7 @@ class BatchResult:
             decision_tick=np.full(N, -1, np.int64),
             decision_distance=np.full((N, 3), np.nan),
             end_tick=np.full(N, flights.ticks, np.int64),
-            end_state=np.full((N, 2 * n + 20), np.nan),
+            end_state=np.full((N, state_size(n)), np.nan),
             momentum_drift=np.full((N, 2), np.nan),
             failures={},
         )

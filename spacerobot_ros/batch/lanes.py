@@ -11,12 +11,13 @@ from dataclasses import astuple, replace
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from spacerobot_ros.batch.controlling import BatchController
 from spacerobot_ros.batch.flights import (
     BatchResult,
     ControlledGoals,
     Counts,
+    Flags,
     Flights,
     FollowedSchedule,
     HeldCommands,
@@ -48,8 +49,6 @@ _PROGRAMS = {
     ControlledGoals: Program.CONTROLLED,
 }
 
-Flags = npt.NDArray[np.bool_]
-
 
 def fly_lanes(flights: Flights, target: Target | None = None) -> BatchResult:
     """Fly many flights at once, one in each SIMD lane, or each in a thread of a device.
@@ -71,14 +70,12 @@ def _fly_all_in_lanes(flights: Flights, target: Target) -> BatchResult:
     tick = CompiledTick.of(flights, model, target)
     fit = starts_accepted_by_plant(flights)
     # The scalar plant gives the message about each irregular start.
-    result = fly_one_by_one(flights, np.flatnonzero(~fit).tolist())
-    failures = dict(result.failures)
+    result = replace(fly_one_by_one(flights, np.flatnonzero(~fit)), engine=target.engine)
     rows = np.flatnonzero(fit)
     size = _block_size(flights, tick)
     for first in range(0, len(rows), size):
-        block = LaneBlock(flights, tick, model, p, rows[first : first + size])
-        block.fly(result, failures)
-    return replace(result, engine=target.engine, failures=failures)
+        LaneBlock(flights, tick, model, p, rows[first : first + size], result).fly()
+    return result
 
 
 def symbolic_model_of(flights: Flights) -> tuple[ModelFunctions, Array]:
@@ -105,14 +102,9 @@ def _block_size(flights: Flights, tick: CompiledTick) -> int:
     each = 8 * (2 * tick.memory_layout.total_rows + 60 * len(flights.report_ticks))
     if flights.sensors is not None:
         each += 8 * chunk * (12 + 2 * n) * 2
-    match flights.program:
-        case FollowedSchedule(positions=positions):
-            tables = [positions]
-        case HeldCommands(joints=joints, wrench=wrench):
-            tables = [joints] if wrench is None else [joints, wrench]
-        case ControlledGoals():
-            tables = []
-    each += sum(2 * table[0].nbytes for table in tables if table.ndim == 3)
+    table = _command_table(flights)
+    if table.ndim == 3:
+        each += 2 * table[0].nbytes
     fitting = tick.target.block_bytes // each
     if tick.target.threads:
         return max(1, int(fitting))
@@ -120,34 +112,47 @@ def _block_size(flights: Flights, tick: CompiledTick) -> int:
     return max(1, min(_MAX_BLOCK_GROUPS, int(fitting) // lanes)) * lanes
 
 
-class LaneBlock:
-    """Memory of the flights that occupy the lanes at the same time.
+def _command_table(flights: Flights) -> Array:
+    """Return the commands or shapes (ticks, width), or (flights, ticks, width) if they differ."""
+    match flights.program:
+        case FollowedSchedule(positions=table) | HeldCommands(table=table):
+            return table
+    return np.zeros((1, flights.command_size))
 
-    Surplus lanes repeat the last flight; their results are dropped.
+
+class LaneBlock:
+    """Memory of the flights that occupy the lanes at the same time; surplus lanes are idle.
+
+    ``result`` gets the results of the flights and the messages of those that fail.
     """
 
     def __init__(
-        self, flights: Flights, tick: CompiledTick, model: ModelFunctions, p: Array, rows: Counts
+        self,
+        flights: Flights,
+        tick: CompiledTick,
+        model: ModelFunctions,
+        p: Array,
+        rows: Counts,
+        result: BatchResult,
     ) -> None:
-        self._flights, self._tick, self._flown = flights, tick, rows
-        self._target, self._rows = tick.target, tick.memory_layout
+        self._flights, self._tick, self._model, self._flown = flights, tick, model, rows
+        self._result, self._target, self._rows = result, tick.target, tick.memory_layout
         self._lanes = len(rows) if tick.target.threads else tick.target.lanes
         self._groups = -(-len(rows) // self._lanes)
-        count = self._groups * self._lanes
-        self._surplus = count - len(rows)
-        self._rows_of_lanes = np.concatenate([rows, np.repeat(rows[-1:], self._surplus)])
+        surplus = np.repeat(rows[-1:], self._groups * self._lanes - len(rows))
+        self._rows_of_lanes = np.concatenate([rows, surplus])
         self._memory = self._target.zeros((self._groups, self._rows.total_rows, self._lanes))
-        self._memory[:, self._rows["alive"]] = 1.0
         self._memory[:, self._rows["decided_state"]] = np.nan
         self._memory[:, self._rows["end_state"]] = np.nan
+        self._write_rows("alive", 1.0)
         self._noise = SensorNoise(flights, self._rows_of_lanes)
         self._ended: dict[int, int] = {}
         """Ticks at which flights failed, by lane in the block."""
         self._profiles: dict[int, ReferenceProfile] = {}
         """Reference profiles of flights with a controller, by lane in the block."""
-        self._write_starts(model, p[self._rows_of_lanes])
+        self._write_starts(p[rows])
         self._write_errors_and_gains()
-        self._loops = count if self._target.threads else self._groups
+        self._loops = len(rows) if self._target.threads else self._groups
         """Number of flights or groups whose ticks are counted, each for itself."""
         arrays = self._target.arrays
         self._at = arrays.zeros(self._loops, np.int64)
@@ -158,64 +163,54 @@ class LaneBlock:
         self._job, self._referenced = self._prepare_job()
 
     def _write_rows(self, name: str, values: Any, lanes: Counts | None = None) -> None:
-        """Write rows of a name: (flights of the block, size), or those of some lanes alone."""
+        """Write rows of a name, (lanes, size) or a number, of all flights or of some lanes."""
         arrays = self._target.arrays
-        values = arrays.asarray(values)
-        if lanes is None:
-            part = values.reshape(self._groups, self._lanes, -1)
-            self._memory[:, self._rows[name]] = arrays.swapaxes(part, 1, 2)
-            return
-        group, lane = np.divmod(lanes[:, np.newaxis], self._lanes)
+        chosen = np.arange(len(self._flown)) if lanes is None else lanes
+        group, lane = np.divmod(chosen[:, np.newaxis], self._lanes)
         rows = np.arange(self._rows.total_rows)[self._rows[name]]
         at = (arrays.asarray(each) for each in (group, rows, lane))
-        self._memory[tuple(at)] = values
+        self._memory[tuple(at)] = arrays.asarray(values)
 
     def _read_rows(self, name: str) -> Array:
-        """Return rows (flights of the block, size) of a name."""
+        """Return rows (flights, size) of a name."""
         part = np.swapaxes(self._target.to_numpy(self._memory[:, self._rows[name]]), 1, 2)
-        return part.reshape(len(self._rows_of_lanes), -1)
+        return part.reshape(len(self._rows_of_lanes), -1)[: len(self._flown)]
 
-    def _write_starts(self, model: ModelFunctions, p: Array, lanes: Counts | None = None) -> None:
-        """Write masses ``p`` and initial states of the flights in all lanes, or in some."""
-        starts, at = self._flights.initial_states, self._rows_of_lanes
-        if lanes is not None:
-            at = at[lanes]
+    def _write_starts(self, p: Array, lanes: Counts | None = None) -> None:
+        """Write masses ``p`` and initial states of all flights, or of those in some lanes."""
+        at = self._flown if lanes is None else self._flown[lanes]
+        starts = self._flights.initial_states[at]
         self._write_rows("p", p, lanes)
-        quaternion = starts.quaternion[at]
-        quaternion = quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True)
-        q, r = starts.q[at], starts.position[at]
-        centers = model.function("center_of_mass", compile=False)(q.T, p.T).full().T
-        of_base = r + _rotate_vectors(quaternion, centers)
-        r_cm = np.where(starts.position_is_of_center_of_mass[at][:, None], r, of_base)
+        quaternion = starts.quaternion / np.linalg.norm(starts.quaternion, axis=1, keepdims=True)
+        centers = self._model.function("center_of_mass", compile=False)(starts.q.T, p.T).full().T
+        of_base = starts.position + _rotate_vectors(quaternion, centers)
+        is_given = starts.position_is_of_center_of_mass[:, np.newaxis]
+        r_cm = np.where(is_given, starts.position, of_base)
+        parts = [starts.q, quaternion]
         if self._flights.actuation == "velocity":
-            state = np.concatenate([q, quaternion], axis=1)
-            self._write_rows("momenta", starts.momenta[at], lanes)
+            self._write_rows("momenta", starts.momenta, lanes)
             self._write_rows("r_cm", r_cm, lanes)
         else:
-            state = np.concatenate(
-                [q, quaternion, starts.qdot[at], starts.momenta[at], r_cm], axis=1
-            )
-        self._write_rows("state", state, lanes)
+            parts += [starts.qdot, starts.momenta, r_cm]
+        self._write_rows("state", np.concatenate(parts, axis=1), lanes)
 
     def _write_errors_and_gains(self) -> None:
-        at = self._rows_of_lanes
-        if self._flights.sensors is not None:
-            self._write_rows("joint_bias", self._flights.sensors.joint_bias[at])
-            self._write_rows("joint_noise", self._flights.sensors.noise[at, 4:5])
-        if self._tick.controller is not None:
-            initial = astuple(GoalMonitor())[1:]
-            self._write_rows("monitor", np.tile(initial, (len(at), 1)))
-            self._memory[:, self._rows["decided"]] = -1.0
-            self._write_rows("gains", self._tick.controller.gains_argument(at.tolist()))
-            if self._flights.sensors is not None:
-                errors = self._flights.sensors
+        at, errors, controller = self._flown, self._flights.sensors, self._tick.controller
+        if errors is not None:
+            self._write_rows("joint_bias", errors.joint_bias[at])
+            self._write_rows("joint_noise", errors.noise[at, 4:5])
+        if controller is not None:
+            self._write_rows("monitor", astuple(GoalMonitor())[1:])
+            self._write_rows("decided", -1.0)
+            self._write_rows("gains", controller.gains_argument(at.tolist()))
+            if errors is not None:
                 self._write_rows("bias", np.hstack([errors.pose_bias[at], errors.joint_bias[at]]))
                 self._write_rows("sigma", errors.noise[at])
 
     def _prepare_job(self) -> tuple[Job, list[Any]]:
         """Return the driver's job, and the arrays that it points to."""
         flights, program = self._flights, self._flights.program
-        table = self._target.arrays.asarray(self._command_table())
+        table = self._target.arrays.asarray(self._table_of_lanes())
         self._instants = self._target.arrays.asarray(np.array(flights.report_ticks, dtype=np.int64))
         each_table = table.ndim == 4
         arrays = {
@@ -243,43 +238,21 @@ class LaneBlock:
             job.deadband = program.deadband
         return job, list(arrays.values())
 
-    def _command_table(self) -> Array:
-        """Return commands (ticks, width), or (groups, ticks, width, lanes) where they differ."""
-        program = self._flights.program
-        match program:
-            case FollowedSchedule():
-                table = self._one_table_per_lane(program.positions)
-            case HeldCommands():
-                parts = [self._one_table_per_lane(program.joints)]
-                if self._flights.actuation == "effort":
-                    wrench = program.wrench
-                    parts.append(
-                        np.zeros((1, 6)) if wrench is None else self._one_table_per_lane(wrench)
-                    )
-                ticks = max(part.shape[-2] for part in parts)
-                each = max(part.ndim for part in parts)
-                table = np.concatenate(
-                    [_pad_table(part, ticks, each, len(self._rows_of_lanes)) for part in parts],
-                    axis=-1,
-                )
-            case ControlledGoals():
-                table = np.zeros((1, self._rows.row_count("command")))
+    def _table_of_lanes(self) -> Array:
+        """Return commands (ticks, width), or (groups, ticks, width, lanes) if they differ."""
+        table = _command_table(self._flights)
         if table.ndim == 3:
-            grouped = table.reshape(self._groups, self._lanes, *table.shape[1:])
+            of_lanes = table[self._rows_of_lanes]
+            grouped = of_lanes.reshape(self._groups, self._lanes, *table.shape[1:])
             table = np.moveaxis(grouped, 1, 3)
         return np.ascontiguousarray(table)
 
-    def _one_table_per_lane(self, table: Array) -> Array:
-        return table if table.ndim == 2 else np.asarray(table[self._rows_of_lanes])
-
-    # -- flying -------------------------------------------------------------------------------
-
-    def fly(self, result: BatchResult, failures: dict[int, str]) -> None:
+    def fly(self) -> None:
         """Fly the flights and write their results."""
         flights, job, library = self._flights, self._job, self._tick.library
         # A tick of no duration under no command reports the start.
         library.start_flights(job)
-        self._write_rows("h", np.full(len(self._rows_of_lanes), flights.control_period))
+        self._memory[:, self._rows["h"]] = flights.control_period
         for begin in range(0, flights.ticks, _CHUNK_TICKS):
             alive = self._target.to_numpy(self._memory[:, self._rows.first_row("alive")])
             if not alive.any():
@@ -293,82 +266,25 @@ class LaneBlock:
                 job.normals = self._target.address(on_target)
                 job.normals_from, job.normals_ticks, job.normals_width = begin, *normals.shape[1:3]
             if not begin:
-                self._begin_control(failures)
-            self._fly_until(end, result, failures)
+                self._begin_control()
+            self._fly_until(end)
         if self._tick.controller is not None:
             library.end_flights(job)
-        self._write_results(result)
+        self._write_results()
 
-    # -- stepping -----------------------------------------------------------------------------
-
-    def begin_stepping(self) -> None:
-        """Prepare for :meth:`restart` and :meth:`step`: surplus lanes are idle."""
-        self._job.program = Program.GIVEN
-        count = len(self._flown)
-        self.end_lanes(np.arange(count, count + self._surplus))
-        self._write_rows("h", np.full(len(self._rows_of_lanes), self._flights.control_period))
-
-    def continue_from(self, other: LaneBlock) -> None:
-        """Take over the states of a block of the same flights whose model has other masses."""
-        for name in ("state", "before", "momenta", "r_cm", "alive"):
-            if name in self._rows.slices:
-                self._write_rows(name, other._read_rows(name))
-
-    def restart(self, model: ModelFunctions, p: Array, lanes: Counts) -> Array:
-        """Restart the flights of some lanes, and return their reports (lanes, width).
-
-        ``p`` are the masses as arguments of the model.
-        """
-        self._write_starts(model, p, lanes)
-        width = self._rows.row_count("command")
-        self._write_rows("command", np.zeros((len(lanes), width)), lanes)
-        if self._flights.actuation == "velocity":
-            self._write_rows("before", np.zeros((len(lanes), self._flights.robot.n)), lanes)
-        # A tick of no duration reports the start; groups that have none are left alone.
-        self._write_rows("h", np.zeros((len(lanes), 1)), lanes)
-        self._write_rows("alive", np.ones((len(lanes), 1)), lanes)
-        self._instants[0] = 0
-        self._tick.library.start_flights(self._job)
-        self._write_rows("h", np.full((len(lanes), 1), self._flights.control_period), lanes)
-        at = self._target.arrays.asarray(lanes)
-        reports = self._reports[at // self._lanes, 0, :, at % self._lanes]
-        return self._target.to_numpy(reports)
-
-    def end_lanes(self, lanes: Counts) -> None:
-        """End the flights of some lanes; a group with only idle lanes is skipped."""
-        self._write_rows("alive", np.zeros((len(lanes), 1)), lanes)
-
-    def step(
-        self, commands: Array, ticks: int, result: BatchResult, failures: dict[int, str]
-    ) -> Array:
-        """Fly some ticks under given commands, and return the reports (flights, width).
-
-        ``commands`` (flights, width) are held. Flights that fail end with a message in
-        ``failures``.
-        """
-        count = len(self._flown)
-        if self._surplus:
-            commands = np.concatenate([commands, np.repeat(commands[-1:], self._surplus, axis=0)])
-        self._write_rows("command", commands)
-        self._at[:], self._instants[0] = 0, ticks
-        self._fly_until(ticks, result, failures)
-        reports = np.moveaxis(self._target.to_numpy(self._reports[:, 0]), 2, 1)
-        return reports.reshape(-1, self._reports.shape[2])[:count]
-
-    def _fly_until(self, tick: int, result: BatchResult, failures: dict[int, str]) -> None:
+    def _fly_until(self, tick: int) -> None:
         self._tick.library.fly_until(self._job, tick)
         while self._pending.any():
-            self._command_outside_lanes(result, failures)
+            self._command_outside_lanes()
             self._tick.library.fly_until(self._job, tick)
-        self._note_failures(failures)
+        self._note_failures()
 
-    def _end_flight(self, index: int, tick: int, message: str, failures: dict[int, str]) -> None:
-        self.end_lanes(np.array([index]))
-        if index < len(self._flown):
-            failures[int(self._flown[index])] = message
-            self._ended[index] = tick
+    def _end_flight(self, lane: int, tick: int, message: str) -> None:
+        self._write_rows("alive", 0.0, np.array([lane]))
+        self._result.failures[int(self._flown[lane])] = message
+        self._ended[lane] = tick
 
-    def _begin_control(self, failures: dict[int, str]) -> None:
+    def _begin_control(self) -> None:
         controller = self._tick.controller
         if controller is None:
             return
@@ -376,98 +292,85 @@ class LaneBlock:
         states = self._read_rows("measured")
         numbers = np.zeros((len(states), self._rows.row_count("profile")))
         most = np.zeros((len(states), self._rows.row_count("bounds")))
-        for index, (row, state) in enumerate(zip(self._rows_of_lanes, states, strict=True)):
+        for lane, (row, state) in enumerate(zip(self._flown.tolist(), states, strict=True)):
             try:
-                profile, most[index] = controller.begin_flight(
-                    int(row), ControlState.unstack(state)
-                )
+                profile, most[lane] = controller.begin_flight(row, ControlState.unstack(state))
             except SpaceRobotError as error:
-                self._end_flight(index, 0, str(error), failures)
+                self._end_flight(lane, 0, str(error))
                 continue
-            self._profiles[index] = profile
-            numbers[index] = controller.profile_argument(profile)
+            self._profiles[lane] = profile
+            numbers[lane] = controller.profile_argument(profile)
         self._write_rows("profile", numbers)
         self._write_rows("bounds", most)
 
-    def _note_failures(self, failures: dict[int, str]) -> None:
+    def _note_failures(self) -> None:
         """Give the flights that the driver has ended their messages."""
         if not self._memory[:, self._rows["failure"]].any():
             return
         reasons, ticks = self._read_rows("failure")[:, 0], self._read_rows("failed_at")[:, 0]
-        for index in np.flatnonzero(reasons).tolist():
-            self._end_flight(index, int(ticks[index]), FAILURES[int(reasons[index]) - 1], failures)
+        for lane in np.flatnonzero(reasons).tolist():
+            self._end_flight(lane, int(ticks[lane]), FAILURES[int(reasons[lane]) - 1])
         self._memory[:, self._rows["failure"]] = 0.0
 
-    def _command_outside_lanes(self, result: BatchResult, failures: dict[int, str]) -> None:
+    def _command_outside_lanes(self) -> None:
         """Compute the commands that lanes wait for."""
-        to_numpy, each = self._target.to_numpy, len(self._rows_of_lanes) // self._loops
-        waiting = np.repeat(to_numpy(self._pending) != 0, each)
-        waiting &= (self._read_rows("exact") * self._read_rows("alive"))[:, 0] != 0.0
-        ticks, states = np.repeat(to_numpy(self._at), each), self._read_rows("measured")
-        for index in np.flatnonzero(waiting).tolist():
-            try:
-                command = self._exact_command(index, int(ticks[index]), states[index])
-            except SpaceRobotError as error:
-                self._end_flight(index, int(ticks[index]), str(error), failures)
-                continue
-            self._write_rows("command", command, np.array([index]))
-            if index < len(self._flown):
-                result.fallback_ticks[self._flown[index]] += 1
-
-    def _exact_command(self, index: int, tick: int, measured: Array) -> Array:
-        controller, row = self._tick.controller, int(self._rows_of_lanes[index])
+        controller, of_loops = self._tick.controller, np.arange(len(self._flown)) // self._lanes
         assert controller is not None
-        state = ControlState.unstack(measured)
-        realised = controller.exact_command(row, self._profiles[index], tick, state).realised
-        return np.concatenate([realised.tau, realised.wrench_B])
+        if self._target.threads:
+            of_loops = np.arange(len(self._flown))
+        waiting = self._target.to_numpy(self._pending)[of_loops] != 0
+        waiting &= (self._read_rows("exact") * self._read_rows("alive"))[:, 0] != 0.0
+        ticks, states = self._target.to_numpy(self._at)[of_loops], self._read_rows("measured")
+        for lane in np.flatnonzero(waiting).tolist():
+            row, tick, state = int(self._flown[lane]), int(ticks[lane]), states[lane]
+            try:
+                command = controller.exact_command(
+                    row, self._profiles[lane], tick, ControlState.unstack(state)
+                )
+            except SpaceRobotError as error:
+                self._end_flight(lane, tick, str(error))
+                continue
+            self._write_rows("command", command, np.array([lane]))
+            self._result.fallback_ticks[row] += 1
 
-    def _write_results(self, result: BatchResult) -> None:
-        count, n, rows = len(self._flown), self._flights.robot.n, self._flown
+    def _reported(self) -> Array:
+        """Return the reports (flights, instants, width)."""
         reports = np.moveaxis(self._target.to_numpy(self._reports), 3, 1)
-        reports = reports.reshape(-1, *self._reports.shape[1:3])
-        for index, tick in self._ended.items():
-            if index < count:
-                reports[index, np.array(self._flights.report_ticks) > tick] = np.nan
-        ends = np.cumsum([n, n, 7, 6, 7])
-        names = ("q", "qdot", "pose", "twist", "momentum")
-        for name, part in zip(names, np.split(reports[:count], ends[:-1], axis=2), strict=True):
-            getattr(result, name)[rows] = part
+        return reports.reshape(-1, *self._reports.shape[1:3])[: len(self._flown)]
+
+    def _write_results(self) -> None:
+        result, rows, n = self._result, self._flown, self._flights.robot.n
+        reports = self._reported()
+        for lane, tick in self._ended.items():
+            reports[lane, np.array(self._flights.report_ticks) > tick] = np.nan
+        result.states[rows] = reports
         for name in ("peak_rate", "peak_effort", "peak_wrench", "impulse", "lowest", "highest"):
-            getattr(result, name)[rows] = self._read_rows(name)[:count]
-        limits = self._read_rows("limits")[:count].astype(np.int64)
+            getattr(result, name)[rows] = self._read_rows(name)
+        limits = self._read_rows("limits").astype(np.int64)
         first = "effort" if self._flights.actuation == "effort" else "rate"
         result.limited_ticks[first][rows] = limits[:, :n]
         result.limited_ticks["stroke"][rows] = limits[:, n:]
         if self._tick.controller is not None:
-            self._write_decisions(result, rows)
+            self._write_decisions(self._tick.controller)
         self._noise.measure(result, rows)
 
-    def _write_decisions(self, result: BatchResult, rows: Counts) -> None:
-        controller, count = self._tick.controller, len(rows)
-        assert controller is not None
-        result.decision[rows] = self._read_rows("decision")[:count, 0].astype(np.int64)
-        result.decision_tick[rows] = self._read_rows("decided")[:count, 0].astype(np.int64)
-        result.momentum_drift[rows] = self._read_rows("drift")[:count]
-        result.end_state[rows] = self._read_rows("end_state")[:count]
-        result.end_tick[rows] = self._read_rows("ended")[:count, 0].astype(np.int64)
+    def _write_decisions(self, controller: BatchController) -> None:
+        result, rows = self._result, self._flown
+        result.decision[rows] = self._read_rows("decision")[:, 0].astype(np.int64)
+        result.decision_tick[rows] = self._read_rows("decided")[:, 0].astype(np.int64)
+        result.momentum_drift[rows] = self._read_rows("drift")
+        result.end_state[rows] = self._read_rows("end_state")
+        result.end_tick[rows] = self._read_rows("ended")[:, 0].astype(np.int64)
         states = self._read_rows("decided_state")
-        for index in np.flatnonzero(result.decision[rows] != Decision.NONE).tolist():
-            goal, state = self._profiles[index].goal, ControlState.unstack(states[index])
-            distance = controller.distance(state, goal)
-            result.decision_distance[rows[index]] = astuple(distance)
+        for lane in np.flatnonzero(result.decision[rows] != Decision.NONE).tolist():
+            goal, state = self._profiles[lane].goal, ControlState.unstack(states[lane])
+            result.decision_distance[rows[lane]] = astuple(controller.distance(state, goal))
 
 
 def _rotate_vectors(quaternion: Array, vectors: Array) -> Array:
     """Return ``R v`` of quaternions (N, 4) and vectors (N, 3)."""
     x, w = quaternion[:, :3], quaternion[:, 3:]
     return np.asarray(vectors + 2 * np.cross(x, np.cross(x, vectors) + w * vectors))
-
-
-def _pad_table(table: Array, ticks: int, dimensions: int, count: int) -> Array:
-    """Return commands with zeros after their last, and a copy for each flight where wanted."""
-    rest = np.zeros((*table.shape[:-2], ticks - table.shape[-2], table.shape[-1]))
-    whole = np.concatenate([table, rest], axis=-2)
-    return np.broadcast_to(whole, (count, *whole.shape)) if dimensions > whole.ndim else whole
 
 
 class SensorNoise:

@@ -124,8 +124,7 @@ class CompiledTick:
     ) -> CompiledTick:
         """Compile the tick of flights, or return an earlier compilation.
 
-        With ``link``, reports end with the pose in B of that link: the rotation by columns (9) and
-        the position (3), m.
+        With ``link``, reports end with the position (3) in B of that link, m.
 
         Raises
         ------
@@ -166,10 +165,8 @@ class CompiledTick:
         poses: dict[str, int] = {}
         if link:
             index = robot.link_names.index(link)
-            R, r = outputs["link_R"], outputs["link_r"]
-            R, r = R[:, 3 * index : 3 * index + 3], ca.reshape(r, 3, -1)[:, index]
-            outputs["link_pose"] = ca.densify(ca.vertcat(ca.vec(R), r))
-            reported, poses = (*reported, "link_pose"), {"link_pose": 12}
+            outputs["place"] = ca.densify(ca.reshape(outputs["link_r"], 3, -1)[:, index])
+            reported, poses = (*reported, "place"), {"place": 3}
         arguments = {"FLIGHT": (*names.inputs, "p"), "REPORT": (*names.inputs, "p")}
         results = {"FLIGHT": names.results_of_every_tick, "REPORT": reported}
         functions = {

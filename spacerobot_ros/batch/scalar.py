@@ -14,6 +14,7 @@ from spacerobot_ros.batch.flights import (
     Flights,
     FollowedSchedule,
     HeldCommands,
+    state_of,
 )
 from spacerobot_ros.control.goal_monitor import Decision, GoalMonitor
 from spacerobot_ros.control.state import ControlState, Reference
@@ -38,17 +39,16 @@ def fly_one_by_one(flights: Flights, rows: Iterable[int] | None = None) -> Batch
 
     The other rows are NaN or zero.
     """
-    result = BatchResult.empty(flights)
-    failures: dict[int, str] = {}
+    result = replace(BatchResult.empty(flights), engine="scalar")
     controller: BatchController | None = None
-    for row in range(len(flights)) if rows is None else rows:
+    for row in range(len(flights)) if rows is None else map(int, rows):
         try:
             if controller is None and isinstance(flights.program, ControlledGoals):
                 controller = BatchController.of(flights)
             _fly_row(flights, row, result, controller)
         except SpaceRobotError as error:
-            failures[row] = str(error)
-    return replace(result, engine="scalar", failures=failures)
+            result.failures[row] = str(error)
+    return result
 
 
 def plant_of(flights: Flights, row: int) -> Plant:
@@ -62,11 +62,10 @@ def plant_of(flights: Flights, row: int) -> Plant:
     )
 
 
-def pose_of_link(plant: Plant, link: str) -> Array:
-    """Return the pose in B of a link of a plant: rotation by columns (9), position (3), m."""
-    index = plant.robot.link_names.index(link)
-    R = plant.link_R[:, 3 * index : 3 * index + 3]
-    return np.concatenate([R.ravel(order="F"), plant.link_r.reshape((3, -1), order="F")[:, index]])
+def split_command(flights: Flights, command: Array) -> list[Array]:
+    """Return a command as arguments of a plant's step."""
+    n = flights.robot.n
+    return [command] if flights.actuation == "velocity" else [command[:n], command[n:]]
 
 
 def _fly_row(
@@ -81,7 +80,7 @@ def _fly_row(
         case FollowedSchedule() as program:
             command = _schedule_commands(flights, program, row)
         case HeldCommands() as program:
-            command = _held_commands(program, row)
+            command = _held_commands(flights, program, row)
         case ControlledGoals(ends_when_decided=ends):
             assert controller is not None
             command = _controlled_commands(controller, row, result)
@@ -92,7 +91,10 @@ def _fly_row(
             sensors.measure()
             measured = sensors if sensors.used else plant
             if tick in instants:
-                _write_report(plant, measured, result, row, instants[tick])
+                column = instants[tick]
+                result.states[row, column] = state_of(plant)
+                result.measured_pose[row, column] = measured.pose
+                result.measured_q[row, column] = measured.q
             decided = result.decision[row] != Decision.NONE
             if tick == flights.ticks or (ends and decided):
                 result.end_tick[row] = tick
@@ -103,21 +105,20 @@ def _fly_row(
             if controller is not None:
                 drift = np.maximum(drift, momentum_change(_momenta_beyond_thrust(plant), momenta))
         if controller is not None:
-            parts = plant.q, plant.qdot, plant.pose, plant.twist, plant.momentum
-            result.end_state[row] = np.concatenate(parts)
+            result.end_state[row] = state_of(plant)
             result.momentum_drift[row] = drift
     finally:
         for name, counts in plant.limit_counts.items():
             result.limited_ticks[name][row] = counts
 
 
-def _held_commands(program: HeldCommands, row: int) -> _Commands:
+def _held_commands(flights: Flights, program: HeldCommands, row: int) -> _Commands:
     """Return the commands of a table, zero after its end."""
-    tables = [program.joints] if program.wrench is None else [program.joints, program.wrench]
-    tables = [_table_of_row(table, row) for table in tables]
+    table = _table_of_row(program.table, row)
 
     def command(tick: int, measured: Plant | Sensors) -> Sequence[Array]:
-        return [table[tick] if tick < len(table) else np.zeros(table.shape[1]) for table in tables]
+        held = table[tick] if tick < len(table) else np.zeros(table.shape[1])
+        return split_command(flights, held)
 
     return command
 
@@ -166,14 +167,6 @@ def _momenta_beyond_thrust(plant: Plant) -> Array:
 
 def _table_of_row(array: Array, row: int) -> Array:
     return array if array.ndim == 2 else np.asarray(array[row])
-
-
-def _write_report(
-    plant: Plant, measured: Plant | Sensors, result: BatchResult, row: int, column: int
-) -> None:
-    for name in ("pose", "twist", "q", "qdot", "momentum"):
-        getattr(result, name)[row, column] = getattr(plant, name)
-    result.measured_pose[row, column], result.measured_q[row, column] = measured.pose, measured.q
 
 
 def _update_peaks(

@@ -7,9 +7,8 @@ without them, in one plant per flight.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -17,14 +16,18 @@ import numpy.typing as npt
 from spacerobot_ros.batch.flights import (
     BatchResult,
     Counts,
+    Flags,
     Flights,
     HeldCommands,
     InitialStates,
     assign_rows,
+    state_of,
+    state_parts,
+    state_size,
 )
 from spacerobot_ros.batch.lanes import LaneBlock, starts_accepted_by_plant, symbolic_model_of
-from spacerobot_ros.batch.native import CompiledTick
-from spacerobot_ros.batch.scalar import plant_of, pose_of_link
+from spacerobot_ros.batch.native import CompiledTick, Program
+from spacerobot_ros.batch.scalar import plant_of, split_command
 from spacerobot_ros.batch.targets import Target, vector_unit
 from spacerobot_ros.errors import CommandError, ParameterError, SpaceRobotError
 from spacerobot_ros.files import warn_once
@@ -32,36 +35,13 @@ from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.compilation import NoLibraryError
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.inertial_parameters import InertialParameters
-from spacerobot_ros.simulation.actuators import PLANTS, build_plant
+from spacerobot_ros.simulation.actuators import build_plant
 from spacerobot_ros.simulation.config import PlantConfig
 from spacerobot_ros.simulation.plant import Plant
-
-LINK_POSE_SIZE = 12
-"""Numbers of a link's pose: rotation by columns and position."""
 
 
 class SteppedFlights:
     """N flights of one robot, advanced together by ticks under given commands.
-
-    After :meth:`reset` and :meth:`step`, the attributes hold the states of the flights:
-
-    ``pose``
-        (N, 7) position ``r_WB`` (m) and quaternion ``R_WB`` (x, y, z, w) of the base.
-    ``twist``
-        (N, 6) ``v_WB_B`` (m/s) and ``omega_WB_B`` (rad/s).
-    ``q``, ``qdot``
-        (N, n) joint positions (m or rad) and velocities (per second).
-    ``momentum``
-        (N, 7) linear (kg m/s) and angular momentum about the centre of mass (kg m^2/s), both in
-        W, and kinetic energy (J).
-    ``link_R``, ``link_r``
-        (N, 3, 3) and (N, 3): pose in B of the link ``link``; empty arrays without one.
-    ``ticks``
-        (N,) ticks since the last reset of each flight.
-    ``has_not_ended``
-        (N,) whether the flight is in progress: it has neither failed nor been ended.
-    ``failures``
-        The messages of flights that failed since their last reset, by row.
 
     A flight that has ended keeps the state of its last tick.
 
@@ -70,7 +50,7 @@ class SteppedFlights:
     robot, actuation, control_period, starts, inertial, integration_step
         See :class:`.Flights`; all flights begin at the starts.
     link
-        Link whose pose is computed; empty: none.
+        Link whose position is computed; empty: none.
     in_lanes
         Whether the flights are in SIMD lanes; if not, or if lanes cannot be compiled, each flight
         has a plant. Both compute the same states up to rounding.
@@ -90,12 +70,18 @@ class SteppedFlights:
     """
 
     pose: Array
+    """(N, 7) position ``r_WB`` (m) and quaternion ``R_WB`` (x, y, z, w) of the base."""
     twist: Array
+    """(N, 6) ``v_WB_B`` (m/s) and ``omega_WB_B`` (rad/s)."""
     q: Array
+    """(N, n) joint positions, m or rad."""
     qdot: Array
+    """(N, n) joint velocities, per second."""
     momentum: Array
-    link_R: Array
+    """(N, 7) linear (kg m/s) and angular momentum about the centre of mass (kg m^2/s), both in W,
+    and kinetic energy (J)."""
     link_r: Array
+    """(N, 3) position in B of the link ``link``, m; (N, 0) without one."""
 
     def __init__(
         self,
@@ -123,38 +109,30 @@ class SteppedFlights:
         self._flights = Flights(
             *(robot, actuation, control_period, 1),
             starts[every],
-            HeldCommands(np.zeros((1, robot.n))),
+            HeldCommands(np.zeros((1, robot.n + 6 * (actuation == "effort")))),
             inertial[every],
             integration_step=integration_step,
         )
-        self.robot, self.control_period, self._link = robot, control_period, link
-        self.command_size = robot.n + (6 if PLANTS[actuation].wrench else 0)
-        """Numbers of a command: n joint velocities, or n efforts and a wrench (6) on the base."""
+        self.robot, self.control_period = robot, control_period
+        self.command_size = self._flights.command_size
+        """See :attr:`.Flights.command_size`."""
         self.ticks = np.zeros(count, dtype=np.int64)
+        """(N,) ticks since the last reset of each flight."""
         self.has_not_ended = np.ones(count, dtype=np.bool_)
-        self.failures: dict[int, str] = {}
+        """(N,) whether the flight is in progress: it has neither failed nor been ended."""
         self._require_regular(self._flights)
-        scalar = plants or not in_lanes
-        self._engine = (
-            _PlantEngine(self._flights, link, plants) if scalar else self._choose_engine(target)
-        )
-        width = 2 * robot.n + 20 + (LINK_POSE_SIZE if link else 0)
-        self._reports = np.zeros((count, width))
-        self._attach_reports()
+        self._engine = self._choose_engine(link, plants, in_lanes, target)
+        self.engine = self._engine.name
+        """Name of the engine: lanes with their registers, or ``scalar``."""
+        self.failures = self._engine.failures
+        """The messages of flights that failed since their last reset, by row."""
+        self._reports = np.zeros((count, state_size(robot.n) + (3 if link else 0)))
+        vars(self).update(state_parts(self._reports, robot.n))
+        self.link_r = self._reports[:, state_size(robot.n) :]
         self._begin(every)
 
     def __len__(self) -> int:
         return len(self.ticks)
-
-    @property
-    def engine(self) -> str:
-        """Name of the engine: lanes with their registers, or ``scalar``."""
-        return self._engine.name
-
-    @property
-    def substeps(self) -> int:
-        """Runge-Kutta steps in a tick."""
-        return self._flights.substeps
 
     @property
     def time(self) -> Array:
@@ -215,7 +193,6 @@ class SteppedFlights:
         """End some flights; they are not stepped until they are reset."""
         chosen = np.atleast_1d(np.asarray(rows, dtype=np.int64))
         self.has_not_ended[chosen] = False
-        self._engine.end(chosen)
 
     def step(self, commands: Array, ticks: int = 1) -> None:
         """Advance all flights in progress by some ticks under held commands.
@@ -245,13 +222,10 @@ class SteppedFlights:
         bad = np.flatnonzero(self.has_not_ended & ~np.isfinite(commands).all(axis=1))
         if bad.size:
             raise CommandError(f"The command of flight {bad[0]} is not finite.")
-        before = self.has_not_ended.copy()
-        failed: dict[int, str] = {}
-        reports = self._engine.step(commands, ticks, failed)
-        self.failures |= failed
-        self.has_not_ended[list(failed)] = False
+        reports = self._engine.step(commands, ticks, self.has_not_ended)
+        self.has_not_ended[list(self.failures)] = False
         self._reports[self.has_not_ended] = reports[self.has_not_ended]
-        self.ticks[before & self.has_not_ended] += ticks
+        self.ticks[self.has_not_ended] += ticks
 
     def _begin(self, rows: Counts) -> None:
         self._reports[rows] = self._engine.start(rows)
@@ -264,58 +238,35 @@ class SteppedFlights:
         for row in np.flatnonzero(~starts_accepted_by_plant(flights)).tolist():
             plant_of(flights, row)
 
-    def _choose_engine(self, target: Target | None) -> _Engine:
-        try:
-            return _LaneEngine(self._flights, self._link, target or vector_unit())
-        except NoLibraryError as reason:
-            warn_once(f"Flights are flown one by one, not in lanes: {reason}.")
-            return _PlantEngine(self._flights, self._link, ())
-
-    def _attach_reports(self) -> None:
-        """Let the attributes be parts of the reports."""
-        n, count = self.robot.n, len(self)
-        ends = np.cumsum([n, n, 7, 6, 7])
-        names = ("q", "qdot", "pose", "twist", "momentum")
-        *parts, rest = np.split(self._reports, ends, axis=1)
-        for name, part in zip(names, parts, strict=True):
-            setattr(self, name, part)
-        rotation, self.link_r = rest[:, :9], rest[:, 9:]
-        self.link_R = np.swapaxes(rotation.reshape((count, 3, -1)), 1, 2)
+    def _choose_engine(
+        self, link: str, plants: Sequence[PlantConfig], in_lanes: bool, target: Target | None
+    ) -> _SteppedLanes | _SteppedPlants:
+        if in_lanes and not plants:
+            try:
+                return _SteppedLanes(self._flights, link, target or vector_unit())
+            except NoLibraryError as reason:
+                warn_once(f"Flights are flown one by one, not in lanes: {reason}.")
+        return _SteppedPlants(self._flights, link, plants)
 
 
-class _Engine(Protocol):
-    """Steps flights; reports are rows of q, qdot, pose, twist, momentum and the link's pose."""
-
-    name: str
-
-    def start(self, rows: Counts) -> Array:
-        """Begin flights at the starts of their rows, and return their reports."""
-
-    def end(self, rows: Counts) -> None:
-        """End flights."""
-
-    def step(self, commands: Array, ticks: int, failures: dict[int, str]) -> Array:
-        """Step the flights in progress; flights that fail are ended, with their messages."""
-
-
-class _LaneEngine:
-    """Flights in SIMD lanes, all in one block; NoLibraryError if no tick can be compiled here."""
+class _SteppedLanes(LaneBlock):
+    """All flights in one block; NoLibraryError if no tick can be compiled here."""
 
     def __init__(self, flights: Flights, link: str, target: Target) -> None:
-        self._flights, self._link, self._target = flights, link, target
-        self._result = BatchResult.empty(flights)
-        self._block = self._new_block()
+        self.name, self._link = target.engine, link
+        result = BatchResult.empty(flights)
+        self.failures = result.failures
+        self._lay_out(flights, target, result)
 
-    def _new_block(self) -> LaneBlock:
-        flights = self._flights
-        self._model, p = symbolic_model_of(flights)
-        tick = CompiledTick.of(flights, self._model, self._target, self._link)
-        self.name = self._target.engine
-        block = LaneBlock(flights, tick, self._model, p, np.arange(len(flights)))
-        block.begin_stepping()
-        return block
+    def _lay_out(self, flights: Flights, target: Target, result: BatchResult) -> None:
+        model, p = symbolic_model_of(flights)
+        tick = CompiledTick.of(flights, model, target, self._link)
+        super().__init__(flights, tick, model, p, np.arange(len(flights)), result)
+        self._job.program = Program.GIVEN
+        self._memory[:, self._rows["h"]] = flights.control_period
 
     def start(self, rows: Counts) -> Array:
+        """Begin flights at the starts of their rows, and return their reports (rows, width)."""
         flights = self._flights
         assert flights.inertial is not None
         model, p = flights.robot.symbolic_model(flights.inertial[rows])
@@ -323,70 +274,72 @@ class _LaneEngine:
             whole, all_p = symbolic_model_of(flights)
             if whole is not self._model:
                 # The first masses with entries that are usually zero need another model.
-                before, self._block = self._block, self._new_block()
-                self._block.continue_from(before)
+                names = ("state", "before", "momenta", "r_cm")
+                kept = {each: self._read_rows(each) for each in names if each in self._rows.slices}
+                self._lay_out(flights, self._target, self._result)
+                for name, values in kept.items():
+                    self._write_rows(name, values)
             p = all_p[rows]
-        return self._block.restart(self._model, p, rows)
+        self._write_starts(p, rows)
+        self._write_rows("command", 0.0, rows)
+        if flights.actuation == "velocity":
+            self._write_rows("before", 0.0, rows)
+        # A tick of no duration reports the start; groups that have none are left alone.
+        self._write_rows("h", 0.0, rows)
+        self._instants[0] = 0
+        self._tick.library.start_flights(self._job)
+        self._write_rows("h", flights.control_period, rows)
+        return self._reported()[rows, 0]
 
-    def end(self, rows: Counts) -> None:
-        self._block.end_lanes(rows)
+    def step(self, commands: Array, ticks: int, under_way: Flags) -> Array:
+        """Step the flights that are under way under held commands, and return all reports."""
+        self._write_rows("alive", under_way[:, np.newaxis])
+        self._write_rows("command", commands)
+        self._at[:], self._instants[0] = 0, ticks
+        self._fly_until(ticks)
+        return self._reported()[:, 0]
 
-    def step(self, commands: Array, ticks: int, failures: dict[int, str]) -> Array:
-        return self._block.step(commands, ticks, self._result, failures)
 
+class _SteppedPlants:
+    """Flights of which each has a plant, stepped one after the other."""
 
-class _PlantEngine:
     name = "scalar"
 
     def __init__(self, flights: Flights, link: str, configs: Sequence[PlantConfig]) -> None:
-        self._flights, self._link, self._configs = flights, link, configs
+        self._flights, self._configs = flights, configs
+        self._link = flights.robot.link_names.index(link) if link else -1
         self._plants: dict[int, Plant] = {}
-        self._alive = np.ones(len(flights), dtype=np.bool_)
         self._masses = [b""] * len(flights)
+        self.failures: dict[int, str] = {}
 
     def start(self, rows: Counts) -> Array:
         for row in rows.tolist():
             self._start_plant(row)
-        self._alive[rows] = True
         return np.array([self._report(self._plants[row]) for row in rows.tolist()])
 
     def _start_plant(self, row: int) -> None:
         """Return the plant of a flight to a start; other masses need another plant."""
         flights = self._flights
         assert flights.inertial is not None
+        start, masses = flights.initial_states.initial_state(row), flights.inertial[row].vector
         if self._configs:
-            start, robot = flights.initial_states.initial_state(row), flights.robot_of(row)
-            self._plants[row] = build_plant(robot, self._configs[row], start)
-            return
-        masses = flights.inertial[row].vector.tobytes()
-        if row in self._plants and self._masses[row] == masses:
-            plant = self._plants[row]
-            plant.initial = flights.initial_states.initial_state(row)
-            plant.reset()
+            self._plants[row] = build_plant(flights.robot_of(row), self._configs[row], start)
+        elif row in self._plants and self._masses[row] == masses.tobytes():
+            self._plants[row].initial = start
+            self._plants[row].reset()
         else:
-            self._plants[row], self._masses[row] = plant_of(flights, row), masses
+            self._plants[row], self._masses[row] = plant_of(flights, row), masses.tobytes()
 
-    def end(self, rows: Counts) -> None:
-        self._alive[rows] = False
-
-    def step(self, commands: Array, ticks: int, failures: dict[int, str]) -> Array:
-        reports, n = [], self._flights.robot.n
-        for row, plant in sorted(self._plants.items()):
-            parts = [commands[row, :n], commands[row, n:]][: 1 + (commands.shape[1] > n)]
-            if self._alive[row]:
-                try:
-                    self._step_plant(plant.step, parts, ticks)
-                except SpaceRobotError as error:
-                    failures[row], self._alive[row] = str(error), False
-            reports.append(self._report(plant))
-        return np.array(reports)
-
-    def _step_plant(self, step: Callable[..., bool], command: list[Array], ticks: int) -> None:
-        for _ in range(ticks):
-            step(*command)
+    def step(self, commands: Array, ticks: int, under_way: Flags) -> Array:
+        for row in np.flatnonzero(under_way).tolist():
+            command = split_command(self._flights, commands[row])
+            try:
+                for _ in range(ticks):
+                    self._plants[row].step(*command)
+            except SpaceRobotError as error:
+                self.failures[row] = str(error)
+        return np.array([self._report(plant) for _, plant in sorted(self._plants.items())])
 
     def _report(self, plant: Plant) -> Array:
-        parts = [plant.q, plant.qdot, plant.pose, plant.twist, plant.momentum]
-        if self._link:
-            parts.append(pose_of_link(plant, self._link))
-        return np.concatenate(parts)
+        of_link = plant.link_r.reshape((3, -1), order="F")[:, self._link]
+        return np.concatenate([state_of(plant), of_link[: 3 * (self._link >= 0)]])

@@ -53,7 +53,7 @@ def flights(sliders: SpaceRobot, program: Any, **changes: Any) -> Flights:
     return Flights(sliders, actuation, 0.05, ticks, starts, program, **chosen)
 
 
-STILL = HeldCommands(np.zeros((5, 3)))
+STILL, RELAXED = HeldCommands(np.zeros((5, 3))), HeldCommands(np.zeros((5, 9)))
 NOT_A_NUMBER = np.zeros((2, 5, 3))
 NOT_A_NUMBER[1, 2, 0] = np.nan
 
@@ -72,16 +72,15 @@ NOT_A_NUMBER[1, 2, 0] = np.nan
         (STILL, {"sensors": range(3)}, "There are sensors of 3 flights, not 2."),
         (FollowedSchedule(np.zeros((5, 3))), {"actuation": "effort"},
          "A schedule needs velocity actuation."),
-        (FollowedSchedule(np.zeros((5, 2))), {}, "The joints are (5, 2), not (ticks, 3)."),
-        (FollowedSchedule(np.zeros((3, 5, 3))), {}, "There are joints of 3 flights, not 2."),
-        (HeldCommands(np.zeros(3)), {}, "The joints are (3,), not (ticks, 3)."),
-        (HeldCommands(np.zeros((1, 1, 2, 3))), {}, "The joints are (1, 1, 2, 3), not (ticks, 3)."),
-        (HeldCommands(np.zeros((0, 3))), {}, "The joints are (0, 3), not (ticks, 3)."),
-        (HeldCommands(NOT_A_NUMBER), {}, "The joints have a number that is not finite."),
-        (HeldCommands(np.zeros((5, 3)), np.zeros((5, 6))), {},
-         "A wrench on the base needs effort actuation."),
-        (HeldCommands(np.zeros((5, 3)), np.zeros((5, 5))), {"actuation": "effort"},
-         "The wrench are (5, 5), not (ticks, 6)."),
+        (FollowedSchedule(np.zeros((5, 2))), {}, "The positions are (5, 2), not (ticks, 3)."),
+        (FollowedSchedule(np.zeros((3, 5, 3))), {}, "There are positions of 3 flights, not 2."),
+        (HeldCommands(np.zeros(3)), {}, "The commands are (3,), not (ticks, 3)."),
+        (HeldCommands(np.zeros((1, 1, 2, 3))), {},
+         "The commands are (1, 1, 2, 3), not (ticks, 3)."),
+        (HeldCommands(np.zeros((0, 3))), {}, "The commands are (0, 3), not (ticks, 3)."),
+        (HeldCommands(NOT_A_NUMBER), {}, "The commands have a number that is not finite."),
+        (RELAXED, {}, "The commands are (5, 9), not (ticks, 3)."),
+        (STILL, {"actuation": "effort"}, "The commands are (5, 3), not (ticks, 9)."),
     ],
 )  # fmt: skip
 def test_flights_are_refused_in_one_sentence(
@@ -109,7 +108,7 @@ def test_joints_that_move_at_the_start_need_efforts(sliders: SpaceRobot) -> None
     with pytest.raises(ParameterError) as refusal:
         flights(sliders, STILL, initial_states=starts)
     assert str(refusal.value) == "Joints under velocity commands must start at rest."
-    assert len(flights(sliders, STILL, initial_states=starts, actuation="effort")) == 2
+    assert len(flights(sliders, RELAXED, initial_states=starts, actuation="effort")) == 2
 
 
 def test_flights_have_their_last_tick_and_the_steps_of_their_plant(sliders: SpaceRobot) -> None:
@@ -173,7 +172,7 @@ def test_sensors_are_rows_of_configurations(sliders: SpaceRobot) -> None:
     assert (errors.seeds.tolist(), len(errors)) == ([3, 17], 2)
     assert errors.config(1) == one
     assert errors.is_active.tolist() == [False, True]
-    none = SensorErrors.none(sliders, 4)
+    none = SensorErrors.of(sliders, [SensorConfig()] * 4)
     assert (len(none), none.noise.shape, none.pose_bias.shape) == (4, (4, 6), (4, 6))
     assert none.joint_bias.shape == (4, 3)
     assert none.seeds.tolist() == [0] * 4
@@ -209,7 +208,7 @@ def test_results_begin_empty(sliders: SpaceRobot) -> None:
         assert limits.tolist() == made.initial_states.q.tolist()
         limits[0] = 9.0
         assert not (made.initial_states.q == 9.0).any()
-    efforts = flights(sliders, STILL, actuation="effort")
+    efforts = flights(sliders, RELAXED, actuation="effort")
     assert list(BatchResult.empty(efforts).limited_ticks) == ["effort", "stroke"]
 
 
@@ -234,7 +233,7 @@ def test_errors_are_distances_and_angles_to_a_pose(sliders: SpaceRobot) -> None:
 
 def test_steps_are_those_of_the_actuation_unless_they_are_given(sliders: SpaceRobot) -> None:
     assert flights(sliders, STILL).substeps == 5
-    assert flights(sliders, STILL, actuation="effort").substeps == 50
+    assert flights(sliders, RELAXED, actuation="effort").substeps == 50
 
 
 # -- flights of a batch are those of the plant: the scalar engine, and what batches refuse -------
@@ -302,7 +301,7 @@ def test_flights_that_do_not_go_together_are_refused(described_sliders: SpaceRob
     for arguments, sentence in (
         (("speed", 0.05, 10, starts, commands), "not velocity or effort"),
         (("velocity", 0.05, 0, starts, commands), "0 ticks"),
-        (("velocity", 0.05, 10, starts, HeldCommands(np.zeros((5, 2)))), "joints are"),
+        (("velocity", 0.05, 10, starts, HeldCommands(np.zeros((5, 2)))), "commands are"),
         (("velocity", 0.05, 10, starts, HeldCommands(np.zeros((3, 5, 3)))), "3 flights"),
         (("effort", 0.05, 10, starts, FollowedSchedule(np.zeros((5, 3)))), "velocity actuation"),
     ):
@@ -361,8 +360,7 @@ class OnePlant:
                 getattr(flights, name), wanted, rtol=1e-12, atol=1e-12, err_msg=name
             )
         for row, plant in enumerate(self.plants if self.link else []):
-            R, r = plant.robot.link_pose(self.link, plant.q)
-            np.testing.assert_allclose(flights.link_R[row], R, atol=1e-12)
+            _, r = plant.robot.link_pose(self.link, plant.q)
             np.testing.assert_allclose(flights.link_r[row], r, atol=1e-12)
 
 
@@ -556,4 +554,4 @@ def test_without_a_compiler_flights_are_plants(
     # Each start is that of its row.
     for row, (part, wanted) in itertools.product(range(2), [("q", starts.q)]):
         assert getattr(flights, part)[row].tolist() == wanted[row].tolist()
-    assert flights.link_r.size == flights.link_R.size == 0
+    assert flights.link_r.size == 0

@@ -126,7 +126,9 @@ def effort_flights(robot: SpaceRobot, count: int) -> Flights:
     # would decide where it ends.
     joints[:, 5, 0] *= 3000.0
     joints[:, 6, 0] = -joints[:, 5, 0]
-    program = HeldCommands(joints, rng.normal(size=(40, 6)))
+    table = np.zeros((count, 40, robot.n + 6))
+    table[:, :30, : robot.n], table[..., robot.n :] = joints, rng.normal(size=(40, 6))
+    program = HeldCommands(table)
     return Flights(
         *(robot, "effort", 0.01, 45, starts, program),
         inertial,
@@ -291,7 +293,7 @@ def controlled(
     config = dataclasses.replace(ControllerConfig(), **(wanted | parameters))
     starts = InitialStates.repeated(robot, InitialState(joint_positions=shape), count)
     starts.position[:, :2] = 0.01 * rng.normal(size=(count, 2))
-    sensors = SensorErrors.none(robot, count)
+    sensors = SensorErrors.of(robot, [SensorConfig()] * count)
     sensors.noise[1:] = noise
     sensors.pose_bias[2:] = 1e-4
     sensors.seeds[:] = np.arange(count)
@@ -478,8 +480,8 @@ def test_the_function_of_lanes_is_the_controller_and_its_monitor(
         if not exact[0]:
             np.testing.assert_allclose(command, expected, rtol=1e-9, atol=1e-9)
         assert bool(exact[0]) <= (size > 1.0)
-        saturated = control.exact_command(1, profile, tick, measured).realised
-        np.testing.assert_allclose(np.concatenate([saturated.tau, saturated.wrench_B]), expected)
+        saturated = control.exact_command(1, profile, tick, measured)
+        np.testing.assert_allclose(saturated, expected)
         decision = control.decide(monitor, tick, measured.qdot, bounds)
         decisions.append(decision)
         assert verdict[0] == decision
