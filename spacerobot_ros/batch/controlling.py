@@ -12,7 +12,6 @@ from spacerobot_ros.batch.flights import ControlledGoals, Flights
 from spacerobot_ros.control.controller import CoordinatedController, build_controller
 from spacerobot_ros.control.goal_monitor import Decision, GoalMonitor
 from spacerobot_ros.control.laws.law import Gains
-from spacerobot_ros.control.outputs import OutputDistance
 from spacerobot_ros.control.reference import (
     OutputErrors,
     ReferenceProfile,
@@ -20,30 +19,12 @@ from spacerobot_ros.control.reference import (
     profile_numbers,
     profile_size,
 )
-from spacerobot_ros.control.state import ControlState, PoseReference, Reference
+from spacerobot_ros.control.state import ControlState, PoseReference
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.model.composite_rigid_body import state_slices
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.symbolic_rotations import quaternion_from_rotvec, quaternion_multiply
 from spacerobot_ros.times import SECOND
-
-CONTROL_INPUTS = (
-    "state",
-    "pose",
-    "twist",
-    "normals",
-    "bias",
-    "sigma",
-    "time",
-    "profile",
-    "gains",
-    "bounds",
-    "monitor",
-)
-"""Arguments of :meth:`BatchController.function`."""
-
-CONTROL_OUTPUTS = ("command", "exact", "measured", "next_monitor", "verdict")
-"""Results of :meth:`BatchController.function`."""
 
 
 class BatchController:
@@ -144,10 +125,6 @@ class BatchController:
         )
         return Decision(int(found))
 
-    def distance(self, state: ControlState, goal: Reference) -> OutputDistance:
-        """Return the distance of the outputs in a state from a goal for all outputs."""
-        return self.controller.distance_between(state, goal)
-
     # -- lanes --------------------------------------------------------------------------------
 
     def profile_argument(self, profile: ReferenceProfile) -> Array:
@@ -173,7 +150,7 @@ class BatchController:
         return np.concatenate([realised.tau, realised.wrench_B])
 
     def function(self) -> ca.Function:
-        """Return the function from :data:`CONTROL_INPUTS` to :data:`CONTROL_OUTPUTS`.
+        """Return the function of a controller's tick. Its arguments and results:
 
         ``state``, ``pose``, ``twist``
             Of the plant.
@@ -210,9 +187,13 @@ class BatchController:
         if fixed is None:
             raise ParameterError(f"Lanes do not support the law '{law.name}' with these options.")
         m = law.outputs.m
-        sizes = (2 * n + 13, 7, 6, 12 + 2 * n, 6 + n, 6, 1, size, 2 * m, m, 3)
-        inputs = [ca.SX.sym(name, count) for name, count in zip(CONTROL_INPUTS, sizes, strict=True)]
-        x, pose, twist, normals, bias, sigma, time, profile, gains, bounds, memory = inputs
+        sizes = {
+            **{"state": 2 * n + 13, "pose": 7, "twist": 6},
+            **{"normals": 12 + 2 * n, "bias": 6 + n, "sigma": 6},
+            **{"time": 1, "profile": size, "gains": 2 * m, "bounds": m, "monitor": 3},
+        }
+        inputs = {name: ca.SX.sym(name, count) for name, count in sizes.items()}
+        x, pose, twist, normals, bias, sigma, time, profile, gains, bounds, memory = inputs.values()
         shape, _, rates, *_ = state_slices(n)
         turn = bias[3:6] + sigma[1] * normals[3:6]
         measured = ca.vertcat(
@@ -252,9 +233,10 @@ class BatchController:
             self._config,
         )
         command = ca.vertcat(actuation[6:], actuation[:6])
-        outputs = command, exact, measured, ca.vertcat(*astuple(monitor)[1:]), verdict
-        dense = ca.cse([ca.densify(output) for output in outputs])
-        return ca.Function("control", inputs, dense, CONTROL_INPUTS, CONTROL_OUTPUTS)
+        outputs = {"command": command, "exact": exact, "measured": measured, "verdict": verdict}
+        outputs["next_monitor"] = ca.vertcat(*astuple(monitor)[1:])
+        dense = ca.cse([ca.densify(output) for output in outputs.values()])
+        return ca.Function("control", [*inputs.values()], dense, [*inputs], [*outputs])
 
 
 def _select_row(array: Array, row: int) -> Array:

@@ -107,7 +107,8 @@ static void measure(const Job &job, long long g, long long tick, V *group) {
   V *measured = group + row::measured;
   const V *q = group + row::state, *bias = group + row::joint_bias;
   for (long long j = 0; j < JOINTS; ++j)
-    measured[j] = job.noisy ? q[j] + bias[j] + group[row::joint_noise] * normal(job, g, tick, j)
+    // The first twelve are of the base.
+    measured[j] = job.noisy ? q[j] + bias[j] + group[row::joint_noise] * normal(job, g, tick, 12 + j)
                             : q[j];
 }
 

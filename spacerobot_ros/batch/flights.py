@@ -349,6 +349,19 @@ class Flights:
         step = self.integration_step or PLANTS[self.actuation].integration_step
         return count_steps(self.control_period, step)
 
+    @property
+    def table(self) -> Array:
+        """Commands or shapes (ticks, width), or (N, ticks, width); zeros under a controller."""
+        match self.program:
+            case FollowedSchedule(positions=table) | HeldCommands(table=table):
+                return table
+        return np.zeros((1, self.command_size))
+
+    def table_of(self, index: int) -> Array:
+        """Return the table (ticks, width) of one flight."""
+        table = self.table
+        return table if table.ndim == 2 else np.asarray(table[index])
+
     def robot_of(self, index: int) -> SpaceRobot:
         """Return the robot of one flight."""
         if self.inertial is None:

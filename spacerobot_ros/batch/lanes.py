@@ -102,7 +102,7 @@ def _block_size(flights: Flights, tick: CompiledTick) -> int:
     each = 8 * (2 * tick.memory_layout.total_rows + 60 * len(flights.report_ticks))
     if flights.sensors is not None:
         each += 8 * chunk * (12 + 2 * n) * 2
-    table = _command_table(flights)
+    table = flights.table
     if table.ndim == 3:
         each += 2 * table[0].nbytes
     fitting = tick.target.block_bytes // each
@@ -110,14 +110,6 @@ def _block_size(flights: Flights, tick: CompiledTick) -> int:
         return max(1, int(fitting))
     lanes = tick.target.lanes
     return max(1, min(_MAX_BLOCK_GROUPS, int(fitting) // lanes)) * lanes
-
-
-def _command_table(flights: Flights) -> Array:
-    """Return the commands or shapes (ticks, width), or (flights, ticks, width) if they differ."""
-    match flights.program:
-        case FollowedSchedule(positions=table) | HeldCommands(table=table):
-            return table
-    return np.zeros((1, flights.command_size))
 
 
 class LaneBlock:
@@ -240,7 +232,7 @@ class LaneBlock:
 
     def _table_of_lanes(self) -> Array:
         """Return commands (ticks, width), or (groups, ticks, width, lanes) if they differ."""
-        table = _command_table(self._flights)
+        table = self._flights.table
         if table.ndim == 3:
             of_lanes = table[self._rows_of_lanes]
             grouped = of_lanes.reshape(self._groups, self._lanes, *table.shape[1:])
@@ -314,10 +306,9 @@ class LaneBlock:
 
     def _command_outside_lanes(self) -> None:
         """Compute the commands that lanes wait for."""
-        controller, of_loops = self._tick.controller, np.arange(len(self._flown)) // self._lanes
+        controller, each = self._tick.controller, 1 if self._target.threads else self._lanes
         assert controller is not None
-        if self._target.threads:
-            of_loops = np.arange(len(self._flown))
+        of_loops = np.arange(len(self._flown)) // each
         waiting = self._target.to_numpy(self._pending)[of_loops] != 0
         waiting &= (self._read_rows("exact") * self._read_rows("alive"))[:, 0] != 0.0
         ticks, states = self._target.to_numpy(self._at)[of_loops], self._read_rows("measured")
@@ -364,7 +355,8 @@ class LaneBlock:
         states = self._read_rows("decided_state")
         for lane in np.flatnonzero(result.decision[rows] != Decision.NONE).tolist():
             goal, state = self._profiles[lane].goal, ControlState.unstack(states[lane])
-            result.decision_distance[rows[lane]] = astuple(controller.distance(state, goal))
+            distance = controller.controller.distance_between(state, goal)
+            result.decision_distance[rows[lane]] = astuple(distance)
 
 
 def _rotate_vectors(quaternion: Array, vectors: Array) -> Array:
@@ -403,17 +395,13 @@ class SensorNoise:
     def draw_noise(self, begin: int, end: int, alive: Array) -> Array | None:
         """Draw the noise of the ticks from ``begin`` up to but excluding ``end``.
 
-        ``alive`` (groups, lanes): whether flights are in progress. Returns the noise that the
-        commands depend on: of joint positions, (groups, ticks, n, lanes), or, with a controller,
-        all noise; None if commands do not depend on noise.
+        ``alive`` (groups, lanes): whether flights are in progress. Returns the noise (groups,
+        ticks, 12 + 2 n, lanes); None if commands do not depend on it.
         """
         if self._errors is None:
             return None
         ticks, width = end - begin, 12 + 2 * self._n
-        columns = slice(0, width) if self._affects_all else slice(12, 12 + self._n)
-        kept = None
-        if self.is_fed_back:
-            kept = np.zeros((len(self._rows), ticks, columns.stop - columns.start))
+        kept = np.zeros((len(self._rows), ticks, width)) if self.is_fed_back else None
         chosen = [(i, tick - begin) for i, tick in enumerate(self._instants) if begin <= tick < end]
         drawn = np.empty((ticks, width))
         for index, generator in enumerate(self._generators):
@@ -421,7 +409,7 @@ class SensorNoise:
                 continue
             generator.standard_normal(out=drawn)
             if kept is not None:
-                kept[index] = drawn[:, columns]
+                kept[index] = drawn
             for instant, tick in chosen:
                 self._at_instants[index, instant] = drawn[tick]
         if kept is None:

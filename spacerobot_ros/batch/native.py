@@ -9,7 +9,7 @@ as C++: the rows of a group's memory (:class:`RowLayout`), the enumerations, and
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import IntEnum
 from typing import Any
@@ -17,7 +17,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from spacerobot_ros.batch.controlling import CONTROL_INPUTS, CONTROL_OUTPUTS, BatchController
+from spacerobot_ros.batch.controlling import BatchController
 from spacerobot_ros.batch.flights import ControlledGoals, Flights
 from spacerobot_ros.batch.targets import Target
 from spacerobot_ros.control.goal_monitor import Decision
@@ -156,46 +156,36 @@ class CompiledTick:
     ) -> CompiledTick:
         effort, robot = flights.actuation == "effort", flights.robot
         names, n = _TICK_VARIABLES[flights.actuation], robot.n
-        make = (effort_plant if effort else velocity_plant).tick_function
-        whole = make(robot, Composition(model, ca.MX), flights.substeps)
-        inputs = whole.mx_in()
-        outputs = dict(zip(names.outputs, whole.call(inputs, True, False), strict=True))
+        make: Callable[..., ca.Function] = velocity_plant.tick_function
         # Reports need all results except the poses of links.
-        reported = tuple(name for name in names.outputs if not name.startswith("link"))
-        poses: dict[str, int] = {}
-        if link:
-            index = robot.link_names.index(link)
-            outputs["place"] = ca.densify(ca.reshape(outputs["link_r"], 3, -1)[:, index])
-            reported, poses = (*reported, "place"), {"place": 3}
-        arguments = {"FLIGHT": (*names.inputs, "p"), "REPORT": (*names.inputs, "p")}
-        results = {"FLIGHT": names.results_of_every_tick, "REPORT": reported}
-        functions = {
-            kind: ca.Function(
-                f"{flights.actuation}_{kind.lower()}", inputs, [outputs[each] for each in chosen]
-            )
-            for kind, chosen in results.items()
+        reported = [name for name in names.outputs if not name.startswith("link")]
+        ticks: dict[str, tuple[Sequence[str], dict[str, bool]]] = {
+            "FLIGHT": (names.results_of_every_tick, {}),
+            "REPORT": (reported + ["place"] * bool(link), {}),
         }
-        sizes = {
-            **{name: whole.nnz_in(i) for i, name in enumerate(arguments["FLIGHT"])},
-            **{name: whole.nnz_out(i) for i, name in enumerate(names.outputs)},
-            **poses,
-        }
-        if not effort:
-            functions["MOMENTUMLESS"] = _momentumless_function(flights, model)
-            arguments["MOMENTUMLESS"] = arguments["FLIGHT"]
-            results["MOMENTUMLESS"] = results["FLIGHT"]
-        has_stops = effort and np.isfinite([robot.lower, robot.upper]).any()
-        if has_stops:
-            for name in ("holding_step", "shape_equations"):
-                functions[name.upper()] = model.function(name, compile=False)
+        if effort:
+            make = effort_plant.tick_function
+        else:
+            ticks["MOMENTUMLESS"] = names.results_of_every_tick, {"momentumless": True}
+        functions: dict[str, ca.Function] = {}
+        for kind, (results, options) in ticks.items():
+            tick = make(robot, Composition(model, ca.MX), flights.substeps, **options)
+            inputs = tick.mx_in()
+            outputs = dict(zip(names.outputs, tick.call(inputs, True, False), strict=True))
+            if link:
+                of_links = ca.reshape(outputs["link_r"], 3, -1)
+                outputs["place"] = ca.densify(of_links[:, robot.link_names.index(link)])
+            chosen = [outputs[each] for each in results]
+            name = f"{flights.actuation}_{kind.lower()}"
+            functions[kind] = ca.Function(name, inputs, chosen, [*names.inputs, "p"], [*results])
         controller = None
         if isinstance(flights.program, ControlledGoals):
             controller = BatchController.of(flights)
             functions["CONTROL"] = controller.function()
-            arguments["CONTROL"], results["CONTROL"] = CONTROL_INPUTS, CONTROL_OUTPUTS
-            control = functions["CONTROL"]
-            sizes |= {each: control.nnz_in(i) for i, each in enumerate(CONTROL_INPUTS)}
-            sizes |= {each: control.nnz_out(i) for i, each in enumerate(CONTROL_OUTPUTS)}
+        sizes: dict[str, int] = {}
+        for each in functions.values():
+            sizes |= {name: each.nnz_in(i) for i, name in enumerate(each.name_in())}
+            sizes |= {name: each.nnz_out(i) for i, name in enumerate(each.name_out())}
         rows = RowLayout(
             {
                 **{"alive": 1, "measured": n, "joint_bias": n, "joint_noise": 1},
@@ -207,12 +197,14 @@ class CompiledTick:
                 **sizes,
             }
         )
-        arrays = {
-            **{
-                f"{kind}_ARGUMENTS": map(rows.first_row, names) for kind, names in arguments.items()
-            },
-            **{f"{kind}_RESULTS": map(rows.first_row, names) for kind, names in results.items()},
-        }
+        arrays: dict[str, Iterable[int]] = {}
+        for kind, each in functions.items():
+            arrays[f"{kind}_ARGUMENTS"] = map(rows.first_row, each.name_in())
+            arrays[f"{kind}_RESULTS"] = map(rows.first_row, each.name_out())
+        has_stops = effort and np.isfinite([robot.lower, robot.upper]).any()
+        if has_stops:
+            for name in ("holding_step", "shape_equations"):
+                functions[name.upper()] = model.function(name, compile=False)
         copies = dict(names.results_fed_back)
         if controller is not None:
             copies["next_monitor"] = "monitor"
@@ -224,7 +216,7 @@ class CompiledTick:
             (efforts, rows.first_row("peak_effort"), n),
         ]
         report, width = [(state, 0, n), (rates, n, n)], 2 * n
-        for name in ("pose", "twist", "momentum", *poses):
+        for name in ("pose", "twist", "momentum", *["place"] * bool(link)):
             report.append((rows.first_row(name), width, rows.row_count(name)))
             width += rows.row_count(name)
         spans = {
@@ -292,18 +284,6 @@ _TICK_VARIABLES = {
         {"next_state": "state"},
     ),
 }
-
-
-def _momentumless_function(flights: Flights, model: ModelFunctions) -> ca.Function:
-    """Return the function ``FLIGHT`` of robots that have no angular momentum."""
-    names = _TICK_VARIABLES["velocity"]
-    tick = velocity_plant.tick_function(
-        flights.robot, Composition(model, ca.MX), flights.substeps, momentumless=True
-    )
-    inputs = tick.mx_in()
-    outputs = dict(zip(names.outputs, tick.call(inputs, True, False), strict=True))
-    chosen = [outputs[each] for each in names.results_of_every_tick]
-    return ca.Function("velocity_momentumless", inputs, chosen)
 
 
 def _shared_declarations(

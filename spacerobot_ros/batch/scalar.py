@@ -79,13 +79,14 @@ def _fly_row(
     match flights.program:
         case FollowedSchedule() as program:
             command = _schedule_commands(flights, program, row)
-        case HeldCommands() as program:
-            command = _held_commands(flights, program, row)
+        case HeldCommands():
+            command = _held_commands(flights, row)
         case ControlledGoals(ends_when_decided=ends):
             assert controller is not None
             command = _controlled_commands(controller, row, result)
     instants = {tick: column for column, tick in enumerate(flights.report_ticks)}
-    momenta, drift = _momenta_beyond_thrust(plant), np.zeros(2)
+    # Thrust does not explain the rest of the momenta.
+    momenta, drift = plant.momentum[:6] - plant.expected_momenta, np.zeros(2)
     try:
         for tick in range(flights.ticks + 1):
             sensors.measure()
@@ -103,7 +104,8 @@ def _fly_row(
             plant.step(*commands)
             _update_peaks(plant, commands, period, result, row)
             if controller is not None:
-                drift = np.maximum(drift, momentum_change(_momenta_beyond_thrust(plant), momenta))
+                now = plant.momentum[:6] - plant.expected_momenta
+                drift = np.maximum(drift, momentum_change(now, momenta))
         if controller is not None:
             result.end_state[row] = state_of(plant)
             result.momentum_drift[row] = drift
@@ -112,9 +114,9 @@ def _fly_row(
             result.limited_ticks[name][row] = counts
 
 
-def _held_commands(flights: Flights, program: HeldCommands, row: int) -> _Commands:
+def _held_commands(flights: Flights, row: int) -> _Commands:
     """Return the commands of a table, zero after its end."""
-    table = _table_of_row(program.table, row)
+    table = flights.table_of(row)
 
     def command(tick: int, measured: Plant | Sensors) -> Sequence[Array]:
         held = table[tick] if tick < len(table) else np.zeros(table.shape[1])
@@ -127,7 +129,7 @@ def _schedule_commands(flights: Flights, program: FollowedSchedule, row: int) ->
     goal = Goal(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]))
     path = BasePath(np.zeros(1), goal.position[None], goal.quaternion[None])
     names, period = flights.robot.joint_names, flights.control_period
-    schedule = GaitSchedule("", names, period, _table_of_row(program.positions, row), path, goal)
+    schedule = GaitSchedule("", names, period, flights.table_of(row), path, goal)
     follower = ScheduleFollower(schedule, 0, program.shape_gain, program.deadband)
     period_ns = round(period * SECOND)
     position, velocity = np.zeros(flights.robot.n), np.zeros(flights.robot.n)
@@ -154,19 +156,12 @@ def _controlled_commands(controller: BatchController, row: int, result: BatchRes
         decision = controller.decide(monitor, tick, state.qdot, bounds)
         if decision is not Decision.NONE and result.decision[row] == Decision.NONE:
             result.decision[row], result.decision_tick[row] = decision, tick
-            result.decision_distance[row] = astuple(controller.distance(state, goal))
+            result.decision_distance[row] = astuple(
+                controller.controller.distance_between(state, goal)
+            )
         return commands
 
     return command
-
-
-def _momenta_beyond_thrust(plant: Plant) -> Array:
-    """Return the part of the momenta (6,) that thrust does not explain."""
-    return np.asarray(plant.momentum[:6] - plant.expected_momenta)
-
-
-def _table_of_row(array: Array, row: int) -> Array:
-    return array if array.ndim == 2 else np.asarray(array[row])
 
 
 def _update_peaks(

@@ -120,7 +120,7 @@ class SteppedFlights:
         """(N,) ticks since the last reset of each flight."""
         self.has_not_ended = np.ones(count, dtype=np.bool_)
         """(N,) whether the flight is in progress: it has neither failed nor been ended."""
-        self._require_regular(self._flights)
+        self.require_startable(starts, None)
         self._engine = self._choose_engine(link, plants, in_lanes, target)
         self.engine = self._engine.name
         """Name of the engine: lanes with their registers, or ``scalar``."""
@@ -168,16 +168,15 @@ class SteppedFlights:
                 f"{len(chosen)} flights are reset to {len(starts)} starts"
                 + ("." if inertial is None else f" with {len(inertial.masses)} rows of masses.")
             )
-        of_others = self._flights.initial_states, self._flights.inertial
-        assert of_others[1] is not None
         # Checked as rows of their own: a refusal changes no flight.
-        self.require_startable(starts, of_others[1][chosen] if inertial is None else inertial)
-        assign_rows(of_others[0], chosen, starts)
+        self.require_startable(starts, inertial)
+        assign_rows(self._flights.initial_states, chosen, starts)
         if inertial is not None:
-            assign_rows(of_others[1], chosen, inertial)
+            assert self._flights.inertial is not None
+            assign_rows(self._flights.inertial, chosen, inertial)
         self._begin(chosen)
 
-    def require_startable(self, starts: InitialStates, inertial: InertialParameters) -> None:
+    def require_startable(self, starts: InitialStates, inertial: InertialParameters | None) -> None:
         """Refuse starts (K rows) and masses as :meth:`reset` does, without a reset.
 
         Raises
@@ -187,7 +186,9 @@ class SteppedFlights:
         RobotDescriptionError
             A mass or an inertia is not physical.
         """
-        self._require_regular(replace(self._flights, initial_states=starts, inertial=inertial))
+        flights = replace(self._flights, initial_states=starts, inertial=inertial)
+        for row in np.flatnonzero(~starts_accepted_by_plant(flights)).tolist():
+            plant_of(flights, row)  # It says why.
 
     def end(self, rows: npt.ArrayLike) -> None:
         """End some flights; they are not stepped until they are reset."""
@@ -232,11 +233,6 @@ class SteppedFlights:
         self.ticks[rows], self.has_not_ended[rows] = 0, True
         for row in rows.tolist():
             self.failures.pop(row, None)
-
-    def _require_regular(self, flights: Flights) -> None:
-        """Refuse starts that the plant would refuse, with its message."""
-        for row in np.flatnonzero(~starts_accepted_by_plant(flights)).tolist():
-            plant_of(flights, row)
 
     def _choose_engine(
         self, link: str, plants: Sequence[PlantConfig], in_lanes: bool, target: Target | None

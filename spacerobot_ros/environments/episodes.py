@@ -129,7 +129,7 @@ class _Start:
     initial: InitialState
     states: InitialStates
     sensors: SensorErrors
-    inertial: InertialParameters
+    inertial: InertialParameters | None
     scenario: Scenario
 
     @classmethod
@@ -139,7 +139,7 @@ class _Start:
         initial = InitialState.of(scenario.plant)
         states = InitialStates.of(robot, [initial])
         sensors = SensorErrors.of(robot, [scenario.plant.sensors])
-        return cls(initial, states, sensors, inertial or robot.inertial, scenario)
+        return cls(initial, states, sensors, inertial, scenario)
 
 
 class EpisodeStarts:
@@ -215,8 +215,9 @@ class EpisodeStarts:
         """Return the start of a draw, or the reason why there is none."""
         try:
             flight = drawn_flight(campaign, self._draws[number], DrawnFlight.of(self.scenario))
-            start = _Start.of(self.robot, flight.scenario, flight.inertial)
-            flights.require_startable(start.states, InertialParameters.stacked([start.inertial]))
+            masses = flight.inertial or self.robot.inertial
+            start = _Start.of(self.robot, flight.scenario, masses)
+            flights.require_startable(start.states, InertialParameters.stacked([masses]))
         except (ParameterError, RobotDescriptionError) as refusal:
             if not any(isinstance(each, str) for each in self._made.values()):
                 warn_once(
@@ -396,8 +397,9 @@ class Episodes:
             for row, k, rng in zip(numbers, which.tolist(), own, strict=True):
                 self._plants[row] = _with_seed(drawn[k].scenario.plant, rng)
         assign_rows(self._sensors, chosen, joined_rows([each.sensors for each in drawn])[which])
-        masses = InertialParameters.stacked([each.inertial for each in drawn])[which]
-        self.flights.reset(chosen, states, masses)
+        masses = [each.inertial for each in drawn if each.inertial is not None]
+        inertial = InertialParameters.stacked(masses)[which] if masses else None
+        self.flights.reset(chosen, states, inertial)
         if goals is not None:
             self.goals[chosen] = goals[chosen]
         elif self._goals_of_scenario:

@@ -472,7 +472,7 @@ def test_the_function_of_lanes_is_the_controller_and_its_monitor(
             *(state, pose, twist, normals, bias, sigma, control.time_of_tick(tick)),
             *(numbers, gains, bounds, memory),
         )
-        command, exact, seen, after, verdict = (np.array(each).ravel() for each in results)
+        command, exact, seen, verdict, after = (np.array(each).ravel() for each in results)
         wanted = np.zeros(17)
         measured.stack(wanted)
         np.testing.assert_allclose(seen, wanted, rtol=1e-12, atol=1e-15)
