@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
+from functools import cached_property
 from os import PathLike, fspath
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -23,6 +24,7 @@ from spacerobot_ros.environments.tasks import (
     Task,
     action_scale,
     command_of,
+    require_names,
 )
 from spacerobot_ros.errors import CommandError, ParameterError, RobotDescriptionError
 from spacerobot_ros.files import warn_once
@@ -34,9 +36,6 @@ from spacerobot_ros.scenario import Scenario, scenario_or_robot
 from spacerobot_ros.simulation.config import OrbitConfig, PlantConfig, TableConfig
 from spacerobot_ros.simulation.faults import FAULT_KINDS
 from spacerobot_ros.simulation.plant import InitialState
-
-if TYPE_CHECKING:
-    from spacerobot_ros.environments.rendering import Camera
 
 _MAX_DRAWS = 10_000
 _MAX_REFUSED_DRAWS = 100
@@ -77,19 +76,8 @@ class EpisodeConfig:
 
     @classmethod
     def of(cls, arguments: Mapping[str, Any]) -> EpisodeConfig:
-        """Return the configuration of keyword arguments.
-
-        Raises
-        ------
-        ParameterError
-            There is no such argument, or a value is invalid.
-        """
-        known = [each.name for each in fields(cls)]
-        for name in arguments:
-            if name not in known:
-                raise ParameterError(
-                    f"There is no argument '{name}' of environments; there are {', '.join(known)}."
-                )
+        """Return the configuration of keyword arguments; ParameterError if one is invalid."""
+        require_names("An environment has no argument", arguments, [x.name for x in fields(cls)])
         values, reward = dict(arguments), arguments.get("reward")
         for name, value in arguments.items():
             if isinstance(value, PathLike):
@@ -142,15 +130,10 @@ class _Start:
         return cls(initial, states, sensors, inertial, scenario)
 
 
-class EpisodeStarts:
+class _Starts:
     """Starts of episodes, from a scenario or from the draws of a campaign.
 
     Draws without a valid robot or start are omitted, with a warning.
-
-    Raises
-    ------
-    ParameterError
-        The scenario or campaign is invalid, or has parts that environments do not support.
     """
 
     def __init__(self, config: EpisodeConfig) -> None:
@@ -181,13 +164,7 @@ class EpisodeStarts:
     def draw(
         self, generators: Sequence[np.random.Generator], flights: SteppedFlights
     ) -> tuple[list[_Start], Counts]:
-        """Draw the starts of episodes: the different ones, and which one each episode has.
-
-        Raises
-        ------
-        ParameterError
-            A draw has a part that environments do not support, or too many draws are refused.
-        """
+        """Draw the starts of episodes: the different ones, and which one each episode has."""
         if self._campaign is None:
             return [self.nominal], np.zeros(len(generators), np.int64)
         drawn = [self._draw_number(self._campaign, rng, flights) for rng in generators]
@@ -265,7 +242,7 @@ class Episodes:
     def __init__(self, config: EpisodeConfig, count: int, *, in_lanes: bool) -> None:
         if not isinstance(count, int | np.integer) or count < 1:
             raise ParameterError(f"The number of environments is {count!r}; it must be at least 1.")
-        self._source = EpisodeStarts(config)
+        self._source = _Starts(config)
         scenario, self.robot = self._source.scenario, self._source.robot
         plant, every = scenario.plant, np.zeros(count, dtype=np.int64)
         self._goals_of_scenario = (config.goals or _GOALS[bool(config.campaign)]) == "scenario"
@@ -281,11 +258,9 @@ class Episodes:
             in_lanes=in_lanes,
             plants=self._plants,
         )
-        self.engine = self.flights.engine
         self.scale, self.taken = self._action_scale(config, scenario)
         wrench = self.taken[self.taken >= self.robot.n] - self.robot.n
         pushed = bool((wrench < 3).any()), bool((wrench >= 3).any())
-        self._camera: Camera | None = None
         self.task: Task = config.kind(self.robot, self._link, pushed)
         self._apply(config)
         self.goals = np.zeros((count, self.task.goal_size))
@@ -293,7 +268,7 @@ class Episodes:
         self._sensors = self._source.nominal.sensors[every]
         self._generators: Sequence[np.random.Generator] = ()
         self.step_duration = config.hold * plant.control_period
-        self.rewards, self.errors = np.zeros(count), np.zeros(count)
+        self.rewards, self.errors = np.zeros((2, count))
         self.observations = np.zeros((count, len(self.task.observation_bounds()[0])))
         self.terminations, self.truncations, self.reached = np.zeros((3, count), dtype=np.bool_)
         if not self._source.has_sensor_errors:
@@ -406,8 +381,6 @@ class Episodes:
             self.goals[chosen] = np.array([task.goal_of(each.scenario) for each in drawn])[which]
         else:
             self.goals[chosen] = task.random_goals(self._states(chosen), self.spread, own)
-        self.terminations[chosen] = self.truncations[chosen] = False
-        self.rewards[chosen] = 0.0
         self._observe(chosen)
 
     def _checked_starts(self, start: Any) -> list[dict[str, Array]]:
@@ -420,9 +393,10 @@ class Episodes:
             )
         sizes = {part.name: 3 for part in fields(InitialState)}
         sizes |= {"quaternion": 4, "joint_positions": n, "joint_velocities": n}
+        for one in each:
+            require_names("A start has no", one, sizes)
         return [
-            {name: _checked_start(name, given, sizes) for name, given in one.items()}
-            for one in each
+            {name: _checked_start(name, one[name], sizes[name]) for name in one} for one in each
         ]
 
     def _checked_goals(self, goal: Any) -> Array:
@@ -436,15 +410,17 @@ class Episodes:
         goals = np.broadcast_to(values, (count, size))
         return self.task.checked_goals(goals)
 
-    def picture(self, row: int) -> npt.NDArray[np.uint8]:
-        """Return a picture (rows, columns, 3) of a robot and its goal."""
+    @cached_property
+    def _camera(self) -> Any:
         # Slow to import, and few environments are drawn.
         from spacerobot_ros.environments.rendering import Camera
 
-        if self._camera is None:
-            self._camera = Camera(self.task)
+        return Camera(self.task)
+
+    def picture(self, row: int) -> npt.NDArray[np.uint8]:
+        """Return a picture (rows, columns, 3) of a robot and its goal."""
         at = slice(row, row + 1)
-        return self._camera.picture(self._states(at), self.goals[at])
+        return np.asarray(self._camera.picture(self._states(at), self.goals[at]))
 
     def step(self, actions: Any) -> None:
         """Step all episodes that have not ended, for ``hold`` ticks.
@@ -505,15 +481,11 @@ class Episodes:
         return RobotStates(pose, twist, flights.q[rows], flights.qdot[rows], link_r)
 
 
-def _checked_start(name: str, given: Any, sizes: Mapping[str, int]) -> Array:
+def _checked_start(name: str, given: Any, size: int) -> Array:
     """Return a given value of a start."""
-    if name not in sizes:
-        raise ParameterError(f"A start has no '{name}'; it has {', '.join(sizes)}.")
     values = as_numbers(given, f"The start's {name}")
-    if values.shape != (sizes[name],) or not np.isfinite(values).all():
-        raise ParameterError(
-            f"The start's {name} is {given!r}; it must be {sizes[name]} finite numbers."
-        )
+    if values.shape != (size,) or not np.isfinite(values).all():
+        raise ParameterError(f"The start's {name} is {given!r}; it must be {size} finite numbers.")
     return values
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import operator
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -10,6 +9,7 @@ import numpy as np
 
 from spacerobot_ros.environments import import_gymnasium
 from spacerobot_ros.environments.episodes import EpisodeConfig, Episodes
+from spacerobot_ros.environments.tasks import require_names
 from spacerobot_ros.errors import ParameterError
 
 import_gymnasium()  # Says how to install it where it is missing.
@@ -23,49 +23,44 @@ from gymnasium.vector import AutoresetMode, VectorEnv  # noqa: E402
 from gymnasium.vector.utils import batch_space  # noqa: E402
 
 
-def _spaces(episodes: Episodes) -> tuple[Any, Any]:
-    low, high = episodes.task.observation_bounds()
-    size = (len(episodes.taken),)
-    return Box(low, high, dtype=np.float64), Box(-1.0, 1.0, size, dtype=np.float64)
-
-
-def _require_render_mode(render_mode: str | None) -> None:
-    """Refuse a render mode by the error after which libraries make environments without one."""
+def _prepare(
+    environment: Any, count: int, arguments: Mapping[str, Any], render_mode: str | None, lanes: bool
+) -> tuple[Any, Any]:
+    """Give an environment its episodes; return the spaces of an observation and an action."""
     if render_mode not in (None, "rgb_array"):
+        # Libraries make environments without one after this type of error.
         raise TypeError(
             f"There is no render_mode '{render_mode}': use 'rgb_array', or leave it out."
         )
+    episodes = Episodes(EpisodeConfig.of(arguments), count, in_lanes=lanes)
+    environment.episodes, environment.render_mode = episodes, render_mode
+    fps = {"render_modes": ["rgb_array"], "render_fps": 1.0 / episodes.step_duration}
+    environment.metadata = {**environment.metadata, **fps}
+    low, high = episodes.task.observation_bounds()
+    actions = Box(-1.0, 1.0, (len(episodes.taken),), dtype=np.float64)
+    return Box(low, high, dtype=np.float64), actions
 
 
 def _begin_options(options: Mapping[str, Any] | None) -> dict[str, Any]:
     """Return the goal and start of the options of a reset; refuse others."""
     if not isinstance(options, Mapping | None):
         raise ParameterError(f"The options of a reset are {options!r}: give a dictionary.")
-    for name in options or {}:
-        if name not in ("goal", "start", "reset_mask"):
-            raise ParameterError(
-                f"A reset has no option '{name}'; it has goal, start, and for vector environments "
-                "reset_mask."
-            )
+    require_names("A reset has no option", options or {}, ("goal", "start", "reset_mask"))
     return {name: value for name, value in (options or {}).items() if name != "reset_mask"}
 
 
 def _seeds_of(seed: Any, count: int) -> list[int | None]:
     """Return a seed for each environment: those of a list, or s + i of a number s."""
-    try:
-        if seed is None or isinstance(seed, int | np.integer):
-            seeds = [None if seed is None else int(seed) + i for i in range(count)]
-        else:
-            seeds = [None if each is None else operator.index(each) for each in seed]
-    except TypeError:
+    alone = not isinstance(seed, list | tuple | np.ndarray)
+    each = [seed] * count if alone else list(seed)
+    if len(each) != count:
+        raise ValueError(f"There are {len(each)} seeds for {count} environments.")
+    if not all(one is None or (isinstance(one, int | np.integer) and one >= 0) for one in each):
         raise Error(
-            f"The seed is {seed!r}: give a whole number, or a list of {count} of them or None."
-        ) from None
-    if len(seeds) != count:
-        raise ValueError(f"There are {len(seeds)} seeds for {count} environments.")
-    if any(each is not None and each < 0 for each in seeds):
-        raise Error(f"The seed is {seed!r}: seeds are whole numbers from 0.")
-    return seeds
+            f"The seed is {seed!r}: give a whole number from 0, or a list of {count} of them or "
+            "None."
+        )
+    return [None if one is None else int(one) + alone * i for i, one in enumerate(each)]
 
 
 class SpaceRobotEnv(gymnasium.Env, EzPickle):
@@ -85,12 +80,11 @@ class SpaceRobotEnv(gymnasium.Env, EzPickle):
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 20}  # noqa: RUF012
 
     def __init__(self, *, render_mode: str | None = None, **arguments: Any) -> None:
-        _require_render_mode(render_mode)
         EzPickle.__init__(self, render_mode=render_mode, **arguments)
-        self.render_mode = render_mode
-        self.episodes = Episodes(EpisodeConfig.of(arguments), 1, in_lanes=False)
-        self.observation_space, self.action_space = _spaces(self.episodes)
-        self.metadata = {**self.metadata, "render_fps": 1.0 / self.episodes.step_duration}
+        self.episodes: Episodes
+        self.observation_space, self.action_space = _prepare(
+            self, 1, arguments, render_mode, lanes=False
+        )
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -166,17 +160,13 @@ class SpaceRobotVectorEnv(VectorEnv, EzPickle):
         render_mode: str | None = None,
         **arguments: Any,
     ) -> None:
-        _require_render_mode(render_mode)
         EzPickle.__init__(self, num_envs, autoreset_mode, render_mode=render_mode, **arguments)
-        self.num_envs, self.render_mode = num_envs, render_mode
-        self.autoreset_mode = AutoresetMode(autoreset_mode)
-        self.episodes = Episodes(EpisodeConfig.of(arguments), num_envs, in_lanes=True)
-        self.metadata = {
-            **self.metadata,
-            "autoreset_mode": self.autoreset_mode,
-            "render_fps": 1.0 / self.episodes.step_duration,
-        }
-        self.single_observation_space, self.single_action_space = _spaces(self.episodes)
+        self.episodes: Episodes
+        self.num_envs, self.autoreset_mode = num_envs, AutoresetMode(autoreset_mode)
+        self.single_observation_space, self.single_action_space = _prepare(
+            self, num_envs, arguments, render_mode, lanes=True
+        )
+        self.metadata["autoreset_mode"] = self.autoreset_mode
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         seeded = [np_random(None) for _ in range(num_envs)]
@@ -240,8 +230,7 @@ class SpaceRobotVectorEnv(VectorEnv, EzPickle):
         episodes.step(actions)
         if again.size:
             self._begin(again)
-        terminations, truncations = episodes.terminations.copy(), episodes.truncations.copy()
-        rewards, ended = episodes.rewards.copy(), terminations | truncations
+        ended = episodes.terminations | episodes.truncations
         infos: dict[str, Any] = {}
         if ended.any():
             infos = {"is_success": episodes.reached & ended, "_is_success": ended.copy()}
@@ -254,7 +243,8 @@ class SpaceRobotVectorEnv(VectorEnv, EzPickle):
             infos |= {"final_obs": last, "_final_obs": ended.copy()}
             self._begin(rows)
         infos |= self._info(np.ones(self.num_envs, dtype=np.bool_))
-        return episodes.observations.copy(), rewards, terminations, truncations, infos
+        results = episodes.rewards, episodes.terminations, episodes.truncations
+        return episodes.observations.copy(), *results, infos
 
     def render(self) -> Any:
         """Return a picture (480, 640, 3) of each robot and its goal; None without a render mode."""

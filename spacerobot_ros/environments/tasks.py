@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numbers
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import Any, ClassVar
@@ -39,9 +39,17 @@ _MIN_SHARE_OF_MOTION = 1e-7
 """Singular values below this share of the largest are considered no motion."""
 
 Flags = npt.NDArray[np.bool_]
+Generators = Sequence[np.random.Generator]
 
 LARGEST_OBSERVATION = 1e6
 """Bound of observed quantities without another bound; observations are clipped to it."""
+
+
+def require_names(none: str, given: Iterable[str], known: Collection[str]) -> None:
+    """Raise ParameterError, which begins with ``none``, for a name that is not known."""
+    for name in given:
+        if name not in known:
+            raise ParameterError(f"{none} '{name}'; it has {', '.join(known)}.")
 
 
 @dataclass(frozen=True)
@@ -107,19 +115,8 @@ class RewardWeights:
 
     @classmethod
     def of(cls, changes: Mapping[str, float] | None) -> RewardWeights:
-        """Return the weights with some changed.
-
-        Raises
-        ------
-        ParameterError
-            There is no such weight, or it is not a finite number.
-        """
-        known = [each.name for each in fields(cls)]
-        for name in changes or {}:
-            if name not in known:
-                raise ParameterError(
-                    f"There is no weight '{name}' of the reward; there are {', '.join(known)}."
-                )
+        """Return the weights with some changed; ParameterError if a change is invalid."""
+        require_names("The reward has no weight", changes or {}, [x.name for x in fields(cls)])
         for name, value in (changes or {}).items():
             if not (isinstance(value, numbers.Real) and np.isfinite(value)):
                 raise ParameterError(
@@ -172,9 +169,7 @@ class Task(ABC):
     def random_goal(self, start: RobotStates, spread: float, rng: np.random.Generator) -> Array:
         """Return a random goal (goal_size,) for one robot at its start."""
 
-    def random_goals(
-        self, starts: RobotStates, spread: float, rngs: Sequence[np.random.Generator]
-    ) -> Array:
+    def random_goals(self, starts: RobotStates, spread: float, rngs: Generators) -> Array:
         """Return random goals (N, goal_size) for N robots, each from its own generator."""
         each = (self.random_goal(starts.row(i), spread, rng) for i, rng in enumerate(rngs))
         return np.array(list(each))
@@ -235,11 +230,7 @@ class Task(ABC):
     def observe(self, states: RobotStates, remaining: Array) -> Array:
         """Return observations: remaining error, q, qdot, twist of the base."""
         parts = [remaining, states.q, states.qdot, states.twist]
-        return np.clip(np.concatenate(parts, axis=1), *self._bounds)
-
-    @cached_property
-    def _bounds(self) -> tuple[Array, Array]:
-        return self.observation_bounds()
+        return np.clip(np.concatenate(parts, axis=1), *self.observation_bounds())
 
     def observation_bounds(self) -> tuple[Array, Array]:
         """Return the smallest and largest observations (error_size + 2 n + 6,)."""
@@ -255,13 +246,8 @@ class _DrawnTogether(Task):
     def random_goal(self, start: RobotStates, spread: float, rng: np.random.Generator) -> Array:
         return np.asarray(self.random_goals(start.row(0), spread, [rng])[0])
 
-    @abstractmethod
-    def random_goals(
-        self, starts: RobotStates, spread: float, rngs: Sequence[np.random.Generator]
-    ) -> Array: ...
 
-
-def _directions_and_shares(rngs: Sequence[np.random.Generator]) -> tuple[Array, Array]:
+def _directions_and_shares(rngs: Generators) -> tuple[Array, Array]:
     """Return random vectors (N, 3), even in all directions, and numbers (N, 1) from 0 to 1."""
     drawn = np.array([(*rng.standard_normal(3), rng.random()) for rng in rngs])
     return drawn[:, :3], drawn[:, 3:]
@@ -274,14 +260,8 @@ class Reorient(_DrawnTogether):
     largest_error = np.pi
 
     @cached_property
-    def directions(self) -> Array:
-        """Axes of random rotations (m, 3) in B, orthonormal: one axis for a planar robot.
-
-        Raises
-        ------
-        ParameterError
-            Nothing rotates the base.
-        """
+    def _directions(self) -> Array:
+        """Axes of random rotations (m, 3) in B, orthonormal: one axis for a planar robot."""
         axes = BaseRotations.of(self.robot).axes
         if len(axes):
             return axes
@@ -293,12 +273,10 @@ class Reorient(_DrawnTogether):
             )
         return np.eye(3)
 
-    def random_goals(
-        self, starts: RobotStates, spread: float, rngs: Sequence[np.random.Generator]
-    ) -> Array:
+    def random_goals(self, starts: RobotStates, spread: float, rngs: Generators) -> Array:
         """Return attitudes within ``spread`` rad of the starts; planar robots rotate in their
         plane."""
-        axes, (turns, shares) = self.directions, _directions_and_shares(rngs)
+        axes, (turns, shares) = self._directions, _directions_and_shares(rngs)
         if len(axes) == 1:
             turns = axes[0] * np.copysign(1.0, turns[:, :1])
         turns = spread * shares * turns / np.linalg.norm(turns, axis=1, keepdims=True)
@@ -333,14 +311,8 @@ class Reach(_DrawnTogether):
     scenario, has_link = "reach", True
 
     @cached_property
-    def directions(self) -> Array:
-        """Directions (m, 3) in B, orthonormal, in which the link moves: two for a planar robot.
-
-        Raises
-        ------
-        ParameterError
-            There are none.
-        """
+    def _directions(self) -> Array:
+        """Directions (m, 3) in B, orthonormal, in which the link moves: two for a planar robot."""
         robot = self.robot
         if self.by_force:
             return np.eye(3)
@@ -355,11 +327,9 @@ class Reach(_DrawnTogether):
             )
         return np.eye(3) if len(found) == 3 else found
 
-    def random_goals(
-        self, starts: RobotStates, spread: float, rngs: Sequence[np.random.Generator]
-    ) -> Array:
+    def random_goals(self, starts: RobotStates, spread: float, rngs: Generators) -> Array:
         """Return positions within ``spread`` m of the links' starts, in their free directions."""
-        axes, (ways, shares) = self.directions, _directions_and_shares(rngs)
+        axes, (ways, shares) = self._directions, _directions_and_shares(rngs)
         if len(axes) < 3:
             R = matrices_from_quaternions(starts.pose[:, 3:])
             ways = np.einsum("nij,nj->ni", R, ways[:, : len(axes)] @ axes)

@@ -310,7 +310,7 @@ def test_wheels_turn_the_base() -> None:
 def test_goals_of_a_scenario() -> None:
     config = EpisodeConfig("reorient", scenario="planar_chain", goals="scenario")
     episodes = Episodes(config, 2, in_lanes=False)
-    assert episodes.engine == "scalar"
+    assert episodes.flights.engine == "scalar"
     episodes.begin([1], [np.random.default_rng(0)] * 2)
     wanted = load_scenario("planar_chain").goal.quaternion
     np.testing.assert_array_equal(episodes.goals, [[0, 0, 0, 1], wanted])
@@ -319,7 +319,7 @@ def test_goals_of_a_scenario() -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"ticks": 3}, "There is no argument 'ticks' of environments; there are task, scenario, "),
+        ({"ticks": 3}, "An environment has no argument 'ticks'; it has task, scenario, "),
         ({"goals": "far"}, "Parameter 'goals' is 'far'; it must be one of random, scenario"),
         ({"hold": 0}, "Parameter 'hold' is 0; it must be a number of at least 1 .ticks."),
         ({"hold": 1.5}, "Parameter 'hold' is 1.5; it must be a whole number"),
@@ -331,7 +331,7 @@ def test_goals_of_a_scenario() -> None:
         ({"spread": -1.0}, "Parameter 'spread' is -1.0; it must be a number of at least 0"),
         ({"time_limit": np.inf}, "Parameter 'time_limit' is inf; it must be a finite"),
         ({"scenario": "a", "campaign": "b"}, "both given: a campaign names its scenario"),
-        ({"reward": {"speed": 1}}, "There is no weight 'speed' of the reward; there are progress"),
+        ({"reward": {"speed": 1}}, "The reward has no weight 'speed'; it has progress"),
         ({"scenario": "faults/late_poses"}, "has faults of sensors, which environments do not"),
         ({"task": 3}, "Parameter 'task' is 3; it must be a text"),
         ({"task": "hover"}, "Argument 'task' is 'hover'; it may be reorient, reach"),
@@ -402,9 +402,9 @@ def test_bad_actions_goals_and_masks_are_refused() -> None:
     with pytest.raises(ValueError, match="There are 3 seeds for 2 environments"):
         vector.reset(seed=[1, 2, 3])
     for seed in (1.5, "x", [1, "x"], [1.5, 2]):
-        with pytest.raises(Error, match="give a whole number, or a list of 2 of them or None"):
+        with pytest.raises(Error, match="give a whole number from 0, or a list of 2"):
             vector.reset(seed=seed)
-    with pytest.raises(Error, match="seeds are whole numbers from 0"):
+    with pytest.raises(Error, match="give a whole number from 0"):
         vector.reset(seed=[4, -1])
     assert vector.np_random_seed == (3, 4)
 
