@@ -33,7 +33,7 @@ from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.inertial_parameters import InertialParameters
 from spacerobot_ros.parameters import as_numbers, configured, nonnegative, parameter
 from spacerobot_ros.scenario import Scenario, scenario_or_robot
-from spacerobot_ros.simulation.config import OrbitConfig, PlantConfig, TableConfig
+from spacerobot_ros.simulation.config import OrbitConfig, TableConfig
 from spacerobot_ros.simulation.faults import FAULT_KINDS
 from spacerobot_ros.simulation.plant import InitialState
 
@@ -114,7 +114,6 @@ class EpisodeConfig:
 class _Start:
     """Start of an episode; ``states`` and ``sensors`` are rows of one flight."""
 
-    initial: InitialState
     states: InitialStates
     sensors: SensorErrors
     inertial: InertialParameters | None
@@ -124,10 +123,9 @@ class _Start:
     def of(
         cls, robot: SpaceRobot, scenario: Scenario, inertial: InertialParameters | None = None
     ) -> _Start:
-        initial = InitialState.of(scenario.plant)
-        states = InitialStates.of(robot, [initial])
+        states = InitialStates.of(robot, [InitialState.of(scenario.plant)])
         sensors = SensorErrors.of(robot, [scenario.plant.sensors])
-        return cls(initial, states, sensors, inertial, scenario)
+        return cls(states, sensors, inertial, scenario)
 
 
 class _Starts:
@@ -175,17 +173,16 @@ class _Starts:
     def _draw_number(
         self, campaign: Campaign, rng: np.random.Generator, flights: SteppedFlights
     ) -> int:
-        start: _Start | str = ""
         for _ in range(_MAX_REFUSED_DRAWS):
             number = int(rng.integers(len(self._draws)))
             if number not in self._made:
                 self._made[number] = self._drawn(campaign, number, flights)
-            start = self._made[number]
-            if isinstance(start, _Start):
+            if isinstance(self._made[number], _Start):
                 return number
         raise ParameterError(
             f"{_MAX_REFUSED_DRAWS} successive draws of the campaign are refused, the last one "
-            f"because: {start} Restrict the dispersions to values that the robot permits."
+            f"because: {self._made[number]} Restrict the dispersions to values that the robot "
+            "permits."
         )
 
     def _drawn(self, campaign: Campaign, number: int, flights: SteppedFlights) -> _Start | str:
@@ -258,6 +255,9 @@ class Episodes:
             in_lanes=in_lanes,
             plants=self._plants,
         )
+        link_r = self.flights.link_r if self._link else None
+        parts = self.flights.pose, self.flights.twist, self.flights.q, self.flights.qdot
+        self._states = RobotStates(*parts, link_r)
         self.scale, self.taken = self._action_scale(config, scenario)
         wrench = self.taken[self.taken >= self.robot.n] - self.robot.n
         pushed = bool((wrench < 3).any()), bool((wrench >= 3).any())
@@ -303,10 +303,8 @@ class Episodes:
         elif self.has_attribute(name):
             setattr(self.task, name, value)
         else:
-            raise ParameterError(
-                f"There is no attribute '{name}' to change; there are {', '.join(_CHANGEABLE)}, "
-                "and attributes of the task."
-            )
+            known = *_CHANGEABLE, "attributes of the task"
+            require_names("An environment has no changeable attribute", [name], known)
 
     def _reaching_link(self, link: str, scenario: Scenario) -> str:
         link = self.robot.description.end_effector(link or scenario.plant.end_effector_frame)
@@ -362,15 +360,17 @@ class Episodes:
         drawn, which = self._source.draw(own, self.flights)
         states = joined_rows([each.states for each in drawn])[which]
         if changes is not None or type(task).start is not Task.start:
-            each = zip(numbers, which.tolist(), own, strict=True)
-            initial = [
-                replace(task.start(drawn[k].initial, rng), **(changes[row] if changes else {}))
-                for row, k, rng in each
-            ]
+            initial = [task.start(states.initial_state(i), rng) for i, rng in enumerate(own)]
+            if changes is not None:
+                given = (changes[row] for row in numbers)
+                initial = [replace(x, **some) for x, some in zip(initial, given, strict=True)]
             states = InitialStates.of(self.robot, initial)
         if self._plants:
             for row, k, rng in zip(numbers, which.tolist(), own, strict=True):
-                self._plants[row] = _with_seed(drawn[k].scenario.plant, rng)
+                # Each episode has another noise of the actuators.
+                sensors = drawn[k].scenario.plant.sensors
+                seeded = replace(sensors, seed=int(rng.integers(2**31)))
+                self._plants[row] = replace(drawn[k].scenario.plant, sensors=seeded)
         assign_rows(self._sensors, chosen, joined_rows([each.sensors for each in drawn])[which])
         masses = [each.inertial for each in drawn if each.inertial is not None]
         inertial = InertialParameters.stacked(masses)[which] if masses else None
@@ -380,7 +380,7 @@ class Episodes:
         elif self._goals_of_scenario:
             self.goals[chosen] = np.array([task.goal_of(each.scenario) for each in drawn])[which]
         else:
-            self.goals[chosen] = task.random_goals(self._states(chosen), self.spread, own)
+            self.goals[chosen] = task.random_goals(self._states[chosen], self.spread, own)
         self._observe(chosen)
 
     def _checked_starts(self, start: Any) -> list[dict[str, Array]]:
@@ -420,7 +420,7 @@ class Episodes:
     def picture(self, row: int) -> npt.NDArray[np.uint8]:
         """Return a picture (rows, columns, 3) of a robot and its goal."""
         at = slice(row, row + 1)
-        return np.asarray(self._camera.picture(self._states(at), self.goals[at]))
+        return np.asarray(self._camera.picture(self._states[at], self.goals[at]))
 
     def step(self, actions: Any) -> None:
         """Step all episodes that have not ended, for ``hold`` ticks.
@@ -438,11 +438,11 @@ class Episodes:
         if shares.shape != wanted:
             raise CommandError(f"The actions are {shares.shape}, not {wanted}.")
         under_way, errors = flights.has_not_ended.copy(), self.errors.copy()
-        before = self._states(np.arange(len(shares)))
+        before, after = self._states[np.arange(len(shares))], self._states  # The former is a copy.
         flights.step(command_of(shares, self.scale, self.taken), self._config.hold)
         # Robots that stand still are not measured: they take no random numbers.
         self._observe(np.flatnonzero(under_way) if self._source.has_sensor_errors else slice(None))
-        after, alive = self._states(slice(None)), flights.has_not_ended
+        alive = flights.has_not_ended
         reached = alive & task.reached(after, self.errors, self.tolerance)
         failed = (under_way & ~alive) | (alive & ~reached & task.failed(after, self.goals))
         shares = np.clip(shares, -1.0, 1.0)
@@ -454,7 +454,7 @@ class Episodes:
         self.truncations = alive & late & ~self.terminations
 
     def _observe(self, rows: Any = slice(None)) -> None:
-        states, goals = self._states(rows), self.goals[rows]
+        states, goals = self._states[rows], self.goals[rows]
         remaining = self.task.remaining(states, goals)
         self.errors[rows] = self.task.errors(remaining)
         if self._source.has_sensor_errors and len(rows):
@@ -473,13 +473,6 @@ class Episodes:
         link = self.robot.link_names.index(self._link)
         return RobotStates(*measured, places.reshape(3, len(rows), -1)[:, :, link].T)
 
-    def _states(self, rows: Any) -> RobotStates:
-        """Return the states of some rows; a slice of rows has the states after later steps, too."""
-        flights = self.flights
-        link_r = flights.link_r[rows] if self._link else None
-        pose, twist = flights.pose[rows], flights.twist[rows]
-        return RobotStates(pose, twist, flights.q[rows], flights.qdot[rows], link_r)
-
 
 def _checked_start(name: str, given: Any, size: int) -> Array:
     """Return a given value of a start."""
@@ -487,8 +480,3 @@ def _checked_start(name: str, given: Any, size: int) -> Array:
     if values.shape != (size,) or not np.isfinite(values).all():
         raise ParameterError(f"The start's {name} is {given!r}; it must be {size} finite numbers.")
     return values
-
-
-def _with_seed(plant: PlantConfig, rng: np.random.Generator) -> PlantConfig:
-    """Return the configuration of a plant whose actuators have another noise in each episode."""
-    return replace(plant, sensors=replace(plant.sensors, seed=int(rng.integers(2**31))))

@@ -141,13 +141,6 @@ class SpaceRobotVectorEnv(VectorEnv, EzPickle):
         When ended episodes are restarted: ``NextStep``, ``SameStep`` or ``Disabled``.
     arguments
         Those of `EpisodeConfig`.
-
-    Raises
-    ------
-    ParameterError
-        An argument is refused.
-    TypeError
-        There is no such render mode.
     """
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"]}  # noqa: RUF012

@@ -67,11 +67,10 @@ class RobotStates:
     link_r: Array | None = None
     """(N, 3) position in B of the task's link, m; None if the task has no link."""
 
-    def row(self, index: int) -> RobotStates:
-        """Return the states of one robot, as arrays of one row."""
-        at = slice(index, index + 1)
-        link_r = None if self.link_r is None else self.link_r[at]
-        return RobotStates(self.pose[at], self.twist[at], self.q[at], self.qdot[at], link_r)
+    def __getitem__(self, rows: slice | npt.NDArray[np.int64]) -> RobotStates:
+        """Return the states of some robots."""
+        link_r = None if self.link_r is None else self.link_r[rows]
+        return RobotStates(self.pose[rows], self.twist[rows], self.q[rows], self.qdot[rows], link_r)
 
 
 @dataclass(frozen=True)
@@ -171,7 +170,7 @@ class Task(ABC):
 
     def random_goals(self, starts: RobotStates, spread: float, rngs: Generators) -> Array:
         """Return random goals (N, goal_size) for N robots, each from its own generator."""
-        each = (self.random_goal(starts.row(i), spread, rng) for i, rng in enumerate(rngs))
+        each = (self.random_goal(starts[i : i + 1], spread, rng) for i, rng in enumerate(rngs))
         return np.array(list(each))
 
     @abstractmethod
@@ -244,7 +243,7 @@ class _DrawnTogether(Task):
     """A task whose random goals are drawn for all robots at once."""
 
     def random_goal(self, start: RobotStates, spread: float, rng: np.random.Generator) -> Array:
-        return np.asarray(self.random_goals(start.row(0), spread, [rng])[0])
+        return np.asarray(self.random_goals(start[:1], spread, [rng])[0])
 
 
 def _directions_and_shares(rngs: Generators) -> tuple[Array, Array]:

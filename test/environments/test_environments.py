@@ -483,7 +483,7 @@ def test_arguments_change_from_episode_to_episode() -> None:
     assert lost.all()
     assert not truncated.any()
     np.testing.assert_allclose(rewards, -7.0 - 0.01 * 0.02, atol=1e-3)
-    with pytest.raises(ParameterError, match="no attribute 'speed' to change; there are reward, "):
+    with pytest.raises(ParameterError, match="no changeable attribute 'speed'; it has reward, "):
         vector.set_attr("speed", 1.0)
     with pytest.raises(ParameterError, match=r"'tolerance' is -1\.0; it must be a number of"):
         vector.set_attr("tolerance", -1.0)
