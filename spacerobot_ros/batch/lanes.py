@@ -34,6 +34,7 @@ from spacerobot_ros.files import warn_once
 from spacerobot_ros.model.compilation import NoLibraryError
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.model_functions import ModelFunctions
+from spacerobot_ros.model.rotations import matrices_from_quaternions
 from spacerobot_ros.simulation.effort_plant import FAILURES
 from spacerobot_ros.times import SECOND
 
@@ -175,7 +176,8 @@ class LaneBlock:
         self._write_rows("p", p, lanes)
         quaternion = starts.quaternion / np.linalg.norm(starts.quaternion, axis=1, keepdims=True)
         centers = self._model.function("center_of_mass", compile=False)(starts.q.T, p.T).full().T
-        of_base = starts.position + _rotate_vectors(quaternion, centers)
+        R = matrices_from_quaternions(quaternion)
+        of_base = starts.position + np.einsum("nij,nj->ni", R, centers)
         is_given = starts.position_is_of_center_of_mass[:, np.newaxis]
         r_cm = np.where(is_given, starts.position, of_base)
         parts = [starts.q, quaternion]
@@ -357,12 +359,6 @@ class LaneBlock:
             goal, state = self._profiles[lane].goal, ControlState.unstack(states[lane])
             distance = controller.controller.distance_between(state, goal)
             result.decision_distance[rows[lane]] = astuple(distance)
-
-
-def _rotate_vectors(quaternion: Array, vectors: Array) -> Array:
-    """Return ``R v`` of quaternions (N, 4) and vectors (N, 3)."""
-    x, w = quaternion[:, :3], quaternion[:, 3:]
-    return np.asarray(vectors + 2 * np.cross(x, np.cross(x, vectors) + w * vectors))
 
 
 class SensorNoise:
