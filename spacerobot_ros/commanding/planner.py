@@ -22,7 +22,7 @@ from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.world import with_world
 from spacerobot_ros.planning.core.method import GaitMethod
 from spacerobot_ros.planning.execution.config import PlannerConfig
-from spacerobot_ros.planning.execution.executive import Executive, Transition
+from spacerobot_ros.planning.execution.executive import Executive
 from spacerobot_ros.planning.execution.goal_file import BASE_GOAL_KEY, IdentifiedGoal
 from spacerobot_ros.planning.execution.state_average import BaseMeasurement
 from spacerobot_ros.planning.execution.status import (
@@ -31,9 +31,7 @@ from spacerobot_ros.planning.execution.status import (
     PlannerStatistics,
     PlannerStatus,
     ScheduleStart,
-    end_effector_values,
-    goal_values,
-    waypoint_counts,
+    Transition,
 )
 from spacerobot_ros.planning.execution.teleoperation import TwistCommand
 from spacerobot_ros.planning.execution.tracker import Setpoint
@@ -231,13 +229,7 @@ class PlannerCommander(Commander):
 
     def _report_waiting_goal(self, goal: IdentifiedGoal, message: str) -> None:
         state = PlannerState.WAITING if self.robot is None else PlannerState.PLANNING
-        status = PlannerStatus(state, message, goal.goal_id, goal_values(goal.goal))
-        status = replace(
-            status,
-            end_effector_goals=end_effector_values(goal.goal),
-            end_effector_waypoints=waypoint_counts(goal.goal),
-        )
-        self._publish_status(status)
+        self._publish_status(PlannerStatus.of_goal(state, message, goal))
 
     def receive_plant_status(self, status: PlantStatus, name: str = "plant") -> None:
         """React to a status of the named plant."""

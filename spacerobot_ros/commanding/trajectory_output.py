@@ -12,8 +12,7 @@ from enum import Enum, IntEnum
 from typing import Protocol
 
 from spacerobot_ros.errors import printable
-from spacerobot_ros.planning.execution.executive import Phase
-from spacerobot_ros.planning.execution.status import ScheduleStart
+from spacerobot_ros.planning.execution.status import Phase, ScheduleStart
 from spacerobot_ros.times import SECOND
 
 _ANSWER_TIMEOUT_NS = 5 * SECOND

@@ -27,7 +27,6 @@ from spacerobot_ros.control.outputs import OutputDistance, OutputSelection
 from spacerobot_ros.control.planned_reference import (
     GoalMotion,
     GrappleReference,
-    PlanJob,
     PlannedReference,
     ReferencePlanner,
 )
@@ -64,7 +63,7 @@ from spacerobot_ros.model.rotations import (
     relative_pose,
 )
 from spacerobot_ros.model.space_robot import SpaceRobot
-from spacerobot_ros.planning.core.cancellation import Cancellation
+from spacerobot_ros.planning.core.cancellation import Cancellation, PlanningJob
 from spacerobot_ros.planning.methods.thrust.goals import Grapple
 
 _FREE_AXIS_MARGIN = 5.0
@@ -223,7 +222,7 @@ class CoordinatedController:
 
     def plan_grapple(
         self, time: float, state: ControlState, grapple: Grapple, lead: float
-    ) -> PlanJob[GrappleReference]:
+    ) -> PlanningJob[GrappleReference]:
         """Return the job that plans a reference to a target, whose motion is given from ``time``
         on. The plan begins ``lead`` s later, from the reference and target predicted for that time.
         """
@@ -237,7 +236,7 @@ class CoordinatedController:
         def work(cancellation: Cancellation) -> GrappleReference:
             return planner.plan_grapple(start, state, limits, later, cancellation)
 
-        return PlanJob(work, time + lead)
+        return PlanningJob(work, time + lead)
 
     def begin_planned(self, time: float, profile: PlannedReference) -> None:
         """Follow a planned reference from a time on."""

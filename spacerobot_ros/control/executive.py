@@ -117,7 +117,6 @@ class ControlExecutive:
         """
         self.servicing = Servicing(config)
         """The tasks before goals, with the target; the owner sets the body that is held."""
-        self._longest_gap = _longest_gap(config)
         self._planning = GoalPlanning(in_background=config.plan_in_background)
         self.reset()
 
@@ -179,7 +178,6 @@ class ControlExecutive:
         """Use other tolerances, times and gains from the next state on."""
         config = config.for_robot(self.controller.law.robot.description)
         self._config = config
-        self._longest_gap = _longest_gap(config)
         self._take_tolerance(self._goal_tolerance)
         self.servicing.configure(config)
         self.controller.set_gains(config.gains)
@@ -471,7 +469,7 @@ class ControlExecutive:
         NotFiniteError
             A measurement is not finite.
         """
-        if self._time is not None and not 0 <= time - self._time <= self._longest_gap:
+        if self._time is not None and not 0 <= time - self._time <= self._config.longest_gap:
             # After a jump of time, the goal continues as before the jump.
             jump = time - self._time
             self.controller.shift_time(jump)
@@ -954,9 +952,6 @@ _NO_ROTATION = np.array([0.0, 0.0, 0.0, 1.0])
 _PLACE: frozenset[Controlled] = frozenset({"position"})
 """What an end-effector goal requests if its attitude is free."""
 
-_MAX_STATE_GAP, _MAX_STATE_GAP_PERIODS = 1.0, 10
-"""Longest gap between two states, s, and in control periods; longer gaps are jumps of time."""
-
 _LATE_POSE_PERIODS = 1.5
 """Longest time without a measurement of the base that is not reported, in control periods."""
 
@@ -972,10 +967,6 @@ _STATE_AND_EVENT_OF_DECISION = {
     Decision.FAILED: (ControllerState.FAILED, EventKind.GOAL_FAILED),
 }
 """State and event of each decision except a loss of control, which is an abort."""
-
-
-def _longest_gap(config: ControllerConfig) -> float:
-    return max(_MAX_STATE_GAP, _MAX_STATE_GAP_PERIODS * config.control_period)
 
 
 def _command_report(controller: CoordinatedController, result: Saturated) -> CommandReport:

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 from typing import TypedDict
 
 from spacerobot_ros.control.controller import CoordinatedController
-from spacerobot_ros.control.planned_reference import PLANNING_TIME, PlanJob, PlannedReference
+from spacerobot_ros.control.planned_reference import PLANNING_TIME, PlannedReference
 from spacerobot_ros.control.state import ControlState, PoseReference
 from spacerobot_ros.errors import PlanningError
 from spacerobot_ros.model.description import Array
-from spacerobot_ros.planning.core.cancellation import Cancellation
+from spacerobot_ros.planning.core.cancellation import Cancellation, PlanningJob
 from spacerobot_ros.planning.core.goal import Controlled
 from spacerobot_ros.planning.execution.goal_file import IdentifiedGoal
 
@@ -44,7 +44,7 @@ class _Plan:
     pending: Mapping[str, IdentifiedGoal]
     aims: Aims
     asked: frozenset[Controlled]
-    job: PlanJob[PlannedReference]
+    job: PlanningJob[PlannedReference]
 
     def is_for(self, pending: Mapping[str, IdentifiedGoal]) -> bool:
         """Whether this plan is for the given pending goals."""
@@ -66,7 +66,7 @@ class GoalPlanning:
         self.time = 0.0
         """Total wall time of planning references, s."""
         self._plan: _Plan | None = None
-        self._job: PlanJob[PlannedReference] | None = None
+        self._job: PlanningJob[PlannedReference] | None = None
         """The last job, which may still run although it is cancelled."""
         self._lead = PLANNING_TIME
 
@@ -140,7 +140,7 @@ class GoalPlanning:
         def work(cancellation: Cancellation) -> PlannedReference:
             return planner.plan(motion, seen, cancellation)
 
-        last, self._job = self._job, PlanJob(work, begins)
+        last, self._job = self._job, PlanningJob(work, begins)
         # Known before the work begins, so that it can be cancelled.
         self._plan = plan = _Plan(dict(pending), aims, asked, self._job)
         self._job.start(in_background=self.in_background, after=last)

@@ -4,11 +4,8 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_left
-from collections.abc import Callable
 from dataclasses import dataclass, replace
-from threading import Thread
-from time import perf_counter
-from typing import ClassVar, Generic, NamedTuple, TypeVar
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
@@ -22,16 +19,15 @@ from spacerobot_ros.control.state import (
     PoseReference,
     Reference,
 )
-from spacerobot_ros.errors import ParameterError, PlanningError
+from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.model.description import Array, RobotDescription
 from spacerobot_ros.model.rotations import matrix_from_quaternion
 from spacerobot_ros.model.space_robot import SpaceRobot
 from spacerobot_ros.model.target_motion import RelativeMotionOverTime
 from spacerobot_ros.model.thrusters import find_thrusters
 from spacerobot_ros.parameters import parameter
-from spacerobot_ros.planning.core.cancellation import Cancellation, PlanningCancelled
+from spacerobot_ros.planning.core.cancellation import Cancellation
 from spacerobot_ros.planning.core.schedule import BasePath
-from spacerobot_ros.planning.execution.worker import MAX_THREAD_END_TIME
 from spacerobot_ros.planning.methods.thrust.goals import Grapple, ThrustGoal, ThrustStart
 from spacerobot_ros.planning.methods.thrust.motion import FrameSample, ThrustMotion
 from spacerobot_ros.planning.methods.thrust.propulsion import Propulsion
@@ -321,77 +317,3 @@ def _moves(pose: PoseReference) -> bool:
 
 def _numbers(pose: PoseReference) -> Array:
     return np.concatenate([pose.position, pose.quaternion])
-
-
-_Planned = TypeVar("_Planned", bound=PlannedReference)
-
-
-class PlanJob(Generic[_Planned]):
-    """A planning job.
-
-    Parameters
-    ----------
-    work
-        Returns the plan, or raises PlanningError.
-    begins
-        Start time of the plan if it is ready by then, s; minus infinity: as soon as it is ready.
-    """
-
-    def __init__(self, work: Callable[[Cancellation], _Planned], begins: float) -> None:
-        self.begins = begins
-        self.done = False
-        self.wall_time = 0.0
-        """Wall time of the job, s."""
-        self._cancellation = Cancellation()
-        self._work = work
-        self._result: _Planned | None = None
-        self._error: BaseException | None = None
-        self._after: PlanJob[_Planned] | None = None
-        self._thread = Thread(target=self._run, daemon=True)
-
-    def start(self, *, in_background: bool, after: PlanJob[_Planned] | None = None) -> None:
-        """Run the job: in a thread, after another job has ended, or immediately."""
-        self._after = after
-        if in_background:
-            self._thread.start()
-        else:
-            self._run()
-
-    def _run(self) -> None:
-        after, self._after = self._after, None
-        if after is not None and after._thread.is_alive():
-            after._thread.join()
-        began = perf_counter()
-        try:
-            self._result = self._work(self._cancellation)
-        except PlanningCancelled:
-            pass
-        except BaseException as error:
-            self._error = error
-        self.wall_time = perf_counter() - began
-        self.done = True
-
-    def cancel(self) -> None:
-        """Cancel the job; its result is dropped. Any thread may call this."""
-        self._cancellation.cancel()
-
-    def close(self) -> None:
-        """Cancel the job and wait for its thread to end."""
-        self.cancel()
-        if self._thread.is_alive():
-            # A thread inside CasADi would crash a process that ends.
-            self._thread.join(MAX_THREAD_END_TIME)
-
-    def result(self) -> _Planned:
-        """Return the plan.
-
-        Raises
-        ------
-        PlanningError
-            There is none.
-        """
-        if self._error is not None:
-            raise self._error
-        if self._result is None:
-            raise PlanningError("Planning was cancelled.")
-        return self._result

@@ -17,7 +17,7 @@ from spacerobot_ros.control.approach import ApproachPlan, TargetClearance, plan_
 from spacerobot_ros.control.config import ControllerConfig
 from spacerobot_ros.control.controller import CoordinatedController
 from spacerobot_ros.control.detumbling import Detumbling, shortest_detumbling
-from spacerobot_ros.control.planned_reference import PLANNING_TIME, GrappleReference, PlanJob
+from spacerobot_ros.control.planned_reference import PLANNING_TIME, GrappleReference
 from spacerobot_ros.control.state import ControlState, PoseReference, Reference
 from spacerobot_ros.errors import ParameterError, PlanningError, RobotDescriptionError, quantity
 from spacerobot_ros.events import Event, EventKind
@@ -31,6 +31,7 @@ from spacerobot_ros.model.grasp import (
     frame_motion,
 )
 from spacerobot_ros.model.target_motion import RelativeMotionOverTime, TorqueFreeMotion
+from spacerobot_ros.planning.core.cancellation import PlanningJob
 from spacerobot_ros.planning.methods.thrust.goals import Grapple
 
 _PREDICTION_TOLERANCE = 0.02
@@ -163,7 +164,7 @@ class ApproachTask:
         self._out_of_reach: RelativeMotion | None = None
         self._remaining = math.inf
         """Time until contact, s."""
-        self._job: PlanJob[GrappleReference] | None = None
+        self._job: PlanningJob[GrappleReference] | None = None
         """The job that plans an approach."""
         self._lead = PLANNING_TIME
 

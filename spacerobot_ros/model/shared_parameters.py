@@ -20,6 +20,9 @@ DEFAULT_TICK_RATE = 20.0
 
 _MIN_RATE = 0.001  # Hz
 
+_MAX_STATE_GAP, _MAX_STATE_GAP_PERIODS = 1.0, 10
+"""Longest gap between two states, s, and in control periods; longer gaps are jumps of time."""
+
 DEFAULT_POSITION_TOLERANCE = 1e-3
 """Automatic position tolerance if no robot is known, m."""
 
@@ -196,6 +199,11 @@ class CommanderConfig(WatchdogConfig, AssumedRobotConfig):
         if self.position_tolerance:
             return self
         return replace(self, position_tolerance=automatic_tolerance(robot))
+
+    @property
+    def longest_gap(self) -> float:
+        """Largest time between two states that is no jump of time, s."""
+        return max(_MAX_STATE_GAP, _MAX_STATE_GAP_PERIODS * self.control_period)
 
     @property
     def control_period(self) -> float:

@@ -32,6 +32,7 @@ from spacerobot_ros.nodes.common.messages import (
 from spacerobot_ros.nodes.common.node import LATCHED, STREAM, described_robot
 from spacerobot_ros.nodes.common.process import run_node
 from spacerobot_ros.nodes.common.trajectory_clients import TrajectoryClients
+from spacerobot_ros.planning.core.cancellation import MAX_THREAD_END_TIME
 from spacerobot_ros.planning.core.goal import EndEffectorGoal, Goal
 from spacerobot_ros.planning.core.schedule import BasePath
 from spacerobot_ros.planning.execution.config import PlannerConfig
@@ -43,7 +44,6 @@ from spacerobot_ros.planning.execution.status import (
     ScheduleStart,
 )
 from spacerobot_ros.planning.execution.tracker import Setpoint
-from spacerobot_ros.planning.execution.worker import MAX_THREAD_END_TIME
 from spacerobot_ros.times import stamp_bytes
 from spacerobot_ros.topics import goal_topic, path_topic, twist_topic
 

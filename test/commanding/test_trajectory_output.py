@@ -11,7 +11,7 @@ from spacerobot_ros.commanding.trajectory_output import (
     TrajectoryEnd,
     TrajectoryOutput,
 )
-from spacerobot_ros.planning.execution.executive import Phase
+from spacerobot_ros.planning.execution.status import Phase
 from spacerobot_ros.times import SECOND
 
 FIRST = 40 * SECOND

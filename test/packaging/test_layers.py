@@ -205,7 +205,8 @@ def test_programs_run_once_their_module_is_whole() -> None:
 MUTABLE = {
     "spacerobot_ros.commanding.fly_to._ActionGoal",
     "spacerobot_ros.control.goal_monitor.GoalMonitor",
-    "spacerobot_ros.planning.execution.executive.ActiveGoal",
+    "spacerobot_ros.planning.execution.status.ActiveGoal",
+    "spacerobot_ros.planning.execution.status.PlannerStatistics",
     "spacerobot_ros.planning.execution.teleoperation._Following",
     "spacerobot_ros.planning.methods.optimal.search._SearchState",
     "spacerobot_ros.flight.verification._Resimulation",

@@ -20,7 +20,7 @@ from spacerobot_ros.planning.core.goal import MAX_PATH_POSES, EndEffectorGoal
 from spacerobot_ros.planning.core.method import PlanRequest
 from spacerobot_ros.planning.core.schedule import GaitSchedule
 from spacerobot_ros.planning.execution.goal_file import GoalFile, IdentifiedGoal
-from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus, waypoint_counts
+from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus
 from spacerobot_ros.planning.methods.pose_path import PosePath, RoundedPath
 from spacerobot_ros.planning.methods.registry import method_options
 from spacerobot_ros.planning.methods.resolved_rate import PathProgress
@@ -338,8 +338,9 @@ def test_a_path_is_a_goal_with_waypoints() -> None:
     assert not other.has_path
     assert not goal.equals(other)
     assert goal.equals(Goal.of_end_effectors([EndEffectorGoal.along("hand", aim.path_values)]))
-    assert waypoint_counts(goal) == {"hand": 1}
-    assert waypoint_counts(other) == {}
+    for each, counts in ((goal, {"hand": 1}), (other, {})):
+        status = PlannerStatus.of_goal(PlannerState.PLANNING, "", IdentifiedGoal(each))
+        assert status.end_effector_waypoints == counts
 
 
 def test_files_of_goals_keep_paths(tmp_path: Any) -> None:

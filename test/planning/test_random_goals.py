@@ -22,8 +22,7 @@ from spacerobot_ros.events import Event
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.planning import Tolerance, plan
 from spacerobot_ros.planning.execution.config import PlannerConfig
-from spacerobot_ros.planning.execution.executive import Phase
-from spacerobot_ros.planning.execution.status import PlannerState
+from spacerobot_ros.planning.execution.status import Phase, PlannerState
 from spacerobot_ros.planning.methods.geometric_phase import (
     PlanarPhase,
     check_planar_chain,

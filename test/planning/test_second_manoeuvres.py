@@ -35,9 +35,9 @@ from spacerobot_ros.errors import UnreachableError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.planning import GaitMethod, GaitSchedule, Goal, Tolerance
 from spacerobot_ros.planning.execution.config import PlannerConfig
-from spacerobot_ros.planning.execution.executive import Executive, Phase
+from spacerobot_ros.planning.execution.executive import Executive
 from spacerobot_ros.planning.execution.state_average import BaseMeasurement
-from spacerobot_ros.planning.execution.status import PlannerState
+from spacerobot_ros.planning.execution.status import Phase, PlannerState
 from spacerobot_ros.planning.execution.worker import Planned, PlanningTask, PlanningWorker, Refused
 from spacerobot_ros.resources import share_directory
 from spacerobot_ros.simulation import InitialState, VelocityPlant

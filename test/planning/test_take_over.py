@@ -24,10 +24,9 @@ from support.planner_loop import (
 from spacerobot_ros.events import Event as FlightEvent
 from spacerobot_ros.planning import BasePath, RobotState
 from spacerobot_ros.planning.execution.config import PlannerConfig
-from spacerobot_ros.planning.execution.executive import Phase
 from spacerobot_ros.planning.execution.goal_file import BASE_GOAL_KEY, GoalFile
 from spacerobot_ros.planning.execution.path_deviation import PathDeviation
-from spacerobot_ros.planning.execution.status import PlannerState
+from spacerobot_ros.planning.execution.status import Phase, PlannerState
 from spacerobot_ros.planning.execution.tracker import TrajectoryTracker
 
 OTHER: Place = ([-0.04, 0.0, 0.01], [0.0, 0.0, 0.0])

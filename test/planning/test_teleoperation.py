@@ -14,8 +14,7 @@ from support.planner_phases import executing, stub_of
 from spacerobot_ros.errors import PlanningError
 from spacerobot_ros.planning.core.clearance import Clearance
 from spacerobot_ros.planning.execution.config import PlannerConfig
-from spacerobot_ros.planning.execution.executive import Phase
-from spacerobot_ros.planning.execution.status import Notice, PlannerState, Severity
+from spacerobot_ros.planning.execution.status import Notice, Phase, PlannerState, Severity
 from spacerobot_ros.planning.execution.teleoperation import TwistCommand, TwistFollower, TwistFrame
 from spacerobot_ros.planning.methods.optimal import OptimalGait
 from spacerobot_ros.planning.methods.resolved_rate import ResolvedRateOptions

@@ -31,6 +31,7 @@ from spacerobot_ros.planning.core.goal import Tolerance
 from spacerobot_ros.planning.core.method import PlanRequest
 from spacerobot_ros.planning.execution.executive import Executive
 from spacerobot_ros.planning.execution.status import PlannerState
+from spacerobot_ros.planning.execution.worker import PlanningWorker
 from spacerobot_ros.planning.methods.optimal.initial_guesses import InitialGuesses
 from spacerobot_ros.planning.methods.optimal.problem import BoundaryConditions, MotionLimits
 from spacerobot_ros.planning.methods.optimal.transcription import turn_function
@@ -216,7 +217,8 @@ def test_wheels_spin_on_after_goals_at_restarts_and_after_an_abort(tmp_path: Pat
     assert np.abs(kept[[0, 1, 3]]).max() > 10.0
     assert angle_between(loop.poses[-100][3:], held[3:]) < 1e-9
     # A planner that is started again has commanded nothing, and keeps what it measures.
-    loop.executive = Executive(robot_of(str(file)), loop.config)
+    robot = robot_of(str(file))
+    loop.executive = Executive(robot, loop.config, PlanningWorker(robot, loop.config))
     loop.tick(100)
     np.testing.assert_allclose(loop.commands[-1], kept, atol=1e-9)
     assert angle_between(loop.poses[-1][3:], held[3:]) < 1e-8

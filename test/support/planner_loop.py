@@ -20,7 +20,7 @@ from spacerobot_ros.planning.core.cancellation import NEVER, Cancellation
 from spacerobot_ros.planning.core.method import GaitMethod, PlanRequest
 from spacerobot_ros.planning.core.schedule import BasePath
 from spacerobot_ros.planning.execution.config import PlannerConfig
-from spacerobot_ros.planning.execution.executive import Executive, Output, Transition
+from spacerobot_ros.planning.execution.executive import Executive
 from spacerobot_ros.planning.execution.goal_file import (
     GoalFile,
     IdentifiedGoal,
@@ -29,10 +29,12 @@ from spacerobot_ros.planning.execution.goal_file import (
 from spacerobot_ros.planning.execution.state_average import BaseMeasurement
 from spacerobot_ros.planning.execution.status import (
     Notice,
+    Output,
     PlannerState,
     PlannerStatus,
     ScheduleStart,
     Severity,
+    Transition,
 )
 from spacerobot_ros.planning.execution.worker import (
     Planned,

@@ -8,9 +8,7 @@ from typing import Any
 import numpy as np
 from support.planner_loop import NEAR, Loop, Place, StubMethod
 
-from spacerobot_ros.planning.execution.executive import (
-    Phase,
-)
+from spacerobot_ros.planning.execution.status import Phase
 
 FAR: Place = ([50.0, 0.0, 0.0], [0.0, 0.0, 0.0])
 OTHER: Place = ([-0.04, 0.0, 0.01], [0.0, 0.0, 0.0])

@@ -1,8 +1,7 @@
 """The planner's state machine: from goals and measured states to setpoints, without ROS.
 
-Read top to bottom: the phases and the transitions between them, the data of a goal and of its
-plans, then the :class:`Executive`, whose :meth:`~Executive.update` is called for every measured
-state. ``docs/planner_state_machine.md`` draws the machine.
+:meth:`Executive.update` is called for every measured state. ``docs/planner_state_machine.md`` has
+the phases, the events that change them, and the table of all transitions.
 
 Other modules do the work of a phase: :mod:`.tracker` computes the commands along a schedule,
 :mod:`.worker` makes plans, :mod:`.state_average` averages measured states, and
@@ -12,23 +11,17 @@ Other modules do the work of a phase: :mod:`.tracker` computes the commands alon
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field, replace
-from enum import Enum
-from typing import Any, NamedTuple
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 from spacerobot_ros.errors import PlanningError, sentence_case
 from spacerobot_ros.events import Event as FlightEvent
 from spacerobot_ros.events import EventKind
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.planning.core.goal import (
-    Controlled,
     PoseError,
     RobotState,
     Tolerance,
-    missed_parts,
-    reached_message,
-    uncontrolled_parts,
 )
 from spacerobot_ros.planning.core.method import PlanRequest
 from spacerobot_ros.planning.core.schedule import GaitSchedule
@@ -41,178 +34,35 @@ from spacerobot_ros.planning.execution.goal_file import (
 from spacerobot_ros.planning.execution.path_deviation import TrackingError
 from spacerobot_ros.planning.execution.state_average import MeasuredState, StateAverage
 from spacerobot_ros.planning.execution.status import (
+    ActiveGoal,
+    Event,
     Notice,
+    Output,
+    Phase,
     PlannerState,
     PlannerStatistics,
     PlannerStatus,
+    PlanReason,
     ScheduleStart,
     Severity,
+    Transition,
     describe_remaining_error,
-    end_effector_values,
-    goal_values,
-    waypoint_counts,
 )
 from spacerobot_ros.planning.execution.teleoperation import Teleoperation, TwistCommand
 from spacerobot_ros.planning.execution.tracker import Setpoint, TakeOver, TrajectoryTracker
 from spacerobot_ros.planning.execution.worker import (
-    PlanFromRestJob,
     PlanJob,
     Planned,
     PlanningTask,
     PlanningWorker,
-    PlanReason,
-    PlanWithBrakingJob,
     Postponed,
-    ReadyPlan,
     Refused,
-    TakeOverJob,
 )
-
-_MAX_GAP, _MAX_GAP_PERIODS = 1.0, 10
-"""Times between two states above these limits, or below zero, are jumps: s, control periods."""
+from spacerobot_ros.times import SECOND
 
 _MAX_IN_MOTION_ATTEMPTS = 2
 """Largest number of plans in motion for one goal: each takes over twice as late as the one
 before."""
-
-_LATE_TIME_SHARE = 1 / 3
-"""Remaining share of a motion's duration from which on the motion counts as late."""
-
-
-# -- phases and transitions -------------------------------------------------------------------
-
-
-class Phase(Enum):
-    """Activity of an executive."""
-
-    IDLE = "idle"  # There is no goal; the joints rest.
-    MEASURING = "measuring"  # A new goal waits for measured states to plan from; the joints rest.
-    PLANNING = "planning"  # The worker computes a plan.
-    EXECUTING = "executing"  # A schedule is tracked.
-    REPLANNING = "replanning"  # A schedule is tracked; a plan that takes over is computed.
-    TAKING_OVER = "taking over"  # A schedule is tracked until its successor takes over.
-    BRAKING = "braking"  # The joints brake along the planned path.
-    EVALUATING = "evaluating"  # A schedule has ended; measured states are compared with the goal.
-    TELEOPERATING = "teleoperating"  # An end-effector follows twists, or brakes after the last one.
-
-
-class Event(Enum):
-    """Cause of a change of phase."""
-
-    NEW_GOAL = "new goal"
-    TWIST = "twist"  # The first twist of a teleoperation.
-    PLAN_REQUESTED = "plan requested"  # A plan from the measured state was requested.
-    PLANNED = "planned"
-    REFUSED = "refused"  # The method has found no plan.
-    PLAN_LATE = "plan late"  # The tick of a take-over has come, and its plan is not ready.
-    TAKEN_OVER = "taken over"  # The tick has come at which a plan takes over.
-    SCHEDULE_ENDED = "schedule ended"
-    AT_REST = "at rest"  # The braking is over.
-    TRACKING_ERROR = "tracking error"  # The base is off its path; the method plans from rest only.
-    OBSTACLES = "obstacles"  # There are other obstacles, which the plan does not know.
-    JOINTS_STUCK = "joints stuck"
-    TIME_JUMPED = "time jumped"  # The schedule does not cover the time of the states.
-    REACHED = "reached"
-    FAILED = "failed"  # All corrections are used, or the measured state is not finite.
-    ABORTED = "aborted"  # The goal is given up on request.
-    PLANT_STOPPED = "plant stopped"  # The plant does not obey commands: the goal is given up.
-    PLANT_RESET = "plant reset"  # The plant was reset, or its robot has captured or released.
-    DEACTIVATED = "deactivated"
-
-
-class Transition(NamedTuple):
-    """A change of phase and its cause."""
-
-    source: Phase
-    event: Event
-    target: Phase
-
-
-_REST_PHASES = (Phase.MEASURING, Phase.EVALUATING)
-_MOTION_PHASES = (Phase.EXECUTING, Phase.REPLANNING, Phase.TAKING_OVER, Phase.BRAKING)
-_TRANSITION_RULES: tuple[tuple[Iterable[Phase], Event, Iterable[Phase]], ...] = (
-    ((Phase.IDLE, *_REST_PHASES), Event.NEW_GOAL, [Phase.MEASURING]),
-    ((*_REST_PHASES, Phase.EXECUTING, Phase.BRAKING), Event.PLAN_REQUESTED, [Phase.PLANNING]),
-    ([Phase.PLANNING], Event.PLANNED, [Phase.EXECUTING]),
-    ([Phase.PLANNING], Event.REFUSED, [Phase.IDLE, *_REST_PHASES, Phase.EXECUTING, Phase.BRAKING]),
-    ((Phase.EXECUTING, Phase.REPLANNING), Event.SCHEDULE_ENDED, _REST_PHASES),
-    ([Phase.EVALUATING], Event.REACHED, [Phase.IDLE]),
-    ([Phase.EVALUATING], Event.FAILED, [Phase.IDLE]),
-    # Plans that take over in motion.
-    ([Phase.EXECUTING], Event.PLAN_REQUESTED, [Phase.REPLANNING]),
-    ([Phase.REPLANNING], Event.PLANNED, [Phase.TAKING_OVER]),
-    ([Phase.REPLANNING], Event.REFUSED, [Phase.EXECUTING]),
-    ([Phase.REPLANNING], Event.PLAN_LATE, [Phase.EXECUTING]),
-    ([Phase.REPLANNING, Phase.TAKING_OVER], Event.NEW_GOAL, [Phase.EXECUTING]),
-    ([Phase.TAKING_OVER], Event.TAKEN_OVER, [Phase.EXECUTING]),
-    # Braking, to plan from rest.
-    ([Phase.EXECUTING], Event.NEW_GOAL, [Phase.BRAKING]),
-    ([Phase.EXECUTING], Event.TRACKING_ERROR, [Phase.BRAKING]),
-    ([Phase.BRAKING], Event.AT_REST, [Phase.IDLE, *_REST_PHASES]),
-    # Obstacles that come, move or go.
-    ([Phase.PLANNING], Event.OBSTACLES, _REST_PHASES),
-    ([Phase.REPLANNING, Phase.TAKING_OVER], Event.OBSTACLES, [Phase.EXECUTING]),
-    ([Phase.EXECUTING], Event.OBSTACLES, [Phase.BRAKING]),
-    # Teleoperation.
-    ([Phase.IDLE], Event.TWIST, [Phase.TELEOPERATING]),
-    ([Phase.TELEOPERATING], Event.AT_REST, [Phase.IDLE, Phase.MEASURING]),
-    # Interruptions.
-    (_MOTION_PHASES, Event.JOINTS_STUCK, _REST_PHASES),
-    (_MOTION_PHASES, Event.TIME_JUMPED, _REST_PHASES),
-    ([Phase.BRAKING], Event.TIME_JUMPED, [Phase.IDLE]),
-    ((Phase.PLANNING, *_MOTION_PHASES), Event.PLANT_RESET, _REST_PHASES),
-    ([Phase.BRAKING], Event.PLANT_RESET, [Phase.IDLE]),
-    ([Phase.TELEOPERATING], Event.TIME_JUMPED, [Phase.IDLE, Phase.MEASURING]),
-    ([Phase.TELEOPERATING], Event.PLANT_RESET, [Phase.IDLE, Phase.MEASURING]),
-    (_MOTION_PHASES, Event.ABORTED, [Phase.BRAKING]),
-    ((*_REST_PHASES, Phase.PLANNING), Event.ABORTED, [Phase.IDLE]),
-    (set(Phase) - {Phase.IDLE}, Event.PLANT_STOPPED, [Phase.IDLE]),
-    ((Phase.MEASURING, Phase.PLANNING, *_MOTION_PHASES), Event.PLANT_STOPPED, [Phase.MEASURING]),
-    (Phase, Event.DEACTIVATED, [Phase.IDLE]),
-)
-TRANSITIONS = frozenset(
-    Transition(source, event, target)
-    for sources, event, targets in _TRANSITION_RULES
-    for source in sources
-    for target in targets
-)
-"""Every allowed transition; ``docs/planner_state_machine.md`` explains each."""
-
-
-class IllegalTransitionError(RuntimeError):
-    """A defect of the executive: a transition that is not in :data:`TRANSITIONS`."""
-
-
-Output = PlannerStatus | ScheduleStart | Notice | Transition | FlightEvent | PursuedGoals
-"""An output of an executive other than its setpoints."""
-
-
-# Constants save the slow look-up of enum members for every state.
-_EXECUTING, _EVALUATING = Phase.EXECUTING, Phase.EVALUATING
-
-
-@dataclass
-class ActiveGoal:
-    """An accepted goal, its present schedule, and the number of corrections so far."""
-
-    identified: IdentifiedGoal
-    schedule: GaitSchedule
-    """The latest executed schedule."""
-    begins_ns: int
-    """Stamp of the state from which the first schedule was planned, ns."""
-    corrections: int = 0
-    manoeuvre_time: float = 0.0
-    """Duration of all schedules for the goal, s."""
-    ends_at: float = 0.0
-    """Simulated time at which the latest schedule ends, s."""
-    next_plan: PlanReason = PlanReason.CORRECTION
-    """Reason of the next plan, if one is needed."""
-    stuck_positions: dict[str, float] = field(default_factory=dict)
-    """Positions of the stuck joints, m or rad, as measured for the last plan."""
-    required: frozenset[Controlled] = frozenset()
-    """Parts of the goal that plans without the stuck joints must control."""
-    not_flown_reason: str = ""
-    """Clause that says why no schedule is flown any longer; empty: schedules are flown."""
 
 
 class Executive:
@@ -231,25 +81,13 @@ class Executive:
     config
         Of the planner.
     worker
-        Makes the plans; None: a :class:`PlanningWorker`.
-
-    Raises
-    ------
-    ParameterError
-        An option of the gait method is incompatible with the robot or with another option.
+        Makes the plans.
     """
 
-    def __init__(
-        self,
-        robot: SpaceRobot,
-        config: PlannerConfig,
-        worker: PlanningWorker | None = None,
-    ) -> None:
-        self._robot, self.config = robot, config
-        self._worker = worker or PlanningWorker(robot, config)
+    def __init__(self, robot: SpaceRobot, config: PlannerConfig, worker: PlanningWorker) -> None:
+        self._robot, self.config, self._worker = robot, config, worker
         self._average = StateAverage(robot, config.averaging, config.rest_tolerance)
         self._tracker = TrajectoryTracker(robot, config)
-        self._max_gap_ns = _max_gap_ns(config)
         self.phase = Phase.IDLE
         """The present phase; :meth:`_change_phase` alone changes it."""
         self.outputs: deque[Output] = deque()
@@ -260,15 +98,18 @@ class Executive:
         """Stamp of the state that :meth:`update` processes, ns."""
         self._new_goal: IdentifiedGoal | None = None
         self._in_motion_attempts = 0
-        self._pending_plan: PlanJob | ReadyPlan | None = None
-        """The requested plan, or the plan that waits for its tick (``TAKING_OVER``)."""
+        self._job: PlanJob | None = None
+        """The requested plan."""
+        self._ready_plan: GaitSchedule | None = None
+        """The result of the job, which waits for its tick (``TAKING_OVER``)."""
         self._active_goal: ActiveGoal | None = None
         self._replan_ns = 0
         """Stamp from which on the remaining motion is planned again, ns."""
         self._commanded_from_ns = 0
         """Stamp of the first state of the present schedule or plan, ns."""
-        self._total_plan_time, self._plan_count, self._command_count = 0.0, 0, 0
-        self._teleoperation = Teleoperation(robot, config, self._worker.clearance)
+        self.statistics = PlannerStatistics()
+        """Time and number of plans for the latest goal, and the number of commands."""
+        self._teleoperation = Teleoperation(robot, config, worker.clearance)
 
     @property
     def setpoint(self) -> Setpoint:
@@ -278,12 +119,7 @@ class Executive:
     @property
     def measuring(self) -> bool:
         """Whether the executive will plan from the next measured base, or evaluate it."""
-        return self._new_goal is not None or self.phase in (_EVALUATING, Phase.TELEOPERATING)
-
-    @property
-    def statistics(self) -> PlannerStatistics:
-        """Time and number of plans for the latest goal, and the number of commands."""
-        return PlannerStatistics(self._total_plan_time, self._plan_count, self._command_count)
+        return self._new_goal is not None or self.phase in (Phase.EVALUATING, Phase.TELEOPERATING)
 
     # -- requests of the owner ----------------------------------------------------------------
 
@@ -316,13 +152,13 @@ class Executive:
     @property
     def unfinished_goals(self) -> frozenset[str]:
         """Ids of the goals that are pursued, being planned, or waiting for a plan."""
-        pursued = self._pursued_goal()
-        return self.waiting_goals | ({pursued.goal_id} if pursued is not None else set())
+        active = self._active_goal
+        return self.waiting_goals | ({active.identified.goal_id} if active is not None else set())
 
     @property
     def waiting_goals(self) -> frozenset[str]:
         """Ids of the goals being planned or waiting for a plan, including one that is replanned."""
-        goals = (self._new_goal, self._planned_goal())
+        goals = (self._new_goal, self._planned_goal)
         return frozenset(goal.goal_id for goal in goals if goal is not None)
 
     def progress(self, goal_id: str) -> tuple[str, float | None]:
@@ -330,9 +166,9 @@ class Executive:
 
         None: no schedule leads to the goal yet.
         """
-        active, planned = self._active_goal, self._planned_goal()
+        active, planned = self._active_goal, self._planned_goal
         if active is not None and active.identified.goal_id == goal_id:
-            left = max(0.0, active.ends_at - self._stamp_ns / 1e9)
+            left = max(0.0, active.time_left(self._stamp_ns))
             return self.phase.value, left + active.schedule.remaining
         if planned is not None and planned.goal_id == goal_id:
             return Phase.PLANNING.value, None
@@ -343,7 +179,7 @@ class Executive:
 
         Returns a message about the joints; None if there is no goal.
         """
-        goal_id, message = self._latest_goal_id(), "The joints rest."
+        latest, message = self._latest_goal, "The joints rest."
         match self.phase:
             case Phase.IDLE:
                 return None
@@ -364,9 +200,7 @@ class Executive:
                     message = f"The joints' controller has {duration:g} s to bring them to rest."
                 self._change_phase(Event.ABORTED, Phase.BRAKING)
         self._forget_goals()
-        self.outputs.append(
-            PlannerStatus(PlannerState.ABORTED, f"Aborted {why}. {message}", goal_id=goal_id)
-        )
+        self._add_abort(f"Aborted {why}. {message}", latest)
         return message
 
     def plant_stopped(
@@ -378,27 +212,23 @@ class Executive:
         until then, or if its plan took so long that no state was processed. A goal that was to
         replace it is planned for from rest.
         """
-        if commanded_until_ns is not None and not self._commands_were_obeyed(
-            commanded_until_ns, rests_since_ns
-        ):
-            return False
         successor = None
         if commanded_until_ns is not None:
+            if not self._commands_were_obeyed(commanded_until_ns, rests_since_ns):
+                return False
             self._drop_plan()
             successor = self._new_goal
         if self.phase is Phase.IDLE:
             return False
-        goal_id = self._latest_goal_id() if successor is None else self._pursued_id()
-        has_goal = bool(self._latest_goal() if successor is None else self._pursued_goal())
-        self._tracker.stop()
-        self._average.restart()
+        given_up = self._latest_goal
+        if successor is not None:
+            given_up = None if self._active_goal is None else self._active_goal.identified
         self._forget_goals()
         self._new_goal = successor
-        self._change_phase(Event.PLANT_STOPPED, self._phase_at_rest())
-        if has_goal:
-            message = f"Aborted by the plant: {why}"
-            self.outputs.append(PlannerStatus(PlannerState.ABORTED, message, goal_id=goal_id))
-        return has_goal
+        self._stop_motion(Event.PLANT_STOPPED)
+        if given_up is not None:
+            self._add_abort(f"Aborted by the plant: {why}", given_up)
+        return given_up is not None
 
     def _commands_were_obeyed(self, commanded_until_ns: int, rests_since_ns: int) -> bool:
         active, since = self._active_goal, self._commanded_from_ns
@@ -464,8 +294,7 @@ class Executive:
             self._tracker.use_robot(robot)
         else:
             self.config, self._tracker = config, TrajectoryTracker(robot, config)
-            self._max_gap_ns = _max_gap_ns(config)
-        self._teleoperation = Teleoperation(robot, self.config, worker.clearance)
+            self._teleoperation = Teleoperation(robot, self.config, worker.clearance)
 
     def plan_at_once(self) -> None:
         """From now on, plan while states wait: the plant is in lockstep."""
@@ -498,14 +327,14 @@ class Executive:
                 self._change_phase(Event.OBSTACLES, Phase.EXECUTING)
         if self.phase is Phase.EXECUTING and active is not None:
             begins = active.ends_at - active.schedule.duration
-            clause = self._worker.approach_ahead(active.schedule, begins, self._stamp_ns / 1e9)
+            clause = self._worker.approach_ahead(active.schedule, begins, self._stamp_ns / SECOND)
             if clause:
                 message = (
                     f"{sentence_case(clause)}: the joints brake, and the remaining motion is "
                     "planned again."
                 )
                 self._add_notice(Severity.WARNING, message)
-                self._add_status(PlannerState.EXECUTING, message, active.identified, active)
+                self.outputs.append(active.status(PlannerState.EXECUTING, message))
                 self._brake_for_replan(Event.OBSTACLES)
 
     def _plan_again(self, message: str) -> None:
@@ -544,12 +373,12 @@ class Executive:
             if self._tracker.is_active:
                 # A moving robot has no average: only its last state counts.
                 self._average.restart()
-            self._add_to_average(measured)
+            self._average.take(measured)
 
     def update(self, measured: MeasuredState) -> Setpoint:
         """Return the setpoint for a measured state; see :attr:`setpoint`."""
         stamp, q, tracker = measured.stamp_ns, measured.q, self._tracker
-        if not 0 <= stamp - self._stamp_ns <= self._max_gap_ns:
+        if not 0 <= stamp - self._stamp_ns <= self.config.longest_gap * SECOND:
             if tracker.is_active:
                 self._handle_time_jump(stamp)
             elif self.phase is Phase.TELEOPERATING:
@@ -559,7 +388,7 @@ class Executive:
             self._end_schedule(stamp)
         # While a schedule is tracked, most states need nothing but a command.
         if (
-            self.phase is not _EXECUTING
+            self.phase is not Phase.EXECUTING
             or self._new_goal is not None
             or tracker.is_check_due(stamp)
         ):
@@ -574,7 +403,7 @@ class Executive:
             base = measured.base() if tracker.needs_wheel_rates else None
             qdot = None if base is None else base.qdot
             tracker.hold(q, qdot, obeyed=not self.plant_rests)
-        self._command_count += 1
+        self.statistics.commands_published += 1
         return tracker.setpoint
 
     def _do_phase_work(self, measured: MeasuredState) -> None:
@@ -590,21 +419,6 @@ class Executive:
             case Phase.EXECUTING:
                 assert self._active_goal is not None
                 self._check_path(self._active_goal, measured)
-
-    def _add_to_average(self, measured: MeasuredState) -> bool:
-        """Add a state to the average; return whether its base was measured."""
-        base = measured.base()
-        if base is None:
-            return False
-        self._average.add(base.pose, base.twist, measured.q, base.qdot)
-        return True
-
-    def _worker_is_free(self) -> bool:
-        """Whether a plan can be requested: the thread of a cancelled plan may still run."""
-        if self._worker.is_busy:
-            self._worker.poll(self._stamp_ns)
-            return False
-        return True
 
     # -- TELEOPERATING ------------------------------------------------------------------------
 
@@ -623,18 +437,16 @@ class Executive:
 
     def _end_teleoperation(self, event: Event, message: str) -> None:
         self._teleoperation.end()
-        self._tracker.stop()
-        self._average.restart()
-        self._change_phase(event, self._phase_at_rest())
+        self._stop_motion(event)
         self.outputs.append(PlannerStatus(PlannerState.IDLE, message))
 
     # -- at rest: MEASURING and EVALUATING ----------------------------------------------------
 
     def _measure_at_rest(self, measured: MeasuredState) -> None:
         """Plan for a new goal, or evaluate the active one, once the state is known."""
-        if not self._worker_is_free():
+        if not self._worker.is_free():
             return
-        self._add_to_average(measured)
+        self._average.take(measured)
         if not self._average.complete:
             return
         if self.phase is Phase.MEASURING:
@@ -648,22 +460,18 @@ class Executive:
 
     def _evaluate(self, active: ActiveGoal) -> None:
         """Compare the measured pose with the goal; plan the remaining motion, or end the goal."""
-        controls = active.schedule.controls
         try:
             state = self._average.state()
         except PlanningError as reason:
-            self._add_status(PlannerState.FAILED, str(reason), active.identified)
+            failed = PlannerStatus.of_goal(PlannerState.FAILED, str(reason), active.identified)
+            self.outputs.append(failed)
             self._end_goal(Event.FAILED)
             return
         goal = active.identified.goal
         error = PoseError.between(state.position, state.quaternion, goal, state.q, self._robot)
-        tolerance = self._tolerance_of(active.identified)
-        if tolerance.admits(error, controls):
-            left = describe_remaining_error(error, controls, tolerance, goal)
-            missed = missed_parts(goal, error, controls, tolerance)
-            decided = PlannerState.REACHED_PARTLY if missed else PlannerState.REACHED
-            message = reached_message(left, missed)
-            self._add_status(decided, message, active.identified, active, error)
+        reached = active.reached(error, self._tolerance_of(active.identified))
+        if reached is not None:
+            self.outputs.append(reached)
             self._end_goal(Event.REACHED)
             return
         if active.not_flown_reason:
@@ -673,9 +481,9 @@ class Executive:
             if active.corrections >= self.config.max_corrections:
                 self._fail_goal(active, error, f" after {active.corrections} correction(s).")
                 return
-            off = describe_remaining_error(error, controls)
+            off = describe_remaining_error(error, active.schedule.controls)
             self._count_correction(active, f"The remaining motion is planned: {off}.")
-        self._request_plan(PlanFromRestJob(active.identified, active.next_plan, error), state)
+        self._request_plan(PlanJob(active.identified, active.next_plan, error), state)
 
     # -- in motion: EXECUTING and BRAKING -----------------------------------------------------
 
@@ -693,59 +501,38 @@ class Executive:
             if self.phase is Phase.EXECUTING:
                 self._brake_for_replan(Event.NEW_GOAL)
             return
-        if not self._worker_is_free():
+        if not self._worker.is_free():
             return
-        base = measured.base()
-        if base is not None:
-            self._average.restart()
-            self._average.add(base.pose, base.twist, measured.q, base.qdot)
-        if not self._average.count:
+        if not self._average.take(measured, alone=True) and not self._average.count:
             return
+        active = self._active_goal
         if take_over is None:
             self._plan_new_goal(waiting)
-        else:
-            self._plan_new_goal_in_motion(waiting, take_over)
+        elif active is not None and waiting.goal.equals(active.identified.goal):
+            self._keep_schedule_for(waiting, active)
+        elif self.config.averaging == 1 or self._tracker.is_check_due(self._stamp_ns):
+            self._plan_new_goal(waiting, take_over)
         self._average.restart()
-
-    def _plan_new_goal_in_motion(self, waiting: IdentifiedGoal, take_over: TakeOver) -> None:
-        assert self._active_goal is not None
-        if waiting.goal.equals(self._active_goal.identified.goal):
-            self._keep_schedule_for(waiting, self._active_goal)
-            return
-        averages = self.config.averaging > 1
-        if averages and not self._tracker.is_check_due(self._stamp_ns):
-            return
-        try:
-            state = self._average.state()
-        except PlanningError:
-            # A later state may allow a plan; otherwise the schedule ends first.
-            return
-        if averages:
-            state = self._tracker.path_check.average_pose(state)
-        self._reset_plan_count()
-        waiting = waiting.kept_at(state.position, state.quaternion)
-        job = TakeOverJob(waiting, PlanReason.IN_MOTION, take_over, waiting.goal)
-        self._request_plan(job, state)
 
     def _keep_schedule_for(self, identified: IdentifiedGoal, active: ActiveGoal) -> None:
         """Make a goal with the same pose and shape the active goal; the schedule continues."""
         self._new_goal = None
-        left = active.ends_at - self._stamp_ns / 1e9
+        left = active.time_left(self._stamp_ns)
         active = replace(active, identified=identified, corrections=0, manoeuvre_time=left)
         self._accept_goal(active)
         message = "The present schedule also leads to this goal."
-        self._add_status(PlannerState.EXECUTING, message, identified, active)
+        self.outputs.append(active.status(PlannerState.EXECUTING, message))
 
     def _check_path(self, active: ActiveGoal, measured: MeasuredState) -> None:
         """Plan the remaining motion periodically, and when the base is off its predicted path."""
         self._average.restart()
         corrected = active.corrections >= self.config.max_corrections
-        if not self._worker_is_free():
+        if not self._worker.is_free():
             return
         replans = self.config.replanning > 0 and self._can_replan()
         if corrected and not replans:
             return
-        if not self._add_to_average(measured):
+        if not self._average.take(measured):
             return
         try:
             state = self._average.state()
@@ -757,11 +544,10 @@ class Executive:
             if replans:
                 self._replan_remaining(active, state)
         elif self._worker.plans_in_background:
-            self._report_path_correction(active, error)
+            self._report_path_correction(error)
             self._brake_for_replan(Event.TRACKING_ERROR)
         else:
-            job = PlanWithBrakingJob(active.identified, PlanReason.TRACKING_ERROR, error)
-            self._request_plan(job, state)
+            self._request_plan(PlanJob(active.identified, PlanReason.TRACKING_ERROR, error), state)
 
     def _can_replan(self) -> bool:
         return (
@@ -777,19 +563,20 @@ class Executive:
         state = self._tracker.path_check.average_pose(state)
         if self._stamp_ns < self._replan_ns or active.schedule.partial:
             return
-        self._replan_ns = self._stamp_ns + round(self.config.replanning * 1e9)
+        self._replan_ns = self._stamp_ns + round(self.config.replanning * SECOND)
         aim = self._tracker.path_check.shift_goal(
             active.identified.goal,
             self._tolerance_of(active.identified),
             active.schedule.controls - {"shape"},
-            late=active.ends_at - self._stamp_ns / 1e9 < _LATE_TIME_SHARE * active.manoeuvre_time,
+            late=active.is_late(self._stamp_ns),
         )
         if aim is None:
             return
         take_over = self._tracker.take_over(self._stamp_ns, state.q, self.config.takeover_time)
         if take_over is None:
             return
-        job = TakeOverJob(active.identified, PlanReason.SHRINKING_HORIZON, take_over, aim)
+        reason = PlanReason.SHRINKING_HORIZON
+        job = PlanJob(active.identified, reason, take_over=take_over, aim=aim)
         self._request_plan(job, replace(state, q=take_over.shapes[0].copy()))
 
     def _brake_for_replan(self, event: Event) -> None:
@@ -805,15 +592,19 @@ class Executive:
     def _await_take_over(self) -> None:
         if self.phase is Phase.REPLANNING:
             self._take_plan_result()
-        match self._pending_plan:
-            case ReadyPlan(job) as ready if self._stamp_ns >= job.take_over.stamp_ns:
-                self._switch_schedule(ready)
-            case TakeOverJob(take_over=take_over) as job if self._stamp_ns >= take_over.stamp_ns:
-                self._handle_late_plan(job)
+        job = self._job
+        if job is None or job.take_over is None or self._stamp_ns < job.take_over.stamp_ns:
+            return
+        if self._ready_plan is None:
+            self._handle_late_plan(job)
+        else:
+            self._switch_schedule(self._ready_plan)
 
-    def _switch_schedule(self, ready: ReadyPlan) -> None:
-        job, schedule, begins_ns = ready.job, ready.schedule, ready.job.take_over.stamp_ns
-        self._pending_plan = None
+    def _switch_schedule(self, schedule: GaitSchedule) -> None:
+        job, self._job, self._ready_plan = self._job, None, None
+        assert job is not None
+        assert job.take_over is not None
+        begins_ns = job.take_over.stamp_ns
         if job.reason.is_for_new_goal:
             self._accept_goal(ActiveGoal(job.identified, schedule, begins_ns))
         reason = job.reason.value
@@ -825,9 +616,9 @@ class Executive:
             method=schedule.method,
             duration_s=f"{schedule.duration:.9g}",
         )
-        self._execute_schedule(schedule, begins_ns, in_motion=True)
+        self._execute_schedule(schedule, begins_ns, event=Event.TAKEN_OVER)
 
-    def _handle_late_plan(self, job: TakeOverJob) -> None:
+    def _handle_late_plan(self, job: PlanJob) -> None:
         """Continue along the present schedule; plan for a new goal once more."""
         self._drop_plan()
         self._in_motion_attempts += job.reason.is_for_new_goal
@@ -838,35 +629,39 @@ class Executive:
 
     # -- plans: request, result, schedule -----------------------------------------------------
 
-    def _plan_new_goal(self, waiting: IdentifiedGoal) -> None:
-        """Request a plan for a new goal that begins at rest, or with braking."""
-        reason = PlanReason.BLEND if self._tracker.is_active else PlanReason.NEW_GOAL
-        self._reset_plan_count()
+    def _plan_new_goal(self, waiting: IdentifiedGoal, take_over: TakeOver | None = None) -> None:
+        """Request a plan for a new goal: from rest, with braking, or in motion."""
+        reason, state, refusal = PlanReason.NEW_GOAL, None, ""
         try:
             state = self._average.state()
-        except PlanningError as refusal:
+        except PlanningError as error:
+            refusal = str(error)
+        if take_over is not None:
+            reason = PlanReason.IN_MOTION
+            if state is None:
+                # A later state may allow a plan; otherwise the schedule ends first.
+                return
+            if self.config.averaging > 1:
+                state = self._tracker.path_check.average_pose(state)
+        elif self._tracker.is_active:
+            reason = PlanReason.BLEND
+        self._new_goal = None
+        self.statistics.plan_time_s, self.statistics.plans = 0.0, 0
+        if state is None:
             self._change_phase(Event.PLAN_REQUESTED, Phase.PLANNING)
-            self._act_on_result(PlanJob(waiting, reason), Refused(str(refusal)))
+            self._act_on_result(PlanJob(waiting, reason), Refused(refusal))
         else:
             waiting = waiting.kept_at(state.position, state.quaternion)
-            self._request_plan(PlanJob(waiting, reason), state)
-
-    def _reset_plan_count(self) -> None:
-        self._new_goal = None
-        self._total_plan_time, self._plan_count = 0.0, 0
+            self._request_plan(PlanJob(waiting, reason, take_over=take_over), state)
 
     def _request_plan(self, job: PlanJob, state: RobotState) -> None:
         """Request a plan from a measured state; unless it is to take over, the joints brake."""
-        goal, active = (
-            job.identified.goal,
-            None if job.reason.is_for_new_goal else self._active_goal,
-        )
+        active = None if job.reason.is_for_new_goal else self._active_goal
         if active is not None and len(active.stuck_positions) != len(self._tracker.stuck):
             names = self._robot.joint_names
             active.stuck_positions = {names[i]: float(state.q[i]) for i in self._tracker.stuck}
-        braking, take_over, rates = None, None, self._tracker.wheel_rates(state)
-        if isinstance(job, TakeOverJob):
-            goal, take_over = job.aim, job.take_over
+        braking, rates = None, self._tracker.wheel_rates(state)
+        if job.take_over is not None:
             self._change_phase(Event.PLAN_REQUESTED, Phase.REPLANNING)
         else:
             braking = self._tracker.braking_shapes(self._stamp_ns)
@@ -876,7 +671,7 @@ class Executive:
             self._change_phase(Event.PLAN_REQUESTED, Phase.PLANNING)
         request = PlanRequest(
             state,
-            goal,
+            job.aim or job.identified.goal,
             self._tolerance_of(job.identified),
             correction=job.reason in (PlanReason.CORRECTION, PlanReason.CONTINUATION),
             previous=None if active is None else active.schedule,
@@ -886,15 +681,18 @@ class Executive:
         self._add_event(EventKind.PLAN_STARTED, message, job.identified, reason=reason)
         fresh = job.reason.is_for_new_goal or not self._tracker.is_active
         if fresh and self._worker.plans_in_background:
-            self._add_status(PlannerState.PLANNING, f"Planning: {reason}.", job.identified, active)
+            about = (PlannerState.PLANNING, f"Planning: {reason}.")
+            status = PlannerStatus.of_goal(*about, job.identified)
+            self.outputs.append(status if active is None else active.status(*about))
         task = PlanningTask(
-            request, braking=braking, rates_after_braking=rates, take_over=take_over
+            request,
+            {} if active is None else active.stuck_positions,
+            frozenset() if active is None else active.required,
+            braking=braking,
+            rates_after_braking=rates,
+            take_over=job.take_over,
         )
-        if active is not None:
-            task = replace(
-                task, stuck_joint_positions=active.stuck_positions, required=active.required
-            )
-        self._pending_plan = job
+        self._job = job
         self._worker.submit(task, self._stamp_ns)
         self._take_plan_result()
 
@@ -902,7 +700,7 @@ class Executive:
         result = self._worker.poll(self._stamp_ns)
         if result is None:
             return
-        self._total_plan_time += result.wall_time
+        self.statistics.plan_time_s += result.wall_time
         if isinstance(result, Postponed):
             self._add_notice(
                 Severity.INFO,
@@ -910,9 +708,9 @@ class Executive:
                 "repeated with a later start.",
             )
             return
-        job, self._pending_plan = self._pending_plan, None
-        assert isinstance(job, PlanJob)
-        self._plan_count += 1
+        job, self._job = self._job, None
+        assert job is not None
+        self.statistics.plans += 1
         self._add_notice(Severity.INFO, f"Planned in {result.wall_time:.6f} s.")
         if isinstance(result, Planned):
             result = _plan_for(job.identified, result)
@@ -929,46 +727,46 @@ class Executive:
 
     def _act_on_result(self, job: PlanJob, result: Planned | Refused) -> None:
         """Execute a plan, or report its refusal; the job alone decides on the next phase."""
-        active = self._active_goal
-        match job, result:
-            case TakeOverJob() as takes_over, Planned(schedule=schedule):
-                self._pending_plan = ReadyPlan(takes_over, schedule)
+        active, reason = self._active_goal, job.reason
+        match result:
+            case Planned(schedule) if job.take_over is not None:
+                self._job, self._ready_plan = job, schedule
                 self._change_phase(Event.PLANNED, Phase.TAKING_OVER)
-            case TakeOverJob(reason=PlanReason.IN_MOTION), Refused(reason=reason):
+            case Planned(schedule, begins_ns=begins):
+                error = None
+                if reason.is_for_new_goal:
+                    self._accept_goal(ActiveGoal(job.identified, schedule, self._stamp_ns))
+                elif isinstance(job.error, TrackingError):
+                    self._report_path_correction(job.error)
+                else:
+                    error = job.error
+                self._execute_schedule(schedule, begins, error)
+            case Refused(why) if reason is PlanReason.IN_MOTION:
                 self._new_goal = self._new_goal or job.identified
                 self._in_motion_attempts += 1
-                again = (
-                    "from a later tick"
-                    if self._in_motion_attempts < _MAX_IN_MOTION_ATTEMPTS
-                    else "from rest"
-                )
-                message = f"No plan begins in motion, so the goal is planned for {again}: {reason}"
+                last = self._in_motion_attempts == _MAX_IN_MOTION_ATTEMPTS
+                again = "from rest" if last else "from a later tick"
+                message = f"No plan begins in motion, so the goal is planned for {again}: {why}"
                 self._add_notice(Severity.WARNING, message)
                 self._change_phase(Event.REFUSED, Phase.EXECUTING)
-            case TakeOverJob(), Refused(reason=reason):
-                message = f"The remaining motion is not planned again: {reason}"
+            case Refused(why) if reason is PlanReason.SHRINKING_HORIZON:
+                message = f"The remaining motion is not planned again: {why}"
                 self._add_notice(Severity.INFO, message)
                 self._change_phase(Event.REFUSED, Phase.EXECUTING)
-            case PlanWithBrakingJob(error=error), Planned(schedule=schedule, begins_ns=begins):
-                assert active is not None
-                self._report_path_correction(active, error)
-                self._execute_schedule(schedule, begins)
-            case PlanWithBrakingJob(error=error), Refused(reason=reason):
-                message = f"{error}, and the remaining motion cannot be planned again: {reason}"
+            case Refused(why) if reason.is_for_new_goal:
+                earlier = " The earlier goal is still pursued." if active is not None else ""
+                message = f"{why}{earlier}"
+                refused = PlannerStatus.of_goal(PlannerState.REFUSED, message, job.identified)
+                self.outputs.append(refused)
+                self._change_phase(Event.REFUSED, self._phase_without_plan())
+            case Refused(why) if isinstance(job.error, TrackingError):
+                message = f"{job.error}, and the remaining motion cannot be planned again: {why}"
                 self._add_notice(Severity.WARNING, message)
                 self._change_phase(Event.REFUSED, self._phase_without_plan())
-            case PlanFromRestJob(error=remaining), Planned(schedule=schedule, begins_ns=begins):
-                self._execute_schedule(schedule, begins, remaining)
-            case PlanFromRestJob(error=remaining), Refused(reason=reason):
+            case Refused(why):
                 assert active is not None
-                self._fail_goal(active, remaining, f", and {reason}", Event.REFUSED)
-            case _, Planned(schedule=schedule, begins_ns=begins):
-                self._accept_goal(ActiveGoal(job.identified, schedule, self._stamp_ns))
-                self._execute_schedule(schedule, begins)
-            case _, Refused(reason=reason):
-                earlier = " The earlier goal is still pursued." if active is not None else ""
-                self._add_status(PlannerState.REFUSED, f"{reason}{earlier}", job.identified)
-                self._change_phase(Event.REFUSED, self._phase_without_plan())
+                assert job.error is not None
+                self._fail_goal(active, job.error, f", and {why}", Event.REFUSED)
 
     def _accept_goal(self, active: ActiveGoal) -> None:
         self._active_goal, self._tracker.stuck = active, []
@@ -980,46 +778,33 @@ class Executive:
         schedule: GaitSchedule,
         begins: int,
         remaining: PoseError | None = None,
-        *,
-        in_motion: bool = False,
+        event: Event = Event.PLANNED,
     ) -> None:
         """Track a schedule for the active goal, from the stamp of its first tick on."""
         active, config = self._active_goal, self.config
         assert active is not None
-        event, start = Event.PLANNED, ""
-        if in_motion:
-            event, start = Event.TAKEN_OVER, ", which begins in motion"
-        self._subtract_remainder(active, begins)
-        active.schedule = schedule
-        self._replan_ns = begins + round(config.replanning * 1e9)
+        start = ", which begins in motion" if event is Event.TAKEN_OVER else ""
+        active.begin(schedule, begins)
+        self._replan_ns = begins + round(config.replanning * SECOND)
         averages = (config.replanning > 0 or config.averaging > 1) and config.takeover_time > 0
         averages = averages and self._worker.starts_in_motion(schedule)
         self._tracker.start(schedule, begins, config.averaging if averages else 0)
         self._commanded_from_ns = self._stamp_ns
-        active.manoeuvre_time += schedule.duration
-        active.ends_at = begins / 1e9 + schedule.duration
-        active.next_plan = PlanReason.CONTINUATION if schedule.partial else PlanReason.CORRECTION
         self._change_phase(event, Phase.EXECUTING)
-        self._add_status(
+        status = active.status(
             PlannerState.EXECUTING,
             f"Executing {_name_gait(schedule.method)} of {schedule.duration:.6g} s{start}.",
-            active.identified,
-            active,
             remaining,
-            schedule,
+            method=schedule.method,
+            duration_s=schedule.duration,
+            notes=schedule.notes,
         )
-        self.outputs.append(ScheduleStart(schedule, begins))
+        self.outputs += [status, ScheduleStart(schedule, begins)]
 
-    @staticmethod
-    def _subtract_remainder(active: ActiveGoal, stamp_ns: int) -> None:
-        remainder = active.ends_at - stamp_ns / 1e9
-        if remainder > 0:
-            active.manoeuvre_time -= min(remainder, active.schedule.duration)
-            active.ends_at = stamp_ns / 1e9
-
-    def _report_path_correction(self, active: ActiveGoal, error: TrackingError) -> None:
+    def _report_path_correction(self, error: TrackingError) -> None:
+        assert self._active_goal is not None
         message = f"{error}: the remaining motion is planned again."
-        self._count_correction(active, message)
+        self._count_correction(self._active_goal, message)
         self._add_notice(Severity.WARNING, message)
 
     def _count_correction(self, active: ActiveGoal, message: str) -> None:
@@ -1031,31 +816,31 @@ class Executive:
 
     def _end_schedule(self, stamp_ns: int) -> None:
         """End the schedule; its result is evaluated unless its goal was given up."""
-        ready = self._pending_plan
-        if isinstance(ready, ReadyPlan):
+        ready = self._ready_plan
+        if ready is not None:
             # No state arrived between the take-over tick and the end of the schedule.
             self._switch_schedule(ready)
-            if not self._tracker.has_ended(stamp_ns, ready.schedule.positions[-1]):
+            if not self._tracker.has_ended(stamp_ns, ready.positions[-1]):
                 return
-        self._drop_plan()
         at_rest = self.phase is Phase.BRAKING
-        self._tracker.stop(at_last_shape=not at_rest)
+        event = Event.AT_REST if at_rest else Event.SCHEDULE_ENDED
+        self._stop_motion(event, at_last_shape=not at_rest)
+
+    def _stop_motion(self, event: Event, *, at_last_shape: bool = False) -> None:
+        """Drop the schedule and any plan; the next phase begins with measurements at rest."""
+        self._drop_plan()
+        self._tracker.stop(at_last_shape=at_last_shape)
         self._average.restart()
-        self._change_phase(
-            Event.AT_REST if at_rest else Event.SCHEDULE_ENDED, self._phase_at_rest()
-        )
+        self._change_phase(event, self._phase_at_rest())
 
     def _handle_time_jump(self, stamp_ns: int) -> None:
         """Plan the remaining motion where the schedule does not cover the present time."""
         if self._tracker.covers(stamp_ns):
             return
-        self._drop_plan()
-        self._tracker.stop()
-        self._average.restart()
         if self._active_goal is not None:
             self._active_goal.next_plan = PlanReason.REPLAN
-        self._change_phase(Event.TIME_JUMPED, self._phase_at_rest())
-        before, now = self._stamp_ns / 1e9, stamp_ns / 1e9
+        self._stop_motion(Event.TIME_JUMPED)
+        before, now = self._stamp_ns / SECOND, stamp_ns / SECOND
         self._add_notice(
             Severity.WARNING,
             f"The time of the states has jumped from {before:.9g} s to {now:.9g} s, for which no "
@@ -1066,13 +851,10 @@ class Executive:
         """Stop the robot, and plan the remaining motion with the joints that are not stuck."""
         tracker = self._tracker
         tracker.stuck += stuck
-        self._drop_plan()
-        tracker.stop()
-        self._subtract_remainder(active, self._stamp_ns)
+        active.cut_off(self._stamp_ns)
         active.required = active.schedule.controls - {"shape"}
         active.next_plan = PlanReason.STUCK_JOINTS
-        self._average.restart()
-        self._change_phase(Event.JOINTS_STUCK, self._phase_at_rest())
+        self._stop_motion(Event.JOINTS_STUCK)
         names = ", ".join(self._robot.joint_names[i] for i in tracker.stuck)
         message = f"Stuck: {names}. The remaining motion is planned without stuck joints."
         self._add_notice(Severity.WARNING, message)
@@ -1081,8 +863,7 @@ class Executive:
     def _drop_plan(self) -> None:
         """Drop the requested or ready plan; its new goal, if any, waits again."""
         self._worker.cancel()
-        plan, self._pending_plan = self._pending_plan, None
-        job = plan.job if isinstance(plan, ReadyPlan) else plan
+        job, self._job, self._ready_plan = self._job, None, None
         if job is not None and job.reason.is_for_new_goal:
             self._new_goal = self._new_goal or job.identified
 
@@ -1100,12 +881,7 @@ class Executive:
         self, active: ActiveGoal, remaining: PoseError, why: str, event: Event = Event.FAILED
     ) -> None:
         """Report that the active goal is not reached; ``why`` ends the message."""
-        about = active.identified
-        off = describe_remaining_error(
-            remaining, active.schedule.controls, self._tolerance_of(about), about.goal
-        )
-        message = f"The goal is not reached: {off}{why}"
-        self._add_status(PlannerState.FAILED, message, active.identified, active, remaining)
+        self.outputs.append(active.failed(remaining, self._tolerance_of(active.identified), why))
         self._end_goal(event)
 
     def _end_goal(self, event: Event) -> None:
@@ -1117,40 +893,25 @@ class Executive:
         self._teleoperation.end()
         self._new_goal = self._active_goal = None
 
+    @property
     def _latest_goal(self) -> IdentifiedGoal | None:
-        """Return the latest proposed goal that is not decided."""
-        return self._new_goal or self._planned_goal() or self._pursued_goal()
+        """The latest proposed goal that is not decided."""
+        active = None if self._active_goal is None else self._active_goal.identified
+        return self._new_goal or self._planned_goal or active
 
+    @property
     def _planned_goal(self) -> IdentifiedGoal | None:
-        plan = self._pending_plan
-        job = plan.job if isinstance(plan, ReadyPlan) else plan
-        return None if job is None else job.identified
-
-    def _pursued_goal(self) -> IdentifiedGoal | None:
-        return None if self._active_goal is None else self._active_goal.identified
+        return None if self._job is None else self._job.identified
 
     def _tolerance_of(self, identified: IdentifiedGoal) -> Tolerance:
         return identified.tolerance or self.config.tolerance
-
-    def _pursued_id(self) -> str:
-        pursued = self._pursued_goal()
-        return "" if pursued is None else pursued.goal_id
-
-    def _latest_goal_id(self) -> str:
-        latest = self._latest_goal()
-        return "" if latest is None else latest.goal_id
 
     # -- outputs ------------------------------------------------------------------------------
 
     def _change_phase(self, event: Event, target: Phase) -> None:
         """Change the phase and report the transition; no other method changes the phase."""
-        transition = Transition(self.phase, event, target)
-        if transition not in TRANSITIONS:
-            raise IllegalTransitionError(
-                f"{self.phase.name} may not become {target.name} by {event.name}."
-            )
+        self.outputs.append(Transition(self.phase, event, target))
         self.phase = target
-        self.outputs.append(transition)
 
     def _add_notice(self, severity: Severity, message: str) -> None:
         self.outputs.append(Notice(severity, message))
@@ -1163,46 +924,12 @@ class Executive:
         level: int = 0,
         **about: str,
     ) -> None:
-        now = self._stamp_ns / 1e9
+        now = self._stamp_ns / SECOND
         self.outputs.append(FlightEvent(kind, message, level, now, identified.goal_id, about))
 
-    def _add_status(
-        self,
-        state: PlannerState,
-        message: str,
-        identified: IdentifiedGoal,
-        active: ActiveGoal | None = None,
-        remaining: PoseError | None = None,
-        schedule: GaitSchedule | None = None,
-    ) -> None:
-        values: dict[str, Any] = {}
-        if active is not None:
-            values["corrections"] = active.corrections
-            values |= {"manoeuvre_time_s": active.manoeuvre_time, "ends_at_s": active.ends_at}
-            values["remaining_s"] = active.schedule.remaining
-            controls = active.schedule.controls
-            values["not_controlled"] = uncontrolled_parts(identified.goal, controls)
-        aim = identified.goal
-        if remaining is not None:
-            if not aim.end_effectors or "position" in aim.base:
-                values["position_error_m"] = remaining.distance
-            if not aim.end_effectors or "attitude" in aim.base:
-                values["attitude_error_rad"] = remaining.angle
-            if aim.end_effectors:
-                values["end_effector_position_error_m"] = remaining.largest_end_effector_distance
-                values["end_effector_attitude_error_rad"] = remaining.largest_end_effector_angle
-        values["end_effector_goals"] = end_effector_values(aim)
-        values["end_effector_waypoints"] = waypoint_counts(aim)
-        if schedule is not None:
-            values |= {"method": schedule.method, "duration_s": schedule.duration}
-            values["notes"] = schedule.notes
-        goal = goal_values(aim)
-        self.outputs.append(PlannerStatus(state, message, identified.goal_id, goal, **values))
-
-
-def _max_gap_ns(config: PlannerConfig) -> int:
-    """Return the longest time between two states that is no jump of time, ns."""
-    return round(max(_MAX_GAP, _MAX_GAP_PERIODS * config.control_period) * 1e9)
+    def _add_abort(self, message: str, goal: IdentifiedGoal | None) -> None:
+        goal_id = "" if goal is None else goal.goal_id
+        self.outputs.append(PlannerStatus(PlannerState.ABORTED, message, goal_id=goal_id))
 
 
 def _plan_for(identified: IdentifiedGoal, planned: Planned) -> Planned | Refused:

@@ -97,6 +97,16 @@ class StateAverage:
         self._rates.append(np.concatenate([twist, qdot]))
         self._shapes.append(q.copy())
 
+    def take(self, measured: MeasuredState, *, alone: bool = False) -> bool:
+        """Add a state if its base was measured, or let it stand ``alone``; return whether."""
+        base = measured.base()
+        if base is None:
+            return False
+        if alone:
+            self.restart()
+        self.add(base.pose, base.twist, measured.q, base.qdot)
+        return True
+
     def state(self) -> RobotState:
         """Return the average of at least one state.
 

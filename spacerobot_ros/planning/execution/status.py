@@ -7,6 +7,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field
 from enum import Enum
 from functools import lru_cache
+from typing import Any, NamedTuple
 
 from spacerobot_ros.errors import quantity
 from spacerobot_ros.events import (
@@ -17,15 +18,25 @@ from spacerobot_ros.events import (
     choice_format,
     number_format,
 )
+from spacerobot_ros.events import (
+    Event as FlightEvent,
+)
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.planning.core.goal import (
     Controlled,
     Goal,
     PoseError,
     Tolerance,
+    missed_parts,
+    reached_message,
     uncontrolled_parts,
 )
 from spacerobot_ros.planning.core.schedule import GaitSchedule, Notes
+from spacerobot_ros.planning.execution.goal_file import IdentifiedGoal, PursuedGoals
+from spacerobot_ros.times import SECOND
+
+_LATE_TIME_SHARE = 1 / 3
+"""Remaining share of a motion's duration from which on the motion counts as late."""
 
 
 class PlannerState(str, Enum):
@@ -121,6 +132,37 @@ class PlannerStatus:
     notes: Notes = field(default_factory=dict)
     not_controlled: tuple[Controlled, ...] = ()
 
+    @classmethod
+    def of_goal(
+        cls,
+        state: PlannerState,
+        message: str,
+        identified: IdentifiedGoal,
+        error: PoseError | None = None,
+        **values: Any,
+    ) -> PlannerStatus:
+        """Return a status with a goal, its remaining error if evaluated, and other ``values``."""
+        goal = identified.goal
+        if error is not None:
+            if not goal.end_effectors or "position" in goal.base:
+                values["position_error_m"] = error.distance
+            if not goal.end_effectors or "attitude" in goal.base:
+                values["attitude_error_rad"] = error.angle
+            if goal.end_effectors:
+                values["end_effector_position_error_m"] = error.largest_end_effector_distance
+                values["end_effector_attitude_error_rad"] = error.largest_end_effector_angle
+        pose = (*goal.position.tolist(), *goal.quaternion.tolist()) if goal.base else ()
+        ways = {x.link: x.waypoints for x in goal.end_effectors}
+        return cls(
+            state,
+            message,
+            identified.goal_id,
+            pose,
+            end_effector_goals={x.link: x.values for x in goal.end_effectors},
+            end_effector_waypoints={k: len(x) for k, x in ways.items() if x is not None},
+            **values,
+        )
+
     def to_values(self) -> dict[str, str]:
         """Return the status as the key-value pairs of a DiagnosticStatus; numbers have 9 digits."""
         return _FORMAT.to_values(self)
@@ -207,7 +249,57 @@ class ScheduleStart:
     stamp_ns: int
 
 
-@dataclass(frozen=True)
+class Phase(Enum):
+    """Activity of an executive."""
+
+    IDLE = "idle"  # There is no goal; the joints rest.
+    MEASURING = "measuring"  # A new goal waits for measured states to plan from; the joints rest.
+    PLANNING = "planning"  # The worker computes a plan.
+    EXECUTING = "executing"  # A schedule is tracked.
+    REPLANNING = "replanning"  # A schedule is tracked; a plan that takes over is computed.
+    TAKING_OVER = "taking over"  # A schedule is tracked until its successor takes over.
+    BRAKING = "braking"  # The joints brake along the planned path.
+    EVALUATING = "evaluating"  # A schedule has ended; measured states are compared with the goal.
+    TELEOPERATING = "teleoperating"  # An end-effector follows twists, or brakes after the last one.
+
+
+class Event(Enum):
+    """Cause of a change of phase."""
+
+    NEW_GOAL = "new goal"
+    TWIST = "twist"  # The first twist of a teleoperation.
+    PLAN_REQUESTED = "plan requested"  # A plan from the measured state was requested.
+    PLANNED = "planned"
+    REFUSED = "refused"  # The method has found no plan.
+    PLAN_LATE = "plan late"  # The tick of a take-over has come, and its plan is not ready.
+    TAKEN_OVER = "taken over"  # The tick has come at which a plan takes over.
+    SCHEDULE_ENDED = "schedule ended"
+    AT_REST = "at rest"  # The braking is over.
+    TRACKING_ERROR = "tracking error"  # The base is off its path; the method plans from rest only.
+    OBSTACLES = "obstacles"  # There are other obstacles, which the plan does not know.
+    JOINTS_STUCK = "joints stuck"
+    TIME_JUMPED = "time jumped"  # The schedule does not cover the time of the states.
+    REACHED = "reached"
+    FAILED = "failed"  # All corrections are used, or the measured state is not finite.
+    ABORTED = "aborted"  # The goal is given up on request.
+    PLANT_STOPPED = "plant stopped"  # The plant does not obey commands: the goal is given up.
+    PLANT_RESET = "plant reset"  # The plant was reset, or its robot has captured or released.
+    DEACTIVATED = "deactivated"
+
+
+class Transition(NamedTuple):
+    """A change of phase and its cause."""
+
+    source: Phase
+    event: Event
+    target: Phase
+
+
+Output = PlannerStatus | ScheduleStart | Notice | Transition | FlightEvent | PursuedGoals
+"""An output of an executive other than its setpoints."""
+
+
+@dataclass
 class PlannerStatistics:
     """Counts of plans and commands, for benchmarks and summaries.
 
@@ -235,21 +327,103 @@ class PlannerStatistics:
         return cls(**json.loads(text))
 
 
-def goal_values(goal: Goal) -> tuple[float, ...]:
-    """Return position and quaternion (7,) of a goal for a status; () if the base is free."""
-    return (*goal.position.tolist(), *goal.quaternion.tolist()) if goal.base else ()
+class PlanReason(Enum):
+    """Reason of a request for a plan; events have its value under ``reason``."""
+
+    NEW_GOAL = "new goal"  # A new goal, from rest.
+    BLEND = "blend"  # A new goal while the joints move: the plan begins with braking.
+    IN_MOTION = "new goal in motion"  # A new goal; its plan takes over in motion.
+    SHRINKING_HORIZON = "shrinking horizon"  # The remaining motion, planned in motion.
+    CORRECTION = "correction"  # The schedule has ended, and the goal is not reached.
+    CONTINUATION = "continuation"  # The next piece of a manoeuvre in pieces.
+    TRACKING_ERROR = "tracking error"  # The base is off its path; the plan begins with braking.
+    REPLAN = "replan"  # The schedule ended by braking, or does not apply any more.
+    STUCK_JOINTS = "stuck joints"  # Some joints are stuck; the plan uses the other joints.
+
+    @property
+    def is_for_new_goal(self) -> bool:
+        """Whether the plan is for a new goal, which is not active yet."""
+        return self in (PlanReason.NEW_GOAL, PlanReason.BLEND, PlanReason.IN_MOTION)
 
 
-def end_effector_values(goal: Goal) -> dict[str, tuple[float, ...]]:
-    """Return the goals of end-effectors by link, as a status reports them."""
-    return {each.link: each.values for each in goal.end_effectors}
+@dataclass
+class ActiveGoal:
+    """An accepted goal, its present schedule, and the number of corrections so far."""
 
+    identified: IdentifiedGoal
+    schedule: GaitSchedule
+    """The latest executed schedule."""
+    begins_ns: int
+    """Stamp of the state from which the first schedule was planned, ns."""
+    corrections: int = 0
+    manoeuvre_time: float = 0.0
+    """Duration of all schedules for the goal, s."""
+    ends_at: float = 0.0
+    """Simulated time at which the latest schedule ends, s."""
+    next_plan: PlanReason = PlanReason.CORRECTION
+    """Reason of the next plan, if one is needed."""
+    stuck_positions: dict[str, float] = field(default_factory=dict)
+    """Positions of the stuck joints, m or rad, as measured for the last plan."""
+    required: frozenset[Controlled] = frozenset()
+    """Parts of the goal that plans without the stuck joints must control."""
+    not_flown_reason: str = ""
+    """Clause that says why no schedule is flown any longer; empty: schedules are flown."""
 
-def waypoint_counts(goal: Goal) -> dict[str, int]:
-    """Return the numbers of waypoints of end-effectors with a path, as a status reports them."""
-    return {
-        each.link: len(each.waypoints) for each in goal.end_effectors if each.waypoints is not None
-    }
+    def begin(self, schedule: GaitSchedule, stamp_ns: int) -> None:
+        """Pursue the goal by another schedule, from the stamp of its first tick on."""
+        self.cut_off(stamp_ns)
+        self.schedule = schedule
+        self.manoeuvre_time += schedule.duration
+        self.ends_at = stamp_ns / SECOND + schedule.duration
+        self.next_plan = PlanReason.CONTINUATION if schedule.partial else PlanReason.CORRECTION
+
+    def cut_off(self, stamp_ns: int) -> None:
+        """Subtract the rest of the schedule after a stamp, which is not flown."""
+        remainder = self.time_left(stamp_ns)
+        if remainder > 0:
+            self.manoeuvre_time -= min(remainder, self.schedule.duration)
+            self.ends_at = stamp_ns / SECOND
+
+    def time_left(self, stamp_ns: int) -> float:
+        """Return the time from a stamp to the end of the schedule, s."""
+        return self.ends_at - stamp_ns / SECOND
+
+    def is_late(self, stamp_ns: int) -> bool:
+        """Whether most of the motion is over."""
+        return self.time_left(stamp_ns) < _LATE_TIME_SHARE * self.manoeuvre_time
+
+    def reached(self, error: PoseError, tolerance: Tolerance) -> PlannerStatus | None:
+        """Return the status of a goal that is reached with an error; None: it is not reached."""
+        goal, controls = self.identified.goal, self.schedule.controls
+        if not tolerance.admits(error, controls):
+            return None
+        left = describe_remaining_error(error, controls, tolerance, goal)
+        missed = missed_parts(goal, error, controls, tolerance)
+        decided = PlannerState.REACHED_PARTLY if missed else PlannerState.REACHED
+        return self.status(decided, reached_message(left, missed), error)
+
+    def failed(self, error: PoseError, tolerance: Tolerance, why: str) -> PlannerStatus:
+        """Return the status of a goal that is not reached; ``why`` ends the message."""
+        controls, goal = self.schedule.controls, self.identified.goal
+        off = describe_remaining_error(error, controls, tolerance, goal)
+        return self.status(PlannerState.FAILED, f"The goal is not reached: {off}{why}", error)
+
+    def status(
+        self, state: PlannerState, message: str, error: PoseError | None = None, **values: Any
+    ) -> PlannerStatus:
+        """Return a status of the goal, with its remaining error if evaluated."""
+        return PlannerStatus.of_goal(
+            state,
+            message,
+            self.identified,
+            error,
+            corrections=self.corrections,
+            manoeuvre_time_s=self.manoeuvre_time,
+            ends_at_s=self.ends_at,
+            remaining_s=self.schedule.remaining,
+            not_controlled=uncontrolled_parts(self.identified.goal, self.schedule.controls),
+            **values,
+        )
 
 
 def describe_remaining_error(

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, replace
-from enum import Enum
-from threading import Thread
+from functools import partial
 
 import numpy as np
 
@@ -16,7 +14,11 @@ from spacerobot_ros.collision import BasePoses
 from spacerobot_ros.errors import PlanningError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array, RobotDescription
-from spacerobot_ros.planning.core.cancellation import Cancellation, PlanningCancelled
+from spacerobot_ros.planning.core.cancellation import (
+    Cancellation,
+    PlanningCancelled,
+    PlanningJob,
+)
 from spacerobot_ros.planning.core.clearance import Clearance
 from spacerobot_ros.planning.core.goal import Controlled, Goal, PoseError, RobotState
 from spacerobot_ros.planning.core.method import GaitMethod, PlanRequest
@@ -25,13 +27,11 @@ from spacerobot_ros.planning.core.schedule import BasePath, GaitSchedule
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.execution.goal_file import IdentifiedGoal
 from spacerobot_ros.planning.execution.path_deviation import TrackingError
+from spacerobot_ros.planning.execution.status import PlanReason
 from spacerobot_ros.planning.execution.tracker import TakeOver
 from spacerobot_ros.planning.methods.registry import METHODS, build_method
 from spacerobot_ros.planning.methods.remaining_joints import RemainingJointsGait
 from spacerobot_ros.times import SECOND
-
-MAX_THREAD_END_TIME = 1.5
-"""Largest wall time for a planning thread to end after its cancellation, s."""
 
 _COASTING_TIME, _COASTING_FACTOR = 2.0, 2.0
 """Rest at the start of a plan in the background if the robot drifts, s, and, if it was too short,
@@ -41,61 +41,29 @@ _MAX_COASTING_TIME = 600.0
 """Longest such time, s."""
 
 
-class PlanReason(Enum):
-    """Reason of a request for a plan; events have its value under ``reason``."""
-
-    NEW_GOAL = "new goal"  # A new goal, from rest.
-    BLEND = "blend"  # A new goal while the joints move: the plan begins with braking.
-    IN_MOTION = "new goal in motion"  # A new goal; its plan takes over in motion.
-    SHRINKING_HORIZON = "shrinking horizon"  # The remaining motion, planned in motion.
-    CORRECTION = "correction"  # The schedule has ended, and the goal is not reached.
-    CONTINUATION = "continuation"  # The next piece of a manoeuvre in pieces.
-    TRACKING_ERROR = "tracking error"  # The base is off its path; the plan begins with braking.
-    REPLAN = "replan"  # The schedule ended by braking, or does not apply any more.
-    STUCK_JOINTS = "stuck joints"  # Some joints are stuck; the plan uses the other joints.
-
-    @property
-    def is_for_new_goal(self) -> bool:
-        """Whether the plan is for a new goal, which is not active yet."""
-        return self in (PlanReason.NEW_GOAL, PlanReason.BLEND, PlanReason.IN_MOTION)
-
-
 @dataclass(frozen=True)
 class PlanJob:
-    """A requested plan; this base class is for new goals, from rest or with braking first."""
+    """A requested plan.
+
+    Attributes
+    ----------
+    identified
+        The goal.
+    reason
+        The reason of the request.
+    error
+        Remaining error of an active goal from rest, or deviation of the base from its path.
+    take_over
+        Tick at which the plan takes over in motion; None: it begins at rest, or with braking.
+    aim
+        The goal shifted, at which the plan ends; None: at the goal.
+    """
 
     identified: IdentifiedGoal
     reason: PlanReason
-
-
-@dataclass(frozen=True)
-class PlanFromRestJob(PlanJob):
-    """A plan from rest for the active goal, from which the robot is off by ``error``."""
-
-    error: PoseError
-
-
-@dataclass(frozen=True)
-class PlanWithBrakingJob(PlanJob):
-    """A plan for the active goal that begins with braking, because the base is off its path."""
-
-    error: TrackingError
-
-
-@dataclass(frozen=True)
-class TakeOverJob(PlanJob):
-    """A plan that takes over in motion, to end at ``aim``: the goal, or the goal shifted."""
-
-    take_over: TakeOver
-    aim: Goal
-
-
-@dataclass(frozen=True)
-class ReadyPlan:
-    """A plan that waits for the tick at which it takes over."""
-
-    job: TakeOverJob
-    schedule: GaitSchedule
+    error: PoseError | TrackingError | None = None
+    take_over: TakeOver | None = None
+    aim: Goal | None = None
 
 
 @dataclass(frozen=True)
@@ -227,7 +195,7 @@ class PlanningWorker:
         )
         self._remaining_joints: tuple[PlanningTask, GaitMethod] | None = None
         """The latest method without stuck joints, and its task."""
-        self._job: _PlanThread | None = None
+        self._job: PlanningJob[GaitSchedule] | None = None
         self._coasting: _Coasting | None = None
         """Rest at the beginning of the requested plan, because the base drifts meanwhile."""
 
@@ -235,6 +203,13 @@ class PlanningWorker:
     def is_busy(self) -> bool:
         """Whether a plan is in progress, its result waits, or its thread still runs."""
         return self._job is not None
+
+    def is_free(self) -> bool:
+        """Whether a plan can be requested, after dropping the result of a cancelled one."""
+        if self.is_busy:
+            self.take_result()
+            return False
+        return True
 
     def _drifts(self, state: RobotState) -> bool:
         """Whether the base moves on while the joints of a robot rest."""
@@ -258,12 +233,9 @@ class PlanningWorker:
     def start(self, task: PlanningTask) -> None:
         """Start the work on a task."""
         assert self._job is None, "one plan at a time"
-        self._job = job = _PlanThread(self, task)
-        if self.plans_in_background:
-            job.start()
-        else:
-            with self._long_work():
-                job.run()
+        self._job = PlanningJob(partial(self.plan, task))
+        with nullcontext() if self.plans_in_background else self._long_work():
+            self._job.start(in_background=self.plans_in_background)
 
     def poll(self, stamp_ns: int) -> Planned | Refused | Postponed | None:
         """Return the result at a state of a stamp; None until the plan has ended, or if it was
@@ -296,22 +268,23 @@ class PlanningWorker:
         if job is None or not job.done:
             return None
         self._job = None
-        if job.exception is not None and not job.cancellation.requested:
-            raise job.exception
-        return None if job.cancellation.requested else job.result
+        try:
+            return Planned(job.result(), job.wall_time)
+        except PlanningCancelled:
+            return None
+        except PlanningError as refusal:
+            return Refused(str(refusal), job.wall_time)
 
     def cancel(self) -> None:
         """Cancel the present plan, which then has no result."""
         job = self._job  # Another thread may clear the attribute meanwhile.
         if job is not None:
-            job.cancellation.cancel()
+            job.cancel()
 
     def close(self) -> None:
         """Cancel the present plan, and wait until its thread has ended."""
-        self.cancel()
-        if self._job is not None and self._job.is_alive():
-            # A thread inside CasADi would crash a process that ends.
-            self._job.join(MAX_THREAD_END_TIME)
+        if self._job is not None:
+            self._job.close()
 
     def approach_ahead(self, schedule: GaitSchedule, begins: float, now: float) -> str:
         """Return the clause that says where the rest of a schedule comes too near to obstacles.
@@ -409,27 +382,3 @@ class PlanningWorker:
             state, position=positions[-1], quaternion=attitudes[-1], q=shapes[-1].copy()
         )
         return after, positions, attitudes
-
-
-class _PlanThread(Thread):
-    def __init__(self, worker: PlanningWorker, task: PlanningTask) -> None:
-        super().__init__(daemon=True)
-        self.cancellation = Cancellation()
-        self.result: Planned | Refused | None = None
-        self.exception: BaseException | None = None
-        self.done = False
-        self._worker, self._task = worker, task
-
-    def run(self) -> None:
-        """Make the plan; keep unexpected exceptions for the polling thread."""
-        began = time.perf_counter()
-        try:
-            schedule = self._worker.plan(self._task, self.cancellation)
-            self.result = Planned(schedule, time.perf_counter() - began)
-        except PlanningCancelled:
-            pass
-        except PlanningError as refusal:
-            self.result = Refused(str(refusal), time.perf_counter() - began)
-        except BaseException as defect:
-            self.exception = defect
-        self.done = True
