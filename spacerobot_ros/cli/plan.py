@@ -133,7 +133,7 @@ def _distance_from(goal: Goal, trial: PlanEvaluation) -> str:
 
 
 def _clearance_line(problem: PlanningProblem, trial: PlanEvaluation) -> str:
-    from spacerobot_ros.collision import CollisionGeometry, PathCheck
+    from spacerobot_ros.collision import CollisionGeometry, nearest_approach
     from spacerobot_ros.planning import RobotState
     from spacerobot_ros.planning.core.prediction import BasePrediction
 
@@ -145,7 +145,7 @@ def _clearance_line(problem: PlanningProblem, trial: PlanEvaluation) -> str:
         base = BasePrediction(robot.interpreted, problem.control_period, step).poses(
             start, positions
         )
-    nearest = PathCheck(geometry).nearest(positions, base)
+    nearest = nearest_approach(geometry, positions, base)
     if nearest is not None:
         return f"clearance   {nearest}"
     reasons = Counter(geometry.ignored_pairs.values())

@@ -2,7 +2,12 @@
 
 from spacerobot_ros.collision.distances import Solid
 from spacerobot_ros.collision.geometry import BasePoses, CollisionGeometry, LinkPair, ObstaclePair
-from spacerobot_ros.collision.nearest import Approach, NearestPair, PathCheck
+from spacerobot_ros.collision.nearest import (
+    Approach,
+    NearestPair,
+    nearest_approach,
+    nearest_approaches,
+)
 
 __all__ = [
     "Approach",
@@ -11,6 +16,7 @@ __all__ = [
     "LinkPair",
     "NearestPair",
     "ObstaclePair",
-    "PathCheck",
     "Solid",
+    "nearest_approach",
+    "nearest_approaches",
 ]

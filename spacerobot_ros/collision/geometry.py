@@ -41,9 +41,6 @@ from spacerobot_ros.model.visuals import Visual, solid_mesh
 _SHAPES, _SEED = 1000, 0
 """Number of random configurations for finding pairs always in contact, and their seed."""
 
-_HALF_RANGE = {JointKind.PRISMATIC: 1.0}
-"""Half of the sampled range of an unlimited joint, m; pi for revolute joints."""
-
 
 _COAXIAL_TOLERANCE = 1e-9
 """Largest offset (m) and tilt (rad) of a body of revolution from the axis of its joint."""
@@ -355,7 +352,9 @@ class CollisionGeometry:
         contact = np.ones(len(self.pairs), dtype=np.bool_)
         if not len(self.pairs):
             return contact
-        poses = self.poses(_random_shapes(self.robot))
+        low, high = self.robot.shape_box
+        shapes = np.random.default_rng(_SEED).uniform(low, high, (_SHAPES, len(low)))
+        poses = self.poses(shapes)
         contact[self.lower_bounds(poses).max(axis=0) > 0] = False
         R, r = poses
         for pair in np.flatnonzero(contact):
@@ -443,14 +442,6 @@ def _solid_in_world(obstacle: Solid, pose: Pose) -> Solid:
         enclosure=replace(box, pose=pose @ box.pose),
         vertices=None if vertices is None else vertices @ pose.R.T + pose.r,
     )
-
-
-def _random_shapes(robot: RobotDescription) -> Array:
-    half = np.array([_HALF_RANGE.get(joint.kind, np.pi) for joint in robot.movable_joints])
-    lower, upper = robot.limits("lower"), robot.limits("upper")
-    low = np.where(np.isfinite(lower), lower, np.minimum(upper, half) - 2 * half)
-    high = np.where(np.isfinite(upper), upper, low + 2 * half)
-    return np.random.default_rng(_SEED).uniform(low, high, (_SHAPES, len(half)))
 
 
 # -- solids -------------------------------------------------------------------------------------

@@ -184,96 +184,93 @@ class _Path:
         return shapes, None if self.base is None else self.base.between(before, share)
 
 
-class PathCheck:
-    """Nearest approaches of the pairs of a robot along paths.
+def nearest_approaches(
+    geometry: CollisionGeometry,
+    positions: Array,
+    required: Array,
+    base: BasePoses | None = None,
+) -> list[Approach]:
+    """Return the nearest approaches of all pairs that come nearer than required, nearest first.
 
     Parameters
     ----------
     geometry
         The solids and pairs.
+    positions
+        (N + 1, n) configurations at the ticks, with straight lines in between; m or rad.
+    required
+        (P,) smallest allowed distances of the pairs, m; minus infinity: any distance.
+    base
+        Poses of the base at the ticks; None: obstacles are ignored.
     """
+    if not len(geometry.pairs):
+        return []
+    path = _Path.of(geometry, positions, base)
+    near = np.flatnonzero(path.lower_bounds_along_path < required)
+    found = (_nearest(geometry, path, p, required[p]) for p in near.tolist())
+    return sorted((each for each in found if each), key=lambda each: each.distance)
 
-    def __init__(self, geometry: CollisionGeometry) -> None:
-        self.geometry = geometry
 
-    def approaches(
-        self, positions: Array, required: Array, base: BasePoses | None = None
-    ) -> list[Approach]:
-        """Return the nearest approaches of all pairs that come nearer than required.
+def nearest_approach(
+    geometry: CollisionGeometry, positions: Array, base: BasePoses | None = None
+) -> Approach | None:
+    """Return the nearest approach of all pairs along a path (N + 1, n); None without pairs.
 
-        Parameters
-        ----------
-        positions
-            (N + 1, n) configurations at the ticks, with straight lines in between; m or rad.
-        required
-            (P,) smallest allowed distances of the pairs, m; minus infinity: any distance.
-        base
-            Poses of the base at the ticks; None: obstacles are ignored.
-        """
-        if not len(self.geometry.pairs):
-            return []
-        path = _Path.of(self.geometry, positions, base)
-        near = np.flatnonzero(path.lower_bounds_along_path < required)
-        found = (self._nearest(path, p, required[p]) for p in near.tolist())
-        return sorted((each for each in found if each), key=lambda each: each.distance)
+    ``base`` has the poses of the base at the ticks; None: obstacles are ignored.
+    """
+    if not len(geometry.pairs):
+        return None
+    path = _Path.of(geometry, positions, base)
+    least = path.lower_bounds_along_path
+    best: Approach | None = None
+    for pair in np.argsort(least, kind="stable").tolist():
+        if best is not None and least[pair] >= best.distance:
+            break
+        limit = np.inf if best is None else best.distance
+        best = _nearest(geometry, path, pair, limit) or best
+    return best
 
-    def nearest(self, positions: Array, base: BasePoses | None = None) -> Approach | None:
-        """Return the nearest approach of all pairs along a path (N + 1, n); None without pairs.
 
-        ``base`` has the poses of the base at the ticks; None: obstacles are ignored.
-        """
-        if not len(self.geometry.pairs):
-            return None
-        path = _Path.of(self.geometry, positions, base)
-        least = path.lower_bounds_along_path
-        best: Approach | None = None
-        for pair in np.argsort(least, kind="stable").tolist():
-            if best is not None and least[pair] >= best.distance:
-                break
-            limit = np.inf if best is None else best.distance
-            best = self._nearest(path, pair, limit) or best
-        return best
+def _nearest(geometry: CollisionGeometry, path: _Path, pair: int, limit: float) -> Approach | None:
+    """Return the nearest approach of a pair; None if it does not come nearer than limit."""
+    motion, bounds = path.largest_motions, path.distance_bounds
 
-    def _nearest(self, path: _Path, pair: int, limit: float) -> Approach | None:
-        """Return the nearest approach of a pair; None if it does not come nearer than limit."""
-        geometry, motion, bounds = self.geometry, path.largest_motions, path.distance_bounds
+    def distances(ticks: Array) -> Array:
+        return geometry.distances(pair, geometry.poses(*path.interpolated(ticks)))
 
-        def distances(ticks: Array) -> Array:
-            return geometry.distances(pair, geometry.poses(*path.interpolated(ticks)))
+    def approach(distance: float, tick: float) -> Approach:
+        shapes, base = path.interpolated(np.array([tick]))
+        place = None
+        if base is not None and geometry.with_obstacles[pair]:
+            place = geometry.nearest_point_on_obstacle(pair, shapes[0], base)
+        return Approach(geometry.links_of(pair), pair, distance, tick, shapes[0], place)
 
-        def approach(distance: float, tick: float) -> Approach:
-            shapes, base = path.interpolated(np.array([tick]))
-            place = None
-            if base is not None and geometry.with_obstacles[pair]:
-                place = geometry.nearest_point_on_obstacle(pair, shapes[0], base)
-            return Approach(geometry.links_of(pair), pair, distance, tick, shapes[0], place)
-
-        if not len(motion):
-            distance = float(distances(np.zeros(1))[0])
-            return approach(distance, 0.0) if distance < limit else None
-        close = (bounds[:-1, pair] + bounds[1:, pair] - motion[:, pair]) / 2 < limit
-        starts = np.flatnonzero(close)
-        if not len(starts):
-            return None
-        ticks = np.unique(np.concatenate([starts, starts + 1])).astype(float)
-        known = distances(ticks)
-        least = int(np.argmin(known))
-        best, at = float(known[least]), float(ticks[least])
-        index = np.searchsorted(ticks, starts)
-        left, right = starts.astype(float), starts + 1.0
-        d_0, d_1, v = known[index], known[index + 1], motion[starts, pair]
-        while True:
-            # Only where the distance may be less than any that is known, and matters.
-            open_ = ((d_0 + d_1 - v) / 2 < min(best, limit)) & (v > _MOTION_RESOLUTION)
-            if not open_.any():
-                break
-            left, right, d_0, d_1, v = (x[open_] for x in (left, right, d_0, d_1, v))
-            middle = (left + right) / 2
-            d = distances(middle)
-            least = int(np.argmin(d))
-            if d[least] < best:
-                best, at = float(d[least]), float(middle[least])
-            left, right = np.concatenate([left, middle]), np.concatenate([middle, right])
-            d_0, d_1 = np.concatenate([d_0, d]), np.concatenate([d, d_1])
-            v = np.concatenate([v, v]) / 2
-        return approach(best, at) if best < limit else None
+    if not len(motion):
+        distance = float(distances(np.zeros(1))[0])
+        return approach(distance, 0.0) if distance < limit else None
+    close = (bounds[:-1, pair] + bounds[1:, pair] - motion[:, pair]) / 2 < limit
+    starts = np.flatnonzero(close)
+    if not len(starts):
+        return None
+    ticks = np.unique(np.concatenate([starts, starts + 1])).astype(float)
+    known = distances(ticks)
+    least = int(np.argmin(known))
+    best, at = float(known[least]), float(ticks[least])
+    index = np.searchsorted(ticks, starts)
+    left, right = starts.astype(float), starts + 1.0
+    d_0, d_1, v = known[index], known[index + 1], motion[starts, pair]
+    while True:
+        # Only where the distance may be less than any that is known, and matters.
+        open_ = ((d_0 + d_1 - v) / 2 < min(best, limit)) & (v > _MOTION_RESOLUTION)
+        if not open_.any():
+            break
+        left, right, d_0, d_1, v = (x[open_] for x in (left, right, d_0, d_1, v))
+        middle = (left + right) / 2
+        d = distances(middle)
+        least = int(np.argmin(d))
+        if d[least] < best:
+            best, at = float(d[least]), float(middle[least])
+        left, right = np.concatenate([left, middle]), np.concatenate([middle, right])
+        d_0, d_1 = np.concatenate([d_0, d]), np.concatenate([d, d_1])
+        v = np.concatenate([v, v]) / 2
+    return approach(best, at) if best < limit else None

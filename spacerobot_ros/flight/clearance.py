@@ -12,7 +12,7 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
-from spacerobot_ros.collision import Approach, BasePoses, CollisionGeometry, PathCheck
+from spacerobot_ros.collision import Approach, BasePoses, CollisionGeometry, nearest_approach
 from spacerobot_ros.model.description import Array, RobotDescription, Shape
 from spacerobot_ros.model.meshes import TriangleMesh, shape_mesh
 from spacerobot_ros.simulation.clearance import ClearanceStatus
@@ -78,7 +78,7 @@ class FlightClearance:
     @cached_property
     def nearest(self) -> Approach:
         """The nearest approach of two links, also between the states."""
-        found = PathCheck(self.geometry).nearest(self.shapes, self.base)
+        found = nearest_approach(self.geometry, self.shapes, self.base)
         assert found is not None
         return found
 

@@ -257,6 +257,15 @@ class RobotDescription:
                 values[i] = (max if kind == "lower" else min)(values[i], bound)
         return np.array(values, dtype=float)
 
+    @property
+    def shape_box(self) -> tuple[Array, Array]:
+        """Finite bounds (n,), (n,) of the shapes: one revolution or 2 m for unlimited joints."""
+        joints = self.movable_joints
+        half = np.array([1.0 if x.kind is JointKind.PRISMATIC else np.pi for x in joints])
+        lower, upper = self.limits("lower"), self.limits("upper")
+        lower = np.where(np.isfinite(lower), lower, np.minimum(upper, half) - 2 * half)
+        return lower, np.where(np.isfinite(upper), upper, lower + 2 * half)
+
     def end_effector(self, link: str = "") -> str:
         """Return the name of the end-effector link: ``link`` if given, else ``end_effector`` if the
         robot has such a link, else an empty text.

@@ -9,7 +9,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 from support.crossing import RADII, URDF
 
-from spacerobot_ros.collision import BasePoses, CollisionGeometry, ObstaclePair, PathCheck
+from spacerobot_ros.collision import (
+    BasePoses,
+    CollisionGeometry,
+    ObstaclePair,
+    nearest_approaches,
+)
 from spacerobot_ros.collision.planes import PlaneDistance
 from spacerobot_ros.flight.clearance import FlightClearance
 from spacerobot_ros.model import SpaceRobot, parse_robot
@@ -86,16 +91,14 @@ def test_the_nearest_approach_is_between_the_ticks(geometry: CollisionGeometry, 
     share = (at - before)[:, np.newaxis]
     dense = (1 - share) * shapes[before] + share * shapes[before + 1]
     least = left_ball_to_rock(dense, base.between(before, share)).min()
-    found = {
-        each.pair: each for each in PathCheck(geometry).approaches(shapes, np.full(3, 9), base)
-    }
+    found = {each.pair: each for each in nearest_approaches(geometry, shapes, np.full(3, 9), base)}
     assert found[pair].distance == pytest.approx(least, abs=3e-4)
     place = found[pair].place_on_obstacle
     assert place is not None
     assert place == pytest.approx(MIDDLE)
     assert "link 'left' and obstacle 'rock' come within" in str(found[pair])
     assert str(found[pair]).endswith("near [0.4, -0.3, 0.7] m")
-    none = PathCheck(geometry).approaches(shapes, np.full(3, least - 1e-3), base)
+    none = nearest_approaches(geometry, shapes, np.full(3, least - 1e-3), base)
     assert pair not in [each.pair for each in none]
 
 

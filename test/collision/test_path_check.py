@@ -9,7 +9,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from spacerobot_ros.collision import BasePoses, CollisionGeometry, PathCheck
+from spacerobot_ros.collision import (
+    BasePoses,
+    CollisionGeometry,
+    nearest_approach,
+    nearest_approaches,
+)
 from spacerobot_ros.collision.rounded_box import RoundedBox, separation
 from spacerobot_ros.model import RobotDescription, load_robot, parse_robot
 from spacerobot_ros.model.description import Array, Pose, Shape
@@ -32,7 +37,6 @@ def wandering(low: Array, high: Array, ticks: int, seed: int) -> Array:
 def test_the_nearest_approach_is_that_of_dense_samples(name: str) -> None:
     robot = load_robot(robot_file(name))
     geometry = CollisionGeometry(robot)
-    check = PathCheck(geometry)
     low, high = robot.limits("lower"), robot.limits("upper")
     for seed in (1, 2):
         positions = wandering(low, high, 24, seed)
@@ -40,7 +44,7 @@ def test_the_nearest_approach_is_that_of_dense_samples(name: str) -> None:
         dense = np.column_stack([np.interp(ticks, np.arange(25), each) for each in positions.T])
         poses = geometry.poses(dense)
         sampled = np.array([geometry.distances(p, poses) for p in range(len(geometry.pairs))])
-        nearest = check.nearest(positions)
+        nearest = nearest_approach(geometry, positions)
         assert nearest is not None
         assert nearest.distance <= sampled.min() + 1e-9
         assert nearest.distance > sampled.min() - 0.02
@@ -49,7 +53,7 @@ def test_the_nearest_approach_is_that_of_dense_samples(name: str) -> None:
         assert at[0] == pytest.approx(nearest.distance, abs=1e-9)
         required = np.full(len(geometry.pairs), 0.03)
         required[nearest.pair] = -np.inf
-        found = check.approaches(positions, required)
+        found = nearest_approaches(geometry, positions, required)
         assert [each.distance for each in found] == sorted(each.distance for each in found)
         below = {p for p in np.flatnonzero(sampled.min(axis=1) < 0.029) if p != nearest.pair}
         assert below <= {each.pair for each in found}
@@ -74,18 +78,18 @@ def test_a_contact_between_two_ticks_is_found() -> None:
     geometry = CollisionGeometry(parse_robot(CROSSING))
     # Both balls pass the middle at 1.4 ticks, 0.15 m apart, and are far away at every tick.
     positions = np.array([[-1.4, -0.7], [-0.4, -0.2], [0.6, 0.3], [0.7, 0.3]])
-    found = PathCheck(geometry).approaches(positions, np.array([0.05]))
+    found = nearest_approaches(geometry, positions, np.array([0.05]))
     assert [str(each) for each in found] == ["links 'left' and 'right' come within 30 mm"]
     assert found[0].distance == pytest.approx(0.15 - 0.12, abs=1e-5)
     assert found[0].tick == pytest.approx(1.4, abs=0.01)
-    assert PathCheck(geometry).approaches(positions, np.array([0.029])) == []
+    assert nearest_approaches(geometry, positions, np.array([0.029])) == []
 
 
 def test_a_single_shape_is_a_path() -> None:
-    check = PathCheck(CollisionGeometry(parse_robot(CROSSING)))
-    (found,) = check.approaches(np.zeros((1, 2)), np.array([0.05]))
+    geometry = CollisionGeometry(parse_robot(CROSSING))
+    (found,) = nearest_approaches(geometry, np.zeros((1, 2)), np.array([0.05]))
     assert found.distance == pytest.approx(0.03, abs=1e-6)
-    assert check.approaches(np.ones((1, 2)), np.array([0.05])) == []
+    assert nearest_approaches(geometry, np.ones((1, 2)), np.array([0.05])) == []
 
 
 def telescope() -> RobotDescription:
@@ -108,7 +112,7 @@ def telescope() -> RobotDescription:
 def test_what_a_slider_carries_out_sweeps_farther_in_a_tick() -> None:
     """Both ends of the tick are far from the post; the ball on the extended slider passes it."""
     geometry = CollisionGeometry(telescope())
-    (found,) = PathCheck(geometry).approaches(np.array([[0.0, 2.0], [0.6, 2.0]]), np.array([0.01]))
+    (found,) = nearest_approaches(geometry, np.array([[0.0, 2.0], [0.6, 2.0]]), np.array([0.01]))
     assert (found.tick, found.distance) == pytest.approx((0.5, -0.2), abs=1e-4)
 
 
@@ -133,7 +137,7 @@ def test_obstacles_are_met_between_ticks_where_the_base_moves_or_turns(
     turned = [0.0, 0.0, math.sin(turn / 2), math.cos(turn / 2)]
     base = BasePoses(np.array([[0.0, 0.0, 0.0], place]), np.array([[0.0, 0.0, 0.0, 1.0], turned]))
     required = np.full(len(geometry.pairs), 0.01)
-    found = PathCheck(geometry).approaches(path, required, base)
+    found = nearest_approaches(geometry, path, required, base)
     assert [each.links.subject for each in found] == ["link 'ball' and obstacle 'rock'"]
     assert (found[0].tick, found[0].distance) == pytest.approx((0.5, -0.05), abs=1e-4)
 
@@ -221,7 +225,7 @@ def test_the_nearest_approach_beside_a_fast_wheel_is_found_at_once(
         return found
 
     monkeypatch.setattr(geometry, "distances", counted)
-    nearest = PathCheck(geometry).nearest(path)
+    nearest = nearest_approach(geometry, path)
     assert nearest is not None
     # Between disc and post along x, 0.6 m apart: their radii are 0.3 m and 0.1 m.
     assert nearest.distance == pytest.approx(0.2, abs=1e-3)

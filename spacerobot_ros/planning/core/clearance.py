@@ -15,7 +15,7 @@ from spacerobot_ros.collision import (
     CollisionGeometry,
     LinkPair,
     ObstaclePair,
-    PathCheck,
+    nearest_approaches,
 )
 from spacerobot_ros.errors import (
     ParameterError,
@@ -109,10 +109,6 @@ class Clearance:
         """Whether the motion of the base matters, because there are obstacles."""
         return bool(self.geometry.with_obstacles.any())
 
-    @cached_property
-    def _check(self) -> PathCheck:
-        return PathCheck(self.geometry)
-
     @property
     def facts(self) -> Array:
         """The numbers that plans depend on: the distance, pairs, and the solids around bodies."""
@@ -201,32 +197,28 @@ class Clearance:
 
     def is_roomy(self, shapes: Array) -> npt.NDArray[np.bool_]:
         """Return (N,) whether all links have room for loops in configurations (N, n)."""
-        geometry, room = self.geometry, _CLEARANCE_FACTOR_FOR_LOOPS * self.distance
-        roomy = np.ones(len(shapes), dtype=np.bool_)
-        if not len(geometry.pairs):
-            return roomy
-        R, r = geometry.poses(shapes)
-        near = geometry.lower_bounds((R, r)) < room
-        for pair in np.flatnonzero(near.any(axis=0)).tolist():
-            at = np.flatnonzero(near[:, pair] & roomy)
-            roomy[at] = geometry.distances(pair, (R[at], r[at])) >= room
-        return roomy
+        return self._keep_distances(shapes, _CLEARANCE_FACTOR_FOR_LOOPS * self.distance)
 
     def is_clear(self, shapes: Array, required: Array) -> bool:
         """Whether links keep the ``required`` distances (P,), m, in all configurations (N, n).
 
         Obstacles do not count.
         """
+        return bool(self._keep_distances(shapes, required).all())
+
+    def _keep_distances(self, shapes: Array, required: Array | float) -> npt.NDArray[np.bool_]:
+        """Return (N,) whether all pairs keep their distances (P,), m, but for obstacles."""
         geometry = self.geometry
+        keep = np.ones(len(shapes), dtype=np.bool_)
         if not len(geometry.pairs):
-            return True
+            return keep
         R, r = geometry.poses(shapes)
-        near = geometry.lower_bounds((R, r)) < required
+        needed = np.broadcast_to(required, len(geometry.pairs))
+        near = geometry.lower_bounds((R, r)) < needed
         for pair in np.flatnonzero(near.any(axis=0)).tolist():
-            at = np.flatnonzero(near[:, pair])
-            if (geometry.distances(pair, (R[at], r[at])) < required[pair]).any():
-                return False
-        return True
+            at = np.flatnonzero(near[:, pair] & keep)
+            keep[at] = geometry.distances(pair, (R[at], r[at])) >= needed[pair]
+        return keep
 
     def approaches(
         self,
@@ -249,7 +241,7 @@ class Clearance:
             return []
         if required is None:
             required = self.required(positions[0], None if base is None else base.rows(slice(1)))
-        return self._check.approaches(positions, required, base)
+        return nearest_approaches(self.geometry, positions, required, base)
 
     def clause(self, approach: Approach, control_period: float | None) -> str:
         """Return a clause about a path that is too near; without a control period no times."""

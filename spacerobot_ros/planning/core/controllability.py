@@ -29,9 +29,6 @@ ZERO_TURN_PER_AREA = 1e-12
 _SAMPLED_SHAPE_COUNT = 24
 """Number of sampled shapes; brackets that span at any shape span at almost all shapes."""
 
-_UNLIMITED_HALF_RANGE = {JointKind.PRISMATIC: 1.0}
-"""Half of the sampled range of an unlimited slider, m; pi for revolute joints."""
-
 
 @dataclass(frozen=True)
 class Controllability:
@@ -83,13 +80,7 @@ class Controllability:
 
 def shape_box(robot: SpaceRobot) -> tuple[Array, Array]:
     """Return finite bounds (n,), (n,) of the shape space: one revolution for unlimited joints."""
-    joints = robot.description.movable_joints
-    half = np.array([_UNLIMITED_HALF_RANGE.get(joint.kind, np.pi) for joint in joints])
-    lower = np.where(
-        np.isfinite(robot.lower), robot.lower, np.minimum(robot.upper, half) - 2 * half
-    )
-    upper = np.where(np.isfinite(robot.upper), robot.upper, lower + 2 * half)
-    return lower, upper
+    return robot.description.shape_box
 
 
 def sample_shapes(robot: SpaceRobot, count: int) -> Array:

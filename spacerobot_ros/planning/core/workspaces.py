@@ -11,13 +11,11 @@ Dubowsky; paper 4, section V).
 Singular shapes are solutions ``(q, u)`` of ``J*(q)^T u = 0, |u| = 1``, with the direction ``u`` in
 which nothing moves. Starting from seeded shapes all over the shape space, Gauss-Newton finds the
 nearest solutions; from each, curves of solutions are followed to larger and to smaller distances.
-Distances change continuously on a curve, so all between its ends are path-dependent; the ends are
-refined to the extreme distances nearby.
+Distances change continuously on a curve, so all between its ends are path-dependent.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import casadi as ca
@@ -255,51 +253,11 @@ class _Search:
         z = z[np.linalg.norm(g, axis=1) < _ZERO_RESIDUAL]
         if not len(z):
             return [], 0
-        ends = [self._follow_singular_curve(z, sign) for sign in (-1.0, 1.0)]
-        radii = [self._equations.evaluate(end)[2] for end in ends]
-        return self._refine_interval_ends(ends, radii), len(z)
-
-    def _refine_interval_ends(
-        self, ends: Sequence[Array], radii: Sequence[Array]
-    ) -> list[Interval]:
-        """Return the union of the intervals of curves, with its ends at extreme distances."""
-        largest = float(radii[1].max())
-        found = []
-        for low, high in _union(np.column_stack(radii), _MAX_CLOSED_GAP * largest):
-            from_below = int(np.argmin(np.abs(radii[0] - low)))
-            from_above = int(np.argmin(np.abs(radii[1] - high)))
-            down = self._extreme(ends[0][from_below], low, 1.0)
-            up = self._extreme(ends[1][from_above], high, -1.0)
-            found.append((down if down > 1e-6 * largest else 0.0, up))
-        return _union(np.array(found), _MAX_CLOSED_GAP * largest)
-
-    def _extreme(self, z: Array, distance: float, sign: float) -> float:
-        """Return the smallest (sign 1) or largest (-1) distance of singular shapes near one."""
-        from scipy.optimize import minimize
-
-        last: list[tuple[bytes, tuple[Array, ...]]] = []
-
-        def at(y: Array) -> tuple[Array, ...]:
-            """Return equations, derivatives, distance and gradient; the solver requests each."""
-            if not last or last[0][0] != y.tobytes():
-                found = self._equations.evaluate(y[np.newaxis])
-                last[:] = [(y.tobytes(), tuple(each[0] for each in found))]
-            return last[0][1]
-
-        near = 2 * _LONGEST_STEP
-        low, high = np.maximum(self._lower, z - near), np.minimum(self._upper, z + near)
-        found = minimize(
-            lambda y: sign * float(at(y)[2]),
-            z,
-            method="SLSQP",
-            jac=lambda y: sign * at(y)[3],
-            bounds=np.column_stack([low, high]),
-            constraints={"type": "eq", "fun": lambda y: at(y)[0], "jac": lambda y: at(y)[1]},
-            options={"ftol": 1e-14, "maxiter": 60},
-        )
-        value, missed = sign * float(found.fun), float(np.linalg.norm(at(found.x)[0]))
-        is_better = sign * (distance - value) > 0
-        return value if missed < _ZERO_RATE and is_better else distance
+        curves = [self._follow_singular_curve(z, sign) for sign in (-1.0, 1.0)]
+        radii = np.column_stack([self._equations.evaluate(end)[2] for end in curves])
+        largest = float(radii.max())
+        radii[radii <= 1e-6 * largest] = 0.0
+        return _union(radii, _MAX_CLOSED_GAP * largest), len(z)
 
     def _project_to_singular_shapes(self, z: Array, steps: int) -> Array:
         """Return the singular shapes nearest to z (K, n + m), by Gauss-Newton within bounds."""

@@ -130,7 +130,6 @@ class AreaLoopGait(GaitMethod):
             None if self.clearance is None else self.clearance.is_roomy,
         )
         self.require_suitable(robot)
-        self._nominal.prepare()
 
     @classmethod
     @override

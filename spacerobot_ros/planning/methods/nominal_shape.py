@@ -10,7 +10,6 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -132,17 +131,9 @@ class NominalShapeChooser:
         self._given_shape = (
             _require_shape(robot, np.array(nominal, dtype=float)) if len(nominal) else None
         )
-        self._only_choice: NominalShape | None = None
         kinds = [joint.kind for joint in robot.description.movable_joints]
         turning = np.array([kind is not JointKind.PRISMATIC for kind in kinds], dtype=bool)
         self._repeating = turning & np.isinf(robot.lower) & np.isinf(robot.upper)
-
-    def prepare(self) -> None:
-        """Choose the nominal shape of a robot with three joints, which does not depend on the
-        present shape."""
-        if self._robot.n == 3:
-            with suppress(PlanningError):
-                self._only_choice = self._choose_nominal(np.zeros(3))
 
     def at(self, q: Array, kept: NominalShape | None = None) -> NominalShape:
         """Return the nominal shape to use from shape ``q`` (n,).
@@ -154,8 +145,6 @@ class NominalShapeChooser:
         PlanningError
             Limits leave no room for loops, or loops there do not rotate the base about all axes.
         """
-        if self._only_choice is not None:
-            return self._only_choice
         return kept if kept is not None and self._can_be_kept(kept, q) else self._choose_nominal(q)
 
     def shapes_with_more_room(self, q: Array, is_clear: ClearanceTest) -> Iterator[NominalShape]:

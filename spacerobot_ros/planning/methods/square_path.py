@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -94,6 +94,51 @@ class SquarePathOptions:
     longest: float = parameter(3600.0, "longest permitted manoeuvre", "s", minimum=1.0, maximum=1e9)
 
 
+@dataclass(frozen=True)
+class SquareLoop:
+    """A square in shape space that rotates the base by the wanted angle.
+
+    Attributes
+    ----------
+    pair
+        Indices (i, j) of the joints that move.
+    centre
+        (2,) ``psi*``, rad.
+    side
+        ``z*``, rad.
+    loops
+        Number of loops.
+    clockwise
+        Sense of travel in the plane (psi_i, psi_j).
+    corners
+        (4, n) shapes in the order of travel; the first is the corner nearest to ``psi_e``.
+    """
+
+    pair: tuple[int, int]
+    centre: Array
+    side: float
+    loops: int
+    clockwise: bool
+    corners: Array
+
+
+@dataclass(frozen=True)
+class _SquareFamily:
+    """Squares of increasing side for one pair of joints: centres (R, 2), sides (R,), phases (R,)
+    counter-clockwise."""
+
+    pair: tuple[int, int]
+    plane: PhasePlane
+    centres: Array
+    sides: Array
+    geometric_phases: Array
+
+    @property
+    def largest(self) -> float:
+        """The largest rotation of the base by one loop, rad."""
+        return float(np.abs(self.geometric_phases).max())
+
+
 class SquarePathGait(GaitMethod):
     """Controls attitude and shape of planar trees of three or more links with revolute joints.
 
@@ -120,13 +165,8 @@ class SquarePathGait(GaitMethod):
         self._durations = tuple(float(x) for x in np.diff(instants))
         self._phase = PlanarPhase(robot)
         centre = np.array([chosen.centre_1, chosen.centre_2])
-        self._search = SquareSearch(
-            robot,
-            self._phase,
-            chosen.most_loops,
-            centre if chosen.given_centre else None,
-            lambda shapes: self._too_near(shapes, at_ticks=False),
-        )
+        self._centre = centre if chosen.given_centre else None
+        self._movable: list[int] = np.flatnonzero(robot.velocity_limit > 0).tolist()
 
     @classmethod
     @override
@@ -150,7 +190,7 @@ class SquarePathGait(GaitMethod):
         wanted = math.remainder(turn - step_1, 2 * math.pi)
         loop = None
         if abs(wanted) > max(_ZERO_ROTATION_ANGLE, _MIN_CORRECTED_SHARE * tolerance.attitude):
-            loop = self._search.find_loop(psi_e, wanted)
+            loop = self._find_loop(psi_e, wanted)
         positions = straight_motion(
             self.robot,
             state.q,
@@ -210,120 +250,32 @@ class SquarePathGait(GaitMethod):
             "corner": loop.corners[0].tolist(),
         }
 
-
-@dataclass(frozen=True)
-class SquareLoop:
-    """A square in shape space that rotates the base by the wanted angle.
-
-    Attributes
-    ----------
-    pair
-        Indices (i, j) of the joints that move.
-    centre
-        (2,) ``psi*``, rad.
-    side
-        ``z*``, rad.
-    loops
-        Number of loops.
-    clockwise
-        Sense of travel in the plane (psi_i, psi_j).
-    corners
-        (4, n) shapes in the order of travel; the first is the corner nearest to ``psi_e``.
-    """
-
-    pair: tuple[int, int]
-    centre: Array
-    side: float
-    loops: int
-    clockwise: bool
-    corners: Array
-
-
-@dataclass(frozen=True)
-class _SquareFamily:
-    """Squares of increasing side for one pair of joints: centres (R, 2), sides (R,), phases (R,)
-    counter-clockwise."""
-
-    pair: tuple[int, int]
-    plane: PhasePlane
-    centres: Array
-    sides: Array
-    geometric_phases: Array
-
-    @property
-    def largest(self) -> float:
-        """The largest rotation of the base by one loop, rad."""
-        return float(np.abs(self.geometric_phases).max())
-
-
-class SquareSearch:
-    """Finds the square loop for a wanted rotation.
-
-    Parameters
-    ----------
-    robot
-        The model, with joint names and limits.
-    phase
-        Its geometric phase.
-    most_loops
-        The wanted rotation may take this many loops.
-    centre
-        (2,) centre of all squares, rad; None: where the curvature is largest.
-    too_near
-        Returns the clause that says where links come too near on straight lines between shapes
-        (K, n); empty: nowhere.
-    """
-
-    def __init__(
-        self,
-        robot: SpaceRobot,
-        phase: PlanarPhase,
-        most_loops: int,
-        centre: Array | None,
-        too_near: Callable[[Array], str] = lambda shapes: "",
-    ) -> None:
-        self._robot = robot
-        self._phase = phase
-        self._most_loops = most_loops
-        self._centre = centre
-        self._too_near = too_near
-        # scipy.optimize loads slowly, so it is loaded here and not during the first plan.
-        from scipy.optimize import brentq
-
-        self._root = brentq
-        self._movable: list[int] = np.flatnonzero(robot.velocity_limit > 0).tolist()
-
-    def find_loop(self, psi_e: Array, wanted: float) -> SquareLoop:
+    def _find_loop(self, psi_e: Array, wanted: float) -> SquareLoop:
         """Return the loop for a rotation ``wanted`` (rad), with other joints at ``psi_e`` (n,).
 
         Of all pairs of joints it is the one that takes the fewest loops, and of those the one
         with the smallest square; if links come too near on all of these, it takes more loops around
-        smaller squares.
-
-        Raises
-        ------
-        PlanningError
-            No square within the joint limits rotates the base far enough, or links come too near on
-            all of them.
+        smaller squares. PlanningError if no square within the joint limits does.
         """
         pairs = itertools.combinations(self._movable, 2)
         found = [
             candidates for pair in pairs if (candidates := self._squares_within_limits(psi_e, pair))
         ]
         largest = max(found, key=lambda candidates: candidates.largest, default=None)
-        if largest is None or largest.largest * self._most_loops < abs(wanted):
+        if largest is None or largest.largest * self.options.most_loops < abs(wanted):
             raise PlanningError(self._describe_refusal(wanted, largest))
         fewest = math.ceil(abs(wanted) / largest.largest)
         obstacle = ""
-        for loops in range(fewest, self._most_loops + 1):
+        for loops in range(fewest, self.options.most_loops + 1):
             for loop in self._squares(psi_e, wanted, found, largest, loops):
-                too_near = self._too_near(np.vstack([psi_e, loop.corners, loop.corners[0], psi_e]))
+                shapes = np.vstack([psi_e, loop.corners, loop.corners[0], psi_e])
+                too_near = self._too_near(shapes, at_ticks=False)
                 if not too_near:
                     return loop
                 obstacle = obstacle or too_near
         raise PlanningError(
             f"On square loops within the joint limits, links come too near to each other with up "
-            f"to most_loops = {self._most_loops} loops: {obstacle}."
+            f"to most_loops = {self.options.most_loops} loops: {obstacle}."
         )
 
     def _squares(
@@ -363,7 +315,7 @@ class SquareSearch:
         """Return the message for a turn without a loop; ``largest`` turns the base farthest."""
         if len(self._movable) < 2:
             return (
-                f"Fewer than two joints of robot '{self._robot.description.name}' have a velocity "
+                f"Fewer than two joints of robot '{self.robot.description.name}' have a velocity "
                 "limit above zero: they cannot follow a loop."
             )
         given = ""
@@ -372,7 +324,7 @@ class SquareSearch:
         if largest is None:
             return f"No square loop{given} fits into the joint limits."
         i, j = largest.pair
-        names = self._robot.joint_names
+        names = self.robot.joint_names
         most = (
             f"square loops of joints '{names[i]}' and '{names[j]}'{given} rotate it by at most "
             f"about {largest.largest:.3g} rad each"
@@ -384,12 +336,12 @@ class SquareSearch:
         return (
             f"A rotation of the base by {wanted:.4g} rad takes "
             f"{math.ceil(abs(wanted) / largest.largest)} loops, more than most_loops = "
-            f"{self._most_loops}: {most}."
+            f"{self.options.most_loops}: {most}."
         )
 
     def _squares_within_limits(self, psi_e: Array, pair: tuple[int, int]) -> _SquareFamily | None:
         """Return squares of increasing side within the joint limits; None without room for any."""
-        at, lower, upper = (x[list(pair)] for x in (psi_e, self._robot.lower, self._robot.upper))
+        at, lower, upper = (x[list(pair)] for x in (psi_e, self.robot.lower, self.robot.upper))
         room = float(np.min(upper - lower))
         if self._centre is not None:
             room = 2 * float(np.minimum(self._centre - lower, upper - self._centre).min())
@@ -406,6 +358,8 @@ class SquareSearch:
 
     def _solve_for_side(self, candidates: _SquareFamily, wanted: float) -> tuple[int, float]:
         """Return the row of the smallest square that turns the base far enough, and its ``z*``."""
+        from scipy.optimize import brentq
+
         # The slack keeps rounding from excluding the largest square.
         enough = np.abs(candidates.geometric_phases) >= min(wanted, candidates.largest)
         row = int(np.argmax(enough))
@@ -420,4 +374,4 @@ class SquareSearch:
         # The last digit of a phase depends on the number of legs in one call of the integration.
         if excess(side) <= 0:
             return row, side
-        return row, float(self._root(excess, 0.0, side, xtol=1e-13, rtol=1e-14))
+        return row, float(brentq(excess, 0.0, side, xtol=1e-13, rtol=1e-14))
