@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -30,7 +29,7 @@ from spacerobot_ros.planning import (
     method_options,
 )
 from spacerobot_ros.planning.core.method import InitialMotion
-from spacerobot_ros.planning.methods.auto import AutoGait, CandidateMethod
+from spacerobot_ros.planning.methods.auto import AutoGait
 
 FOLDER = Path(__file__).parents[2] / "urdf"
 PERIOD = 0.25
@@ -186,12 +185,13 @@ def made(
 def choice_of(*methods: type[Made]) -> tuple[Planner, list[str]]:
     robot, built = robot_named("planar_chain"), list[str]()
 
-    def build(method: type[Made]) -> GaitMethod:
-        built.append(method.name)
-        return method(robot, PERIOD)
+    candidates = {entry.name: entry for entry in methods}
 
-    candidates = {entry.name: CandidateMethod(entry, partial(build, entry)) for entry in methods}
-    return Planner(AutoGait(robot, PERIOD, candidates=candidates), TOLERANCE), built
+    def build(name: str) -> GaitMethod:
+        built.append(name)
+        return candidates[name](robot, PERIOD)
+
+    return Planner(AutoGait(robot, PERIOD, candidates=candidates, build=build), TOLERANCE), built
 
 
 ATTITUDE = frozenset({"attitude"})

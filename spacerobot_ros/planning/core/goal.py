@@ -501,20 +501,13 @@ class PoseError:
         if q is not None and goal.joint_positions is not None:
             shape = goal.joint_positions - q
         if q is not None and robot is not None and goal.end_effectors:
-            hands = tuple(
-                cls.of_end_effector(robot, position, quaternion, q, each)
+            poses = [
+                end_effector_pose(robot, each.link, position, quaternion, q)
                 for each in goal.end_effectors
-            )
+            ]
+            hands = tuple(map(cls.of_link, map(np.concatenate, poses), goal.end_effectors))
         turn = attitude_error(quaternion, goal.quaternion)
         return cls(goal.position - position, turn, shape, hands)
-
-    @classmethod
-    def of_end_effector(
-        cls, robot: SpaceRobot, position: Array, quaternion: Array, q: Array, goal: EndEffectorGoal
-    ) -> PoseError:
-        """Return the error from the pose of a link to its goal, for a pose and a shape."""
-        pose = end_effector_pose(robot, goal.link, position, quaternion, q)
-        return cls.of_link(np.concatenate(pose), goal)
 
     @classmethod
     def of_link(cls, pose: Array, goal: Goal | EndEffectorGoal) -> PoseError:

@@ -196,17 +196,11 @@ class GoalFile:
 def decode_goal(entry: Mapping[str, Any]) -> Goal:
     """Return the goal of an entry of :func:`encode_goal`; `KeyError` or `TypeError`: it is none."""
     goal = Goal.checked(entry["position"], entry["quaternion"], entry["joint_positions"])
-    paths = entry.get("paths", {})
-    goals = [
-        EndEffectorGoal.along(link, [*paths[link], values])
-        if link in paths
-        else EndEffectorGoal.checked(link, values)
-        for link, values in entry.get("end_effectors", {}).items()
-    ]
     asked = entry.get("asked", POSE)
     goal = replace(goal, asked=frozenset(part for part in POSE if part in asked))
-    if not goals:
+    if "end_effectors" not in entry:
         return goal
+    goals = [EndEffectorGoal.of_numbers(*each) for each in entry["end_effectors"].items()]
     parts = frozenset(part for part in POSE if part in entry["base"])
     return replace(goal, end_effectors=Goal.of_end_effectors(goals).end_effectors, base=parts)
 
@@ -223,12 +217,6 @@ def encode_goal(identified: IdentifiedGoal) -> dict[str, Any]:
     if goal.asked != POSE:
         entry["asked"] = sorted(goal.asked)
     if goal.end_effectors:
-        entry["end_effectors"] = {each.link: list(each.values) for each in goal.end_effectors}
+        entry["end_effectors"] = {each.link: each.numbers for each in goal.end_effectors}
         entry["base"] = sorted(goal.base)
-    if goal.has_path:
-        entry["paths"] = {
-            each.link: each.waypoints.tolist()
-            for each in goal.end_effectors
-            if each.waypoints is not None
-        }
     return {**entry, "id": identified.goal_id} if identified.goal_id else entry

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import ClassVar
 
 from typing_extensions import override
@@ -25,14 +26,6 @@ from spacerobot_ros.planning.core.method import NO_JOINTS, GaitMethod, PlanReque
 from spacerobot_ros.planning.core.schedule import GaitSchedule
 
 
-@dataclass(frozen=True)
-class CandidateMethod:
-    """A gait method to try, and a function that builds it with its options for the robot."""
-
-    method: type[GaitMethod]
-    build: Callable[[], GaitMethod]
-
-
 class AutoGait(GaitMethod):
     """Plans by all methods that suit the robot, and returns the shortest manoeuvre.
 
@@ -45,6 +38,8 @@ class AutoGait(GaitMethod):
     ----------
     candidates
         The methods by name; of equally long manoeuvres, that of the first method is taken.
+    build
+        Returns the method of a name with its options for the robot.
     """
 
     name: ClassVar[str] = "auto"
@@ -56,17 +51,17 @@ class AutoGait(GaitMethod):
         control_period: float,
         integration_step: float = DEFAULT_INTEGRATION_STEP,
         *,
-        candidates: Mapping[str, CandidateMethod],
+        candidates: Mapping[str, type[GaitMethod]],
+        build: Callable[[str], GaitMethod],
     ) -> None:
         super().__init__(robot, control_period, integration_step)
-        self._candidates = candidates
+        self._candidates, self._get_method = candidates, cache(build)
         self._unsuitable: dict[str, SpaceRobotError] = {}
-        for name, candidate in candidates.items():
+        for name, method in candidates.items():
             try:
-                candidate.method.require_suitable(robot)
+                method.require_suitable(robot)
             except PlanningError as refusal:
                 self._unsuitable[name] = refusal
-        self._built_methods: dict[str, GaitMethod] = {}
 
     @override
     def plan(self, request: PlanRequest, cancellation: Cancellation = NEVER) -> GaitSchedule:
@@ -88,10 +83,10 @@ class AutoGait(GaitMethod):
         if request.goal.end_effectors:
             names = [name for name in self._candidates if name not in self._unsuitable]
         if request.goal.has_path:
-            names = [name for name in names if self._candidates[name].method.follows_paths]
+            names = [name for name in names if self._candidates[name].follows_paths]
         if request.motion is not None:
             for name in names:
-                if not self._candidates[name].method.starts_in_motion:
+                if not self._candidates[name].starts_in_motion:
                     refusals[name] = PlanningError(f"{name} plans from rest only.")
             names = [name for name in names if name not in refusals]
         flying = "" if request.previous is None else request.previous.method
@@ -138,7 +133,7 @@ class AutoGait(GaitMethod):
         """Return the methods to compare; add the refusals of the other methods."""
         pose: dict[str, frozenset[Controlled]] = {}
         for name in self._candidates:
-            if name in refusals or not self._candidates[name].method.plans_for_base:
+            if name in refusals or not self._candidates[name].plans_for_base:
                 continue
             try:
                 pose[name] = self._get_method(name).controls & POSE
@@ -168,11 +163,6 @@ class AutoGait(GaitMethod):
         except (ParameterError, PlanningError) as refusal:
             refusals[name] = refusal
             return None
-
-    def _get_method(self, name: str) -> GaitMethod:
-        if name not in self._built_methods:
-            self._built_methods[name] = self._candidates[name].build()
-        return self._built_methods[name]
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from functools import partial
 from typing import Any
 
 from spacerobot_ros.errors import ParameterError
@@ -12,7 +11,7 @@ from spacerobot_ros.parameters import configured, require_known
 from spacerobot_ros.planning.core.clearance import Clearance
 from spacerobot_ros.planning.core.method import GaitMethod
 from spacerobot_ros.planning.methods.area_loop import AreaLoopGait
-from spacerobot_ros.planning.methods.auto import AutoGait, CandidateMethod
+from spacerobot_ros.planning.methods.auto import AutoGait
 from spacerobot_ros.planning.methods.lie_bracket import LieBracketGait
 from spacerobot_ros.planning.methods.optimal import OptimalGait
 from spacerobot_ros.planning.methods.resolved_rate import ResolvedRateGait
@@ -58,17 +57,15 @@ def build_method(
     method = METHODS[name]
     if method is not AutoGait:
         return method(robot, control_period, integration_step, options.get(name), clearance)
-    candidates = {
-        other: CandidateMethod(
-            entry,
-            partial(
-                build_method, other, robot, control_period, integration_step, options, clearance
-            ),
-        )
-        for other, entry in METHODS.items()
-        if entry is not AutoGait
-    }
-    return AutoGait(robot, control_period, integration_step, candidates=candidates)
+    return AutoGait(
+        robot,
+        control_period,
+        integration_step,
+        candidates={other: each for other, each in METHODS.items() if each is not AutoGait},
+        build=lambda other: build_method(
+            other, robot, control_period, integration_step, options, clearance
+        ),
+    )
 
 
 def method_options(name: str, values: Mapping[str, Any]) -> Any:
