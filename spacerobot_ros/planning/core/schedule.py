@@ -95,6 +95,12 @@ class GaitSchedule:
         )
 
     @property
+    def title(self) -> str:
+        """Method and duration for messages, such as "an optimal gait of 12 s"."""
+        article = "an" if self.method[:1] in tuple("aeiou") else "a"
+        return f"{article} {self.method} gait of {self.duration:.6g} s"
+
+    @property
     def ticks(self) -> int:
         """Number of held commands N."""
         return len(self.positions) - 1

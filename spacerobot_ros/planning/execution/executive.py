@@ -11,7 +11,7 @@ Other modules do the work of a phase: :mod:`.tracker` computes the commands alon
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 from spacerobot_ros.errors import PlanningError, sentence_case
@@ -76,12 +76,8 @@ class Executive:
 
     Parameters
     ----------
-    robot
-        The model.
-    config
-        Of the planner.
-    worker
-        Makes the plans.
+    robot, config, worker
+        The model, the parameters of the planner, and the worker that makes the plans.
     """
 
     def __init__(self, robot: SpaceRobot, config: PlannerConfig, worker: PlanningWorker) -> None:
@@ -240,14 +236,8 @@ class Executive:
         """End the schedule at the next state: the robot's own controller has ended it.
 
         The measured state is compared with the goal as after every schedule, and the remaining
-        motion is planned again.
-
-        Parameters
-        ----------
-        why
-            Clause that says why it ended early; empty: it was followed to its end.
-        final
-            Whether there are no further plans: the goal fails unless it is reached.
+        motion is planned again; ``final``: there are no further plans. ``why`` is the clause that
+        says why it ended early; empty: it was followed to its end.
         """
         active = self._active_goal
         if active is None:
@@ -272,16 +262,9 @@ class Executive:
     def use_robot(
         self, robot: SpaceRobot, worker: PlanningWorker, config: PlannerConfig | None = None
     ) -> None:
-        """Plan again for the present goal, if any: for another robot, or at another rate.
+        """Plan again for the present goal, if any, by another worker.
 
-        Parameters
-        ----------
-        robot
-            The robot with its present mass properties.
-        worker
-            Makes the plans from now on.
-        config
-            Configuration with the present rate of the plant; None: as it was.
+        The robot has other mass properties, or ``config`` has another rate of the plant.
         """
         what = (
             "The robot has a different mass" if config is None else "The plant has a different rate"
@@ -305,12 +288,8 @@ class Executive:
         """Plan around other obstacles from now on.
 
         A plan in progress is restarted. If the rest of the present schedule comes too near to
-        obstacles, the joints brake, and the remaining motion is planned again.
-
-        Parameters
-        ----------
-        make_worker
-            Returns the worker that knows the obstacles; called when no plan is in progress.
+        obstacles, the joints brake, and the remaining motion is planned again. ``make_worker``
+        returns the worker that knows the obstacles; it is called when no plan is in progress.
         """
         self._drop_plan()
         self._worker.close()
@@ -386,13 +365,7 @@ class Executive:
         self._stamp_ns = stamp
         if tracker.has_ended(stamp, q):
             self._end_schedule(stamp)
-        # While a schedule is tracked, most states need nothing but a command.
-        if (
-            self.phase is not Phase.EXECUTING
-            or self._new_goal is not None
-            or tracker.is_check_due(stamp)
-        ):
-            self._do_phase_work(measured)
+        self._do_phase_work(measured)
         if tracker.is_active:
             stuck = tracker.track(stamp, q, obeyed=not self.plant_rests)
             if stuck and self._active_goal is not None:
@@ -416,7 +389,7 @@ class Executive:
                 self._await_take_over()
             case Phase.EXECUTING | Phase.BRAKING if self._new_goal is not None:
                 self._measure_in_motion(self._new_goal, measured)
-            case Phase.EXECUTING:
+            case Phase.EXECUTING if self._tracker.is_check_due(self._stamp_ns):
                 assert self._active_goal is not None
                 self._check_path(self._active_goal, measured)
 
@@ -464,37 +437,36 @@ class Executive:
             state = self._average.state()
         except PlanningError as reason:
             failed = PlannerStatus.of_goal(PlannerState.FAILED, str(reason), active.identified)
-            self.outputs.append(failed)
-            self._end_goal(Event.FAILED)
+            self._end_goal(failed, Event.FAILED)
             return
         goal = active.identified.goal
         error = PoseError.between(state.position, state.quaternion, goal, state.q, self._robot)
-        reached = active.reached(error, self._tolerance_of(active.identified))
+        tolerance, why = self._tolerance_of(active.identified), ""
+        reached = active.reached(error, tolerance)
         if reached is not None:
-            self.outputs.append(reached)
-            self._end_goal(Event.REACHED)
+            self._end_goal(reached, Event.REACHED)
             return
+        corrects = active.next_plan is PlanReason.CORRECTION
         if active.not_flown_reason:
-            self._fail_goal(active, error, f", and {active.not_flown_reason}.")
+            why = f", and {active.not_flown_reason}."
+        elif corrects and active.corrections >= self.config.max_corrections:
+            why = f" after {active.corrections} correction(s)."
+        if why:
+            self._end_goal(active.failed(error, tolerance, why), Event.FAILED)
             return
-        if active.next_plan is PlanReason.CORRECTION:
-            if active.corrections >= self.config.max_corrections:
-                self._fail_goal(active, error, f" after {active.corrections} correction(s).")
-                return
+        if corrects:
             off = describe_remaining_error(error, active.schedule.controls)
-            self._count_correction(active, f"The remaining motion is planned: {off}.")
+            active.corrections += 1
+            message = f"The remaining motion is planned: {off}."
+            self._add_event(EventKind.CORRECTION, message, active.identified, 1, active.counted)
         self._request_plan(PlanJob(active.identified, active.next_plan, error), state)
 
     # -- in motion: EXECUTING and BRAKING -----------------------------------------------------
 
     def _measure_in_motion(self, waiting: IdentifiedGoal, measured: MeasuredState) -> None:
         """Plan for a new goal from the present state, or brake first if planning takes time."""
-        take_over = None
-        if (
-            self.phase is Phase.EXECUTING
-            and self._in_motion_attempts < _MAX_IN_MOTION_ATTEMPTS
-            and self._can_replan()
-        ):
+        take_over, attempts_left = None, self._in_motion_attempts < _MAX_IN_MOTION_ATTEMPTS
+        if self.phase is Phase.EXECUTING and attempts_left and self._can_replan():
             after = self.config.takeover_time * 2**self._in_motion_attempts
             take_over = self._tracker.take_over(self._stamp_ns, measured.q, after)
         if take_over is None and self._worker.plans_in_background:
@@ -544,7 +516,7 @@ class Executive:
             if replans:
                 self._replan_remaining(active, state)
         elif self._worker.plans_in_background:
-            self._report_path_correction(error)
+            self._correct_path(active, error)
             self._brake_for_replan(Event.TRACKING_ERROR)
         else:
             self._request_plan(PlanJob(active.identified, PlanReason.TRACKING_ERROR, error), state)
@@ -608,14 +580,9 @@ class Executive:
         if job.reason.is_for_new_goal:
             self._accept_goal(ActiveGoal(job.identified, schedule, begins_ns))
         reason = job.reason.value
-        self._add_event(
-            EventKind.PLAN_TAKEN_OVER,
-            f"A plan takes over in motion: {reason}.",
-            job.identified,
-            reason=reason,
-            method=schedule.method,
-            duration_s=f"{schedule.duration:.9g}",
-        )
+        message = f"A plan takes over in motion: {reason}."
+        about = {"reason": reason, **_about(schedule)}
+        self._add_event(EventKind.PLAN_TAKEN_OVER, message, job.identified, about=about)
         self._execute_schedule(schedule, begins_ns, event=Event.TAKEN_OVER)
 
     def _handle_late_plan(self, job: PlanJob) -> None:
@@ -624,8 +591,8 @@ class Executive:
         self._in_motion_attempts += job.reason.is_for_new_goal
         self._change_phase(Event.PLAN_LATE, Phase.EXECUTING)
         message = "The plan was not ready when it was to take over."
-        self._add_notice(Severity.WARNING, message)
-        self._add_event(EventKind.PLAN_LATE, message, job.identified, 1, reason=job.reason.value)
+        about = {"reason": job.reason.value}
+        self._add_warning(EventKind.PLAN_LATE, message, job.identified, about)
 
     # -- plans: request, result, schedule -----------------------------------------------------
 
@@ -678,7 +645,7 @@ class Executive:
         )
         reason = job.reason.value
         message = f"A plan is made: {reason}."
-        self._add_event(EventKind.PLAN_STARTED, message, job.identified, reason=reason)
+        self._add_event(EventKind.PLAN_STARTED, message, job.identified, about={"reason": reason})
         fresh = job.reason.is_for_new_goal or not self._tracker.is_active
         if fresh and self._worker.plans_in_background:
             about = (PlannerState.PLANNING, f"Planning: {reason}.")
@@ -713,16 +680,11 @@ class Executive:
         self.statistics.plans += 1
         self._add_notice(Severity.INFO, f"Planned in {result.wall_time:.6f} s.")
         if isinstance(result, Planned):
-            result = _plan_for(job.identified, result)
+            result = result.for_goal(job.identified)
         if isinstance(result, Planned):
-            schedule = result.schedule
-            self._add_event(
-                EventKind.PLAN_READY,
-                f"The plan is {_name_gait(schedule.method)} of {schedule.duration:.6g} s.",
-                job.identified,
-                method=schedule.method,
-                duration_s=f"{schedule.duration:.9g}",
-            )
+            message = f"The plan is {result.schedule.title}."
+            about = _about(result.schedule)
+            self._add_event(EventKind.PLAN_READY, message, job.identified, about=about)
         self._act_on_result(job, result)
 
     def _act_on_result(self, job: PlanJob, result: Planned | Refused) -> None:
@@ -737,36 +699,41 @@ class Executive:
                 if reason.is_for_new_goal:
                     self._accept_goal(ActiveGoal(job.identified, schedule, self._stamp_ns))
                 elif isinstance(job.error, TrackingError):
-                    self._report_path_correction(job.error)
+                    assert active is not None
+                    self._correct_path(active, job.error)
                 else:
                     error = job.error
                 self._execute_schedule(schedule, begins, error)
-            case Refused(why) if reason is PlanReason.IN_MOTION:
-                self._new_goal = self._new_goal or job.identified
-                self._in_motion_attempts += 1
-                last = self._in_motion_attempts == _MAX_IN_MOTION_ATTEMPTS
-                again = "from rest" if last else "from a later tick"
-                message = f"No plan begins in motion, so the goal is planned for {again}: {why}"
-                self._add_notice(Severity.WARNING, message)
-                self._change_phase(Event.REFUSED, Phase.EXECUTING)
-            case Refused(why) if reason is PlanReason.SHRINKING_HORIZON:
-                message = f"The remaining motion is not planned again: {why}"
-                self._add_notice(Severity.INFO, message)
-                self._change_phase(Event.REFUSED, Phase.EXECUTING)
-            case Refused(why) if reason.is_for_new_goal:
-                earlier = " The earlier goal is still pursued." if active is not None else ""
-                message = f"{why}{earlier}"
-                refused = PlannerStatus.of_goal(PlannerState.REFUSED, message, job.identified)
-                self.outputs.append(refused)
-                self._change_phase(Event.REFUSED, self._phase_without_plan())
-            case Refused(why) if isinstance(job.error, TrackingError):
-                message = f"{job.error}, and the remaining motion cannot be planned again: {why}"
-                self._add_notice(Severity.WARNING, message)
-                self._change_phase(Event.REFUSED, self._phase_without_plan())
             case Refused(why):
-                assert active is not None
-                assert job.error is not None
-                self._fail_goal(active, job.error, f", and {why}", Event.REFUSED)
+                self._handle_refusal(job, why)
+
+    def _handle_refusal(self, job: PlanJob, why: str) -> None:
+        """Report that there is no plan; an active goal at rest fails."""
+        active, reason = self._active_goal, job.reason
+        if reason is PlanReason.IN_MOTION:
+            self._new_goal = self._new_goal or job.identified
+            self._in_motion_attempts += 1
+            last = self._in_motion_attempts == _MAX_IN_MOTION_ATTEMPTS
+            again = "from rest" if last else "from a later tick"
+            message = f"No plan begins in motion, so the goal is planned for {again}: {why}"
+            self._add_notice(Severity.WARNING, message)
+        elif reason is PlanReason.SHRINKING_HORIZON:
+            message = f"The remaining motion is not planned again: {why}"
+            self._add_notice(Severity.INFO, message)
+        elif reason.is_for_new_goal:
+            message = why if active is None else f"{why} The earlier goal is still pursued."
+            refused = PlannerStatus.of_goal(PlannerState.REFUSED, message, job.identified)
+            self.outputs.append(refused)
+        elif isinstance(job.error, TrackingError):
+            message = f"{job.error}, and the remaining motion cannot be planned again: {why}"
+            self._add_notice(Severity.WARNING, message)
+        else:
+            assert active is not None
+            assert job.error is not None
+            tolerance = self._tolerance_of(active.identified)
+            self._end_goal(active.failed(job.error, tolerance, f", and {why}"), Event.REFUSED)
+            return
+        self._change_phase(Event.REFUSED, self._phase_without_plan())
 
     def _accept_goal(self, active: ActiveGoal) -> None:
         self._active_goal, self._tracker.stuck = active, []
@@ -793,7 +760,7 @@ class Executive:
         self._change_phase(event, Phase.EXECUTING)
         status = active.status(
             PlannerState.EXECUTING,
-            f"Executing {_name_gait(schedule.method)} of {schedule.duration:.6g} s{start}.",
+            f"Executing {schedule.title}{start}.",
             remaining,
             method=schedule.method,
             duration_s=schedule.duration,
@@ -801,16 +768,10 @@ class Executive:
         )
         self.outputs += [status, ScheduleStart(schedule, begins)]
 
-    def _report_path_correction(self, error: TrackingError) -> None:
-        assert self._active_goal is not None
-        message = f"{error}: the remaining motion is planned again."
-        self._count_correction(self._active_goal, message)
-        self._add_notice(Severity.WARNING, message)
-
-    def _count_correction(self, active: ActiveGoal, message: str) -> None:
+    def _correct_path(self, active: ActiveGoal, error: TrackingError) -> None:
         active.corrections += 1
-        count = str(active.corrections)
-        self._add_event(EventKind.CORRECTION, message, active.identified, 1, corrections=count)
+        message = f"{error}: the remaining motion is planned again."
+        self._add_warning(EventKind.CORRECTION, message, active.identified, active.counted)
 
     # -- ends of schedules and goals ----------------------------------------------------------
 
@@ -857,8 +818,7 @@ class Executive:
         self._stop_motion(Event.JOINTS_STUCK)
         names = ", ".join(self._robot.joint_names[i] for i in tracker.stuck)
         message = f"Stuck: {names}. The remaining motion is planned without stuck joints."
-        self._add_notice(Severity.WARNING, message)
-        self._add_event(EventKind.STUCK_JOINT, message, active.identified, 1, joints=names)
+        self._add_warning(EventKind.STUCK_JOINT, message, active.identified, {"joints": names})
 
     def _drop_plan(self) -> None:
         """Drop the requested or ready plan; its new goal, if any, waits again."""
@@ -877,14 +837,8 @@ class Executive:
             return Phase.MEASURING
         return Phase.IDLE if self._active_goal is None else Phase.EVALUATING
 
-    def _fail_goal(
-        self, active: ActiveGoal, remaining: PoseError, why: str, event: Event = Event.FAILED
-    ) -> None:
-        """Report that the active goal is not reached; ``why`` ends the message."""
-        self.outputs.append(active.failed(remaining, self._tolerance_of(active.identified), why))
-        self._end_goal(event)
-
-    def _end_goal(self, event: Event) -> None:
+    def _end_goal(self, status: PlannerStatus, event: Event) -> None:
+        self.outputs.append(status)
         self._active_goal = None
         self._change_phase(event, self._phase_at_rest())
 
@@ -916,32 +870,28 @@ class Executive:
     def _add_notice(self, severity: Severity, message: str) -> None:
         self.outputs.append(Notice(severity, message))
 
+    def _add_warning(
+        self, kind: EventKind, message: str, about: IdentifiedGoal, values: Mapping[str, str]
+    ) -> None:
+        self._add_notice(Severity.WARNING, message)
+        self._add_event(kind, message, about, 1, values)
+
     def _add_event(
         self,
         kind: EventKind,
         message: str,
         identified: IdentifiedGoal,
         level: int = 0,
-        **about: str,
+        about: Mapping[str, str] | None = None,
     ) -> None:
         now = self._stamp_ns / SECOND
-        self.outputs.append(FlightEvent(kind, message, level, now, identified.goal_id, about))
+        self.outputs.append(FlightEvent(kind, message, level, now, identified.goal_id, about or {}))
 
     def _add_abort(self, message: str, goal: IdentifiedGoal | None) -> None:
         goal_id = "" if goal is None else goal.goal_id
         self.outputs.append(PlannerStatus(PlannerState.ABORTED, message, goal_id=goal_id))
 
 
-def _plan_for(identified: IdentifiedGoal, planned: Planned) -> Planned | Refused:
-    """Return a plan with its goal, which it may aim beside; refused if it controls too little."""
-    schedule = replace(planned.schedule, goal=identified.goal)
-    try:
-        identified.required.require_control(identified.goal, schedule.controls, schedule.method)
-    except PlanningError as refusal:
-        return Refused(str(refusal), planned.wall_time)
-    return replace(planned, schedule=schedule)
-
-
-def _name_gait(method: str) -> str:
-    """Return "an optimal gait" or the like, for messages."""
-    return f"{'an' if method[:1] in tuple('aeiou') else 'a'} {method} gait"
+def _about(schedule: GaitSchedule) -> dict[str, str]:
+    """Return method and duration of a schedule, for events."""
+    return {"method": schedule.method, "duration_s": f"{schedule.duration:.9g}"}

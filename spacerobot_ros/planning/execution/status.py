@@ -384,6 +384,11 @@ class ActiveGoal:
             self.manoeuvre_time -= min(remainder, self.schedule.duration)
             self.ends_at = stamp_ns / SECOND
 
+    @property
+    def counted(self) -> dict[str, str]:
+        """The number of corrections, for events."""
+        return {"corrections": str(self.corrections)}
+
     def time_left(self, stamp_ns: int) -> float:
         """Return the time from a stamp to the end of the schedule, s."""
         return self.ends_at - stamp_ns / SECOND

@@ -105,6 +105,17 @@ class Planned:
     wall_time: float
     begins_ns: int = 0
 
+    def for_goal(self, identified: IdentifiedGoal) -> Planned | Refused:
+        """Return the plan with its goal, which it may aim beside; refused if it controls too
+        little.
+        """
+        goal, schedule = identified.goal, replace(self.schedule, goal=identified.goal)
+        try:
+            identified.required.require_control(goal, schedule.controls, schedule.method)
+        except PlanningError as refusal:
+            return Refused(str(refusal), self.wall_time)
+        return replace(self, schedule=schedule)
+
 
 @dataclass(frozen=True)
 class Postponed:
