@@ -10,7 +10,7 @@ import logging
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -56,39 +56,6 @@ class Solid:
         return self.body == WORLD_BODY
 
 
-class DistanceFunction(Protocol):
-    """Distances (N,), m, of two solids, given by index, at poses of their links.
-
-    Attitudes are (N, 3, 3), positions (N, 3) in m, both in a common frame. A negative distance is a
-    penetration depth. If ``exact`` is false, distances are lower bounds.
-    """
-
-    exact: bool
-
-    def __call__(
-        self, first: int, R_1: Array, r_1: Array, second: int, R_2: Array, r_2: Array
-    ) -> Array:
-        """Return the distances."""
-        ...
-
-    def planes(
-        self, first: int, R_1: Array, r_1: Array, second: int, R_2: Array, r_2: Array
-    ) -> tuple[Array, Array]:
-        """Return the distances, and planes and points (N, 7) between the solids.
-
-        A plane touches the first solid at its point nearest to the second. It is a unit normal (3,)
-        toward the second solid and the distance from the origin, m, in the frame of the first link.
-        The point (3,) is the nearest point of the second solid in the frame of its link, m.
-        """
-        ...
-
-
-def distance_function(solids: Sequence[Solid]) -> DistanceFunction:
-    """Return exact distances, or bounds if the package coal is not installed."""
-    coal = _coal()
-    return EnclosureDistances(solids) if coal is None else ExactDistances(solids, coal)
-
-
 @lru_cache(maxsize=1)
 def _coal() -> Any:
     """Return the module coal; None: it is not installed, which is logged once an installation."""
@@ -107,7 +74,11 @@ def _coal() -> Any:
 
 
 class ExactDistances:
-    """Exact distances of shapes and of the convex hulls of meshes, by coal."""
+    """Exact distances of shapes and of the convex hulls of meshes, by coal.
+
+    Two solids are given by index, with attitudes (N, 3, 3) and positions (N, 3), m, of their links
+    in a common frame. Negative distances are penetration depths.
+    """
 
     exact = True
 
@@ -141,14 +112,19 @@ class ExactDistances:
     def __call__(
         self, first: int, R_1: Array, r_1: Array, second: int, R_2: Array, r_2: Array
     ) -> Array:
-        """Return the distances."""
+        """Return the distances (N,), m."""
         poses = R_1, r_1, R_2, r_2
         return np.array([distance for distance, *_ in self._results(first, second, *poses)])
 
     def planes(
         self, first: int, R_1: Array, r_1: Array, second: int, R_2: Array, r_2: Array
     ) -> tuple[Array, Array]:
-        """Return the distances, and planes and points between the solids."""
+        """Return the distances (N,), m, and planes and points (N, 7) between the solids.
+
+        A plane touches the first solid at its point nearest to the second. It is a unit normal (3,)
+        toward the second solid and the distance from the origin, m, in the frame of the first link.
+        The point (3,) is the nearest point of the second solid in the frame of its link, m.
+        """
         (_, R_a, r_a), (_, R_b, r_b) = self._geometries[first], self._geometries[second]
         distances, planes = np.empty(len(R_1)), np.empty((len(R_1), 7))
         results = self._results(first, second, R_1, r_1, R_2, r_2)
@@ -232,7 +208,10 @@ class PlacedSolids:
 
 
 class EnclosureDistances:
-    """Lower bounds of distances: those of the rounded boxes around the solids."""
+    """Lower bounds of distances: those of the rounded boxes around the solids.
+
+    Arguments and results are those of :class:`ExactDistances`.
+    """
 
     exact = False
 
@@ -252,3 +231,12 @@ class EnclosureDistances:
         """Return the distances, and planes and points between the enclosures."""
         one, other = self._enclosures[first], self._enclosures[second]
         return separating_planes(one, R_1, r_1, other, R_2, r_2)
+
+
+DistanceFunction = ExactDistances | EnclosureDistances
+
+
+def distance_function(solids: Sequence[Solid]) -> DistanceFunction:
+    """Return exact distances, or bounds if the package coal is not installed."""
+    coal = _coal()
+    return EnclosureDistances(solids) if coal is None else ExactDistances(solids, coal)

@@ -168,9 +168,9 @@ class CollisionGeometry:
     ) -> None:
         self.robot = robot
         self._kinematics = ForwardKinematics(robot)
-        self.solids, self.notes, self.unread_meshes = _read_solids(robot, mesh_of)
+        self.solids, self.notes, self.unread_meshes = solids_of(robot, mesh_of)
         if robot.world is not None:
-            obstacles, notes, unread = _read_solids(robot.world, mesh_of)
+            obstacles, notes, unread = solids_of(robot.world, mesh_of)
             frames = robot.world.frames
             self.solids += tuple(_solid_in_world(each, frames[each.link][1]) for each in obstacles)
             self.notes += notes
@@ -273,7 +273,7 @@ class CollisionGeometry:
         """Return the distances (N,) of a pair, m, and planes and points (N, 7) between them.
 
         Planes are in the frame of the first link, points in that of the second one
-        (:meth:`.DistanceFunction.planes`). For a link and an obstacle, planes belong to the
+        (:meth:`.ExactDistances.planes`). For a link and an obstacle, planes belong to the
         obstacle and are in W.
         """
         R, r = poses
@@ -449,19 +449,10 @@ def _solid_in_world(obstacle: Solid, pose: Pose) -> Solid:
 
 def solids_of(
     robot: RobotDescription, mesh_of: Callable[[Shape], TriangleMesh] = shape_mesh
-) -> tuple[tuple[Solid, ...], tuple[str, ...]]:
-    """Return the solids of a robot, and notes on links whose geometry may be unexpected.
-
-    See :class:`CollisionGeometry` for ``mesh_of``.
-    """
-    solids, notes, unread = _read_solids(robot, mesh_of)
-    return solids, notes + tuple(each.note for each in unread)
-
-
-def _read_solids(
-    robot: RobotDescription, mesh_of: Callable[[Shape], TriangleMesh]
 ) -> tuple[tuple[Solid, ...], tuple[str, ...], tuple[UnreadMesh, ...]]:
-    """Return solids and notes as :func:`solids_of`, and meshes that cannot be read."""
+    """Return the solids of a robot, notes on links whose geometry may be unexpected, and meshes
+    that cannot be read. See :class:`CollisionGeometry` for ``mesh_of``.
+    """
     solids: list[Solid] = []
     notes: list[str] = []
     unread: list[UnreadMesh] = []
@@ -511,7 +502,7 @@ def collision_visuals(
 
     See :class:`~spacerobot_ros.collision.geometry.CollisionGeometry` for ``mesh_of``.
     """
-    solids, _ = solids_of(robot, mesh_of)
+    solids, _, _ = solids_of(robot, mesh_of)
     return tuple(Visual(each.link, each.body, each.shape, _mesh_of(each)) for each in solids)
 
 

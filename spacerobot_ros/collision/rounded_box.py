@@ -169,7 +169,8 @@ def _widest_gaps(
     best, directions = found[rows, widest], axes[rows, :, widest]
     apart = best > 0
     if apart.any():
-        nearest = _directions(c_1, A, c_2, B, first.half, second.half)
+        x, y = _nearest_points(c_1, A, c_2, B, first.half, second.half)
+        nearest = (y - x) / np.maximum(np.linalg.norm(y - x, axis=1, keepdims=True), 1e-300)
         cores = np.where(apart, gaps(nearest[:, :, np.newaxis])[:, 0], -np.inf)
         directions = np.where((cores > best)[:, np.newaxis], nearest, directions)
         best = np.maximum(best, cores)
@@ -198,13 +199,6 @@ def _nearest_points(
         x = _projected(y, c_1, A, a)
         y = _projected(x, c_2, B, b)
     return x, y
-
-
-def _directions(c_1: Array, A: Array, c_2: Array, B: Array, a: Array, b: Array) -> Array:
-    """Return unit vectors (N, 3) from about the nearest point of a box to that of another."""
-    x, y = _nearest_points(c_1, A, c_2, B, a, b)
-    way = y - x
-    return np.asarray(way / np.maximum(np.linalg.norm(way, axis=1, keepdims=True), 1e-300))
 
 
 def _projected(points: Array, c: Array, R: Array, half: Array) -> Array:

@@ -16,6 +16,7 @@ from spacerobot_ros.model.description import Array
 from spacerobot_ros.planning.core.controllability import (
     Controllability,
     best_sampled_brackets,
+    best_triple,
     brackets_at,
     check_sliding_masses,
     curvatures,
@@ -179,10 +180,8 @@ def _check_shape(robot: SpaceRobot, shape: Sequence[float]) -> Array:
 def _condition_numbers(robot: SpaceRobot) -> Array:
     if robot.n < 3:
         return np.full(_CONDITION_SAMPLE_COUNT, np.inf)
-    # One call for the matrices of all triples; each shape has its best conditioned triple.
     K = curvatures(robot, sample_shapes(robot, _CONDITION_SAMPLE_COUNT))
-    i, j, k = np.array(list(itertools.combinations(range(robot.n), 3))).T
-    M = np.stack([K[:, :, i, j], K[:, :, j, k], K[:, :, k, i]], axis=-1).transpose(0, 2, 1, 3)
-    values = np.linalg.svd(M, compute_uv=False)
-    inverse = (values[..., 2] / np.maximum(values[..., 0], 1e-300)).max(axis=1)
+    matrices = np.array([best_triple(at, range(robot.n))[1] for at in K])
+    values = np.linalg.svd(matrices, compute_uv=False)
+    inverse = values[:, 2] / np.maximum(values[:, 0], 1e-300)
     return np.asarray(np.where(inverse > 1e-6, 1 / np.maximum(inverse, 1e-300), np.inf))

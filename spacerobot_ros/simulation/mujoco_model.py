@@ -171,7 +171,7 @@ def _add_contacts(
     if target is not None:
         body, link = target
         _add_target(spec, body)
-        solids, _ = solids_of(body)
+        solids, _, _ = solids_of(body)
         shapes = [
             _add_shape(mujoco, spec, solid, f"{TARGET}{index}", TARGET)
             for index, solid in enumerate(solids)

@@ -164,12 +164,8 @@ class AreaLoopGait(GaitMethod):
         chosen = self._nominal.at(state.q, None if progress is None else progress.nominal)
         if progress is None:
             chosen = self._nominal_shape_with_clearance(request, final, chosen, cancellation)
-        nominal = self._nominal.move_to_nearest_turn(chosen, state.q)
         flown = 0 if progress is None else progress.cycles
-        gait = self._add_legs(gait, [(nominal.shape, self.options.edge_time)])
-        # The motion from the nominal to the final shape turns the base, too.
-        aside = self._turn_to_final_shape(nominal, final)
-        target = quaternion_multiply(goal.quaternion, quaternion_inverse(aside))
+        nominal, gait, target = self._move_to_nominal(request, final, chosen)
         remaining = 0.0
         for planned in range(self.options.cycles_per_plan + 1):
             cancellation.raise_if_requested()
@@ -221,11 +217,7 @@ class AreaLoopGait(GaitMethod):
         come too near, and whether links keep clear without a smaller loop.
         """
         state = request.state
-        nominal = self._nominal.move_to_nearest_turn(chosen, state.q)
-        gait = _PlannedMotion(state.q[np.newaxis], state.quaternion[np.newaxis])
-        gait = self._add_legs(gait, [(nominal.shape, self.options.edge_time)])
-        aside = self._turn_to_final_shape(nominal, final)
-        target = quaternion_multiply(request.goal.quaternion, quaternion_inverse(aside))
+        nominal, gait, target = self._move_to_nominal(request, final, chosen)
         left = attitude_error(gait.attitudes[-1], target)
         missing, enough = float(np.linalg.norm(left)), request.tolerance.attitude
         if missing <= enough:
@@ -373,11 +365,19 @@ class AreaLoopGait(GaitMethod):
             ends.append((nominal.shape, self.options.edge_time / 2))
         return ends
 
-    def _turn_to_final_shape(self, nominal: NominalShape, final: Array | None) -> Array:
-        """Return the turn (4,) of the base on the straight way from nominal to final shape."""
+    def _move_to_nominal(
+        self, request: PlanRequest, final: Array | None, chosen: NominalShape
+    ) -> tuple[NominalShape, _PlannedMotion, Array]:
+        """Return the nearest nominal shape, the way to it, and the attitude (4,) to reach there:
+        the straight way from there to the final shape turns the base, too.
+        """
+        state, edge_time = request.state, self.options.edge_time
+        nominal = self._nominal.move_to_nearest_turn(chosen, state.q)
+        gait = _PlannedMotion(state.q[np.newaxis], state.quaternion[np.newaxis])
         start = _PlannedMotion(nominal.shape[np.newaxis], _IDENTITY[np.newaxis])
-        ends = [] if final is None else [(final, self.options.edge_time)]
-        return self._add_legs(start, ends).attitudes[-1]
+        aside = self._add_legs(start, [] if final is None else [(final, edge_time)]).attitudes[-1]
+        target = quaternion_multiply(request.goal.quaternion, quaternion_inverse(aside))
+        return nominal, self._add_legs(gait, [(nominal.shape, edge_time)]), target
 
     def _add_legs(self, gait: _PlannedMotion, ends: LegEnds) -> _PlannedMotion:
         shapes = straight_motion(
@@ -461,23 +461,18 @@ def edge_path(areas: Array, longest: Array) -> EdgePath:
     return rectangles
 
 
-def cube_edges(areas: Array) -> tuple[Array, bool]:
-    """Return the edges ``d`` (3,) of the box, and whether its path is traversed backwards.
+def _cube_path(areas: Array, longest: Array) -> EdgePath:
+    """Return the path with edges +d1, +d2, +d3, -d1, -d2, -d3 around areas (3,), none of them zero.
 
-    Edges +d1, +d2, +d3, -d1, -d2, -d3 have the projected areas (d1 d2, d2 d3, -d1 d3); backwards
-    these change sign. No area may be zero.
+    The projected areas are (d1 d2, d2 d3, -d1 d3), with the product -(d1 d2 d3)^2; backwards these
+    change sign.
     """
     S12, S23, S31 = areas
-    # The product of the projected areas is -(d1 d2 d3)^2.
     backwards = bool(S12 * S23 * S31 > 0)
     sense = -1.0 if backwards else 1.0
     d1 = np.sqrt(abs(S12)) * np.sqrt(abs(S31 / S23))
     d2 = sense * S12 / d1
-    return np.array([d1, d2, sense * S23 / d2]), backwards
-
-
-def _cube_path(areas: Array, longest: Array) -> EdgePath:
-    d, backwards = cube_edges(areas)
+    d = np.array([d1, d2, sense * S23 / d2])
     corners = np.vstack([np.zeros(3), np.cumsum(np.vstack([np.diag(d), -np.diag(d)]), axis=0)])
     corners[-1] = 0.0
     loop = corners - d / 2

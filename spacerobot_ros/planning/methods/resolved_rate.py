@@ -495,16 +495,6 @@ class PathProgress:
     route: PosePath
     travelled_lengths: Array
 
-    def remaining_route(self, positions: Array, q: Array) -> PosePath:
-        """Return the remaining part of the route in a shape (n,).
-
-        ``positions`` (N + 1, n) are the shapes at the ticks of the schedule.
-        """
-        nearest = int(
-            np.argmin(np.linalg.norm(positions[-len(self.travelled_lengths) :] - q, axis=1))
-        )
-        return self.route.remaining_after(float(self.travelled_lengths[nearest]))
-
 
 class ResolvedRateGait(GaitMethod):
     """End-effectors on straight lines, or along paths, to their goals, with the base free.
@@ -602,7 +592,9 @@ class ResolvedRateGait(GaitMethod):
         )
         before = request.previous
         if before is not None and isinstance(before.progress, PathProgress):
-            rest = before.progress.remaining_route(before.positions, state.q)
+            done = before.progress.travelled_lengths
+            off = np.linalg.norm(before.positions[-len(done) :] - state.q, axis=1)
+            rest = before.progress.route.remaining_after(float(done[np.argmin(off)]))
         else:
             points = aim.path_values[-1:] if request.correction else aim.path_values
             # Without an attitude any will do: it does not turn.
