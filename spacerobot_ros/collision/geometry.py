@@ -188,7 +188,10 @@ class CollisionGeometry:
         if obstacles_alone:
             self.pairs = self.pairs[[self.solids[j].is_obstacle for _, j in self.pairs]]
             return
-        self._exclude_pairs(self._pairs_always_in_contact())
+        contact = self._pairs_always_in_contact()
+        for pair in np.flatnonzero(contact).tolist():
+            self.ignored_pairs.setdefault(self.links_of(pair), "always in contact")
+        self.pairs = self.pairs[~contact]
 
     @cached_property
     def distance_function(self) -> DistanceFunction:
@@ -364,11 +367,6 @@ class CollisionGeometry:
                     contact[pair] = False
                     break
         return contact
-
-    def _exclude_pairs(self, contact: npt.NDArray[np.bool_]) -> None:
-        for pair in np.flatnonzero(contact):
-            self.ignored_pairs.setdefault(self.links_of(int(pair)), "always in contact")
-        self.pairs = self.pairs[~contact]
 
     # -- motion -------------------------------------------------------------------------------
 

@@ -109,7 +109,7 @@ def test_a_schedule_has_ended_when_its_last_shape_is_reached_or_long_over() -> N
 def test_braking_takes_half_of_the_way_that_the_time_would_have_taken() -> None:
     """The time of the gait runs at the rate 1 - t/T: after t it is at t - t^2 / (2 T)."""
     follower = ScheduleFollower(schedule_of(), START_NS, 2.0)
-    braking = follower.braking_follower(START_NS + 4 * PERIOD_NS, 1.2)
+    braking = BrakingFollower(follower, START_NS + 4 * PERIOD_NS, 1.2)
     for ticks in (0.0, 3.0, 7.5, 12.0, 40.0):
         t = min(ticks * PERIOD, 1.2)
         way = 0.4 + t - t**2 / (2 * 1.2)
@@ -126,19 +126,19 @@ def test_braking_takes_half_of_the_way_that_the_time_would_have_taken() -> None:
 
 def test_braking_near_the_end_of_a_schedule_stays_on_it() -> None:
     follower = ScheduleFollower(schedule_of(), START_NS, 2.0)
-    braking = follower.braking_follower(START_NS + 19 * PERIOD_NS, 1.0)
+    braking = BrakingFollower(follower, START_NS + 19 * PERIOD_NS, 1.0)
     np.testing.assert_allclose(commanded(braking, 30, RAMP[20])[0], RAMP[20])
 
 
 def test_wheels_go_over_to_their_rates_after_the_schedule_while_the_others_brake() -> None:
     ends = np.array([0.0, 0.6, 0.0])
     schedule = replace(schedule_of(), end_velocities=ends)
-    braking = ScheduleFollower(schedule, START_NS, 2.0).braking_follower(
-        START_NS + 4 * PERIOD_NS, 1.2
+    braking = BrakingFollower(
+        ScheduleFollower(schedule, START_NS, 2.0), START_NS + 4 * PERIOD_NS, 1.2
     )
     places = np.array([commanded(braking, 4 + ticks, np.zeros(3))[0] for ticks in range(16)])
-    plain = ScheduleFollower(schedule_of(), START_NS, 2.0).braking_follower(
-        START_NS + 4 * PERIOD_NS, 1.2
+    plain = BrakingFollower(
+        ScheduleFollower(schedule_of(), START_NS, 2.0), START_NS + 4 * PERIOD_NS, 1.2
     )
     others = np.array([commanded(plain, 4 + ticks, np.zeros(3))[0] for ticks in range(16)])
     np.testing.assert_array_equal(places[:, [0, 2]], others[:, [0, 2]])
@@ -151,7 +151,7 @@ def test_wheels_go_over_to_their_rates_after_the_schedule_while_the_others_brake
 @pytest.mark.parametrize("since", [0, 3, 9, 40])
 def test_the_shapes_of_braking_are_those_that_will_be_commanded(since: int) -> None:
     follower = ScheduleFollower(schedule_of(), START_NS, 2.0)
-    braking = follower.braking_follower(START_NS + 4 * PERIOD_NS, 1.0)
+    braking = BrakingFollower(follower, START_NS + 4 * PERIOD_NS, 1.0)
     shapes = braking.shapes(START_NS + (4 + since) * PERIOD_NS)
     assert len(shapes) == max(1, 10 - since) + 1
     for k, shape in enumerate(shapes):
@@ -286,7 +286,7 @@ def test_a_plan_in_flight_begins_where_the_momenta_bring_the_base_meanwhile() ->
     worker = PlanningWorker(robot, PlannerConfig(tick_rate=1 / PERIOD), method)
     resting = np.zeros((40, 3))
     follower = ScheduleFollower(schedule_of(resting), START_NS, 1.0)
-    braking = follower.braking_follower(START_NS, 2.0).shapes(START_NS)
+    braking = BrakingFollower(follower, START_NS, 2.0).shapes(START_NS)
     inertia = robot.inertia_matrix(np.zeros(3))[3:6, 3:6]
     np.testing.assert_allclose(inertia, np.diag(np.diag(inertia)), atol=1e-12)
     p, L = np.array([0.3, -0.2, 0.1]), np.array([0.05, 0.0, 0.0])

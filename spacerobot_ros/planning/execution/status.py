@@ -6,7 +6,6 @@ import json
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field
 from enum import Enum
-from functools import lru_cache
 from typing import Any, NamedTuple
 
 from spacerobot_ros.errors import quantity
@@ -462,29 +461,18 @@ def describe_remaining_error(
     if body and hand:
         remaining += f", {hand} from {'theirs' if several else 'its goal'}"
     parts_left = () if goal is None else uncontrolled_parts(goal, controls)
-    return remaining + _describe_tolerance(tolerance, controls, len(error.shape) > 0, parts_left)
-
-
-@lru_cache  # Flights of a campaign ask for the same.
-def _describe_tolerance(
-    tolerance: Tolerance | None,
-    controls: frozenset[Controlled],
-    has_shape: bool,
-    parts_left: tuple[Controlled, ...],
-) -> str:
-    """Return the words in brackets of :func:`describe_remaining_error`; empty if there are none."""
     notes = []
     if tolerance is not None:
         hands = "end_effectors" in controls
         limits = (
             (quantity(tolerance.position, "m"), hands or "position" in controls),
             (quantity(tolerance.attitude, "rad"), hands or "attitude" in controls),
-            (quantity(tolerance.shape, "at the joints"), "shape" in controls and has_shape),
+            (quantity(tolerance.shape, "at the joints"), "shape" in controls and "shape" in parts),
         )
         notes.append("tolerance " + ", ".join(text for text, counts in limits if counts))
     if parts_left:
         notes.append(f"{' and '.join(parts_left)} not controlled")
-    return f" ({'; '.join(notes)})" if notes else ""
+    return remaining + (f" ({'; '.join(notes)})" if notes else "")
 
 
 def manoeuvre_time(statuses: Iterable[tuple[float, PlannerStatus]], end_s: float) -> float | None:

@@ -80,11 +80,11 @@ class ScheduleFollower:
         self, schedule: GaitSchedule, start_ns: int, shape_gain: float, deadband: float = 0.0
     ) -> None:
         self.schedule = schedule
-        self._start_ns = start_ns
+        self.start_ns = start_ns
         self._period_ns = round(schedule.control_period * SECOND)
         self._last_tick = schedule.ticks
         self._end_ns = start_ns + self._last_tick * self._period_ns
-        self._gain = min(shape_gain, 1.0 / schedule.control_period)
+        self.gain = min(shape_gain, 1.0 / schedule.control_period)
         self._positions = schedule.positions
         # The joints rest after the last tick, and wheels keep their rates. The part of the
         # feedback known beforehand is added here: qdot = qdot_k + gain (q_k - q), and q alone is
@@ -93,7 +93,7 @@ class ScheduleFollower:
         if schedule.end_velocities is not None:
             self._after = schedule.end_velocities
         velocities = np.vstack([schedule.velocities, self._after])
-        self._feedforward = velocities + self._gain * self._positions
+        self._feedforward = velocities + self.gain * self._positions
         self._velocities, self._deadband = velocities, deadband
 
     def has_ended(self, stamp_ns: int, q: Array) -> bool:
@@ -111,26 +111,22 @@ class ScheduleFollower:
 
     def covers(self, stamp_ns: int) -> bool:
         """Whether the schedule, or the settling after it, covers a time."""
-        return self._start_ns <= stamp_ns <= self._end_ns + _MAX_SETTLING_TIME * SECOND
+        return self.start_ns <= stamp_ns <= self._end_ns + _MAX_SETTLING_TIME * SECOND
 
     def take_over(self, stamp_ns: int, after: float) -> TakeOver | None:
         """Return the first tick at least ``after`` s from now; None after the last tick."""
-        now = max((stamp_ns - self._start_ns) // self._period_ns, 0)
+        now = max((stamp_ns - self.start_ns) // self._period_ns, 0)
         tick = now + max(1, math.ceil(after / self.schedule.control_period - 1e-9))
         if tick >= self._last_tick:
             return None
         positions = self._positions
         motion = InitialMotion(self.schedule.velocities[tick - 1], positions[tick:])
         shapes = positions[now : tick + 1].copy()
-        return TakeOver(self._start_ns + tick * self._period_ns, shapes, motion)
-
-    def braking_follower(self, stamp_ns: int, duration: float) -> BrakingFollower:
-        """Return a follower that brakes along this schedule to rest within ``duration`` s."""
-        return BrakingFollower(self.schedule, self._start_ns, stamp_ns, duration, self._gain)
+        return TakeOver(self.start_ns + tick * self._period_ns, shapes, motion)
 
     def command(self, stamp_ns: int, q: Array, position: Array, velocity: Array) -> None:
         """Write the wanted shape now (n,) and the velocities to hold from now (n,)."""
-        k = (stamp_ns - self._start_ns) // self._period_ns
+        k = (stamp_ns - self.start_ns) // self._period_ns
         k = 0 if k < 0 else min(k, self._last_tick)
         position[:] = self._positions[k]
         late = stamp_ns - self._end_ns
@@ -139,12 +135,12 @@ class ScheduleFollower:
         if self._deadband:
             error = position - q
             error -= np.clip(error, -self._deadband, self._deadband)
-            velocity[:] = self._velocities[k] + self._gain * error
+            velocity[:] = self._velocities[k] + self.gain * error
             return
-        np.multiply(q, -self._gain, out=velocity)
+        np.multiply(q, -self.gain, out=velocity)
         velocity += self._feedforward[k]
         if late > 0:
-            velocity += self._gain * (late / SECOND) * self._after
+            velocity += self.gain * (late / SECOND) * self._after
 
 
 class BrakingFollower:
@@ -156,30 +152,18 @@ class BrakingFollower:
 
     Parameters
     ----------
-    schedule
-        The schedule that was followed.
-    start_ns
-        Stamp of its first tick, ns.
+    follower
+        Of the schedule until then.
     stamp_ns
         When the braking begins, ns.
     duration
         T, s; the gait continues for half of it.
-    shape_gain
-        Feedback gain from shape error to velocity, 1/s.
     """
 
-    def __init__(
-        self,
-        schedule: GaitSchedule,
-        start_ns: int,
-        stamp_ns: int,
-        duration: float,
-        shape_gain: float,
-    ) -> None:
-        self.schedule = schedule
-        self._begin_s = (stamp_ns - start_ns) / SECOND
+    def __init__(self, follower: ScheduleFollower, stamp_ns: int, duration: float) -> None:
+        self.schedule, self._gain = follower.schedule, follower.gain
+        self._begin_s = (stamp_ns - follower.start_ns) / SECOND
         self._stamp_ns, self._duration = stamp_ns, duration
-        self._gain = min(shape_gain, 1.0 / schedule.control_period)
 
     def covers(self, stamp_ns: int) -> bool:
         """Whether the braking covers a time."""
@@ -325,7 +309,7 @@ class TrajectoryTracker:
 
     def _begin_braking(self, stamp_ns: int) -> BrakingFollower | None:
         if isinstance(self._follower, ScheduleFollower):
-            return self._follower.braking_follower(stamp_ns, self._config.abort_time)
+            return BrakingFollower(self._follower, stamp_ns, self._config.abort_time)
         return self._follower
 
     def take_over(self, stamp_ns: int, q: Array, after: float) -> TakeOver | None:
