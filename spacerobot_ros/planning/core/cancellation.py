@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable
 from threading import Thread
 from time import perf_counter
-from typing import Generic, NoReturn, TypeVar
+from typing import Generic, TypeVar
 
 from spacerobot_ros.errors import PlanningError
 
@@ -45,16 +45,8 @@ class Cancellation:
             raise PlanningCancelled("Planning was cancelled.")
 
 
-class _Never(Cancellation):
-    """A cancellation for plans that run to their end."""
-
-    def cancel(self) -> NoReturn:
-        """Raise an error: all plans without their own cancellation share this one."""
-        raise RuntimeError("NEVER cannot be cancelled: all plans that run to their end share it.")
-
-
-NEVER: Cancellation = _Never()
-"""The cancellation for plans that run to their end."""
+NEVER = Cancellation()
+"""The cancellation of plans that run to their end; nobody requests it."""
 
 
 _Plan = TypeVar("_Plan")

@@ -28,7 +28,6 @@ from spacerobot_ros.model.rotations import (
 )
 from spacerobot_ros.planning.core.goal import (
     Controlled,
-    EndEffectorGoal,
     Goal,
     PoseError,
     RobotState,
@@ -170,35 +169,28 @@ class PathCheck:
         Plans are made with the masses of the URDF. So the goal is shifted by the error that is
         expected from the estimated masses, as far as it exceeds a share of the tolerance.
         """
-        position, quaternion = self.end
         last = self._positions[-1]
         error = PoseError.between(*self.expected_end, goal, last, self._robot)
         near = Tolerance(*(_NEAR_SHARES[late] * x for x in (within.position, within.attitude)))
         if near.admits(error, controls):
             return None
-        moved = error.position * _excess_share(error.distance, _AIM_SHARES[late] * within.position)
-        turn = error.rotvec * _excess_share(error.angle, _AIM_SHARES[late] * within.attitude)
-        aimed = quaternion_multiply(quaternion, quaternion_from_rotvec(turn))
-        hands = tuple(
-            self._aimed_end_effector(each, missing, within, late=late)
-            for each, missing in zip(goal.end_effectors, error.end_effectors, strict=True)
-        )
-        return replace(goal, position=position + moved, quaternion=aimed, end_effectors=hands)
+        allowed = Tolerance(*(_AIM_SHARES[late] * x for x in (within.position, within.attitude)))
+        position, quaternion = _aim(self.end, error, allowed)
+        hands = []
+        for each, missing in zip(goal.end_effectors, error.end_effectors, strict=True):
+            end = end_effector_pose(self._robot, each.link, *self.end, last)
+            r, turned = _aim(end, missing, allowed)
+            attitude = None if each.quaternion is None else turned
+            hands.append(replace(each, position=r, quaternion=attitude))
+        return replace(goal, position=position, quaternion=quaternion, end_effectors=tuple(hands))
 
-    def _aimed_end_effector(
-        self, goal: EndEffectorGoal, error: PoseError, within: Tolerance, *, late: bool
-    ) -> EndEffectorGoal:
-        position, quaternion = end_effector_pose(
-            self._robot, goal.link, *self.end, self._positions[-1]
-        )
-        position = position + error.position * _excess_share(
-            error.distance, _AIM_SHARES[late] * within.position
-        )
-        if goal.quaternion is None:
-            return replace(goal, position=position)
-        turn = error.rotvec * _excess_share(error.angle, _AIM_SHARES[late] * within.attitude)
-        aimed = quaternion_multiply(quaternion, quaternion_from_rotvec(turn))
-        return replace(goal, position=position, quaternion=aimed)
+
+def _aim(end: tuple[Array, Array], error: PoseError, allowed: Tolerance) -> tuple[Array, Array]:
+    """Return the pose to aim at from an end (3,), (4,), as far as its error exceeds the allowed."""
+    position, quaternion = end
+    moved = error.position * _excess_share(error.distance, allowed.position)
+    turn = error.rotvec * _excess_share(error.angle, allowed.attitude)
+    return position + moved, quaternion_multiply(quaternion, quaternion_from_rotvec(turn))
 
 
 def _excess_share(error: float, allowed: float) -> float:
