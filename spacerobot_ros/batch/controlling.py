@@ -11,6 +11,7 @@ import numpy as np
 from spacerobot_ros.batch.flights import ControlledGoals, Flights
 from spacerobot_ros.control.controller import CoordinatedController, build_controller
 from spacerobot_ros.control.goal_monitor import Decision, GoalMonitor
+from spacerobot_ros.control.goals import require_controlled_axes
 from spacerobot_ros.control.laws.law import Gains
 from spacerobot_ros.control.reference import (
     OutputErrors,
@@ -90,7 +91,7 @@ class BatchController:
         controller.set_gains(self._gains(row))
         joints = None if program.joints is None else _select_row(program.joints, row)
         base, hand = _pose_goal(program.base, row), _pose_goal(program.end_effector, row)
-        controller.require_controlled_axes(state, self._config, base=base, end_effector=hand)
+        require_controlled_axes(controller.law, state, self._config, Reference(base, hand))
         controller.set_goals(0.0, state, base=base, end_effector=hand, joints=joints)
         profile = controller.profile
         assert profile is not None

@@ -21,7 +21,8 @@ from spacerobot_ros.commanding.plant_state import Pairing, Stamped
 from spacerobot_ros.control import ControlState, NotFiniteError, PoseReference, Reference
 from spacerobot_ros.control.config import ControllerConfig
 from spacerobot_ros.control.controller import CoordinatedController, build_controller
-from spacerobot_ros.control.executive import GOAL_KEYS, ControlExecutive
+from spacerobot_ros.control.executive import ControlExecutive
+from spacerobot_ros.control.goals import GOAL_KEYS
 from spacerobot_ros.control.planned_reference import PlannedReference
 from spacerobot_ros.control.reference import HeldVelocityReference, ReferenceProfile
 from spacerobot_ros.control.servicing import Task

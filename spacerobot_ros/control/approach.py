@@ -173,15 +173,12 @@ class ArmReach:
         """Pose of the base in W."""
         self._arm = FixedBaseArm(robot, link, self.base, axes)
         self._joint_names, self._rates = robot.joint_names, rates
-        self._q = state.q.copy()
+        self.q = state.q.copy()
+        """Present shape (n,)."""
 
     def distance_to(self, motion: FrameMotion, k: int) -> float:
         """Return the smallest distance (m or rad) of the arm from the k-th pose of a motion."""
-        return self._arm.nearest_shape(self._q, Pose(motion.R[k], motion.r[k]))[1]
-
-    def present_shapes(self, count: int) -> Array:
-        """Return the present shape, repeated ``count`` times (count, n)."""
-        return np.tile(self._q, (count, 1))
+        return self._arm.nearest_shape(self.q, Pose(motion.R[k], motion.r[k]))[1]
 
     def shapes_along(self, motion: FrameMotion, period: float) -> tuple[Array, str]:
         """Return the shapes (K, n) of the arm along a motion, from its present shape, and the
@@ -189,7 +186,7 @@ class ArmReach:
 
         ``period`` is the time between two poses of the motion, s.
         """
-        q, shapes = self._q, np.empty((len(motion.r), len(self._q)))
+        q, shapes = self.q, np.empty((len(motion.r), len(self.q)))
         for k in range(len(motion.r)):
             before = q
             q, distance = self._arm.nearest_shape(q, Pose(motion.R[k], motion.r[k]))
@@ -271,15 +268,15 @@ def plan_approach(
                 motion = grapple.between_samples(first, last, every).with_relative_motion(
                     plan.relative(times)
                 )
-                excess, sentence = _largest_limit_share(motion, limits, axes)
-                if excess > 1.0:
+                share = _largest_limit_share(motion, limits, axes)
+                if share[0] > 1.0:
                     break
-            failure.note(excess, sentence)
-            if excess > 1.0:
+            failure.limit = min(failure.limit, share)
+            if share[0] > 1.0:
                 continue
             distance = reach.distance_to(motion, -1)
             if distance > REACHED_DISTANCE:
-                failure.out_of_reach(distance, plan.contact)
+                failure.nearest = min(failure.nearest, (distance, plan.contact))
                 if way:
                     continue
                 break  # A longer path meets the target later, which other start times do, too.
@@ -291,21 +288,18 @@ def plan_approach(
                 if clearance is None or why:
                     continue
                 ticks = np.r_[0:first:every, first:last:every]
-                shapes = np.concatenate([reach.present_shapes(len(ticks) - len(shapes)), shapes])
+                waiting = np.tile(reach.q, (len(ticks) - len(shapes), 1))
+                shapes = np.concatenate([waiting, shapes])
                 # A hand that is planned for in motion may be beside the target already.
                 closes = 0 if moving else int(np.sum(ticks * _SAMPLE_PERIOD < plan.closing_time))
                 near = clearance.nearest(reach.base, shapes, grapple.rows(ticks), closes)
                 if near is not None and near.distance < clearance.min_distance:
                     break
-            if (
-                clearance is not None
-                and near is not None
-                and near.distance < clearance.min_distance
-            ):
+            if clearance and near and near.distance < clearance.min_distance:
                 in_the_way = True
                 failure.blocked(near, clearance.min_distance, plan.contact)
             elif why:
-                failure.arm_cannot_follow(why, plan.contact)
+                failure.unreachable = why, plan.contact
             else:
                 return plan if near is None else replace(plan, distance=near.distance)
             if failure.blocks == _MAX_BLOCKED_PATHS:
@@ -351,54 +345,47 @@ def _largest_limit_share(
 
 
 class _RefusalReasons:
-    """The reasons why start times were not taken, and the best of each kind."""
+    """The best refused approach of each kind."""
 
     def __init__(self) -> None:
-        self._excess, self._limit = np.inf, ""
-        self._distance, self._nearest_at = np.inf, 0.0
-        self._why, self._tried_at = "", 0.0
+        self.limit = math.inf, ""
+        """Share of a limit, and the clause about it."""
+        self.nearest = math.inf, 0.0
+        """Distance of the arm from the grapple frame at contact, and the time of contact, s."""
+        self.unreachable = "", 0.0
+        """Why the arm could not follow the last path, and its time of contact, s."""
+        self.beside = -math.inf, 0.0, ""
+        """Distance from the target body, m, the time of contact, s, and the clause about them."""
         self.blocks = 0
         """Number of paths that come too close to the target body."""
-        self._beside = -np.inf, "", 0.0
-        """Distance of the best such path, m, the clause about it, and its time of contact, s."""
-
-    def note(self, excess: float, limit: str) -> None:
-        if excess < self._excess:
-            self._excess, self._limit = excess, limit
-
-    def out_of_reach(self, distance: float, contact: float) -> None:
-        if distance < self._distance:
-            self._distance, self._nearest_at = distance, contact
-
-    def arm_cannot_follow(self, why: str, contact: float) -> None:
-        self._why, self._tried_at = why, contact
 
     def blocked(self, nearest: NearestLinks, least: float, contact: float) -> None:
         self.blocks += 1
-        if nearest.distance < self._beside[0]:
-            return
         first, second = nearest.links
         near = f"come within {nearest.distance:.3g} m of"
         limit = f", and 'target.clearance' is {least:g} m"
         if nearest.distance <= 0.0:
             near, limit = "touch", ""
         why = f"link '{first}' would {near} '{second}' of the target{limit}"
-        self._beside = nearest.distance, why, contact
+        self.beside = max(self.beside, (nearest.distance, contact, why))
 
     def message(self, horizon: float) -> str:
-        if self._excess > 1.0:
+        excess, limit = self.limit
+        if excess > 1.0:
             return (
                 "The target moves too fast to be met: the end-effector's reference would need "
-                f"{self._limit}."
+                f"{limit}."
             )
         within = f"within the next {horizon:g} s"
-        why, contact = (self._beside[1:]) if self.blocks else (self._why, self._tried_at)
+        (distance, contact), (why, tried_at) = self.nearest, self.unreachable
+        if self.blocks:
+            _, tried_at, why = self.beside
         if why:
-            return f"The target cannot be met {within}: with contact at {contact:.4g} s, {why}."
+            return f"The target cannot be met {within}: with contact at {tried_at:.4g} s, {why}."
         return (
-            f"The target is out of reach {within}: at best, with contact at "
-            f"{self._nearest_at:.4g} s, the end-effector stays {self._distance:.3g} m or rad away "
-            "from its grapple frame while the base holds its place."
+            f"The target is out of reach {within}: at best, with contact at {contact:.4g} s, the "
+            f"end-effector stays {distance:.3g} m or rad away from its grapple frame while the "
+            "base holds its place."
         )
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from enum import Enum
@@ -11,7 +11,6 @@ from enum import Enum
 import casadi as ca
 import numpy as np
 
-from spacerobot_ros.control.approach import ArmReach
 from spacerobot_ros.control.config import ControllerConfig
 from spacerobot_ros.control.detumbling import Detumbling
 from spacerobot_ros.control.laws.computed_torque import ComputedTorqueLaw
@@ -55,9 +54,7 @@ from spacerobot_ros.errors import (
 from spacerobot_ros.files import warn_once
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.grasp import Payload
-from spacerobot_ros.model.inverse_kinematics import AXES
 from spacerobot_ros.model.rotations import (
-    attitude_error,
     compose_poses,
     matrix_from_quaternion,
     relative_pose,
@@ -65,10 +62,6 @@ from spacerobot_ros.model.rotations import (
 from spacerobot_ros.model.space_robot import SpaceRobot
 from spacerobot_ros.planning.core.cancellation import Cancellation, PlanningJob
 from spacerobot_ros.planning.methods.thrust.goals import Grapple
-
-_FREE_AXIS_MARGIN = 5.0
-"""Number of tolerances by which a goal may differ from the pose in an uncontrolled axis: noise
-moves a measured pose out of the plane of a planar robot."""
 
 _LONGEST_MOTION = 1e9
 """Longest duration of a reference, s, as of the longest flights."""
@@ -87,10 +80,6 @@ class Mode(str, Enum):
     MEASURED = "measured"
     ESTIMATED = "estimated"
     STOPPED = "stopped"
-
-
-_MEASURED = Mode.MEASURED
-"""Looked up faster than the enum member, at every state."""
 
 
 class CoordinatedController:
@@ -190,10 +179,8 @@ class CoordinatedController:
         carries it and the arm keeps its shape. The integral of the errors is reset. The reference
         follows the profile; it is not planned.
         """
-        start, goal, _, carries = self.motion_to(
-            time, state, base=base, end_effector=end_effector, joints=joints
-        )
-        self._begin_motion(time, state, start, goal, carries=carries)
+        motion = self.motion_to(time, state, base=base, end_effector=end_effector, joints=joints)
+        self._begin_motion(time, state, motion)
 
     def motion_to(
         self,
@@ -207,7 +194,7 @@ class CoordinatedController:
         """Return the motion from the reference at a time to the goals of :meth:`set_goals`."""
         if self.coming_to_rest:
             self.profile, self.coming_to_rest = None, False
-        start = self._present_reference(time, state)
+        start = self.reference_at(time, state)
         goal = start if self.profile is None else self.profile.goal
         carries = end_effector is None and (self.profile is None or self.profile.carries)
         if base is not None:
@@ -230,7 +217,7 @@ class CoordinatedController:
         assert planner is not None
         if self.coming_to_rest:
             self.profile, self.coming_to_rest = None, False
-        start, limits = self._present_reference(time + lead, state), self._motion
+        start, limits = self.reference_at(time + lead, state), self._motion
         later = replace(grapple, motion=grapple.motion.later(lead))
 
         def work(cancellation: Cancellation) -> GrappleReference:
@@ -238,60 +225,13 @@ class CoordinatedController:
 
         return PlanningJob(work, time + lead)
 
-    def begin_planned(self, time: float, profile: PlannedReference) -> None:
-        """Follow a planned reference from a time on."""
+    def begin(self, time: float, profile: ReferenceProfile) -> None:
+        """Follow a profile from a time on."""
         self.profile, self._began = profile, time
         with self._failures_of_law(time):
             self.law.start(time, profile.start, profile.goal)
 
-    def require_controlled_axes(
-        self,
-        state: ControlState,
-        config: ControllerConfig,
-        *,
-        base: PoseReference | None = None,
-        end_effector: PoseReference | None = None,
-    ) -> None:
-        """Refuse goals that differ from the present pose in an axis that the law does not control.
-
-        The law of a planar robot controls only the axes of its plane. A position or an attitude
-        without any controlled axis is not checked: that part is not controlled at all.
-
-        Raises
-        ------
-        PlanningError
-            A goal is several tolerances away from the pose; the message names the axes.
-        """
-        selection, labels = self.law.outputs.selection, ", ".join(self.law.outputs.labels)
-        here = Reference.present(self.law.robot, state, selection.end_effector_link)
-        for name, goal in (("base", base), ("end_effector", end_effector)):
-            start, controlled = getattr(here, name), getattr(selection, name)
-            if goal is None or start is None:
-                continue
-            way = goal.position - start.position
-            turn_B = attitude_error(start.quaternion, goal.quaternion)
-            turn = matrix_from_quaternion(start.quaternion) @ turn_B
-            for part, unit, axes, error, tolerance in (
-                ("position", "m", AXES[:3], way, config.position_tolerance),
-                ("attitude", "rad", AXES[3:], turn, config.attitude_tolerance),
-            ):
-                left = [i for i in range(3) if axes[i] not in controlled]
-                off = float(np.linalg.norm(error[left]))
-                if 0 < len(left) < 3 and off > _FREE_AXIS_MARGIN * tolerance:
-                    raise PlanningError(
-                        f"The goal {part} of the {name.replace('_', '-')} is {off:.4g} {unit} from "
-                        f"the present one in {' and '.join(axes[i] for i in left)} of the world, "
-                        f"which the law '{self.law.name}' does not control; its outputs are "
-                        f"{labels}."
-                    )
-
-    def require_bounded_duration(
-        self,
-        state: ControlState,
-        *,
-        base: PoseReference | None = None,
-        end_effector: PoseReference | None = None,
-    ) -> None:
+    def require_bounded_duration(self, state: ControlState, goals: Reference) -> None:
         """Refuse goals whose reference would take longer than any flight.
 
         Raises
@@ -303,7 +243,7 @@ class CoordinatedController:
             self.law.robot, state, self.law.outputs.selection.end_effector_link
         )
         motion = self._motion_within_limits(state)
-        duration = self._profile_type(here, Reference(base, end_effector), motion).duration
+        duration = self._profile_type(here, goals, motion).duration
         if duration > _LONGEST_MOTION:
             raise PlanningError(
                 f"The reference to the goal would take {duration:.3g} s, and the longest is "
@@ -315,14 +255,10 @@ class CoordinatedController:
         motion = self._motion.within_thruster_limits(self._limits, self.law.robot, state.q)
         return motion if self.wheels is None else self.wheels.limits_with_wheels(motion, state.q)
 
-    def _begin_motion(
-        self, time: float, state: ControlState, start: Reference, goal: Reference, *, carries: bool
-    ) -> None:
-        motion = self._motion_within_limits(state)
-        self.profile = self._profile_type(start, goal, motion, carries=carries)
-        self._began = time
-        with self._failures_of_law(time):
-            self.law.start(time, start, goal)
+    def _begin_motion(self, time: float, state: ControlState, motion: GoalMotion) -> None:
+        start, goal, _, carries = motion
+        limits = self._motion_within_limits(state)
+        self.begin(time, self._profile_type(start, goal, limits, carries=carries))
 
     @contextmanager
     def _failures_of_law(self, time: float) -> Iterator[None]:
@@ -360,9 +296,9 @@ class CoordinatedController:
     def restart_motion(self, time: float, state: ControlState) -> None:
         """Restart towards the present goals from the measured pose instead of the reference."""
         profile, self.profile, self.coming_to_rest = self.profile, None, False
-        start = self._present_reference(time, state)
+        start = self.reference_at(time, state)
         goal, carries = (start, True) if profile is None else (profile.goal, profile.carries)
-        self._begin_motion(time, state, start, goal, carries=carries)
+        self._begin_motion(time, state, GoalMotion(start, goal, self._motion, carries))
 
     def hold_here(self, time: float, state: ControlState) -> None:
         """Hold the measured pose and shape; the earlier reference is dropped."""
@@ -390,16 +326,12 @@ class CoordinatedController:
         force, period = self._limits.force, self._control_period
         return Detumbling(self.law.robot, payload, force, torque, torque_limit, period)
 
-    def arm_reach(self, state: ControlState) -> ArmReach:
-        """Return the reach of the end-effector from a state."""
-        selection = self.law.outputs.selection
-        rates = self.joint_rate_limits.rates
-        axes, link = selection.end_effector, selection.end_effector_link
-        return ArmReach(self.law.robot, link, axes, state, rates)
-
     def reference_at(self, time: float, state: ControlState) -> Reference:
         """Return the reference at a time; before the first one, the pose of the robot at rest."""
-        return self._present_reference(time, state)
+        if self.profile is not None:
+            return self.profile.at(time - self._began)
+        link = self.law.outputs.selection.end_effector_link
+        return Reference.present(self.law.robot, state, link)
 
     def shift_time(self, seconds: float) -> None:
         """Shift the start of the reference by a jump of time (s)."""
@@ -438,15 +370,12 @@ class CoordinatedController:
             commanded = self._braking_command(q, qdot)
         else:
             if self.profile is None:
-                here = self._present_reference(time, state)
-                self.profile = StepReference(here, here, self._motion, carries=True)
-                self._began = time
-                with self._failures_of_law(time):
-                    self.law.start(time, here, here)
+                here = self.reference_at(time, state)
+                self.begin(time, StepReference(here, here, self._motion, carries=True))
             # The law is always evaluated, for its errors and status.
             self.law.time = time
             with self._failures_of_law(time):
-                commanded = self.law.command(state, self._reference_at(time))
+                commanded = self.law.command(state, self._followed_reference(time))
             if not self.gains_checked:
                 self.gains_checked = True
                 if warning := self.law.sampling_warning():
@@ -474,25 +403,18 @@ class CoordinatedController:
         self, state: ControlState, commanded: Actuation, periods: int = 1
     ) -> Saturated:
         """Return the realised part of a command that is held for some control periods."""
-        if self.wheels is not None:
-            return self._apply_with_wheels(self.wheels, state, commanded, periods)
-        result = self._limits.apply(commanded)
-        kept = self.joint_rate_limits.apply(state, result.realised, self._limits.effort, periods)
-        return result if kept is result.realised else Saturated.of(commanded, kept)
-
-    def _apply_with_wheels(
-        self, wheels: WheelControl, state: ControlState, commanded: Actuation, periods: int
-    ) -> Saturated:
-        """Return the realised part of a command on the gyrostat, by wheels first."""
-        given = self._realised_with_wheels(wheels, commanded)
+        given = self._realised(commanded)
         kept = self.joint_rate_limits.apply(state, given, self._limits.effort, periods)
-        if kept is not given:
+        if self.wheels is not None and kept is not given:
             # Joints that are too fast have the wrench lowered.
-            kept = self._realised_with_wheels(wheels, kept)
+            kept = self._realised(kept)
         return Saturated.of(commanded, kept)
 
-    def _realised_with_wheels(self, wheels: WheelControl, wanted: Actuation) -> Actuation:
-        """Return what wheels and then thrusters and joints give of a command."""
+    def _realised(self, wanted: Actuation) -> Actuation:
+        """Return what wheels, if there are any, and then thrusters and joints give of a command."""
+        wheels = self.wheels
+        if wheels is None:
+            return self._limits.apply(wanted).realised
         torque = wheels.command_torque(wanted.wrench_B[3:])
         rest = wanted.wrench_B.copy()
         rest[3:] -= torque
@@ -545,26 +467,14 @@ class CoordinatedController:
             worst[kind] = max(worst[kind], math.hypot(*[error[i] for i in places]))
         return OutputErrors(**worst)
 
-    def largest_error_share(self, bounds: Array) -> float:
-        """Return the largest error of the last command as a share of its bound (m,), > 0."""
-        return self.law.largest_error_share(bounds)
-
     def distance_from_reference(self) -> OutputDistance:
         """Return the distance of the last command's outputs from the reference."""
         return self.law.outputs.selection.distance(self.law.error)
-
-    def distance_to_goal(self) -> OutputDistance:
-        """Return the distance of the last command's outputs from the end of the reference."""
-        return self.distance_between(self.law.state, self.goal)
 
     def distance_between(self, state: ControlState, goal: Reference) -> OutputDistance:
         """Return the distance of the outputs in a state from a goal for all outputs."""
         outputs = self.law.outputs
         return outputs.selection.distance(outputs.errors(state, goal))
-
-    def labelled_errors(self) -> Mapping[str, float]:
-        """Return the error of each output by its label."""
-        return dict(zip(self.law.outputs.labels, self.law.error.tolist(), strict=True))
 
     def error_bounds(self, margins: OutputErrors) -> Array:
         """Return the errors (m,) of the outputs beyond which control is lost.
@@ -595,14 +505,7 @@ class CoordinatedController:
         periods = (time - before) / self._control_period
         return round(periods) if 1.0 < periods < _MAX_HELD_PERIODS else 1
 
-    def _present_reference(self, time: float, state: ControlState) -> Reference:
-        """Return the present reference; before the first one, the pose of the robot."""
-        if self.profile is not None:
-            return self.profile.at(time - self._began)
-        link = self.law.outputs.selection.end_effector_link
-        return Reference.present(self.law.robot, state, link)
-
-    def _reference_at(self, time: float) -> Reference:
+    def _followed_reference(self, time: float) -> Reference:
         assert self.profile is not None
         own, given = self.profile.at(time - self._began), self._followed
         if given.base is None and given.joints is None and given.end_effector is None:
@@ -621,7 +524,7 @@ class CoordinatedController:
         if measured is not None:
             if self._estimator is not None:
                 self._estimator.reset(measured)
-            self.mode, self._brake = _MEASURED, None
+            self.mode, self._brake = Mode.MEASURED, None
             return measured
         if self._sent is None or self.mode is Mode.STOPPED:
             self.mode = Mode.STOPPED

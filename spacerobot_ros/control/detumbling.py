@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import casadi as ca
 import numpy as np
 
-from spacerobot_ros.control.limits import decay_rate
+from spacerobot_ros.control.limits import decay_rate, limit_norm
 from spacerobot_ros.control.state import Actuation, ControlState
 from spacerobot_ros.model.compilation import BufferedFunction, dense_function
 from spacerobot_ros.model.description import Array
@@ -72,33 +72,12 @@ def largest_feasible_share(start: Array, change: Array, limit: float) -> float:
     return min(highest, 1.0)
 
 
-@dataclass(frozen=True)
-class GraspWrenchModel:
-    """The wrench of a grasp on the body that it holds."""
-
-    payload: Payload
-    function: BufferedFunction
-
-    @classmethod
-    def of(cls, robot: SpaceRobot, payload: Payload) -> GraspWrenchModel:
-        """Return the wrench model of a robot's grasp; the robot's model includes the body."""
-        return cls(payload, BufferedFunction(_grasp_wrench(robot, payload)))
-
-    def wrench(self, state: ControlState, z: Array, zdot: Array) -> Array:
-        """Return force over torque (6,) at the end-effector, base components.
-
-        Parameters
-        ----------
-        state
-            The state.
-        z, zdot
-            Velocities ``[v_cm; omega; qdot]`` (6 + n,), base components, and their rates.
-        """
-        return self.function(state.q, z, zdot)[0]
-
-
 def _grasp_wrench(robot: SpaceRobot, payload: Payload) -> ca.Function:
-    """Return ``(q, z, zdot) -> wrench``, by Newton and Euler."""
+    """Return ``(q, z, zdot) -> wrench`` of a grasp on its body, by Newton and Euler.
+
+    The wrench is force over torque (6,) at the end-effector, ``z`` are the velocities
+    ``[v_cm; omega; qdot]`` (6 + n,), all in base components. The robot's model includes the body.
+    """
     N = 6 + robot.n
     q, z, zdot = ca.SX.sym("q", robot.n), ca.SX.sym("z", N), ca.SX.sym("zdot", N)
     J = robot.function(f"jacobian:{payload.link}", compile=False)(q)
@@ -152,7 +131,7 @@ class Detumbling:
         self._robot, self._rate = robot, decay_rate(control_period)
         self._force, self.torque = force, torque
         self._limit = torque_limit or math.inf
-        self._grasp = None if payload is None else GraspWrenchModel.of(robot, payload)
+        self._grasp = None if payload is None else BufferedFunction(_grasp_wrench(robot, payload))
         self.largest_grasp_torque = 0.0
         """Largest torque of the grasp due to a command, N m."""
 
@@ -175,8 +154,8 @@ class Detumbling:
         C = robot.bias(state.q, v_cm, state.omega_WB_B, state.qdot)
         # A force at the base turns the robot about its centre of mass, too.
         to_cm = J[:3, 3:6].T
-        n = _limit_norm(-r * self.angular_momentum(state), self.torque)
-        f = _limit_norm(-r * robot.total_mass * v_cm, self._force)
+        n = limit_norm(-r * self.angular_momentum(state), self.torque)
+        f = limit_norm(-r * robot.total_mass * v_cm, self._force)
         f = f * largest_feasible_share(n, -(to_cm @ f), self.torque) if f.any() else f
         wanted = np.concatenate([f, n, -r * state.qdot])
 
@@ -188,8 +167,8 @@ class Detumbling:
 
         share = 1.0
         if self._grasp is not None:
-            free = self._grasp.wrench(state, z, accelerations(0.0))[3:].copy()
-            change = self._grasp.wrench(state, z, accelerations(1.0))[3:] - free
+            free = self._grasp(state.q, z, accelerations(0.0))[0][3:].copy()
+            change = self._grasp(state.q, z, accelerations(1.0))[0][3:] - free
             share = (
                 largest_feasible_share(free, change, self._limit) if self._limit < math.inf else 1.0
             )
@@ -200,8 +179,3 @@ class Detumbling:
         torque = share * n - to_cm @ force
         tau = H[6:] @ zdot + C[6:] - J[:3, 6:].T @ force
         return Actuation(np.concatenate([force, torque]), tau)
-
-
-def _limit_norm(vector: Array, limit: float) -> Array:
-    size = float(np.linalg.norm(vector))
-    return vector if size <= limit else vector * (limit / size)

@@ -4,42 +4,35 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from enum import IntEnum
-from types import MappingProxyType
-
-import numpy as np
 
 from spacerobot_ros.control.config import ControllerConfig
 from spacerobot_ros.control.controller import CoordinatedController, Mode
-from spacerobot_ros.control.goal_monitor import Decision, GoalMonitor
-from spacerobot_ros.control.goal_planning import Aims, GoalPlanning, PlannedGoals
+from spacerobot_ros.control.goal_planning import GoalPlanning, PlannedGoals
+from spacerobot_ros.control.goals import (
+    END_EFFECTOR,
+    GOAL_KEYS,
+    GoalWatch,
+    aims_of,
+    config_with,
+    goal_parts,
+    goals_to_save,
+    require_controlled_axes,
+)
 from spacerobot_ros.control.limits import Saturated
-from spacerobot_ros.control.outputs import OutputDistance
 from spacerobot_ros.control.planned_reference import PLANNING_TIME, PlannedReference
 from spacerobot_ros.control.servicing import Servicing, Task, TaskProgress, TaskState
-from spacerobot_ros.control.stall_monitor import StallMonitor
 from spacerobot_ros.control.state import Actuation, ControlState, PoseReference, Reference
 from spacerobot_ros.control.status import CommandReport, ControllerState, ControllerStatus
 from spacerobot_ros.errors import CommandError, ParameterError, PlanningError
 from spacerobot_ros.events import Event, EventKind
 from spacerobot_ros.model.description import Array, RobotDescription
 from spacerobot_ros.model.grasp import Payload
-from spacerobot_ros.model.rotations import (
-    attitude_error,
-    matrix_from_quaternion,
-    quaternion_from_matrix,
-)
 from spacerobot_ros.planning.core.goal import (
-    POSE,
     Controlled,
-    Goal,
-    PoseError,
     Tolerance,
-    missed_parts,
-    missed_turn,
-    reached_message,
 )
 from spacerobot_ros.planning.execution.goal_file import (
     BASE_GOAL_KEY,
@@ -47,13 +40,6 @@ from spacerobot_ros.planning.execution.goal_file import (
     PursuedGoals,
 )
 from spacerobot_ros.times import SECOND
-
-END_EFFECTOR = "end_effector"
-"""Key of the goal of the end-effector in files of goals."""
-
-GOAL_KEYS = (BASE_GOAL_KEY, END_EFFECTOR)
-"""Keys of goals: the frames of the robot that have goal poses."""
-
 
 Output = ControllerStatus | Event | PursuedGoals
 """Output of an executive, apart from its commands."""
@@ -69,10 +55,6 @@ class _Next(IntEnum):
     """The robot holds the measured pose, without a goal."""
     ABORT = 3
     """Like ``HOLD``, and the abort is reported."""
-
-
-# Names of the module are found faster than members of an enum: they are needed for every state.
-_MEASURED, _TRACKING, _NO_DECISION = Mode.MEASURED, ControllerState.TRACKING, Decision.NONE
 
 
 class ControlExecutive:
@@ -96,13 +78,6 @@ class ControlExecutive:
     While the base is not measured, the reported state is ``ESTIMATING`` or ``STOPPED`` instead, and
     the state of the goal stays as it is. ``REFUSED`` is reported for a single goal and is not a
     state.
-
-    Parameters
-    ----------
-    controller
-        The controller.
-    config
-        Tolerances, times and gains; :meth:`configure` changes them.
     """
 
     def __init__(self, controller: CoordinatedController, config: ControllerConfig) -> None:
@@ -116,7 +91,6 @@ class ControlExecutive:
         the state changes, when commands begin or cease to be limited, and every ``status_period``.
         """
         self.servicing = Servicing(config)
-        """The tasks before goals, with the target; the owner sets the body that is held."""
         self._planning = GoalPlanning(in_background=config.plan_in_background)
         self.reset()
 
@@ -138,28 +112,19 @@ class ControlExecutive:
         """Goals that are pursued together, by part of the robot."""
         self._goal_id = ""
         """Id of the latest goal, which statuses carry."""
-        self._asked: frozenset[Controlled] = frozenset()
-        self._asked_of_hand: frozenset[Controlled] = frozenset()
-        """Parts of the base pose, and of the end-effector pose, that the present goals request."""
-        self._monitor, self._stall = GoalMonitor(), StallMonitor()
+        self._asked: dict[str, frozenset[Controlled]] = dict.fromkeys(GOAL_KEYS, frozenset())
+        """Parts of the poses of base and end-effector that the present goals request."""
+        self._watch = GoalWatch()
         self._was_measured = False
         self.servicing.end()
-        self._resumes = True
-        """Whether the present goal is saved in the file of goals."""
         self._after_tasks: dict[str, IdentifiedGoal] = {}
         self._requested: tuple[Task, ...] | None = None
         """Tasks that were requested without a goal, and wait for the next measured state."""
-        self._error_bounds: Array | None = None
-        """Errors (m,) of the outputs beyond which control is lost."""
         self._guided = False
         """Whether the last command followed an external reference."""
         self._next_report = 0.0
         self._limited = False
         self._command_report: CommandReport | None = None
-        self._contacts: tuple[str, ...] = ()
-        """The links that touch."""
-        self._touched = ""
-        """The first contact on the way to the present goal, and when; empty: there was none."""
 
     def cancel_plan(self) -> None:
         """Cancel the reference being planned; any thread may call this."""
@@ -181,7 +146,12 @@ class ControlExecutive:
         self._take_tolerance(self._goal_tolerance)
         self.servicing.configure(config)
         self.controller.set_gains(config.gains)
-        self._stall.restart()
+        self._watch.stall.restart()
+
+    @property
+    def _pursues(self) -> bool:
+        """Whether a goal is pursued, or the tasks before one."""
+        return self._goal_state is ControllerState.TRACKING
 
     @property
     def state(self) -> ControllerState:
@@ -189,8 +159,8 @@ class ControlExecutive:
         mode = self.controller.mode
         if not self._was_measured:
             return ControllerState.WAITING
-        if mode is _MEASURED:
-            stalled = self._stall.cause and self._goal_state is _TRACKING
+        if mode is Mode.MEASURED:
+            stalled = self._watch.stall.cause and self._pursues
             return ControllerState.STALLED if stalled else self._goal_state
         if mode is not Mode.ESTIMATED:
             return ControllerState.STOPPED
@@ -204,7 +174,7 @@ class ControlExecutive:
     @property
     def unfinished_goals(self) -> frozenset[str]:
         """Ids of pursued and waiting goals, including those whose abort is not reported yet."""
-        present = self._next is _Next.ABORT or self._goal_state is ControllerState.TRACKING
+        present = self._next is _Next.ABORT or self._pursues
         pursued = self._goals.values() if present else ()
         return self.waiting_goals.union(goal.goal_id for goal in pursued)
 
@@ -227,88 +197,13 @@ class ControlExecutive:
     def submit(self, key: str, goal: IdentifiedGoal) -> None:
         """Accept a goal of the ``base`` or the ``end_effector``, effective from the next state.
 
-        The other frame keeps its goal. A goal that names an end-effector is for that end-effector,
-        and for the base if it has a base pose.
+        The other frame keeps its goal.
 
-        Raises
-        ------
-        PlanningError
-            The law does not control the frame, or the goal's shape has another number of joints.
+        Raises PlanningError; see :func:`goal_parts`.
         """
-        if key == END_EFFECTOR:
-            self._require_output(key)
-        unnamed = all(each.link == "" for each in goal.goal.end_effectors)
-        parts = self._parts_of(goal) if goal.goal.end_effectors else {key: goal}
-        if key == END_EFFECTOR and unnamed:
-            # A pose on the topic of the end-effector is met by the axes that are controlled.
-            hand = parts[key]
-            parts[key] = replace(hand, goal=replace(hand.goal, asked=_PLACE))
-        for part, each in parts.items():
-            self._require_controlled(part, each)
-        for part, each in parts.items():
+        for part, each in goal_parts(self.controller, key, goal).items():
             self._pending.pop(part, None)
             self._pending[part] = each
-
-    def _parts_of(self, identified: IdentifiedGoal) -> dict[str, IdentifiedGoal]:
-        law, goal = self.controller.law, identified.goal
-        link, axes = law.outputs.selection.end_effector_link, law.outputs.selection.end_effector
-        # The law's end-effector is the default one here, whatever its name.
-        hands = tuple(replace(each, link=each.link or link) for each in goal.end_effectors)
-        goal = replace(goal, end_effectors=hands).for_robot(law.robot.description)
-        parts = {}
-        if goal.base:
-            pose = replace(goal, end_effectors=(), base=POSE, asked=goal.asked & goal.base)
-            parts[BASE_GOAL_KEY] = replace(identified, goal=pose)
-        for each in goal.end_effectors:
-            if each.link != link:
-                raise PlanningError(
-                    f"The goal is for '{each.link}', which the law '{law.name}' does not control"
-                    f"{f'; it controls {link!r}' if link else ''}."
-                )
-            if each.waypoints is not None:
-                raise PlanningError(
-                    f"The goal of '{each.link}' is a path, which a controller does not follow: "
-                    "plan it with the method 'resolved_rate'."
-                )
-            turned = any(axis.startswith("r") for axis in axes)
-            if each.quaternion is None and turned:
-                raise PlanningError(
-                    f"The goal of '{each.link}' is a position only, and the law '{law.name}' "
-                    "controls its attitude: add an orientation."
-                )
-            asked, quaternion = POSE, each.quaternion
-            if quaternion is None:
-                asked, quaternion = _PLACE, _NO_ROTATION
-            pose = Goal(each.position, quaternion, goal.joint_positions, asked=asked)
-            parts[END_EFFECTOR] = replace(identified, goal=pose)
-        return parts
-
-    def _require_output(self, key: str) -> None:
-        law = self.controller.law
-        if not getattr(law.outputs.selection, key):
-            raise PlanningError(
-                f"The law '{law.name}' does not control the {key.replace('_', '-')} of this robot; "
-                f"its outputs are {', '.join(law.outputs.labels)}."
-            )
-
-    def _require_controlled(self, key: str, goal: IdentifiedGoal) -> None:
-        self._require_output(key)
-        self._require_tolerances_met(key, goal)
-        law = self.controller.law
-        shape, wheels = goal.goal.joint_positions, self.controller.wheels
-        n = law.robot.n if wheels is None else law.robot.n + len(wheels.wheels)
-        if shape is not None and len(shape) != n:
-            raise PlanningError(
-                f"The goal has a shape of {len(shape)} joints; robot "
-                f"'{law.robot.description.name}' has {n}."
-            )
-
-    def _require_tolerances_met(self, key: str, identified: IdentifiedGoal) -> None:
-        selection, goal = self.controller.law.outputs.selection, identified.goal
-        axes = selection.base if key == BASE_GOAL_KEY else selection.end_effector
-        controls = controlled_parts(axes, selection.joints)
-        who = f"the law '{self.controller.law.name}'"
-        identified.required.require_control(goal, controls, who)
 
     def request(self, task: Task) -> None:
         """Begin a task at the next measured state, without a goal after it."""
@@ -316,8 +211,7 @@ class ControlExecutive:
 
     def refuse(self, message: str, goal_id: str = "") -> None:
         """Report the refusal of a goal; an earlier goal is still pursued."""
-        self._publish(ControllerState.REFUSED, message, goal_id)
-        self._report_decision(EventKind.GOAL_REFUSED, message, ControllerState.REFUSED, goal_id)
+        self._publish_decision(ControllerState.REFUSED, message, goal_id)
 
     def resume(self, saved: Mapping[str, IdentifiedGoal]) -> None:
         """Accept the goals that an earlier controller saved.
@@ -349,11 +243,11 @@ class ControlExecutive:
         self, why: str, commanded_until_ns: int | None = None, rests_since_ns: int = 0
     ) -> bool:
         """Give up every goal at once, because the plant ignores commands from now on."""
-        pursued = self._goal_state is ControllerState.TRACKING
         if commanded_until_ns is not None:
-            if not pursued or commanded_until_ns < round(self._monitor.started * SECOND):
+            began_ns = round(self._watch.monitor.started * SECOND)
+            if not self._pursues or commanded_until_ns < began_ns:
                 return False
-        elif not (pursued or self._pending):
+        elif not (self._pursues or self._pending):
             return False
         self._give_up(f"Aborted by the plant: {why}")
         # Reported at once, as the next measured state may come late; an earlier abort is, too.
@@ -362,13 +256,8 @@ class ControlExecutive:
         return True
 
     def take_contacts(self, contacts: tuple[str, ...], time: float) -> None:
-        """Take the links that touch from a time on, s. A goal fails if a new contact occurs on the
-        way.
-        """
-        met = [each for each in contacts if each not in self._contacts]
-        self._contacts = contacts
-        if not self._touched and self._goal_state is _TRACKING:
-            self._touched = _touch(met, time)
+        """Take the links that touch from a time on, s; a new contact on the way fails a goal."""
+        self._watch.take_contacts(contacts, time, pursues=self._pursues)
 
     def on_plant_obeying(self) -> None:
         """Hold the pose of the next measured state, not an earlier one."""
@@ -386,7 +275,7 @@ class ControlExecutive:
             return
         planner.use_obstacles(world)
         self._planning.drop()
-        if self._goal_state is not _TRACKING or self._time is None or self.servicing.task:
+        if not self._pursues or self._time is None or self.servicing.task:
             return
         left = self.controller.time_until_blocked(self._time)
         if left < 2 * PLANNING_TIME:
@@ -403,14 +292,13 @@ class ControlExecutive:
     def plant_reset(self) -> None:
         """Restart the goal at the next measured state; without a goal, hold its pose."""
         self.servicing.end()
-        if self._goal_state is ControllerState.TRACKING and self._after_tasks:
+        if self._pursues and self._after_tasks:
             self._pending = {**self._after_tasks, **self._pending}
         self._begin_anew_or_hold()
 
     def _begin_anew_or_hold(self) -> None:
         """Begin the goal again at the next measured state; without a goal, hold its pose."""
-        tracking = self._goal_state is ControllerState.TRACKING
-        self._plan_next(_Next.BEGIN_ANEW if tracking else _Next.HOLD)
+        self._plan_next(_Next.BEGIN_ANEW if self._pursues else _Next.HOLD)
 
     def _plan_next(self, reaction: _Next) -> None:
         """Have the robot react to the next measured state, unless more was asked for before."""
@@ -427,12 +315,12 @@ class ControlExecutive:
         controller.take_over_goals(self.controller)
         self.controller = controller
         self.servicing.hold(payload)
-        if self._goal_state is ControllerState.TRACKING:
+        if self._pursues:
             self._plan_next(_Next.BEGIN_ANEW)
 
     def _give_up(self, message: str) -> None:
         """Drop every goal; the message is that of the status from now on."""
-        pursued = self._pending or self._goal_state is ControllerState.TRACKING
+        pursued = self._pending or self._pursues
         # A decided goal stays decided: an abort without an undecided goal has no goal id.
         self._goal_id = self._latest_id() if pursued else ""
         self._goals = {**self._goals, **self._pending} if pursued else {}
@@ -446,9 +334,8 @@ class ControlExecutive:
 
     def _report_abort(self) -> None:
         self._goal_state = self._reported_state = ControllerState.ABORTED
-        self._end_goals(EventKind.GOAL_ABORTED, self._goal_state, self._abort_message)
-        self._publish(ControllerState.ABORTED, self._abort_message)
-        self._report_decision(EventKind.GOAL_ABORTED, self._abort_message, ControllerState.ABORTED)
+        self._end_goals(ControllerState.ABORTED, self._abort_message)
+        self._publish_decision(ControllerState.ABORTED, self._abort_message, self._goal_id)
 
     # -- states -------------------------------------------------------------------------------
 
@@ -474,8 +361,7 @@ class ControlExecutive:
             jump = time - self._time
             self.controller.shift_time(jump)
             self.servicing.restart()
-            self._monitor.shift_time(jump)
-            self._stall.restart()
+            self._watch.shift_time(jump)
             self._next_report += jump
         self._time = time
         wheels = self.controller.wheels
@@ -495,13 +381,13 @@ class ControlExecutive:
                 self._pending = {**self._goals, **self._pending}
             elif reaction is _Next.BEGIN_ANEW:
                 self.controller.restart_motion(time, measured)
-                self._monitor.restart_settling()
-                self._stall.restart()
-                self._error_bounds = None
-            too_fast = self.controller.coming_to_rest and self._monitor.fast_states
+                self._watch.begin_anew()
+            too_fast = self.controller.coming_to_rest and self._watch.monitor.fast_states
             if not too_fast:
                 self._follow_goals(time, measured)
-            self._watch_rates(qdot)
+            lost = self._watch.loss_by_rates(self.controller, qdot)
+            if lost and not self._is_moved_otherwise:
+                self._abort_on_lost_control(lost)
         if reference is not None:
             self.controller.follow(reference)
         result = self.controller.command(time, measured, q, qdot)
@@ -523,13 +409,8 @@ class ControlExecutive:
             for event in self.controller.wheels.events():
                 self.outputs.append(event)
                 self._next_report = time
-        if self.controller.mode is _MEASURED and self._goal_state is _TRACKING:
-            self._watch_errors()
-        pursued = self._goal_state is _TRACKING and self.servicing.task is None
-        if self.controller.mode is _MEASURED and pursued:
-            self._decide(time)
-            if self._goal_state is _TRACKING and not self._is_moved_otherwise:
-                self._stall.observe(time, self.controller, result, self._goal_config)
+        if self.controller.mode is Mode.MEASURED and self._pursues:
+            self._judge(time, result)
         state = self.state
         if (
             state is self._reported_state
@@ -539,84 +420,34 @@ class ControlExecutive:
             return
         self._next_report = time + self._config.status_period
         self._reported_state, self._limited = state, result.limited
-        self._command_report = _command_report(self.controller, result)
+        self._command_report = CommandReport.of(self.controller, result)
         # Whoever has sent a goal learns that it is being planned.
         planned = state is ControllerState.HOLDING and self._planning.active
         self._publish(state, self._message(state), self._latest_id() if planned else self._goal_id)
 
-    def _decide(self, time: float) -> None:
-        """Report the decision about the goal, if this state brings it."""
-        controller, monitor, config = self.controller, self._monitor, self._goal_config
-        at_rest, ends = controller.reference_at_rest(time), controller.reference_ends
-        assert ends is not None
-        if not at_rest and not monitor.is_late(time, ends, config):
-            # Errors decide nothing while the reference moves.
-            monitor.restart_settling()
+    def _judge(self, time: float, result: Saturated) -> None:
+        """Report a decision about the goal, a loss of control over it, or that it stalls."""
+        watch, config = self._watch, self._goal_config
+        if not self._is_moved_otherwise:
+            lost = watch.loss_by_errors(self.controller, self._config)
+            if lost:
+                self._abort_on_lost_control(lost)
+                return
+        if self.servicing.task is not None:
             return
-        decision = monitor.decide_by_errors(time, at_rest, ends, controller.errors(), config)
-        if decision != _NO_DECISION:
-            self._goal_state, kind = _STATE_AND_EVENT_OF_DECISION[Decision(int(decision))]
-            if decision == Decision.REACHED and self._touched:
-                self._goal_state, kind = _STATE_AND_EVENT_OF_DECISION[Decision.FAILED]
-            elif decision == Decision.REACHED and self._missed_parts():
-                self._goal_state = ControllerState.REACHED_PARTLY
-                kind = EventKind.GOAL_REACHED_PARTLY
-            message = self._message(self._goal_state)
-            self._end_goals(kind, self._goal_state, message)
-            self._report_decision(kind, message, self._goal_state)
+        decided = watch.decision(self.controller, time, self._asked, config)
+        if decided is not None:
+            self._goal_state, message = decided, self._message(decided)
+            self._end_goals(decided, message)
+            self._report_decision(decided, message, self._goal_id)
+        elif not self._is_moved_otherwise:
+            watch.stall.observe(time, self.controller, result, config)
 
-    def _missed_parts(self) -> dict[str, str]:
-        """Return the :func:`missed_parts` in the state of the last command."""
-        law, goal, config = self.controller.law, self.controller.goal, self._goal_config
-        state, outputs = law.state, law.outputs.selection
-        tolerance = Tolerance(config.position_tolerance, config.attitude_tolerance)
-        missed: dict[str, str] = {}
-        if goal.base is not None and self._asked:
-            aimed = Goal(goal.base.position, goal.base.quaternion, asked=self._asked)
-            error = PoseError.between(state.r_WB, state.quaternion_WB, aimed)
-            missed |= missed_parts(aimed, error, controlled_parts(outputs.base), tolerance)
-        turned = "attitude" in self._asked_of_hand - controlled_parts(outputs.end_effector)
-        if goal.end_effector is not None and turned:
-            R_BE, _ = law.robot.link_pose(outputs.end_effector_link, state.q)
-            R_WE = matrix_from_quaternion(state.quaternion_WB) @ R_BE
-            turn = attitude_error(quaternion_from_matrix(R_WE), goal.end_effector.quaternion)
-            missed |= missed_turn(float(np.linalg.norm(turn)), tolerance)
-        return missed
-
-    def _end_goals(self, kind: EventKind, state: ControllerState, message: str) -> None:
+    def _end_goals(self, state: ControllerState, message: str) -> None:
         """Report the end of all goals but the latest, whose status continues."""
         for goal_id in sorted({goal.goal_id for goal in self._goals.values()} - {self._goal_id}):
-            self._publish(state, message, goal_id)
-            self._report_decision(kind, message, state, goal_id)
+            self._publish_decision(state, message, goal_id)
         self._goals = {}
-
-    # -- control that is lost -----------------------------------------------------------------
-
-    def _watch_rates(self, qdot: Array) -> None:
-        """Give up all goals if a joint stays far beyond its rate limit: its motor does not master
-        it."""
-        lost = self._monitor.check_rates(self.controller.joint_rate_limits.largest_rate_share(qdot))
-        if not lost or self._is_moved_otherwise:
-            return
-        rates = self.controller.joint_rate_limits.rates
-        joint = int(np.argmax(np.abs(qdot) / rates))
-        moving = self.controller.law.robot.description.movable_joints[joint]
-        self._abort_on_lost_control(
-            f"joint '{moving.name}' moves at {qdot[joint]:.3g} {moving.unit}/s instead of "
-            f"{rates[joint]:.3g} {moving.unit}/s"
-        )
-
-    def _watch_errors(self) -> None:
-        """Give up all goals if the errors grow far beyond the distance of the goal."""
-        if self._is_moved_otherwise:
-            return
-        if self._error_bounds is None:
-            margins = self._config.error_margin
-            self._error_bounds = self.controller.error_bounds(margins.as_errors())
-        share = self.controller.largest_error_share(self._error_bounds)
-        if self._monitor.check_errors(share):
-            away = self.controller.distance_from_reference()
-            self._abort_on_lost_control(f"the errors grow, the robot is {away} from the reference")
 
     @property
     def _is_moved_otherwise(self) -> bool:
@@ -666,9 +497,10 @@ class ControlExecutive:
             case TaskState.DONE if self._pending:
                 self._begin_goals(time, state, carried=True)
             case TaskState.DONE:
-                decision = Decision.FAILED if self._touched else Decision.REACHED
-                self._goal_state, kind = _STATE_AND_EVENT_OF_DECISION[decision]
-                self._report_decision(kind, self._message(self._goal_state), self._goal_state)
+                touched = bool(self._watch.touched)
+                self._goal_state = ControllerState.FAILED if touched else ControllerState.REACHED
+                message = self._message(self._goal_state)
+                self._report_decision(self._goal_state, message, self._goal_id)
             case TaskState.REFUSED | TaskState.FAILED:
                 self._end_tasks(time, state, progress)
 
@@ -677,30 +509,28 @@ class ControlExecutive:
         for key, pending in list(self._pending.items()):
             goal = pending.goal.kept_at(state.r_WB, state.quaternion_WB)
             pose = PoseReference(goal.position, goal.quaternion)
-            config = self._config_with(pending.tolerance)
+            goals = Reference(pose) if key == BASE_GOAL_KEY else Reference(end_effector=pose)
+            config = config_with(self._config, pending.tolerance)
             try:
-                self.controller.require_controlled_axes(state, config, **{key: pose})
-                self.controller.require_bounded_duration(state, **{key: pose})
+                require_controlled_axes(self.controller.law, state, config, goals)
+                self.controller.require_bounded_duration(state, goals)
             except PlanningError as error:
-                self._pending = {
-                    part: each
-                    for part, each in self._pending.items()
-                    if each.goal_id != pending.goal_id
-                }
+                refused = [p for p, g in self._pending.items() if g.goal_id == pending.goal_id]
+                for part in refused:
+                    del self._pending[part]
                 self.refuse(str(error), pending.goal_id)
                 break
 
     def _begin_tasks(self, time: float, tasks: tuple[Task, ...]) -> None:
         self.servicing.begin(tasks)
-        self._touched = _touch(self._contacts, time)
+        self._watch.forget_touch(time)
         self._begin_tracking(time)
         self._wait_for_tasks()
 
     def _begin_tracking(self, time: float) -> None:
         self._goal_state = ControllerState.TRACKING
-        self._monitor.begin(time)
-        self._stall.restart()
-        self._next_report, self._error_bounds = time, None
+        self._watch.begin(time)
+        self._next_report = time
 
     def _wait_for_tasks(self) -> None:
         """Report and save the pending goals, which begin after the tasks."""
@@ -717,7 +547,7 @@ class ControlExecutive:
         self._goal_id = goal_id
         self.controller.hold_here(time, state)
         if progress.state is TaskState.REFUSED:
-            self._end_goals(EventKind.GOAL_REFUSED, ControllerState.REFUSED, progress.message)
+            self._end_goals(ControllerState.REFUSED, progress.message)
             self._goal_state, self._goal_id = ControllerState.HOLDING, ""
             self.refuse(progress.message, goal_id)
         else:
@@ -732,21 +562,21 @@ class ControlExecutive:
                 return
             poses, asked = planned.aims, planned.asked
         else:
-            poses, asked = self._aims(state)
-        pursued = self._goals if self._goal_state is ControllerState.TRACKING else {}
+            poses, asked = aims_of(self.controller, self._pending, state)
+        pursued = self._goals if self._pursues else {}
         again = self._goal_id == self._latest_id() and bool(pursued)
         self._goal_id = self._latest_id()
         self._goals = {**pursued, **self._pending}
         self._after_tasks = dict(self._pending) if carried else {}
-        self._resumes = all(pending.resumes for pending in self._pending.values())
+        resumes = all(pending.resumes for pending in self._pending.values())
         self._take_tolerance(next(reversed(self._pending.values())).tolerance)
         if BASE_GOAL_KEY in self._pending or BASE_GOAL_KEY not in pursued:
-            self._asked = asked
+            self._asked[BASE_GOAL_KEY] = asked
         if END_EFFECTOR in self._pending:
-            self._asked_of_hand = self._pending[END_EFFECTOR].goal.asked
+            self._asked[END_EFFECTOR] = self._pending[END_EFFECTOR].goal.asked
         self._pending.clear()
         if planned is not None:
-            self.controller.begin_planned(planned.begins, planned.profile)
+            self.controller.begin(planned.begins, planned.profile)
         else:
             if carried:
                 # Tasks have left the earlier reference behind.
@@ -754,29 +584,10 @@ class ControlExecutive:
             self.controller.set_goals(time, state, **poses)
         if not (carried or again):
             self._report_acceptance(None if planned is None else planned.profile)
-            self._touched = _touch(self._contacts, time)
+            self._watch.forget_touch(time)
         self._begin_tracking(time)
-        self.outputs.append(PursuedGoals(self._goals_to_save()))
-
-    def _aims(self, state: ControlState) -> tuple[Aims, frozenset[Controlled]]:
-        """Return the poses and the shape of the pending goals, and the parts of the base's pose
-        that they ask for.
-        """
-        goals = {key: pending.goal for key, pending in self._pending.items()}
-        asked: frozenset[Controlled] = frozenset()
-        if BASE_GOAL_KEY in goals:
-            goal = goals[BASE_GOAL_KEY].kept_at(state.r_WB, state.quaternion_WB)
-            goals[BASE_GOAL_KEY], asked = goal, goal.asked
-        poses = {key: PoseReference(goal.position, goal.quaternion) for key, goal in goals.items()}
-        shapes = [g.joint_positions for g in goals.values() if g.joint_positions is not None]
-        if self.controller.wheels is not None:
-            shapes = [shape[self.controller.wheels.wheels.other] for shape in shapes]
-        aims = Aims(
-            base=poses.get(BASE_GOAL_KEY),
-            end_effector=poses.get(END_EFFECTOR),
-            joints=shapes[0] if shapes else None,
-        )
-        return aims, asked
+        saved = goals_to_save(self.controller, self._asked, self._goal_id, resumes=resumes)
+        self.outputs.append(PursuedGoals(saved))
 
     def _planned(self, time: float, state: ControlState, *, carried: bool) -> PlannedGoals | None:
         """Return the planned reference of the pending goals.
@@ -785,9 +596,15 @@ class ControlExecutive:
         """
         if carried and not self._planning.active:
             self.controller.hold_here(time, state)
-        pending, aims = self._pending, lambda: self._aims(state)
+        pending = self._pending
         try:
-            return self._planning.planned(time, state, self.controller, pending, aims)
+            return self._planning.planned(
+                time,
+                state,
+                self.controller,
+                pending,
+                lambda: aims_of(self.controller, pending, state),
+            )
         except PlanningError as error:
             goal_id = self._latest_id()
             if all(goal is self._goals.get(part) for part, goal in pending.items()):
@@ -799,17 +616,8 @@ class ControlExecutive:
             return None
 
     def _take_tolerance(self, tolerance: Tolerance | None) -> None:
-        self._goal_tolerance, self._goal_config = tolerance, self._config_with(tolerance)
-
-    def _config_with(self, tolerance: Tolerance | None) -> ControllerConfig:
-        if tolerance is None:
-            return self._config
-        return replace(
-            self._config,
-            position_tolerance=tolerance.position,
-            attitude_tolerance=tolerance.attitude,
-            joint_tolerance=tolerance.shape,
-        )
+        self._goal_tolerance = tolerance
+        self._goal_config = config_with(self._config, tolerance)
 
     def _report_acceptance(self, plan: PlannedReference | None = None) -> None:
         message, about = "The goal is accepted.", {}
@@ -822,37 +630,12 @@ class ControlExecutive:
         goal_id = self._goal_id
         self.outputs.append(Event(EventKind.GOAL_ACCEPTED, message, goal_id=goal_id, about=about))
 
-    def _goals_to_save(self) -> dict[str, IdentifiedGoal]:
-        goal, selection = self.controller.goal, self.controller.law.outputs.selection
-        shape = goal.joints.q if goal.joints is not None and selection.joints else None
-        if shape is not None and self.controller.wheels is not None:
-            shape = self.controller.wheels.shape_with_wheels(shape)
-        poses = {BASE_GOAL_KEY: goal.base}
-        profile = self.controller.profile
-        if profile is not None and not profile.carries:
-            poses[END_EFFECTOR] = goal.end_effector
-        return {
-            key: IdentifiedGoal(
-                Goal(
-                    pose.position,
-                    pose.quaternion,
-                    shape,
-                    asked=self._asked if key == BASE_GOAL_KEY else POSE,
-                ),
-                self._goal_id,
-                resumes=self._resumes,
-            )
-            for key, pose in poses.items()
-            if pose is not None and getattr(selection, key)
-        }
-
     def _latest_id(self) -> str:
         return next(reversed(self._pending.values())).goal_id if self._pending else self._goal_id
 
     # -- status -------------------------------------------------------------------------------
 
-    def _publish(self, state: ControllerState, message: str, goal_id: str | None = None) -> None:
-        about = self._goal_id if goal_id is None else goal_id
+    def _publish(self, state: ControllerState, message: str, goal_id: str) -> None:
         task = self.servicing.task
         name = "" if task is None else task.value
         ends = self.controller.reference_ends
@@ -861,14 +644,16 @@ class ControlExecutive:
         if flies and ends is not None:
             settled = ends + self._config.settle_time
         report = self._command_report
-        self.outputs.append(ControllerStatus(state, message, about, report, name, settled))
+        self.outputs.append(ControllerStatus(state, message, goal_id, report, name, settled))
 
-    def _report_decision(
-        self, kind: EventKind, message: str, state: ControllerState, goal_id: str | None = None
-    ) -> None:
-        """Report the decision about a goal as an event; by default, about the present goal."""
-        about = self._goal_id if goal_id is None else goal_id
-        self.outputs.append(Event(kind, message, state.level, goal_id=about))
+    def _publish_decision(self, state: ControllerState, message: str, goal_id: str) -> None:
+        self._publish(state, message, goal_id)
+        self._report_decision(state, message, goal_id)
+
+    def _report_decision(self, state: ControllerState, message: str, goal_id: str) -> None:
+        """Report the decision about a goal as an event."""
+        kind = EventKind(f"goal_{state.value}")
+        self.outputs.append(Event(kind, message, state.level, goal_id=goal_id))
 
     def _message(self, state: ControllerState) -> str:
         match state:
@@ -892,12 +677,9 @@ class ControlExecutive:
                 return f"Flying to the goal; {away} from the reference{later}."
             case ControllerState.STALLED:
                 away = self.controller.distance_from_reference()
-                return f"Stalled {away} from the reference: {self._stall.cause}."
+                return f"Stalled {away} from the reference: {self._watch.stall.cause}."
             case ControllerState.REACHED | ControllerState.REACHED_PARTLY | ControllerState.FAILED:
-                away, config = self.controller.distance_to_goal(), self._goal_config
-                missed = self._missed_parts() if state is ControllerState.REACHED_PARTLY else {}
-                cause, touched = self._stall.cause, self._touched
-                return decided_message(state, away, config, cause, missed, touched)
+                return self._watch.message(state, self.controller, self._asked, self._goal_config)
             case ControllerState.ABORTED:
                 return self._abort_message
             case ControllerState.ESTIMATING:
@@ -909,79 +691,5 @@ class ControlExecutive:
                 raise ValueError("a refusal has its own message")
 
 
-def _touch(contacts: Sequence[str], time: float) -> str:
-    """Return a clause on the first of some contacts at a time, s; empty: there is none."""
-    return f"{contacts[0]} touched at {time:.4g} s" if contacts else ""
-
-
-_NOTHING_MISSED: Mapping[str, str] = MappingProxyType({})
-
-
-def decided_message(
-    state: ControllerState,
-    distance: OutputDistance,
-    config: ControllerConfig,
-    cause: str = "",
-    missed: Mapping[str, str] = _NOTHING_MISSED,
-    touched: str = "",
-) -> str:
-    """Return the message about a reached or failed goal, with the distance from it.
-
-    ``cause`` is the known reason why the robot came no closer; ``missed`` are the missed parts of a
-    partly reached goal; ``touched`` is the contact that makes the goal fail.
-    """
-    limits = (
-        (distance.position, config.position_tolerance),
-        (distance.attitude, config.attitude_tolerance),
-        (distance.joints, config.joint_tolerance),
-    )
-    tolerance = OutputDistance(*(math.nan if math.isnan(off) else most for off, most in limits))
-    away = f"{distance} from it (tolerance {tolerance})"
-    if state is not ControllerState.FAILED:
-        return reached_message(away, missed)
-    if touched:
-        return f"The goal is not reached without contact, as {touched}: {away}."
-    late = f"not reached in time, as {cause}" if cause else "not reached in time"
-    if not any(off > most for off, most in limits):
-        away += f", within tolerance for less than the settling time of {config.settle_time:g} s"
-    return f"The goal is {late}: {away}."
-
-
-_NO_ROTATION = np.array([0.0, 0.0, 0.0, 1.0])
-
-_PLACE: frozenset[Controlled] = frozenset({"position"})
-"""What an end-effector goal requests if its attitude is free."""
-
 _LATE_POSE_PERIODS = 1.5
 """Longest time without a measurement of the base that is not reported, in control periods."""
-
-
-def controlled_parts(axes: Sequence[str], joints: Sequence[str] = ()) -> frozenset[Controlled]:
-    """Return the parts of a goal that outputs control: axes of a pose, and joints."""
-    parts: set[Controlled] = {"attitude" if axis.startswith("r") else "position" for axis in axes}
-    return frozenset(parts | {"shape"} if joints else parts)
-
-
-_STATE_AND_EVENT_OF_DECISION = {
-    Decision.REACHED: (ControllerState.REACHED, EventKind.GOAL_REACHED),
-    Decision.FAILED: (ControllerState.FAILED, EventKind.GOAL_FAILED),
-}
-"""State and event of each decision except a loss of control, which is an abort."""
-
-
-def _command_report(controller: CoordinatedController, result: Saturated) -> CommandReport:
-    status, excess, wheels = controller.law.status, result.excess, controller.wheels
-    state = controller.law.state
-    return CommandReport(
-        law=controller.law.name,
-        singular=status.singular,
-        smallest_singular_value=status.smallest_singular_value,
-        damping=status.damping,
-        lost_force_N=float(np.linalg.norm(excess.wrench_B[:3])),
-        lost_torque_Nm=float(np.linalg.norm(excess.wrench_B[3:])),
-        lost_effort=float(np.abs(excess.tau).max(initial=0.0)),
-        errors=controller.labelled_errors(),
-        wheels={} if wheels is None else wheels.shares,
-        momentum={} if wheels is None else wheels.budget(state.q, state.qdot),
-        dumping=wheels is not None and wheels.dumping,
-    )

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields, replace
-from functools import cached_property
 from operator import mul
 from typing import NamedTuple
 
@@ -154,34 +153,10 @@ class ActuatorLimits:
 
     def apply(self, commanded: Actuation) -> Saturated:
         """Return the command within the limits."""
-        if self._keeps(commanded):
-            return Saturated(commanded, self._no_excess)
-        wrench = np.concatenate(
-            [
-                _limit_norm(commanded.wrench_B[:3], self.force),
-                _limit_norm(commanded.wrench_B[3:], self.torque),
-            ]
-        )
+        force = limit_norm(commanded.wrench_B[:3], self.force)
+        torque = limit_norm(commanded.wrench_B[3:], self.torque)
         tau = np.clip(commanded.tau, -self.effort, self.effort)
-        return Saturated.of(commanded, Actuation(wrench, tau))
-
-    def _keeps(self, commanded: Actuation) -> bool:
-        # In Python's numbers: numpy takes longer for so few.
-        wrench = commanded.wrench_B.tolist()
-        if not (math.hypot(*wrench[:3]) <= self.force and math.hypot(*wrench[3:]) <= self.torque):
-            return False
-        for effort, limit in zip(commanded.tau.tolist(), self._efforts, strict=True):
-            if not -limit <= effort <= limit:
-                return False
-        return True
-
-    @cached_property
-    def _efforts(self) -> list[float]:
-        return self.effort.tolist()
-
-    @cached_property
-    def _no_excess(self) -> Actuation:
-        return Actuation(np.zeros(6), np.zeros(self.effort.size))
+        return Saturated.of(commanded, Actuation(np.concatenate([force, torque]), tau))
 
     def expression(self, actuation: ca.SX) -> ca.SX:
         """Return the realised part of a command ``[f; n; tau]`` (6 + n,), as :meth:`apply` does."""
@@ -193,7 +168,8 @@ class ActuatorLimits:
         return ca.vertcat(*parts, ca.fmin(ca.fmax(actuation[6:], -self.effort), self.effort))
 
 
-def _limit_norm(vector: Array, limit: float) -> Array:
+def limit_norm(vector: Array, limit: float) -> Array:
+    """Return a vector of at most a norm, in the same direction."""
     size = math.sqrt(vector.dot(vector))
     return vector if size <= limit else vector * (limit / size)
 

@@ -13,7 +13,12 @@ from enum import Enum
 
 import numpy as np
 
-from spacerobot_ros.control.approach import ApproachPlan, TargetClearance, plan_approach
+from spacerobot_ros.control.approach import (
+    ApproachPlan,
+    ArmReach,
+    TargetClearance,
+    plan_approach,
+)
 from spacerobot_ros.control.config import ControllerConfig
 from spacerobot_ros.control.controller import CoordinatedController
 from spacerobot_ros.control.detumbling import Detumbling, shortest_detumbling
@@ -30,7 +35,7 @@ from spacerobot_ros.model.grasp import (
     TargetBody,
     frame_motion,
 )
-from spacerobot_ros.model.target_motion import RelativeMotionOverTime, TorqueFreeMotion
+from spacerobot_ros.model.target_motion import TorqueFreeMotion
 from spacerobot_ros.planning.core.cancellation import PlanningJob
 from spacerobot_ros.planning.methods.thrust.goals import Grapple
 
@@ -121,23 +126,6 @@ class MeasuredTarget:
         self.motion, self.time = BodyMotion.of(pose, twist), time
 
 
-@dataclass(frozen=True)
-class MotionPlan:
-    """A planned motion of base and arm as an approach that has begun."""
-
-    reference: GrappleReference
-    start: float = 0.0
-
-    @property
-    def contact(self) -> float:
-        """Time at which the end-effector has the pose of the grapple frame, s."""
-        return self.reference.duration
-
-    def relative(self, times: Array) -> RelativeMotionOverTime:
-        """Return the motion relative to the grapple frame at times (K,)."""
-        return self.reference.relative(times)
-
-
 _LATEST_BEGIN = 0.1
 """Longest delay of a motion relative to its planned start, s."""
 
@@ -157,7 +145,9 @@ class ApproachTask:
     def __init__(self, target: MeasuredTarget, config: ControllerConfig) -> None:
         self.target, self.config = target, config
         self.events: list[Event] = []
-        self._plan: ApproachPlan | MotionPlan | None = None
+        self._plan: ApproachPlan | GrappleReference | None = None
+        self._start = self._contact = 0.0
+        """When the end-effector sets out and meets the target, s after the plan was made."""
         self._predicted: TorqueFreeMotion | None = None
         self._planned_at = 0.0
         self._began: float | None = None
@@ -213,15 +203,15 @@ class ApproachTask:
         )
         hand = frame_motion(controller.law.robot, link, motion)
         self._out_of_reach = RelativeMotion.between(hand, grapple.body_motion())
-        if now > plan.contact + options.patience:
+        if now > self._contact + options.patience:
             return self._ended(
                 f"the target is missed: at contact the end-effector is {self._distance_text}, and "
                 f"nothing captured it within {options.patience:g} s"
             )
-        if now >= plan.start:
+        if now >= self._start:
             moving = grapple.with_relative_motion(plan.relative(np.array([now])))
             controller.follow(Reference(end_effector=PoseReference.of_motion(moving)))
-        self._remaining = plan.contact - now
+        self._remaining = self._contact - now
         return _ACTIVE
 
     def close(self) -> None:
@@ -261,19 +251,6 @@ class ApproachTask:
         off = RelativeMotion.between(expected, measured.at(self.target.body.grapple))
         return off.distance > _PREDICTION_TOLERANCE or off.angle > _PREDICTION_TOLERANCE
 
-    def _clearance(self, controller: CoordinatedController) -> TargetClearance | None:
-        target, link = self.target, controller.law.outputs.selection.end_effector_link
-        least = self.config.target.clearance
-        if target.description is None or target.body is None or not least:
-            return None
-        return TargetClearance(
-            controller.law.robot.description,
-            link,
-            target.description,
-            target.body.grapple,
-            least,
-        )
-
     def _plan_motion(
         self,
         time: float,
@@ -311,25 +288,20 @@ class ApproachTask:
             self._lead *= 2
             return
         self._predicted, self._planned_at = planned.grapple.motion, job.begins
-        self._plan = MotionPlan(planned)
-        controller.begin_planned(job.begins, planned)
-        contact, grapple = job.begins + planned.duration, planned.grapple
-        left = float(
-            np.linalg.norm(grapple.joined_momentum(controller.law.robot.total_mass, planned.motion))
-        )
+        self._plan, self._start, self._contact = planned, 0.0, planned.duration
+        controller.begin(job.begins, planned)
+        contact, mass = job.begins + planned.duration, controller.law.robot.total_mass
+        left = float(np.linalg.norm(planned.grapple.joined_momentum(mass, planned.motion)))
         message = (
             f"Base and end-effector set out at {job.begins:.4g} s and meet the target at "
             f"{contact:.4g} s; the plan leaves {left:.4g} N m s after the grasp."
         )
         about = {
-            "starts_s": f"{job.begins:.9g}",
-            "closes_s": f"{contact:.9g}",
-            "contact_s": f"{contact:.9g}",
             "detumble": options.detumble,
             "planned_momentum_Nms": f"{left:.9g}",
             "planned_cost": f"{planned.motion.spent:.9g}",
         }
-        self.events.append(Event(EventKind.APPROACH_STARTED, message, about=about))
+        self._report(message, (job.begins, contact, contact), about)
 
     def _make_plan(
         self,
@@ -339,32 +311,40 @@ class ApproachTask:
         body: TargetBody,
         measured: BodyMotion,
     ) -> None:
+        law, options, described = controller.law, self.config.target, self.target.description
+        outputs, clearance = law.outputs.selection, None
         held = controller.followed_end_effector
         held = held or controller.reference_at(time, state).end_effector
         assert held is not None
-        axes = controller.law.outputs.selection.end_effector
-        target = TorqueFreeMotion(body, measured)
-        plan = plan_approach(
-            target,
-            held,
-            self.config.target,
-            self.config.motion,
-            controller.arm_reach(state),
-            axes,
-            self._clearance(controller),
+        if described is not None and options.clearance:
+            clearance = TargetClearance(
+                law.robot.description,
+                outputs.end_effector_link,
+                described,
+                body.grapple,
+                options.clearance,
+            )
+        target, rates = TorqueFreeMotion(body, measured), controller.joint_rate_limits.rates
+        axes = outputs.end_effector
+        reach = ArmReach(law.robot, outputs.end_effector_link, axes, state, rates)
+        plan = plan_approach(target, held, options, self.config.motion, reach, axes, clearance)
+        self._plan, self._start, self._contact = plan, plan.start, plan.contact
+        self._predicted, self._planned_at = target, time
+        starts, closes, contact = (
+            time + each for each in (plan.start, plan.closing_time, plan.contact)
         )
-        self._plan, self._predicted, self._planned_at = plan, target, time
         message = (
-            f"The end-effector sets out at {time + plan.start:.4g} s, closes in at "
-            f"{time + plan.closing_time:.4g} s, and meets the target at "
-            f"{time + plan.contact:.4g} s."
+            f"The end-effector sets out at {starts:.4g} s, closes in at {closes:.4g} s, and meets "
+            f"the target at {contact:.4g} s."
         )
-        about = {
-            "starts_s": f"{time + plan.start:.9g}",
-            "closes_s": f"{time + plan.closing_time:.9g}",
-            "contact_s": f"{time + plan.contact:.9g}",
-        }
-        self.events.append(Event(EventKind.APPROACH_STARTED, message, about=about))
+        self._report(message, (starts, closes, contact))
+
+    def _report(
+        self, message: str, times: tuple[float, float, float], more: dict[str, str] | None = None
+    ) -> None:
+        names = ("starts_s", "closes_s", "contact_s")
+        about = {name: f"{time:.9g}" for name, time in zip(names, times, strict=True)}
+        self.events.append(Event(EventKind.APPROACH_STARTED, message, about=about | (more or {})))
 
 
 class DetumblingTask:
@@ -384,9 +364,6 @@ class DetumblingTask:
         self._law: Detumbling | None = None
         self._began = self._momentum = self._fastest = 0.0
         self._at_rest_since: float | None = None
-
-    def close(self) -> None:
-        """Do nothing: there is no background work."""
 
     def step(
         self,
@@ -504,28 +481,25 @@ class Servicing:
 
     def begin(self, tasks: Sequence[Task]) -> None:
         """Begin with the first task at the next state."""
-        self._drop_present()
+        self.restart()
         self._remaining_tasks = list(tasks)
 
     def restart(self) -> None:
         """Restart the present task."""
-        self._drop_present()
-
-    def _drop_present(self) -> None:
-        if self._present is not None:
+        if isinstance(self._present, ApproachTask):
             self._present.close()
         self._present = None
 
     def end(self) -> None:
         """Drop the remaining tasks."""
-        self._drop_present()
+        self.restart()
         self._remaining_tasks = []
 
     def hold(self, payload: Payload | None) -> None:
         """Take over the body that the robot holds from now on."""
         self.payload = payload
         if self.task is Task.DETUMBLE:
-            self._drop_present()
+            self.restart()
 
     def step(
         self,
@@ -538,14 +512,16 @@ class Servicing:
         """Advance the present task; DONE after the last one. ``in_background``: a thread plans."""
         while self._remaining_tasks:
             if self.task is not Task.APPROACH or self.payload is None:
-                if self._present is None:
-                    self._present = self._build_task(self._remaining_tasks[0])
+                if self._present is None and self.task is Task.APPROACH:
+                    self._present = ApproachTask(self.target, self._config)
+                elif self._present is None:
+                    self._present = DetumblingTask(self.payload, self._config)
                 progress = self._present.step(time, state, controller, in_background=in_background)
                 self._events += self._present.events
                 self._present.events.clear()
                 if progress.state is not TaskState.DONE:
                     return progress
-            self._drop_present()
+            self.restart()
             self._remaining_tasks = self._remaining_tasks[1:]
             controller.follow(Reference())
             controller.hold_here(time, state)
@@ -555,8 +531,3 @@ class Servicing:
         """Return the events since the last call."""
         events, self._events = self._events, []
         return events
-
-    def _build_task(self, task: Task) -> ApproachTask | DetumblingTask:
-        if task is Task.APPROACH:
-            return ApproachTask(self.target, self._config)
-        return DetumblingTask(self.payload, self._config)

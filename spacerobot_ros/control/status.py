@@ -5,6 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from enum import Enum
+from typing import TYPE_CHECKING
+
+import numpy as np
 
 from spacerobot_ros.events import (
     BOOLEAN,
@@ -14,6 +17,10 @@ from spacerobot_ros.events import (
     number_format,
 )
 from spacerobot_ros.planning.core.goal import Controlled
+
+if TYPE_CHECKING:
+    from spacerobot_ros.control.controller import CoordinatedController
+    from spacerobot_ros.control.limits import Saturated
 
 
 class ControllerState(str, Enum):
@@ -97,6 +104,25 @@ class CommandReport:
     wheels: Mapping[str, float] = field(default_factory=dict)
     momentum: Mapping[str, float] = field(default_factory=dict)
     dumping: bool = False
+
+    @classmethod
+    def of(cls, controller: CoordinatedController, result: Saturated) -> CommandReport:
+        """Return the report on the last command of a controller, which became ``result``."""
+        law, excess, wheels = controller.law, result.excess, controller.wheels
+        status, state = law.status, law.state
+        return cls(
+            law=law.name,
+            singular=status.singular,
+            smallest_singular_value=status.smallest_singular_value,
+            damping=status.damping,
+            lost_force_N=float(np.linalg.norm(excess.wrench_B[:3])),
+            lost_torque_Nm=float(np.linalg.norm(excess.wrench_B[3:])),
+            lost_effort=float(np.abs(excess.tau).max(initial=0.0)),
+            errors=dict(zip(law.outputs.labels, law.error.tolist(), strict=True)),
+            wheels={} if wheels is None else wheels.shares,
+            momentum={} if wheels is None else wheels.budget(state.q, state.qdot),
+            dumping=wheels is not None and wheels.dumping,
+        )
 
     def controls(self, part: str = "base") -> frozenset[Controlled]:
         """Return which of position, attitude and shape the outputs control.

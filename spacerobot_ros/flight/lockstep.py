@@ -32,7 +32,7 @@ from spacerobot_ros.commanding.controller import (
 from spacerobot_ros.commanding.goal_follower import GoalFollower, Status
 from spacerobot_ros.commanding.planner import PlannerCommander
 from spacerobot_ros.commanding.plant_state import Stamped
-from spacerobot_ros.control.executive import END_EFFECTOR
+from spacerobot_ros.control.goals import END_EFFECTOR
 from spacerobot_ros.errors import ParameterError, SpaceRobotError
 from spacerobot_ros.events import Event
 from spacerobot_ros.flight.flight import Flight

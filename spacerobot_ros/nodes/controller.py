@@ -20,7 +20,7 @@ from spacerobot_ros.commanding.controller import (
 )
 from spacerobot_ros.commanding.goal_follower import Status
 from spacerobot_ros.control.config import ControllerConfig
-from spacerobot_ros.control.executive import END_EFFECTOR
+from spacerobot_ros.control.goals import END_EFFECTOR
 from spacerobot_ros.control.planned_reference import PlannedReference
 from spacerobot_ros.control.servicing import Task
 from spacerobot_ros.control.status import ControllerState

@@ -20,7 +20,7 @@ from spacerobot_ros.commanding.fly_to import FlyTo
 from spacerobot_ros.commanding.planner import PlannerCommander
 from spacerobot_ros.commanding.trajectory_output import TrajectoryOutput
 from spacerobot_ros.control.config import ControllerConfig
-from spacerobot_ros.control.executive import END_EFFECTOR
+from spacerobot_ros.control.goals import END_EFFECTOR
 from spacerobot_ros.errors import PlanningError
 from spacerobot_ros.events import EventKind
 from spacerobot_ros.model import SpaceRobot

@@ -30,7 +30,7 @@ from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.wheels import ReactionWheels
 from spacerobot_ros.parameters import configured
 from spacerobot_ros.planning import Goal
-from spacerobot_ros.planning.execution.goal_file import IdentifiedGoal
+from spacerobot_ros.planning.execution.goal_file import IdentifiedGoal, PursuedGoals
 from spacerobot_ros.resources import robot_file
 
 RNG = np.random.default_rng(3)
@@ -563,7 +563,8 @@ def test_goal_shapes_are_those_of_the_whole_robot() -> None:
     reached = loop.executive.controller.goal.joints
     assert reached is not None
     np.testing.assert_allclose(reached.q, [0.3])
-    saved = loop.executive._goals_to_save()["base"].goal.joint_positions
+    (pursued,) = (each for each in loop.executive.outputs if isinstance(each, PursuedGoals))
+    saved = pursued.goals["base"].goal.joint_positions
     assert saved is not None
     np.testing.assert_allclose(saved, [0.0, 0.0, 0.3, 0.0])
 

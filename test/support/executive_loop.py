@@ -14,7 +14,8 @@ import numpy.typing as npt
 from spacerobot_ros.control import ControlState, Reference
 from spacerobot_ros.control.config import ControllerConfig
 from spacerobot_ros.control.controller import build_controller
-from spacerobot_ros.control.executive import GOAL_KEYS, ControlExecutive
+from spacerobot_ros.control.executive import ControlExecutive
+from spacerobot_ros.control.goals import GOAL_KEYS
 from spacerobot_ros.control.status import ControllerState, ControllerStatus
 from spacerobot_ros.events import Event
 from spacerobot_ros.model import SpaceRobot

@@ -1,0 +1,412 @@
+"""Goals of a controller: their parts, what a law controls of them, and how they end."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from spacerobot_ros.control.config import ControllerConfig
+from spacerobot_ros.control.controller import CoordinatedController
+from spacerobot_ros.control.goal_monitor import Decision, GoalMonitor
+from spacerobot_ros.control.goal_planning import Aims
+from spacerobot_ros.control.laws.law import ControlLaw
+from spacerobot_ros.control.outputs import OutputDistance
+from spacerobot_ros.control.stall_monitor import StallMonitor
+from spacerobot_ros.control.state import ControlState, PoseReference, Reference
+from spacerobot_ros.control.status import ControllerState
+from spacerobot_ros.errors import PlanningError
+from spacerobot_ros.model.description import Array
+from spacerobot_ros.model.inverse_kinematics import AXES
+from spacerobot_ros.model.rotations import (
+    attitude_error,
+    matrix_from_quaternion,
+    quaternion_from_matrix,
+)
+from spacerobot_ros.planning.core.goal import (
+    POSE,
+    Controlled,
+    Goal,
+    PoseError,
+    Tolerance,
+    missed_parts,
+    missed_turn,
+    reached_message,
+)
+from spacerobot_ros.planning.execution.goal_file import BASE_GOAL_KEY, IdentifiedGoal
+
+END_EFFECTOR = "end_effector"
+"""Key of the goal of the end-effector in files of goals."""
+
+GOAL_KEYS = (BASE_GOAL_KEY, END_EFFECTOR)
+"""Keys of goals: the frames of the robot that have goal poses."""
+
+_FREE_AXIS_MARGIN = 5.0
+"""Number of tolerances by which a goal may differ from the pose in an uncontrolled axis: noise
+moves a measured pose out of the plane of a planar robot."""
+
+_NO_ROTATION = np.array([0.0, 0.0, 0.0, 1.0])
+
+_PLACE: frozenset[Controlled] = frozenset({"position"})
+"""What an end-effector goal requests if its attitude is free."""
+
+
+def goal_parts(
+    controller: CoordinatedController, key: str, identified: IdentifiedGoal
+) -> dict[str, IdentifiedGoal]:
+    """Return the goals of base and end-effector in a goal received for one of them.
+
+    A goal that names an end-effector is for that end-effector, and for the base if it has a base
+    pose.
+
+    Raises
+    ------
+    PlanningError
+        The law does not control the frame, or the goal's shape has another number of joints.
+    """
+    hands = identified.goal.end_effectors
+    if key == END_EFFECTOR:
+        _require_output(controller, key)
+    parts = _parts_of(controller, identified) if hands else {key: identified}
+    if key == END_EFFECTOR and all(each.link == "" for each in hands):
+        # A pose on the topic of the end-effector is met by the axes that are controlled.
+        parts[key] = replace(parts[key], goal=replace(parts[key].goal, asked=_PLACE))
+    for part, each in parts.items():
+        _require_controlled(controller, part, each)
+    return parts
+
+
+def _parts_of(
+    controller: CoordinatedController, identified: IdentifiedGoal
+) -> dict[str, IdentifiedGoal]:
+    law, goal = controller.law, identified.goal
+    link, axes = law.outputs.selection.end_effector_link, law.outputs.selection.end_effector
+    # The law's end-effector is the default one here, whatever its name.
+    hands = tuple(replace(each, link=each.link or link) for each in goal.end_effectors)
+    goal = replace(goal, end_effectors=hands).for_robot(law.robot.description)
+    parts = {}
+    if goal.base:
+        pose = replace(goal, end_effectors=(), base=POSE, asked=goal.asked & goal.base)
+        parts[BASE_GOAL_KEY] = replace(identified, goal=pose)
+    for each in goal.end_effectors:
+        if each.link != link:
+            raise PlanningError(
+                f"The goal is for '{each.link}', which the law '{law.name}' does not control"
+                f"{f'; it controls {link!r}' if link else ''}."
+            )
+        if each.waypoints is not None:
+            raise PlanningError(
+                f"The goal of '{each.link}' is a path, which a controller does not follow: "
+                "plan it with the method 'resolved_rate'."
+            )
+        asked, quaternion = POSE, each.quaternion
+        if quaternion is None:
+            if any(axis.startswith("r") for axis in axes):
+                raise PlanningError(
+                    f"The goal of '{each.link}' is a position only, and the law '{law.name}' "
+                    "controls its attitude: add an orientation."
+                )
+            asked, quaternion = _PLACE, _NO_ROTATION
+        pose = Goal(each.position, quaternion, goal.joint_positions, asked=asked)
+        parts[END_EFFECTOR] = replace(identified, goal=pose)
+    return parts
+
+
+def _require_output(controller: CoordinatedController, key: str) -> None:
+    law = controller.law
+    if not getattr(law.outputs.selection, key):
+        raise PlanningError(
+            f"The law '{law.name}' does not control the {key.replace('_', '-')} of this robot; "
+            f"its outputs are {', '.join(law.outputs.labels)}."
+        )
+
+
+def _require_controlled(
+    controller: CoordinatedController, key: str, identified: IdentifiedGoal
+) -> None:
+    _require_output(controller, key)
+    law, goal, wheels = controller.law, identified.goal, controller.wheels
+    selection = law.outputs.selection
+    controls = controlled_parts(getattr(selection, key), selection.joints)
+    identified.required.require_control(goal, controls, f"the law '{law.name}'")
+    n = law.robot.n if wheels is None else law.robot.n + len(wheels.wheels)
+    if goal.joint_positions is not None and len(goal.joint_positions) != n:
+        raise PlanningError(
+            f"The goal has a shape of {len(goal.joint_positions)} joints; robot "
+            f"'{law.robot.description.name}' has {n}."
+        )
+
+
+def controlled_parts(axes: Sequence[str], joints: Sequence[str] = ()) -> frozenset[Controlled]:
+    """Return the parts of a goal that outputs control: axes of a pose, and joints."""
+    parts: set[Controlled] = {"attitude" if axis.startswith("r") else "position" for axis in axes}
+    return frozenset(parts | {"shape"} if joints else parts)
+
+
+def require_controlled_axes(
+    law: ControlLaw, state: ControlState, config: ControllerConfig, goals: Reference
+) -> None:
+    """Refuse goals that differ from the present pose in an axis that the law does not control.
+
+    The law of a planar robot controls only the axes of its plane. A position or an attitude
+    without any controlled axis is not checked: that part is not controlled at all.
+
+    Raises
+    ------
+    PlanningError
+        A goal is several tolerances away from the pose; the message names the axes.
+    """
+    selection, labels = law.outputs.selection, ", ".join(law.outputs.labels)
+    here = Reference.present(law.robot, state, selection.end_effector_link)
+    for name in GOAL_KEYS:
+        goal, start, controlled = (getattr(each, name) for each in (goals, here, selection))
+        if goal is None or start is None:
+            continue
+        way = goal.position - start.position
+        turn_B = attitude_error(start.quaternion, goal.quaternion)
+        turn = matrix_from_quaternion(start.quaternion) @ turn_B
+        for part, unit, axes, error, tolerance in (
+            ("position", "m", AXES[:3], way, config.position_tolerance),
+            ("attitude", "rad", AXES[3:], turn, config.attitude_tolerance),
+        ):
+            left = [i for i in range(3) if axes[i] not in controlled]
+            off = float(np.linalg.norm(error[left]))
+            if 0 < len(left) < 3 and off > _FREE_AXIS_MARGIN * tolerance:
+                raise PlanningError(
+                    f"The goal {part} of the {name.replace('_', '-')} is {off:.4g} {unit} from "
+                    f"the present one in {' and '.join(axes[i] for i in left)} of the world, "
+                    f"which the law '{law.name}' does not control; its outputs are {labels}."
+                )
+
+
+def aims_of(
+    controller: CoordinatedController, goals: Mapping[str, IdentifiedGoal], state: ControlState
+) -> tuple[Aims, frozenset[Controlled]]:
+    """Return the poses and the shape of goals in a state, and the parts of the base's pose that
+    they ask for.
+    """
+    asked: frozenset[Controlled] = frozenset()
+    poses, shapes = {}, []
+    for key, identified in goals.items():
+        goal = identified.goal
+        if key == BASE_GOAL_KEY:
+            goal = goal.kept_at(state.r_WB, state.quaternion_WB)
+            asked = goal.asked
+        poses[key] = PoseReference(goal.position, goal.quaternion)
+        if goal.joint_positions is not None:
+            shapes.append(goal.joint_positions)
+    if controller.wheels is not None:
+        shapes = [shape[controller.wheels.wheels.other] for shape in shapes]
+    aims = Aims(
+        base=poses.get(BASE_GOAL_KEY),
+        end_effector=poses.get(END_EFFECTOR),
+        joints=shapes[0] if shapes else None,
+    )
+    return aims, asked
+
+
+def missed_parts_of(
+    controller: CoordinatedController,
+    asked: Mapping[str, frozenset[Controlled]],
+    config: ControllerConfig,
+) -> dict[str, str]:
+    """Return the :func:`missed_parts` in the state of the last command.
+
+    ``asked`` are the requested parts of the poses of base and end-effector.
+    """
+    law, goal = controller.law, controller.goal
+    state, outputs = law.state, law.outputs.selection
+    tolerance = Tolerance(config.position_tolerance, config.attitude_tolerance)
+    missed: dict[str, str] = {}
+    if goal.base is not None and asked[BASE_GOAL_KEY]:
+        aimed = Goal(goal.base.position, goal.base.quaternion, asked=asked[BASE_GOAL_KEY])
+        error = PoseError.between(state.r_WB, state.quaternion_WB, aimed)
+        missed |= missed_parts(aimed, error, controlled_parts(outputs.base), tolerance)
+    turned = "attitude" in asked[END_EFFECTOR] - controlled_parts(outputs.end_effector)
+    if goal.end_effector is not None and turned:
+        R_BE, _ = law.robot.link_pose(outputs.end_effector_link, state.q)
+        R_WE = matrix_from_quaternion(state.quaternion_WB) @ R_BE
+        turn = attitude_error(quaternion_from_matrix(R_WE), goal.end_effector.quaternion)
+        missed |= missed_turn(float(np.linalg.norm(turn)), tolerance)
+    return missed
+
+
+def goals_to_save(
+    controller: CoordinatedController,
+    asked: Mapping[str, frozenset[Controlled]],
+    goal_id: str,
+    *,
+    resumes: bool,
+) -> dict[str, IdentifiedGoal]:
+    """Return the goals of the present reference by part of the robot.
+
+    ``asked``: see :func:`missed_parts_of`.
+    """
+    goal, selection = controller.goal, controller.law.outputs.selection
+    shape = goal.joints.q if goal.joints is not None and selection.joints else None
+    if shape is not None and controller.wheels is not None:
+        shape = controller.wheels.shape_with_wheels(shape)
+    poses = {BASE_GOAL_KEY: goal.base}
+    profile = controller.profile
+    if profile is not None and not profile.carries:
+        poses[END_EFFECTOR] = goal.end_effector
+    found = {}
+    for key, pose in poses.items():
+        if pose is not None and getattr(selection, key):
+            parts = asked[key] if key == BASE_GOAL_KEY else POSE
+            kept = Goal(pose.position, pose.quaternion, shape, asked=parts)
+            found[key] = IdentifiedGoal(kept, goal_id, resumes=resumes)
+    return found
+
+
+def config_with(config: ControllerConfig, tolerance: Tolerance | None) -> ControllerConfig:
+    """Return a configuration with the tolerances of a goal; None: those of the parameters."""
+    if tolerance is None:
+        return config
+    return replace(
+        config,
+        position_tolerance=tolerance.position,
+        attitude_tolerance=tolerance.attitude,
+        joint_tolerance=tolerance.shape,
+    )
+
+
+class GoalWatch:
+    """The states since a goal began: how the goal ends, stalls or control over it is lost."""
+
+    def __init__(self) -> None:
+        self.monitor, self.stall = GoalMonitor(), StallMonitor()
+        self._error_bounds: Array | None = None
+        """Errors (m,) of the outputs beyond which control is lost."""
+        self._contacts: tuple[str, ...] = ()
+        """The links that touch."""
+        self.touched = ""
+        """The first contact on the way to the present goal, and when; empty: there was none."""
+
+    def begin(self, time: float) -> None:
+        """Begin a goal or a task at a time, s."""
+        self.monitor.begin(time)
+        self._begin_motion()
+
+    def begin_anew(self) -> None:
+        """Begin the motion to the goal again, from another pose."""
+        self.monitor.restart_settling()
+        self._begin_motion()
+
+    def _begin_motion(self) -> None:
+        self.stall.restart()
+        self._error_bounds = None
+
+    def shift_time(self, jump: float) -> None:
+        """Continue after a jump of time, s."""
+        self.monitor.shift_time(jump)
+        self.stall.restart()
+
+    def forget_touch(self, time: float) -> None:
+        """Begin a way at a time, s; links that touch now touch on it, too."""
+        self.touched = _touch(self._contacts, time)
+
+    def take_contacts(self, contacts: tuple[str, ...], time: float, *, pursues: bool) -> None:
+        """Take the links that touch from a time on, s; a new contact counts on the way."""
+        met = [each for each in contacts if each not in self._contacts]
+        self._contacts = contacts
+        if not self.touched and pursues:
+            self.touched = _touch(met, time)
+
+    def loss_by_rates(self, controller: CoordinatedController, qdot: Array) -> str:
+        """Return a clause on a joint that stays far beyond its rate limit; empty: none does."""
+        limits = controller.joint_rate_limits
+        if not self.monitor.check_rates(limits.largest_rate_share(qdot)):
+            return ""
+        joint = int(np.argmax(np.abs(qdot) / limits.rates))
+        moving = controller.law.robot.description.movable_joints[joint]
+        return (
+            f"joint '{moving.name}' moves at {qdot[joint]:.3g} {moving.unit}/s instead of "
+            f"{limits.rates[joint]:.3g} {moving.unit}/s"
+        )
+
+    def loss_by_errors(self, controller: CoordinatedController, config: ControllerConfig) -> str:
+        """Return a clause on errors far beyond the distance of the goal; empty: they are not."""
+        if self._error_bounds is None:
+            self._error_bounds = controller.error_bounds(config.error_margin.as_errors())
+        share = controller.law.largest_error_share(self._error_bounds)
+        if not self.monitor.check_errors(share):
+            return ""
+        away = controller.distance_from_reference()
+        return f"the errors grow, the robot is {away} from the reference"
+
+    def decision(
+        self,
+        controller: CoordinatedController,
+        time: float,
+        asked: Mapping[str, frozenset[Controlled]],
+        config: ControllerConfig,
+    ) -> ControllerState | None:
+        """Return the state of a goal that is decided at a time, s; None: it is not yet.
+
+        ``asked``: see :func:`missed_parts_of`.
+        """
+        at_rest, ends = controller.reference_at_rest(time), controller.reference_ends
+        assert ends is not None
+        if not at_rest and not self.monitor.is_late(time, ends, config):
+            # Errors decide nothing while the reference moves.
+            self.monitor.restart_settling()
+            return None
+        decision = self.monitor.decide_by_errors(time, at_rest, ends, controller.errors(), config)
+        if decision == Decision.NONE:
+            return None
+        if decision == Decision.FAILED or self.touched:
+            return ControllerState.FAILED
+        if missed_parts_of(controller, asked, config):
+            return ControllerState.REACHED_PARTLY
+        return ControllerState.REACHED
+
+    def message(
+        self,
+        state: ControllerState,
+        controller: CoordinatedController,
+        asked: Mapping[str, frozenset[Controlled]],
+        config: ControllerConfig,
+    ) -> str:
+        """Return the message about a reached or failed goal; see :meth:`decision`."""
+        away, missed = controller.distance_between(controller.law.state, controller.goal), {}
+        if state is ControllerState.REACHED_PARTLY:
+            missed = missed_parts_of(controller, asked, config)
+        return decided_message(state, away, config, self.stall.cause, missed, self.touched)
+
+
+def _touch(contacts: Sequence[str], time: float) -> str:
+    """Return a clause on the first of some contacts at a time, s; empty: there is none."""
+    return f"{contacts[0]} touched at {time:.4g} s" if contacts else ""
+
+
+def decided_message(
+    state: ControllerState,
+    distance: OutputDistance,
+    config: ControllerConfig,
+    cause: str = "",
+    missed: Mapping[str, str] | None = None,
+    touched: str = "",
+) -> str:
+    """Return the message about a reached or failed goal, with the distance from it.
+
+    ``cause`` is the known reason why the robot came no closer; ``missed`` are the missed parts of a
+    partly reached goal; ``touched`` is the contact that makes the goal fail.
+    """
+    limits = (
+        (distance.position, config.position_tolerance),
+        (distance.attitude, config.attitude_tolerance),
+        (distance.joints, config.joint_tolerance),
+    )
+    tolerance = OutputDistance(*(math.nan if math.isnan(off) else most for off, most in limits))
+    away = f"{distance} from it (tolerance {tolerance})"
+    if state is not ControllerState.FAILED:
+        return reached_message(away, missed or {})
+    if touched:
+        return f"The goal is not reached without contact, as {touched}: {away}."
+    late = f"not reached in time, as {cause}" if cause else "not reached in time"
+    if not any(off > most for off, most in limits):
+        away += f", within tolerance for less than the settling time of {config.settle_time:g} s"
+    return f"The goal is {late}: {away}."
