@@ -9,11 +9,9 @@ from __future__ import annotations
 
 import time
 from abc import ABC, abstractmethod
-from collections import deque
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from enum import Enum
-from typing import Any, Literal, Protocol
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from spacerobot_ros.commanding.fly_to import (
     FlyTo,
@@ -23,7 +21,10 @@ from spacerobot_ros.commanding.fly_to import (
     Progress,
 )
 from spacerobot_ros.commanding.goal_follower import Status, decision_event
+from spacerobot_ros.commanding.host import CommanderActivity, CommanderHost, StateDecoder
 from spacerobot_ros.commanding.plant_state import (
+    InputWatch,
+    Pairing,
     PlantChange,
     PlantListener,
     PlantStopped,
@@ -41,7 +42,6 @@ from spacerobot_ros.model.shared_parameters import DEFAULT_POSITION_TOLERANCE
 from spacerobot_ros.model.world import links_with_shapes, obstacles_from_topic
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.core.goal import Tolerance
-from spacerobot_ros.planning.core.schedule import BasePath
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.execution.goal_file import (
     BASE_GOAL_KEY,
@@ -50,9 +50,12 @@ from spacerobot_ros.planning.execution.goal_file import (
     IdentifiedGoal,
     PursuedGoals,
 )
-from spacerobot_ros.planning.execution.status import ScheduleStart
-from spacerobot_ros.simulation.status import PlantState, PlantStatus
+from spacerobot_ros.simulation.status import PlantStatus
 from spacerobot_ros.times import SECOND
+
+if TYPE_CHECKING:
+    from spacerobot_ros.control.executive import ControlExecutive
+    from spacerobot_ros.planning.execution.executive import Executive
 
 _LONGEST_REPETITION = 1.0
 """Longest simulated time between two contradictions that indicates two publishers, s."""
@@ -61,186 +64,10 @@ _NEVER_NS = -(10**20)
 
 _REPORT_PERIOD = 1.0  # wall s, between warnings about ignored states
 
-_LONGEST_SILENCE, _SILENT_PERIODS = 1.0, 5
-"""Time without a state after which it is reported as missing, wall s, and at least in control
-periods."""
-
-_SUSPENSION_TIME = 0.5
-"""Wall time between two checks beyond which this process itself was suspended, s."""
-
 _EQUAL_RATES = 0.05
 """Largest relative difference between two rates that are considered equal."""
 
 _FAULT_LOG_PERIOD = 5.0  # wall s, of one kind of faulty message
-LogLevel = Literal["debug", "info", "warning", "error"]
-
-
-class CommanderActivity(Enum):
-    """Whether a commander handles states."""
-
-    INACTIVE = "inactive"
-    ACTIVE = "active"
-    DECIDED = "decided"
-    """The commander has stopped after a decision about its goal (``stop_when_decided``)."""
-
-
-class CommanderHost(Protocol):
-    """The host of a commander: a node, a loop without ROS, or a test."""
-
-    def send_command(self, stamp_ns: int) -> None:
-        """Send the commander's present values as the command for the state with a stamp."""
-
-    def publish_status(self, status: Any) -> None:
-        """Publish a status of the goal."""
-
-    def report_event(self, event: Event) -> None:
-        """Publish an event."""
-
-    def publish_start(self, start: ScheduleStart) -> None:
-        """Publish the start of a schedule; only planners have schedules."""
-
-    def publish_path(self, path: BasePath, stamp_ns: int) -> None:
-        """Publish the path of a planned reference that begins; only controllers have them."""
-
-    def log(self, level: LogLevel, message: str) -> None:
-        """Write a line into the log."""
-
-    def has_publisher(self, topic: str) -> bool:
-        """Whether a publisher of odom, or of a reference, is connected."""
-
-    def waiting_states(self) -> tuple[Sequence[Stamped], Sequence[Stamped]]:
-        """Return received odoms and joints that the commander has not taken yet."""
-
-
-class GoalExecutive(Protocol):
-    """The common interface of executives: goals, and the effects of the plant on them."""
-
-    outputs: deque[Any]
-    """Statuses, events and other outputs to publish, in order; the commander removes them."""
-
-    @property
-    def unfinished_goals(self) -> frozenset[str]:
-        """Ids of pursued and waiting goals."""
-
-    @property
-    def waiting_goals(self) -> frozenset[str]:
-        """Ids of goals that are not pursued yet, for example because they wait for a plan."""
-
-    def progress(self, goal_id: str) -> tuple[str, float | None]:
-        """Return the present activity for a goal, and the predicted time until its end, s.
-
-        None: there is no prediction.
-        """
-
-    def cancel_plan(self) -> None:
-        """Cancel the planning in progress; any thread may call this."""
-        ...
-
-    def plan_at_once(self) -> None:
-        """Make later plans synchronously, because the plant is in lockstep."""
-        ...
-
-    def configure(self, config: Any) -> None:
-        """Use the live parameters of another configuration from the next state on."""
-
-    def abort(self, why: str) -> str | None:
-        """Give up all goals; return a message about the robot, or None without a goal."""
-
-    def plant_stopped(
-        self, why: str, commanded_until_ns: int | None = None, rests_since_ns: int = 0
-    ) -> bool:
-        """Give up every goal at once, because the plant ignores commands from now on.
-
-        Parameters
-        ----------
-        why
-            The message of the plant; it becomes part of the status.
-        commanded_until_ns
-            If the plant rests because commands were missing: the stamp of the last command that it
-            received; later goals continue. None: the plant obeys no commands.
-        rests_since_ns
-            Stamp since which that plant rests, ns.
-
-        Returns
-        -------
-        bool
-            Whether a goal was given up.
-        """
-
-    def on_plant_obeying(self) -> None:
-        """React to a plant that obeys again."""
-
-    def plant_reset(self) -> None:
-        """Restart the present goal, because the state of the robot has changed."""
-
-
-class StateDecoder(Protocol):
-    """Reads the messages of one robot, which are opaque to a commander."""
-
-    q: Array
-    """Positions (n,) of the latest accepted joints, m or rad."""
-    qdot: Array
-    """Rates (n,) of the latest accepted joints, m/s or rad/s."""
-
-    def check_robot(self, joints: Any) -> None:
-        """Raise CommandError if the joint states are of another robot."""
-
-    def decode_joints(self, joints: Any) -> int:
-        """Read joints into ``q`` and ``qdot``; return their stamp, ns, or raise CommandError."""
-
-    def decode_base(self, odom: Any) -> tuple[Array, Array]:
-        """Return pose (7,) and twist (6,) of an odom or base reference, or raise CommandError."""
-
-    def measured_base(self, odom: Any) -> tuple[Array, Array]:
-        """Like :meth:`decode_base`, but the next call may overwrite the returned arrays."""
-
-    def target(self, odom: Any) -> tuple[Array, Array]:
-        """Return pose (7,) and twist (6,) of an odom of the target, or raise CommandError."""
-
-    def joint_reference(self, message: Any) -> tuple[Array, Array]:
-        """Return positions and rates (n,) of a joint reference, or raise CommandError."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class StateArrays:
-    """A whole state as arrays: the joints, and the base if it is measured."""
-
-    stamp_ns: int
-    q: Array
-    qdot: Array
-    pose: Array | None = None
-    twist: Array | None = None
-
-
-class ArrayDecoder:
-    """A :class:`StateDecoder` of :class:`StateArrays`."""
-
-    q: Array
-    qdot: Array
-
-    def check_robot(self, joints: StateArrays) -> None:
-        """Accept any joints."""
-
-    def decode_joints(self, joints: StateArrays) -> int:
-        """Store the joints unchanged."""
-        self.q, self.qdot = joints.q, joints.qdot
-        return joints.stamp_ns
-
-    def decode_base(self, odom: StateArrays) -> tuple[Array, Array]:
-        """Return pose and twist."""
-        assert odom.pose is not None
-        assert odom.twist is not None
-        return odom.pose, odom.twist
-
-    def measured_base(self, odom: StateArrays) -> tuple[Array, Array]:
-        """Return pose and twist."""
-        return self.decode_base(odom)
-
-    target = decode_base
-
-    def joint_reference(self, message: StateArrays) -> tuple[Array, Array]:
-        """Return positions and rates."""
-        return message.q, message.qdot
 
 
 class Commander(ABC):
@@ -251,21 +78,14 @@ class Commander(ABC):
     the plant, whatever rate is configured. Goals received before the robot's description wait for
     it. All goals are given up if the plant reports that it does not obey (:class:`PlantListener`).
 
-    Parameters
-    ----------
-    config
-        Parameters of the commander.
-    host
-        Receives the outputs.
-    goal_keys
-        Parts of the robot that goals may be for.
-    pose_required
-        Whether a state waits for its odom.
-    clock
-        Returns the wall time, s.
+    ``goal_keys`` are the parts of the robot that goals may be for; ``pose_required``: a state waits
+    for its odom; ``clock`` returns the wall time, s.
     """
 
-    executive: GoalExecutive | None = None
+    executive: ControlExecutive | Executive | None = None
+
+    _without_goal: ClassVar[tuple[str, str]]
+    """State and message of a status without a goal."""
 
     def __init__(
         self,
@@ -301,10 +121,7 @@ class Commander(ABC):
         self._waiting_goals: dict[str, IdentifiedGoal] = {}
         """Goals that were received before the robot's description."""
         self._fly_to = FlyToGoals(self._goal_errors, self._report_aborted)
-        self._activated = self._heard = self._checked = clock()
-        """Wall times of the activation, the last state and the last check, s."""
-        self.refusal = ""
-        """Why the last joint states were refused, as a clause; empty: not refused."""
+        self.inputs = InputWatch(self.states, self.plant, host.has_publisher, clock)
         self._reported_missing = self._reported_waiting = ""
         """What the last status reported as missing, as a clause, and the waiting goal; empty:
         nothing."""
@@ -355,15 +172,15 @@ class Commander(ABC):
                 f"Parameter 'tick_rate' is {given:g} Hz, but the plant has {rate:g} Hz: "
                 f"commands follow the plant. Set it to {rate:g}, or leave it out.",
             )
-        if self.robot is not None:
+        if self.robot is not None and self.executive is not None:
             self._change_rate(self.robot)
         self.answer_latest()
 
     def drop_robot(self, why: str) -> None:
         """Give up the goals and the robot; later goals wait for another robot."""
         if self.executive is not None:
-            self._give_up_goals(PlantStopped(why))
-            self._stop_executive(why)
+            self.give_up_goals(PlantStopped(why))
+            self._stop_executive()
         self.robot = self.executive = self._decoder = self._described = None
 
     def activate(self) -> None:
@@ -374,7 +191,7 @@ class Commander(ABC):
         ParameterError
             The file of goals is invalid.
         """
-        self._activated = self._heard = self._checked = self._clock()
+        self.inputs.begin()
         self._reported_missing = ""
         self._resume_goals(self._goal_file.load())
         self.activity = CommanderActivity.ACTIVE
@@ -388,7 +205,7 @@ class Commander(ABC):
         if self.config.resume_file:
             why += " A goal from a topic is resumed when the node is activated again."
         if self.activity is not CommanderActivity.INACTIVE and self.executive is not None:
-            self._stop_executive(why)
+            self._stop_executive()
         self.activity, self._waiting_goals = CommanderActivity.INACTIVE, {}
         self._fly_to.end_dropped_goals((), why)
 
@@ -425,24 +242,10 @@ class Commander(ABC):
         self._accept_goal(key, accepted)
         return accepted
 
-    def receive_fly_to(
-        self, goal_id: str, read: Callable[[], FlyTo], client: FlyToClient
-    ) -> IdentifiedGoal | None:
+    def receive_fly_to(self, goal_id: str, read: Callable[[], FlyTo], client: FlyToClient) -> None:
         """Accept or refuse the goal of an action; the client receives feedback and a result.
 
-        Parameters
-        ----------
-        goal_id
-            Unique id of the goal in statuses.
-        read
-            Returns the goal, or raises PlanningError with the message of the refusal.
-        client
-            Client that waits for the result.
-
-        Returns
-        -------
-        IdentifiedGoal | None
-            The goal; None: it is refused.
+        ``read`` returns the goal, or raises PlanningError with the message of the refusal.
         """
         try:
             self._require_free()
@@ -450,14 +253,13 @@ class Commander(ABC):
         except PlanningError as error:
             self._fly_to.begin(goal_id, client, None)
             self._refuse_goal(str(error), goal_id)
-            return None
+            return
         self._fly_to.begin(goal_id, client, request)
         tolerance = request.tolerance_or(self._default_tolerance())
         accepted = IdentifiedGoal(
             request.goal, goal_id, tolerance, resumes=False, required=request.tolerance
         )
         self._accept_goal(BASE_GOAL_KEY, accepted)
-        return accepted
 
     def cancel_fly_to(self, goal_id: str) -> None:
         """Abort the goal of an action; a goal about to be replaced ends when it is replaced."""
@@ -506,9 +308,8 @@ class Commander(ABC):
     def _publish_decision(self, status: Status) -> None:
         """Publish a status, and an event if the status decides a goal."""
         self._publish_status(status)
-        event = decision_event(status)
-        if event is not None:
-            self.host.report_event(event)
+        if status.state.decided:
+            self.host.report_event(decision_event(status))
 
     def _publish_status(self, status: Status) -> None:
         # A replaced goal ends before its successor begins: the last status is of the present goal.
@@ -552,9 +353,7 @@ class Commander(ABC):
         """Publish that a goal of an action has been aborted, by the reason for a later goal."""
         status = self._make_status("aborted", message, goal_id)
         self.host.publish_status(status)
-        event = decision_event(status)
-        assert event is not None
-        self.host.report_event(event)
+        self.host.report_event(decision_event(status))
         return status
 
     def _progress(self, goal_id: str, goal: Goal, begun_ns: int) -> Progress:
@@ -606,7 +405,7 @@ class Commander(ABC):
         self._take_states(odoms, [Stamped(stamp_ns, joints), *waiting])
         if self._fly_to:
             self._watch_fly_to()
-        self._heard = self._clock()
+        self.inputs.note_state()
 
     def take_odom(self, stamp_ns: int, odom: Any) -> None:
         """Take an odom of the present time, and handle its state if complete."""
@@ -629,17 +428,14 @@ class Commander(ABC):
         if not self.config.tick_rate:
             self._follow_rate()
         if self._reported_missing:
-            self._heard = self._clock()
+            self.inputs.note_state()
             self._report_missing()
         self.answer()
 
     def take_accepted_jump(self) -> str:
         """Take the set-aside state once its time is accepted; call this ten times per second.
 
-        Returns
-        -------
-        str
-            A warning about messages that were ignored, at most once a second; empty: none.
+        Return a warning about messages that were ignored, at most once a second; empty: none.
         """
         stamps = self.stamps
         self._follow_rate()
@@ -663,35 +459,17 @@ class Commander(ABC):
         """Clause that names the messages for which states wait; empty: none."""
         if self.robot is None:
             return "a robot on 'robot_description'"
-        topics = {"joint_states": self.states.joints, "odom": self.states.odom}
-        absent = [topic for topic, message in topics.items() if message is None]
-        refused = f", whose messages are refused: {self.refusal}" if self.refusal else ""
-        if absent:
-            waited = self._clock() - self._activated >= _LONGEST_SILENCE
-            unheard = [topic for topic in absent if waited and not self.host.has_publisher(topic)]
-            nobody = f", and no node publishes {_quoted(unheard)}" if unheard else ""
-            return f"states on {_quoted(absent)}{refused}{nobody}"
-        silence = self._clock() - self._heard
-        longest = max(_LONGEST_SILENCE, _SILENT_PERIODS * self.config.control_period)
-        if silence > longest and self.plant.status.state is PlantState.INACTIVE:
-            return "the plant, which is inactive: activate it"
-        if silence > longest and not (self.plant.paused or self.plant.in_lockstep):
-            ceased = "" if refused else ", which have ceased"
-            return f"states on 'joint_states'{refused}{ceased}"
-        return ""
+        return self.inputs.missing(self.config.control_period)
 
     def _report_missing(self) -> None:
         """Report in the status what is missing, and when it is there again."""
-        now = self._clock()
-        if now - self._checked > _SUSPENSION_TIME:
-            self._heard += now - self._checked  # This process itself stood still.
-        self._checked = now
+        self.inputs.excuse_suspension()
         missing = self.missing
         goal_id = self._pursued_goal_id if missing else ""
         known = missing == self._reported_missing and goal_id == self._reported_waiting
         if known or not self.active:
             return
-        if missing and self._reported_missing and now - self._activated < _LONGEST_SILENCE:
+        if missing and self._reported_missing and self.inputs.just_begun:
             return  # The rest is on its way.
         self._reported_missing, self._reported_waiting = missing, goal_id
         if missing:
@@ -732,10 +510,10 @@ class Commander(ABC):
             if self._decoder is not None:
                 self._decoder.check_robot(joints)
         except CommandError as error:
-            self.refusal = str(error)
+            self.inputs.refusal = str(error)
             self._log_fault("joints", f"joint_states: {error}.")
             return False
-        self.refusal = ""
+        self.inputs.refusal = ""
         return True
 
     def _log_fault(self, kind: str, message: str) -> None:
@@ -756,7 +534,7 @@ class Commander(ABC):
         """React to a status of the named plant."""
         for change in self.plant.update(status, name):
             if isinstance(change, PlantStopped):
-                self._give_up_goals(change)
+                self.give_up_goals(change)
                 continue
             if change is PlantChange.RESET:
                 self.states.forget_pose()
@@ -781,10 +559,7 @@ class Commander(ABC):
                 self._change_masses(self.robot)
 
     def receive_obstacles(self, text: str) -> None:
-        """Plan around the obstacles of a URDF text from now on; empty: no obstacles.
-
-        If the text is refused, this is logged and the previous obstacles are kept.
-        """
+        """Plan around the obstacles of a URDF text from now on, if it is valid; empty: none."""
         if text == self._obstacles:
             return
         try:
@@ -810,11 +585,8 @@ class Commander(ABC):
             self.host.log("error", f"plant/status: {error}")
             return robot
 
-    def on_plant_silent(self, message: str) -> None:
-        """Give up the goals, because the plant no longer sends anything."""
-        self._give_up_goals(PlantStopped(message))
-
-    def _give_up_goals(self, stopped: PlantStopped) -> None:
+    def give_up_goals(self, stopped: PlantStopped) -> None:
+        """Give up the goals, because the plant does not obey or is silent."""
         if stopped.commanded_until_ns is None:
             self._goal_file.delete()
         if self.executive is not None:
@@ -845,19 +617,16 @@ class Commander(ABC):
 
     def reconfigure(self, config: Any) -> None:
         """Use the live parameters of another configuration from now on."""
-        self._given, self.config = config, self._adapted(config)
+        adapted = self._adapted(config)
+        self._given, self.config = config, adapted
         if self.executive is not None:
-            self.executive.configure(self.config)
+            self.executive.configure(adapted)
 
     def _adapted(self, config: Any) -> Any:
         """Return a configuration for the robot and the plant: one in lockstep waits for plans."""
         background = config.plan_in_background and not self.plant.in_lockstep
         config = replace(config, tick_rate=self.config.tick_rate, plan_in_background=background)
         return config if self._described is None else config.for_robot(self._described.description)
-
-    @property
-    def _knows_rate(self) -> bool:
-        return self.config.tick_rate > 0
 
     @abstractmethod
     def _change_rate(self, robot: SpaceRobot) -> None:
@@ -866,7 +635,7 @@ class Commander(ABC):
     @property
     def _pursued_goal_id(self) -> str:
         """Id of a goal that is pursued or waits; empty: none is."""
-        return next(iter(sorted(self._active_goal_ids())), "")
+        return min(self._active_goal_ids(), default="")
 
     def _report_present_status(self) -> None:
         """Publish the status of the goal again: states come again."""
@@ -878,17 +647,12 @@ class Commander(ABC):
 
     @property
     @abstractmethod
-    def _without_goal(self) -> tuple[str, str]:
-        """State and message of a status without a goal."""
-
-    @property
-    @abstractmethod
     def _actuation_refusal(self) -> str:
         """Message on a plant that takes other commands than these; empty: it takes them."""
 
     @abstractmethod
-    def _stop_executive(self, why: str) -> None:
-        """Stop the executive, which gives up its goals, with a message for their statuses."""
+    def _stop_executive(self) -> None:
+        """Stop the executive, which gives up its goals."""
 
     @abstractmethod
     def _resume_goals(self, saved: Mapping[str, IdentifiedGoal]) -> None:
@@ -898,9 +662,16 @@ class Commander(ABC):
     def _submit_goal(self, key: str, goal: IdentifiedGoal) -> None:
         """Give a goal to the executive."""
 
-    @abstractmethod
     def answer(self) -> None:
-        """Handle the ready state, if any, while the commander is active."""
+        """Handle a ready state once, if the commander is active and knows the rate."""
+        if self.executive is not None and self.active and self.config.tick_rate > 0:
+            pairing = self.states.take_ready()
+            if pairing is not None:
+                self._answer_state(pairing)
+
+    @abstractmethod
+    def _answer_state(self, pairing: Pairing) -> None:
+        """Handle the state of the latest messages."""
 
     @abstractmethod
     def _forward_plant_state(self) -> None:
@@ -928,7 +699,3 @@ class Commander(ABC):
     @abstractmethod
     def _forward(self, output: Any) -> None:
         """Publish a status, or another output that this executive alone has."""
-
-
-def _quoted(topics: Iterable[str]) -> str:
-    return " and ".join(f"'{topic}'" for topic in topics)

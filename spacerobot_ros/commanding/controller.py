@@ -6,17 +6,13 @@ import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import replace
-from operator import is_not
 from typing import Any
 
 import numpy as np
 
-from spacerobot_ros.commanding.commander import (
-    Commander,
-    CommanderHost,
-    StateDecoder,
-)
+from spacerobot_ros.commanding.commander import Commander
 from spacerobot_ros.commanding.goal_follower import Status
+from spacerobot_ros.commanding.host import CommanderHost, StateDecoder
 from spacerobot_ros.commanding.plant_state import Pairing, Stamped
 from spacerobot_ros.control import ControlState, NotFiniteError, PoseReference, Reference
 from spacerobot_ros.control.config import ControllerConfig
@@ -29,7 +25,7 @@ from spacerobot_ros.control.servicing import Task
 from spacerobot_ros.control.status import ControllerState, ControllerStatus
 from spacerobot_ros.errors import CommandError, PlanningError
 from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.model.description import Array, RobotDescription
+from spacerobot_ros.model.description import RobotDescription
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.execution.goal_file import BASE_GOAL_KEY, IdentifiedGoal
 from spacerobot_ros.times import SECOND
@@ -61,6 +57,7 @@ class ControllerCommander(Commander):
 
     config: ControllerConfig
     executive: ControlExecutive | None
+    _without_goal = "holding", "Waiting for a goal; the robot holds its pose."
 
     def __init__(
         self,
@@ -82,8 +79,6 @@ class ControllerCommander(Commander):
         """Wall time of the last check of waiting states, s."""
         self._pose_has_come = self._odom_was_connected = False
         self.effort, self.wrench = np.zeros(0), np.zeros(6)
-        self._measured: ControlState | None = None
-        self._measured_arrays: tuple[Array, ...] = ()
         self._target: RobotDescription | None = None
         self._target_odometry: Stamped | None = None
         """The latest odometry of the target, until it is read."""
@@ -272,11 +267,11 @@ class ControllerCommander(Commander):
             self.executive.use_obstacles(self._world)
 
     def _change_rate(self, robot: SpaceRobot) -> None:
-        if self.executive is not None:
-            self._change_masses(robot)
-            self.executive.configure(self.config)
-            self.rehearse()
-            self._held_velocities = HeldVelocityReference(self.config.control_period)
+        assert self.executive is not None
+        self._change_masses(robot)
+        self.executive.configure(self.config)
+        self.rehearse()
+        self._held_velocities = HeldVelocityReference(self.config.control_period)
 
     @property
     def _actuation_refusal(self) -> str:
@@ -287,11 +282,7 @@ class ControllerCommander(Commander):
             "plant with actuation:=effort."
         )
 
-    @property
-    def _without_goal(self) -> tuple[str, str]:
-        return "holding", "Waiting for a goal; the robot holds its pose."
-
-    def _stop_executive(self, why: str) -> None:
+    def _stop_executive(self) -> None:
         assert self.executive is not None
         self.executive.reset()
 
@@ -338,13 +329,6 @@ class ControllerCommander(Commander):
         before, self._odom_was_connected = self._odom_was_connected, self.host.has_publisher("odom")
         return not before
 
-    def answer(self) -> None:
-        """Handle a state once, as soon as all its messages have arrived."""
-        if self.executive is not None and self.active and self._knows_rate:
-            pairing = self.states.take_ready()
-            if pairing is not None:
-                self._answer_state(pairing)
-
     def _answer_state(self, pairing: Pairing, *, send: bool = True) -> None:
         """Answer one state with one command of the same stamp."""
         executive, decoder, states = self.executive, self._decoder, self.states
@@ -359,7 +343,8 @@ class ControllerCommander(Commander):
         try:
             q, qdot, measured = decoder.q, decoder.qdot, None
             if pairing is Pairing.WHOLE:
-                measured = self._measured_state(*decoder.measured_base(states.odom), q, qdot)
+                pose, twist = map(np.array, decoder.decode_base(states.odom))
+                measured = ControlState(pose[:3], pose[3:], twist[:3], twist[3:], q, qdot)
             now = stamp / SECOND
             self._read_target(decoder)
             result = executive.command(now, measured, q, qdot, self._reference(decoder))
@@ -380,16 +365,6 @@ class ControllerCommander(Commander):
             self._published_plan = profile
             if isinstance(profile, PlannedReference):
                 self.host.publish_path(profile.path, stamp_ns)
-
-    def _measured_state(self, *arrays: Array) -> ControlState:
-        """Return the state of a pose (7,), a twist (6,), q and qdot (n,)."""
-        measured = self._measured
-        # Messages of one robot are read into the same arrays, which the state has parts of.
-        if measured is None or any(map(is_not, arrays, self._measured_arrays)):
-            pose, twist, q, qdot = self._measured_arrays = arrays
-            measured = ControlState(pose[:3], pose[3:], twist[:3], twist[3:], q, qdot)
-            self._measured = measured
-        return measured
 
     def _read_target(self, decoder: StateDecoder) -> None:
         if self._target_odometry is not None:

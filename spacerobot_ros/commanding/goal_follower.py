@@ -54,9 +54,7 @@ class GoalFollower:
         return status.state.decided
 
 
-def decision_event(status: Status) -> Event | None:
-    """Return the event of a status that decides a goal; None for other statuses."""
-    if not status.state.decided:
-        return None
+def decision_event(status: Status) -> Event:
+    """Return the event of a status that decides a goal."""
     kind = EventKind(f"goal_{status.state.value}")
     return Event(kind, status.message, status.state.level, goal_id=status.goal_id)

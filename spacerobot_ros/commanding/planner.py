@@ -8,11 +8,8 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from typing import Any
 
-from spacerobot_ros.commanding.commander import (
-    Commander,
-    CommanderHost,
-    StateDecoder,
-)
+from spacerobot_ros.commanding.commander import Commander
+from spacerobot_ros.commanding.host import CommanderHost, StateDecoder
 from spacerobot_ros.commanding.plant_state import Pairing
 from spacerobot_ros.commanding.trajectory_output import TrajectoryEnd, TrajectoryOutput
 from spacerobot_ros.errors import CommandError, PlanningError
@@ -79,6 +76,7 @@ class PlannerCommander(Commander):
 
     config: PlannerConfig
     executive: Executive | None
+    _without_goal = "idle", "Waiting for a goal pose."
 
     def __init__(
         self,
@@ -112,12 +110,14 @@ class PlannerCommander(Commander):
         return self.executive.setpoint
 
     def _build_executive(self, robot: SpaceRobot, decoder: StateDecoder) -> None:
-        worker = self._make_worker(robot, self._method)
+        worker = self._make_worker(robot)
         self.executive = Executive(robot, self.config, worker)
         self._measured = _MeasuredState(decoder)
 
-    def _make_worker(self, robot: SpaceRobot, method: GaitMethod | None) -> PlanningWorker:
+    def _make_worker(self, robot: SpaceRobot) -> PlanningWorker:
         described = robot.description
+        # A given method is one for the robot without its payload.
+        method = self._method if robot is self._described else None
         if self._obstacles is not None:
             described = with_world(described, self._world)
         return PlanningWorker(robot, self.config, method, self._on_long_work, described)
@@ -130,31 +130,22 @@ class PlannerCommander(Commander):
     def _use_obstacles(self) -> None:
         executive, robot = self.executive, self.robot
         if executive is not None and robot is not None:
-            method = self._method if robot is self._described else None
             with self._on_long_work():
-                executive.use_obstacles(lambda: self._make_worker(robot, method))
+                executive.use_obstacles(lambda: self._make_worker(robot))
             self._forward_outputs()
 
     def _change_masses(self, robot: SpaceRobot) -> None:
-        assert self.executive is not None
-        # A given method is one for the robot without its payload.
-        method = self._method if robot is self._described else None
-        with self._on_long_work():
-            worker = self._make_worker(robot, method)
-        self.executive.use_robot(robot, worker)
-        self._forward_outputs()
+        self._change_robot(robot, None)
 
     def _change_rate(self, robot: SpaceRobot) -> None:
-        if self.executive is None:
-            return
-        with self._on_long_work():
-            worker = self._make_worker(robot, self._method)
-        self.executive.use_robot(robot, worker, self.config)
-        self._forward_outputs()
+        self._change_robot(robot, self.config)
 
-    @property
-    def _without_goal(self) -> tuple[str, str]:
-        return "idle", "Waiting for a goal pose."
+    def _change_robot(self, robot: SpaceRobot, config: PlannerConfig | None) -> None:
+        assert self.executive is not None
+        with self._on_long_work():
+            worker = self._make_worker(robot)
+        self.executive.use_robot(robot, worker, config)
+        self._forward_outputs()
 
     @property
     def _actuation_refusal(self) -> str:
@@ -166,7 +157,7 @@ class PlannerCommander(Commander):
             "coordinated_control."
         )
 
-    def _stop_executive(self, why: str) -> None:
+    def _stop_executive(self) -> None:
         assert self.executive is not None
         if self.trajectories is None:
             commands = self.statistics.commands_published
@@ -257,16 +248,10 @@ class PlannerCommander(Commander):
         # A goal to plan for or to evaluate needs every pose, even after its joints.
         return self.executive is not None and self.executive.measuring
 
-    def answer(self) -> None:
-        """Handle a state as soon as its joints have arrived; only plans need its pose."""
-        executive = self.executive
-        if executive is None or not self.active or not self._knows_rate:
-            return
-        states = self.states
-        pairing = states.take_ready()
-        if pairing is None:
-            return
-        measured = self._measured
+    def _answer_state(self, pairing: Pairing) -> None:
+        """Answer a state as soon as its joints have arrived; only plans need its pose."""
+        executive, states, measured = self.executive, self.states, self._measured
+        assert executive is not None
         measured.odom = None if pairing is Pairing.WITHOUT_POSE else states.odom
         try:
             measured.stamp_ns = measured.decoder.decode_joints(states.joints)

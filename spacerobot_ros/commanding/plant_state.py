@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from enum import Enum
 from statistics import fmean, median
@@ -428,3 +428,72 @@ def _timeout_rest(status: PlantStatus) -> PlantStopped | None:
     if not (math.isfinite(last) and math.isfinite(since)):
         return None
     return PlantStopped(why, round(last * SECOND), round(since * SECOND))
+
+
+# -- inputs that do not come ------------------------------------------------------------------
+
+_LONGEST_SILENCE, _SILENT_PERIODS = 1.0, 5
+"""Time without a state after which it is reported as missing, wall s, and at least in control
+periods."""
+
+_SUSPENSION_TIME = 0.5
+"""Wall time between two checks beyond which this process itself was suspended, s."""
+
+
+class InputWatch:
+    """Whether the states of a plant arrive; ``clock`` returns the wall time, s."""
+
+    def __init__(
+        self,
+        states: StateSynchroniser,
+        plant: PlantListener,
+        has_publisher: Callable[[str], bool],
+        clock: Callable[[], float],
+    ) -> None:
+        self._states, self._plant = states, plant
+        self._has_publisher, self._clock = has_publisher, clock
+        self.refusal = ""
+        """Why the last joint states were refused, as a clause; empty: not refused."""
+        self.begin()
+
+    def begin(self) -> None:
+        """Begin to wait for states."""
+        self._begun = self._heard = self._checked = self._clock()
+
+    def note_state(self) -> None:
+        """Record that a state has arrived."""
+        self._heard = self._clock()
+
+    @property
+    def just_begun(self) -> bool:
+        """Whether inputs may still be on their way."""
+        return self._clock() - self._begun < _LONGEST_SILENCE
+
+    def excuse_suspension(self) -> None:
+        """Count no silence for the time in which this process itself stood still."""
+        now = self._clock()
+        if now - self._checked > _SUSPENSION_TIME:
+            self._heard += now - self._checked
+        self._checked = now
+
+    def missing(self, control_period: float) -> str:
+        """Return a clause that names the messages for which states wait; empty: none."""
+        topics = {"joint_states": self._states.joints, "odom": self._states.odom}
+        absent = [topic for topic, message in topics.items() if message is None]
+        refused = f", whose messages are refused: {self.refusal}" if self.refusal else ""
+        if absent:
+            unheard = [t for t in absent if not (self.just_begun or self._has_publisher(t))]
+            nobody = f", and no node publishes {_quoted(unheard)}" if unheard else ""
+            return f"states on {_quoted(absent)}{refused}{nobody}"
+        silence = self._clock() - self._heard
+        if silence <= max(_LONGEST_SILENCE, _SILENT_PERIODS * control_period):
+            return ""
+        if self._plant.status.state is PlantState.INACTIVE:
+            return "the plant, which is inactive: activate it"
+        if self._plant.paused or self._plant.in_lockstep:
+            return ""
+        return f"states on 'joint_states'{refused or ', which have ceased'}"
+
+
+def _quoted(topics: Iterable[str]) -> str:
+    return " and ".join(f"'{topic}'" for topic in topics)

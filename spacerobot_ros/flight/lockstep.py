@@ -24,12 +24,13 @@ from enum import Enum
 
 import numpy as np
 
-from spacerobot_ros.commanding.commander import ArrayDecoder, Commander, StateArrays
+from spacerobot_ros.commanding.commander import Commander
 from spacerobot_ros.commanding.controller import (
     JOINT_REFERENCE,
     ControllerCommander,
 )
 from spacerobot_ros.commanding.goal_follower import GoalFollower, Status
+from spacerobot_ros.commanding.host import ArrayDecoder, StateArrays
 from spacerobot_ros.commanding.planner import PlannerCommander
 from spacerobot_ros.commanding.plant_state import Stamped
 from spacerobot_ros.control.goals import END_EFFECTOR
@@ -181,7 +182,7 @@ class _DecisionState(Enum):
 
 @dataclass(frozen=True)
 class _Host:
-    """The :class:`~spacerobot_ros.commanding.commander.CommanderHost` of a commander here."""
+    """The :class:`~spacerobot_ros.commanding.host.CommanderHost` of a commander here."""
 
     flight: LockstepFlight
     node: str

@@ -448,7 +448,7 @@ class JointOrder:
 class MessageDecoder:
     """Reads measured states and references of one robot from serialised messages.
 
-    It is the :class:`~spacerobot_ros.commanding.commander.StateDecoder` of the nodes.
+    It is the :class:`~spacerobot_ros.commanding.host.StateDecoder` of the nodes.
 
     Parameters
     ----------
@@ -464,8 +464,7 @@ class MessageDecoder:
         self.ignored, self.joined = self._joints.ignored, self._joints.joined
         """Ignored parts of joint states, and the function that merges joint states."""
         self._references = JointReader(joint_names, ["position", "velocity"])
-        self._measured = {_POSE_PATH: np.zeros(7), _TWIST_PATH: np.zeros(6)}
-        spans = {path: len(array) for path, array in self._measured.items()}
+        spans = {_POSE_PATH: 7, _TWIST_PATH: 6}
         self._odom = TemplateReader(ODOMETRY, spans)
         self._target = TemplateReader(ODOMETRY, spans)
         self.q, self.qdot = self._joints.values["position"], self._joints.values["velocity"]
@@ -480,13 +479,6 @@ class MessageDecoder:
         """Return pose (7,) and twist (6,) of an Odometry."""
         self._odom.accept(odom)
         return self._odom.floats(_POSE_PATH), self._odom.floats(_TWIST_PATH)
-
-    def measured_base(self, odom: bytes) -> tuple[Array, Array]:
-        """Return :meth:`decode_base` in arrays that the next call overwrites."""
-        self._odom.accept(odom)
-        for path, array in self._measured.items():
-            array[:] = self._odom.floats(path)
-        return self._measured[_POSE_PATH], self._measured[_TWIST_PATH]
 
     def target(self, odom: bytes) -> tuple[Array, Array]:
         """Return pose (7,) and twist (6,) of an Odometry of the target."""

@@ -7,12 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from spacerobot_ros.commanding.commander import (
-    ArrayDecoder,
-    Commander,
-    StateArrays,
-)
+from spacerobot_ros.commanding.commander import Commander
 from spacerobot_ros.commanding.goal_follower import Status
+from spacerobot_ros.commanding.host import ArrayDecoder, StateArrays
 from spacerobot_ros.commanding.plant_state import Stamped
 from spacerobot_ros.errors import CommandError
 from spacerobot_ros.events import Event

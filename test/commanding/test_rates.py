@@ -12,8 +12,8 @@ from commanding.commanders import GOAL, Rig
 from support.executive_loop import planar_manipulator
 from support.sentences import assert_one_sentence
 
-from spacerobot_ros.commanding.commander import ArrayDecoder, StateArrays
 from spacerobot_ros.commanding.controller import ControllerCommander
+from spacerobot_ros.commanding.host import ArrayDecoder, StateArrays
 from spacerobot_ros.commanding.planner import PlannerCommander
 from spacerobot_ros.control.config import ControllerConfig
 from spacerobot_ros.control.servicing import Task

@@ -26,7 +26,6 @@ from visualization_msgs.msg import MarkerArray
 
 from spacerobot_ros.messages.layout import Layout, encode
 from spacerobot_ros.messages.readers import (
-    MessageDecoder,
     MessageTemplate,
     TemplateReader,
     UnreadableError,
@@ -196,20 +195,6 @@ def test_a_template_changes_its_numbers_and_nothing_else(
     prototype.pose.covariance = np.arange(36.0)
     prototype.header.stamp = Time(sec=time_ns // 10**9, nanosec=time_ns % 10**9)
     assert sent == prototype
-
-
-@few
-@given(st.lists(messages(Odometry), min_size=2, max_size=4))
-def test_a_measured_base_is_read_into_the_same_arrays(given: list[Odometry]) -> None:
-    decoder, kept = MessageDecoder([]), []
-    for odom in given:
-        pose, twist = decoder.measured_base(serialize_message(odom))
-        p, o = odom.pose.pose.position, odom.pose.pose.orientation
-        v, w = odom.twist.twist.linear, odom.twist.twist.angular
-        np.testing.assert_array_equal(pose, [p.x, p.y, p.z, o.x, o.y, o.z, o.w])
-        np.testing.assert_array_equal(twist, [v.x, v.y, v.z, w.x, w.y, w.z])
-        kept.append((pose, twist))
-    assert all(pose is kept[0][0] and twist is kept[0][1] for pose, twist in kept)
 
 
 @few

@@ -19,9 +19,10 @@ from rclpy.subscription import Subscription
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 
-from spacerobot_ros.commanding.commander import Commander, LogLevel
+from spacerobot_ros.commanding.commander import Commander
 from spacerobot_ros.commanding.goal_follower import Status
-from spacerobot_ros.commanding.plant_state import Stamped
+from spacerobot_ros.commanding.host import LogLevel
+from spacerobot_ros.commanding.plant_state import PlantStopped, Stamped
 from spacerobot_ros.control.config import ControllerConfig
 from spacerobot_ros.errors import CommandError, SpaceRobotError
 from spacerobot_ros.messages.builders import StateFrames, robot_frames
@@ -185,7 +186,7 @@ class CommanderNode(FlightNode):
         """Drop all goals if the plant is silent and the parameters request it."""
         super().on_silence(silence)
         if self.config.watchdog_action == "abort" and not silence.over:
-            self.commander.on_plant_silent(silence.message)
+            self.commander.give_up_goals(PlantStopped(silence.message))
 
     # -- the host of the commander ------------------------------------------------------------
 
@@ -351,7 +352,7 @@ class CommanderNode(FlightNode):
         except CommandError:
             return raw  # The commander refuses it.
         if whole is None:
-            self.commander.refusal = self._decoder.incomplete
+            self.commander.inputs.refusal = self._decoder.incomplete
         return whole
 
     def _on_joints(self, raw: bytes) -> None:

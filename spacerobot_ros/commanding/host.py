@@ -1,0 +1,115 @@
+"""The surroundings of a commander: its host, and the decoder of the states that it receives."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import Enum
+from typing import Any, Literal, Protocol
+
+from spacerobot_ros.commanding.plant_state import Stamped
+from spacerobot_ros.events import Event
+from spacerobot_ros.model.description import Array
+from spacerobot_ros.planning.core.schedule import BasePath
+from spacerobot_ros.planning.execution.status import ScheduleStart
+
+LogLevel = Literal["debug", "info", "warning", "error"]
+
+
+class CommanderActivity(Enum):
+    """Whether a commander handles states."""
+
+    INACTIVE = "inactive"
+    ACTIVE = "active"
+    DECIDED = "decided"
+    """The commander has stopped after a decision about its goal (``stop_when_decided``)."""
+
+
+class CommanderHost(Protocol):
+    """The host of a commander: a node, a loop without ROS, or a test."""
+
+    def send_command(self, stamp_ns: int) -> None:
+        """Send the commander's present values as the command for the state with a stamp."""
+
+    def publish_status(self, status: Any) -> None:
+        """Publish a status of the goal."""
+
+    def report_event(self, event: Event) -> None:
+        """Publish an event."""
+
+    def publish_start(self, start: ScheduleStart) -> None:
+        """Publish the start of a schedule; only planners have schedules."""
+
+    def publish_path(self, path: BasePath, stamp_ns: int) -> None:
+        """Publish the path of a planned reference that begins; only controllers have them."""
+
+    def log(self, level: LogLevel, message: str) -> None:
+        """Write a line into the log."""
+
+    def has_publisher(self, topic: str) -> bool:
+        """Whether a publisher of odom, or of a reference, is connected."""
+
+    def waiting_states(self) -> tuple[Sequence[Stamped], Sequence[Stamped]]:
+        """Return received odoms and joints that the commander has not taken yet."""
+
+
+class StateDecoder(Protocol):
+    """Reads the messages of one robot, which are opaque to a commander."""
+
+    q: Array
+    """Positions (n,) of the latest accepted joints, m or rad."""
+    qdot: Array
+    """Rates (n,) of the latest accepted joints, m/s or rad/s."""
+
+    def check_robot(self, joints: Any) -> None:
+        """Raise CommandError if the joint states are of another robot."""
+
+    def decode_joints(self, joints: Any) -> int:
+        """Read joints into ``q`` and ``qdot``; return their stamp, ns, or raise CommandError."""
+
+    def decode_base(self, odom: Any) -> tuple[Array, Array]:
+        """Return pose (7,) and twist (6,) of an odom or base reference, or raise CommandError."""
+
+    def target(self, odom: Any) -> tuple[Array, Array]:
+        """Return pose (7,) and twist (6,) of an odom of the target, or raise CommandError."""
+
+    def joint_reference(self, message: Any) -> tuple[Array, Array]:
+        """Return positions and rates (n,) of a joint reference, or raise CommandError."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StateArrays:
+    """A whole state as arrays: the joints, and the base if it is measured."""
+
+    stamp_ns: int
+    q: Array
+    qdot: Array
+    pose: Array | None = None
+    twist: Array | None = None
+
+
+class ArrayDecoder:
+    """A :class:`StateDecoder` of :class:`StateArrays`."""
+
+    q: Array
+    qdot: Array
+
+    def check_robot(self, joints: StateArrays) -> None:
+        """Accept any joints."""
+
+    def decode_joints(self, joints: StateArrays) -> int:
+        """Store the joints unchanged."""
+        self.q, self.qdot = joints.q, joints.qdot
+        return joints.stamp_ns
+
+    def decode_base(self, odom: StateArrays) -> tuple[Array, Array]:
+        """Return pose and twist."""
+        assert odom.pose is not None
+        assert odom.twist is not None
+        return odom.pose, odom.twist
+
+    target = decode_base
+
+    def joint_reference(self, message: StateArrays) -> tuple[Array, Array]:
+        """Return positions and rates."""
+        return message.q, message.qdot
