@@ -103,7 +103,6 @@ class RecorderNode(FlightNode):
     """The current recording, or the last one."""
 
     def __init__(self, name: str = "recorder", **kwargs: Any) -> None:
-        self._stamps = _StampReader()
         self._parameter_requests: dict[str, RemoteParameters | None] = {}
         """Names of the parameter records that are in the bag or requested from nodes."""
         self._topics_without_owner: set[str] = set()
@@ -332,9 +331,7 @@ class RecorderNode(FlightNode):
         listener = None
         if self._transforms is not None:
             listener = self._transforms.listener(topic)
-        take = _recording_callback(
-            recording, self._stamps, topic, kind, channel, self._clock_topic, listener
-        )
+        take = _recording_callback(recording, topic, kind, channel, self._clock_topic, listener)
         qos = _subscribed_qos(offered)
         if qos.durability == DurabilityPolicy.TRANSIENT_LOCAL:
             recording.latched[channel] = None
@@ -503,40 +500,24 @@ class _RecordedTransforms:
             self._recording.record(channel, static, time_ns)
 
 
-class _StampReader:
-    """Reads the stamps at the beginning of messages; messages of one state share their stamp."""
-
-    def __init__(self) -> None:
-        self._stamp = b""
-        self._time_ns = 0
-
-    def time_ns(self, raw: bytes) -> int:
-        """Return the stamp of a serialised message, ns; 0 if it is negative."""
-        stamp = raw[HEADER_STAMP]
-        if stamp != self._stamp:
-            self._stamp, self._time_ns = stamp, first_time_ns(raw)
-        return self._time_ns
-
-
 def _recording_callback(
     recording: Recording,
-    stamps: _StampReader,
     topic: str,
     kind: Any,
     channel: int,
-    clock: str = _CLOCK_TOPIC,
-    listener: RawCallback | None = None,
+    clock: str,
+    listener: RawCallback | None,
 ) -> RawCallback:
     """Return the callback of a topic's messages: the clock sets the time of all others."""
-    record, time_of = recording.record, stamps.time_ns
+    record = recording.record
     urdf_name = f"{topic.strip('/').replace('/', '.')}.urdf"
 
     def on_clock(raw: bytes) -> None:
-        recording.set_clock(time_of(raw))
+        recording.set_clock(first_time_ns(raw))
         record(channel, raw)
 
     def on_stamped(raw: bytes) -> None:
-        record(channel, raw, time_of(raw))
+        record(channel, raw, first_time_ns(raw))
 
     def on_description(raw: bytes) -> None:
         if urdf_name not in recording.attached:
@@ -547,22 +528,21 @@ def _recording_callback(
     def on_other(raw: bytes) -> None:
         record(channel, raw)
 
-    if topic.endswith(f"/{_DESCRIPTION_TOPIC}") and topic != clock:
-        return _record_and_listen(on_description, listener)
-    header = next(iter(kind.get_fields_and_field_types().values()), "")
-    take = on_stamped if header == "std_msgs/Header" else on_other
-    return _record_and_listen(on_clock if topic == clock else take, listener)
-
-
-def _record_and_listen(record: RawCallback, listener: RawCallback | None) -> RawCallback:
+    if topic == clock:
+        take = on_clock
+    elif topic.endswith(f"/{_DESCRIPTION_TOPIC}"):
+        take = on_description
+    else:
+        header = next(iter(kind.get_fields_and_field_types().values()), "")
+        take = on_stamped if header == "std_msgs/Header" else on_other
     if listener is None:
-        return record
+        return take
 
-    def take(raw: bytes) -> None:
-        record(raw)
+    def record_and_listen(raw: bytes) -> None:
+        take(raw)
         listener(raw)
 
-    return take
+    return record_and_listen
 
 
 def loss_events(recording: Recording, topic: str) -> SubscriptionEventCallbacks:

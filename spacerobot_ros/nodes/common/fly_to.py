@@ -7,10 +7,9 @@ and ``nav2_msgs/action/NavigateToPose``.
 from __future__ import annotations
 
 import math
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 from geometry_msgs.msg import PoseStamped
 from rclpy.action import ActionServer, CancelResponse, GoalResponse
@@ -45,66 +44,28 @@ _BASE_GOAL_NAME = "The goal of the base"
 
 @dataclass(frozen=True)
 class Surroundings:
-    """Facts about a node that are needed to read a goal.
-
-    Attributes
-    ----------
-    world_frame
-        Name of the frame of goals.
-    joint_names
-        Joints of the robot; None: there is no robot yet.
-    pose_of
-        Returns the pose (7,) of another frame in the frame of goals; None if unknown.
-    """
+    """Facts about a node that are needed to read a goal."""
 
     world_frame: str
     joint_names: Sequence[str] | None
+    """Joints of the robot; None: there is no robot yet."""
     pose_of: Callable[[str], Array | None]
+    """Returns the pose (7,) of another frame in the frame of goals; None if unknown."""
 
 
-class GoalAction(ABC):
-    """An action type for goals: its name and the conversion of its messages.
-
-    Parameters
-    ----------
-    kind
-        Class of the type.
-    """
-
-    package: str
-    type_name: str
-    name: str
-    """Name of the server, below the node's."""
-
-    def __init__(self, kind: Any) -> None:
-        self.kind = kind
-
-    @abstractmethod
-    def read(self, request: Any, surroundings: Surroundings) -> FlyTo:
-        """Return the goal of a request.
-
-        Raises
-        ------
-        PlanningError
-            It is refused.
-        """
-
-    @abstractmethod
-    def feedback(self, progress: Progress, world_frame: str) -> Any:
-        """Return the course of a goal as a message."""
-
-    @abstractmethod
-    def result(self, result: FlyToResult) -> Any:
-        """Return a result as a message."""
-
-
-class FlyToAction(GoalAction):
+@dataclass(frozen=True)
+class FlyToAction:
     """``spacerobot_msgs/action/FlyTo``: goals of any kind."""
 
-    package, type_name, name = "spacerobot_msgs", "FlyTo", "~/fly_to"
+    kind: Any
+    """Class of the action."""
+
+    package: ClassVar = "spacerobot_msgs"
+    type_name: ClassVar = "FlyTo"
+    name: ClassVar = "~/fly_to"
 
     def read(self, request: Any, surroundings: Surroundings) -> FlyTo:
-        """Return the goal of a request; see :meth:`GoalAction.read`."""
+        """Return the goal of a request, or raise PlanningError: it is refused."""
         links, poses = list(request.end_effectors), list(request.end_effector_poses)
         if len(links) != len(poses):
             raise PlanningError(
@@ -163,13 +124,19 @@ class FlyToAction(GoalAction):
         return message
 
 
-class NavigateToPoseAction(GoalAction):
+@dataclass(frozen=True)
+class NavigateToPoseAction:
     """``nav2_msgs/action/NavigateToPose``: base poses only."""
 
-    package, type_name, name = "nav2_msgs", "NavigateToPose", "~/navigate_to_pose"
+    kind: Any
+    """Class of the action."""
+
+    package: ClassVar = "nav2_msgs"
+    type_name: ClassVar = "NavigateToPose"
+    name: ClassVar = "~/navigate_to_pose"
 
     def read(self, request: Any, surroundings: Surroundings) -> FlyTo:
-        """Return the goal of a request; see :meth:`GoalAction.read`."""
+        """Return the goal of a request, or raise PlanningError: it is refused."""
         if request.behavior_tree:
             raise PlanningError(
                 f"The goal names the behavior tree '{request.behavior_tree}': none are supported; "
@@ -207,6 +174,10 @@ class NavigateToPoseAction(GoalAction):
         return message
 
 
+GoalAction = FlyToAction | NavigateToPoseAction
+"""An action for goals; ``name`` is that of its server, below the node's."""
+
+
 class _Server(ActionServer):
     """An action server whose goals end when the commander decides, not when a callback returns."""
 
@@ -221,19 +192,7 @@ class _Server(ActionServer):
 
 
 class GoalClient:
-    """The client of one goal of a server; a :class:`.FlyToClient`.
-
-    Parameters
-    ----------
-    server
-        The server, which sends the result.
-    handle
-        The server's handle of the goal.
-    action
-        The type of action, which converts feedback and result.
-    world_frame
-        Name of the frame of poses.
-    """
+    """The client of one goal of a server; a :class:`.FlyToClient`."""
 
     def __init__(
         self, server: _Server, handle: ServerGoalHandle, action: GoalAction, world_frame: str
@@ -260,12 +219,8 @@ class GoalClient:
 class GoalActions:
     """The action servers of a commander node; they exist as long as the node.
 
-    A client therefore receives the result of a goal that a cleanup of the node has ended.
-
-    Parameters
-    ----------
-    node
-        The node; while it is not configured, goals are rejected.
+    A client therefore receives the result of a goal that a cleanup of the node has ended. While the
+    node is not configured, goals are rejected.
     """
 
     def __init__(self, node: Any) -> None:

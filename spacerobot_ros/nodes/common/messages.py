@@ -265,11 +265,6 @@ class KnownFrames:
     """The frames known to a node: those of its robot's state, and those of /tf if available.
 
     Messages of /tf are stored serialised and read when a frame is requested.
-
-    Parameters
-    ----------
-    node
-        The node that subscribes to /tf.
     """
 
     def __init__(self, node: Any) -> None:

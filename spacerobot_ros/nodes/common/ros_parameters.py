@@ -30,15 +30,7 @@ _CHECKS_UNTIL_LOST = 50
 
 
 class RemoteParameters:
-    """All parameters of another node; call :meth:`look` until it returns true.
-
-    Parameters
-    ----------
-    node
-        The node that sends the request.
-    name
-        Full name of the other node.
-    """
+    """All parameters of another node, by its full name; call :meth:`look` until it returns true."""
 
     def __init__(self, node: Node, name: str) -> None:
         self._node, self.name = node, name
@@ -132,7 +124,8 @@ def declare(node: Node, parameters: Sequence[Parameter]) -> dict[str, Value]:
     values = {}
     for parameter in parameters:
         name = parameter.name
-        given = _given_value(node, name)
+        override = node._parameter_overrides.get(name)
+        given = None if override is None else override.value
         value = parameter.default if given is None else parameter.checked(given)
         stored = _ros_parameter(parameter, value)
         if value == ():
@@ -146,26 +139,14 @@ def declare(node: Node, parameters: Sequence[Parameter]) -> dict[str, Value]:
     return values
 
 
-def _given_value(node: Node, name: str) -> Any:
-    overrides = getattr(node, "_parameter_overrides", None)
-    if isinstance(overrides, dict):
-        return overrides[name].value if name in overrides else None
-    # Other versions of rclpy: a declaration without a type, at three times the cost.
-    node.declare_parameter(name, None, ParameterDescriptor(dynamic_typing=True))
-    value = node.get_parameter(name).value
-    node.undeclare_parameter(name)
-    return value
-
-
 def unknown_parameters(node: Node) -> str:
     """Return a sentence about the parameters that were set but do not exist on a node.
 
     It suggests the nearest existing name for each; empty if all are known.
     """
-    given = getattr(node, "_parameter_overrides", {})
     unknown = [
         name
-        for name in given
+        for name in node._parameter_overrides
         if not node.has_parameter(name) and not name.startswith(_QOS_OVERRIDES)
     ]
     if not unknown:

@@ -32,11 +32,6 @@ class TrajectoryClients:
 
     If a cleanup of the node destroyed them, an executor might still hold an answer for one.
 
-    Parameters
-    ----------
-    node
-        The planner's node.
-
     Raises
     ------
     ParameterError

@@ -55,21 +55,13 @@ class HeartbeatState(str, Enum):
 
 @dataclass(frozen=True)
 class SilenceReport:
-    """A node has become silent, or is back.
-
-    Attributes
-    ----------
-    name
-        Full name of the node.
-    seconds
-        Duration without a heartbeat, wall s.
-    over
-        Whether the node is back.
-    """
+    """A node has become silent, or is back."""
 
     name: str
     seconds: float
+    """Duration without a heartbeat, wall s."""
     over: bool = False
+    """Whether the node is back."""
 
     @property
     def message(self) -> str:
@@ -129,18 +121,9 @@ class Watchdog:
 
 
 class Liveness:
-    """Sends the heartbeats of a node, and watches those of other nodes.
+    """Sends the heartbeats of a node, and watches those of the roles that it depends on.
 
-    Parameters
-    ----------
-    node
-        The node that sends them; its timers stop once they are destroyed.
-    role
-        Its role.
-    depends_on
-        The roles that it watches.
-    on_silence
-        Called when a node has become silent, or is back.
+    ``on_silence`` is called when a watched node has become silent, or is back.
     """
 
     def __init__(

@@ -53,17 +53,7 @@ _RESTING_SHARE = 0.01
 
 
 class PlantReport:
-    """Writes logs and diagnostics of one plant.
-
-    Parameters
-    ----------
-    node
-        The plant's node.
-    plant, commands
-        Sources of the report.
-    real_time
-        Clock of a plant in real time; None in lockstep.
-    """
+    """Writes logs and diagnostics of one plant."""
 
     def __init__(
         self,
@@ -139,19 +129,7 @@ _LONGEST_WAIT = 0.5  # wall s, for readers
 
 
 class StatePublisher:
-    """Publishes the state topics that the table of topics lists for a plant.
-
-    Parameters
-    ----------
-    node
-        The node that owns the publishers.
-    robot
-        The robot whose state is published.
-    state
-        The reported quantities.
-    config
-        Configuration of the plant, with the names of the frames.
-    """
+    """Publishes the state topics that the table of topics lists for a plant."""
 
     def __init__(
         self, node: FlightNode, robot: SpaceRobot, state: ReportedState, config: PlantConfig
@@ -304,19 +282,7 @@ class TransformPublisher:
 
 
 class ClearancePublisher:
-    """Publishes the smallest distance between links, and reports their contacts.
-
-    Parameters
-    ----------
-    node
-        The plant's node.
-    plant
-        The plant.
-    monitor
-        Measures the distances.
-    stream
-        The topic; None: a new one.
-    """
+    """Publishes the smallest distance between links, and reports their contacts."""
 
     def __init__(
         self,

@@ -70,15 +70,7 @@ M = TypeVar("M")
 
 
 class LatestMessage(Generic[M]):
-    """The last message of a topic, deserialized on demand.
-
-    Parameters
-    ----------
-    node
-        The node that subscribes; it is not spun.
-    kind, topic
-        Type and topic of the messages.
-    """
+    """The last message of a topic, deserialized on demand; its node is not spun."""
 
     def __init__(self, node: Node, kind: type[M], topic: str) -> None:
         self._kind = kind
@@ -106,19 +98,11 @@ class LatestMessage(Generic[M]):
 class Listener:
     """Collects the state of the stack.
 
-    Parameters
-    ----------
-    streams
-        A node that is not spun, for streams of states.
-    node
-        The viewer node, whose callbacks receive statuses, goals and heartbeats.
-    frame
-        Frame of the goals.
-    on_status
-        Called for every status with ``plant``, ``planner``, ``controller`` or ``replay`` and the
-        full name of the node that published it.
-    silent_after
-        Wall time without a heartbeat after which an active node is silent, s; 0: never.
+    The node ``streams``, which is not spun, receives states; callbacks of ``node`` receive
+    statuses, goals (in ``frame``) and heartbeats. ``on_status`` is called for every status with
+    ``plant``, ``planner``, ``controller`` or ``replay`` and the full name of the node that
+    published it. An active node without a heartbeat for ``silent_after`` (wall s; 0: never) is
+    silent.
     """
 
     def __init__(
