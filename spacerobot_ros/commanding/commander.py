@@ -280,7 +280,6 @@ class Commander(ABC):
         return answer
 
     def _require_free(self) -> None:
-        """Raise PlanningError if no goal is accepted now."""
         if not self.active:
             raise PlanningError(f"The goal is refused: this node is {self.activity.value}.")
         if self._actuation_refusal:
@@ -306,7 +305,6 @@ class Commander(ABC):
         self._publish_decision(self._make_status("aborted", message, goal.goal_id))
 
     def _publish_decision(self, status: Status) -> None:
-        """Publish a status, and an event if the status decides a goal."""
         self._publish_status(status)
         if status.state.decided:
             self.host.report_event(decision_event(status))
@@ -335,7 +333,6 @@ class Commander(ABC):
         return pursued
 
     def _watch_fly_to(self) -> None:
-        """Send feedback to the clients of actions after a state."""
         self._fly_to.advance(self.stamps.now_ns, self._progress)
         self._abort_fly_to()
         self._fly_to.end_dropped_goals(self._active_goal_ids())
@@ -365,7 +362,6 @@ class Commander(ABC):
         return Progress(phase, remaining, elapsed, now, self._base_pose(), errors)
 
     def _goal_errors(self, goal: Goal) -> GoalErrors:
-        """Return the errors of the last measured state to a goal; NaN where nothing is known."""
         pose = self._base_pose()
         if pose is None or self.robot is None or self._decoder is None:
             return GoalErrors()
@@ -375,7 +371,6 @@ class Commander(ABC):
             return GoalErrors()
 
     def _base_pose(self) -> Array | None:
-        """Return the last measured pose (7,) of the base; None if it is not known."""
         odom, decoder = self.states.odom, self._decoder
         # Before the first joints, there is no shape of the robot either.
         if odom is None or decoder is None or self.states.joints is None:
@@ -517,7 +512,6 @@ class Commander(ABC):
         return True
 
     def _log_fault(self, kind: str, message: str) -> None:
-        """Log a fault of messages, at most once a period for each kind."""
         now = self._clock()
         if now - self._fault_log_times.get(kind, -_FAULT_LOG_PERIOD) >= _FAULT_LOG_PERIOD:
             self._fault_log_times[kind] = now
@@ -638,7 +632,6 @@ class Commander(ABC):
         return min(self._active_goal_ids(), default="")
 
     def _report_present_status(self) -> None:
-        """Publish the status of the goal again: states come again."""
         status, goal_id = self._last_status, self._pursued_goal_id
         if not goal_id:
             self._publish_status(self._make_status(*self._without_goal, ""))

@@ -194,7 +194,6 @@ class ControllerCommander(Commander):
             self.answer()
 
     def _do_without(self, topic: str) -> None:
-        """Let states no longer wait for a reference that is silent."""
         assert self.executive is not None
         followed = self.states.latest(topic) is not None
         self.states.require(topic, required=False)
@@ -330,7 +329,6 @@ class ControllerCommander(Commander):
         return not before
 
     def _answer_state(self, pairing: Pairing, *, send: bool = True) -> None:
-        """Answer one state with one command of the same stamp."""
         executive, decoder, states = self.executive, self._decoder, self.states
         assert executive is not None
         assert decoder is not None
@@ -360,7 +358,6 @@ class ControllerCommander(Commander):
         self._forward_outputs()
 
     def _publish_plan(self, profile: ReferenceProfile | None, stamp_ns: int) -> None:
-        """Publish the path of a reference that begins, if it is planned."""
         if profile is not self._published_plan:
             self._published_plan = profile
             if isinstance(profile, PlannedReference):
@@ -373,7 +370,6 @@ class ControllerCommander(Commander):
             self.executive.servicing.target.measure(stamp_ns / SECOND, *decoder.target(message))
 
     def _reference(self, decoder: StateDecoder) -> Reference | None:
-        """Return the external reference for this state; None without external references."""
         base, joints = self.states.latest(BASE_REFERENCE), self.states.latest(JOINT_REFERENCE)
         if base is None and joints is None:
             return None

@@ -276,10 +276,8 @@ class FlyToGoals:
             if served.request is None or served.client is None:
                 continue
             if served.first_state_ns is None or now_ns < served.first_state_ns:
-                served.first_state_ns, served.last_feedback_ns = (
-                    now_ns,
-                    None,
-                )  # Also after a jump of time.
+                # Also after a jump of time.
+                served.first_state_ns, served.last_feedback_ns = now_ns, None
             limit = served.request.time_limit
             if limit and now_ns - served.first_state_ns >= limit * SECOND:
                 self.request_abort(goal_id, f"after its time limit of {limit:g} s")

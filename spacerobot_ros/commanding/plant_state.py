@@ -68,12 +68,7 @@ class StampFilter:
     Any other state is a *time jump*, and is set aside. If a state of the present time follows, the
     jump is ignored and counted. If none follows for 0.5 s of wall time, the time has really
     changed, for example after a restart of the plant, and the jump is accepted. A plant in lockstep
-    waits that long for its command.
-
-    Parameters
-    ----------
-    clock
-        Returns the wall time, s.
+    waits that long for its command. ``clock`` returns the wall time, s.
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
@@ -218,11 +213,6 @@ class StateSynchroniser:
 
     Further topics can be required as well (:meth:`require`): a state then waits for a message of
     its stamp on each of these topics.
-
-    Parameters
-    ----------
-    pose_required
-        Whether a state waits for its odom.
     """
 
     def __init__(self, *, pose_required: bool) -> None:

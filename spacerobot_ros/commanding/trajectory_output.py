@@ -151,19 +151,7 @@ class TrajectoryOutput:
         )
 
     def ended(self, number: int, outcome: Outcome, code: int, text: str) -> None:
-        """End a schedule with the result of the server.
-
-        Parameters
-        ----------
-        number
-            Number of the schedule.
-        outcome
-            Final state of the goal.
-        code
-            ``error_code`` of the result.
-        text
-            ``error_string`` of the result.
-        """
+        """End a schedule with the result of the server: ``error_code`` and ``error_string``."""
         if number == self._sent:
             self._end(_motion_end(outcome, code, text))
 

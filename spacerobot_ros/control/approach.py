@@ -152,18 +152,8 @@ class ApproachPlan:
 class ArmReach:
     """Whether an arm can follow motions of its end-effector with a fixed base.
 
-    Parameters
-    ----------
-    robot
-        The model.
-    link
-        Link of the end-effector.
-    axes
-        Axes of the end-effector that are controlled.
-    state
-        The present state.
-    rates
-        Largest rates of the joints (n,).
+    ``axes`` of the end-effector ``link`` are controlled; ``rates`` are the largest ones of the
+    joints (n,).
     """
 
     def __init__(
@@ -316,7 +306,6 @@ def _closing_path(standoff: Array, options: ApproachOptions, limits: MotionLimit
 
 
 def _outward_durations() -> Iterator[float]:
-    """Yield durations of paths to the standoff, s."""
     duration = _SHORTEST_PATH
     while duration < _LONGEST_PATH:
         yield duration
@@ -407,18 +396,9 @@ class TargetClearance:
     Relative to the target, its body is a fixed obstacle. The collision checks therefore take the
     target as the robot's world, and the base pose relative to the target.
 
-    Parameters
-    ----------
-    robot
-        The robot.
-    link
-        Link of the end-effector, whose rigid body may touch the target when closing in.
-    target
-        The target, one rigid body.
-    grapple
-        Pose of the grapple frame in the frame T of the target.
-    min_distance
-        Smallest permitted distance, m.
+    ``link`` is that of the end-effector, whose rigid body may touch the target when closing in;
+    ``grapple`` is the pose of the grapple frame in the frame T of the target, and ``least`` the
+    smallest permitted distance, m.
     """
 
     def __init__(

@@ -297,7 +297,6 @@ class ControlExecutive:
         self._begin_anew_or_hold()
 
     def _begin_anew_or_hold(self) -> None:
-        """Begin the goal again at the next measured state; without a goal, hold its pose."""
         self._plan_next(_Next.BEGIN_ANEW if self._pursues else _Next.HOLD)
 
     def _plan_next(self, reaction: _Next) -> None:
@@ -455,13 +454,11 @@ class ControlExecutive:
         return bool(self._guided or self.plant_blocked or self.controller.coming_to_rest)
 
     def _abort_on_lost_control(self, why: str) -> None:
-        """Give up every goal, and bring the robot to rest."""
         self._give_up(f"Aborted: control is lost, {why}; the robot is brought to rest.")
         self.controller.come_to_rest()
         self._report_abort()
 
     def _hold_pose(self, time: float, state: ControlState, *, aborted: bool) -> None:
-        """Hold the measured pose, after an abort or when the plant obeys again."""
         self.controller.hold_here(time, state)
         if aborted:
             self._report_abort()
@@ -541,7 +538,6 @@ class ControlExecutive:
         self.outputs.append(PursuedGoals(dict(self._pending)))
 
     def _end_tasks(self, time: float, state: ControlState, progress: TaskProgress) -> None:
-        """Give up the tasks, and the goals after them, and hold the measured pose."""
         goal_id = self._latest_id() if self._pending else self._goal_id
         self._give_up(progress.message)
         self._goal_id = goal_id
@@ -651,7 +647,6 @@ class ControlExecutive:
         self._report_decision(state, message, goal_id)
 
     def _report_decision(self, state: ControllerState, message: str, goal_id: str) -> None:
-        """Report the decision about a goal as an event."""
         kind = EventKind(f"goal_{state.value}")
         self.outputs.append(Event(kind, message, state.level, goal_id=goal_id))
 

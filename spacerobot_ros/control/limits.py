@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields, replace
-from operator import mul
 from typing import NamedTuple
 
 import casadi as ca
@@ -206,7 +205,6 @@ class JointRateLimits:
         self._rest_rate = decay_rate(control_period)
         self._dynamics = BufferedFunction(_joint_dynamics(robot))
         self._per_rate = 1 / (_SLOW_RATE_SHARE * self.rates)
-        self._inverse = (1 / self.rates).tolist()
         self._per_effort = self._largest_mobilities() * control_period * self._per_rate
         self._shares = list(zip(self._per_rate.tolist(), self._per_effort.tolist(), strict=True))
 
@@ -248,7 +246,9 @@ class JointRateLimits:
         if not np.isfinite(self.rates).any():
             return ca.SX(0)
         n, tau = self._robot.n, actuation[6:]
-        near = ca.sum1(_rate_shares(qdot, tau, self._per_rate, self._per_effort) > 1.0)
+        # A joint cannot reach its largest rate while its share is at most 1.
+        shares = ca.fabs(qdot) * self._per_rate + ca.fabs(tau) * self._per_effort
+        near = ca.sum1(shares > 1.0)
         flat, Fs, columns = self._dynamics.function(q, omega, qdot)
         Js, G = ca.reshape(flat, n, n).T, ca.reshape(columns, 6, n).T
         qddot = solve_positive_definite(Js, tau + G @ actuation[:6] - Fs)
@@ -262,8 +262,7 @@ class JointRateLimits:
 
     def largest_rate_share(self, qdot: Array) -> float:
         """Return the largest of the rates (n,) as a share of its limit."""
-        # Python numbers: arrays of a few joints take longer, and every state calls this.
-        return max((0.0, *map(abs, map(mul, qdot.tolist(), self._inverse))))
+        return float(np.abs(qdot * (1 / self.rates)).max(initial=0.0))
 
     def braking_command(self, state: ControlState) -> Actuation:
         """Return the unlimited command under which joint rates and momenta decay.
@@ -301,13 +300,6 @@ class JointRateLimits:
             Js, _, _ = self._evaluate_dynamics(ControlState(zero, zero, zero, zero, q, np.zeros(n)))
             largest = np.maximum(largest, np.diag(np.linalg.inv(Js)))
         return largest
-
-
-def _rate_shares(
-    qdot: ca.SX, tau: ca.SX, per_rate: ca.SX | Array, per_effort: ca.SX | Array
-) -> ca.SX:
-    """Return numbers (n,) that are 1 at most while a joint cannot reach its largest rate."""
-    return ca.fabs(qdot) * per_rate + ca.fabs(tau) * per_effort
 
 
 def decay_rate(control_period: float) -> float:

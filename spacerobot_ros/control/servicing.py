@@ -93,24 +93,17 @@ _ACTIVE, _DONE = TaskProgress(TaskState.ACTIVE), TaskProgress(TaskState.DONE)
 
 
 class MeasuredTarget:
-    """The last measurement of the target.
-
-    Attributes
-    ----------
-    description, body
-        Description and body of the target; None: not received.
-    why_unknown
-        Why the body is unknown; empty: nothing was received.
-    motion, time
-        Motion of its root link, and the time of the measurement, s; None before the first one.
-    """
+    """Description and last measurement of the target; None: not received."""
 
     def __init__(self) -> None:
         self.description: RobotDescription | None = None
         self.body: TargetBody | None = None
         self.why_unknown = ""
+        """Why the body is unknown; empty: nothing was received."""
         self.motion: BodyMotion | None = None
+        """Motion of its root link."""
         self.time = -math.inf
+        """Time of the measurement, s."""
 
     def describe(self, target: RobotDescription, grapple_frame: str) -> None:
         """Take the description of the target."""
@@ -133,13 +126,6 @@ _LATEST_BEGIN = 0.1
 class ApproachTask:
     """One approach, planned at its first state and replanned if the target deviates from its
     prediction.
-
-    Parameters
-    ----------
-    target
-        The target, which is measured while the approach continues.
-    config
-        Parameters of the controller.
     """
 
     def __init__(self, target: MeasuredTarget, config: ControllerConfig) -> None:
@@ -348,15 +334,7 @@ class ApproachTask:
 
 
 class DetumblingTask:
-    """Detumbling until the robot has been at rest for the settling time.
-
-    Parameters
-    ----------
-    payload
-        The body that the robot holds, if any.
-    config
-        Parameters of the controller.
-    """
+    """Detumbling until the robot, with the body that it holds, has been at rest for a while."""
 
     def __init__(self, payload: Payload | None, config: ControllerConfig) -> None:
         self.payload, self.config = payload, config
@@ -438,13 +416,7 @@ class DetumblingTask:
 
 
 class Servicing:
-    """The tasks of a controller: those before its goals, and those on request.
-
-    Parameters
-    ----------
-    config
-        Parameters of the controller.
-    """
+    """The tasks of a controller: those before its goals, and those on request."""
 
     def __init__(self, config: ControllerConfig) -> None:
         tasks = Task.parsed(config.tasks)

@@ -115,7 +115,6 @@ class StallMonitor:
 
     @property
     def _is_limited(self) -> bool:
-        """Whether commands were limited for most of the present time."""
         return 2 * self._limited > self._samples
 
     def _compare(self, controller: CoordinatedController, result: Saturated) -> None:
@@ -157,7 +156,6 @@ class StallMonitor:
 
 
 def _joint_at_stop(robot: SpaceRobot, q: Array) -> str:
-    """Return that a joint is at a stop; empty: none is."""
     span = robot.upper - robot.lower
     margin = _STOP_SHARE * np.where(np.isfinite(span), span, 0.0)
     for name, at_stop in zip(

@@ -127,16 +127,8 @@ class WheelAllocation:
 class WheelControl:
     """The wheels of a controlled robot: measured rates, commanded torques, and events.
 
-    Parameters
-    ----------
-    robot
-        The robot.
-    options
-        Parameters of its wheels.
-    control_period
-        Time between two commands, s.
-    thruster_torque
-        Largest torque of the thrusters, N m; infinite: no limit, zero: there are no thrusters.
+    ``control_period`` is the time between two commands, s, and ``thruster_torque`` the largest
+    torque of the thrusters, N m; infinite: no limit, zero: there are no thrusters.
 
     Raises
     ------
@@ -206,8 +198,6 @@ class WheelControl:
     @property
     def torque_about_every_axis(self) -> float:
         """Largest torque that the wheels in use provide about every axis, N m; 0: not about all."""
-        if self.rank < 3:
-            return 0.0
         return self._allocate.within(self.wheels.torque[self._used])
 
     # -- measurements -------------------------------------------------------------------------
@@ -286,7 +276,7 @@ class WheelControl:
             return motion
         wheels, used = self.wheels, self._used
         inertia = float(np.linalg.eigvalsh(self.gyrostat.inertia_matrix(q)[3:6, 3:6])[-1])
-        torque = self._allocate.within(wheels.torque[used])
+        torque = self.torque_about_every_axis
         momentum = self._allocate.within((wheels.inertia * wheels.rate)[used])
         share = _MOTION_SHARE / inertia
         return replace(
@@ -373,22 +363,13 @@ class WheelControl:
                 message = f"{turns}: it is saturated and provides no more torque in this direction."
                 self._add(EventKind.WHEEL_SATURATED, message, 1, name)
             elif share >= options.warning_rate and not self._announced[i]:
-                self._announced[i] = share
-                self._add(
-                    EventKind.WHEEL_NEAR_LIMIT,
-                    f"{turns}{self._saturation_clause(int(i))}.",
-                    1,
-                    name,
-                )
+                self._announced[i], seconds = share, self.time_to_saturation(int(i))
+                when = f", and will saturate in {seconds:.3g} s" if math.isfinite(seconds) else ""
+                self._add(EventKind.WHEEL_NEAR_LIMIT, f"{turns}{when}.", 1, name)
         if options.dump_rate and not self.dumping:
             fastest = int(np.argmax(np.where(self._used, shares, 0.0)))
             if shares[fastest] >= options.dump_rate:
                 self._begin_dump(f"because wheel '{wheels.names[fastest]}' is fast")
-
-    def _saturation_clause(self, i: int) -> str:
-        """Return a clause on the time in which a wheel saturates at its present torque."""
-        seconds = self.time_to_saturation(i)
-        return f", and will saturate in {seconds:.3g} s" if math.isfinite(seconds) else ""
 
     def time_to_saturation(self, i: int) -> float:
         """Return the time until wheel i reaches its largest rate at its present torque, s."""

@@ -7,7 +7,7 @@ from functools import partial
 from typing import Any, ClassVar
 
 from diagnostic_msgs.msg import DiagnosticStatus
-from geometry_msgs.msg import PoseStamped, WrenchStamped
+from geometry_msgs.msg import WrenchStamped
 from nav_msgs.msg import Odometry, Path
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
@@ -35,14 +35,11 @@ from spacerobot_ros.messages.readers import (
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.urdf import parse_robot
 from spacerobot_ros.nodes.common.commander import CommanderNode
-from spacerobot_ros.nodes.common.messages import end_effector_goal
 from spacerobot_ros.nodes.common.node import LATCHED, STREAM, described_robot
 from spacerobot_ros.nodes.common.process import run_node
 from spacerobot_ros.nodes.common.watchdog import HEARTBEAT_QOS, HeartbeatState, Role
 from spacerobot_ros.nodes.common.watchdog import TOPIC as HEARTBEAT
-from spacerobot_ros.planning.core.goal import Goal
 from spacerobot_ros.planning.core.schedule import BasePath
-from spacerobot_ros.planning.execution.goal_file import BASE_GOAL_KEY
 from spacerobot_ros.planning.execution.status import ScheduleStart
 from spacerobot_ros.times import first_time_ns, stamp_bytes
 
@@ -58,11 +55,9 @@ class CoordinatedControlNode(CommanderNode):
     """
 
     Config: ClassVar = ControllerConfig
+    default_name: ClassVar = "coordinated_control"
     config: ControllerConfig
     commander: ControllerCommander
-
-    def __init__(self, name: str = "coordinated_control", **kwargs: Any) -> None:
-        super().__init__(name, **kwargs)
 
     # -- life ---------------------------------------------------------------------------------
 
@@ -143,16 +138,6 @@ class CoordinatedControlNode(CommanderNode):
             self.commander.use_target(parse_robot(message.data))
         except SpaceRobotError as error:
             self.get_logger().error(f"target/robot_description: {error}")
-
-    def read_goal(self, key: str, message: PoseStamped) -> Goal:
-        """Return the goal of a message for the base or the end-effector.
-
-        If the orientation of an end-effector is all zeros, any attitude is accepted.
-        """
-        if key == BASE_GOAL_KEY:
-            return super().read_goal(key, message)
-        what, frame = "The goal of the end-effector", self.config.world_frame
-        return Goal.of_end_effectors([end_effector_goal("", message, frame, what, self._pose_of)])
 
     # -- outputs ------------------------------------------------------------------------------
 

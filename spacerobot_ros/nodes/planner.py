@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import replace
 from threading import Thread
 from typing import Any, ClassVar
 
 import numpy as np
-from geometry_msgs.msg import PoseStamped, TwistStamped
+from geometry_msgs.msg import TwistStamped
 from nav_msgs.msg import Path
 from rclpy.publisher import Publisher
 from sensor_msgs.msg import JointState
@@ -22,10 +21,8 @@ from spacerobot_ros.messages.builders import path_message, trajectory_message
 from spacerobot_ros.messages.markers import goal_markers
 from spacerobot_ros.messages.readers import joint_template
 from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.model.description import DEFAULT_END_EFFECTOR, Array
 from spacerobot_ros.nodes.common.commander import CommanderNode
 from spacerobot_ros.nodes.common.messages import (
-    end_effector_goal,
     path_poses,
     shape_of,
 )
@@ -36,7 +33,6 @@ from spacerobot_ros.planning.core.cancellation import MAX_THREAD_END_TIME
 from spacerobot_ros.planning.core.goal import EndEffectorGoal, Goal
 from spacerobot_ros.planning.core.schedule import BasePath
 from spacerobot_ros.planning.execution.config import PlannerConfig
-from spacerobot_ros.planning.execution.goal_file import BASE_GOAL_KEY
 from spacerobot_ros.planning.execution.status import (
     PlannerState,
     PlannerStatistics,
@@ -62,15 +58,13 @@ class PlannerNode(CommanderNode):
     """
 
     Config: ClassVar = PlannerConfig
+    default_name: ClassVar = "planner"
     config: PlannerConfig
     commander: PlannerCommander
     _trajectories: Any = None
     """Clients of FollowJointTrajectory, for ``output: trajectory``."""
     _announcement: Thread | None = None
     """Publishes the latest schedule."""
-
-    def __init__(self, name: str = "planner", **kwargs: Any) -> None:
-        super().__init__(name, **kwargs)
 
     @property
     def statistics(self) -> PlannerStatistics:
@@ -85,7 +79,7 @@ class PlannerNode(CommanderNode):
 
     def configure(self) -> None:
         """Create the topics; if no robot is configured, the planner waits for robot_description."""
-        self._shape: Array | None = None
+        self.goal_shape = None
         self._commands: Publisher | None = None
         if self.config.output != "trajectory":
             topic = "joint_commands" if self.config.output == "commands" else "joint_reference"
@@ -130,7 +124,6 @@ class PlannerNode(CommanderNode):
         super().destroy_node()
 
     def _follow_trajectories(self) -> None:
-        """Send schedules to the robot's own controller from now on."""
         if self._trajectories is None:
             self._trajectories = TrajectoryClients(self)
         self.commander.trajectories = self._trajectories.connect(
@@ -143,7 +136,7 @@ class PlannerNode(CommanderNode):
 
     def use(self, robot: SpaceRobot) -> None:
         """Plan for this robot from now on."""
-        self._shape = None
+        self.goal_shape = None
         self.commander.use_robot(robot, self.decoder_of(robot))
         self._message = joint_template(robot.joint_names)
         self._setpoint: Setpoint | None = None
@@ -168,29 +161,9 @@ class PlannerNode(CommanderNode):
         self.create_subscription(Path, path_topic(link), on_path, STREAM)
 
     def _read_path(self, link: str, message: Path) -> Goal:
-        """Return the goal of a path for an end-effector; PlanningError if it is refused."""
         what, frame = f"The path of the end-effector '{link}'", self.config.world_frame
-        aim = EndEffectorGoal.along(link, path_poses(message, frame, what, self._pose_of))
-        if link == DEFAULT_END_EFFECTOR:
-            aim = replace(aim, link="")
-        return Goal.of_end_effectors([aim], joint_positions=self.goal_shape())
-
-    def read_goal(self, key: str, message: PoseStamped) -> Goal:
-        """Return the goal of a message for the base or an end-effector.
-
-        If the orientation of an end-effector is all zeros, any attitude is accepted.
-        """
-        if key == BASE_GOAL_KEY:
-            return super().read_goal(key, message)
-        what, frame = f"The goal of the end-effector '{key}'", self.config.world_frame
-        aim = end_effector_goal(key, message, frame, what, self._pose_of)
-        if key == DEFAULT_END_EFFECTOR:
-            aim = replace(aim, link="")
-        return Goal.of_end_effectors([aim], joint_positions=self.goal_shape())
-
-    def goal_shape(self) -> Array | None:
-        """Return the joint positions (n,) of the last goal_joint_states message; None: any."""
-        return self._shape
+        poses = path_poses(message, frame, what, self.pose_of)
+        return self.goal_of_link(EndEffectorGoal.along(link, poses))
 
     def _on_goal_shape(self, message: JointState) -> None:
         """Keep the joint positions in which later goals must end, for methods that support them."""
@@ -198,7 +171,7 @@ class PlannerNode(CommanderNode):
         if robot is None:
             return
         try:
-            self._shape = shape_of(message, robot.joint_names) if message.name else None
+            self.goal_shape = shape_of(message, robot.joint_names) if message.name else None
         except PlanningError as error:
             self.publish_status(PlannerStatus(PlannerState.REFUSED, str(error)))
 

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar
 
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.clock import Clock as RosClock
 from rclpy.clock import ClockType
 from rclpy.event_handler import SubscriptionEventCallbacks
@@ -41,16 +41,17 @@ from spacerobot_ros.messages.builders import (
     RobotTransforms,
     StateFrames,
 )
-from spacerobot_ros.messages.diagnostics import diagnostic_name
+from spacerobot_ros.messages.diagnostics import diagnostic_name, encode_diagnostics
 from spacerobot_ros.messages.readers import read_text
+from spacerobot_ros.messages.statuses import StatusRecord
 from spacerobot_ros.model.description import RobotDescription
 from spacerobot_ros.model.urdf import parse_robot
-from spacerobot_ros.nodes.common.messages import diagnostic_status, message_class
+from spacerobot_ros.nodes.common.messages import message_class
 from spacerobot_ros.nodes.common.node import STREAM, FlightNode
 from spacerobot_ros.nodes.common.process import run_node
 from spacerobot_ros.nodes.common.ros_parameters import RemoteParameters
 from spacerobot_ros.nodes.common.watchdog import Role
-from spacerobot_ros.times import HEADER_STAMP, SECOND, first_time_ns, set_stamp
+from spacerobot_ros.times import HEADER_STAMP, SECOND, first_time_ns
 from spacerobot_ros.topics import TOPICS_NOT_RECORDED
 from spacerobot_ros.version import __version__
 
@@ -224,6 +225,11 @@ class RecorderNode(FlightNode):
         return self.recording.messages if self.recording is not None else 0
 
     @property
+    def exit_code(self) -> int:
+        """1 if an error has ended the recording."""
+        return 0 if self.failure is None else 1
+
+    @property
     def failure(self) -> RecordingError | None:
         """Error that has ended the recording; None without an error."""
         return self.recording.failure if self.recording is not None else None
@@ -306,7 +312,6 @@ class RecorderNode(FlightNode):
                 self._parameter_requests[record] = RemoteParameters(self, full)
 
     def _follow_clock(self, recording: Recording) -> None:
-        """Follow the time of a clock that is not recorded itself."""
 
         def on_clock(raw: bytes) -> None:
             recording.set_clock(first_time_ns(raw))
@@ -342,7 +347,6 @@ class RecorderNode(FlightNode):
     # -- reports ------------------------------------------------------------------------------
 
     def _on_failure(self, error: RecordingError) -> None:
-        """Report an error that ends the recording; the other nodes continue."""
         message = f"Recording has ended: {error}"
         self.get_logger().error(message)
         self._report_bag_event(EventKind.RECORDING_FAILED, message, level=2)
@@ -369,42 +373,36 @@ class RecorderNode(FlightNode):
     def _publish_losses(self, recording: Recording) -> None:
         if not recording.lost:
             return
-        counts = dict(sorted(recording.lost.items()))
+        counts = {topic: str(count) for topic, count in sorted(recording.lost.items())}
         listed = ", ".join(f"{count} on '{topic}'" for topic, count in counts.items())
         message = f"Messages were lost on their way to the recorder: {listed}."
         self.get_logger().warning(message, throttle_duration_sec=_LOSS_LOG_PERIOD)
-        self._publish_diagnostics("lost messages", DiagnosticStatus.WARN, message, counts)
+        self._publish_diagnostics(recording, "lost messages", 1, message, counts)
 
     def _publish_state(self) -> None:
         recording = self.recording
         if recording is None or recording.state is RecordingState.CLOSED:
             return
         failure = recording.failure
-        self._publish_diagnostics(
-            "bag",
-            DiagnosticStatus.ERROR if failure else DiagnosticStatus.OK,
-            str(failure) if failure else "recording" if recording.running else "paused",
-            {
-                "messages": recording.messages,
-                "messages_lost": recording.lost.total(),
-                "topics": len(self._recorded),
-                "bytes_written": recording.writer.bytes_written,
-                "bytes_waiting": recording.writer.bytes_waiting,
-            },
-        )
+        message = str(failure) if failure else "recording" if recording.running else "paused"
+        values = {
+            "messages": str(recording.messages),
+            "messages_lost": str(recording.lost.total()),
+            "topics": str(len(self._recorded)),
+            "bytes_written": str(recording.writer.bytes_written),
+            "bytes_waiting": str(recording.writer.bytes_waiting),
+        }
+        self._publish_diagnostics(recording, "bag", 2 if failure else 0, message, values)
 
     def _publish_diagnostics(
-        self, what: str, level: bytes, message: str, values: Mapping[str, object]
+        self, recording: Recording, what: str, level: int, message: str, values: Mapping[str, str]
     ) -> None:
         # The publisher is created on first use, as each one is discovered and recorded.
         if self._diagnostics is None:
             self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", STREAM)
         name = diagnostic_name(self.get_fully_qualified_name(), what)
-        bag = "" if self.recording is None else self.recording.writer.path.name
-        array = DiagnosticArray(status=[diagnostic_status(name, level, message, values, bag)])
-        now_ns = self.recording.now_ns if self.recording is not None else 0
-        set_stamp(array.header.stamp, now_ns)
-        self._diagnostics.publish(array)
+        record = StatusRecord(name, level, message, values, recording.writer.path.name)
+        self._diagnostics.publish(encode_diagnostics([record], recording.now_ns))
 
 
 class _RecordedTransforms:
@@ -464,40 +462,26 @@ class _RecordedTransforms:
             return
         if not self._recording.running or self._is_published():
             return
-        new = self._frames is None
-        if not self._read_state(self._odom, self._joint_states, time_ns):
-            return
-        assert self._frames is not None
-        if new:
-            self._write_static(self._frames, time_ns)
-        message = self._frames.message(time_ns, state.pose, state.q)
-        self._recording.record(self._channel, message, time_ns)
-
-    def _read_state(self, odom: bytes, joints: bytes, time_ns: int) -> bool:
-        """Take a state whose transforms are due; return whether it is one of the robot."""
-        state = self._state
-        assert state is not None
         try:
-            state.accept(odom, joints)
-            if self._frames is None:
-                assert self._description is not None
-                channel = self._recording.writer.add_topic(
-                    self._topics[0], TRANSFORM_TYPE, QosProfile(depth=100)
-                )
-                self._frames = RobotTransforms(
-                    self._description, state.world, state.prefix, links=True
-                )
-                self._channel = channel
+            state.accept(self._odom, self._joint_states)
+            frames = self._frames or self._begin(state, time_ns)
         except (CommandError, RecordingError):
-            return False  # It is of another robot. The next message reports a failed write.
+            return  # It is of another robot. The next message reports a failed write.
         self._last_ns, self._next_ns = time_ns, time_ns + self._period_ns
-        return True
+        self._recording.record(self._channel, frames.message(time_ns, state.pose, state.q), time_ns)
 
-    def _write_static(self, frames: RobotTransforms, time_ns: int) -> None:
+    def _begin(self, state: StateFrames, time_ns: int) -> RobotTransforms:
+        """Return the transforms of the robot of a first state; write those of fixed links."""
+        assert self._description is not None
+        writer, (moving, fixed) = self._recording.writer, self._topics
+        frames = RobotTransforms(self._description, state.world, state.prefix, links=True)
+        self._channel = writer.add_topic(moving, TRANSFORM_TYPE, QosProfile(depth=100))
         static = frames.static_message(time_ns)
         if static is not None:
-            channel = self._recording.writer.add_topic(self._topics[1], TRANSFORM_TYPE, LATCHED)
+            channel = writer.add_topic(fixed, TRANSFORM_TYPE, LATCHED)
             self._recording.record(channel, static, time_ns)
+        self._frames = frames
+        return frames
 
 
 def _recording_callback(
@@ -593,18 +577,7 @@ def _read_descriptions(path: str) -> list[tuple[str, dict[str, str]]]:
 
 def main() -> None:
     """Record until SIGINT or SIGTERM; the exit code is 1 if the recording has failed."""
-    made: list[RecorderNode] = []
-
-    def make() -> RecorderNode:
-        made.append(RecorderNode())
-        return made[0]
-
-    code = run_node(make)
-    failure = made[0].failure if made else None
-    if failure is not None and not code:
-        print(f"{failure}", file=sys.stderr)
-        code = 1
-    sys.exit(code)
+    sys.exit(run_node(RecorderNode))
 
 
 if __name__ == "__main__":

@@ -24,8 +24,9 @@ from spacerobot_ros.bag.config import ReplayConfig
 from spacerobot_ros.bag.playback import ReplayStatus, SubscriberWait, renamed_topics
 from spacerobot_ros.errors import CommandError, ParameterError, RecordingError, SpaceRobotError
 from spacerobot_ros.messages.builders import TRANSFORM_TYPE
+from spacerobot_ros.messages.statuses import StatusRecord
 from spacerobot_ros.model.visuals import MeshFolder, has_meshes
-from spacerobot_ros.nodes.common.messages import diagnostic_status, message_class
+from spacerobot_ros.nodes.common.messages import message_class
 from spacerobot_ros.nodes.common.node import LATCHED, STREAM, FlightNode
 from spacerobot_ros.nodes.common.process import run_node
 from spacerobot_ros.nodes.common.watchdog import Role
@@ -321,7 +322,7 @@ class ReplayNode(FlightNode):
         )
         message = f"The replay is at {status.position_s:.3f} s of {status.duration_s:.3f} s."
         name = self.get_fully_qualified_name()
-        self._status_topic.publish(diagnostic_status(name, b"\0", message, status.to_values()))
+        self._status_topic.publish(StatusRecord(name, 0, message, status.to_values()).encoded())
 
     def _step(self) -> str:
         if not (self._paused and self._begun):
@@ -338,7 +339,6 @@ class ReplayNode(FlightNode):
 
 
 def _with_mesh_files(send: Callable[[bytes], None], meshes: MeshFolder) -> Callable[[bytes], None]:
-    """Return a function that sends robot descriptions with files of the bag's meshes."""
 
     def send_with_files(data: bytes) -> None:
         try:

@@ -31,9 +31,9 @@ from spacerobot_ros.bag import free_name
 from spacerobot_ros.errors import ParameterError, SpaceRobotError
 from spacerobot_ros.events import Event, EventKind
 from spacerobot_ros.measures import Outcome
+from spacerobot_ros.messages.statuses import StatusRecord
 from spacerobot_ros.model.shared_parameters import robot_of
 from spacerobot_ros.nodes import NODE_TYPES
-from spacerobot_ros.nodes.common.messages import diagnostic_status
 from spacerobot_ros.nodes.common.node import STREAM
 from spacerobot_ros.nodes.common.process import FASTDDS_FILE_VARIABLES
 from spacerobot_ros.nodes.common.streams import MatchedEndpoints, topics_without_all_matches
@@ -384,9 +384,8 @@ class MultiProcessStack:
                 at = self._time_ns / SECOND
                 event = Event(EventKind.NODE_RESTARTED, message, 1, at, about={"node": name})
                 values = event.to_values(time.time())
-                level = bytes([event.level])
-                status = diagnostic_status(self.client.node.get_name(), level, message, values)
-                self._events.publish(status)
+                record = StatusRecord(self.client.node.get_name(), event.level, message, values)
+                self._events.publish(record.encoded())
 
     def _end_nodes(self, names: Sequence[str]) -> dict[str, int]:
         for name in names:

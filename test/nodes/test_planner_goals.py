@@ -346,7 +346,7 @@ def test_a_goal_has_the_shape_that_was_wanted_before_it(harness: Harness, tmp_pa
     harness.connect()
     names = ["slider_3", "slider_1", "slider_2"]
     shapes.publish(JointState(name=names, position=[0.3, 0.1, 0.2]))
-    harness.spin_until(lambda: flight.planner._shape is not None, "the shape is received")
+    harness.spin_until(lambda: flight.planner.goal_shape is not None, "the shape is received")
     flight.send(NEAR)
     flight.start()
     harness.spin_until(path.exists, "the goal is pursued")
@@ -355,4 +355,4 @@ def test_a_goal_has_the_shape_that_was_wanted_before_it(harness: Harness, tmp_pa
     assert goal.joint_positions.tolist() == [0.1, 0.2, 0.3]
     # A message without joints lets later goals end in any.
     shapes.publish(JointState())
-    harness.spin_until(lambda: flight.planner._shape is None, "the shape is free")
+    harness.spin_until(lambda: flight.planner.goal_shape is None, "the shape is free")

@@ -16,7 +16,7 @@ from support.planner_flight import NEAR, PLANNER, Flight, stamp_of
 from support.ros_harness import LATCHED, Harness, Probe
 from support.sentences import assert_one_sentence
 
-from spacerobot_ros.nodes.common.messages import diagnostic_status
+from spacerobot_ros.messages.statuses import StatusRecord
 from spacerobot_ros.simulation.status import PlantState, PlantStatus
 
 pytestmark = pytest.mark.usefixtures("one_plant")
@@ -169,8 +169,8 @@ def forged(harness: Harness, name: str) -> tuple[Probe, Publisher]:
     return forger, topic
 
 
-def latched_message() -> DiagnosticStatus:
-    return diagnostic_status("/plant", b"\2", "Nothing moves.", LATCHED_PLANT.to_values())
+def latched_message() -> bytes:
+    return StatusRecord("/plant", 2, "Nothing moves.", LATCHED_PLANT.to_values()).encoded()
 
 
 def test_a_status_of_another_node_stops_nothing_and_is_reported(harness: Harness) -> None:
@@ -233,7 +233,7 @@ def plant_status(loop: Loop, status: PlantStatus) -> None:
         )
         loop.harness.matched(loop.plant_topic)  # type: ignore[attr-defined]
     loop.plant_topic.publish(  # type: ignore[attr-defined]
-        diagnostic_status("/plant", bytes([status.level]), status.message, status.to_values())
+        StatusRecord("/plant", status.level, status.message, status.to_values()).encoded()
     )
     loop.harness.settle(loop.probe)
 

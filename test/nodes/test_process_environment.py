@@ -165,7 +165,7 @@ class Failing(PlantNode):
     """A plant that cannot be configured, and whose report of that fails, too."""
 
     events: list[Event]
-    reported: list[str]
+    failures: list[str]
 
     def configure(self) -> None:
         raise ZeroDivisionError("one by none")
@@ -174,14 +174,14 @@ class Failing(PlantNode):
         self.events.append(event)
 
     def on_failure(self, message: str, error: Exception) -> None:
-        self.reported.append(message)
+        self.failures.append(message)
         raise KeyError("no place for it")
 
 
 def test_a_transition_that_raises_anything_is_reported_and_may_be_tried_again(
     ros_context: rclpy.Context,
 ) -> None:
-    Failing.events, Failing.reported = [], []
+    Failing.events, Failing.failures = [], []
     node = Failing(context=ros_context, autostart=False)
     try:
         node.get_logger().set_level(50)
@@ -195,7 +195,7 @@ def test_a_transition_that_raises_anything_is_reported_and_may_be_tried_again(
             assert re.fullmatch(message, str(node.fault))
         failed = [event for event in node.events if event.kind is EventKind.FAILED]
         assert [(event.message, event.level) for event in failed] == [(str(node.fault), 2)] * 2
-        assert node.reported == [str(node.fault)] * 4, (
+        assert node.failures == [str(node.fault)] * 4, (
             "when it fails, and when everything is released"
         )
     finally:

@@ -110,7 +110,7 @@ def test_a_topic_system_drives_the_plant(
     system = TopicSystem(harness, SystemTag.of(rig.probe.last("robot_description").data))
     # Before a controller is active, what comes is refused, and nothing is latched.
     harness.spin_until(lambda: system.written >= 3, "commands")
-    counts = rig.plant._commands.counts
+    counts = rig.plant.commands.counts
     harness.spin_until(lambda: counts.total() >= 2, "refusals")
     velocities = [f"{joint}/velocity" for joint in GOAL]
     harness.spin_until(lambda: system.states[velocities[0]] == 0.0, "a state")
@@ -124,7 +124,7 @@ def test_a_topic_system_drives_the_plant(
 
     harness.spin_until(there, "the goal")
     assert {reason.value for reason in counts} == {"not_finite"}
-    assert not rig.plant._commands.fault
+    assert not rig.plant.commands.fault
     assert not any(math.isnan(value) for value in system.states.values())
 
 

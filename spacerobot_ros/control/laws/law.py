@@ -612,10 +612,9 @@ class ControlLaw(ABC):
 
     def largest_error_share(self, bounds: Array) -> float:
         """Return the largest error at the last command as a share of its bound (m,), > 0."""
-        errors = self._out["error"].tolist()
-        shares = [abs(e / bound) for e, bound in zip(errors, bounds.tolist(), strict=True)]
-        # The largest of some numbers may hide one that is none: it must not count as reached.
-        return math.nan if math.isnan(sum(shares)) else max(shares, default=0.0)
+        # Of numpy's, as the largest number of Python may hide one that is none: it must not count
+        # as reached.
+        return float(np.abs(self._out["error"] / bounds).max(initial=0.0))
 
     @property
     def error_rate(self) -> Array:

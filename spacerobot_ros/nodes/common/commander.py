@@ -7,6 +7,7 @@ import time
 from abc import abstractmethod
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import replace
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
@@ -30,17 +31,19 @@ from spacerobot_ros.messages.diagnostics import encode_diagnostics, state_diagno
 from spacerobot_ros.messages.readers import MessageDecoder
 from spacerobot_ros.messages.statuses import StatusRecord, read_status
 from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.model.description import Array
+from spacerobot_ros.model.description import DEFAULT_END_EFFECTOR, Array
 from spacerobot_ros.model.shared_parameters import robot_from_text, robot_of
 from spacerobot_ros.nodes.common.fly_to import GoalActions, Surroundings
 from spacerobot_ros.nodes.common.messages import (
     KnownFrames,
+    end_effector_goal,
     goal_description,
     goal_of,
 )
 from spacerobot_ros.nodes.common.node import BEST_EFFORT, LATCHED, STREAM, FlightNode
 from spacerobot_ros.nodes.common.watchdog import Role, SilenceReport
 from spacerobot_ros.planning import Goal
+from spacerobot_ros.planning.core.goal import EndEffectorGoal
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.execution.goal_file import BASE_GOAL_KEY
 from spacerobot_ros.simulation.status import PlantStatus
@@ -70,6 +73,9 @@ class CommanderNode(FlightNode):
     config: PlannerConfig | ControllerConfig
     commander: Commander
     """Commander of the node, created whenever the node is configured."""
+
+    goal_shape: Array | None = None
+    """Joint positions (n,) required at the end of goals; None: any."""
 
     _statuses: Subscription | None = None
     _decoder: MessageDecoder | None = None
@@ -174,7 +180,7 @@ class CommanderNode(FlightNode):
         """Return the frames and joints needed to read action goals."""
         robot = self.commander.robot
         names = None if robot is None else robot.joint_names
-        return Surroundings(self.config.world_frame, names, self._pose_of)
+        return Surroundings(self.config.world_frame, names, self.pose_of)
 
     @property
     def simulated_time_s(self) -> float | None:
@@ -227,7 +233,6 @@ class CommanderNode(FlightNode):
         )
 
     def _waiting(self, topic: str) -> list[bytes]:
-        """Take and return the messages that wait in a subscription."""
         found: list[bytes] = []
         handle, kind = self.inputs[topic].handle, self.inputs[topic].msg_type
         with handle:
@@ -238,7 +243,6 @@ class CommanderNode(FlightNode):
     # -- inputs -------------------------------------------------------------------------------
 
     def _on_description(self, message: String) -> None:
-        """Use the robot of a received description unless it equals the last one."""
         if message.data == self._description:
             return
         self._description = message.data
@@ -263,23 +267,30 @@ class CommanderNode(FlightNode):
             self.get_logger().info(line)
 
     def read_goal(self, key: str, message: PoseStamped) -> Goal:
-        """Return the goal of a message for the base or another part of the robot.
+        """Return the goal of a message for the base or an end-effector.
+
+        If the orientation of an end-effector is all zeros, any attitude is accepted.
 
         Raises
         ------
         PlanningError
             It is refused.
         """
-        what = f"The goal of the {key.replace('_', '-')}"
         frame = self.config.world_frame
-        return goal_of(message, frame, what, self.goal_shape(), self._pose_of)
+        if key == BASE_GOAL_KEY:
+            return goal_of(message, frame, "The goal of the base", self.goal_shape, self.pose_of)
+        link = "" if key == DEFAULT_END_EFFECTOR else f" '{key}'"
+        what = f"The goal of the end-effector{link}"
+        return self.goal_of_link(end_effector_goal(key, message, frame, what, self.pose_of))
 
-    def goal_shape(self) -> Array | None:
-        """Return the joint positions (n,) required at the end of goals; None: any."""
-        return None
+    def goal_of_link(self, aim: EndEffectorGoal) -> Goal:
+        """Return the goal of one end-effector; the default one has no name."""
+        if aim.link == DEFAULT_END_EFFECTOR:
+            aim = replace(aim, link="")
+        return Goal.of_end_effectors([aim], joint_positions=self.goal_shape)
 
-    def _pose_of(self, frame: str) -> Array | None:
-        """Return the pose (7,) of a frame in the world, None if that is not known."""
+    def pose_of(self, frame: str) -> Array | None:
+        """Return the pose (7,) of a frame in the world; None: it is not known."""
         own: dict[str, tuple[str, Array]] = {}
         robot, states = self.commander.robot, self.commander.states
         if robot is not None and states.odom and states.joints:
@@ -387,7 +398,6 @@ class CommanderNode(FlightNode):
             )
 
     def _resubscribe_best_effort(self) -> None:
-        """Subscribe to the state with best-effort QoS, as sensor drivers publish it."""
         self.get_logger().info(
             f"A publisher of '{self._unheard}' uses best effort; so does the subscription now."
         )
@@ -417,7 +427,6 @@ class CommanderNode(FlightNode):
             self._publish_diagnostics(ignored)
 
     def _publish_diagnostics(self, warning: str = "") -> None:
-        """Publish the commander's status and the number of ignored states, or a warning."""
         robot, stamps = self.commander.robot, self.commander.stamps
         ignored: dict[str, object] = {"ignored": stamps.ignored}
         if self._decoder is not None:

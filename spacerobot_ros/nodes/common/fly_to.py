@@ -269,7 +269,6 @@ class GoalActions:
         return server
 
     def _run_in_executor(self, act: Callable[[], None]) -> None:
-        """Call a function once from the executor."""
 
         def once() -> None:
             self._node.destroy_timer(timer)

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import importlib
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from geometry_msgs.msg import PoseStamped, TransformStamped
 from nav_msgs.msg import Path
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
@@ -73,19 +72,6 @@ def interface_class(module: str, name: str) -> Any | None:
     except Exception:  # Several kinds tell that it, or its libraries, are not on the paths.
         return None
     return kind
-
-
-def diagnostic_status(
-    name: str, level: bytes, message: str, values: Mapping[str, object], hardware_id: str = ""
-) -> DiagnosticStatus:
-    """Return the status of the component ``name``, with values as texts."""
-    return DiagnosticStatus(
-        level=level,
-        name=name,
-        message=message,
-        hardware_id=hardware_id,
-        values=[KeyValue(key=key, value=str(value)) for key, value in values.items()],
-    )
 
 
 def shape_message(goal: Goal, joint_names: Sequence[str]) -> JointState:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import time
 import traceback
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable
+from contextlib import AbstractContextManager, suppress
 from dataclasses import replace
 from typing import Any, ClassVar
 
@@ -100,8 +100,10 @@ class FlightNode(LifecycleNode):
     depends_on: ClassVar[tuple[Role, ...]] = ()
     """Roles of the nodes whose silence this node reports."""
 
-    def __init__(self, name: str, *, autostart: bool | None = None, **kwargs: Any) -> None:
-        super().__init__(name, **kwargs)
+    default_name: ClassVar[str] = ""
+
+    def __init__(self, name: str = "", *, autostart: bool | None = None, **kwargs: Any) -> None:
+        super().__init__(name or self.default_name, **kwargs)
         self.fault: SpaceRobotError | None = None
         self.on_end: Callable[[int], None] = lambda code: None
         """Function that a finished node calls with its exit code."""
@@ -356,11 +358,14 @@ class FlightNode(LifecycleNode):
         about = {"node": silence.name, "silent_s": f"{silence.seconds:.3f}"}
         self.report_event(Event(kind, silence.message, level, about=about))
 
-    @contextmanager
-    def long_work(self) -> Iterator[None]:
+    def long_work(self) -> AbstractContextManager[None]:
         """Announce a long computation to the nodes that depend on this one."""
-        with self._liveness.busy():
-            yield
+        return self._liveness.busy()
+
+    @property
+    def exit_code(self) -> int:
+        """Exit code of the process of a node that ends on request."""
+        return 0
 
     def drain(self, executor: EventsExecutor) -> None:
         """Complete pending work within about a second before the node ends."""
@@ -486,7 +491,6 @@ class FlightNode(LifecycleNode):
         fix(self, (each for each in declared if each.read_only), fixed=fixed)
 
     def _require_changeable(self, changes: list[RosParameter]) -> None:
-        """Raise ParameterError if a requested change concerns a parameter that is constant now."""
         for change in changes:
             if change.name == AUTOSTART.name:
                 raise ParameterError(

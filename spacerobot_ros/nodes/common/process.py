@@ -182,7 +182,7 @@ def _run_node(factory: Callable[[], FlightNode], arguments: list[str] | None) ->
             node.drain(executor)
             node.finalize()
             _await_delivery(node)
-        return stop.result() or 0
+        return stop.result() or node.exit_code
     finally:
         logging.getLogger("spacerobot_ros").removeHandler(warnings)
         if node is not None:

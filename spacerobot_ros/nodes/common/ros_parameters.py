@@ -59,7 +59,6 @@ class RemoteParameters:
             self.values = {name: json.dumps(_json_value(value)) for name, value in values}
 
     def _call(self, kind: Any, service: str, request: Any) -> Generator[bool, None, Any]:
-        """Return the answer of a service; None if it is late."""
         client: Client = self._node.create_client(kind, f"{self.name}/{service}")
         try:
             future, asked_at, ready = None, 0, 0

@@ -80,13 +80,11 @@ class _Connection:
         return bool(self._client.server_is_ready())
 
     def send(self, number: int, start: ScheduleStart) -> None:
-        """Send a schedule, which begins when it arrives."""
         goal = self._kind.Goal(trajectory=joint_trajectory(start.schedule))
         answer = self._client.send_goal_async(goal)
         answer.add_done_callback(lambda future: self._on_answer(number, future.result()))
 
     def cancel(self, number: int) -> None:
-        """Cancel a schedule, or cancel it once it is accepted."""
         handle = self._handles.get(number)
         if handle is None:
             self._cancelled.add(number)

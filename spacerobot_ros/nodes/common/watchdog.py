@@ -15,10 +15,9 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.timer import Timer
 
-from spacerobot_ros.messages.diagnostics import diagnostic_name
-from spacerobot_ros.messages.statuses import read_status
+from spacerobot_ros.messages.diagnostics import diagnostic_name, encode_diagnostics
+from spacerobot_ros.messages.statuses import StatusRecord, read_status
 from spacerobot_ros.model.compilation import compilation_contexts
-from spacerobot_ros.nodes.common.messages import diagnostic_status
 
 TOPIC = "heartbeat"
 
@@ -222,11 +221,11 @@ class Liveness:
         silent = sorted(self._watchdog.silent)
         values = dict.fromkeys(silent, "silent")
         values.update({each.name: "back" for each in news if each.over})
-        status = diagnostic_status(
+        record = StatusRecord(
             diagnostic_name(self._node.get_fully_qualified_name(), "watchdog"),
-            DiagnosticStatus.ERROR if silent else DiagnosticStatus.OK,
+            2 if silent else 0,
             f"silent: {', '.join(silent)}" if silent else "all nodes send heartbeats",
             values,
             self._role,
         )
-        self._diagnostics.publish(DiagnosticArray(status=[status]))
+        self._diagnostics.publish(encode_diagnostics([record], 0))

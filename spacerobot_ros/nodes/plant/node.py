@@ -160,16 +160,16 @@ class PlantNode(FlightNode):
         self._lockstep: Lockstep | None = None
         self._real_time: RealTime | None = None
         if config.time_mode == "lockstep":
-            self._lockstep = Lockstep(self._commands)
+            self._lockstep = Lockstep(self.commands)
         else:
             self._real_time = RealTime(self._period_ns, config.real_time_factor)
         self._monitor = PlantMonitor(
-            self._commands, self.plant, config if self._undecided else decided
+            self.commands, self.plant, config if self._undecided else decided
         )
-        self._publisher = StatePublisher(self, robot, self._reported, config)
-        self._transforms = TransformPublisher(self, robot, self._reported, config)
-        self._markers = LinkMarkers(self, self.plant, config.world_frame)
-        self._report = PlantReport(self, self.plant, self._commands, self._real_time)
+        self._publisher = StatePublisher(self, robot, self.reported, config)
+        self._transforms = TransformPublisher(self, robot, config)
+        self._markers = LinkMarkers(self, config.world_frame)
+        self._report = PlantReport(self, self._real_time)
         self._pose_ticks = (
             self._ticks_for_viewers(config.base_pose_period, _LONGEST_MARKER_PERIOD) or 1
         )
@@ -184,7 +184,7 @@ class PlantNode(FlightNode):
         self._clearance = None
         if self._clearance_ticks:
             self._clearance = ClearancePublisher.of(
-                self, self.plant, robot.description, has_contact_forces=config.engine == "mujoco"
+                self, robot.description, has_contact_forces=config.engine == "mujoco"
             )
         self._obstacles: str | None = None
         """The last text on the topic obstacles; None: the robot's own obstacles are used."""
@@ -208,13 +208,13 @@ class PlantNode(FlightNode):
 
     def _use_plant(self, plant: PlantWithFaults, config: PlantConfig) -> None:
         self.plant, plant.tick = plant, self._tick
-        self._reported = ReportedState(plant, config)
-        self._commands = CommandValidator(plant, config)
+        self.reported = ReportedState(plant, config)
+        self.commands = CommandValidator(plant, config)
         self._readers = {
             source.topic: CommandReader(
                 source, plant.robot, config.prefix_for(plant.robot.description)
             )
-            for source in self._commands.sources
+            for source in self.commands.sources
         }
         self._capturing = plant.capturing
         self._injected_seen = plant.injected
@@ -232,25 +232,21 @@ class PlantNode(FlightNode):
         assert self._monitor is not None
         self._undecided, config = False, self.config.decided(actuation)
         if actuation == "effort":
-            commands, robot = self._commands, self.plant.robot
+            commands, robot = self.commands, self.plant.robot
             before = self.plant
             self._use_plant(self._plant_now(robot, config), config)
             self.plant.succeed(before)
-            self._commands.succeed(commands)
+            self.commands.succeed(commands)
             if self._lockstep is not None:
-                self._lockstep = Lockstep(self._commands)
-            self._publisher.observe(self._reported)
-            self._transforms.observe(self._reported)
-            self._markers.observe(self.plant)
-            self._report.observe(self._commands, self.plant)
-            if self._clearance is not None:
-                self._clearance.observe(self.plant)
+                self._lockstep = Lockstep(self.commands)
+            self._publisher.observe(self.reported)
+            self._report.observe_plant()
             self._count_commanders()
         self._under_efforts = None
         if self._real_time is not None:
             # Time stands still meanwhile: this command, and the wrench beside it, answer its state.
             self._real_time.start(self._steady.now().nanoseconds, self._tick)
-        self._monitor.observe(self._commands, self.plant, config)
+        self._monitor.observe(self.commands, self.plant, config)
         self.get_logger().info(
             f"Commands carry {_CARRIED[actuation]}: the plant uses this actuation."
         )
@@ -285,7 +281,7 @@ class PlantNode(FlightNode):
     def activate(self) -> None:
         """Publish the robot and its current state, and start stepping."""
         self._active = self._when_active
-        self._commands.revoke_before(self.time_ns)
+        self.commands.revoke_before(self.time_ns)
         self._publisher.publish_description()
         if self._tf_ticks:
             self._transforms.publish_static(self.time_ns)
@@ -312,7 +308,7 @@ class PlantNode(FlightNode):
         if self._active in (PlantState.INACTIVE, PlantState.FAILED):
             return
         self._active = PlantState.INACTIVE
-        self._commands.rest()
+        self.commands.rest()
         self._publish_changed_status()
 
     def start_message(self) -> str:
@@ -338,7 +334,7 @@ class PlantNode(FlightNode):
             self._publish_status(PlantStatus(PlantState.FAILED, message, reason))
             return
         self._monitor.failure = reason, message
-        self._commands.rest()
+        self.commands.rest()
         self._publish_changed_status()
 
     def drain(self, executor: EventsExecutor) -> None:
@@ -346,7 +342,7 @@ class PlantNode(FlightNode):
         if self._active is not PlantState.RUNNING or self._real_time is None:
             return
         self._readers, self._undecided = {}, False  # No command counts any more.
-        self._commands.rest()
+        self.commands.rest()
         self._publish_changed_status()
         end, began = time.monotonic() + _LONGEST_REST, self._tick
 
@@ -428,7 +424,7 @@ class PlantNode(FlightNode):
 
     def _step(self) -> None:
         try:
-            limited = self.plant.step(*self._commands.begin_step())
+            limited = self.plant.step(*self.commands.begin_step())
         except SpaceRobotError as error:
             time = self.time_ns / SECOND
             raise SpaceRobotError(f"The plant stops at {time:g} s: {error}") from error
@@ -446,7 +442,7 @@ class PlantNode(FlightNode):
 
     def _publish(self) -> None:
         now = self._tick * self._period_ns
-        if self._reported.update():
+        if self.reported.update():
             self._publisher.rebuild()
         self._publisher.publish(now, all_topics=self._tick % self._pose_ticks == 0)
         if self._clearance is not None:
@@ -490,7 +486,7 @@ class PlantNode(FlightNode):
             return
         for _ in range(real_time.due_ticks(self._steady.now().nanoseconds, self._tick)):
             real_time.count_tick(self._steady.now().nanoseconds, self._tick)
-            silent = self._commands.drop_old(self.time_ns)
+            silent = self.commands.drop_old(self.time_ns)
             for source in silent:
                 self._report.timed_out(source, self.config.command_timeout)
             if silent:
@@ -505,7 +501,7 @@ class PlantNode(FlightNode):
             return  # A new subscriber receives the state after the pause.
         self._check_for_commanders()
         assert self._lockstep is not None
-        if self._lockstep.must_step_at_check(self._tick, pose_lost=self._reported.sensors.dropout):
+        if self._lockstep.must_step_at_check(self._tick, pose_lost=self.reported.sensors.dropout):
             self._step()
         elif self._lockstep.waits and self._publisher.has_new_readers():
             self._publisher.publish(self.time_ns, all_topics=True)
@@ -518,10 +514,10 @@ class PlantNode(FlightNode):
 
     def _check_for_commanders(self) -> None:
         self._count_commanders()
-        self._commands.require_commanded()
+        self.commands.require_commanded()
 
     def _count_commanders(self) -> None:
-        for source in self._commands.sources:
+        for source in self.commands.sources:
             # Names to count by are not remapped.
             source.commanders = self.count_publishers(self.resolve_topic_name(source.topic))
 
@@ -535,7 +531,7 @@ class PlantNode(FlightNode):
         reader = self._readers.get(topic)
         if reader is None:
             return  # Servos take no wrench.
-        refusal = reader.offer(self._commands, raw, self._tick * self._period_ns)
+        refusal = reader.offer(self.commands, raw, self._tick * self._period_ns)
         if refusal is not None:
             self._report.refused(reader.source, refusal)
             if refusal.latches:
@@ -544,12 +540,12 @@ class PlantNode(FlightNode):
             self._publish_changed_status()
         if self._real_time is None:
             self._step_if_complete()
-        elif reader.source is self._commands.sources[0]:
+        elif reader.source is self.commands.sources[0]:
             now = self._steady.now().nanoseconds
             self._real_time.count_command(now, reader.source.stamp_ns)
 
     def _step_if_complete(self) -> None:
-        if self._active is PlantState.RUNNING and self._commands.complete:
+        if self._active is PlantState.RUNNING and self.commands.complete:
             self._step()
 
     def _on_injection(self, inject: Callable[[str], None], message: String) -> None:
@@ -577,9 +573,7 @@ class PlantNode(FlightNode):
             described = with_world(self.plant.robot.description, world)
             with self.long_work():
                 # The plant in MuJoCo has the obstacles of the beginning alone.
-                self._clearance = ClearancePublisher.of(
-                    self, self.plant, described, self._clearance
-                )
+                self._clearance = ClearancePublisher.of(self, described, self._clearance)
             if self._clearance is None and self._monitor is not None and self._monitor.contacts:
                 # Nothing is left that could touch.
                 self._monitor.contacts = ()
@@ -589,7 +583,7 @@ class PlantNode(FlightNode):
         """Bring all joints to rest if a commander is silent and the parameters request it."""
         super().on_silence(silence)
         if self.config.watchdog_action == "latch" and not silence.over:
-            self._commands.latch("watchdog", f"node '{silence.name}' is silent", self.time_ns)
+            self.commands.latch("watchdog", f"node '{silence.name}' is silent", self.time_ns)
             self._report.latched()
             self._publish_changed_status()
 
@@ -597,7 +591,7 @@ class PlantNode(FlightNode):
 
     def _reset(self) -> str:
         self.plant.reset()
-        self._commands.reset(self.time_ns)
+        self.commands.reset(self.time_ns)
         assert self._monitor is not None
         self._monitor.resets += 1
         # Commanders must know of the reset before they answer a state after it.
@@ -607,13 +601,13 @@ class PlantNode(FlightNode):
         return "The robot is back in its initial state; time continues."
 
     def _abort(self) -> str:
-        self._commands.latch("abort", "stopped on request", self.time_ns)
+        self.commands.latch("abort", "stopped on request", self.time_ns)
         self._report.latched()
         self._publish_changed_status()
         return f"{latched_text('stopped on request')}."
 
     def _rearm(self) -> str:
-        fault = self._commands.rearm()
+        fault = self.commands.rearm()
         if not fault:
             return "No fault was latched."
         assert self._monitor is not None
@@ -627,10 +621,8 @@ class PlantNode(FlightNode):
             raise CommandError("There is no target: set parameter 'target.robot' to its URDF.")
         if not self._is_running_or_paused:
             raise CommandError(f"The plant is {self._active.value}: nothing moves.")
-        if self._commands.fault:
-            raise CommandError(
-                f"A fault is latched: {self._commands.fault}; rearm the plant first."
-            )
+        if self.commands.fault:
+            raise CommandError(f"A fault is latched: {self.commands.fault}; rearm the plant first.")
         report = act(self._capturing)
         self._publish_changed_status()
         return report.event(self.time_ns / SECOND).message

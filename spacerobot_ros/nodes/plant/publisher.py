@@ -26,17 +26,14 @@ from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import RobotDescription
 from spacerobot_ros.nodes.common.messages import message_class, transform_class
 from spacerobot_ros.nodes.common.node import LATCHED, STREAM, FlightNode
-from spacerobot_ros.simulation.actuators import PlantWithFaults, thrusters_in
-from spacerobot_ros.simulation.capture import capture_in
+from spacerobot_ros.simulation.actuators import thrusters_in
 from spacerobot_ros.simulation.commands import (
     NO_STAMP,
     CommandSource,
-    CommandValidator,
     Reason,
     Refusal,
 )
 from spacerobot_ros.simulation.config import PlantConfig
-from spacerobot_ros.simulation.plant import Plant
 from spacerobot_ros.simulation.sensors import ReportedState
 from spacerobot_ros.simulation.status import latched_text
 from spacerobot_ros.simulation.time_modes import RealTime
@@ -44,6 +41,7 @@ from spacerobot_ros.times import SECOND, stamp_bytes
 from spacerobot_ros.topics import TOPICS, Topic, pose_topic
 
 if TYPE_CHECKING:
+    from spacerobot_ros.nodes.plant.node import PlantNode
     from spacerobot_ros.simulation.clearance import ClearanceMonitor
 
 _LOG_PERIOD = 5.0  # wall s, of lines of one kind
@@ -55,25 +53,17 @@ _RESTING_SHARE = 0.01
 class PlantReport:
     """Writes logs and diagnostics of one plant."""
 
-    def __init__(
-        self,
-        node: FlightNode,
-        plant: PlantWithFaults,
-        commands: CommandValidator,
-        real_time: RealTime | None,
-    ) -> None:
-        self._node, self._commands, self._plant = node, commands, plant
-        name = node.get_fully_qualified_name()
-        self._diagnostics = PlantDiagnostics(name, plant, commands, real_time)
+    def __init__(self, node: PlantNode, real_time: RealTime | None) -> None:
+        self._node, name = node, node.get_fully_qualified_name()
+        self._diagnostics = PlantDiagnostics(name, node.plant, node.commands, real_time)
         self._stream = node.create_publisher(DiagnosticArray, "/diagnostics", STREAM)
-        thrusters = thrusters_in(plant)
+        thrusters = thrusters_in(node.plant)
         if thrusters is not None and thrusters.missing:
             node.get_logger().warning(f"The thrusters cannot produce {thrusters.missing}.")
 
-    def observe(self, commands: CommandValidator, plant: PlantWithFaults) -> None:
-        """Report on these from now on."""
-        self._commands, self._plant = commands, plant
-        self._diagnostics.observe(commands, plant)
+    def observe_plant(self) -> None:
+        """Report on the present plant of the node from now on."""
+        self._diagnostics.observe(self._node.commands, self._node.plant)
 
     def refused(self, source: CommandSource, refusal: Refusal) -> None:
         """Log a refused command, which its validator has counted."""
@@ -88,7 +78,7 @@ class PlantReport:
 
     def latched(self) -> None:
         """Log that a fault is latched."""
-        self._node.get_logger().error(f"{latched_text(self._commands.fault)}.")
+        self._node.get_logger().error(f"{latched_text(self._node.commands.fault)}.")
 
     def timed_out(self, source: CommandSource, timeout: float) -> None:
         """Log that a commander's commands have ceased."""
@@ -100,7 +90,7 @@ class PlantReport:
 
     def limited(self) -> None:
         """Log that joints were held back in the last step, unless they merely rest on a stop."""
-        plant, texts = self._plant, []
+        plant, texts = self._node.plant, []
         resting = np.zeros(plant.robot.n, dtype=np.bool_)
         if plant.takes_wrench:
             limit = plant.robot.effort_limit
@@ -244,10 +234,8 @@ class TransformPublisher:
     If the package ``tf2_msgs`` is missing, nothing is published; bags have the transforms anyway.
     """
 
-    def __init__(
-        self, node: FlightNode, robot: SpaceRobot, state: ReportedState, config: PlantConfig
-    ) -> None:
-        self._state, self._kind = state, transform_class()
+    def __init__(self, node: PlantNode, robot: SpaceRobot, config: PlantConfig) -> None:
+        self._node, self._kind = node, transform_class()
         if self._kind is None or not config.tf_period:
             self.publishes = False
             return
@@ -263,10 +251,6 @@ class TransformPublisher:
         if self._frames.static_message(0) is not None:
             self._static = node.create_publisher(self._kind, STATIC_TRANSFORMS, LATCHED)
 
-    def observe(self, state: ReportedState) -> None:
-        """Publish the frames of another state from now on."""
-        self._state = state
-
     def publish_static(self, time_ns: int) -> None:
         """Publish the transforms of fixed links."""
         if self._static is not None:
@@ -274,8 +258,8 @@ class TransformPublisher:
 
     def publish(self, time_ns: int) -> None:
         """Publish the transforms of the last reported state, if it has a pose."""
-        if not self._state.sensors.dropout:
-            quantities = self._state.quantities
+        if not self._node.reported.sensors.dropout:
+            quantities = self._node.reported.quantities
             self._stream.publish(
                 self._frames.message(time_ns, quantities["measured_pose"], quantities["measured_q"])
             )
@@ -286,20 +270,18 @@ class ClearancePublisher:
 
     def __init__(
         self,
-        node: FlightNode,
-        plant: Plant,
+        node: PlantNode,
         monitor: ClearanceMonitor,
         stream: Publisher | None = None,
     ) -> None:
-        self._node, self._plant, self._monitor = node, plant, monitor
+        self._node, self._monitor = node, monitor
         self._name = node.get_fully_qualified_name()
         self._stream = stream or node.create_publisher(DiagnosticStatus, "clearance", STREAM)
 
     @classmethod
     def of(
         cls,
-        node: FlightNode,
-        plant: Plant,
+        node: PlantNode,
         described: RobotDescription,
         before: ClearancePublisher | None = None,
         *,
@@ -315,25 +297,21 @@ class ClearancePublisher:
 
         monitor = ClearanceMonitor.of(
             described,
-            tuple(plant.robot.link_names),
+            tuple(node.plant.robot.link_names),
             None if before is None else before._monitor,
-            capturing=capture_in(plant),
+            capturing=node.plant.capturing,
             has_contact_forces=has_contact_forces,
         )
         if monitor is None:
             return None
-        return cls(node, plant, monitor, None if before is None else before._stream)
-
-    def observe(self, plant: Plant) -> None:
-        """Measure another plant of the same robot from now on."""
-        self._plant = plant
+        return cls(node, monitor, None if before is None else before._stream)
 
     def look(self, time_ns: int, *, publishes: bool) -> tuple[str, ...] | None:
         """Report contacts that have begun or ended; return the current ones, or None if unchanged.
 
         ``publishes``: also publish the current clearance.
         """
-        plant = self._plant
+        plant = self._node.plant
         status, events = self._monitor.measure(
             plant.link_R, plant.link_r, plant.pose, time_ns / SECOND
         )
@@ -352,22 +330,18 @@ class ClearancePublisher:
 class LinkMarkers:
     """Publishes all visuals of a robot, of its target and of obstacles as one marker array."""
 
-    def __init__(self, node: FlightNode, plant: PlantWithFaults, world_frame: str) -> None:
-        self._plant, robot = plant, plant.robot.description
+    def __init__(self, node: PlantNode, world_frame: str) -> None:
+        self._node, plant = node, node.plant
         target = None if plant.capturing is None else plant.capturing.target.description
         self._stream = node.create_publisher(MarkerArray, "markers", STREAM)
-        self._markers = RobotMarkers(robot, target, world_frame)
+        self._markers = RobotMarkers(plant.robot.description, target, world_frame)
         self.use_obstacles = self._markers.use_obstacles
-
-    def observe(self, plant: PlantWithFaults) -> None:
-        """Draw another plant of the same robot from now on."""
-        self._plant = plant
 
     def publish(self, time_ns: int) -> None:
         """Publish the markers of all visuals at their current poses."""
         if not self._markers.draws_anything:
             return
-        plant = self._plant
+        plant = self._node.plant
         target = None if plant.capturing is None else plant.capturing.target_pose
         self._stream.publish(
             self._markers.message(time_ns, plant.pose, plant.link_R, plant.link_r, target)

@@ -258,7 +258,6 @@ class ViewerNode(FlightNode):
             editor.show_check(check)
 
     def _question(self, state: StackState, goals: Mapping[Part, Goal]) -> GoalQuestion | str:
-        """Return the check of goals, or the reason why they are not checked."""
         if not self.config.check_goals:
             return "Parameter 'check_goals' is false."
         return make_question(state, goals, self._robot, self._remote_values)
@@ -377,13 +376,11 @@ class ViewerNode(FlightNode):
             self._page.editor.touch(time.monotonic())
 
     def _offer_end_effectors(self) -> None:
-        """Offer goals of the robot's links for which the planner takes some."""
         links = planned_links(self._remote_values.get("planner"), self._robot)
         self._add_goal_topics(links)
         self._page.editor.offer_end_effectors(links)
 
     def _show_plant(self) -> None:
-        """Update the faults that can be injected, and the thrusters."""
         values = self._remote_values.get("plant")
         if self._robot is None or values is None:
             self._page.faults.offer(FaultTargets())
