@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -41,6 +41,18 @@ _LONGEST_CHECK_PERIOD = 0.2
 process was suspended."""
 
 
+@dataclass
+class _ReferenceWait:
+    """How long states have waited for a topic of references, since its last message."""
+
+    missed_since_ns: int | None = None
+    """Stamp of the first state without its reference, ns."""
+    waited: float = 0.0
+    """Wall time for which states have waited, s."""
+    silent: bool = False
+    """Whether states no longer wait for it."""
+
+
 class ControllerCommander(Commander):
     """Commands a wrench and joint efforts for every state (:class:`ControlExecutive`).
 
@@ -69,12 +81,7 @@ class ControllerCommander(Commander):
     ) -> None:
         super().__init__(config, host, GOAL_KEYS, pose_required=True, clock=clock)
         self._partner_is_busy = partner_is_busy
-        self._silent: set[str] = set()
-        """Topics of references that are silent; states do not wait for them."""
-        self._missed_since: dict[str, int] = {}
-        """Stamp of the first state without its reference, by topic, ns."""
-        self._waited: dict[str, float] = {}
-        """Wall time for which states have waited since the last message, by topic, s."""
+        self._references: dict[str, _ReferenceWait] = {}
         self._looked = clock()
         """Wall time of the last check of waiting states, s."""
         self._pose_has_come = self._odom_was_connected = False
@@ -91,9 +98,7 @@ class ControllerCommander(Commander):
         """Handle states from now on, each with the references that have a publisher."""
         for topic in (JOINT_REFERENCE, BASE_REFERENCE):
             self.states.require(topic, required=self.host.has_publisher(topic))
-        self._silent.clear()
-        self._missed_since.clear()
-        self._waited.clear()
+            self._references[topic] = _ReferenceWait()
         super().activate()
 
     def dump_momentum(self) -> str:
@@ -147,10 +152,9 @@ class ControllerCommander(Commander):
     def receive_reference(self, topic: str, stamp_ns: int, message: Any) -> None:
         """Take a reference, and handle its state if complete."""
         self.states.put_required(topic, stamp_ns, message)
-        self._missed_since.pop(topic, None)
-        self._waited.pop(topic, None)
-        if topic in self._silent:
-            self._silent.discard(topic)
+        before = self._references.get(topic)
+        self._references[topic] = _ReferenceWait()
+        if before is not None and before.silent:
             self.host.log("info", f"'{topic}' is no longer silent: it is followed again.")
         self.answer()
 
@@ -175,8 +179,9 @@ class ControllerCommander(Commander):
         """Do without references that states have missed for their timeout of simulated time."""
         now, timeout = self.stamps.now_ns, self.config.reference_timeout
         for topic in missing:
-            since = self._missed_since.setdefault(topic, now)
-            if timeout and now - since >= timeout * SECOND:
+            wait = self._references[topic]
+            wait.missed_since_ns = now if wait.missed_since_ns is None else wait.missed_since_ns
+            if timeout and now - wait.missed_since_ns >= timeout * SECOND:
                 self._do_without(topic)
 
     def _watch_waiting_state(self) -> None:
@@ -185,10 +190,11 @@ class ControllerCommander(Commander):
         elapsed, self._looked = min(now - self._looked, _LONGEST_CHECK_PERIOD), now
         missing = () if self.executive is None else self.states.missing
         for topic in missing:
+            wait = self._references[topic]
             # A planner that plans for long answers afterwards, unless it is killed meanwhile.
             if not (self._partner_is_busy() and self.host.has_publisher(topic)):
-                self._waited[topic] = self._waited.get(topic, 0.0) + elapsed
-            if timeout and self._waited.get(topic, 0.0) >= timeout:
+                wait.waited += elapsed
+            if timeout and wait.waited >= timeout:
                 self._do_without(topic)
         if missing:
             self.answer()
@@ -197,16 +203,14 @@ class ControllerCommander(Commander):
         assert self.executive is not None
         followed = self.states.latest(topic) is not None
         self.states.require(topic, required=False)
-        self._missed_since.pop(topic, None)
-        self._waited.pop(topic, None)
-        self._silent.add(topic)
+        self._references[topic] = _ReferenceWait(silent=True)
         if followed:
             self.executive.reference_ended(Reference())
         self.host.log("warning", f"'{topic}' is silent: the controller continues without it.")
 
     def _publish_status(self, status: Status) -> None:
-        if self._silent and status.state is not ControllerState.REFUSED:
-            silent = " and ".join(sorted(self._silent))
+        silent = " and ".join(sorted(t for t, each in self._references.items() if each.silent))
+        if silent and status.state is not ControllerState.REFUSED:
             status = replace(status, message=f"{status.message} There is no reference on {silent}.")
         super()._publish_status(status)
 

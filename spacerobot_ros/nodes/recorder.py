@@ -140,10 +140,11 @@ class RecorderNode(FlightNode):
                 self.recording,
                 config.tf_period,
                 (frames[0], frames[1]),
-                lambda: frames[0] in self._recorded,
+                lambda: frames[0] in self.topics,
                 map(self.resolve_topic_name, ("odom", "joint_states", _DESCRIPTION_TOPIC)),
             )
-        self._recorded: set[str] = set()
+        self.topics: set[str] = set()
+        """Full names of the topics that are subscribed."""
         self._unreadable_topics: set[str] = set()
         self._diagnostics: Publisher | None = None
         steady = RosClock(clock_type=ClockType.STEADY_TIME)
@@ -215,11 +216,6 @@ class RecorderNode(FlightNode):
     # -- what it has ---------------------------------------------------------------------------
 
     @property
-    def topics(self) -> set[str]:
-        """Full names of the topics that are subscribed."""
-        return set(self._recorded)
-
-    @property
     def messages_recorded(self) -> int:
         """Number of messages written."""
         return self.recording.messages if self.recording is not None else 0
@@ -246,7 +242,7 @@ class RecorderNode(FlightNode):
         if recording is None or recording.state is RecordingState.CLOSED:
             return
         for topic, types in self.get_topic_names_and_types():
-            known = topic in self._recorded or topic in self._unreadable_topics
+            known = topic in self.topics or topic in self._unreadable_topics
             if not known and self._is_chosen(topic, types[0]):
                 self._record(recording, topic, types[0])
         for topic in tuple(self._topics_without_owner):
@@ -331,7 +327,7 @@ class RecorderNode(FlightNode):
             self._unreadable_topics.add(topic)
             self.get_logger().warning(f"Topic '{topic}' is not recorded: {error}")
             return
-        self._recorded.add(topic)
+        self.topics.add(topic)
         self._request_parameters(topic, publishers[0])
         listener = None
         if self._transforms is not None:
@@ -388,7 +384,7 @@ class RecorderNode(FlightNode):
         values = {
             "messages": str(recording.messages),
             "messages_lost": str(recording.lost.total()),
-            "topics": str(len(self._recorded)),
+            "topics": str(len(self.topics)),
             "bytes_written": str(recording.writer.bytes_written),
             "bytes_waiting": str(recording.writer.bytes_waiting),
         }

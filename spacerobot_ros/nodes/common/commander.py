@@ -171,11 +171,6 @@ class CommanderNode(FlightNode):
             self._goal_actions.destroy()
         super().destroy_node()
 
-    @property
-    def takes_goals(self) -> bool:
-        """Whether action goals are accepted, because the node is configured."""
-        return self._has_entities
-
     def surroundings(self) -> Surroundings:
         """Return the frames and joints needed to read action goals."""
         robot = self.commander.robot

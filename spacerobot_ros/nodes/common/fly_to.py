@@ -240,7 +240,7 @@ class GoalActions:
         node = self._node
 
         def on_request(_: Any) -> GoalResponse:
-            return GoalResponse.ACCEPT if node.takes_goals else GoalResponse.REJECT
+            return GoalResponse.ACCEPT if node.has_entities else GoalResponse.REJECT
 
         def on_goal(handle: ServerGoalHandle) -> None:
             handle.execute()

@@ -236,7 +236,7 @@ class FlightNode(LifecycleNode):
 
     def _fail(self, what: str, error: Exception) -> None:
         """Stop working after an exception of a callback; the executor continues."""
-        if self._destroyed or (isinstance(error, InvalidHandle) and not self._has_entities):
+        if self._destroyed or (isinstance(error, InvalidHandle) and not self.has_entities):
             return  # The executor may still call back for a destroyed entity.
         self.get_logger().debug("".join(traceback.format_exception(error)))
         if isinstance(error, SpaceRobotError):
@@ -300,7 +300,7 @@ class FlightNode(LifecycleNode):
         return machine.current_state[0] if machine else State.PRIMARY_STATE_UNKNOWN
 
     @property
-    def _has_entities(self) -> bool:
+    def has_entities(self) -> bool:
         """Whether entities of ``configure`` exist: the node is configured or in a transition."""
         return self.lifecycle_state not in (
             State.PRIMARY_STATE_UNKNOWN,

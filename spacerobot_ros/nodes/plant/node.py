@@ -91,7 +91,8 @@ class PlantNode(FlightNode):
     def __init__(self, name: str = "plant", **kwargs: Any) -> None:
         self._active = PlantState.INACTIVE
         self._when_active = PlantState.RUNNING
-        self._tick, self._period_ns = 0, 1
+        self.tick, self._period_ns = 0, 1
+        """Number of the tick whose state was published last, and the time between two, ns."""
         self._wall_timers: list[Timer] = []
         self._monitor: PlantMonitor | None = None
         self.status = PlantStatus(PlantState.INACTIVE)
@@ -99,14 +100,9 @@ class PlantNode(FlightNode):
         super().__init__(name, **kwargs)
 
     @property
-    def tick(self) -> int:
-        """Number of the tick whose state was published last."""
-        return self._tick
-
-    @property
     def time_ns(self) -> int:
         """Simulated time of the last published state, ns."""
-        return self._tick * self._period_ns
+        return self.tick * self._period_ns
 
     @property
     def simulated_time_s(self) -> float:
@@ -150,7 +146,7 @@ class PlantNode(FlightNode):
             # Make the equations of its brakes now: between two ticks, the plant would be late.
             CommandValidator(self._under_efforts, under_efforts)
         last = self._last_state(robot)
-        self._tick = 0 if last is None else round(last.time_ns / self._period_ns)
+        self.tick = 0 if last is None else round(last.time_ns / self._period_ns)
         self._use_plant(
             build_plant(robot, decided)
             if last is None
@@ -207,7 +203,7 @@ class PlantNode(FlightNode):
         self._publish_status(self._monitor.status)
 
     def _use_plant(self, plant: PlantWithFaults, config: PlantConfig) -> None:
-        self.plant, plant.tick = plant, self._tick
+        self.plant, plant.tick = plant, self.tick
         self.reported = ReportedState(plant, config)
         self.commands = CommandValidator(plant, config)
         self._readers = {
@@ -245,7 +241,7 @@ class PlantNode(FlightNode):
         self._under_efforts = None
         if self._real_time is not None:
             # Time stands still meanwhile: this command, and the wrench beside it, answer its state.
-            self._real_time.start(self._steady.now().nanoseconds, self._tick)
+            self._real_time.start(self._steady.now().nanoseconds, self.tick)
         self._monitor.observe(self.commands, self.plant, config)
         self.get_logger().info(
             f"Commands carry {_CARRIED[actuation]}: the plant uses this actuation."
@@ -294,7 +290,7 @@ class PlantNode(FlightNode):
                 self.create_timer(_READER_CHECK_PERIOD, self._on_subscriber_check, clock=steady)
             ]
         else:
-            self._real_time.start(steady.now().nanoseconds, self._tick)
+            self._real_time.start(steady.now().nanoseconds, self.tick)
             self._wall_timers = [
                 self.create_timer(self._real_time.period, self._on_wall_tick, clock=steady),
                 self.create_timer(_READER_CHECK_PERIOD, self._on_commander_check, clock=steady),
@@ -344,14 +340,14 @@ class PlantNode(FlightNode):
         self._readers, self._undecided = {}, False  # No command counts any more.
         self.commands.rest()
         self._publish_changed_status()
-        end, began = time.monotonic() + _LONGEST_REST, self._tick
+        end, began = time.monotonic() + _LONGEST_REST, self.tick
 
         def at_rest() -> bool:
-            return self._tick > began and bool(np.all(np.abs(self.plant.qdot) <= _MAX_RATE_AT_REST))
+            return self.tick > began and bool(np.all(np.abs(self.plant.qdot) <= _MAX_RATE_AT_REST))
 
         while not at_rest() and time.monotonic() < end and self.is_active:
             executor.spin_once(timeout_sec=0.02)
-        if self._tick == began and self.is_active:
+        if self.tick == began and self.is_active:
             self._step()  # In slow real time one tick suffices, in which servos stop.
 
     def _stop_timers(self) -> None:
@@ -433,30 +429,30 @@ class PlantNode(FlightNode):
         if self._capturing is not None and self._capturing.reports:
             # Commanders must know of the other robot before they answer a state of it.
             self._publish_changed_status()
-        self._tick += 1
+        self.tick += 1
         self._publish()
-        if self._lockstep is not None and self._tick % _MAX_UNCONFIRMED_TICKS == 0:
+        if self._lockstep is not None and self.tick % _MAX_UNCONFIRMED_TICKS == 0:
             self._publisher.await_readers()
         if self.plant.injected is not self._injected_seen:
             self._publish_changed_status()
 
     def _publish(self) -> None:
-        now = self._tick * self._period_ns
+        now = self.tick * self._period_ns
         if self.reported.update():
             self._publisher.rebuild()
-        self._publisher.publish(now, all_topics=self._tick % self._pose_ticks == 0)
+        self._publisher.publish(now, all_topics=self.tick % self._pose_ticks == 0)
         if self._clearance is not None:
             self._look_at_contacts(self._clearance, now)
-        if self._tf_ticks and self._tick % self._tf_ticks == 0:
+        if self._tf_ticks and self.tick % self._tf_ticks == 0:
             self._transforms.publish(now)
-        if self._marker_ticks and self._tick % self._marker_ticks == 0:
+        if self._marker_ticks and self.tick % self._marker_ticks == 0:
             self._markers.publish(now)
-        if self._report_ticks and self._tick % self._report_ticks == 0:
+        if self._report_ticks and self.tick % self._report_ticks == 0:
             self._publish_report()
 
     def _look_at_contacts(self, clearance: ClearancePublisher, now: int) -> None:
-        publishes = self._tick % self._clearance_ticks == 0
-        if not (publishes or self._tick % self.config.contact_ticks == 0):
+        publishes = self.tick % self._clearance_ticks == 0
+        if not (publishes or self.tick % self.config.contact_ticks == 0):
             return
         contacts = clearance.look(now, publishes=publishes)
         if contacts is not None:
@@ -484,8 +480,8 @@ class PlantNode(FlightNode):
         assert real_time is not None
         if self._active is not PlantState.RUNNING:
             return
-        for _ in range(real_time.due_ticks(self._steady.now().nanoseconds, self._tick)):
-            real_time.count_tick(self._steady.now().nanoseconds, self._tick)
+        for _ in range(real_time.due_ticks(self._steady.now().nanoseconds, self.tick)):
+            real_time.count_tick(self._steady.now().nanoseconds, self.tick)
             silent = self.commands.drop_old(self.time_ns)
             for source in silent:
                 self._report.timed_out(source, self.config.command_timeout)
@@ -501,7 +497,7 @@ class PlantNode(FlightNode):
             return  # A new subscriber receives the state after the pause.
         self._check_for_commanders()
         assert self._lockstep is not None
-        if self._lockstep.must_step_at_check(self._tick, pose_lost=self.reported.sensors.dropout):
+        if self._lockstep.must_step_at_check(self.tick, pose_lost=self.reported.sensors.dropout):
             self._step()
         elif self._lockstep.waits and self._publisher.has_new_readers():
             self._publisher.publish(self.time_ns, all_topics=True)
@@ -531,7 +527,7 @@ class PlantNode(FlightNode):
         reader = self._readers.get(topic)
         if reader is None:
             return  # Servos take no wrench.
-        refusal = reader.offer(self.commands, raw, self._tick * self._period_ns)
+        refusal = reader.offer(self.commands, raw, self.tick * self._period_ns)
         if refusal is not None:
             self._report.refused(reader.source, refusal)
             if refusal.latches:
@@ -637,7 +633,7 @@ class PlantNode(FlightNode):
             if self._real_time is None:
                 self._step_if_complete()
             else:
-                self._real_time.start(self._steady.now().nanoseconds, self._tick)
+                self._real_time.start(self._steady.now().nanoseconds, self.tick)
         response.success = True
         response.message = self._when_active.value
         return response
