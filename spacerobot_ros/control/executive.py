@@ -13,7 +13,6 @@ from spacerobot_ros.control.controller import CoordinatedController, Mode
 from spacerobot_ros.control.goal_planning import GoalPlanning, PlannedGoals
 from spacerobot_ros.control.goals import (
     END_EFFECTOR,
-    GOAL_KEYS,
     GoalWatch,
     aims_of,
     config_with,
@@ -31,7 +30,6 @@ from spacerobot_ros.events import Event, EventKind
 from spacerobot_ros.model.description import Array, RobotDescription
 from spacerobot_ros.model.grasp import Payload
 from spacerobot_ros.planning.core.goal import (
-    Controlled,
     Tolerance,
 )
 from spacerobot_ros.planning.execution.goal_file import (
@@ -112,8 +110,6 @@ class ControlExecutive:
         """Goals that are pursued together, by part of the robot."""
         self._goal_id = ""
         """Id of the latest goal, which statuses carry."""
-        self._asked: dict[str, frozenset[Controlled]] = dict.fromkeys(GOAL_KEYS, frozenset())
-        """Parts of the poses of base and end-effector that the present goals request."""
         self._watch = GoalWatch()
         self._was_measured = False
         self.servicing.end()
@@ -434,7 +430,7 @@ class ControlExecutive:
                 return
         if self.servicing.task is not None:
             return
-        decided = watch.decision(self.controller, time, self._asked, config)
+        decided = watch.decision(self.controller, time, config)
         if decided is not None:
             self._goal_state, message = decided, self._message(decided)
             self._end_goals(decided, message)
@@ -567,9 +563,9 @@ class ControlExecutive:
         resumes = all(pending.resumes for pending in self._pending.values())
         self._take_tolerance(next(reversed(self._pending.values())).tolerance)
         if BASE_GOAL_KEY in self._pending or BASE_GOAL_KEY not in pursued:
-            self._asked[BASE_GOAL_KEY] = asked
+            self._watch.asked[BASE_GOAL_KEY] = asked
         if END_EFFECTOR in self._pending:
-            self._asked[END_EFFECTOR] = self._pending[END_EFFECTOR].goal.asked
+            self._watch.asked[END_EFFECTOR] = self._pending[END_EFFECTOR].goal.asked
         self._pending.clear()
         if planned is not None:
             self.controller.begin(planned.begins, planned.profile)
@@ -582,7 +578,7 @@ class ControlExecutive:
             self._report_acceptance(None if planned is None else planned.profile)
             self._watch.forget_touch(time)
         self._begin_tracking(time)
-        saved = goals_to_save(self.controller, self._asked, self._goal_id, resumes=resumes)
+        saved = goals_to_save(self.controller, self._watch.asked, self._goal_id, resumes=resumes)
         self.outputs.append(PursuedGoals(saved))
 
     def _planned(self, time: float, state: ControlState, *, carried: bool) -> PlannedGoals | None:
@@ -674,7 +670,7 @@ class ControlExecutive:
                 away = self.controller.distance_from_reference()
                 return f"Stalled {away} from the reference: {self._watch.stall.cause}."
             case ControllerState.REACHED | ControllerState.REACHED_PARTLY | ControllerState.FAILED:
-                return self._watch.message(state, self.controller, self._asked, self._goal_config)
+                return self._watch.message(state, self.controller, self._goal_config)
             case ControllerState.ABORTED:
                 return self._abort_message
             case ControllerState.ESTIMATING:

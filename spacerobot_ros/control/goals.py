@@ -207,32 +207,6 @@ def aims_of(
     return aims, asked
 
 
-def missed_parts_of(
-    controller: CoordinatedController,
-    asked: Mapping[str, frozenset[Controlled]],
-    config: ControllerConfig,
-) -> dict[str, str]:
-    """Return the :func:`missed_parts` in the state of the last command.
-
-    ``asked`` are the requested parts of the poses of base and end-effector.
-    """
-    law, goal = controller.law, controller.goal
-    state, outputs = law.state, law.outputs.selection
-    tolerance = Tolerance(config.position_tolerance, config.attitude_tolerance)
-    missed: dict[str, str] = {}
-    if goal.base is not None and asked[BASE_GOAL_KEY]:
-        aimed = Goal(goal.base.position, goal.base.quaternion, asked=asked[BASE_GOAL_KEY])
-        error = PoseError.between(state.r_WB, state.quaternion_WB, aimed)
-        missed |= missed_parts(aimed, error, controlled_parts(outputs.base), tolerance)
-    turned = "attitude" in asked[END_EFFECTOR] - controlled_parts(outputs.end_effector)
-    if goal.end_effector is not None and turned:
-        R_BE, _ = law.robot.link_pose(outputs.end_effector_link, state.q)
-        R_WE = matrix_from_quaternion(state.quaternion_WB) @ R_BE
-        turn = attitude_error(quaternion_from_matrix(R_WE), goal.end_effector.quaternion)
-        missed |= missed_turn(float(np.linalg.norm(turn)), tolerance)
-    return missed
-
-
 def goals_to_save(
     controller: CoordinatedController,
     asked: Mapping[str, frozenset[Controlled]],
@@ -242,7 +216,7 @@ def goals_to_save(
 ) -> dict[str, IdentifiedGoal]:
     """Return the goals of the present reference by part of the robot.
 
-    ``asked``: see :func:`missed_parts_of`.
+    ``asked`` are the parts of the poses of base and end-effector that goals request.
     """
     goal, selection = controller.goal, controller.law.outputs.selection
     shape = goal.joints.q if goal.joints is not None and selection.joints else None
@@ -282,6 +256,8 @@ class GoalWatch:
         """Errors (m,) of the outputs beyond which control is lost."""
         self._contacts: tuple[str, ...] = ()
         """The links that touch."""
+        self.asked: dict[str, frozenset[Controlled]] = dict.fromkeys(GOAL_KEYS, frozenset())
+        """Parts of the poses of base and end-effector that the present goals request."""
         self.touched = ""
         """The first contact on the way to the present goal, and when; empty: there was none."""
 
@@ -338,16 +314,9 @@ class GoalWatch:
         return f"the errors grow, the robot is {away} from the reference"
 
     def decision(
-        self,
-        controller: CoordinatedController,
-        time: float,
-        asked: Mapping[str, frozenset[Controlled]],
-        config: ControllerConfig,
+        self, controller: CoordinatedController, time: float, config: ControllerConfig
     ) -> ControllerState | None:
-        """Return the state of a goal that is decided at a time, s; None: it is not yet.
-
-        ``asked``: see :func:`missed_parts_of`.
-        """
+        """Return the state of a goal that is decided at a time, s; None: it is not yet."""
         at_rest, ends = controller.reference_at_rest(time), controller.reference_ends
         assert ends is not None
         if not at_rest and not self.monitor.is_late(time, ends, config):
@@ -359,21 +328,37 @@ class GoalWatch:
             return None
         if decision == Decision.FAILED or self.touched:
             return ControllerState.FAILED
-        if missed_parts_of(controller, asked, config):
+        if self._missed_parts(controller, config):
             return ControllerState.REACHED_PARTLY
         return ControllerState.REACHED
 
+    def _missed_parts(
+        self, controller: CoordinatedController, config: ControllerConfig
+    ) -> dict[str, str]:
+        """Return the :func:`missed_parts` in the state of the last command."""
+        law, goal = controller.law, controller.goal
+        state, outputs = law.state, law.outputs.selection
+        tolerance = Tolerance(config.position_tolerance, config.attitude_tolerance)
+        missed: dict[str, str] = {}
+        if goal.base is not None and self.asked[BASE_GOAL_KEY]:
+            aimed = Goal(goal.base.position, goal.base.quaternion, asked=self.asked[BASE_GOAL_KEY])
+            error = PoseError.between(state.r_WB, state.quaternion_WB, aimed)
+            missed |= missed_parts(aimed, error, controlled_parts(outputs.base), tolerance)
+        turned = "attitude" in self.asked[END_EFFECTOR] - controlled_parts(outputs.end_effector)
+        if goal.end_effector is not None and turned:
+            R_BE, _ = law.robot.link_pose(outputs.end_effector_link, state.q)
+            R_WE = matrix_from_quaternion(state.quaternion_WB) @ R_BE
+            turn = attitude_error(quaternion_from_matrix(R_WE), goal.end_effector.quaternion)
+            missed |= missed_turn(float(np.linalg.norm(turn)), tolerance)
+        return missed
+
     def message(
-        self,
-        state: ControllerState,
-        controller: CoordinatedController,
-        asked: Mapping[str, frozenset[Controlled]],
-        config: ControllerConfig,
+        self, state: ControllerState, controller: CoordinatedController, config: ControllerConfig
     ) -> str:
         """Return the message about a reached or failed goal; see :meth:`decision`."""
         away, missed = controller.distance_between(controller.law.state, controller.goal), {}
         if state is ControllerState.REACHED_PARTLY:
-            missed = missed_parts_of(controller, asked, config)
+            missed = self._missed_parts(controller, config)
         return decided_message(state, away, config, self.stall.cause, missed, self.touched)
 
 
