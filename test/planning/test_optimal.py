@@ -33,7 +33,7 @@ from spacerobot_ros.planning.methods.optimal.problem import (
     Trajectory,
 )
 from spacerobot_ros.planning.methods.optimal.search import ManoeuvreSearch
-from spacerobot_ros.planning.methods.optimal.transcription import PathInequality, Stages
+from spacerobot_ros.planning.methods.optimal.transcription import Stages
 
 Array = npt.NDArray[np.float64]
 
@@ -333,12 +333,12 @@ def arm() -> SpaceRobot:
 
 
 def solved(
-    arm: SpaceRobot, velocity: Array | float = 0.0, inequalities: tuple[PathInequality, ...] = ()
+    arm: SpaceRobot, velocity: Array | float = 0.0, inequality: ca.Function | None = None
 ) -> Trajectory:
     """Return the fastest way of the arm to turn its base, from joints that move at a velocity."""
     options = OptimalOptions()
     constraints = PathConstraints.of(arm, options)
-    stages = Stages.of(arm, np.eye(3), False, constraints, inequalities)
+    stages = Stages.of(arm, np.eye(3), False, constraints, inequality=inequality)
     solver = MultipleShooting(stages, INTERVALS)
     boundary = BoundaryConditions(ARM_START, TURN.as_quat(), ARM_START, velocity=velocity)
     limits = MotionLimits.of(arm, options)
@@ -382,7 +382,7 @@ def test_a_solution_keeps_inequalities_of_shape_velocity_and_acceleration(arm: S
         return np.abs(np.array([end * accelerations for end in ends]))
 
     assert power(free).max() > 0.2
-    kept = solved(arm, inequalities=(PathInequality(bound),))
+    kept = solved(arm, inequality=bound)
     assert power(kept).max() <= 0.1 + 1e-5
     assert kept.duration > free.duration
 

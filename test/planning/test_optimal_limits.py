@@ -22,10 +22,10 @@ from spacerobot_ros.errors import ParameterError, PlanningError
 from spacerobot_ros.files import Cache
 from spacerobot_ros.model import SpaceRobot, model_functions
 from spacerobot_ros.planning import GaitSchedule, plan
-from spacerobot_ros.planning.methods.optimal import multiple_shooting, search
+from spacerobot_ros.planning.methods.optimal import search
 from spacerobot_ros.planning.methods.optimal.problem import OptimalOptions, PathConstraints
 from spacerobot_ros.planning.methods.optimal.search import ManoeuvreSearch
-from spacerobot_ros.planning.methods.optimal.transcription import PathInequality, Stages, program
+from spacerobot_ros.planning.methods.optimal.transcription import Stages, program
 
 EAST = [1.0, 0.0, 0.0]
 SUN = [float(np.cos(0.3)), float(np.sin(0.3)), 0.0]
@@ -126,8 +126,7 @@ class SlowClock:
 @pytest.fixture
 def ticking(monkeypatch: pytest.MonkeyPatch) -> None:
     """Have 20 ms go by whenever a search asks for the time, on any machine."""
-    for module in (multiple_shooting, search):
-        monkeypatch.setattr(module, "time", SlowClock(0.02))
+    monkeypatch.setattr(search, "time", SlowClock(0.02))
 
 
 @pytest.mark.usefixtures("ticking")
@@ -145,8 +144,7 @@ def test_all_searches_of_a_plan_share_its_time(
 ) -> None:
     """A base that drifts is planned for at once, then for its passes of the goal, then for any."""
     clock = SlowClock(0.02)
-    for module in (multiple_shooting, search):
-        monkeypatch.setattr(module, "time", clock)
+    monkeypatch.setattr(search, "time", clock)
     few: dict[str, Any] = {"iterations": 6, "starts": 24, "angular_momentum": [1.5, -0.6, 1.1]}
     with pytest.raises(PlanningError, match=r"within optimal\.time_budget 0\.5 s"):
         of_arm(arm, [0.5, -0.6, 0.4], time_budget=0.5, **few)
@@ -158,8 +156,7 @@ def test_a_plan_is_the_same_on_a_busy_machine(
 ) -> None:
     turn = [0.2, -0.3, 0.25]
     quiet = of_arm(arm, turn, answers=2)
-    for module in (multiple_shooting, search):
-        monkeypatch.setattr(module, "time", SlowClock())
+    monkeypatch.setattr(search, "time", SlowClock())
     busy = of_arm(arm, turn, answers=2)
     assert busy.positions.tobytes() == quiet.positions.tobytes()
     assert busy.notes == quiet.notes
@@ -357,9 +354,7 @@ def test_derivatives_of_the_program_are_those_of_its_functions(arm: SpaceRobot) 
     )
     q, v, a = (ca.SX.sym(name, 3) for name in "qva")
     power = ca.Function("power", [q, v, a], [5.0 - ca.cos(q) * v * a])
-    stages = Stages.of(
-        arm, np.eye(3), position=True, constraints=constraints, inequalities=[PathInequality(power)]
-    )
+    stages = Stages.of(arm, np.eye(3), position=True, constraints=constraints, inequality=power)
     made = program(stages, 3)
     x, p, g = (made.problem[name] for name in ("x", "p", "g"))
     lam = ca.MX.sym("lam", g.numel())

@@ -9,37 +9,23 @@ limits if it takes f times as long.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
 
 import casadi as ca
 import numpy as np
-from typing_extensions import override
 
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.planning.core.joint_efforts import JointEfforts, given_effort_limits
-from spacerobot_ros.planning.methods.optimal.multiple_shooting import (
-    TOLERANCE,
-    DurationBounds,
-    MultipleShooting,
-    Neighbourhood,
-    StopRule,
-)
 from spacerobot_ros.planning.methods.optimal.problem import (
     BoundaryConditions,
-    MotionLimits,
     OptimalOptions,
     Trajectory,
     per_joint,
 )
-from spacerobot_ros.planning.methods.optimal.transcription import PathInequality, Stages
 
 _PLANNED_EFFORT_SHARE = 0.98
 """Share of the limits that a solution uses: the rest is for changes of its path."""
-
-_AT_LIMITS_FROM, _AT_LIMITS_BEYOND = 0.9, 0.1
-"""Shares of the limits by which efforts of a guess at the limits may be below and above them."""
 
 
 class LimitedEfforts(JointEfforts):
@@ -104,8 +90,8 @@ class LimitedEfforts(JointEfforts):
         peak = self.peak(trajectory, boundary)
         return trajectory if peak <= 1 else trajectory.stretched(math.sqrt(peak))
 
-    def inequality(self, *, drifting: bool = False) -> PathInequality:
-        """Return the limits as a path constraint at both ends of every interval."""
+    def inequality(self, *, drifting: bool = False) -> ca.Function:
+        """Return the limits as an inequality of :meth:`.Stages.of`."""
         n = len(self.limit)
         q, qdot, qddot = (ca.SX.sym(name, n) for name in ("q", "qdot", "qddot"))
         arguments = [q, qdot, qddot, ca.SX.sym("L_B", 3)] if drifting else [q, qdot, qddot]
@@ -113,71 +99,4 @@ class LimitedEfforts(JointEfforts):
         efforts = self._drifting_function if drifting else self._function
         tau = efforts(*arguments)[limited.tolist()]
         share = tau / (_PLANNED_EFFORT_SHARE * self.limit[limited])
-        return PathInequality(ca.Function("efforts", arguments, [ca.vertcat(1 - share, 1 + share)]))
-
-
-class EffortLimitedShooting(MultipleShooting):
-    """Multiple shooting that also keeps joint efforts within limits.
-
-    The problem is solved without them first: they cost time, and do not matter for most motions. If
-    the solution exceeds them, the problem with them is solved from there.
-
-    Parameters
-    ----------
-    stages
-        Returns the functions of the problem with these path inequalities.
-    intervals
-        The number of intervals N.
-    efforts
-        The limits.
-    tolerance
-        That of :class:`MultipleShooting`.
-    drifting
-        Whether the angular momentum is a parameter of the stages.
-    """
-
-    def __init__(
-        self,
-        stages: Callable[[Sequence[PathInequality]], Stages],
-        intervals: int,
-        efforts: LimitedEfforts,
-        tolerance: float = TOLERANCE,
-        *,
-        drifting: bool = False,
-    ) -> None:
-        super().__init__(stages(()), intervals, tolerance)
-        self._with_drift = drifting
-        self._stages, self._efforts, self._tolerance = stages, efforts, tolerance
-        self._limited: MultipleShooting | None = None
-
-    @override
-    def solve(
-        self,
-        boundary: BoundaryConditions,
-        limits: MotionLimits,
-        guess: Trajectory,
-        stop: StopRule,
-        duration: DurationBounds,
-        near: Neighbourhood | None = None,
-        *,
-        refining: bool = False,
-    ) -> Trajectory | None:
-        """Solve as :class:`MultipleShooting` does, with joint efforts within limits."""
-        # A guess whose efforts just reach their limits was made for these limits.
-        peak = self._efforts.peak(guess, boundary)
-        if not _AT_LIMITS_FROM <= peak <= 1 + _AT_LIMITS_BEYOND:
-            solution = super().solve(
-                boundary, limits, guess, stop, duration, near, refining=refining
-            )
-            if solution is None or self._efforts.peak(solution, boundary) <= 1:
-                return solution
-            guess = solution if duration.fixed else self._efforts.slowed(solution, boundary)
-        if self._limited is None:
-            stages = self._stages((self._efforts.inequality(drifting=self._with_drift),))
-            self._limited = MultipleShooting(stages, self.intervals, self._tolerance)
-        solution = self._limited.solve(
-            boundary, limits, guess, stop, duration, near, refining=refining
-        )
-        self.iterations, self.converged = self._limited.iterations, self._limited.converged
-        self.lack = self._limited.lack
-        return solution
+        return ca.Function("efforts", arguments, [ca.vertcat(1 - share, 1 + share)])

@@ -11,7 +11,6 @@ import hashlib
 import io
 import json
 import math
-import sys
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -67,8 +66,6 @@ from spacerobot_ros.planning.methods.optimal.search import (
     SearchProblem,
 )
 from spacerobot_ros.version import __version__
-
-_MAX_CORRECTION_INTERVALS = 40
 
 _MAX_STARTS_IN_MOTION = 12
 """Largest number of guesses for a manoeuvre from moving joints, which do not stop meanwhile."""
@@ -140,24 +137,6 @@ class _BaseMotion:
     def state_at(self, state: RobotState, tick: int) -> RobotState:
         """Return a state with the pose of the base at a tick."""
         return replace(state, position=self.positions[tick], quaternion=self.attitudes[tick])
-
-
-@dataclass(frozen=True)
-class _Task:
-    """A request with what a search takes; the options are those of this search."""
-
-    request: PlanRequest
-    boundary: BoundaryConditions
-    limits: MotionLimits
-    options: OptimalOptions
-    cancellation: Cancellation
-    clock: SearchClock
-
-    @property
-    def velocity(self) -> Array | float:
-        """Joint velocities (n,) that are held before the start."""
-        motion = self.request.motion
-        return self.boundary.velocity if motion is None else motion.velocity
 
 
 @dataclass(frozen=True)
@@ -423,7 +402,7 @@ class OptimalGait(GaitMethod):
         chosen = replace(self.options, duration=0.0, answers=1) if correction else self.options
         if duration is not None:
             chosen = replace(chosen, duration=duration)
-        task = _Task(request, boundary, limits, chosen, cancellation, clock)
+        task = SearchProblem(request, boundary, limits, chosen, clock, cancellation)
         if motion is not None:
             return self._plan_in_motion(task, motion, given=duration is not None)
         end = boundary.final_velocity
@@ -477,7 +456,7 @@ class OptimalGait(GaitMethod):
             self.robot, request, shape, self._limits, direction_W
         )
 
-    def _schedule(self, task: _Task, found: _PlanResult) -> GaitSchedule:
+    def _schedule(self, task: SearchProblem, found: _PlanResult) -> GaitSchedule:
         request, after = task.request, task.boundary.final_velocity
         return self._build_schedule(
             request.state, request.goal, found.positions, found.notes, task.velocity, after
@@ -487,7 +466,7 @@ class OptimalGait(GaitMethod):
     def _connection_bounds(self) -> ConnectionBounds:
         return ConnectionBounds.of(self.robot, self._specification.base_rotations.axes)
 
-    def _require_enough_time(self, task: _Task, *, final_is_given: bool) -> DurationBound:
+    def _require_enough_time(self, task: SearchProblem, *, final_is_given: bool) -> DurationBound:
         """Return a bound of the duration of all manoeuvres from rest to the goal.
 
         ``final_is_given``: the goal has the last shape of the boundary conditions. PlanningError if
@@ -515,7 +494,7 @@ class OptimalGait(GaitMethod):
             )
         return bound
 
-    def _begin_in_asked_time(self, task: _Task) -> _PlanResult:
+    def _begin_in_asked_time(self, task: SearchProblem) -> _PlanResult:
         """Return a manoeuvre from rest that takes no longer than the options ask for.
 
         NotFoundError if none was found; if a longer one was, the message has its duration.
@@ -526,7 +505,7 @@ class OptimalGait(GaitMethod):
         if given >= unlimited.longest:
             return self._begin_now(task)
         with suppress(NotFoundError):
-            return self._begin_now(task, _STARTS_BEFORE_FASTEST)
+            return self._begin_now(replace(task, max_failed_starts=_STARTS_BEFORE_FASTEST))
         fastest = math.inf
         with suppress(NotFoundError):
             found = self._begin_now(replace(task, options=unlimited))
@@ -546,37 +525,17 @@ class OptimalGait(GaitMethod):
             f"that was found takes {fastest:.6g} s. Allow more time.{refusal}"
         )
 
-    def _begin_now(
-        self,
-        task: _Task,
-        max_failed_starts: int = sys.maxsize,
-        guess: Array | None = None,
-        motion: InitialMotion | None = None,
-    ) -> _PlanResult:
-        """Return a manoeuvre that begins at once; see :class:`.SearchProblem` for the others.
+    def _begin_now(self, task: SearchProblem) -> _PlanResult:
+        """Return a manoeuvre that begins at once.
 
         Without effort limits if that keeps them, and otherwise with them. Limits that are the
         robot's own, and that no manoeuvre is found to keep, are not kept.
         """
-        boundary, correction = task.boundary, task.request.correction and motion is None
-        intervals = self.options.intervals
-        problem = SearchProblem(
-            boundary,
-            task.limits,
-            task.request.state.quaternion,
-            min(intervals, _MAX_CORRECTION_INTERVALS) if correction else intervals,
-            task.options,
-            guess,
-            # While a gentle manoeuvre takes its time, the base of a robot that drifts turns on.
-            correction and not boundary.is_timed,
-            max_failed_starts,
-            motion,
-        )
         kind = self._kind_of(task.request.goal)
-        found = kind.without_effort_limits.search(problem, task.cancellation, task.clock)
+        found = kind.without_effort_limits.search(task)
         if not self._is_within_efforts(task, found):
             try:
-                found = kind.within_efforts.search(problem, task.cancellation, task.clock)
+                found = kind.within_efforts.search(task)
             except NotFoundError:
                 if self._efforts_are_strict:
                     raise
@@ -592,7 +551,7 @@ class OptimalGait(GaitMethod):
             )
         return _PlanResult(found, found.held.positions, notes)
 
-    def _begin_now_or_coast(self, task: _Task) -> _PlanResult:
+    def _begin_now_or_coast(self, task: SearchProblem) -> _PlanResult:
         """Return a manoeuvre of a robot that drifts: joints may rest until the goal is in reach.
 
         The drift may lead away from the goal faster than the joints turn the base back; later, it
@@ -603,9 +562,9 @@ class OptimalGait(GaitMethod):
         momenta, rest = (state.linear_momentum, state.angular_momentum), np.zeros(self.robot.n)
         _, omega = self.robot.base_twist(state.quaternion, state.q, rest, *momenta)
         rate = float(np.linalg.norm(omega))
-        brief = _within_time(task, _MAX_ANGLE_WITHOUT_COASTING / rate)
+        brief = task.within_time(_MAX_ANGLE_WITHOUT_COASTING / rate)
         with suppress(NotFoundError):
-            return self._begin_now(brief, _STARTS_BEFORE_COASTING)
+            return self._begin_now(replace(brief, max_failed_starts=_STARTS_BEFORE_COASTING))
         last = min(longest, _COASTING_TURNS * 2 * math.pi / rate)
         ticks = math.ceil(last / self.control_period)
         coast = self._motion_along(state, np.tile(state.q, (ticks + 1, 1)))
@@ -615,7 +574,7 @@ class OptimalGait(GaitMethod):
                 return self._plan_for_coasting_time(task, coast, end)
             except (PlanningError, UnusableCandidateError):
                 task.cancellation.raise_if_requested()
-        return self._begin_now(_within_time(task, last))
+        return self._begin_now(task.within_time(last))
 
     def _motion_along(self, state: RobotState, shapes: Array) -> _BaseMotion:
         attitudes = self._prediction.attitudes(shapes, state.quaternion, state.angular_momentum)
@@ -623,7 +582,7 @@ class OptimalGait(GaitMethod):
         positions = self._prediction.positions(state, times, shapes, attitudes)
         return _BaseMotion(shapes, attitudes, positions)
 
-    def _later(self, task: _Task, coast: _BaseMotion, ticks: int) -> _Task:
+    def _later(self, task: SearchProblem, coast: _BaseMotion, ticks: int) -> SearchProblem:
         """Return the task of a manoeuvre that begins after some ticks of coasting."""
         state = task.request.state
         after = coast.state_at(state, ticks)
@@ -634,7 +593,7 @@ class OptimalGait(GaitMethod):
         aimed = replace(aimed, state=after, angular_momentum=L_B)
         return replace(task, request=later, boundary=aimed)
 
-    def _goal_passing_ticks(self, task: _Task, coast: _BaseMotion, step: int) -> list[int]:
+    def _goal_passing_ticks(self, task: SearchProblem, coast: _BaseMotion, step: int) -> list[int]:
         """Return the ticks at which the coasting base passes the goal, the closest pass first."""
         grid = np.arange(0, len(coast.shapes), step)
         turns = np.array([self._later(task, coast, int(k)).boundary.goal_rotation for k in grid])
@@ -644,7 +603,9 @@ class OptimalGait(GaitMethod):
         closest = passes[np.argsort(-near[passes], kind="stable")]
         return [int(tick) for tick in grid[closest][:_MAX_COASTING_ENDS]]
 
-    def _plan_for_coasting_time(self, task: _Task, coast: _BaseMotion, end: int) -> _PlanResult:
+    def _plan_for_coasting_time(
+        self, task: SearchProblem, coast: _BaseMotion, end: int
+    ) -> _PlanResult:
         """Return a manoeuvre that ends about when the coasting base passes the goal, at tick
         ``end``.
 
@@ -659,8 +620,9 @@ class OptimalGait(GaitMethod):
         free = self._begin_now(replace(there, boundary=at_rest, options=few))
         takes = len(free.positions) - 1
         begin = max(0, end - takes)
-        later = _within_time(self._later(task, coast, begin), _MAX_DURATION_RATIO * takes * h)
-        found = self._begin_now(later, _STARTS_AFTER_COASTING, free.positions)
+        later = self._later(task, coast, begin).within_time(_MAX_DURATION_RATIO * takes * h)
+        few_failed = replace(later, guess=free.positions, max_failed_starts=_STARTS_AFTER_COASTING)
+        found = self._begin_now(few_failed)
         self._constraints.check(coast.shapes[:begin], coast.attitudes[:begin], h)
         return replace(
             found,
@@ -668,7 +630,9 @@ class OptimalGait(GaitMethod):
             notes={**found.notes, "coasting_time": begin * h},
         )
 
-    def _plan_in_motion(self, task: _Task, motion: InitialMotion, *, given: bool) -> GaitSchedule:
+    def _plan_in_motion(
+        self, task: SearchProblem, motion: InitialMotion, *, given: bool
+    ) -> GaitSchedule:
         """Plan from moving joints; the remaining previous motion is the first guess.
 
         ``given``: the duration of the options is that of this request.
@@ -689,7 +653,7 @@ class OptimalGait(GaitMethod):
             answers=1 if again else chosen.answers,
         )
         try:
-            found = self._begin_now(replace(task, options=budget), motion=motion)
+            found = self._begin_now(replace(task, options=budget))
         except NotFoundError as refusal:
             # The present manoeuvre goes on where the same goal is planned for again; a base that
             # drifts would have to pass its goal later.
@@ -700,7 +664,7 @@ class OptimalGait(GaitMethod):
         return self._schedule(task, found)
 
     def _plan_with_braking(
-        self, task: _Task, motion: InitialMotion, refusal: NotFoundError
+        self, task: SearchProblem, motion: InitialMotion, refusal: NotFoundError
     ) -> GaitSchedule:
         """Plan from the shape in which joints that brake as fast as they may come to rest.
 
@@ -738,7 +702,7 @@ class OptimalGait(GaitMethod):
         """Whether limits of efforts are asked for: others are kept where a manoeuvre is found."""
         return self.options.effort_limits != 0 or bool(self.options.max_effort)
 
-    def _is_within_efforts(self, task: _Task, found: Manoeuvre) -> bool:
+    def _is_within_efforts(self, task: SearchProblem, found: Manoeuvre) -> bool:
         if self._efforts is None:
             return True
         L_B, after = task.boundary.momenta_in_base(found.held.quaternions), np.zeros(self.robot.n)
@@ -846,11 +810,6 @@ class OptimalGait(GaitMethod):
 
         digest.update(json.dumps(facts, sort_keys=True, default=listed).encode())
         return digest.hexdigest()
-
-
-def _within_time(task: _Task, seconds: float) -> _Task:
-    """Return a task whose manoeuvre takes no longer than a time, s."""
-    return replace(task, options=replace(task.options, longest=min(task.options.longest, seconds)))
 
 
 def _asked_time(chosen: OptimalOptions) -> tuple[str, float]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import os
-import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -84,23 +83,16 @@ class StopRule:
         Largest number of its steps.
     cancellation
         Stops it at its next iterate.
-    deadline, last_call
-        ``time.monotonic()``, s, at which it stops with a feasible iterate, and without one;
-        infinite if no wall time limits the search.
+    is_over
+        Whether the wall time is used up, if there is a feasible iterate or not.
     watch
         Called at every iterate.
     """
 
     iterations: int
     cancellation: Cancellation = NEVER
-    deadline: float = math.inf
-    last_call: float = math.inf
+    is_over: Callable[[bool], bool] = lambda feasible: False
     watch: Callable[[], None] = lambda: None
-
-    def is_expired(self, *, found: bool) -> bool:
-        """Whether the wall time is used up; ``found``: there is a feasible iterate."""
-        end = self.deadline if found else self.last_call
-        return end < math.inf and time.monotonic() > end
 
 
 @dataclass(frozen=True)
@@ -369,7 +361,7 @@ class SolverMonitor(ca.Callback):
             # The first iterate is the guess itself.
             self._iterates > self._stop.iterations
             or self._stop.cancellation.requested
-            or self._stop.is_expired(found=self.best is not None)
+            or self._stop.is_over(self.best is not None)
         )
         np.frombuffer(results[0])[:] = stops
         return 0

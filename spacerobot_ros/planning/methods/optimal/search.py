@@ -33,13 +33,12 @@ from typing import NamedTuple
 import numpy as np
 
 from spacerobot_ros.collision import Approach
-from spacerobot_ros.collision.planes import PlaneDistance
 from spacerobot_ros.errors import NotFoundError, PlanningError
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.rotations import quaternion_multiply
 from spacerobot_ros.model.wheels import ReactionWheels
 from spacerobot_ros.planning.core.cancellation import NEVER, Cancellation
-from spacerobot_ros.planning.core.method import InitialMotion
+from spacerobot_ros.planning.core.method import InitialMotion, PlanRequest
 from spacerobot_ros.planning.core.progress import SearchPhase, SearchProgress, log_progress
 from spacerobot_ros.planning.methods.optimal.held_commands import (
     CommandHolder,
@@ -47,7 +46,6 @@ from spacerobot_ros.planning.methods.optimal.held_commands import (
     ManoeuvreModel,
 )
 from spacerobot_ros.planning.methods.optimal.initial_guesses import InitialGuesses, move_to_ends
-from spacerobot_ros.planning.methods.optimal.joint_efforts import EffortLimitedShooting
 from spacerobot_ros.planning.methods.optimal.kept_distances import KeptDistances, instants_of
 from spacerobot_ros.planning.methods.optimal.multiple_shooting import (
     TOLERANCE,
@@ -63,7 +61,7 @@ from spacerobot_ros.planning.methods.optimal.problem import (
     Trajectory,
     UnusableCandidateError,
 )
-from spacerobot_ros.planning.methods.optimal.transcription import PathInequality, Stages
+from spacerobot_ros.planning.methods.optimal.transcription import Stages
 
 _LOG = logging.getLogger(__name__)
 
@@ -89,6 +87,9 @@ _BUDGET_FACTOR_WITHOUT_SOLUTION = 5.0
 
 _COARSE_GRID_RATIO, _COARSE_GRID_RATIO_IN_MOTION = 5, 4
 """Ratio of the full grid to the coarse one: in motion, a plan may stay on the coarse grid."""
+
+_MAX_CORRECTION_INTERVALS = 40
+"""Largest number of intervals of corrections, which are short."""
 
 _MIN_COARSE_INTERVALS, _MIN_COARSE_INTERVALS_IN_MOTION = 8, 10
 """Smallest number of intervals of a coarse grid; with fewer there is none."""
@@ -241,21 +242,10 @@ class SearchClock:
         """s."""
         return time.monotonic() - self.began
 
-    @property
-    def deadline(self) -> float:
-        """``time.monotonic()``, s, at which a plan with a manoeuvre ends; infinite: never."""
-        return self.began + self.budget if self.budget > 0 else math.inf
-
-    @property
-    def last_call(self) -> float:
-        """``time.monotonic()``, s, at which a plan without a manoeuvre ends; infinite: never."""
-        factor = _BUDGET_FACTOR_WITHOUT_SOLUTION
-        return self.began + factor * self.budget if self.budget > 0 else math.inf
-
     def is_over(self, *, found: bool) -> bool:
         """Whether the wall time is used up; ``found``: there is a manoeuvre."""
-        end = self.deadline if found else self.last_call
-        return end < math.inf and time.monotonic() > end
+        factor = 1.0 if found else _BUDGET_FACTOR_WITHOUT_SOLUTION
+        return self.budget > 0 and self.elapsed > factor * self.budget
 
 
 @dataclass(frozen=True)
@@ -264,34 +254,45 @@ class SearchProblem:
 
     Attributes
     ----------
+    request
+        The request. If the joints move, the remainder of their motion is the first guess.
     boundary, limits
         Both ends, and the limits of the joints.
-    quaternion
-        (4,) attitude of R_WB at the start.
-    intervals
-        Those of the full grid.
     options
-        The options of ``optimal``.
+        The options of this search.
+    clock, cancellation
+        The wall time of the plan, and whether it is cancelled.
     guess
         (M, n) shapes that are moved to the ends and come before all other guesses; None: none.
-    gentle
-        Whether the manoeuvre takes the path of least effort, whose rotation of the base depends
-        least on errors of masses.
     max_failed_starts
         Guesses without any solution after which the search ends.
-    motion
-        Motion of the joints at the start, whose remainder is the first guess; None: they rest.
     """
 
+    request: PlanRequest
     boundary: BoundaryConditions
     limits: MotionLimits
-    quaternion: Array
-    intervals: int
     options: OptimalOptions
+    clock: SearchClock
+    cancellation: Cancellation = NEVER
     guess: Array | None = None
-    gentle: bool = False
     max_failed_starts: int = sys.maxsize
-    motion: InitialMotion | None = None
+
+    @property
+    def motion(self) -> InitialMotion | None:
+        """Motion of the joints at the start; None: they rest."""
+        return self.request.motion
+
+    @property
+    def velocity(self) -> Array | float:
+        """Joint velocities (n,) that are held before the start."""
+        return self.boundary.velocity if self.motion is None else self.motion.velocity
+
+    @property
+    def intervals(self) -> int:
+        """Those of the full grid."""
+        is_correction = self.request.correction and self.motion is None
+        most = _MAX_CORRECTION_INTERVALS if is_correction else sys.maxsize
+        return min(self.options.intervals, most)
 
     @property
     def is_timed(self) -> bool:
@@ -299,9 +300,22 @@ class SearchProblem:
         return self.boundary.is_timed or self.motion is not None
 
     @property
+    def gentle(self) -> bool:
+        """Whether the manoeuvre takes the path of least effort, whose rotation of the base depends
+        least on errors of masses.
+        """
+        # While a gentle manoeuvre takes its time, the base of a robot that drifts turns on.
+        return self.request.correction and not self.is_timed
+
+    @property
     def hastens(self) -> bool:
         """Whether the fastest manoeuvre is searched for."""
         return self.options.duration == 0 and not self.gentle
+
+    def within_time(self, seconds: float) -> SearchProblem:
+        """Return the problem of a manoeuvre that takes no longer than a time, s."""
+        longest = min(self.options.longest, seconds)
+        return replace(self, options=replace(self.options, longest=longest))
 
     def cost(self, trajectory: Trajectory) -> float:
         """Return the cost: the duration, or the effort if the duration is given."""
@@ -338,8 +352,6 @@ class _SearchState:
     """
 
     problem: SearchProblem
-    cancellation: Cancellation
-    clock: SearchClock
     coarse: _Grid
     full: _Grid
     phase: SearchPhase | None = None
@@ -356,24 +368,25 @@ class _SearchState:
         most = _MAX_WORK_PER_ITERATION * self.problem.options.iterations
         if not found:
             most *= _WORK_FACTOR_WITHOUT_PATH
-        return self.work > most or self.clock.is_over(found=found)
+        return self.work > most or self.problem.clock.is_over(found=found)
 
     def stop_rule(self, *, found: bool = False, work: float = 0.0) -> StopRule:
         """Return when the solver stops in the present phase; ``work`` is that of each step."""
-        iterations, end = self.problem.options.iterations, self.clock.deadline
-        last = end if found else self.clock.last_call
-        if self.phase is SearchPhase.CLEARING:
-            # A path on the way to a clear one is no manoeuvre.
-            end = last = self.clock.last_call
+        problem, iterations = self.problem, self.problem.options.iterations
         if self.phase in (SearchPhase.CLEARING, SearchPhase.SHORTENING):
             iterations = min(iterations, _MAX_CLEARING_ITERATIONS)
-        return StopRule(iterations, self.cancellation, end, last, partial(self._watch, work))
 
-    def _watch(self, work: float) -> None:
-        self.work += work
-        elapsed = self.clock.elapsed
-        if elapsed >= self._reported + _REPORT_PERIOD:
-            self.report("going on")
+        def is_over(feasible: bool) -> bool:
+            # A path on the way to a clear one is no manoeuvre.
+            is_manoeuvre = self.phase is not SearchPhase.CLEARING and (found or feasible)
+            return problem.clock.is_over(found=is_manoeuvre)
+
+        def watch() -> None:
+            self.work += work
+            if problem.clock.elapsed >= self._reported + _REPORT_PERIOD:
+                self.report("going on")
+
+        return StopRule(iterations, problem.cancellation, is_over, watch)
 
     def begin(self, phase: SearchPhase) -> None:
         """Begin a phase, and report it."""
@@ -384,7 +397,7 @@ class _SearchState:
     def report(self, result: str, duration: float = math.inf) -> None:
         """Report a result; ``duration``, s, is that of a path which may be the best."""
         self.best = min(self.best, duration)
-        self._reported = elapsed = self.clock.elapsed
+        self._reported = elapsed = self.problem.clock.elapsed
         # Without a coarse solution, some guesses are tried on the full grid as well.
         most = max(self.problem.options.starts, self.starts)
         phase = self.phase or SearchPhase.SEARCHING
@@ -399,7 +412,7 @@ class _SearchState:
         except UnusableCandidateError as reason:
             self.rejection = str(reason)
             self.report(self.rejection)
-        self.cancellation.raise_if_requested()
+        self.problem.cancellation.raise_if_requested()
 
 
 def _touch(near: Sequence[Approach]) -> bool:
@@ -430,16 +443,11 @@ class ManoeuvreSearch:
         self._model, self._period = model, model.control_period
         self._wheels = ReactionWheels.of(model.robot.description)
         self._holder = CommandHolder(model)
-        self._stages: dict[tuple[bool, bool, bool], Stages] = {}
+        self._stages: dict[tuple[bool, bool], Stages] = {}
         self._solvers: dict[tuple[_Grid, bool, tuple[int, ...], bool], MultipleShooting] = {}
 
-    def search(
-        self,
-        problem: SearchProblem,
-        cancellation: Cancellation = NEVER,
-        clock: SearchClock | None = None,
-    ) -> Manoeuvre:
-        """Return the fastest manoeuvre found; ``clock`` is that of the plan; None: a new one.
+    def search(self, problem: SearchProblem) -> Manoeuvre:
+        """Return the fastest manoeuvre found.
 
         Raises
         ------
@@ -460,12 +468,11 @@ class ManoeuvreSearch:
             velocity = self._initial_velocity(problem.motion, problem.limits)
             problem = replace(problem, boundary=replace(problem.boundary, velocity=velocity))
         kept = self._model.begin(problem.boundary)
-        clock = clock or SearchClock(options.time_budget)
-        state = _SearchState(problem, cancellation, clock, *self._grids(problem))
+        state = _SearchState(problem, *self._grids(problem))
         found = self._search_on_grids(state)
         if found and kept is not None:
             found = self._keep_clear(state, kept, found)
-        cut_short = clock.is_over(found=bool(found))
+        cut_short = problem.clock.is_over(found=bool(found))
         if not found:
             within = f" within optimal.time_budget {options.time_budget:g} s" if cut_short else ""
             in_motion = "" if problem.motion is None else " that begins in motion"
@@ -520,7 +527,7 @@ class ManoeuvreSearch:
         if state.coarse == state.full or problem.options.answers == 1:
             return self._search_from_guesses(state, state.full, starts)
         found = self._search_from_guesses(state, state.coarse, starts)
-        if found or state.starts >= problem.max_failed_starts or state.clock.is_over(found=False):
+        if found or state.starts >= problem.max_failed_starts or problem.clock.is_over(found=False):
             return found
         return self._search_from_guesses(state, state.full, min(starts, _MAX_FULL_GRID_STARTS))
 
@@ -528,8 +535,7 @@ class ManoeuvreSearch:
         self, state: _SearchState, grid: _Grid, starts: int
     ) -> list[Manoeuvre]:
         """Return manoeuvres from at most ``starts`` guesses on a grid; none if none is found."""
-        problem, clock = state.problem, state.clock
-        solver = self._solver(problem, grid)
+        problem, solver = state.problem, self._solver(state.problem, grid)
         solutions: list[Trajectory] = []
         enough = problem.options.answers
         for number, guess in enumerate(itertools.islice(self._guesses(state, solver), starts), 1):
@@ -539,7 +545,7 @@ class ManoeuvreSearch:
             if solution is not None:
                 solutions.append(solution)
             # A search may also be cut short within its last start.
-            cut_short = clock.is_over(found=bool(solutions)) or not (
+            cut_short = problem.clock.is_over(found=bool(solutions)) or not (
                 solutions or state.starts < problem.max_failed_starts
             )
             going_on = len(solutions) < enough and not problem.solutions_agree(solutions)
@@ -580,12 +586,11 @@ class ManoeuvreSearch:
         is given, or a gentle one; None: none was found."""
         problem, boundary, limits = state.problem, state.problem.boundary, state.problem.limits
         shortest, T = self._shortest_duration(problem), problem.options.duration
-        guess = self._model.constraints.slowed(guess)
+        guess = self._slow_to_effort_limits(self._model.constraints.slowed(guess), boundary)
         if problem.hastens:
             bounds = DurationBounds(shortest, problem.options.longest)
         else:
             if problem.gentle and T == 0:
-                guess = self._slow_to_effort_limits(guess, boundary)
                 T = max(_GENTLE_DURATION_FACTOR * guess.duration, shortest)
             else:
                 T = self._given_duration(problem.options)
@@ -599,7 +604,7 @@ class ManoeuvreSearch:
             solution = grid.solve(
                 boundary, within, guess, stop, bounds, refining=refining and problem.hastens
             )
-            state.cancellation.raise_if_requested()
+            problem.cancellation.raise_if_requested()
             if solution is not None:
                 break
         if solution is None or in_given_time or problem.motion is not None:
@@ -676,7 +681,8 @@ class ManoeuvreSearch:
                     held = self._holder.hold(slower, problem.boundary, problem.limits)
         if held is None:
             raise UnusableCandidateError(_NO_HELD_COMMANDS)
-        attitudes = quaternion_multiply(problem.quaternion, held.quaternions)
+        start = problem.request.state.quaternion
+        attitudes = quaternion_multiply(start, held.quaternions)
         constraints.check(held.positions, attitudes, self._period)
         duration = (len(held.positions) - 1) * self._period
         return Manoeuvre(held, duration, trajectory)
@@ -710,7 +716,7 @@ class ManoeuvreSearch:
             guess = guess.stretched(T / guess.duration)
             within, stop = planned[min(number, len(planned) - 1)], state.stop_rule()
             solution = solver.solve(aim, within, guess, stop, DurationBounds(T, T), near)
-            state.cancellation.raise_if_requested()
+            problem.cancellation.raise_if_requested()
             if solution is None:
                 continue
             held = self._holder.hold(
@@ -910,7 +916,7 @@ class ManoeuvreSearch:
         for number in range(_MAX_SHORTENING_ROUNDS):
             state.report("clear path", path.duration)
             is_over = number >= _MIN_SHORTENING_ROUNDS and state.is_over(found=True)
-            if is_over or reach < _MIN_REACH_SHARE or state.clock.is_over(found=True):
+            if is_over or reach < _MIN_REACH_SHARE or state.problem.clock.is_over(found=True):
                 break
             try:
                 faster, _ = self._solve_apart(
@@ -981,7 +987,7 @@ class ManoeuvreSearch:
         # On the same grid, a solver continues at its own last solution.
         stop = state.stop_rule(found=True, work=solver.nonzeros)
         solution = solver.solve(boundary, within, guess, stop, bounds, near)
-        state.cancellation.raise_if_requested()
+        problem.cancellation.raise_if_requested()
         pairs = f"{len(kept.pairs)} pair(s) apart"
         if solution is None:
             state.report(f"{pairs}, {_NO_PATH_FOUND}")
@@ -1022,42 +1028,26 @@ class ManoeuvreSearch:
         position, drifting = problem.boundary.center is not None, problem.boundary.drifts
         key = grid, position, pairs, drifting
         if key not in self._solvers:
-            library = self._model.distances
-            rows = partial(library.of, pairs) if pairs and library else None
-            of = partial(self._get_stages, position, rows, instants_of(grid.intervals), drifting)
-            efforts = self._model.efforts
-            self._solvers[key] = (
-                MultipleShooting(of(), *grid)
-                if efforts is None
-                else EffortLimitedShooting(
-                    of, grid.intervals, efforts, grid.tolerance, drifting=drifting
-                )
-            )
+            stages = self._stages_of(position=position, drifting=drifting)
+            if pairs and self._model.distances is not None:
+                rows = self._model.distances.of(pairs)
+                stages = stages.with_distances(rows, instants_of(grid.intervals))
+            self._solvers[key] = MultipleShooting(stages, *grid)
         return self._solvers[key]
 
-    def _get_stages(
-        self,
-        position: bool,
-        rows: Callable[[], list[PlaneDistance]] | None,
-        instants: int,
-        drifting: bool,
-        inequalities: Sequence[PathInequality] = (),
-    ) -> Stages:
-        key = position, bool(inequalities), drifting
+    def _stages_of(self, *, position: bool, drifting: bool) -> Stages:
+        key, model = (position, drifting), self._model
         if key not in self._stages:
-            model = self._model
             self._stages[key] = Stages.of(
                 model.robot,
                 model.axes,
                 position,
                 model.constraints,
-                inequalities,
+                inequality=model.efforts and model.efforts.inequality(drifting=drifting),
                 end_effectors=model.end_effectors and model.end_effectors.function,
                 drifting=drifting,
             )
-        if rows is None:
-            return self._stages[key]
-        return self._stages[key].with_distances(rows(), instants)
+        return self._stages[key]
 
     def _planned_limits(
         self, problem: SearchProblem, limits: MotionLimits, *, in_given_time: bool

@@ -64,24 +64,6 @@ Indices = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True)
-class PathInequality:
-    """An inequality ``function(q, qdot, qddot, L_B) >= 0`` that holds along the path.
-
-    Attributes
-    ----------
-    function
-        Of SX: shape, velocities and accelerations of the joints, each (n,), to any number of rows.
-        If the robot drifts, a fourth argument is its angular momentum (3,) about the centre of
-        mass in the base.
-    instants
-        Where in each interval it is imposed, 0 its beginning, 1 its end.
-    """
-
-    function: ca.Function
-    instants: tuple[float, ...] = (0.0, 1.0)
-
-
-@dataclass(frozen=True)
 class ConstraintBlock:
     """Rows of the program that depend on few variables z, with their derivatives.
 
@@ -191,8 +173,8 @@ class Stages:
         axes: Array,
         position: bool,
         constraints: PathConstraints,
-        inequalities: Sequence[PathInequality] = (),
         *,
+        inequality: ca.Function | None = None,
         end_effectors: ca.Function | None = None,
         drifting: bool = False,
     ) -> Stages:
@@ -206,8 +188,12 @@ class Stages:
             (m, 3) directions in the base along which the attitude must be reached.
         position
             Whether the centre of mass must end at ``center`` in the base.
-        constraints, inequalities
+        constraints
             Constraints of the path.
+        inequality
+            Of SX: shape, velocities and accelerations of the joints, each (n,), and, if the robot
+            drifts, its angular momentum (3,) about the centre of mass in the base. Its rows are not
+            negative at both ends of every interval; None: there are none.
         end_effectors
             Of SX: ``(rotation (4,), shape (n,), parameters)``, rows that vanish at the end.
         drifting
@@ -225,7 +211,7 @@ class Stages:
             p.append(ca.SX.sym("end_effectors", end_effectors.size1_in(2)))
             reached.append(end_effectors(X, s, p[-1]))
         ends = ConstraintBlock.of("end", ca.vertcat(X, s), ca.vertcat(*p), ca.vertcat(*reached))
-        interval = _cached_interval(robot, constraints, inequalities, drifting=drifting)
+        interval = _cached_interval(robot, constraints, inequality, drifting=drifting)
         path = interval.rows - _count_dynamics_rows(n)
         turn = turn_function(robot, drifting=drifting)
         return cls(n, beginning_block(n), interval, ends, path, turn)
@@ -251,7 +237,7 @@ def _count_dynamics_rows(joints: int) -> int:
 def _cached_interval(
     robot: SpaceRobot,
     constraints: PathConstraints,
-    inequalities: Sequence[PathInequality],
+    inequality: ca.Function | None,
     *,
     drifting: bool,
 ) -> ConstraintBlock:
@@ -265,13 +251,13 @@ def _cached_interval(
         robot.equations_key,
         float(constraints.imposed_base_rate).hex(),
         ca.Function("on_knots", [q, X, direction], [on_knots]).serialize(),
-        *(f"{each.instants} {each.function.serialize()}" for each in inequalities),
+        "" if inequality is None else inequality.serialize(),
         f"drifting {drifting}",
     ]
     return ConstraintBlock.cached(
         "interval",
         facts,
-        lambda: _interval_block(robot, constraints, inequalities, drifting=drifting),
+        lambda: _interval_block(robot, constraints, inequality, drifting=drifting),
     )
 
 
@@ -283,7 +269,7 @@ def hash_of(facts: Sequence[str]) -> str:
 def _interval_block(
     robot: SpaceRobot,
     constraints: PathConstraints,
-    inequalities: Sequence[PathInequality],
+    inequality: ca.Function | None,
     *,
     drifting: bool,
 ) -> ConstraintBlock:
@@ -305,9 +291,7 @@ def _interval_block(
     )
     motion = ca.vertcat(v_next - v - h * a, s_next - s - h * v_next)
 
-    kept = _path_constraint_rows(
-        n, constraints, inequalities, z, attitude.rotations, direction, L_0
-    )
+    kept = _path_constraint_rows(n, constraints, inequality, z, attitude.rotations, direction, L_0)
     by_motion, by_path = ca.SX.sym("lambda_v", 2 * n), ca.SX.sym("lambda_g", kept.shape[0])
     plain = ca.dot(by_motion, motion) + ca.dot(by_path, kept)
     return ConstraintBlock.with_derivatives(
@@ -477,7 +461,7 @@ def _point_derivative_columns(
 def _path_constraint_rows(
     n: int,
     constraints: PathConstraints,
-    inequalities: Sequence[PathInequality],
+    inequality: ca.Function | None,
     z: ca.SX,
     rates: Sequence[ca.SX],
     direction: ca.SX,
@@ -494,11 +478,11 @@ def _path_constraint_rows(
         for end in (0.0, 1.0):
             w = first + (end - GAUSS[0]) / (GAUSS[1] - GAUSS[0]) * (second - first)
             rows.append(1 - ca.sumsqr(w / fastest))
-    for each in inequalities:
-        for tau in each.instants:
+    if inequality is not None:
+        for tau in (0.0, 1.0):
             point = state_within_interval(tau, s, h * v, h * v_next)
             drift = [momentum_in_base(tau, X, X_next, L_0)] if L_0.numel() else []
-            rows.append(each.function(point[:n], point[n:] / h, a, *drift))
+            rows.append(inequality(point[:n], point[n:] / h, a, *drift))
     return ca.vertcat(*rows)
 
 
