@@ -19,7 +19,7 @@ from spacerobot_ros.planning.core.goal import EndEffectorGoal, RobotState
 from spacerobot_ros.planning.core.prediction import BasePrediction
 from spacerobot_ros.planning.methods.optimal import initial_guesses
 from spacerobot_ros.planning.methods.optimal.end_effectors import EndEffectorRows
-from spacerobot_ros.planning.methods.optimal.held_commands import CommandHolder, ManoeuvreModel
+from spacerobot_ros.planning.methods.optimal.held_commands import ManoeuvreModel
 from spacerobot_ros.planning.methods.optimal.initial_guesses import InitialGuesses
 from spacerobot_ros.planning.methods.optimal.multiple_shooting import _pack_parameters
 from spacerobot_ros.planning.methods.optimal.problem import (
@@ -209,7 +209,7 @@ def held() -> dict[str, Any]:
         turn = guess.quaternions[-1]
         final = None if free else guess.shapes[-1]
         boundary = BoundaryConditions(guess.shapes[0], turn, guess.shapes[-1], final)
-        commands = CommandHolder(model).hold(guess, boundary, WITHIN)
+        commands = model.hold(guess, boundary, WITHIN)
         found[f"guess {number}, {period} s"] = (
             None
             if commands is None

@@ -34,7 +34,7 @@ from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.dynamics import solve_positive_definite
 from spacerobot_ros.model.rotations import (
     attitude_error,
-    matrix_from_quaternion,
+    matrices_from_quaternions,
     quaternion_from_rotvec,
     quaternion_multiply,
 )
@@ -96,7 +96,7 @@ class HeldCommands:
 
 @dataclass(frozen=True)
 class ManoeuvreModel:
-    """Model and constraints of all manoeuvres of one robot.
+    """Model and constraints of all manoeuvres of one robot, as which their commands are held.
 
     Attributes
     ----------
@@ -131,20 +131,6 @@ class ManoeuvreModel:
             return None
         return self.distances.begin(boundary, turn_is_known=len(self.axes) == 3)
 
-
-class CommandHolder:
-    """Converts trajectories of one robot to held commands."""
-
-    def __init__(self, model: ManoeuvreModel) -> None:
-        self._robot = robot = model.robot
-        self._prediction = model.prediction
-        self._period = model.control_period
-        self._axes, self._efforts = model.axes, model.efforts
-        self._end_effectors = model.end_effectors
-        self._curvature = robot.function("curvature", compile=False)
-        self._connection = robot.connection
-        self._n = robot.n
-
     def hold(
         self,
         trajectory: Trajectory,
@@ -166,17 +152,17 @@ class CommandHolder:
         if boundary.final is not None:
             final = np.where(np.isfinite(boundary.final), boundary.final, final)
         if boundary.center is not None:
-            nearest = nearest_shape_for_center(self._robot, limits, final, boundary.center)
+            nearest = nearest_shape_for_center(self.robot, limits, final, boundary.center)
             if nearest is None:
                 return None
             final = nearest
-        ticks = max(1, math.ceil(trajectory.duration / self._period - _TICK_ROUNDING))
+        ticks = max(1, math.ceil(trajectory.duration / self.control_period - _TICK_ROUNDING))
         most = (
             ticks if fixed else max(_MIN_SMOOTH_TICKS, math.ceil(_MAX_STRETCH_FACTOR * ticks) + 4)
         )
         free = boundary.final is None and boundary.center is None
         # The last shape is that at which end-effectors are at their goals.
-        choices = (False, True)[free and self._end_effectors is not None : 1 + free]
+        choices = (False, True)[free and self.end_effectors is not None : 1 + free]
         programs = 0
         for _ in range(_MAX_STRETCHES):
             factor, too_fast = math.inf, True
@@ -186,14 +172,16 @@ class CommandHolder:
                 if held is None:
                     continue
                 after = boundary.final_velocity
-                needed, overrun = limits.excess(held.positions, self._period, before, after)
+                needed, overrun = limits.excess(held.positions, self.control_period, before, after)
                 if overrun > _LIMIT_ROUNDING:
                     held = self._adjust_to_goal(
                         positions, boundary, final, limits, moves_end=moves_end, clipped=True
                     )
                     if held is None:
                         continue
-                    needed, overrun = limits.excess(held.positions, self._period, before, after)
+                    needed, overrun = limits.excess(
+                        held.positions, self.control_period, before, after
+                    )
                 too_fast = needed > 1 + _LIMIT_ROUNDING
                 needed = max(needed, self._effort_excess(held, boundary, before))
                 if overrun <= _LIMIT_ROUNDING:
@@ -225,10 +213,10 @@ class CommandHolder:
         self, held: HeldCommands, boundary: BoundaryConditions, before: Array | float
     ) -> float:
         """Return the factor by which commands must be slower to keep the joints' efforts."""
-        if self._efforts is None:
+        if self.efforts is None:
             return 0.0
         L_B = boundary.momenta_in_base(held.quaternions)
-        return self._efforts.excess(held.positions, before, L_B, boundary.final_velocity)
+        return self.efforts.excess(held.positions, before, L_B, boundary.final_velocity)
 
     def _fit_to_limits(
         self,
@@ -253,7 +241,7 @@ class CommandHolder:
                 rows,
                 error,
                 limits,
-                self._period,
+                self.control_period,
                 before,
                 boundary.final_velocity,
                 moves_end=moves_end,
@@ -269,14 +257,14 @@ class CommandHolder:
         if held is None:
             return None
         after = boundary.final_velocity
-        needed, overrun = limits.excess(held.positions, self._period, before, after)
+        needed, overrun = limits.excess(held.positions, self.control_period, before, after)
         needed = max(needed, self._effort_excess(held, boundary, before))
         return held if max(needed - 1, overrun) <= _LIMIT_ROUNDING else None
 
     def _attitudes(self, positions: Array, boundary: BoundaryConditions) -> Array:
         """Return the attitudes (N + 1, 4) at the ticks, from the starting one."""
         start = np.array([0.0, 0.0, 0.0, 1.0])
-        return self._prediction.attitudes(positions, start, boundary.angular_momentum)
+        return self.prediction.attitudes(positions, start, boundary.angular_momentum)
 
     def _move_to_final(
         self, positions: Array, boundary: BoundaryConditions, final: Array, limits: MotionLimits
@@ -341,7 +329,7 @@ class CommandHolder:
                 waves = self._build_waves(positions, limits)
                 if moves_end:
                     ramps = self._build_ramps(s, limits)
-                    if self._end_effectors is not None:
+                    if self.end_effectors is not None:
                         # The others make up for joints at the end of their range.
                         ramps = ramps * self._smooth_weights(positions[-1], limits)
                     waves = np.hstack([waves, ramps])
@@ -354,15 +342,15 @@ class CommandHolder:
         shape = np.sin(math.pi * s) * np.sin(math.pi * s * order) / order
         speed, _ = self._speeds_and_half_ranges(positions[0], limits)
         fading = self._smooth_weights(positions, limits)
-        joints = np.eye(self._n) * speed
+        joints = np.eye(self.robot.n) * speed
         waves = (
             shape[:, :, np.newaxis, np.newaxis] * (fading[:, np.newaxis] * joints)[:, np.newaxis]
         )
-        return np.asarray(waves.reshape(len(positions), -1, self._n))
+        return np.asarray(waves.reshape(len(positions), -1, self.robot.n))
 
     def _smooth_weights(self, positions: Array, limits: MotionLimits) -> Array:
         """Return factors (..., n) that vanish where joints are at the ends of their ranges."""
-        _, half = self._speeds_and_half_ranges(positions.reshape(-1, self._n)[0], limits)
+        _, half = self._speeds_and_half_ranges(positions.reshape(-1, self.robot.n)[0], limits)
         room = np.minimum(positions - limits.lower, limits.upper - positions)
         with np.errstate(divide="ignore", invalid="ignore"):
             fading = np.clip(np.nan_to_num(room / (_FADING_ZONE * half), nan=0.0), 0.0, 1.0)
@@ -371,8 +359,8 @@ class CommandHolder:
 
     def _build_ramps(self, s: Array, limits: MotionLimits) -> Array:
         """Return ramps (N + 1, n, n) that move the last shape."""
-        speed, _ = self._speeds_and_half_ranges(np.zeros(self._n), limits)
-        return np.asarray((s**2 * (3 - 2 * s))[:, :, np.newaxis] * np.eye(self._n) * speed)
+        speed, _ = self._speeds_and_half_ranges(np.zeros(self.robot.n), limits)
+        return np.asarray((s**2 * (3 - 2 * s))[:, :, np.newaxis] * np.eye(self.robot.n) * speed)
 
     def _speeds_and_half_ranges(self, q: Array, limits: MotionLimits) -> tuple[Array, Array]:
         """Return a speed (n,) of every joint, and half of its range round q (n,)."""
@@ -386,10 +374,10 @@ class CommandHolder:
 
         With it, derivatives of the rows of end-effectors by turn (m', 3) and last shape (m', n).
         """
-        error = self._axes @ attitude_error(quaternions[-1], boundary.goal_rotation)
-        if self._end_effectors is None:
+        error = self.axes @ attitude_error(quaternions[-1], boundary.goal_rotation)
+        if self.end_effectors is None:
             return np.asarray(error), None, None
-        rows, by_turn, by_shape = self._end_effectors.evaluate(
+        rows, by_turn, by_shape = self.end_effectors.evaluate(
             quaternions[-1:], positions[-1:], boundary.end_effectors
         )
         return np.concatenate([error, -rows[0]]), by_turn[0], by_shape[0]
@@ -404,7 +392,7 @@ class CommandHolder:
     ) -> Array:
         """Return derivatives (m, N + 1, n) of the numbers at the end by the shapes."""
         turns = self._turns_by_shapes(positions, quaternions, boundary)
-        rows = np.tensordot(self._axes, turns, axes=1)
+        rows = np.tensordot(self.axes, turns, axes=1)
         if by_turn is None or by_shape is None:
             return rows
         others = np.tensordot(by_turn, turns, axes=1)
@@ -415,29 +403,23 @@ class CommandHolder:
         self, positions: Array, quaternions: Array, boundary: BoundaryConditions
     ) -> Array:
         """Return the turns (3, N + 1, n) of the final attitude by all shapes, base components."""
-        # A few hundred points of a smooth integrand are plenty for Newton's direction.
-        stride = max(1, len(positions) // 200)
-        chosen = np.arange(stride // 2, len(positions), stride)
-        shapes = positions[chosen]
-        moved = np.gradient(positions, axis=0)[chosen] * stride
-        K = self._curvature(shapes.T).full().reshape(6, len(chosen), self._n, self._n)[3:]
+        moved = np.gradient(positions, axis=0)
+        curvature = self.robot.function("curvature", compile=False)
+        K = curvature(positions.T).full().reshape(6, len(positions), self.robot.n, -1)[3:]
         # The columns of one shape run over i fastest: K[axis, shape, j, i].
-        R = np.array([matrix_from_quaternion(x) for x in quaternions[chosen]])
+        R = matrices_from_quaternions(quaternions)
         turned = R @ np.einsum("akji,kj->kai", K, moved)
-        L_B = boundary.momenta_in_base(quaternions[chosen])
+        L_B = boundary.momenta_in_base(quaternions)
         if L_B is not None:
-            turned = self._drift.carried(shapes, L_B, R, turned, stride * self._period)
-        R_f = matrix_from_quaternion(quaternions[-1])
-        # Each of the chosen shapes stands for those around it.
-        near = np.minimum(np.arange(len(positions)) // stride, len(chosen) - 1)
-        by_shapes = (R_f.T @ turned)[near] / np.bincount(near)[near, np.newaxis, np.newaxis]
+            turned = self._drift.carried(positions, L_B, R, turned, self.control_period)
+        by_shapes = R[-1].T @ turned
         # The last step of a change that does not vanish at the end turns the base directly.
-        by_shapes[-1] -= self._connection(positions[-1])[3:]
+        by_shapes[-1] -= self.robot.connection(positions[-1])[3:]
         return np.asarray(by_shapes.transpose(1, 0, 2))
 
     @cached_property
     def _drift(self) -> DriftVariation:
-        return DriftVariation(self._robot)
+        return DriftVariation(self.robot)
 
 
 class DriftVariation:
@@ -532,11 +514,8 @@ def least_change(
     Returns
     -------
     :
-        The change with the least sum of squares, each joint's divided by its speed; None: there is
-        none, or no solver of quadratic programs.
+        The change with the least sum of squares, each joint's divided by its speed; None: none.
     """
-    if not ca.has_conic("osqp"):
-        return None
     N, n = len(positions) - 1, positions.shape[1]
     moving = slice(1, N + 1 if moves_end else N)
     count = N - 1 + moves_end

@@ -41,7 +41,6 @@ from spacerobot_ros.planning.core.cancellation import NEVER, Cancellation
 from spacerobot_ros.planning.core.method import InitialMotion, PlanRequest
 from spacerobot_ros.planning.core.progress import SearchPhase, SearchProgress, log_progress
 from spacerobot_ros.planning.methods.optimal.held_commands import (
-    CommandHolder,
     HeldCommands,
     ManoeuvreModel,
 )
@@ -442,7 +441,6 @@ class ManoeuvreSearch:
     def __init__(self, model: ManoeuvreModel) -> None:
         self._model, self._period = model, model.control_period
         self._wheels = ReactionWheels.of(model.robot.description)
-        self._holder = CommandHolder(model)
         self._stages: dict[tuple[bool, bool], Stages] = {}
         self._solvers: dict[tuple[_Grid, bool, tuple[int, ...], bool], MultipleShooting] = {}
 
@@ -672,13 +670,13 @@ class ManoeuvreSearch:
         if problem.is_timed:
             held = self._hold_in_whole_ticks(state, trajectory, kept)
         else:
-            held = self._holder.hold(trajectory, problem.boundary, problem.limits, fixed=fixed)
+            held = self._model.hold(trajectory, problem.boundary, problem.limits, fixed=fixed)
             if held is not None and not fixed:
                 excess = constraints.excess_rate(held.quaternions, self._period)
                 if 1 < excess <= _MAX_RATE_EXCESS:
                     # At zero momentum the base turns as much slower as the joints move.
                     slower = trajectory.stretched(excess * _RATE_RESERVE)
-                    held = self._holder.hold(slower, problem.boundary, problem.limits)
+                    held = self._model.hold(slower, problem.boundary, problem.limits)
         if held is None:
             raise UnusableCandidateError(_NO_HELD_COMMANDS)
         start = problem.request.state.quaternion
@@ -719,13 +717,13 @@ class ManoeuvreSearch:
             problem.cancellation.raise_if_requested()
             if solution is None:
                 continue
-            held = self._holder.hold(
+            held = self._model.hold(
                 solution, problem.boundary, problem.limits, fixed=True, before=before
             )
             if held is not None:
                 return held
             guess = solution
-            aim = self._holder.corrected_end(solution, problem.boundary, ticks + more)
+            aim = self._model.corrected_end(solution, problem.boundary, ticks + more)
         return None
 
     # -- 5. clear ---------------------------------------------------------------------------------
