@@ -18,8 +18,8 @@ from spacerobot_ros.planning.core.goal import EndEffectorGoal, PoseError, Tolera
 from spacerobot_ros.planning.core.method import PlanRequest
 from spacerobot_ros.planning.methods.optimal.end_effectors import (
     EndEffectorRows,
-    reach_of_end_effector,
 )
+from spacerobot_ros.planning.methods.optimal.motion_bounds import reach_of_end_effector
 from spacerobot_ros.planning.methods.registry import method_options
 
 Array = npt.NDArray[np.float64]

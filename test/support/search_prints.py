@@ -108,7 +108,6 @@ def guesses() -> dict[str, Any]:
         source.with_initial_velocity(first, velocity, LIMITS)
     )
     found["on another grid"] = _trajectory(InitialGuesses(*_areas(), 47).resample(first))
-    found["through shapes"] = _trajectory(source.from_shapes(first.shapes[::7], LIMITS))
     found["from ticks"] = _trajectory(source.from_ticks(first.shapes[::5], velocity, 0.35))
     return found
 

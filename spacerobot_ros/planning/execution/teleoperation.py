@@ -28,9 +28,9 @@ from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.execution.state_average import MeasuredState
 from spacerobot_ros.planning.methods.optimal.end_effectors import (
     EndEffectorRows,
-    reach_of_end_effector,
 )
 from spacerobot_ros.planning.methods.optimal.goal_specification import BaseRotations
+from spacerobot_ros.planning.methods.optimal.motion_bounds import reach_of_end_effector
 from spacerobot_ros.planning.methods.optimal.problem import MotionLimits
 from spacerobot_ros.planning.methods.resolved_rate import (
     MIN_PROGRESS_RATE,

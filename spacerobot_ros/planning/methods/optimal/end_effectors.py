@@ -16,7 +16,7 @@ finds only the nearest minimum, and every family of shapes has its own.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import casadi as ca
@@ -24,10 +24,9 @@ import numpy as np
 
 from spacerobot_ros.errors import NotFoundError, PlanningError, Proof, UnreachableError
 from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.model.description import Array, JointKind
+from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.rotations import (
     matrix_from_quaternion,
-    quaternion_from_rotvec,
     quaternion_inverse,
     quaternion_multiply,
     quaternions_from_rotvecs,
@@ -48,7 +47,8 @@ from spacerobot_ros.planning.core.goal import (
 )
 from spacerobot_ros.planning.core.method import PlanRequest
 from spacerobot_ros.planning.methods.optimal.goal_specification import GoalSpecification
-from spacerobot_ros.planning.methods.optimal.motion_bounds import moving_joint_ranges
+from spacerobot_ros.planning.methods.optimal.initial_guesses import attitudes_along
+from spacerobot_ros.planning.methods.optimal.motion_bounds import reach_of_end_effector
 from spacerobot_ros.planning.methods.optimal.problem import (
     BoundaryConditions,
     MotionLimits,
@@ -191,16 +191,10 @@ class EndEffectorRows:
 
     def turns_along_direct_path(self, start: Array, ends: Array) -> Array:
         """Return the rotations (K, 4) of the base on straight paths from a shape to ends (K, n)."""
-        N = _DIRECT_PATH_STEPS
-        step = (ends - start) / N
-        shapes = start + step[:, np.newaxis] * np.arange(N)[:, np.newaxis]
-        steps = np.repeat(step, N, axis=0).T
-        Omega = self.turn(shapes.reshape(-1, len(start)).T, steps, steps).full().T
-        rotations = quaternions_from_rotvecs(Omega).reshape(len(ends), N, 4)
-        X = np.tile([0.0, 0.0, 0.0, 1.0], (len(ends), 1))
-        for k in range(N):
-            X = quaternion_multiply(X, rotations[:, k])
-        return X
+        step = ((ends - start) / _DIRECT_PATH_STEPS)[:, np.newaxis]
+        shapes = start + step * np.arange(_DIRECT_PATH_STEPS)[:, np.newaxis]
+        steps = np.broadcast_to(step, shapes.shape)
+        return attitudes_along(self.turn, shapes, steps, steps)[:, -1]
 
     def rank(self, fixed_attitude: bool) -> tuple[int, int]:
         """Return how many of the rows the joints move independently, and how many rows there are.
@@ -384,7 +378,6 @@ class EndEffectorSpecification:
         request: PlanRequest,
         shape: Array | None,
         limits: MotionLimits,
-        direction_W: Array | None,
     ) -> BoundaryConditions:
         """Return the boundary conditions of a request, with possible ends for guesses.
 
@@ -415,10 +408,8 @@ class EndEffectorSpecification:
         rows.require_directions(state, goals, (tolerance.position, tolerance.attitude))
         _require_within_radius(robot, limits, state, goal)
         parameters = rows.pack(state, goals)
-        R_WB = matrix_from_quaternion(state.quaternion)
-        direction = np.zeros(3) if direction_W is None else R_WB.T @ direction_W
         if shape is not None:
-            turn = self._turn_with_shape(request, shape, turn, parameters)
+            turn = self._turn_with_shape(request, shape, turn, limits, parameters)
             ends: list[PossibleEnd] = [PossibleEnd(shape, turn)]
         else:
             ends = self._find_possible_ends(state.q, limits, parameters, turn)
@@ -430,14 +421,17 @@ class EndEffectorSpecification:
             turn,
             ends[0].shape,
             shape,
-            None,
-            direction,
             end_effectors=np.zeros(0) if self.ends_in_one_shape else parameters,
             possible_ends=tuple(ends),
         )
 
     def _turn_with_shape(
-        self, request: PlanRequest, shape: Array, turn: Array, parameters: Array
+        self,
+        request: PlanRequest,
+        shape: Array,
+        turn: Array,
+        limits: MotionLimits,
+        parameters: Array,
     ) -> Array:
         """Return the turn (4,) of the base that puts the end-effectors to their goals in a shape.
 
@@ -449,12 +443,22 @@ class EndEffectorSpecification:
             X = self.rows.turns_along_direct_path(request.state.q, shape[np.newaxis])[0]
         most = max(tolerance.position, _GIVEN_SHAPE_ERROR)
         if not self.attitude and len(self.rows.axes):
-            # Loops of the joints turn the base about the axes; Newton's method finds how far.
+            # Loops of the joints turn the base about the axes; in the given shape alone.
             candidates = quaternions_from_rotvecs(
                 np.vstack([np.zeros((1, 3)), *(np.pi * k / 2 * self.rows.axes for k in (1, 2, 3))])
             )
-            found = [self._nearest_turn(each, shape, parameters) for each in candidates]
-            X = min(found, key=lambda each: each[1])[0]
+            shapes = np.tile(shape, (len(candidates), 1))
+            _, turns, miss = self._inverse_kinematics(
+                shapes,
+                shape,
+                replace(limits, lower=shape, upper=shape),
+                parameters,
+                candidates,
+                fixed=False,
+                damping=_DAMPING_OF_EXACT_ENDS,
+                error=_GIVEN_SHAPE_ERROR,
+            )
+            X = turns[np.argmin(miss)]
         values, _, _ = self.rows.evaluate(X[np.newaxis], shape[np.newaxis], parameters)
         if np.abs(values).max(initial=0.0) > most:
             raise UnreachableError(
@@ -464,26 +468,6 @@ class EndEffectorSpecification:
                 Proof.MOMENTUM,
             )
         return X
-
-    def _nearest_turn(self, X: Array, shape: Array, parameters: Array) -> tuple[Array, float]:
-        """Return the turn (4,) near X at which the rows of a shape are least, and their norm."""
-
-        def at(turn: Array) -> tuple[Array, Array]:
-            values, by_rotation, _ = self.rows.evaluate(
-                turn[np.newaxis], shape[np.newaxis], parameters
-            )
-            return values[0], by_rotation[0] @ self.rows.axes.T
-
-        (values, J), size = at(X), 1.0
-        for _ in range(_ITERATIONS):
-            step = self.rows.axes.T @ np.linalg.lstsq(J, -values, rcond=1e-9)[0]
-            there = quaternion_multiply(X, quaternion_from_rotvec(size * step))
-            after, J_after = at(there)
-            # Far from a goal that no turn meets, whole steps go to and fro.
-            if nearer := np.linalg.norm(after) < np.linalg.norm(values):
-                X, values, J = there, after, J_after
-            size = min(1.0, 2 * size) if nearer else size / 2
-        return X, float(np.linalg.norm(values))
 
     def _find_possible_ends(
         self, start: Array, limits: MotionLimits, parameters: Array, turn: Array
@@ -634,39 +618,3 @@ def _require_within_radius(
                 f"{reach:.4g} m.",
                 Proof.LIMITS,
             )
-
-
-def reach_of_end_effector(robot: SpaceRobot, lower: Array, upper: Array, link: str) -> float:
-    """Return an upper bound, m, of the distance of a link's origin from the centre of mass.
-
-    ``r_CE`` is the mean of the vectors from the centres of mass of the bodies to E, weighted by
-    their masses, and each is no longer than the chain of joints in between (triangle inequality).
-    ``lower`` and ``upper`` (n,) are the limits of the joints.
-    """
-    bodies = robot.description.bodies
-    if robot.description.has_mimic_joints:
-        lower, upper = moving_joint_ranges(robot, lower, upper)
-    travel = [
-        max(abs(low), abs(high)) if body.joint.kind is JointKind.PRISMATIC else 0.0
-        for body, low, high in zip(bodies[1:], lower, upper, strict=True)
-        if body.joint is not None
-    ]
-
-    def chain(body: int, point: Array) -> dict[int, tuple[Array, float]]:
-        """Return a point, and the vector from there, for a body and each body that carries it."""
-        found, way = {body: (point, 0.0)}, 0.0
-        while body > 0:
-            way += float(np.linalg.norm(point)) + travel[body - 1]
-            point, body = bodies[body].origin.r, bodies[body].parent
-            found[body] = (point, way)
-        return found
-
-    index, pose = robot.description.frames[link]
-    of_link, total = chain(index, pose.r), 0.0
-    for number, body in enumerate(bodies):
-        of_body = chain(number, body.inertia.com)
-        # The first body in common; the topological order has it last.
-        common = max(of_link.keys() & of_body.keys())
-        (u, first), (v, second) = of_link[common], of_body[common]
-        total += body.inertia.mass * (first + second + float(np.linalg.norm(u - v)))
-    return total / robot.total_mass

@@ -59,9 +59,6 @@ _JOINT_LIMIT_ROUNDING = 1e-9  # m or rad
 _QUADRATURE_NODES = 48
 """Gauss-Legendre nodes along the path to a shape."""
 
-_MAX_REPORTED_RANGE_FACTOR = 4.0
-"""Ratio to the joint range up to which a shape beyond the limits is reported."""
-
 _POSITION_TOLERANCE = 1e-10  # m
 
 
@@ -136,7 +133,6 @@ class GoalSpecification:
         request: PlanRequest,
         shape: Array | None,
         limits: MotionLimits,
-        direction_W: Array | None,
     ) -> BoundaryConditions:
         """Return the boundary conditions of a request.
 
@@ -146,8 +142,6 @@ class GoalSpecification:
             The model, the request, and the limits of its motion.
         shape
             (n,) of the goal, within the joint limits; None: any.
-        direction_W
-            (3,) kept direction of the path constraints, if there is one.
 
         Raises
         ------
@@ -174,17 +168,16 @@ class GoalSpecification:
                 turn = self._turn_on_way_to_shape(robot, turn, state.q, shape, tolerance.attitude)
                 # With one joint, the goal attitude fixes the final shape.
                 shape = shape if robot.n > 1 else None
-        R_WB = matrix_from_quaternion(state.quaternion)
-        direction = np.zeros(3) if direction_W is None else R_WB.T @ direction_W
         if not self.position:
             likely = state.q if shape is None else shape
-            return BoundaryConditions(state.q, turn, likely, shape, None, direction)
+            return BoundaryConditions(state.q, turn, likely, shape)
         if not self.attitude:
             raise PlanningError(
                 "The position of the base depends on its attitude: optimal reaches it together "
                 "with the attitude (optimal.base_attitude 1)."
             )
         # The centre of mass r + R c(q) is fixed, which determines c(q_f).
+        R_WB = matrix_from_quaternion(state.quaternion)
         r_cm = state.position + R_WB @ robot.center_of_mass(state.q)
         center = matrix_from_quaternion(goal.quaternion).T @ (r_cm - goal.position)
         if shape is not None:
@@ -196,15 +189,15 @@ class GoalSpecification:
                     "ignore the position with optimal.base_position 2.",
                     Proof.MOMENTUM,
                 )
-            return BoundaryConditions(state.q, turn, shape, shape, None, direction)
+            return BoundaryConditions(state.q, turn, shape, shape)
         likely = shape_for_center(
             robot, limits, state.q, center, POSITION_SLACK * tolerance.position
         )
         center = robot.center_of_mass(likely)
         # With three joints, one centre of mass has at most a few shapes.
         if robot.n <= 3:
-            return BoundaryConditions(state.q, turn, likely, likely, None, direction)
-        return BoundaryConditions(state.q, turn, likely, None, center, direction)
+            return BoundaryConditions(state.q, turn, likely, likely)
+        return BoundaryConditions(state.q, turn, likely, center=center)
 
     def require_turning_with_drift(self, robot: SpaceRobot, state: RobotState) -> None:
         """Refuse drifting robots whose joints rotate the base about no axis or about another one.
@@ -413,22 +406,16 @@ def nearest_shape_for_center(
     robot: SpaceRobot, limits: MotionLimits, near: Array, wanted: Array
 ) -> Array | None:
     """Return the shape nearest to ``near`` whose centre of mass is at ``wanted`` (3,) exactly."""
-    q = _shape_without_limits(robot, near, wanted)
-    if np.maximum(limits.lower - q, q - limits.upper).max() > _JOINT_LIMIT_ROUNDING:
-        return near if _distance_to_center(robot, near, wanted) <= _POSITION_TOLERANCE else None
-    q = np.clip(q, limits.lower, limits.upper)
-    return q if _distance_to_center(robot, q, wanted) <= _POSITION_TOLERANCE else None
-
-
-def _shape_without_limits(robot: SpaceRobot, near: Array, wanted: Array) -> Array:
-    """Return a shape by Newton's method, without joint limits."""
     q = near.copy()
     for _ in range(20):
         miss = wanted - robot.center_of_mass(q)
         if np.linalg.norm(miss) <= 1e-14:
             break
         q = q + np.linalg.lstsq(center_rate(robot, q), miss, rcond=1e-9)[0]
-    return q
+    if np.maximum(limits.lower - q, q - limits.upper).max() > _JOINT_LIMIT_ROUNDING:
+        q = near
+    q = np.clip(q, limits.lower, limits.upper)
+    return q if _distance_to_center(robot, q, wanted) <= _POSITION_TOLERANCE else None
 
 
 def _distance_to_center(robot: SpaceRobot, q: Array, wanted: Array) -> float:
@@ -449,23 +436,6 @@ def _unreachable_center_error(
             f"{distance:.3g} m from it. A nearer position, "
             "another attitude, or optimal.base_position 2, which ignores the position, may help."
         )
-    free = _shape_without_limits(robot, near, wanted)
-    # With three sliders, one centre of mass has one shape.
-    if (
-        len(sliders_of(robot)) == robot.n == 3
-        and _distance_to_center(robot, free, wanted) <= _POSITION_TOLERANCE
-    ):
-        worst = int(np.argmax(np.maximum(limits.lower - free, free - limits.upper)))
-        joint = robot.description.movable_joints[worst]
-        message = (
-            f"The goal is beyond the joint limits: it needs joint '{joint.name}' at "
-            f"{free[worst]:.4g} {joint.unit}, and optimal keeps it in [{limits.lower[worst]:.4g}, "
-            f"{limits.upper[worst]:.4g}] {joint.unit}."
-        )
-        if np.abs(free).max() < _MAX_REPORTED_RANGE_FACTOR * (
-            1 + np.abs(limits.joint_ranges(near)[1]).max()
-        ):
-            return UnreachableError(message, Proof.LIMITS)
     return UnreachableError(
         "The goal position is out of reach: without thrust the centre of mass stays where it is, "
         f"and the joints of '{name}' put the base no nearer than {gap:.3g} m to it.",

@@ -15,8 +15,8 @@ changes of all shapes at the ticks; the end is linear in them to first order, an
 programs reach it (sequential quadratic programming). Otherwise the manoeuvre takes a few
 ticks longer.
 
-If that fails and the last shape is free, it is changed as well: loops of some robots do not rotate
-the base. A manoeuvre of a few ticks is a polygon that does not resemble the curve any more; with
+If the last shape is free, it is changed as well: loops of some robots do not rotate the base. A
+manoeuvre of a few ticks is a polygon that does not resemble the curve any more; with
 two or three ticks it may have too few corners to end on the goal, and takes one more.
 """
 
@@ -42,10 +42,7 @@ from spacerobot_ros.planning.core.prediction import BasePrediction
 from spacerobot_ros.planning.methods.optimal.end_effectors import EndEffectorRows
 from spacerobot_ros.planning.methods.optimal.goal_specification import nearest_shape_for_center
 from spacerobot_ros.planning.methods.optimal.joint_efforts import LimitedEfforts
-from spacerobot_ros.planning.methods.optimal.kept_distances import (
-    DistanceLibrary,
-    KeptDistances,
-)
+from spacerobot_ros.planning.methods.optimal.kept_distances import DistanceLibrary
 from spacerobot_ros.planning.methods.optimal.problem import (
     BoundaryConditions,
     MotionLimits,
@@ -57,7 +54,6 @@ _WAVES_PER_JOINT = 6
 
 _ATTITUDE_TOLERANCE = 1e-11  # rad
 _MAX_NEWTON_STEPS = 25
-_MAX_STRETCHES = 40
 _MAX_STRETCH_FACTOR = 1.25
 """Largest factor that stretches a manoeuvre to keep its limits; otherwise other starts are
 better."""
@@ -119,18 +115,6 @@ class ManoeuvreModel:
     end_effectors: EndEffectorRows | None = None
     distances: DistanceLibrary | None = None
 
-    def begin(self, boundary: BoundaryConditions) -> KeptDistances | None:
-        """Return the distances that are kept between two ends; None: any.
-
-        Raises
-        ------
-        PlanningError
-            Links are too near at an end.
-        """
-        if self.distances is None:
-            return None
-        return self.distances.begin(boundary, turn_is_known=len(self.axes) == 3)
-
     def hold(
         self,
         trajectory: Trajectory,
@@ -161,52 +145,31 @@ class ManoeuvreModel:
             ticks if fixed else max(_MIN_SMOOTH_TICKS, math.ceil(_MAX_STRETCH_FACTOR * ticks) + 4)
         )
         free = boundary.final is None and boundary.center is None
-        # The last shape is that at which end-effectors are at their goals.
-        choices = (False, True)[free and self.end_effectors is not None : 1 + free]
         programs = 0
-        for _ in range(_MAX_STRETCHES):
-            factor, too_fast = math.inf, True
+        while ticks <= most:
+            factor, too_fast = 1.0, True
             positions = trajectory.at_ticks(ticks)
-            for moves_end in choices:
-                held = self._adjust_to_goal(positions, boundary, final, limits, moves_end=moves_end)
-                if held is None:
-                    continue
+            held = self._adjust_to_goal(positions, boundary, final, limits, moves_end=free)
+            if held is not None:
                 after = boundary.final_velocity
                 needed, overrun = limits.excess(held.positions, self.control_period, before, after)
-                if overrun > _LIMIT_ROUNDING:
-                    held = self._adjust_to_goal(
-                        positions, boundary, final, limits, moves_end=moves_end, clipped=True
-                    )
-                    if held is None:
-                        continue
-                    needed, overrun = limits.excess(
-                        held.positions, self.control_period, before, after
-                    )
-                too_fast = needed > 1 + _LIMIT_ROUNDING
-                needed = max(needed, self._effort_excess(held, boundary, before))
-                if overrun <= _LIMIT_ROUNDING:
-                    if needed <= 1 + _LIMIT_ROUNDING:
-                        return held
-                    factor = min(factor, needed)
-                if ticks >= _MIN_SMOOTH_TICKS:
-                    break
+                too_fast = max(needed - 1, overrun) > _LIMIT_ROUNDING
+                factor = max(needed, self._effort_excess(held, boundary, before))
+                if not too_fast and factor <= 1 + _LIMIT_ROUNDING:
+                    return held
             if too_fast and programs < _MAX_PROGRAMS:
                 programs += 1
-                held = self._fit_to_limits(
+                fitted = self._fit_to_limits(
                     positions, boundary, final, limits, before, moves_end=free
                 )
-                if held is not None:
-                    return held
-                if factor < math.inf and programs < _MAX_PROGRAMS:
+                if fitted is not None:
+                    return fitted
+                if programs < _MAX_PROGRAMS:
                     factor = min(factor, _PROGRAM_STRETCH)
-            if factor == math.inf:
-                if ticks >= _MIN_SMOOTH_TICKS:
-                    return None
-                # A polygon with more corners may reach the goal.
-                factor = 1.0
-            ticks = max(ticks + 1, math.ceil(ticks * factor - 1e-9))
-            if ticks > most:
+            # A polygon with more corners may reach the goal.
+            if held is None and ticks >= _MIN_SMOOTH_TICKS:
                 return None
+            ticks = max(ticks + 1, math.ceil(ticks * factor - 1e-9))
         return None
 
     def _effort_excess(
@@ -297,18 +260,18 @@ class ManoeuvreModel:
         limits: MotionLimits,
         *,
         moves_end: bool,
-        clipped: bool = False,
     ) -> HeldCommands | None:
         """Add waves to shapes (N + 1, n) so that they end in the goal attitude; None on failure.
 
-        ``moves_end``: the last shape is changed, too. ``clipped``: after every step, shapes beyond
-        the joint limits are put on them, and the others make up for the change.
+        ``moves_end``: the last shape is changed, too.
         """
         positions = self._move_to_final(positions, boundary, final, limits)
         s = np.linspace(0.0, 1.0, len(positions))[:, np.newaxis]
         waves, best = self._build_waves(positions, limits), math.inf
         if moves_end:
-            waves = np.hstack([waves, self._build_ramps(s, limits)])
+            speed, _ = _speeds_and_half_ranges(positions[0], limits)
+            ramps = (s**2 * (3 - 2 * s))[:, :, np.newaxis] * np.eye(self.robot.n) * speed
+            waves = np.hstack([waves, ramps])
         for _ in range(_MAX_NEWTON_STEPS):
             quaternions = self._attitudes(positions, boundary)
             error, by_turn, by_shape = self._end_error(positions, quaternions, boundary)
@@ -324,15 +287,6 @@ class ManoeuvreModel:
             J = np.einsum("mkn,kwn->mw", rows, waves)
             amplitudes = np.linalg.lstsq(J, error, rcond=1e-10)[0]
             positions = positions + np.einsum("kin,i->kn", waves, amplitudes)
-            if clipped:
-                positions = np.clip(positions, limits.lower, limits.upper)
-                waves = self._build_waves(positions, limits)
-                if moves_end:
-                    ramps = self._build_ramps(s, limits)
-                    if self.end_effectors is not None:
-                        # The others make up for joints at the end of their range.
-                        ramps = ramps * self._smooth_weights(positions[-1], limits)
-                    waves = np.hstack([waves, ramps])
         return None
 
     def _build_waves(self, positions: Array, limits: MotionLimits) -> Array:
@@ -340,32 +294,16 @@ class ManoeuvreModel:
         s = np.linspace(0.0, 1.0, len(positions))[:, np.newaxis]
         order = np.arange(1, _WAVES_PER_JOINT + 1)
         shape = np.sin(math.pi * s) * np.sin(math.pi * s * order) / order
-        speed, _ = self._speeds_and_half_ranges(positions[0], limits)
-        fading = self._smooth_weights(positions, limits)
+        speed, half = _speeds_and_half_ranges(positions[0], limits)
+        room = np.minimum(positions - limits.lower, limits.upper - positions)
+        fading = np.clip(np.nan_to_num(room / (_FADING_ZONE * half), nan=0.0), 0.0, 1.0)
+        # The wave begins smoothly, so that accelerations stay small.
+        fading = fading**2 * (3 - 2 * fading)
         joints = np.eye(self.robot.n) * speed
         waves = (
             shape[:, :, np.newaxis, np.newaxis] * (fading[:, np.newaxis] * joints)[:, np.newaxis]
         )
         return np.asarray(waves.reshape(len(positions), -1, self.robot.n))
-
-    def _smooth_weights(self, positions: Array, limits: MotionLimits) -> Array:
-        """Return factors (..., n) that vanish where joints are at the ends of their ranges."""
-        _, half = self._speeds_and_half_ranges(positions.reshape(-1, self.robot.n)[0], limits)
-        room = np.minimum(positions - limits.lower, limits.upper - positions)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            fading = np.clip(np.nan_to_num(room / (_FADING_ZONE * half), nan=0.0), 0.0, 1.0)
-        # The wave begins smoothly, so that accelerations stay small.
-        return np.asarray(fading**2 * (3 - 2 * fading))
-
-    def _build_ramps(self, s: Array, limits: MotionLimits) -> Array:
-        """Return ramps (N + 1, n, n) that move the last shape."""
-        speed, _ = self._speeds_and_half_ranges(np.zeros(self.robot.n), limits)
-        return np.asarray((s**2 * (3 - 2 * s))[:, :, np.newaxis] * np.eye(self.robot.n) * speed)
-
-    def _speeds_and_half_ranges(self, q: Array, limits: MotionLimits) -> tuple[Array, Array]:
-        """Return a speed (n,) of every joint, and half of its range round q (n,)."""
-        half = limits.joint_ranges(q)[1]
-        return np.where(np.isfinite(limits.velocity), limits.velocity, half), half
 
     def _end_error(
         self, positions: Array, quaternions: Array, boundary: BoundaryConditions
@@ -420,6 +358,12 @@ class ManoeuvreModel:
     @cached_property
     def _drift(self) -> DriftVariation:
         return DriftVariation(self.robot)
+
+
+def _speeds_and_half_ranges(q: Array, limits: MotionLimits) -> tuple[Array, Array]:
+    """Return a speed (n,) of every joint, and half of its range round q (n,)."""
+    half = limits.joint_ranges(q)[1]
+    return np.where(np.isfinite(limits.velocity), limits.velocity, half), half
 
 
 class DriftVariation:
@@ -521,9 +465,8 @@ def least_change(
     count = N - 1 + moves_end
     if count < 1:
         return None
-    _, half = limits.joint_ranges(positions[0])
     # Unknowns are shares of a tick at full speed.
-    scale = np.where(np.isfinite(limits.velocity), limits.velocity, half) * period
+    scale = _speeds_and_half_ranges(positions[0], limits)[0] * period
     scaled = (rows[:, moving] * scale).reshape(len(rows), -1)
     weight = 1.0 / np.maximum(np.linalg.norm(scaled, axis=1), 1e-12)
 

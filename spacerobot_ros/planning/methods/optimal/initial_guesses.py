@@ -275,15 +275,7 @@ class InitialGuesses:
         parts = shapes[..., :-1, :], steps[..., :-1, :], steps[..., 1:, :]
         if self._angular_momentum is not None:
             return self._integrate_drift(*parts, np.asarray(durations), self._angular_momentum)
-        Omega = self._turn(*(x.reshape(-1, x.shape[-1]).T for x in parts)).full().T
-        rotations = quaternions_from_rotvecs(Omega).reshape(*parts[0].shape[:-1], 4)
-        quaternions = np.empty((*shapes.shape[:-1], 4))
-        quaternions[..., 0, :] = [0.0, 0.0, 0.0, 1.0]
-        for k in range(rotations.shape[-2]):
-            quaternions[..., k + 1, :] = quaternion_multiply(
-                quaternions[..., k, :], rotations[..., k, :]
-            )
-        return quaternions
+        return attitudes_along(self._turn, *parts)
 
     def _integrate_drift(
         self, q: Array, u: Array, u_next: Array, durations: Array, L_0: Array
@@ -312,17 +304,11 @@ class InitialGuesses:
         coarse = np.linspace(0.0, 1.0, len(solution.shapes))
         shapes = solution.at_ticks(intervals)
         velocities = _interpolate(self._instants, coarse, solution.velocities)
-        step = solution.duration / intervals
-        return Trajectory(
-            step, shapes, velocities, self._integrate_attitudes(shapes, step * velocities, step)
-        )
+        return self._trajectory(solution.duration / intervals, shapes, velocities)
 
-    def from_shapes(self, shapes: Array, limits: MotionLimits) -> Trajectory:
-        """Return a guess through shapes (M, n) at equal intervals, as fast as the limits allow."""
-        at = np.linspace(0.0, 1.0, len(shapes))
-        path = _interpolate(self._instants, at, shapes)
-        (trajectory,) = self._build_trajectories(path[np.newaxis], limits)
-        return trajectory
+    def _trajectory(self, step: float, shapes: Array, velocities: Array) -> Trajectory:
+        attitudes = self._integrate_attitudes(shapes, step * velocities, step)
+        return Trajectory(step, shapes, velocities, attitudes)
 
     def from_ticks(self, positions: Array, velocity: Array, period: float) -> Trajectory:
         """Return shapes (M + 1, n) at ticks that begin with a velocity (n,) and end at rest."""
@@ -333,9 +319,7 @@ class InitialGuesses:
         shapes, velocities = (
             _interpolate(self._instants, ticks, values) for values in (positions, rates)
         )
-        return Trajectory(
-            step, shapes, velocities, self._integrate_attitudes(shapes, step * velocities, step)
-        )
+        return self._trajectory(step, shapes, velocities)
 
     def with_initial_velocity(
         self, guess: Trajectory, velocity: Array, limits: MotionLimits
@@ -349,8 +333,22 @@ class InitialGuesses:
         shapes = guess.shapes + back * x * (1 - x) ** 2 * velocity
         velocities = guess.velocities + (1 - x) * (1 - 3 * x) * velocity
         shapes = np.clip(shapes, limits.lower, limits.upper)
-        quaternions = self._integrate_attitudes(shapes, guess.step * velocities, guess.step)
-        return Trajectory(guess.step, shapes, velocities, quaternions)
+        return self._trajectory(guess.step, shapes, velocities)
+
+
+def attitudes_along(turn: ca.Function, q: Array, u: Array, u_next: Array) -> Array:
+    """Return the attitudes (..., N + 1, 4) along N steps (..., N, n) from rest, each from the one
+    before; ``turn`` is the function of a step (:func:`.turn_function`).
+    """
+    Omega = turn(*(x.reshape(-1, x.shape[-1]).T for x in (q, u, u_next))).full().T
+    rotations = quaternions_from_rotvecs(Omega).reshape(*q.shape[:-1], 4)
+    quaternions = np.empty((*q.shape[:-2], q.shape[-2] + 1, 4))
+    quaternions[..., 0, :] = [0.0, 0.0, 0.0, 1.0]
+    for k in range(rotations.shape[-2]):
+        quaternions[..., k + 1, :] = quaternion_multiply(
+            quaternions[..., k, :], rotations[..., k, :]
+        )
+    return quaternions
 
 
 def _rates_between(quaternions: Array, step: float) -> Array:
@@ -416,12 +414,3 @@ _LOOPS: tuple[Loop, ...] = (
     _trigonometric_loop,
     _square_loop,
 )
-
-
-def move_to_ends(shapes: Array, boundary: BoundaryConditions, limits: MotionLimits) -> Array:
-    """Return the shapes (M, n) of a manoeuvre, moved to other ends and within the limits."""
-    s = np.linspace(0.0, 1.0, len(shapes))[:, np.newaxis]
-    late = s**3 * (10 - 15 * s + 6 * s**2)
-    last = shapes[-1] if boundary.final is None else boundary.final
-    moved = shapes + (1 - late) * (boundary.start - shapes[0]) + late * (last - shapes[-1])
-    return np.clip(moved, limits.lower, limits.upper)

@@ -66,14 +66,11 @@ class LimitedEfforts(JointEfforts):
             limit *= 1 - options.effort_reserve
         return cls(robot, limit, control_period) if np.any(np.isfinite(limit)) else None
 
-    def peak(self, trajectory: Trajectory, boundary: BoundaryConditions | None = None) -> float:
-        """Return the largest ratio of efforts on a trajectory to those that solutions may use.
-
-        The angular momentum is that of the ``boundary`` conditions; None: zero.
-        """
+    def slowed(self, trajectory: Trajectory, boundary: BoundaryConditions) -> Trajectory:
+        """Return the trajectory, slowed along its path until its efforts keep the limits."""
         q, v = trajectory.shapes, trajectory.velocities
         a = np.diff(v, axis=0) / trajectory.step
-        L_B = None if boundary is None else boundary.momenta_in_base(trajectory.quaternions)
+        L_B = boundary.momenta_in_base(trajectory.quaternions)
         before, after = (None, None) if L_B is None else (L_B[:-1], L_B[1:])
         ends = np.vstack(
             [
@@ -81,13 +78,7 @@ class LimitedEfforts(JointEfforts):
                 self._effort_shares(q[1:], v[1:], a, after),
             ]
         )
-        return float(np.abs(ends).max()) / _PLANNED_EFFORT_SHARE
-
-    def slowed(
-        self, trajectory: Trajectory, boundary: BoundaryConditions | None = None
-    ) -> Trajectory:
-        """Return the trajectory, slowed along its path until its efforts keep the limits."""
-        peak = self.peak(trajectory, boundary)
+        peak = float(np.abs(ends).max()) / _PLANNED_EFFORT_SHARE
         return trajectory if peak <= 1 else trajectory.stretched(math.sqrt(peak))
 
     def inequality(self, *, drifting: bool = False) -> ca.Function:

@@ -393,10 +393,7 @@ class OptimalGait(GaitMethod):
         if motion is not None and shape is None and same_shape:
             # The present shape is a shape on the path.
             shape = motion.remaining[-1]
-        boundary = self._boundary(request, shape)
-        L_0 = matrix_from_quaternion(state.quaternion).T @ state.angular_momentum
-        boundary = replace(boundary, state=state, angular_momentum=L_0)
-        boundary = self._with_wheels(boundary, request)
+        boundary = self._with_wheels(self._boundary(request, shape), request)
         # A manoeuvre ends within the margin if its goal does.
         limits = self._limits.within(margin, q, boundary.likely_final_shape)
         chosen = replace(self.options, duration=0.0, answers=1) if correction else self.options
@@ -413,47 +410,49 @@ class OptimalGait(GaitMethod):
             self._constraints.check(q[np.newaxis], attitude, self.control_period)
         except UnusableCandidateError as reason:
             raise PlanningError(f"The start violates a path constraint: {reason}.") from None
-        key = None
-        if self._cache is not None and not correction and duration is None:
-            key = self._request_key(request)
-            if kept := self._cache.load(f"{key[:32]}.npz", key):
-                plan = _CachedPlan.from_bytes(kept[1])
-                notes: Notes = {**plan.notes, "from_cache": 1.0}
-                return self._build_schedule(
-                    state, goal, plan.positions, notes, boundary.velocity, end
-                )
-        bound = self._require_enough_time(task, final_is_given=shape is not None or same_shape)
+        cache = None if correction or duration is not None else self._cache
+        key = "" if cache is None else self._request_key(request)
+        if cache is not None and (kept := cache.load(f"{key[:32]}.npz", key)):
+            positions, notes = _unpacked_plan(kept[1])
+            notes = {**notes, "from_cache": 1.0}
+            return self._build_schedule(state, goal, positions, notes, boundary.velocity, end)
+        found = self._plan_from_rest(task, final_is_given=shape is not None or same_shape)
+        # A result of a busy machine is not cached, as an idle machine finds a better one.
+        within = self._is_within_efforts(task, found.manoeuvre) and not found.manoeuvre.cut_short
+        if cache is not None and within:
+            cache.store(f"{key[:32]}.npz", key, _packed_plan(found.positions, found.notes))
+        return self._schedule(task, found)
+
+    def _plan_from_rest(self, task: SearchProblem, *, final_is_given: bool) -> _PlanResult:
+        """Return a manoeuvre whose joints rest at the start; see :meth:`_require_enough_time`."""
+        bound = self._require_enough_time(task, final_is_given=final_is_given)
+        boundary, options = task.boundary, task.options
         # The clearance of a base that coasts on among obstacles is not checked.
         coasts = boundary.drifts and not len(self._wheels)
         try:
-            if coasts and chosen.duration == 0 and not self._has_obstacles:
-                found = self._begin_now_or_coast(task)
-            elif correction or boundary.is_timed or chosen.time_budget > 0:
-                found = self._begin_now(task)
-            else:
-                found = self._begin_in_asked_time(task)
+            if coasts and options.duration == 0 and not self._has_obstacles:
+                return self._begin_now_or_coast(task)
+            if task.request.correction or boundary.is_timed or options.time_budget > 0:
+                return self._begin_now(task)
+            return self._begin_in_asked_time(task)
         except NotFoundError as refusal:
             if bound.seconds == 0:
                 raise
             raise NotFoundError(f"{refusal} It is proved that {bound}.") from None
-        schedule = self._schedule(task, found)
-        # A result of a busy machine is not cached, as an idle machine finds a better one.
-        if (
-            self._cache is not None
-            and key is not None
-            and not found.manoeuvre.cut_short
-            and self._is_within_efforts(task, found.manoeuvre)
-        ):
-            kept_plan = _CachedPlan(schedule.positions, found.notes)
-            self._cache.store(f"{key[:32]}.npz", key, kept_plan.to_bytes())
-        return schedule
 
     def _boundary(self, request: PlanRequest, shape: Array | None) -> BoundaryConditions:
         """Return the ends of a request whose goal shape (n,) is another one; None: any."""
-        specification = self._kind_of(request.goal).specification
-        direction_W = self._constraints.direction_W
-        return specification.boundary_conditions(
-            self.robot, request, shape, self._limits, direction_W
+        specification, state = self._kind_of(request.goal).specification, request.state
+        ends = specification.boundary_conditions(self.robot, request, shape, self._limits)
+        R_BW, direction_W = (
+            matrix_from_quaternion(state.quaternion).T,
+            self._constraints.direction_W,
+        )
+        return replace(
+            ends,
+            direction=np.zeros(3) if direction_W is None else R_BW @ direction_W,
+            state=state,
+            angular_momentum=R_BW @ state.angular_momentum,
         )
 
     def _schedule(self, task: SearchProblem, found: _PlanResult) -> GaitSchedule:
@@ -506,19 +505,14 @@ class OptimalGait(GaitMethod):
             return self._begin_now(task)
         with suppress(NotFoundError):
             return self._begin_now(replace(task, max_failed_starts=_STARTS_BEFORE_FASTEST))
-        fastest = math.inf
-        with suppress(NotFoundError):
-            found = self._begin_now(replace(task, options=unlimited))
-            fastest = found.manoeuvre.duration
-            if chosen.duration == 0 and fastest <= given:
-                return found
-        refusal = ""
-        if not _MAX_FASTEST_RATIO * given < fastest < math.inf:
+        found = self._begin_now(replace(task, options=unlimited))
+        fastest, refusal = found.manoeuvre.duration, ""
+        if chosen.duration == 0 and fastest <= given:
+            return found
+        if fastest <= _MAX_FASTEST_RATIO * given:
             try:
                 return self._begin_now(task)
             except NotFoundError as reason:
-                if fastest == math.inf:
-                    raise
                 refusal = f" {reason}"
         raise NotFoundError(
             f"No manoeuvre to the goal was found within optimal.{name} = {given:g} s: the fastest "
@@ -584,13 +578,8 @@ class OptimalGait(GaitMethod):
 
     def _later(self, task: SearchProblem, coast: _BaseMotion, ticks: int) -> SearchProblem:
         """Return the task of a manoeuvre that begins after some ticks of coasting."""
-        state = task.request.state
-        after = coast.state_at(state, ticks)
-        later = replace(task.request, state=after)
+        later = replace(task.request, state=coast.state_at(task.request.state, ticks))
         aimed = self._boundary(later, self.goal_shape(later.goal))
-        R_BW = matrix_from_quaternion(after.quaternion).T
-        L_B = R_BW @ matrix_from_quaternion(state.quaternion) @ task.boundary.angular_momentum
-        aimed = replace(aimed, state=after, angular_momentum=L_B)
         return replace(task, request=later, boundary=aimed)
 
     def _goal_passing_ticks(self, task: SearchProblem, coast: _BaseMotion, step: int) -> list[int]:
@@ -621,7 +610,9 @@ class OptimalGait(GaitMethod):
         takes = len(free.positions) - 1
         begin = max(0, end - takes)
         later = self._later(task, coast, begin).within_time(_MAX_DURATION_RATIO * takes * h)
-        few_failed = replace(later, guess=free.positions, max_failed_starts=_STARTS_AFTER_COASTING)
+        few_failed = replace(
+            later, guess=free.manoeuvre.solution, max_failed_starts=_STARTS_AFTER_COASTING
+        )
         found = self._begin_now(few_failed)
         self._constraints.check(coast.shapes[:begin], coast.attitudes[:begin], h)
         return replace(
@@ -819,19 +810,13 @@ def _asked_time(chosen: OptimalOptions) -> tuple[str, float]:
     return "longest", chosen.longest
 
 
-@dataclass(frozen=True)
-class _CachedPlan:
-    """A cached schedule: shapes (N + 1, n) at the ticks, and the notes."""
+def _packed_plan(positions: Array, notes: Notes) -> bytes:
+    """Return shapes (N + 1, n) at the ticks, and notes, as the content of a file."""
+    file = io.BytesIO()
+    np.savez(file, positions=positions, notes=json.dumps(notes))
+    return file.getvalue()
 
-    positions: Array
-    notes: Notes
 
-    def to_bytes(self) -> bytes:
-        file = io.BytesIO()
-        np.savez(file, positions=self.positions, notes=json.dumps(self.notes))
-        return file.getvalue()
-
-    @classmethod
-    def from_bytes(cls, content: bytes) -> _CachedPlan:
-        with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
-            return cls(arrays["positions"], json.loads(str(arrays["notes"])))
+def _unpacked_plan(content: bytes) -> tuple[Array, Notes]:
+    with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
+        return arrays["positions"], json.loads(str(arrays["notes"]))

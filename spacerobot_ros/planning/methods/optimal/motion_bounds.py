@@ -179,7 +179,7 @@ class ConnectionBounds:
     @classmethod
     def of(cls, robot: SpaceRobot, axes: Array) -> ConnectionBounds:
         """Return the bounds of a robot whose base rotates about ``axes`` (m, 3), in the base."""
-        tree = _Tree.of(robot)
+        tree = _Tree.of(robot, robot.lower, robot.upper)
         least, base = sum(tree.least_moments), tree.least_moments[0]
         if len(axes) == 1:
             about = float(axes[0] @ tree.bodies[0].inertia.about_com @ axes[0])
@@ -194,10 +194,11 @@ class ConnectionBounds:
 
     def of_link(self, robot: SpaceRobot, link: str) -> LinkBounds:
         """Return the bounds of the motion of a link of the robot."""
-        tree, (body, pose) = _Tree.of(robot), robot.description.frames[link]
-        masses = [each.inertia.mass for each in tree.bodies]
-        apart = tree.distances(body, pose.r, -1, np.eye(3))
-        far = float(sum(masses[k] * distance for k, distance in apart) / sum(masses))
+        tree, (body, pose) = (
+            _Tree.of(robot, robot.lower, robot.upper),
+            robot.description.frames[link],
+        )
+        far = tree.reach(body, pose.r)
         turning, levers = tree.chain(body, pose.r)
         place = self.turn * far + self.center + _coupled(robot, levers)
         return LinkBounds(self.turn + _coupled(robot, turning), place, far)
@@ -245,10 +246,10 @@ class _Tree:
     least_moments: list[float]
 
     @classmethod
-    def of(cls, robot: SpaceRobot) -> _Tree:
+    def of(cls, robot: SpaceRobot, lower_q: Array, upper_q: Array) -> _Tree:
         bodies = robot.description.bodies
         hinges, travels = np.zeros((len(bodies), 3)), [0.0] * len(bodies)
-        ranges = zip(*moving_joint_ranges(robot, robot.lower, robot.upper), strict=True)
+        ranges = zip(*moving_joint_ranges(robot, lower_q, upper_q), strict=True)
         for b, (body, (lower, upper)) in enumerate(zip(bodies[1:], ranges, strict=True), 1):
             assert body.joint is not None
             hinges[b] = body.origin.r
@@ -258,6 +259,14 @@ class _Tree:
                     hinges[b] += body.origin.R @ body.joint.axis * (lower + upper) / 2
         moments = [float(np.linalg.eigvalsh(body.inertia.about_com)[0]) for body in bodies]
         return cls(bodies, hinges, travels, [max(0.0, moment) for moment in moments])
+
+    def reach(self, body: int, point: Array) -> float:
+        """Return the largest distance, m, of a point (3,) of a body from the centre of mass: it is
+        the mean of the vectors from those of all bodies, weighted by their masses.
+        """
+        masses = [each.inertia.mass for each in self.bodies]
+        apart = self.distances(body, point, -1, np.eye(3))
+        return float(sum(masses[k] * distance for k, distance in apart) / sum(masses))
 
     def moved_by(self, joint: int, *, planar: bool) -> tuple[float, float, float]:
         """Return bounds of the angular momentum ``h`` about the centre of mass (kg m^2/s), of the
@@ -342,6 +351,14 @@ class _Tree:
             far = way(at, point, whole)
             for k, more in self.distances(parent, self.hinges[at], at, whole):
                 yield k, far + more
+
+
+def reach_of_end_effector(robot: SpaceRobot, lower: Array, upper: Array, link: str) -> float:
+    """Return an upper bound, m, of the distance of a link's origin from the centre of mass, with
+    the joints within ``lower`` and ``upper`` (n,).
+    """
+    body, pose = robot.description.frames[link]
+    return _Tree.of(robot, lower, upper).reach(body, pose.r)
 
 
 @dataclass(frozen=True)

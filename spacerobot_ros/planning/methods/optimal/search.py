@@ -44,7 +44,7 @@ from spacerobot_ros.planning.methods.optimal.held_commands import (
     HeldCommands,
     ManoeuvreModel,
 )
-from spacerobot_ros.planning.methods.optimal.initial_guesses import InitialGuesses, move_to_ends
+from spacerobot_ros.planning.methods.optimal.initial_guesses import InitialGuesses
 from spacerobot_ros.planning.methods.optimal.kept_distances import KeptDistances, instants_of
 from spacerobot_ros.planning.methods.optimal.multiple_shooting import (
     TOLERANCE,
@@ -109,9 +109,6 @@ _SAME_COST_TOLERANCE = 1e-3
 _AGREEING_COST_TOLERANCE = 3e-3
 """Relative difference of costs up to which solutions agree: the coarse grid and the solver's
 tolerance cause such differences."""
-
-_AGREEING_SOLUTIONS_WITH_GUESS = 2
-"""Agreeing solutions that end a search whose first guess was given."""
 
 _MAX_ITERATIONS_OF_STOPS = 120
 """Steps of the solver from a guess in which wheels stop the base: most take twenty."""
@@ -262,7 +259,7 @@ class SearchProblem:
     clock, cancellation
         The wall time of the plan, and whether it is cancelled.
     guess
-        (M, n) shapes that are moved to the ends and come before all other guesses; None: none.
+        The first guess; None: any.
     max_failed_starts
         Guesses without any solution after which the search ends.
     """
@@ -273,7 +270,7 @@ class SearchProblem:
     options: OptimalOptions
     clock: SearchClock
     cancellation: Cancellation = NEVER
-    guess: Array | None = None
+    guess: Trajectory | None = None
     max_failed_starts: int = sys.maxsize
 
     @property
@@ -327,11 +324,8 @@ class SearchProblem:
     def solutions_agree(self, solutions: Sequence[Trajectory]) -> bool:
         """Whether enough of the solutions agree with the best one."""
         costs = np.array([self.cost(each) for each in solutions])
-        agreeing = self.options.agreeing
-        if self.guess is not None:
-            agreeing = min(agreeing, _AGREEING_SOLUTIONS_WITH_GUESS)
         same = int(np.sum(costs <= costs.min(initial=math.inf) * (1 + _AGREEING_COST_TOLERANCE)))
-        return 0 < agreeing <= same
+        return 0 < self.options.agreeing <= same
 
 
 class _Grid(NamedTuple):
@@ -465,7 +459,9 @@ class ManoeuvreSearch:
         if problem.motion is not None:
             velocity = self._initial_velocity(problem.motion, problem.limits)
             problem = replace(problem, boundary=replace(problem.boundary, velocity=velocity))
-        kept = self._model.begin(problem.boundary)
+        kept, knows_turn = None, len(self._model.axes) == 3
+        if self._model.distances is not None:
+            kept = self._model.distances.begin(problem.boundary, turn_is_known=knows_turn)
         state = _SearchState(problem, *self._grids(problem))
         found = self._search_on_grids(state)
         if found and kept is not None:
@@ -499,7 +495,7 @@ class ManoeuvreSearch:
             for guess in source.generate(boundary, limits, likely):
                 yield source.with_initial_velocity(guess, velocity, limits)
         if problem.guess is not None:
-            yield source.from_shapes(move_to_ends(problem.guess, boundary, limits), limits)
+            yield source.resample(problem.guess)
         if len(self._wheels) and len(self._model.axes):
             robot = self._model.robot
             yield from source.generate_with_wheels(self._wheels, boundary, limits, robot)
@@ -646,9 +642,6 @@ class ManoeuvreSearch:
                     refined = self._solve_from_guess(
                         state, full, guess, found=bool(found), refining=True
                     )
-                    if refined is None and problem.motion is not None:
-                        # The path of least effort in its time may be found all the same.
-                        refined = guess
                 if refined is None:
                     raise UnusableCandidateError(_NO_PATH_FOUND)
                 manoeuvre = self._make_held_commands(state, refined)
@@ -734,38 +727,42 @@ class ManoeuvreSearch:
         """Return manoeuvres that keep clear: those that were found, if the fastest one does; else
         one near to them, or near to other paths; none if none is found.
         """
-        in_order = sorted(found, key=lambda one: one.duration)
+        problem, in_order = state.problem, sorted(found, key=lambda one: one.duration)
         if not kept.approaches(in_order[0].held.positions, in_order[0].held.quaternions):
             return found
         state.best, state.is_clearing = math.inf, True
         known = [each.solution for each in in_order]
-        clear: list[tuple[KeptDistances, Trajectory]] = []
+        clear: list[tuple[KeptDistances, Trajectory, float]] = []
         of_known = ((each, 1.0) for each in known)
-        paths = itertools.chain(of_known, self._other_paths(state, kept, known, clear))
-        if not self._has_coarse_paths(state):
-            for path, reach in itertools.islice(paths, len(known) + _MAX_FULL_GRID_STARTS):
+        others = self._other_paths(state, kept, known, clear)
+        # A motion that is timed is too far off on a coarse grid: joints run on in long intervals.
+        coarsely = problem.hastens and state.coarse != state.full and not problem.is_timed
+        if not coarsely:
+            others = itertools.islice(others, _MAX_FULL_GRID_STARTS)
+        enough = _CLEAR_ANSWERS if coarsely else 1
+        for number, (path, reach) in enumerate(itertools.chain(of_known, others), 1):
+            apart = kept.anew()
+            if not coarsely:
+                clear.append((apart, path, reach))
+            elif all(path.duration < each.duration for _, each, _ in clear):
                 with state.attempt():
-                    return [self._clear_finely(state, kept.anew(), path, reach)]
-            return []
-        for number, (path, reach) in enumerate(paths, 1):
-            if reach > 1 or all(path.duration < each.duration for _, each in clear):
-                with state.attempt():
-                    clear.append(self._clear_coarsely(state, kept.anew(), path, reach))
-            if number == len(known) or len(clear) == _CLEAR_ANSWERS:
+                    fast = self._clear_coarsely(state, apart, path, reach)
+                    clear.append((apart, fast, 1.0))
+            if (coarsely and number == len(known)) or len(clear) == enough:
                 if freed := self._finely_cleared(state, clear):
                     return freed
                 clear.clear()
         return self._finely_cleared(state, clear)
 
     def _finely_cleared(
-        self, state: _SearchState, clear: list[tuple[KeptDistances, Trajectory]]
+        self, state: _SearchState, clear: list[tuple[KeptDistances, Trajectory, float]]
     ) -> list[Manoeuvre]:
         """Return a manoeuvre near to the fastest of clear paths on the coarse grid, or to the next;
         none if none is found.
         """
-        for apart, path in sorted(clear, key=lambda each: each[1].duration):
+        for each in sorted(clear, key=lambda each: each[1].duration):
             with state.attempt():
-                return [self._clear_finely(state, apart, path)]
+                return [self._clear_finely(state, *each)]
         return []
 
     def _other_paths(
@@ -806,33 +803,26 @@ class ManoeuvreSearch:
             if not kept.approaches_of(guess):
                 yield guess, _REACH_FROM_GUESS
 
-    def _has_coarse_paths(self, state: _SearchState) -> bool:
-        """Whether paths are made clear on the coarse grid first."""
-        problem = state.problem
-        # A motion that is timed is too far off on it: joints run on in long intervals.
-        return problem.hastens and state.coarse != state.full and not problem.is_timed
-
     def _clear_coarsely(
         self, state: _SearchState, kept: KeptDistances, path: Trajectory, reach: float
-    ) -> tuple[KeptDistances, Trajectory]:
-        """Return a fast path near to another one that keeps clear on the coarse grid, with the
-        pairs that it keeps apart; UnusableCandidateError if none was found.
+    ) -> Trajectory:
+        """Return a fast path near to another one that keeps clear on the coarse grid;
+        UnusableCandidateError if none was found.
         """
         apart = _Apart(kept, state.coarse)
         slow, _ = self._clear(state, apart, path, _CLEARING_TIME_FACTOR * path.duration, reach)
         fast, _ = self._shorten(state, apart, slow, None)
-        return kept, fast
+        return fast
 
     def _clear_finely(
-        self, state: _SearchState, kept: KeptDistances, path: Trajectory, reach: float = 1.0
+        self, state: _SearchState, kept: KeptDistances, path: Trajectory, reach: float
     ) -> Manoeuvre:
         """Return a manoeuvre near to a path that keeps clear, by the full grid;
         UnusableCandidateError if none was found.
         """
-        problem, options = state.problem, state.problem.options
+        options = state.problem.options
         hold = partial(self._make_held_commands, state, kept=kept)
         apart = _Apart(kept, state.full, hold)
-        shortest = self._shortest_duration(problem)
         duration, made = _CLEARING_TIME_FACTOR * path.duration, None
         if kept.pairs:
             # A path that is clear on the coarse grid mostly is on the full one, as fast.
@@ -841,18 +831,10 @@ class ManoeuvreSearch:
             path, made = self._shorten(state, apart, path, None)
         elif options.duration > 0:
             duration = self._given_duration(options)
-        elif problem.gentle:
-            path = self._slow_to_effort_limits(path, problem.boundary)
-            duration = max(_GENTLE_DURATION_FACTOR * path.duration, shortest)
         if made is None:
             path, made = self._clear(state, apart, path, duration, reach)
-            if problem.hastens:
+            if options.duration == 0:
                 path, made = self._shorten(state, apart, path, made)
-        if problem.gentle:
-            fast = path.at_full_speed(problem.limits, shortest)
-            made = hold(self._slow_to_effort_limits(fast, problem.boundary))
-            if near := kept.approaches(made.held.positions, made.held.quaternions):
-                raise UnusableCandidateError(kept.message(near[0], self._period))
         assert made is not None
         if made.duration > max(options.longest, options.duration) + self._period / 2:
             raise UnusableCandidateError(_NO_PATH_FOUND)
@@ -972,8 +954,7 @@ class ManoeuvreSearch:
         solver = self._solver(problem, apart.grid, kept.pairs)
         if len(guess.shapes) != apart.grid.intervals + 1:
             guess = self._guesses_on(solver, boundary).resample(guess)
-        shortest = self._shortest_duration(problem)
-        bounds = DurationBounds(shortest, problem.options.longest)
+        bounds = DurationBounds(self._shortest_duration(problem), problem.options.longest)
         if duration is not None:
             bounds = DurationBounds(duration, duration)
         if problem.motion is not None and duration is not None:
@@ -992,11 +973,6 @@ class ManoeuvreSearch:
             raise UnusableCandidateError(_NO_PATH_FOUND)
         lack = f"{1e3 * solver.lack:.3g} mm too near"
         state.report(f"{pairs}, {solution.duration:.6g} s, {lack}")
-        free_rate = self._model.constraints.base_rate_limit == 0
-        if duration is None and not solver.converged and free_rate and problem.motion is None:
-            # A solution without convergence is not yet as fast as possible.
-            solution = solution.at_full_speed(limits, shortest)
-            solution = self._slow_to_effort_limits(solution, boundary)
         return solution, solver.lack
 
     # -- what the steps share ---------------------------------------------------------------------
