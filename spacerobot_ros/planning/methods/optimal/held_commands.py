@@ -154,7 +154,7 @@ class ManoeuvreModel:
                 after = boundary.final_velocity
                 needed, overrun = limits.excess(held.positions, self.control_period, before, after)
                 too_fast = max(needed - 1, overrun) > _LIMIT_ROUNDING
-                factor = max(needed, self._effort_excess(held, boundary, before))
+                factor = max(needed, self._slowing_factor(held, boundary, before))
                 if not too_fast and factor <= 1 + _LIMIT_ROUNDING:
                     return held
             if too_fast and programs < _MAX_PROGRAMS:
@@ -172,14 +172,18 @@ class ManoeuvreModel:
             ticks = max(ticks + 1, math.ceil(ticks * factor - 1e-9))
         return None
 
-    def _effort_excess(
+    def _slowing_factor(
         self, held: HeldCommands, boundary: BoundaryConditions, before: Array | float
     ) -> float:
-        """Return the factor by which commands must be slower to keep the joints' efforts."""
+        """Return the factor by which commands must be slower to keep the joints' efforts and the
+        rate of the base.
+        """
+        rate = self.constraints.excess_rate(held.quaternions, self.control_period)
         if self.efforts is None:
-            return 0.0
+            return rate
         L_B = boundary.momenta_in_base(held.quaternions)
-        return self.efforts.excess(held.positions, before, L_B, boundary.final_velocity)
+        after = boundary.final_velocity
+        return max(rate, self.efforts.excess(held.positions, before, L_B, after))
 
     def _fit_to_limits(
         self,
@@ -221,7 +225,7 @@ class ManoeuvreModel:
             return None
         after = boundary.final_velocity
         needed, overrun = limits.excess(held.positions, self.control_period, before, after)
-        needed = max(needed, self._effort_excess(held, boundary, before))
+        needed = max(needed, self._slowing_factor(held, boundary, before))
         return held if max(needed - 1, overrun) <= _LIMIT_ROUNDING else None
 
     def _attitudes(self, positions: Array, boundary: BoundaryConditions) -> Array:

@@ -117,26 +117,14 @@ _MAX_FULL_GRID_STARTS = 3
 """Number of guesses on the full grid after a coarse grid without solutions, and of other paths that
 are made clear on it alone: it costs the most."""
 
-_LIMIT_SHARE_IN_GIVEN_TIME = 0.99
-"""Share of velocity and acceleration limits for manoeuvres of a given duration: the rest is for
-held commands."""
-
-_ACCELERATION_SHARES_IN_MOTION = (0.98, 1.0)
-"""In motion: shares of accelerations that plans use, tried in turn: the rest is for changes of the
-path, but a joint near its limit may need all of it to come to rest in time."""
-
 _VELOCITY_RESERVE_IN_MOTION = 0.02
-"""In motion: largest share of velocities reserved for the same reason: a joint at full speed is
-slowed down by it in a quarter of a control period."""
+"""In motion: largest share of velocities reserved for changes of the path in held commands: a joint
+at full speed is slowed down by it in a quarter of a control period."""
 
 _ADDITIONAL_TICKS, _ADDITIONAL_SHARES_OF_STOPS = (0, 0, 1, 3, 7), (0.03, 0.08)
 """Control periods that are added if held commands miss the goal or a limit (the second time, the
 end is corrected), and shares of the duration if wheels stop the base: they use their torque all
 the time."""
-
-_MAX_RATE_EXCESS, _RATE_RESERVE = 1.1, 1.002
-"""Largest excess of the base rate of held commands over its bound at which they are slowed down, as
-the bound is imposed only at the steps of a solution, and the factor of that excess."""
 
 _HELD_REACH_SHARE = 0.3
 """Share of the largest reach by which a clear path may change in a solution in whole ticks."""
@@ -592,16 +580,16 @@ class ManoeuvreSearch:
             if problem.motion is not None:
                 # Only its commands are solved for.
                 return guess
-        in_given_time = problem.options.duration > 0
-        solution, stop = None, state.stop_rule(found=found)
-        for within in self._planned_limits(problem, limits, in_given_time=in_given_time):
-            solution = grid.solve(
-                boundary, within, guess, stop, bounds, refining=refining and problem.hastens
-            )
-            problem.cancellation.raise_if_requested()
-            if solution is not None:
-                break
-        if solution is None or in_given_time or problem.motion is not None:
+        solution = grid.solve(
+            boundary,
+            self._planned_limits(problem, limits),
+            guess,
+            state.stop_rule(found=found),
+            bounds,
+            refining=refining and problem.hastens,
+        )
+        problem.cancellation.raise_if_requested()
+        if solution is None or problem.options.duration > 0 or problem.motion is not None:
             return solution
         is_fastest = grid.converged or self._model.constraints.base_rate_limit > 0
         if problem.hastens and is_fastest:
@@ -664,12 +652,6 @@ class ManoeuvreSearch:
             held = self._hold_in_whole_ticks(state, trajectory, kept)
         else:
             held = self._model.hold(trajectory, problem.boundary, problem.limits, fixed=fixed)
-            if held is not None and not fixed:
-                excess = constraints.excess_rate(held.quaternions, self._period)
-                if 1 < excess <= _MAX_RATE_EXCESS:
-                    # At zero momentum the base turns as much slower as the joints move.
-                    slower = trajectory.stretched(excess * _RATE_RESERVE)
-                    held = self._model.hold(slower, problem.boundary, problem.limits)
         if held is None:
             raise UnusableCandidateError(_NO_HELD_COMMANDS)
         start = problem.request.state.quaternion
@@ -699,13 +681,13 @@ class ManoeuvreSearch:
         additional = list(_ADDITIONAL_TICKS)
         if len(self._wheels):
             additional += [math.ceil(share * ticks) for share in _ADDITIONAL_SHARES_OF_STOPS]
-        planned = self._planned_limits(problem, limits, in_given_time=True)
+        within = self._planned_limits(problem, limits)
         # In a given time there is no other than the first.
         most = 2 if problem.options.duration > 0 else len(additional)
-        for number, more in enumerate(additional[:most]):
+        for more in additional[:most]:
             T = (ticks + more) * self._period
             guess = guess.stretched(T / guess.duration)
-            within, stop = planned[min(number, len(planned) - 1)], state.stop_rule()
+            stop = state.stop_rule()
             solution = solver.solve(aim, within, guess, stop, DurationBounds(T, T), near)
             problem.cancellation.raise_if_requested()
             if solution is None:
@@ -949,8 +931,7 @@ class ManoeuvreSearch:
         UnusableCandidateError if none was found.
         """
         problem, boundary, kept = state.problem, state.problem.boundary, apart.kept
-        given = problem.options.duration > 0
-        limits = self._planned_limits(problem, problem.limits, in_given_time=given)[-1]
+        limits = self._planned_limits(problem, problem.limits)
         solver = self._solver(problem, apart.grid, kept.pairs)
         if len(guess.shapes) != apart.grid.intervals + 1:
             guess = self._guesses_on(solver, boundary).resample(guess)
@@ -1023,21 +1004,11 @@ class ManoeuvreSearch:
             )
         return self._stages[key]
 
-    def _planned_limits(
-        self, problem: SearchProblem, limits: MotionLimits, *, in_given_time: bool
-    ) -> list[MotionLimits]:
-        """Return the limits that solutions are to keep, one after the other until one does."""
-        if problem.motion is not None:
-            velocity = self._planned_speed_limit(limits)
-            return [
-                replace(limits, velocity=velocity, acceleration=share * limits.acceleration)
-                for share in _ACCELERATION_SHARES_IN_MOTION
-            ]
-        if not in_given_time:
-            return [limits]
-        share = _LIMIT_SHARE_IN_GIVEN_TIME
-        velocity, acceleration = share * limits.velocity, share * limits.acceleration
-        return [replace(limits, velocity=velocity, acceleration=acceleration)]
+    def _planned_limits(self, problem: SearchProblem, limits: MotionLimits) -> MotionLimits:
+        """Return the limits that solutions are to keep."""
+        if problem.motion is None:
+            return limits
+        return replace(limits, velocity=self._planned_speed_limit(limits))
 
     def _planned_speed_limit(self, limits: MotionLimits) -> Array:
         """Return the largest velocities (n,) that are planned in motion."""
