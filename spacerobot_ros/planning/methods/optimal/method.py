@@ -503,9 +503,14 @@ class OptimalGait(GaitMethod):
         name, given = _asked_time(chosen)
         if given >= unlimited.longest:
             return self._begin_now(task)
-        with suppress(NotFoundError):
+        try:
             return self._begin_now(replace(task, max_failed_starts=_STARTS_BEFORE_FASTEST))
-        found = self._begin_now(replace(task, options=unlimited))
+        except NotFoundError as reason:
+            none_found = reason
+        try:
+            found = self._begin_now(replace(task, options=unlimited))
+        except NotFoundError:
+            raise none_found from None
         fastest, refusal = found.manoeuvre.duration, ""
         if chosen.duration == 0 and fastest <= given:
             return found
@@ -535,7 +540,6 @@ class OptimalGait(GaitMethod):
                     raise
         notes: Notes = {
             "starts": float(found.starts),
-            "durations": list(found.solutions),
             "solution_time": found.solution.duration,
         }
         if found.cut_short:

@@ -3,7 +3,7 @@
 1. **Guesses**: the direct path with loops; in motion, the remainder of the motion comes first.
 2. **Coarse solutions**: guesses are solved on a coarse grid, at a small part of the cost of the
    full one, until some solutions agree.
-3. **Full grid**: the best solution, and the next if it is about as good, are refined.
+3. **Full grid**: the best solution is refined; the next, if that fails.
 4. **Held commands**: a solution becomes commands that end on the goal. If its duration matters (the
    robot drifts, or joints move at an end), it cannot be stretched to whole control periods: the
    path of least effort in as many periods, or a few more, is solved for.
@@ -96,13 +96,6 @@ _MIN_COARSE_INTERVALS, _MIN_COARSE_INTERVALS_IN_MOTION = 8, 10
 _COARSE_TOLERANCE = 1e-4
 """Tolerance on a coarse grid from rest, whose solutions differ more from later ones."""
 
-_MAX_REFINED_SOLUTIONS, _MAX_REFINED_SOLUTIONS_IN_MOTION = 2, 1
-"""Largest number of solutions that are refined: few in motion, because the robot keeps moving."""
-
-_MAX_REFINED_COST_RATIO = 1.1
-"""Largest ratio of the cost of a coarse solution to the best one at which it is refined, too: the
-coarse grid underestimates some costs by more than others."""
-
 _SAME_COST_TOLERANCE = 1e-3
 """Relative difference of costs up to which two solutions count as the same."""
 
@@ -114,8 +107,7 @@ _MAX_ITERATIONS_OF_STOPS = 120
 """Steps of the solver from a guess in which wheels stop the base: most take twenty."""
 
 _MAX_FULL_GRID_STARTS = 3
-"""Number of guesses on the full grid after a coarse grid without solutions, and of other paths that
-are made clear on it alone: it costs the most."""
+"""Number of other paths that are made clear on the full grid alone: it costs the most."""
 
 _VELOCITY_RESERVE_IN_MOTION = 0.02
 """In motion: largest share of velocities reserved for changes of the path in held commands: a joint
@@ -192,8 +184,6 @@ class Manoeuvre:
         The trajectory that was converted to held commands.
     starts
         Guesses that were tried.
-    solutions
-        Durations of all manoeuvres that were found, s.
     cut_short
         Whether the wall time was used up before the search had come to its end.
     """
@@ -202,7 +192,6 @@ class Manoeuvre:
     duration: float
     solution: Trajectory
     starts: int = 1
-    solutions: list[float] = field(default_factory=list)
     cut_short: bool = False
 
 
@@ -379,9 +368,7 @@ class _SearchState:
         """Report a result; ``duration``, s, is that of a path which may be the best."""
         self.best = min(self.best, duration)
         self._reported = elapsed = self.problem.clock.elapsed
-        # Without a coarse solution, some guesses are tried on the full grid as well.
-        most = max(self.problem.options.starts, self.starts)
-        phase = self.phase or SearchPhase.SEARCHING
+        phase, most = self.phase or SearchPhase.SEARCHING, self.problem.options.starts
         progress = SearchProgress(self.starts, most, self.best, phase, elapsed)
         log_progress(_LOG, progress, f"{phase.value}: {result} after {elapsed:.2f} s")
 
@@ -450,12 +437,16 @@ class ManoeuvreSearch:
         kept, knows_turn = None, len(self._model.axes) == 3
         if self._model.distances is not None:
             kept = self._model.distances.begin(problem.boundary, turn_is_known=knows_turn)
+        if self._wheels_stop_base(problem):
+            # Guesses with wheels are near to solutions.
+            iterations = min(options.iterations, _MAX_ITERATIONS_OF_STOPS)
+            problem = replace(problem, options=replace(options, answers=1, iterations=iterations))
         state = _SearchState(problem, *self._grids(problem))
-        found = self._search_on_grids(state)
-        if found and kept is not None:
+        found = self._search_from_guesses(state)
+        if found is not None and kept is not None:
             found = self._keep_clear(state, kept, found)
-        cut_short = problem.clock.is_over(found=bool(found))
-        if not found:
+        cut_short = problem.clock.is_over(found=found is not None)
+        if found is None:
             within = f" within optimal.time_budget {options.time_budget:g} s" if cut_short else ""
             in_motion = "" if problem.motion is None else " that begins in motion"
             limit = "duration" if options.duration > 0 else "longest"
@@ -465,9 +456,7 @@ class ManoeuvreSearch:
                 f"{within}: {state.rejection}. {longer} optimal.starts, optimal.iterations or "
                 f"optimal.intervals, a longer optimal.{limit}, or a smaller goal may help."
             )
-        best = min(found, key=lambda one: one.duration)
-        durations = [one.duration for one in found]
-        return replace(best, starts=state.starts, solutions=durations, cut_short=cut_short)
+        return replace(found, starts=state.starts, cut_short=cut_short)
 
     # -- 1. guesses -------------------------------------------------------------------------------
 
@@ -496,31 +485,16 @@ class ManoeuvreSearch:
 
     # -- 2. coarse solutions ----------------------------------------------------------------------
 
-    def _search_on_grids(self, state: _SearchState) -> list[Manoeuvre]:
-        """Return manoeuvres that need not keep clear, from guesses on a coarse grid first."""
-        problem, starts = state.problem, state.problem.options.starts
-        if self._wheels_stop_base(problem):
-            # Guesses with wheels are near to solutions.
-            iterations = min(problem.options.iterations, _MAX_ITERATIONS_OF_STOPS)
-            brief = replace(problem.options, answers=1, iterations=iterations)
-            state.problem = replace(problem, options=brief)
-            return self._search_from_guesses(state, state.full, starts)
+    def _search_from_guesses(self, state: _SearchState) -> Manoeuvre | None:
+        """Return a manoeuvre that need not keep clear, from guesses on a coarse grid first; None:
+        none was found.
+        """
+        problem, enough = state.problem, state.problem.options.answers
         # A single answer from rest costs less without a coarse grid.
-        if state.coarse == state.full or problem.options.answers == 1:
-            return self._search_from_guesses(state, state.full, starts)
-        found = self._search_from_guesses(state, state.coarse, starts)
-        if found or state.starts >= problem.max_failed_starts or problem.clock.is_over(found=False):
-            return found
-        return self._search_from_guesses(state, state.full, min(starts, _MAX_FULL_GRID_STARTS))
-
-    def _search_from_guesses(
-        self, state: _SearchState, grid: _Grid, starts: int
-    ) -> list[Manoeuvre]:
-        """Return manoeuvres from at most ``starts`` guesses on a grid; none if none is found."""
-        problem, solver = state.problem, self._solver(state.problem, grid)
+        grid = state.full if enough == 1 else state.coarse
+        solver = self._solver(problem, grid)
         solutions: list[Trajectory] = []
-        enough = problem.options.answers
-        for number, guess in enumerate(itertools.islice(self._guesses(state, solver), starts), 1):
+        for guess in itertools.islice(self._guesses(state, solver), problem.options.starts):
             solution = self._solve_start(state, solver, guess, found=bool(solutions))
             if grid == state.coarse:
                 state.solved.append((guess, solution))
@@ -530,15 +504,13 @@ class ManoeuvreSearch:
             cut_short = problem.clock.is_over(found=bool(solutions)) or not (
                 solutions or state.starts < problem.max_failed_starts
             )
-            going_on = len(solutions) < enough and not problem.solutions_agree(solutions)
-            if going_on and number < starts and not cut_short:
-                continue
-            found = self._refine_solutions(state, solutions, grid)
-            if found or cut_short:
-                return found
-            # These are none; the next ones count one by one.
-            solutions, enough = [], 1
-        return []
+            if cut_short or len(solutions) >= enough or problem.solutions_agree(solutions):
+                found = self._refine_best(state, solutions, grid)
+                if found is not None or cut_short:
+                    return found
+                # These are none; the next ones count one by one.
+                solutions, enough = [], 1
+        return self._refine_best(state, solutions, grid)
 
     def _solve_start(
         self, state: _SearchState, grid: MultipleShooting, guess: Trajectory, *, found: bool = False
@@ -599,44 +571,27 @@ class ManoeuvreSearch:
 
     # -- 3. full grid -----------------------------------------------------------------------------
 
-    def _refine_solutions(
+    def _refine_best(
         self, state: _SearchState, solutions: list[Trajectory], grid: _Grid
-    ) -> list[Manoeuvre]:
-        """Return manoeuvres from the best solutions on a grid, refined on the full grid.
-
-        If the search ended because solutions agree, the next one is refined only if it promises
-        a shorter time than the refined best one.
+    ) -> Manoeuvre | None:
+        """Return a manoeuvre from the best solution on a grid, refined on the full grid, or from
+        the next one if that fails; None: from none of them.
         """
-        problem, in_motion = state.problem, state.problem.motion is not None
-        most = _MAX_REFINED_SOLUTIONS_IN_MOTION if in_motion else _MAX_REFINED_SOLUTIONS
+        problem = state.problem
         state.begin(SearchPhase.REFINING)
-        found: list[Manoeuvre] = []
-        costs: list[float] = []
-        solutions_agree = problem.solutions_agree(solutions)
         for solution in sorted(solutions, key=problem.cost):
-            cost = problem.cost(solution)
-            if found and (len(found) == most or cost > _MAX_REFINED_COST_RATIO * costs[0]):
-                break
-            least = min((one.solution.duration for one in found), default=math.inf)
-            if solutions_agree and solution.duration > (1 - _SAME_COST_TOLERANCE) * least:
-                break
-            if any(abs(cost - other) <= _SAME_COST_TOLERANCE * other for other in costs):
-                continue
             with state.attempt():
                 refined: Trajectory | None = solution
                 if grid != state.full:
                     full = self._solver(problem, state.full)
                     guess = self._guesses_on(full, problem.boundary).resample(solution)
-                    refined = self._solve_from_guess(
-                        state, full, guess, found=bool(found), refining=True
-                    )
+                    refined = self._solve_from_guess(state, full, guess, refining=True)
                 if refined is None:
                     raise UnusableCandidateError(_NO_PATH_FOUND)
                 manoeuvre = self._make_held_commands(state, refined)
-                found.append(manoeuvre)
-                costs.append(cost)
                 state.report(f"manoeuvre of {manoeuvre.duration:.6g} s")
-        return found
+                return manoeuvre
+        return None
 
     # -- 4. held commands -------------------------------------------------------------------------
 
@@ -704,25 +659,22 @@ class ManoeuvreSearch:
     # -- 5. clear ---------------------------------------------------------------------------------
 
     def _keep_clear(
-        self, state: _SearchState, kept: KeptDistances, found: list[Manoeuvre]
-    ) -> list[Manoeuvre]:
-        """Return manoeuvres that keep clear: those that were found, if the fastest one does; else
-        one near to them, or near to other paths; none if none is found.
+        self, state: _SearchState, kept: KeptDistances, found: Manoeuvre
+    ) -> Manoeuvre | None:
+        """Return a manoeuvre that keeps clear: the one that was found, if it does; else one near to
+        it, or near to other paths; None: none is found.
         """
-        problem, in_order = state.problem, sorted(found, key=lambda one: one.duration)
-        if not kept.approaches(in_order[0].held.positions, in_order[0].held.quaternions):
+        problem = state.problem
+        if not kept.approaches(found.held.positions, found.held.quaternions):
             return found
         state.best, state.is_clearing = math.inf, True
-        known = [each.solution for each in in_order]
         clear: list[tuple[KeptDistances, Trajectory, float]] = []
-        of_known = ((each, 1.0) for each in known)
-        others = self._other_paths(state, kept, known, clear)
+        others = self._other_paths(state, kept, found.solution, clear)
         # A motion that is timed is too far off on a coarse grid: joints run on in long intervals.
         coarsely = problem.hastens and state.coarse != state.full and not problem.is_timed
         if not coarsely:
             others = itertools.islice(others, _MAX_FULL_GRID_STARTS)
-        enough = _CLEAR_ANSWERS if coarsely else 1
-        for number, (path, reach) in enumerate(itertools.chain(of_known, others), 1):
+        for number, (path, reach) in enumerate(itertools.chain([(found.solution, 1.0)], others)):
             apart = kept.anew()
             if not coarsely:
                 clear.append((apart, path, reach))
@@ -730,28 +682,28 @@ class ManoeuvreSearch:
                 with state.attempt():
                     fast = self._clear_coarsely(state, apart, path, reach)
                     clear.append((apart, fast, 1.0))
-            if (coarsely and number == len(known)) or len(clear) == enough:
-                if freed := self._finely_cleared(state, clear):
+            if number == 0 or not coarsely or len(clear) == _CLEAR_ANSWERS:
+                if (freed := self._finely_cleared(state, clear)) is not None:
                     return freed
                 clear.clear()
         return self._finely_cleared(state, clear)
 
     def _finely_cleared(
         self, state: _SearchState, clear: list[tuple[KeptDistances, Trajectory, float]]
-    ) -> list[Manoeuvre]:
+    ) -> Manoeuvre | None:
         """Return a manoeuvre near to the fastest of clear paths on the coarse grid, or to the next;
-        none if none is found.
+        None: none is found.
         """
         for each in sorted(clear, key=lambda each: each[1].duration):
             with state.attempt():
-                return [self._clear_finely(state, *each)]
-        return []
+                return self._clear_finely(state, *each)
+        return None
 
     def _other_paths(
         self,
         state: _SearchState,
         kept: KeptDistances,
-        known: Sequence[Trajectory],
+        known: Trajectory,
         found: Sequence[object],
     ) -> Iterator[tuple[Trajectory, float]]:
         """Yield other paths with the share of the largest reach in which clear ones are looked for:
@@ -762,7 +714,7 @@ class ManoeuvreSearch:
         if problem.boundary.drifts and problem.motion is None:
             # A robot that drifts finds others sooner after it has coasted.
             return
-        costs = [problem.cost(each) for each in known]
+        costs = [problem.cost(known)]
         solver = self._solver(problem, state.coarse)
         brakes = problem.motion is not None and not problem.boundary.drifts
         most = _MAX_CLEAR_STARTS_IN_MOTION if brakes else _MAX_CLEAR_STARTS
