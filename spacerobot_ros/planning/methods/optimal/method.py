@@ -83,7 +83,8 @@ _MOVING_AIM_FACTORS = (1.05, 1.2, 1.5)
 """Factors of the last duration at which a manoeuvre is planned if they do not agree."""
 
 _STARTS_BEFORE_COASTING = 8
-"""Guesses without a solution after which a robot that drifts coasts with its joints at rest."""
+"""Guesses without a solution after which a robot that drifts coasts with its joints at rest, and
+those for the rotation that remains when its base passes the goal."""
 
 _STARTS_AFTER_COASTING = 3
 """Guesses without a solution after which the next pass of the goal is tried."""
@@ -98,9 +99,6 @@ _COASTING_TURNS = 4.0
 
 _MAX_COASTING_ENDS = 3
 """Largest number of tried instants at which the coasting base passes the goal."""
-
-_STARTS_PER_COASTING_END = 8
-"""Guesses for the rotation that remains when the base passes the goal."""
 
 _MAX_DURATION_RATIO = 2.5
 """Longest time of a manoeuvre that ends at a pass, as multiple of that at zero momentum."""
@@ -399,9 +397,13 @@ class OptimalGait(GaitMethod):
         chosen = replace(self.options, duration=0.0, answers=1) if correction else self.options
         if duration is not None:
             chosen = replace(chosen, duration=duration)
+        elif motion is not None and request.previous is not None and chosen.duration > 0:
+            # The previous manoeuvre continues, and keeps its end time.
+            remaining = (len(motion.remaining) - 1) * self.control_period
+            chosen = replace(chosen, duration=remaining)
         task = SearchProblem(request, boundary, limits, chosen, clock, cancellation)
         if motion is not None:
-            return self._plan_in_motion(task, motion, given=duration is not None)
+            return self._plan_in_motion(task, motion)
         end = boundary.final_velocity
         if self._is_reached(state, goal) and np.allclose(end, boundary.velocity, rtol=_ZERO_ERROR):
             return self._build_schedule(state, goal, q[np.newaxis], {"starts": 0.0}, 0.0, end)
@@ -609,7 +611,7 @@ class OptimalGait(GaitMethod):
         h = self.control_period
         there = self._later(task, coast, end)
         at_rest = replace(there.boundary, angular_momentum=np.zeros(3))
-        few = replace(task.options, starts=min(task.options.starts, _STARTS_PER_COASTING_END))
+        few = replace(task.options, starts=min(task.options.starts, _STARTS_BEFORE_COASTING))
         free = self._begin_now(replace(there, boundary=at_rest, options=few))
         takes = len(free.positions) - 1
         begin = max(0, end - takes)
@@ -625,25 +627,15 @@ class OptimalGait(GaitMethod):
             notes={**found.notes, "coasting_time": begin * h},
         )
 
-    def _plan_in_motion(
-        self, task: SearchProblem, motion: InitialMotion, *, given: bool
-    ) -> GaitSchedule:
-        """Plan from moving joints; the remaining previous motion is the first guess.
-
-        ``given``: the duration of the options is that of this request.
-        """
+    def _plan_in_motion(self, task: SearchProblem, motion: InitialMotion) -> GaitSchedule:
+        """Plan from moving joints; the remaining previous motion is the first guess."""
         too_fast = np.abs(motion.velocity) > task.limits.velocity * (1 + _LIMIT_ROUNDING)
         if too_fast.any():
             names = ", ".join(np.array(self.robot.joint_names)[too_fast])
             raise PlanningError(f"Joints move faster than the velocity limits of optimal: {names}.")
-        again, chosen = task.request.previous is not None, self.options
-        duration = task.options.duration if given else chosen.duration
-        if again and not given and duration > 0:
-            # The previous manoeuvre continues, and keeps its end time.
-            duration = (len(motion.remaining) - 1) * self.control_period
+        again, chosen = task.request.previous is not None, task.options
         budget = replace(
             chosen,
-            duration=duration,
             starts=1 if again else min(chosen.starts, _MAX_STARTS_IN_MOTION),
             answers=1 if again else chosen.answers,
         )
@@ -653,7 +645,7 @@ class OptimalGait(GaitMethod):
             # The present manoeuvre goes on where the same goal is planned for again; a base that
             # drifts would have to pass its goal later.
             rests = not (task.boundary.drifts or len(self._wheels))
-            if again or duration > 0 or not rests or not motion.velocity.any():
+            if again or chosen.duration > 0 or not rests or not motion.velocity.any():
                 raise
             return self._plan_with_braking(task, motion, refusal)
         return self._schedule(task, found)

@@ -69,9 +69,8 @@ _NO_HELD_COMMANDS = "held commands could not be brought to the goal within the l
 
 # -- constants, each with its reason --------------------------------------------------------------
 
-_MIN_TICKS, _MIN_TICKS_IN_MOTION = 2, 4
-"""Smallest number of ticks of a manoeuvre: one to start, another one to stop; in motion, one to
-brake."""
+_MIN_TICKS = 2
+"""Smallest number of ticks of a manoeuvre: one to start, another one to stop."""
 
 _GENTLE_TICKS, _GENTLE_TIME = 20, 1.0
 """Ticks or time, s, of a gentle manoeuvre, whichever is less: it corrects a small error, and a
@@ -84,24 +83,19 @@ fast as the limits allow."""
 _BUDGET_FACTOR_WITHOUT_SOLUTION = 5.0
 """As ``optimal.time_budget`` is documented."""
 
-_COARSE_GRID_RATIO, _COARSE_GRID_RATIO_IN_MOTION = 5, 4
-"""Ratio of the full grid to the coarse one: in motion, a plan may stay on the coarse grid."""
+_COARSE_GRID_RATIO, _MIN_COARSE_INTERVALS = 5, 8
+"""Ratio of the full grid to the coarse one, and the smallest number of intervals of that; with
+fewer there is none."""
 
 _MAX_CORRECTION_INTERVALS = 40
 """Largest number of intervals of corrections, which are short."""
 
-_MIN_COARSE_INTERVALS, _MIN_COARSE_INTERVALS_IN_MOTION = 8, 10
-"""Smallest number of intervals of a coarse grid; with fewer there is none."""
-
 _COARSE_TOLERANCE = 1e-4
-"""Tolerance on a coarse grid from rest, whose solutions differ more from later ones."""
+"""Tolerance on a coarse grid, whose solutions differ more from later ones."""
 
-_SAME_COST_TOLERANCE = 1e-3
-"""Relative difference of costs up to which two solutions count as the same."""
-
-_AGREEING_COST_TOLERANCE = 3e-3
-"""Relative difference of costs up to which solutions agree: the coarse grid and the solver's
-tolerance cause such differences."""
+_SAME_COST_TOLERANCE = 3e-3
+"""Relative difference of costs up to which solutions count as the same: the coarse grid and the
+solver's tolerance cause such differences."""
 
 _MAX_ITERATIONS_OF_STOPS = 120
 """Steps of the solver from a guess in which wheels stop the base: most take twenty."""
@@ -301,7 +295,7 @@ class SearchProblem:
     def solutions_agree(self, solutions: Sequence[Trajectory]) -> bool:
         """Whether enough of the solutions agree with the best one."""
         costs = np.array([self.cost(each) for each in solutions])
-        same = int(np.sum(costs <= costs.min(initial=math.inf) * (1 + _AGREEING_COST_TOLERANCE)))
+        same = int(np.sum(costs <= costs.min(initial=math.inf) * (1 + _SAME_COST_TOLERANCE)))
         return 0 < self.options.agreeing <= same
 
 
@@ -549,9 +543,6 @@ class ManoeuvreSearch:
             else:
                 T = self._given_duration(problem.options)
             guess, bounds = guess.stretched(T / guess.duration), DurationBounds(T, T)
-            if problem.motion is not None:
-                # Only its commands are solved for.
-                return guess
         solution = grid.solve(
             boundary,
             self._planned_limits(problem, limits),
@@ -561,12 +552,8 @@ class ManoeuvreSearch:
             refining=refining and problem.hastens,
         )
         problem.cancellation.raise_if_requested()
-        if solution is None or problem.options.duration > 0 or problem.motion is not None:
+        if solution is None or problem.hastens or problem.options.duration > 0:
             return solution
-        is_fastest = grid.converged or self._model.constraints.base_rate_limit > 0
-        if problem.hastens and is_fastest:
-            return solution
-        # A solution without convergence is not yet as fast as possible.
         return self._slow_to_effort_limits(solution.at_full_speed(limits, shortest), boundary)
 
     # -- 3. full grid -----------------------------------------------------------------------------
@@ -912,18 +899,14 @@ class ManoeuvreSearch:
 
     def _grids(self, problem: SearchProblem) -> tuple[_Grid, _Grid]:
         """Return the coarse grid and the full one: the same one if there is no coarse one."""
-        full, in_motion = _Grid(problem.intervals), problem.motion is not None
-        if in_motion:
-            coarse = _Grid(full.intervals // _COARSE_GRID_RATIO_IN_MOTION)
-            fewest = _MIN_COARSE_INTERVALS_IN_MOTION
-        else:
-            coarse = _Grid(full.intervals // _COARSE_GRID_RATIO, _COARSE_TOLERANCE)
-            fewest = _MIN_COARSE_INTERVALS
+        full = _Grid(problem.intervals)
+        coarse = _Grid(full.intervals // _COARSE_GRID_RATIO, _COARSE_TOLERANCE)
         # On a coarse grid the attitude of a base that wheels stop is too far off.
-        if coarse.intervals < fewest or self._wheels_stop_base(problem):
+        if coarse.intervals < _MIN_COARSE_INTERVALS or self._wheels_stop_base(problem):
             return full, full
         # A single answer in motion is for the rest of a manoeuvre, which is short.
-        return coarse, (coarse if in_motion and problem.options.answers == 1 else full)
+        is_rest = problem.motion is not None and problem.options.answers == 1
+        return coarse, (coarse if is_rest else full)
 
     def _wheels_stop_base(self, problem: SearchProblem) -> bool:
         return len(self._wheels) > 0 and problem.boundary.is_timed and problem.motion is None
@@ -980,8 +963,6 @@ class ManoeuvreSearch:
 
     def _shortest_duration(self, problem: SearchProblem) -> float:
         """Return the duration that a manoeuvre has at least, s."""
-        if problem.motion is not None:
-            return min(_MIN_TICKS_IN_MOTION * self._period, problem.options.longest)
         gentle = min(_GENTLE_TICKS * self._period, _GENTLE_TIME) if problem.gentle else 0.0
         return max(_MIN_TICKS * self._period, gentle)
 

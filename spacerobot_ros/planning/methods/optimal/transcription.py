@@ -212,7 +212,7 @@ class Stages:
             reached.append(end_effectors(X, s, p[-1]))
         ends = ConstraintBlock.of("end", ca.vertcat(X, s), ca.vertcat(*p), ca.vertcat(*reached))
         interval = _cached_interval(robot, constraints, inequality, drifting=drifting)
-        path = interval.rows - _count_dynamics_rows(n)
+        path = interval.rows - (2 * n + 4)
         turn = turn_function(robot, drifting=drifting)
         return cls(n, beginning_block(n), interval, ends, path, turn)
 
@@ -228,10 +228,6 @@ def beginning_block(joints: int) -> ConstraintBlock:
     h, s, v = ca.SX.sym("h"), ca.SX.sym("s", joints), ca.SX.sym("v", joints)
     start = ca.SX.sym("start", joints)
     return ConstraintBlock.of("beginning", ca.vertcat(h, s, v), start, s - h * v / 2 - start)
-
-
-def _count_dynamics_rows(joints: int) -> int:
-    return 2 * joints + 4
 
 
 def _cached_interval(
