@@ -103,10 +103,6 @@ _MAX_ITERATIONS_OF_STOPS = 120
 _MAX_FULL_GRID_STARTS = 3
 """Number of other paths that are made clear on the full grid alone: it costs the most."""
 
-_VELOCITY_RESERVE_IN_MOTION = 0.02
-"""In motion: largest share of velocities reserved for changes of the path in held commands: a joint
-at full speed is slowed down by it in a quarter of a control period."""
-
 _ADDITIONAL_TICKS, _ADDITIONAL_SHARES_OF_STOPS = (0, 0, 1, 3, 7), (0.03, 0.08)
 """Control periods that are added if held commands miss the goal or a limit (the second time, the
 end is corrected), and shares of the duration if wheels stop the base: they use their torque all
@@ -545,7 +541,7 @@ class ManoeuvreSearch:
             guess, bounds = guess.stretched(T / guess.duration), DurationBounds(T, T)
         solution = grid.solve(
             boundary,
-            self._planned_limits(problem, limits),
+            limits,
             guess,
             state.stop_rule(found=found),
             bounds,
@@ -623,14 +619,13 @@ class ManoeuvreSearch:
         additional = list(_ADDITIONAL_TICKS)
         if len(self._wheels):
             additional += [math.ceil(share * ticks) for share in _ADDITIONAL_SHARES_OF_STOPS]
-        within = self._planned_limits(problem, limits)
         # In a given time there is no other than the first.
         most = 2 if problem.options.duration > 0 else len(additional)
         for more in additional[:most]:
             T = (ticks + more) * self._period
             guess = guess.stretched(T / guess.duration)
             stop = state.stop_rule()
-            solution = solver.solve(aim, within, guess, stop, DurationBounds(T, T), near)
+            solution = solver.solve(aim, limits, guess, stop, DurationBounds(T, T), near)
             problem.cancellation.raise_if_requested()
             if solution is None:
                 continue
@@ -768,7 +763,7 @@ class ManoeuvreSearch:
         apart: _Apart,
         path: Trajectory,
         duration: float,
-        reach: float = 1.0,
+        reach: float,
     ) -> tuple[Trajectory, Manoeuvre | None]:
         """Return a clear path near to one, in a given duration (s), and its held commands; by
         steps of a share of the largest reach at first. UnusableCandidateError if none was found.
@@ -870,7 +865,6 @@ class ManoeuvreSearch:
         UnusableCandidateError if none was found.
         """
         problem, boundary, kept = state.problem, state.problem.boundary, apart.kept
-        limits = self._planned_limits(problem, problem.limits)
         solver = self._solver(problem, apart.grid, kept.pairs)
         if len(guess.shapes) != apart.grid.intervals + 1:
             guess = self._guesses_on(solver, boundary).resample(guess)
@@ -882,8 +876,7 @@ class ManoeuvreSearch:
             source, lacking = self._guesses_on(solver, boundary), boundary.velocity
             lacking = lacking - guess.velocities[0]
             guess = source.with_initial_velocity(guess, lacking, problem.limits)
-        within = kept.within(limits, guess, pushing=near.largest_lack > 0)
-        # On the same grid, a solver continues at its own last solution.
+        within = kept.within(problem.limits, guess, pushing=near.largest_lack > 0)
         stop = state.stop_rule(found=True, work=solver.nonzeros)
         solution = solver.solve(boundary, within, guess, stop, bounds, near)
         problem.cancellation.raise_if_requested()
@@ -939,27 +932,13 @@ class ManoeuvreSearch:
             )
         return self._stages[key]
 
-    def _planned_limits(self, problem: SearchProblem, limits: MotionLimits) -> MotionLimits:
-        """Return the limits that solutions are to keep."""
-        if problem.motion is None:
-            return limits
-        return replace(limits, velocity=self._planned_speed_limit(limits))
-
-    def _planned_speed_limit(self, limits: MotionLimits) -> Array:
-        """Return the largest velocities (n,) that are planned in motion."""
-        given_up = np.minimum(
-            _VELOCITY_RESERVE_IN_MOTION * limits.velocity, limits.acceleration * self._period / 4
-        )
-        return np.where(np.isfinite(limits.velocity), limits.velocity - given_up, limits.velocity)
-
     def _initial_velocity(self, motion: InitialMotion, limits: MotionLimits) -> Array:
         """Return the velocities (n,) at the start: between those that are held before and after."""
         between = motion.velocity
         if len(motion.remaining) > 1:
             after = (motion.remaining[1] - motion.remaining[0]) / self._period
             between = (motion.velocity + after) / 2
-        speed = self._planned_speed_limit(limits)
-        return np.clip(between, -speed, speed)
+        return np.clip(between, -limits.velocity, limits.velocity)
 
     def _shortest_duration(self, problem: SearchProblem) -> float:
         """Return the duration that a manoeuvre has at least, s."""
