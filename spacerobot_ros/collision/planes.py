@@ -43,33 +43,29 @@ class PlaneDistance:
     Attributes
     ----------
     values
-        ``(q, w) -> d``, m.
+        ``(y, w) -> d``, m, of ``y = [q; X]`` (n + 4) with a quaternion X of any norm; only the
+        distance from an obstacle depends on X.
     jacobian
-        ``(q, w) -> dd/dq`` (1, n).
+        ``(y, w) -> dd/dy`` (1, n + 4).
     hessian
-        ``(q, w, lambda) -> `` the Hessian (n, n) of ``lambda d``.
-    is_of_obstacle
-        Whether one of the pair is an obstacle: the functions then take ``y = [q; X]`` (n + 4) in
-        place of q, with a quaternion X of any norm.
+        ``(y, w, lambda) -> `` the Hessian (n + 4, n + 4) of ``lambda d``.
     """
 
     values: ca.Function
     jacobian: ca.Function
     hessian: ca.Function
-    is_of_obstacle: bool = False
 
     @classmethod
     def of(
         cls, geometry: CollisionGeometry, pair: int, center_of_mass: ca.Function
     ) -> PlaneDistance:
         """Derive the distance of a pair, given by index; ``center_of_mass`` is ``q -> r_BC``."""
-        robot, of_obstacle = geometry.robot, bool(geometry.with_obstacles[pair])
-        n = len(robot.joint_names)
-        y, plane = ca.SX.sym("y", n + 4 if of_obstacle else n), ca.SX.sym("plane", PLANE_SIZE)
+        robot, n = geometry.robot, len(geometry.robot.joint_names)
+        y, plane = ca.SX.sym("y", n + 4), ca.SX.sym("plane", PLANE_SIZE)
         multiplier, q = ca.SX.sym("lambda"), y[:n]
         normal, offset, point = plane[:3], plane[3], plane[4:]
         first, second = (geometry.solids[i] for i in geometry.pairs[pair])
-        if of_obstacle:
+        if geometry.with_obstacles[pair]:
             chain, X = _chain_of(robot, first.body), y[n:]
             R_BL, r_BL = _pose_of_link(robot, first, chain, joint_positions(robot, q))
             R_X = symbolic_rotations.matrix_from_quaternion(X / ca.norm_2(X))
@@ -83,7 +79,6 @@ class PlaneDistance:
             ca.Function("distances", [y, plane], [ca.cse(d)]),
             ca.Function("distances_jac", [y, plane], [ca.cse(ca.jacobian(d, y))]),
             ca.Function("distances_hess", [y, plane, multiplier], [ca.cse(hessian)]),
-            of_obstacle,
         )
 
 
@@ -96,8 +91,9 @@ def support_distance(
 ) -> ca.Function:
     """Return ``(y, plane) -> d``, m: the distance of the whole second solid from a plane.
 
-    The arguments are those of :class:`PlaneDistance`, whose point is not used. For an obstacle the
-    plane is in W, and ``y = [q; X; r]`` (n + 7) has the position of the centre of mass. The solid
+    The plane is that of :class:`PlaneDistance`, whose point is not used, and ``y = q``. For an
+    obstacle the plane is in W, and ``y = [q; X; r]`` (n + 7) has the rotation of the base and the
+    position of the centre of mass. The solid
     is its rounded box, whose extent along the normal is ``sum h_i |n e_i| + radius``. So the
     distance holds however it has turned, and is smaller than that of a shape within the box.
     """

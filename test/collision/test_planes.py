@@ -26,6 +26,11 @@ def shapes(geometry: CollisionGeometry, count: int) -> Array:
     return np.random.default_rng(11).uniform(low, high, (count, len(low)))
 
 
+def y_of(q: Array) -> Array:
+    """Return what rows are functions of: without obstacles, the base may have any attitude."""
+    return np.concatenate([q, [0.0, 0.0, 0.0, 1.0]])
+
+
 def rows_of(geometry: CollisionGeometry, pair: int) -> PlaneDistance:
     center_of_mass = SpaceRobot(geometry.robot).function("center_of_mass", compile=False)
     return PlaneDistance.of(geometry, pair, center_of_mass)
@@ -50,7 +55,7 @@ def test_a_row_is_the_distance_where_its_plane_is_made(name: str, enclosures: bo
         contacts += int((exact < 0).sum())
         np.testing.assert_allclose(distances, exact, atol=1e-12)
         np.testing.assert_allclose(np.linalg.norm(planes[:, :3], axis=1), 1.0, atol=1e-9)
-        found = [float(row.values(q, plane)) for q, plane in zip(at, planes, strict=True)]
+        found = [float(row.values(y_of(q), plane)) for q, plane in zip(at, planes, strict=True)]
         # Depths by coal are those of an iteration.
         np.testing.assert_allclose(found, exact, atol=2e-5)
     assert contacts or name != "dual_arm"
@@ -65,7 +70,7 @@ def test_a_row_changes_as_the_distance_does(name: str) -> None:
         row = rows_of(geometry, pair)
         distances, planes = geometry.planes(pair, geometry.poses(at))
         for q, d, plane in zip(at, distances, planes, strict=True):
-            J = row.jacobian(q, plane).full()[0]
+            J = row.jacobian(y_of(q), plane).full()[0, : len(q)]
             moves = step * np.eye(len(q))
             after = geometry.distances(pair, geometry.poses(np.vstack([q + moves, q - moves])))
             ahead, behind = (after[: len(q)] - d) / step, (d - after[len(q) :]) / step
@@ -83,12 +88,13 @@ def test_derivatives_are_those_of_differences() -> None:
         _, planes = geometry.planes(pair, geometry.poses(at))
         # Away from the shapes that the planes were made for, too.
         for q, plane in zip(at[::-1], planes, strict=True):
-            moves = step * np.eye(len(q))
-            J = row.jacobian(q, plane).full()
-            slope = [float(row.values(q + e, plane) - row.values(q - e, plane)) for e in moves]
+            y = y_of(q)
+            moves = step * np.eye(len(y))
+            J = row.jacobian(y, plane).full()
+            slope = [float(row.values(y + e, plane) - row.values(y - e, plane)) for e in moves]
             assert np.array([slope]) / (2 * step) == pytest.approx(J, abs=1e-7)
             bend = [
-                (row.jacobian(q + e, plane) - row.jacobian(q - e, plane)).full()[0] for e in moves
+                (row.jacobian(y + e, plane) - row.jacobian(y - e, plane)).full()[0] for e in moves
             ]
-            H = row.hessian(q, plane, -1.3).full()
+            H = row.hessian(y, plane, -1.3).full()
             assert -1.3 * np.array(bend) / (2 * step) == pytest.approx(H, abs=1e-7)

@@ -237,12 +237,12 @@ N = 2
 
 
 def planes_of_links() -> PlaneDistance:
-    q, plane, multiplier = ca.SX.sym("q", N), ca.SX.sym("plane", 7), ca.SX.sym("lambda")
-    d = ca.sin(q[0]) * q[1] * plane[1] + q[0] ** 2 - plane[3]
+    y, plane, multiplier = ca.SX.sym("y", N + 4), ca.SX.sym("plane", 7), ca.SX.sym("lambda")
+    d = ca.sin(y[0]) * y[1] * plane[1] + y[0] ** 2 - plane[3]
     return PlaneDistance(
-        ca.Function("d", [q, plane], [d]),
-        ca.Function("J", [q, plane], [ca.jacobian(d, q)]),
-        ca.Function("H", [q, plane, multiplier], [ca.hessian(multiplier * d, q)[0]]),
+        ca.Function("d", [y, plane], [d]),
+        ca.Function("J", [y, plane], [ca.jacobian(d, y)]),
+        ca.Function("H", [y, plane, multiplier], [ca.hessian(multiplier * d, y)[0]]),
     )
 
 
@@ -253,7 +253,6 @@ def planes_of_obstacles() -> PlaneDistance:
         ca.Function("d", [y, plane], [d]),
         ca.Function("J", [y, plane], [ca.jacobian(d, y)]),
         ca.Function("H", [y, plane, multiplier], [ca.hessian(multiplier * d, y)[0]]),
-        is_of_obstacle=True,
     )
 
 

@@ -386,28 +386,22 @@ def _distance_block(n: int, pairs: Sequence[PlaneDistance], instants: int) -> Co
     h, s, v, v_next = ca.MX.sym("h"), *(ca.MX.sym(name, n) for name in ("s", "v", "v+"))
     X, X_next, lack = ca.MX.sym("X", 4), ca.MX.sym("X+", 4), ca.MX.sym("lack")
     z = ca.vertcat(h, X, s, v, X_next, v_next, lack)
-    turning = any(rows.is_of_obstacle for rows in pairs)
     planes = ca.MX.sym("planes", PLANE_SIZE, len(pairs) * instants)
     multipliers = ca.MX.sym("lambda", len(pairs) * instants)
     values, jacobian, hessian = [], [], ca.MX(z.numel(), z.numel())
-    size, curved = n + 4 if turning else n, [_curved_where_it_counts(rows) for rows in pairs]
+    size, curved = n + 4, [_curved_where_it_counts(rows) for rows in pairs]
     for number, by_row in enumerate(ca.vertsplit(multipliers, len(pairs)), 1):
         tau = number / instants
         # The point is s + h (b v + c v+).
         b, c = tau - 1 / 2 - tau**2 / 2, tau**2 / 2
         along = b * v + c * v_next
-        point = s + h * along
-        turned = ca.vertcat(point, (1 - tau) * X + tau * X_next)
+        y = ca.vertcat(s + h * along, (1 - tau) * X + tau * X_next)
         slopes, slope, curvature = [], ca.MX(1, size), ca.MX(size, size)
         for row, (rows, multiplier) in enumerate(zip(pairs, ca.vertsplit(by_row), strict=True)):
             plane = planes[:, (number - 1) * len(pairs) + row]
-            at = turned if rows.is_of_obstacle else point, plane
-            J, (weighted, H) = rows.jacobian(*at), curved[row](*at, multiplier)
-            if turning and not rows.is_of_obstacle:
-                J, weighted = (ca.horzcat(each, ca.MX(1, 4)) for each in (J, weighted))
-                H = ca.diagcat(H, ca.MX(4, 4))
-            values.append(rows.values(*at) + lack)
-            slopes.append(J)
+            weighted, H = curved[row](y, plane, multiplier)
+            values.append(rows.values(y, plane) + lack)
+            slopes.append(rows.jacobian(y, plane))
             slope += weighted
             curvature += H
         J, slope = ca.vertcat(*slopes), slope[:, :n]
@@ -445,11 +439,10 @@ def _curved_where_it_counts(rows: PlaneDistance) -> ca.Function:
 def _point_derivative_columns(
     A: ca.MX, along: ca.MX, weights: tuple[ca.MX, ca.MX], tau: float, n: int
 ) -> ca.MX:
-    """Return ``A P``, where P is the derivative of a point of an interval, and of the turn there if
-    A has columns for it, with respect to ``[h; X; s; v; X+; v+]``.
+    """Return ``A P``, where P is the derivative of a point of an interval and of the turn there
+    with respect to ``[h; X; s; v; X+; v+]``.
     """
-    q, by_step = A[:, :n], A[:, :n] @ along
-    X = A[:, n:] if A.size2() > n else ca.MX(A.size1(), 4)
+    q, X, by_step = A[:, :n], A[:, n:], A[:, :n] @ along
     b, c = weights
     return ca.horzcat(by_step, (1 - tau) * X, q, b * q, tau * X, c * q)
 
