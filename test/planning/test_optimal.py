@@ -344,7 +344,7 @@ def solved(
     limits = MotionLimits.of(arm, options)
     curvature = arm.function("curvature", compile=False)
     guesses = InitialGuesses(stages.rotation_of_step, curvature, INTERVALS)
-    guess = next(guesses.generate(boundary, limits, ARM_START))
+    guess = next(guesses.generate(boundary, limits))
     solution = solver.solve(boundary, limits, guess, StopRule(300), DurationBounds(1.0, 60.0))
     assert solver.converged
     assert solution is not None

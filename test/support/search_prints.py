@@ -88,12 +88,10 @@ def guesses() -> dict[str, Any]:
     found: dict[str, Any] = {}
     source = InitialGuesses(*_areas(), 60)
     boundary = BoundaryConditions(START, TURN, FINAL, FINAL)
-    sequence = source.generate(boundary, LIMITS, FINAL)
+    sequence = source.generate(boundary, LIMITS)
     found["to one end"] = [_trajectory(next(sequence)) for _ in range(6)]
     ends = (PossibleEnd(FINAL, TURN), PossibleEnd(-FINAL / 2, np.array([0.6, 0.0, 0.0, 0.8])))
-    sequence = source.generate(
-        BoundaryConditions(START, TURN, FINAL, possible_ends=ends), LIMITS, FINAL
-    )
+    sequence = source.generate(BoundaryConditions(START, TURN, FINAL, possible_ends=ends), LIMITS)
     found["to two ends"] = [_trajectory(next(sequence)) for _ in range(5)]
     instants = np.linspace(0.0, 1.0, 31)
     for name in ("_trigonometric_loop", "_three_frequency_loop", "_square_loop"):
@@ -102,7 +100,7 @@ def guesses() -> dict[str, Any]:
             _sums(loop(np.random.default_rng(seed), instants, n))
             for seed, n in itertools.product((1, 2), (2, 5))
         ]
-    first = next(source.generate(boundary, LIMITS, FINAL))
+    first = next(source.generate(boundary, LIMITS))
     velocity = np.array([0.2, -0.3, 0.5])
     found["moving at the start"] = _trajectory(
         source.with_initial_velocity(first, velocity, LIMITS)
@@ -192,7 +190,7 @@ def held() -> dict[str, Any]:
     stages = Stages.of(robot, np.eye(3), False, PathConstraints.of(robot, OptimalOptions()))
     source = InitialGuesses(stages.rotation_of_step, robot.function("curvature", compile=False), 60)
     way = BoundaryConditions(START, TURN, FINAL, FINAL)
-    sequence = source.generate(way, WITHIN, FINAL)
+    sequence = source.generate(way, WITHIN)
     found: dict[str, Any] = {}
     for number, (period, free) in enumerate(
         ((0.1, False), (0.25, True), (0.7, False), (0.4, True))

@@ -201,17 +201,12 @@ class EndEffectorRows:
 
         They are counted at shapes in general position, with the attitude of the base given or free.
         """
-        ranks, rows = [], 0
-        for q, turn in zip(*self._samples(), strict=True):
-            blocks = []
-            for each in self.directions:
-                by_shape, by_turn = self._rates(each.link, q, turn)
-                use = np.hstack([by_shape] if fixed_attitude else [by_shape, by_turn])
-                blocks += [each.displacements @ use[:3], each.rotations @ use[3:]]
-            J = np.vstack(blocks)
-            rows = len(J)
-            ranks.append(int(np.linalg.matrix_rank(J, tol=1e-6)))
-        return max(ranks), rows
+        shapes, turns = self._samples()
+        nowhere = np.tile([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0], len(self.links))
+        _, by_rotation, J = self.evaluate(turns, shapes, nowhere)
+        if not fixed_attitude:
+            J = np.concatenate([J, by_rotation @ self.axes.T], axis=2)
+        return int(np.linalg.matrix_rank(J, tol=1e-6).max()), J.shape[1]
 
     def require_directions(
         self, state: RobotState, goals: Sequence[EndEffectorGoal], tolerance: tuple[float, float]

@@ -83,13 +83,12 @@ class InitialGuesses:
         self._instants = np.linspace(0.0, 1.0, intervals + 1)
         self._angular_momentum = angular_momentum
 
-    def generate(
-        self, boundary: BoundaryConditions, limits: MotionLimits, final: Array
-    ) -> Iterator[Trajectory]:
-        """Yield guesses that end in the shape ``final`` (n,), or in all possible ends in turn."""
+    def generate(self, boundary: BoundaryConditions, limits: MotionLimits) -> Iterator[Trajectory]:
+        """Yield guesses that end in the likely shape, or in all possible ends in turn."""
         rng = np.random.default_rng(1)
         half = limits.joint_ranges(boundary.start)[1]
-        ends = boundary.possible_ends or (PossibleEnd(final, boundary.goal_rotation),)
+        likely = PossibleEnd(boundary.likely_final_shape, boundary.goal_rotation)
+        ends = boundary.possible_ends or (likely,)
         sizes = []
         for end in ends:
             (direct,) = self._build_trajectories(
@@ -129,7 +128,7 @@ class InitialGuesses:
         follow from the momentum.
         """
         direct = self._direct_path(boundary.start, boundary.likely_final_shape)
-        loops = self.generate(boundary, limits, boundary.likely_final_shape)
+        loops = self.generate(boundary, limits)
         for number in itertools.count():
             shapes = next(loops).shapes if number else direct
             found = self._turned_by_wheels(wheels, boundary, limits, robot, shapes)

@@ -272,6 +272,12 @@ class OptimalGait(GaitMethod):
             rates[index] = qdot[index]
         return rates
 
+    def _require_speeds(self, velocity: Array) -> None:
+        too_fast = np.abs(velocity) > self._limits.velocity * (1 + _LIMIT_ROUNDING)
+        if too_fast.any():
+            names = ", ".join(np.array(self.robot.joint_names)[too_fast])
+            raise PlanningError(f"Joints move faster than the velocity limits of optimal: {names}.")
+
     def _with_wheels(
         self, boundary: BoundaryConditions, request: PlanRequest
     ) -> BoundaryConditions:
@@ -291,10 +297,7 @@ class OptimalGait(GaitMethod):
         elif request.previous is not None and request.previous.end_velocities is not None:
             near = request.previous.end_velocities[wheels.index]
         limit = self._limits.velocity
-        fast = np.abs(begin) > limit * (1 + _LIMIT_ROUNDING)
-        if fast.any():
-            names = ", ".join(np.array(self.robot.joint_names)[fast])
-            raise PlanningError(f"Wheels spin faster than the velocity limits of optimal: {names}.")
+        self._require_speeds(begin)
         begin = np.clip(begin, -limit, limit)
         L_B = boundary.angular_momentum
         if boundary.drifts:
@@ -629,10 +632,7 @@ class OptimalGait(GaitMethod):
 
     def _plan_in_motion(self, task: SearchProblem, motion: InitialMotion) -> GaitSchedule:
         """Plan from moving joints; the remaining previous motion is the first guess."""
-        too_fast = np.abs(motion.velocity) > task.limits.velocity * (1 + _LIMIT_ROUNDING)
-        if too_fast.any():
-            names = ", ".join(np.array(self.robot.joint_names)[too_fast])
-            raise PlanningError(f"Joints move faster than the velocity limits of optimal: {names}.")
+        self._require_speeds(motion.velocity)
         again, chosen = task.request.previous is not None, task.options
         budget = replace(
             chosen,

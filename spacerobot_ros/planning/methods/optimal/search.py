@@ -308,7 +308,7 @@ class _SearchState:
 
     ``starts`` guesses were tried, ``rejection`` is the reason against the last candidate, ``best``
     the duration of the fastest path so far, s: of the clear ones if it ``is_clearing``. ``solved``
-    are guesses on the coarse grid with their solutions, ``work`` is that on clear paths.
+    are solutions on the coarse grid, a guess each, ``work`` is that on clear paths.
     """
 
     problem: SearchProblem
@@ -320,7 +320,7 @@ class _SearchState:
     best: float = math.inf
     is_clearing: bool = False
     work: float = 0.0
-    solved: list[tuple[Trajectory, Trajectory | None]] = field(default_factory=list)
+    solved: list[Trajectory | None] = field(default_factory=list)
     _reported: float = 0.0
 
     def is_over(self, *, found: bool) -> bool:
@@ -454,19 +454,18 @@ class ManoeuvreSearch:
         """Yield guesses on a grid without end, in the same order for equal problems."""
         problem, source = state.problem, self._guesses_on(grid, state.problem.boundary)
         boundary, limits, motion = problem.boundary, problem.limits, problem.motion
-        likely = boundary.likely_final_shape
         if motion is not None:
             velocity = np.broadcast_to(boundary.velocity, boundary.start.shape)
             if len(motion.remaining) > 1:
                 yield source.from_ticks(motion.remaining, velocity, self._period)
-            for guess in source.generate(boundary, limits, likely):
+            for guess in source.generate(boundary, limits):
                 yield source.with_initial_velocity(guess, velocity, limits)
         if problem.guess is not None:
             yield source.resample(problem.guess)
         if len(self._wheels) and len(self._model.axes):
             robot = self._model.robot
             yield from source.generate_with_wheels(self._wheels, boundary, limits, robot)
-        yield from source.generate(boundary, limits, likely)
+        yield from source.generate(boundary, limits)
 
     def _guesses_on(self, grid: MultipleShooting, boundary: BoundaryConditions) -> InitialGuesses:
         curvature = self._model.robot.function("curvature", compile=False)
@@ -487,7 +486,7 @@ class ManoeuvreSearch:
         for guess in itertools.islice(self._guesses(state, solver), problem.options.starts):
             solution = self._solve_start(state, solver, guess, found=bool(solutions))
             if grid == state.coarse:
-                state.solved.append((guess, solution))
+                state.solved.append(solution)
             if solution is not None:
                 solutions.append(solution)
             # A search may also be cut short within its last start.
@@ -614,7 +613,6 @@ class ManoeuvreSearch:
         pairs = () if kept is None else kept.pairs
         solver = self._solver(problem, _Grid(len(trajectory.shapes) - 1), pairs)
         ticks = max(_MIN_TICKS, math.ceil(trajectory.duration / self._period - 1e-6))
-        before = None if problem.motion is None else problem.motion.velocity
         guess, aim = trajectory, problem.boundary
         additional = list(_ADDITIONAL_TICKS)
         if len(self._wheels):
@@ -630,7 +628,7 @@ class ManoeuvreSearch:
             if solution is None:
                 continue
             held = self._model.hold(
-                solution, problem.boundary, problem.limits, fixed=True, before=before
+                solution, problem.boundary, problem.limits, fixed=True, before=problem.velocity
             )
             if held is not None:
                 return held
@@ -702,8 +700,8 @@ class ManoeuvreSearch:
         most = _MAX_CLEAR_STARTS_IN_MOTION if brakes else _MAX_CLEAR_STARTS
         starts = min(problem.options.starts, most)
         others = itertools.islice(self._guesses(state, solver), len(state.solved), starts)
-        solved = ((guess, self._solve_start(state, solver, guess)) for guess in others)
-        for _, solution in itertools.chain(state.solved[:starts], solved):
+        solved = (self._solve_start(state, solver, guess) for guess in others)
+        for solution in itertools.chain(state.solved[:starts], solved):
             if state.is_over(found=bool(found)):
                 return
             if solution is None:
