@@ -93,9 +93,9 @@ _MAX_CORRECTION_INTERVALS = 40
 _COARSE_TOLERANCE = 1e-4
 """Tolerance on a coarse grid, whose solutions differ more from later ones."""
 
-_SAME_COST_TOLERANCE = 3e-3
-"""Relative difference of costs up to which solutions count as the same: the coarse grid and the
-solver's tolerance cause such differences."""
+_SAME_COST_TOLERANCE, _AGREEING_COST_TOLERANCE = 1e-3, 3e-3
+"""Relative differences of costs up to which two solutions count as the same, and up to which they
+agree: the coarse grid and the solver's tolerance cause such differences."""
 
 _MAX_ITERATIONS_OF_STOPS = 120
 """Steps of the solver from a guess in which wheels stop the base: most take twenty."""
@@ -291,7 +291,7 @@ class SearchProblem:
     def solutions_agree(self, solutions: Sequence[Trajectory]) -> bool:
         """Whether enough of the solutions agree with the best one."""
         costs = np.array([self.cost(each) for each in solutions])
-        same = int(np.sum(costs <= costs.min(initial=math.inf) * (1 + _SAME_COST_TOLERANCE)))
+        same = int(np.sum(costs <= costs.min(initial=math.inf) * (1 + _AGREEING_COST_TOLERANCE)))
         return 0 < self.options.agreeing <= same
 
 
