@@ -15,8 +15,8 @@ changes of all shapes at the ticks; the end is linear in them to first order, an
 programs reach it (sequential quadratic programming). Otherwise the manoeuvre takes a few
 ticks longer.
 
-If the last shape is free, it is changed as well: loops of some robots do not rotate the base. A
-manoeuvre of a few ticks is a polygon that does not resemble the curve any more; with
+The program changes the last shape as well, if that is free: loops of some robots do not rotate the
+base. A manoeuvre of a few ticks is a polygon that does not resemble the curve any more; with
 two or three ticks it may have too few corners to end on the goal, and takes one more.
 """
 
@@ -145,11 +145,12 @@ class ManoeuvreModel:
             ticks if fixed else max(_MIN_SMOOTH_TICKS, math.ceil(_MAX_STRETCH_FACTOR * ticks) + 4)
         )
         free = boundary.final is None and boundary.center is None
-        programs = 0
+        # The last shape is that at which end-effectors are at their goals.
+        moves_end, programs = free and self.end_effectors is not None, 0
         while ticks <= most:
             factor, too_fast = 1.0, True
             positions = trajectory.at_ticks(ticks)
-            held = self._adjust_to_goal(positions, boundary, final, limits, moves_end=free)
+            held = self._adjust_to_goal(positions, boundary, final, limits, moves_end=moves_end)
             if held is not None:
                 after = boundary.final_velocity
                 needed, overrun = limits.excess(held.positions, self.control_period, before, after)
@@ -274,6 +275,8 @@ class ManoeuvreModel:
         waves, best = self._build_waves(positions, limits), math.inf
         if moves_end:
             speed, _ = _speeds_and_half_ranges(positions[0], limits)
+            # The others make up for joints at the end of their range.
+            speed = speed * self._fading(positions[-1:], limits)[0]
             ramps = (s**2 * (3 - 2 * s))[:, :, np.newaxis] * np.eye(self.robot.n) * speed
             waves = np.hstack([waves, ramps])
         for _ in range(_MAX_NEWTON_STEPS):
@@ -298,16 +301,21 @@ class ManoeuvreModel:
         s = np.linspace(0.0, 1.0, len(positions))[:, np.newaxis]
         order = np.arange(1, _WAVES_PER_JOINT + 1)
         shape = np.sin(math.pi * s) * np.sin(math.pi * s * order) / order
-        speed, half = _speeds_and_half_ranges(positions[0], limits)
-        room = np.minimum(positions - limits.lower, limits.upper - positions)
-        fading = np.clip(np.nan_to_num(room / (_FADING_ZONE * half), nan=0.0), 0.0, 1.0)
-        # The wave begins smoothly, so that accelerations stay small.
-        fading = fading**2 * (3 - 2 * fading)
+        speed, _ = _speeds_and_half_ranges(positions[0], limits)
+        fading = self._fading(positions, limits)
         joints = np.eye(self.robot.n) * speed
         waves = (
             shape[:, :, np.newaxis, np.newaxis] * (fading[:, np.newaxis] * joints)[:, np.newaxis]
         )
         return np.asarray(waves.reshape(len(positions), -1, self.robot.n))
+
+    def _fading(self, positions: Array, limits: MotionLimits) -> Array:
+        """Return factors (K, n) that vanish smoothly at the ends of the joints' ranges."""
+        half = limits.joint_ranges(positions[0])[1]
+        room = np.minimum(positions - limits.lower, limits.upper - positions)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            share = np.clip(np.nan_to_num(room / (_FADING_ZONE * half), nan=0.0), 0.0, 1.0)
+        return np.asarray(share**2 * (3 - 2 * share))
 
     def _end_error(
         self, positions: Array, quaternions: Array, boundary: BoundaryConditions
