@@ -108,6 +108,10 @@ _ADDITIONAL_TICKS, _ADDITIONAL_SHARES_OF_STOPS = (0, 0, 1, 3, 7), (0.03, 0.08)
 end is corrected), and shares of the duration if wheels stop the base: they use their torque all
 the time."""
 
+_HELD_SHARE = 0.99
+"""Share of velocity and acceleration limits for solutions in whole ticks from rest: the rest is for
+held commands. Without it, wheels that stop a base take twice the CPU."""
+
 _HELD_REACH_SHARE = 0.3
 """Share of the largest reach by which a clear path may change in a solution in whole ticks."""
 
@@ -607,6 +611,12 @@ class ManoeuvreSearch:
         more, is solved for.
         """
         problem, limits, near = state.problem, state.problem.limits, None
+        if problem.motion is None:
+            velocity, acceleration = (
+                _HELD_SHARE * limits.velocity,
+                _HELD_SHARE * limits.acceleration,
+            )
+            limits = replace(limits, velocity=velocity, acceleration=acceleration)
         if kept is not None and kept.pairs:
             limits = kept.within(limits, trajectory)
             near = Neighbourhood.within(limits, _HELD_REACH_SHARE)
