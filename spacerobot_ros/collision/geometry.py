@@ -294,24 +294,26 @@ class CollisionGeometry:
         return float(distances[0]), int(pairs[0])
 
     def nearest_along(
-        self, shapes: Array, base: BasePoses | None = None
+        self, shapes: Array, base: BasePoses | None = None, required: Array | float = 0.0
     ) -> tuple[Array, npt.NDArray[np.int64]]:
         """Return the smallest distances (N,) in configurations (N, n), m, and their pairs (N,).
 
-        Distances are infinite if there are no pairs; obstacles are ignored without poses of the
-        base.
+        Distances are those beyond ``required``, (P,) distances of the pairs, of which minus
+        infinity ignores one. They are infinite if there are no pairs; obstacles are ignored without
+        poses of the base.
         """
         distances = np.full(len(shapes), np.inf)
         pairs = np.zeros(len(shapes), dtype=np.int64)
         if not len(self.pairs) or not len(shapes):
             return distances, pairs
         R, r = self.poses(shapes, base)
-        bounds = self.lower_bounds((R, r))
+        required = np.broadcast_to(required, len(self.pairs))
+        bounds = self.lower_bounds((R, r)) - required
         # Pairs that may be the nearest come first, so that most others need not be looked at.
         for pair in np.argsort(bounds.min(axis=0), kind="stable").tolist():
             at = np.flatnonzero(bounds[:, pair] < distances)
             if len(at):
-                found = self.distances(pair, (R[at], r[at]))
+                found = self.distances(pair, (R[at], r[at])) - required[pair]
                 nearer = found < distances[at]
                 distances[at[nearer]], pairs[at[nearer]] = found[nearer], pair
         return distances, pairs

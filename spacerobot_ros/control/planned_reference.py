@@ -21,6 +21,7 @@ from spacerobot_ros.control.state import (
 )
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.model.description import Array, RobotDescription
+from spacerobot_ros.model.grasp import RobotMotion
 from spacerobot_ros.model.rotations import matrix_from_quaternion
 from spacerobot_ros.model.space_robot import SpaceRobot
 from spacerobot_ros.model.target_motion import RelativeMotionOverTime
@@ -28,7 +29,7 @@ from spacerobot_ros.model.thrusters import find_thrusters
 from spacerobot_ros.parameters import parameter
 from spacerobot_ros.planning.core.cancellation import Cancellation
 from spacerobot_ros.planning.core.schedule import BasePath
-from spacerobot_ros.planning.methods.thrust.goals import Grapple, ThrustGoal, ThrustStart
+from spacerobot_ros.planning.methods.thrust.goals import Grapple, ThrustGoal
 from spacerobot_ros.planning.methods.thrust.motion import FrameSample, ThrustMotion
 from spacerobot_ros.planning.methods.thrust.propulsion import Propulsion
 from spacerobot_ros.planning.methods.thrust.search import ThrustOptions, ThrustPlanner
@@ -291,20 +292,19 @@ class ReferencePlanner:
             No motion is found.
         """
         begin, _ = self._begin(start, state)
-        motion = self._planner.plan(begin, ThrustGoal(grapple=grapple), cancellation)
+        motion = self._planner.plan(begin, grapple, cancellation)
         return GrappleReference(start, limits, motion, grapple)
 
-    def _begin(self, start: Reference, state: ControlState) -> tuple[ThrustStart, Array]:
+    def _begin(self, start: Reference, state: ControlState) -> tuple[RobotMotion, Array]:
         """Return where a plan from a reference begins, and the shape (n,) there."""
         self._planner.clearance = self._clearance
         base, joints = start.base, start.joints if self._outputs.joints else None
         assert base is not None
         R_BW = matrix_from_quaternion(base.quaternion).T
         q, qdot = (state.q, state.qdot) if joints is None else (joints.q, joints.qdot)
-        begin = ThrustStart(
-            np.concatenate([base.position, base.quaternion]),
-            R_BW @ base.velocity,
-            R_BW @ base.angular_velocity,
+        begin = RobotMotion(
+            _numbers(base),
+            np.concatenate([R_BW @ base.velocity, R_BW @ base.angular_velocity]),
             q.copy(),
             qdot.copy() if _moves(base) else np.zeros(len(q)),
         )

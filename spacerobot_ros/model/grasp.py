@@ -168,6 +168,11 @@ class RobotMotion:
     q: Array
     qdot: Array
 
+    @classmethod
+    def at_rest(cls, pose: Array, q: Array) -> RobotMotion:
+        """Return a state without velocities."""
+        return cls(pose, np.zeros(6), q, np.zeros(len(q)))
+
     @property
     def R_WB(self) -> Array:
         """Attitude of the base link (3, 3)."""

@@ -16,11 +16,11 @@ from support.thrust_flights import distance_from_target, tumbled
 from spacerobot_ros import fly
 from spacerobot_ros.errors import PlanningError
 from spacerobot_ros.model import SpaceRobot, load_robot
-from spacerobot_ros.model.grasp import BodyMotion, TargetBody
+from spacerobot_ros.model.grasp import BodyMotion, RobotMotion, TargetBody
 from spacerobot_ros.model.target_motion import TorqueFreeMotion
 from spacerobot_ros.model.thrusters import thrusters_of_urdf
 from spacerobot_ros.model.urdf import parse_robot
-from spacerobot_ros.planning.methods.thrust.goals import Grapple, ThrustGoal, ThrustStart
+from spacerobot_ros.planning.methods.thrust.goals import Grapple
 from spacerobot_ros.planning.methods.thrust.propulsion import Propulsion
 from spacerobot_ros.planning.methods.thrust.search import ThrustOptions, ThrustPlanner
 from spacerobot_ros.resources import robot_file, share_directory
@@ -62,8 +62,8 @@ def meeting(free: BodyMotion, clearance: float = 0.02) -> Grapple:
 
 def test_a_fixture_is_met_with_its_pose_and_velocities_round_the_target() -> None:
     planner, free = boomed(), slab((2.5, 0.2, -0.1), (0.004, -0.003, 0.0))
-    start, target = ThrustStart.at_rest(HERE, np.zeros(1)), parse_robot(SLAB)
-    motion = planner.plan(start, ThrustGoal(grapple=meeting(free)))
+    start, target = RobotMotion.at_rest(HERE, np.zeros(1)), parse_robot(SLAB)
+    motion = planner.plan(start, meeting(free))
     T, dt = motion.duration, 1e-3
     X, r = tumbled(target, free, np.array([0.0, T - dt, T, T + dt]))
     R, hand = Rotation.from_quat(X), motion.at(T).end_effector
@@ -76,7 +76,7 @@ def test_a_fixture_is_met_with_its_pose_and_velocities_round_the_target() -> Non
     assert hand.angular_velocity == pytest.approx(turned, abs=1e-4)
     robot = planner.robot.description
     assert distance_from_target(robot, target, motion, free) > 0.0199
-    careless = planner.plan(start, ThrustGoal(grapple=meeting(free, 0.0)))
+    careless = planner.plan(start, meeting(free, 0.0))
     assert distance_from_target(robot, target, careless, free) < 0
 
 
@@ -101,10 +101,9 @@ def test_a_fixture_that_faces_away_is_met_when_it_has_turned() -> None:
     planner, target = servicer(), load_robot(SATELLITE)
     free = satellite([0.254, 0.691, -0.641, -0.216], [-2.38, 1.2, 3.88], [-5.93, 0.91, 0.0])
     motion = TorqueFreeMotion(TargetBody.of(target, "grapple"), free)
-    start = ThrustStart.at_rest(HERE, FOLDED)
+    start = RobotMotion.at_rest(HERE, FOLDED)
     clear, careless = (
-        planner.plan(start, ThrustGoal(grapple=Grapple(motion, target, distance)))
-        for distance in (0.02, 0.0)
+        planner.plan(start, Grapple(motion, target, distance)) for distance in (0.02, 0.0)
     )
     robot = planner.robot.description
     assert distance_from_target(robot, target, careless, free) < -0.1
@@ -119,10 +118,10 @@ def test_a_grasp_leaves_no_angular_momentum_if_that_is_asked_for() -> None:
     free = satellite([-0.04, -0.62, 0.59, 0.51], [3.9, 0.4, 0.6], [0.0, 2.0, -2.0])
     R, omega = free.R_WT, free.omega
     grapple = Grapple(TorqueFreeMotion(body, free))
-    start = ThrustStart.at_rest(HERE, FOLDED)
+    start = RobotMotion.at_rest(HERE, FOLDED)
     totals, durations = [], []
     for detumbles in (False, True):
-        asked = ThrustGoal(grapple=replace(grapple, detumbles=detumbles))
+        asked = replace(grapple, detumbles=detumbles)
         motion = planner.plan(start, asked)
         model = pin.buildModelFromXML(planner.robot.description.urdf, pin.JointModelFreeFlyer())
         data, last = model.createData(), motion.at(motion.duration)
@@ -153,11 +152,11 @@ def test_a_grasp_leaves_no_angular_momentum_if_that_is_asked_for() -> None:
 
 
 def test_meetings_that_cannot_be_are_refused_in_a_sentence() -> None:
-    start = ThrustStart.at_rest(HERE, np.zeros(1))
+    start = RobotMotion.at_rest(HERE, np.zeros(1))
 
     def refusal(free: BodyMotion, **options: Any) -> str:
         with pytest.raises(PlanningError) as refused:
-            boomed(**options).plan(start, ThrustGoal(grapple=meeting(free)))
+            boomed(**options).plan(start, meeting(free))
         return str(refused.value)
 
     # From rest to 6 m/s takes 17 kg 128 s by 0.8 N.

@@ -13,10 +13,11 @@ from support.thrust_flights import beyond, flown_by_pinocchio
 
 from spacerobot_ros.errors import NotFoundError, ParameterError, PlanningError, UnreachableError
 from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.model.grasp import RobotMotion
 from spacerobot_ros.model.thrusters import ThrusterTable, thrusters_of_urdf
 from spacerobot_ros.model.urdf import parse_world
 from spacerobot_ros.model.world import with_world
-from spacerobot_ros.planning.methods.thrust.goals import ThrustGoal, ThrustStart
+from spacerobot_ros.planning.methods.thrust.goals import ThrustGoal
 from spacerobot_ros.planning.methods.thrust.motion import ThrustMotion
 from spacerobot_ros.planning.methods.thrust.propulsion import Propulsion
 from spacerobot_ros.planning.methods.thrust.search import ThrustOptions, ThrustPlanner
@@ -53,7 +54,7 @@ def test_shortest_times_and_least_impulses_are_those_of_closed_forms(rotates: bo
     way, turn = np.array([0.0, 1.2, 0.0]), np.array([0.0, 0.0, 1.1])
     displacement, rotvec = (0 * way, turn) if rotates else (way, 0 * turn)
     distance, limit, inertia = (1.1, TORQUE, INERTIA[2]) if rotates else (1.2, FORCE, MASS)
-    start = ThrustStart.at_rest(START, np.zeros(0))
+    start = RobotMotion.at_rest(START, np.zeros(0))
     goal = ThrustGoal(beyond(START, displacement, rotvec))
     fastest = cube_planner(time_factor=1.0).plan(start, goal)
     shortest = 2 * np.sqrt(distance * inertia / limit)
@@ -74,7 +75,7 @@ def test_a_cube_turns_on_the_way_where_that_lets_more_thrusters_push() -> None:
     planner = ThrustPlanner(robot, Propulsion.of_table(table), options)
     upright = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
     goal = ThrustGoal(upright + np.eye(7)[0] * 1.2)
-    motion = planner.plan(ThrustStart.at_rest(upright, np.zeros(0)), goal)
+    motion = planner.plan(RobotMotion.at_rest(upright, np.zeros(0)), goal)
     assert motion.duration < 0.947 * straight
     turned = Rotation.from_quat(motion.at(motion.duration / 2).base.quaternion)
     assert turned.magnitude() > 0.2
@@ -82,7 +83,7 @@ def test_a_cube_turns_on_the_way_where_that_lets_more_thrusters_push() -> None:
 
 def test_pinocchio_ends_at_the_goal_under_the_wrenches_and_efforts_of_a_plan() -> None:
     planner = servicer()
-    start = ThrustStart.at_rest(START, FOLDED)
+    start = RobotMotion.at_rest(START, FOLDED)
     goal = beyond(START, np.array([1.0, 0.4, -0.2]), np.array([0.1, -0.2, 0.5]))
     shape = FOLDED + np.array([0.3, 0.2, -0.4, 0.5, -0.3, 0.6])
     motion = planner.plan(start, ThrustGoal(base=goal, shape=shape))
@@ -100,7 +101,7 @@ def test_pinocchio_ends_at_the_goal_under_the_wrenches_and_efforts_of_a_plan() -
 
 
 def test_an_arm_that_is_to_keep_its_shape_keeps_it_all_the_way() -> None:
-    planner, start = servicer(), ThrustStart.at_rest(START, FOLDED)
+    planner, start = servicer(), RobotMotion.at_rest(START, FOLDED)
     goal = beyond(START, np.array([1.0, 0.4, -0.2]), np.array([0.1, -0.2, 0.5]))
     motion = planner.plan(start, ThrustGoal(base=goal, shape=FOLDED, keeps_shape=True))
     assert np.abs(motion.path()[0] - FOLDED).max() < 1e-9
@@ -113,7 +114,7 @@ def test_hand_and_base_reach_their_poses_together() -> None:
     pose = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
     base = np.array([1.0, 0.4, -0.2, *Rotation.from_rotvec([0.1, -0.2, 0.5]).as_quat()])
     hand = np.array([2.28, 1.85, 0.79, *Rotation.from_rotvec([-0.56, 0.95, 1.05]).as_quat()])
-    motion = planner.plan(ThrustStart.at_rest(pose, FOLDED), ThrustGoal(base, hand))
+    motion = planner.plan(RobotMotion.at_rest(pose, FOLDED), ThrustGoal(base, hand))
     last = motion.at(motion.duration)
     assert last.end_effector is not None
     for frame, goal in ((last.base, base), (last.end_effector, hand)):
@@ -125,7 +126,7 @@ def test_hand_and_base_reach_their_poses_together() -> None:
 def test_accelerations_are_the_derivatives_of_velocities() -> None:
     planner = servicer()
     goal = beyond(START, np.array([-0.5, 0.4, 0.3]), np.array([0.4, 0.1, -0.3]))
-    motion = planner.plan(ThrustStart.at_rest(START, FOLDED), ThrustGoal(base=goal, shape=FOLDED))
+    motion = planner.plan(RobotMotion.at_rest(START, FOLDED), ThrustGoal(base=goal, shape=FOLDED))
     time, dt = 7.37 * motion.step, 1e-4
     before, at, after = (motion.at(time + by) for by in (-dt, 0.0, dt))
     for one, frame, other in zip(before[:2], at[:2], after[:2], strict=True):
@@ -151,7 +152,7 @@ def test_a_box_in_the_way_is_passed_clear_of_it() -> None:
         "</robot>"
     )
     robot = SpaceRobot(with_world(SpaceRobot.from_urdf(CUBE).description, world))
-    start = ThrustStart.at_rest(START, np.zeros(0))
+    start = RobotMotion.at_rest(START, np.zeros(0))
     motion = cube_planner(robot).plan(start, ThrustGoal(goal))
     free = cube_planner().plan(start, ThrustGoal(goal))
     body, box = coal.Box(0.4, 0.3, 0.2), coal.Box(*size)
@@ -181,7 +182,7 @@ def test_a_box_in_the_way_is_passed_clear_of_it() -> None:
 
 
 def test_what_cannot_be_planned_is_refused_in_a_sentence() -> None:
-    start = ThrustStart.at_rest(START, np.zeros(0))
+    start = RobotMotion.at_rest(START, np.zeros(0))
     goal = ThrustGoal(beyond(START, np.array([1.0, 0.0, 0.0]), np.zeros(3)))
     with pytest.raises(UnreachableError, match=r"takes 11\.3\d* s at least, and plan\.duration"):
         cube_planner(duration=5.0).plan(start, goal)
@@ -200,7 +201,7 @@ def test_what_cannot_be_planned_is_refused_in_a_sentence() -> None:
         Propulsion.within(np.inf, 1.0)
     far = np.array([9.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
     with pytest.raises(NotFoundError, match="No joint positions were found that put"):
-        servicer().plan(ThrustStart.at_rest(START, FOLDED), ThrustGoal(START, far))
+        servicer().plan(RobotMotion.at_rest(START, FOLDED), ThrustGoal(START, far))
 
 
 BOOM = CUBE.replace(
@@ -215,7 +216,7 @@ BOOM = CUBE.replace(
 
 def test_options_bound_the_motion_of_joints_and_the_levels() -> None:
     robot = SpaceRobot.from_urdf(BOOM)
-    start = ThrustStart.at_rest(START, np.array([0.3]))
+    start = RobotMotion.at_rest(START, np.array([0.3]))
     goal = ThrustGoal(beyond(START, np.array([0.4, 0.1, 0.0]), np.zeros(3)), shape=np.array([-1.2]))
 
     def planned(**options: Any) -> ThrustMotion:

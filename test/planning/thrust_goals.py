@@ -17,9 +17,10 @@ from support.thrust_flights import beyond, flown_by_pinocchio
 from spacerobot_ros.collision import BasePoses
 from spacerobot_ros.errors import PlanningError
 from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.model.grasp import RobotMotion
 from spacerobot_ros.model.thrusters import thrusters_of_urdf
 from spacerobot_ros.model.urdf import parse_world
-from spacerobot_ros.planning.methods.thrust.goals import ThrustGoal, ThrustStart
+from spacerobot_ros.planning.methods.thrust.goals import ThrustGoal
 from spacerobot_ros.planning.methods.thrust.propulsion import Propulsion
 from spacerobot_ros.planning.methods.thrust.search import ThrustOptions, ThrustPlanner
 from spacerobot_ros.resources import robot_file
@@ -71,7 +72,7 @@ def measure(name: str, count: int, boxes: int, seed: int) -> str:
             links = "".join(box(k, at, rng, size) for k, at in enumerate(middle))
             world = parse_world(f'<robot name="world"><link name="w"/>{links}</robot>')
             planner.clearance = planner.clearance_among(world)
-        start = ThrustStart.at_rest(begin, folded)
+        start = RobotMotion.at_rest(begin, folded)
         began = time.process_time()
         try:
             motion = planner.plan(start, ThrustGoal(goal, shape=shape))

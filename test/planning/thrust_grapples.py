@@ -19,10 +19,10 @@ from support.thrust_flights import distance_from_target, tumbled
 from spacerobot_ros import fly
 from spacerobot_ros.errors import PlanningError
 from spacerobot_ros.model import SpaceRobot, load_robot
-from spacerobot_ros.model.grasp import BodyMotion, TargetBody
+from spacerobot_ros.model.grasp import BodyMotion, RobotMotion, TargetBody
 from spacerobot_ros.model.target_motion import TorqueFreeMotion
 from spacerobot_ros.model.thrusters import thrusters_of_urdf
-from spacerobot_ros.planning.methods.thrust.goals import Grapple, ThrustGoal, ThrustStart
+from spacerobot_ros.planning.methods.thrust.goals import Grapple
 from spacerobot_ros.planning.methods.thrust.propulsion import Propulsion
 from spacerobot_ros.planning.methods.thrust.search import ThrustOptions, ThrustPlanner
 from spacerobot_ros.resources import robot_file, share_directory
@@ -48,7 +48,7 @@ def planned(rate: float, count: int, seed: int, *, detumbles: bool, bare: bool) 
     body = TargetBody.of(target, "grapple")
     table = thrusters_of_urdf(robot.description)
     planner = ThrustPlanner(robot, Propulsion.of_table(table, 0.2), ThrustOptions(), "end_effector")
-    start = ThrustStart.at_rest(np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]), FOLDED)
+    start = RobotMotion.at_rest(np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]), FOLDED)
     rng, cpu, nearest, missed, left = np.random.default_rng(seed), [], [], [], []
     longer, touching = [], 0
     for number in range(count):
@@ -56,11 +56,11 @@ def planned(rate: float, count: int, seed: int, *, detumbles: bool, bare: bool) 
         grapple = Grapple(TorqueFreeMotion(body, free), target, 0.02)
         began = time.process_time()
         try:
-            plain = planner.plan(start, ThrustGoal(grapple=grapple))
+            plain = planner.plan(start, grapple)
             if detumbles:
                 began = time.process_time()
                 asked = replace(grapple, detumbles=True)
-                motion = planner.plan(start, ThrustGoal(grapple=asked))
+                motion = planner.plan(start, asked)
                 longer.append(motion.duration / plain.duration)
                 spins = np.linalg.norm(body.inertia.about_com @ free.R_WT.T @ free.omega)
                 joined = grapple.joined_momentum(robot.total_mass, motion)
@@ -80,7 +80,7 @@ def planned(rate: float, count: int, seed: int, *, detumbles: bool, bare: bool) 
             np.linalg.norm(r[1] + Rotation.from_quat(X[1]).apply(body.grapple.r) - hand[0])
         )
         if bare:
-            careless = planner.plan(start, ThrustGoal(grapple=replace(grapple, clearance=0.0)))
+            careless = planner.plan(start, replace(grapple, clearance=0.0))
             touching += distance_from_target(robot.description, target, careless, free) <= 0
         print(f"{number}: {cpu[-1]:.2f} s of CPU, {motion.duration:.1f} s", flush=True)
     line = (

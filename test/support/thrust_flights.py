@@ -12,8 +12,7 @@ from scipy.spatial.transform import Rotation
 from spacerobot_ros.collision import BasePoses, CollisionGeometry
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array, RobotDescription
-from spacerobot_ros.model.grasp import BodyMotion
-from spacerobot_ros.planning.methods.thrust.goals import ThrustStart
+from spacerobot_ros.model.grasp import BodyMotion, RobotMotion
 from spacerobot_ros.planning.methods.thrust.motion import ThrustMotion
 
 
@@ -24,7 +23,7 @@ def beyond(start: Array, displacement: Array, rotvec: Array) -> Array:
     return np.concatenate([start[:3] + R.apply(displacement), turned.as_quat()])
 
 
-def flown_by_pinocchio(robot: SpaceRobot, motion: ThrustMotion, start: ThrustStart) -> Array:
+def flown_by_pinocchio(robot: SpaceRobot, motion: ThrustMotion, start: RobotMotion) -> Array:
     """Return where Pinocchio ends under the wrenches and efforts of a motion: q of its model."""
     model = pin.buildModelFromXML(robot.description.urdf, pin.JointModelFreeFlyer())
     model.gravity = pin.Motion.Zero()

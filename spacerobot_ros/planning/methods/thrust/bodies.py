@@ -8,16 +8,18 @@ transformed to W by the pose of the target at that time.
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from spacerobot_ros.collision import Approach, BasePoses
-from spacerobot_ros.collision.geometry import CollisionGeometry, Poses
+from spacerobot_ros.collision.geometry import Poses
 from spacerobot_ros.collision.planes import support_distance
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
+from spacerobot_ros.model.grasp import RobotMotion
 from spacerobot_ros.model.rotations import (
     matrices_from_quaternions,
     quaternion_inverse,
@@ -27,8 +29,8 @@ from spacerobot_ros.model.target_motion import TorqueFreeMotion
 from spacerobot_ros.planning.core.clearance import Clearance
 from spacerobot_ros.planning.methods.optimal.transcription import ConstraintBlock
 from spacerobot_ros.planning.methods.thrust.goals import Grapple, base_for_hand
-from spacerobot_ros.planning.methods.thrust.motion import EXACT_STEPS, ThrustMotion
-from spacerobot_ros.planning.methods.thrust.solver import ThrustKnots
+from spacerobot_ros.planning.methods.thrust.motion import EXACT_STEPS, ThrustMotion, base_poses
+from spacerobot_ros.planning.methods.thrust.solver import ThrustKnots, state_parts
 from spacerobot_ros.planning.methods.thrust.transcription import INSTANTS, KeptPlaces, pair_block
 
 _NO_DISTANCE = 1e3
@@ -43,16 +45,19 @@ class _Samples(NamedTuple):
     times: Array
 
 
-@dataclass(frozen=True)
 class _Surroundings:
-    """The distances of links and of obstacles that rest in W or, if there is one, on a target."""
+    """The distances of links and of obstacles that rest in W or, if there is one, on a target.
 
-    clearance: Clearance
-    target: TorqueFreeMotion | None = None
+    Its first pair is number ``first`` of all pairs of a motion.
+    """
 
-    @property
-    def geometry(self) -> CollisionGeometry:
-        return self.clearance.geometry
+    def __init__(self, clearance: Clearance, first: int, target: TorqueFreeMotion | None) -> None:
+        self.clearance, self.first, self.target = clearance, first, target
+        self.geometry = clearance.geometry
+        self.of_hand = np.zeros(len(self.geometry.pairs), dtype=bool)
+        """Whether each pair (P,) is the body that grasps and the target."""
+        self.required = np.zeros(0)
+        """Distances (P,), m."""
 
     def base(self, path: _Samples) -> BasePoses:
         """Return the poses of the base in the frame in which the obstacles rest."""
@@ -66,14 +71,16 @@ class _Surroundings:
     def poses(self, path: _Samples) -> Poses:
         return self.geometry.poses(path.shapes, self.base(path))
 
-    def in_world(self, planes: Array, times: Array) -> Array:
-        """Return planes (K, 7) of obstacles in W at times (K,)."""
-        if self.target is None:
-            return planes
-        X_WT, r_WT = self.target.body_poses(times)
-        normal = np.einsum("kij,kj->ki", matrices_from_quaternions(X_WT), planes[:, :3])
-        offset = planes[:, 3:4] + np.sum(normal * r_WT, axis=1, keepdims=True)
-        return np.hstack([normal, offset, planes[:, 4:]])
+    def planes(self, pair: int, path: _Samples, at: npt.NDArray[np.int64]) -> Array:
+        """Return planes (K, 7) of a pair at instants (K,) of a path, those of obstacles in W."""
+        R, r = self.poses(path)
+        _, planes = self.geometry.planes(pair, (R[at], r[at]))
+        if self.target is not None and self.geometry.with_obstacles[pair]:
+            X_WT, r_WT = self.target.body_poses(path.times[at])
+            normal = np.einsum("kij,kj->ki", matrices_from_quaternions(X_WT), planes[:, :3])
+            planes[:, 3] += np.sum(normal * r_WT, axis=1)
+            planes[:, :3] = normal
+        return planes
 
 
 class Bodies:
@@ -86,65 +93,61 @@ class Bodies:
         The model.
     clearance
         The distances of links and obstacles; None: they are not checked.
-    grapple
-        The target, whose grapple frame ``link`` meets; None: there is none.
+    start
+        Where the motion begins.
+    link, grapple
+        The link that meets a target, and the target; None: there is none.
+
+    Raises
+    ------
+    PlanningError
+        The start is too near, or the robot touches an obstacle or the target.
     """
 
     def __init__(
-        self, robot: SpaceRobot, clearance: Clearance | None, link: str, grapple: Grapple | None
+        self,
+        robot: SpaceRobot,
+        clearance: Clearance | None,
+        start: RobotMotion,
+        link: str,
+        grapple: Grapple | None,
     ) -> None:
-        self._robot, self._link = robot, link
-        self._around = [] if clearance is None else [_Surroundings(clearance)]
+        self._robot = robot
+        self._around = [] if clearance is None else [_Surroundings(clearance, 0, None)]
         if grapple is not None and grapple.description is not None and grapple.clearance > 0:
             among = replace(robot.description, world=grapple.description)
             distance, name = grapple.clearance, "target.clearance"
             kept = Clearance(among, distance, name, obstacles_alone=True)
-            self._around.append(_Surroundings(kept, grapple.motion))
-        counts = [len(each.geometry.pairs) for each in self._around]
-        self._first = np.cumsum([0, *counts]).tolist()
-        self.required = np.zeros(0)
-        """Distances (P,) of all pairs, m."""
-
-    def begin(self, shape: Array, pose: Array) -> None:
-        """Set the distances required of a motion that starts in a shape (n,) and a pose (7,) of the
-        base.
-
-        Raises
-        ------
-        PlanningError
-            The start is too near, or the robot touches an obstacle or the target.
-        """
-        start = _Samples(shape[np.newaxis], _poses(pose), np.zeros(1))
-        found = [np.zeros(0)]
+            first = sum(len(each.geometry.pairs) for each in self._around)
+            self._around.append(_Surroundings(kept, first, grapple.motion))
+        shape = start.q[np.newaxis]
+        begin = _Samples(shape, _poses(start.pose), np.zeros(1))
         for each in self._around:
-            required = each.clearance.required(shape, each.base(start))
+            each.required = each.clearance.required(start.q, each.base(begin))
             if each.target is not None:
                 # The body that grasps comes as near as the grasp has it.
-                grapple = each.target.grapple_in_target
-                at = base_for_hand(self._robot, self._link, shape, grapple)
-                grasp = each.geometry.poses(shape[np.newaxis], _poses(at))
-                for pair in np.flatnonzero(self._is_of_hand(each)).tolist():
+                hand, solids = robot.description.frames[link][0], each.geometry.solids
+                each.of_hand[:] = [solids[i].body == hand for i, _ in each.geometry.pairs]
+                at = base_for_hand(robot, link, start.q, each.target.grapple_in_target)
+                grasp = each.geometry.poses(shape, _poses(at))
+                for pair in np.flatnonzero(each.of_hand).tolist():
                     grasped = float(each.geometry.distances(pair, grasp)[0]) / 2
-                    required[pair] = min(required[pair], grasped)
-            found.append(required)
-        self.required = np.concatenate(found)
-
-    def _is_of_hand(self, around: _Surroundings) -> Array:
-        hand, solids = self._robot.description.frames[self._link][0], around.geometry.solids
-        return np.array([solids[i].body == hand for i, _ in around.geometry.pairs], dtype=bool)
+                    each.required[pair] = min(each.required[pair], grasped)
 
     def require_end(self, shape: Array, pose: Array) -> None:
         """Refuse a goal, a shape (n,) and a pose (7,) of the base, at which links are too near."""
-        for each, required in zip(self._around, self._by_surroundings(), strict=True):
-            each.clearance.require_shape(shape, required, _poses(pose))
-
-    def _by_surroundings(self) -> list[Array]:
-        return [self.required[i:j] for i, j in zip(self._first, self._first[1:], strict=False)]
+        for each in self._around:
+            each.clearance.require_shape(shape, each.required, _poses(pose))
 
     def _pair(self, number: int) -> tuple[_Surroundings, int]:
         """Return the surroundings of a pair, and its number there."""
-        k = int(np.searchsorted(self._first, number, side="right")) - 1
-        return self._around[k], number - self._first[k]
+        around = next(each for each in reversed(self._around) if each.first <= number)
+        return around, number - around.first
+
+    def required(self, number: int) -> float:
+        """Return the distance that is required of a pair, m."""
+        around, pair = self._pair(number)
+        return float(around.required[pair])
 
     # -- rows of the program ------------------------------------------------------------------
 
@@ -161,44 +164,38 @@ class Bodies:
         distance = support_distance(around.geometry, pair, center_of_mass)
         return pair_block(self._robot.n, distance)
 
-    def base_poses(self, shapes: Array, X: Array, r_WC: Array) -> BasePoses:
-        """Return the poses of the base from those of the centre of mass (K, ...)."""
-        c = self._robot.function("center_of_mass")(shapes.T).full().T
-        return BasePoses(r_WC - np.einsum("kij,kj->ki", matrices_from_quaternions(X), c), X)
-
     def _along(self, knots: ThrustKnots) -> _Samples:
         """Return a path at the instants (N K,) at which pairs are kept apart."""
         N, h = len(knots.levels), knots.step
         tau = np.tile(np.arange(1, INSTANTS + 1) / INSTANTS, N)[:, np.newaxis]
         k = np.repeat(np.arange(N), INSTANTS)
-        q, v, V = knots.shapes, knots.velocities, knots.v_WC
-        shapes = q[k] + h * (tau * v[k] + tau**2 / 2 * (v[k + 1] - v[k]))
-        X = (1 - tau) * knots.quaternions[k] + tau * knots.quaternions[k + 1]
+        # A copy, whose parts are views.
+        states = (1 - tau) * knots.states[k] + tau * knots.states[k + 1]
+        X, _, r, _, q, _ = state_parts(states)
         X /= np.linalg.norm(X, axis=1, keepdims=True)
-        r = knots.r_WC[k] + h * (tau * V[k] + tau**2 / 2 * (V[k + 1] - V[k]))
-        return _Samples(shapes, self.base_poses(shapes, X, r), (k + tau[:, 0]) * h)
+        _, _, r_0, V, q_0, v = state_parts(knots.states)
+        q[:] = q_0[k] + h * (tau * v[k] + tau**2 / 2 * (v[k + 1] - v[k]))
+        r[:] = r_0[k] + h * (tau * V[k] + tau**2 / 2 * (V[k + 1] - V[k]))
+        return _Samples(q, base_poses(self._robot, states), (k + tau[:, 0]) * h)
 
     def distances(self, number: int, knots: ThrustKnots) -> Array:
         """Return the distances (N K,) of a pair at these instants, m."""
         around, pair = self._pair(number)
         return around.geometry.distances(pair, around.poses(self._along(knots)))
 
-    def room(self, knots: ThrustKnots, pairs: Collection[int] = ()) -> float:
-        """Return by how much obstacles, the target and some other pairs are farther away along a
-        path than required, at least, m.
+    def room(self, knots: ThrustKnots, pairs: Collection[int] | None = None) -> float:
+        """Return by how much obstacles, the target and some other pairs (None: all) are farther
+        away along a path than required, at least, m.
         """
         path, least = self._along(knots), np.inf
-        parts = zip(self._around, self._by_surroundings(), self._first, strict=False)
-        for around, required, first in parts:
-            geometry = around.geometry
-            R, r = around.poses(path)
-            bounds = geometry.lower_bounds((R, r)) - required
-            # Pairs that may be the nearest come first, so that most others need not be looked at.
-            for pair in np.argsort(bounds.min(axis=0), kind="stable").tolist():
-                at = np.flatnonzero(bounds[:, pair] < least)
-                if len(at) and (geometry.with_obstacles[pair] or first + pair in pairs):
-                    found = geometry.distances(pair, (R[at], r[at])) - required[pair]
-                    least = min(least, float(found.min()))
+        for around in self._around:
+            required = around.required.copy()
+            if pairs is not None:
+                numbers = around.first + np.arange(len(required))
+                counted = around.geometry.with_obstacles | np.isin(numbers, list(pairs))
+                required[~counted] = -np.inf
+            found, _ = around.geometry.nearest_along(path.shapes, around.base(path), required)
+            least = min(least, float(found.min()))
         return least
 
     def places(self, approach: Approach, knots: ThrustKnots) -> set[int]:
@@ -207,7 +204,7 @@ class Bodies:
         """
         around, pair = self._pair(approach.pair)
         first = around.geometry.solids[around.geometry.pairs[pair][0]]
-        reach = self.required[approach.pair] + first.enclosure.bounding_radius
+        reach = around.required[pair] + first.enclosure.bounding_radius
         near = self.distances(approach.pair, knots) < reach
         place = int(approach.tick / EXACT_STEPS * INSTANTS) - 1
         near[max(place, 0) : place + 2] = True
@@ -220,13 +217,10 @@ class Bodies:
         for number, places in kept:
             at = np.array(places)
             around, pair = self._pair(number)
-            R, r = around.poses(path)
-            _, planes = around.geometry.planes(pair, (R[at], r[at]))
-            if around.geometry.with_obstacles[pair]:
-                planes = around.in_world(planes, path.times[at])
+            planes = around.planes(pair, path, at)
             at_ends = (at < INSTANTS) | (at >= last)
-            wanted = self.required[number] + np.where(at_ends, 0.0, room[number])
-            if around.target is not None and self._is_of_hand(around)[pair]:
+            wanted = around.required[pair] + np.where(at_ends, 0.0, room[number])
+            if around.of_hand[pair]:
                 # Boxes around the hand would touch before it does.
                 wanted[at >= last] = -np.inf
             planes[:, 3] += np.maximum(wanted, -_NO_DISTANCE)
@@ -240,11 +234,10 @@ class Bodies:
         shapes, base = motion.path()
         path = _Samples(shapes, base, np.linspace(0.0, motion.duration, len(shapes)))
         found: list[Approach] = []
-        parts = zip(self._around, self._by_surroundings(), self._first, strict=False)
-        for around, required, first in parts:
-            for each in around.clearance.approaches(shapes, required, around.base(path)):
+        for around in self._around:
+            for each in around.clearance.approaches(shapes, around.required, around.base(path)):
                 place = each.place_on_obstacle if around.target is None else None
-                found.append(replace(each, pair=each.pair + first, place_on_obstacle=place))
+                found.append(replace(each, pair=each.pair + around.first, place_on_obstacle=place))
         return sorted(found, key=lambda each: each.distance)
 
     def is_in_the_way(self, near: Sequence[Approach]) -> bool:

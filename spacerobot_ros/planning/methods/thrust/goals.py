@@ -1,8 +1,7 @@
-"""Starts and goals of motions under thrust."""
+"""Goals of motions under thrust."""
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,30 +13,13 @@ from spacerobot_ros.model.rotations import compose_poses, relative_pose
 from spacerobot_ros.model.target_motion import TorqueFreeMotion
 from spacerobot_ros.planning.core.goal import end_effector_pose
 from spacerobot_ros.planning.methods.thrust.motion import ThrustMotion
-
-
-@dataclass(frozen=True)
-class ThrustStart:
-    """Start of a motion: pose (7,) of the base and its twist ``v_WB_B``, ``omega_WB_B`` (3,),
-    positions and velocities (n,) of the joints.
-    """
-
-    pose: Array
-    v_WB_B: Array
-    omega_WB_B: Array
-    q: Array
-    qdot: Array
-
-    @classmethod
-    def at_rest(cls, pose: Array, q: Array) -> ThrustStart:
-        """Return a start without velocities."""
-        return cls(pose, np.zeros(3), np.zeros(3), q, np.zeros(len(q)))
+from spacerobot_ros.planning.methods.thrust.solver import state_parts
 
 
 @dataclass(frozen=True)
 class Grapple:
-    """A target that the end-effector meets at any time: it then has the pose and the velocities of
-    the grapple frame.
+    """The goal to meet a target at any time: the end-effector then has the pose and the velocities
+    of the grapple frame.
 
     Attributes
     ----------
@@ -66,30 +48,26 @@ class Grapple:
         """Return the angular momentum (3,) of a robot of a mass (kg) and the target about their
         centre of mass, in W, after a motion to it, N m s.
         """
-        state, at = motion.final_state, self.motion.numbers(motion.duration)
-        L, r, v, of_target = at[5:8], at[8:11], at[11:14], float(at[14])
-        momenta = (
-            np.concatenate([mass * state[10:], state[4:7]]),
-            np.concatenate([of_target * v, L]),
-        )
-        return combined_momenta((mass, of_target), (state[7:10], r), momenta)[3:]
+        _, L, r, V, *_ = state_parts(motion.final_state)
+        at = self.motion.numbers(motion.duration)
+        L_T, r_T, V_T, of_target = at[5:8], at[8:11], at[11:14], float(at[14])
+        momenta = np.concatenate([mass * V, L]), np.concatenate([of_target * V_T, L_T])
+        return combined_momenta((mass, of_target), (r, r_T), momenta)[3:]
 
 
 @dataclass(frozen=True)
 class ThrustGoal:
-    """Goal of a motion, at rest or with a target.
+    """Goal of a motion at rest.
 
-    ``base`` and ``end_effector`` are poses (7,), position and quaternion in W, or None;
-    ``shape`` are joint positions (n,), NaN for joints that are free, None for all free;
-    ``keeps_shape``: joints that are not free keep the positions of the start all the way;
-    ``grapple`` is a target instead of the others.
+    ``base`` and ``end_effector`` are poses (7,), position and quaternion in W, the latter or None.
+    ``shape`` are joint positions (n,), NaN for joints that are free, None for all free.
+    ``keeps_shape``: joints that are not free keep the positions of the start all the way.
     """
 
-    base: Array | None = None
+    base: Array
     end_effector: Array | None = None
     shape: Array | None = None
     keeps_shape: bool = False
-    grapple: Grapple | None = None
 
 
 def base_for_hand(robot: SpaceRobot, link: str, shape: Array, hand: Array) -> Array:
@@ -97,12 +75,3 @@ def base_for_hand(robot: SpaceRobot, link: str, shape: Array, hand: Array) -> Ar
     still = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
     there = np.concatenate(end_effector_pose(robot, link, still[:3], still[3:], shape))
     return compose_poses(hand, relative_pose(there, still))
-
-
-def shortest_catch(distance: float, leaving: float, acceleration: float) -> float:
-    """Return the least time (s) in which a body at rest meets one that is ``distance`` m away and
-    recedes at a speed (m/s, negative: it approaches), with equal velocity, at an acceleration
-    (m/s^2).
-    """
-    slack = leaving**2 / 2 + acceleration * max(distance, 0.0)
-    return max((leaving + 2 * math.sqrt(slack)) / acceleration, abs(leaving) / acceleration)

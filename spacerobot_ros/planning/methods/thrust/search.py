@@ -22,6 +22,7 @@ from spacerobot_ros.collision import Approach
 from spacerobot_ros.errors import NotFoundError, PlanningError, Proof, UnreachableError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array, Pose, RobotDescription
+from spacerobot_ros.model.grasp import RobotMotion
 from spacerobot_ros.model.inverse_kinematics import (
     REACHED_DISTANCE,
     FixedBaseArm,
@@ -32,6 +33,7 @@ from spacerobot_ros.model.rotations import (
     matrices_from_quaternions,
     matrix_from_quaternion,
     quaternion_from_matrix,
+    quaternion_inverse,
     quaternion_multiply,
     quaternions_from_rotvecs,
     rotvecs_from_quaternions,
@@ -47,20 +49,20 @@ from spacerobot_ros.planning.methods.optimal.multiple_shooting import DurationBo
 from spacerobot_ros.planning.methods.optimal.problem import MotionLimits, MotionOptions
 from spacerobot_ros.planning.methods.optimal.transcription import ConstraintBlock
 from spacerobot_ros.planning.methods.thrust.bodies import Bodies
-from spacerobot_ros.planning.methods.thrust.goals import (
-    Grapple,
-    ThrustGoal,
-    ThrustStart,
-    base_for_hand,
-    shortest_catch,
+from spacerobot_ros.planning.methods.thrust.goals import Grapple, ThrustGoal, base_for_hand
+from spacerobot_ros.planning.methods.thrust.motion import (
+    MotionFunctions,
+    ThrustMotion,
+    base_poses,
 )
-from spacerobot_ros.planning.methods.thrust.motion import MotionFunctions, ThrustMotion
 from spacerobot_ros.planning.methods.thrust.propulsion import Propulsion
 from spacerobot_ros.planning.methods.thrust.solver import (
     ThrustBoundary,
     ThrustKnots,
     ThrustSolver,
     Weights,
+    state_parts,
+    with_joints_moved,
 )
 from spacerobot_ros.planning.methods.thrust.transcription import (
     EndKind,
@@ -209,7 +211,7 @@ class ThrustPlanner:
         return MotionFunctions.of(self.robot, self.link)
 
     def plan(
-        self, start: ThrustStart, goal: ThrustGoal, cancellation: Cancellation = NEVER
+        self, start: RobotMotion, goal: ThrustGoal | Grapple, cancellation: Cancellation = NEVER
     ) -> ThrustMotion:
         """Return the motion of least propellant to a goal.
 
@@ -219,34 +221,27 @@ class ThrustPlanner:
             There is no motion within the limits, none was found, or the search was cancelled.
         """
         self._solvers = {key: each for key, each in self._solvers.items() if not key[1]}
+        grapple = goal if isinstance(goal, Grapple) else None
+        bodies = Bodies(self.robot, self.clearance, start, self.link, grapple)
         stop = StopRule(self.options.iterations, cancellation)
-        bodies = Bodies(self.robot, self.clearance, self.link, goal.grapple)
-        bodies.begin(start.q, start.pose)
-        if goal.grapple is not None:
-            return self._plan_grapple(start, goal.grapple, bodies, stop)
-        boundary, end = self._boundary(start, goal)
-        kind = EndKind(goal.base is not None, self.link if goal.end_effector is not None else "")
-        if kind.base:
-            bodies.require_end(end.q, end.base)
-        guess = self._guess(boundary, end, np.zeros(3))
+        if isinstance(goal, Grapple):
+            return self._plan_grapple(start, goal, bodies, stop)
+        boundary, q = self._boundary(start, goal)
+        bodies.require_end(q, goal.base)
+        kind = EndKind("" if goal.end_effector is None else self.link)
+        guess = self.guess(boundary, goal.base, q, np.zeros(3))
         return _Search(self, boundary, kind, stop, bodies).run(guess)
 
     def _plan_grapple(
-        self, start: ThrustStart, grapple: Grapple, bodies: Bodies, stop: StopRule
+        self, start: RobotMotion, grapple: Grapple, bodies: Bodies, stop: StopRule
     ) -> ThrustMotion:
         """Return the motion to a target: with no angular momentum left, or as little as there is
         a motion for.
         """
-        self._require_catch(start, grapple)
-        boundary, kind = self._meeting(start), EndKind(base=False, link=self.link, target=True)
-        latest = max(grapple.horizon, 2 * _MEETING_PERIOD)
-        for time in np.arange(_MEETING_PERIOD, latest, _MEETING_PERIOD).tolist():
-            guess = self._meeting_guess(boundary, grapple, time)
-            if guess.duration <= time:
-                break
-        guess = guess.stretched(time / guess.duration)
+        boundary, kind = self._meeting(start), EndKind(self.link, target=True)
+        self._require_catch(boundary.start, grapple)
         plain = _Search(self, boundary, kind, stop, bodies, grapple)
-        motion = plain.run(guess)
+        motion = plain.run(plain.first_meeting())
         if not grapple.detumbles:
             return motion
         left = grapple.joined_momentum(self.robot.total_mass, motion)
@@ -270,8 +265,9 @@ class ThrustPlanner:
                 if bodies.row_key(pair) not in self._rows:
                     self._rows[bodies.row_key(pair)] = bodies.rows(pair)
             rows = [self._rows[bodies.row_key(pair)] for pair, _ in kept]
+            intervals, acceleration = self.options.intervals, self.limits.acceleration
             self._solvers[kind, kept] = ThrustSolver(
-                self._stages[kind], self.options.intervals, rows, [at for _, at in kept]
+                self._stages[kind], intervals, acceleration, rows, [at for _, at in kept]
             )
         return self._solvers[kind, kept]
 
@@ -281,44 +277,40 @@ class ThrustPlanner:
 
     # -- both ends ----------------------------------------------------------------------------
 
-    def _state(self, start: ThrustStart) -> Array:
-        """Return ``[X; L; r; V]`` (13,) of a start."""
-        robot, X = self.robot, start.pose[3:]
-        p_W, L_W, _ = robot.momentum(X, start.q, start.v_WB_B, start.omega_WB_B, start.qdot)
-        r_WC = start.pose[:3] + matrix_from_quaternion(X) @ robot.center_of_mass(start.q)
-        return np.concatenate([X, L_W, r_WC, p_W / robot.total_mass])
+    def _start(self, start: RobotMotion, goals: Array) -> ThrustBoundary:
+        """Return a motion from a start within the limits of the joints, with any end."""
+        robot, N, X = self.robot, self.options.intervals, start.pose[3:]
+        p_W, L_W, _ = robot.momentum(X, start.q, start.twist[:3], start.twist[3:], start.qdot)
+        r_WC = start.pose[:3] + start.R_WB @ robot.center_of_mass(start.q)
+        state = np.concatenate([X, L_W, r_WC, p_W / robot.total_mass, start.q, start.qdot])
+        bounds = np.multiply.outer([-1.0, 1.0], np.full((N + 1, len(state)), np.inf))
+        quaternions, *_, s, v = state_parts(bounds)
+        quaternions[0], quaternions[1] = -1.1, 1.1
+        s[0], s[1] = self.limits.lower, self.limits.upper
+        v[0], v[1] = -self.limits.velocity, self.limits.velocity
+        bounds[:, 0, :13], v[:, 0] = state[:13], start.qdot
+        v[:, -1, self._wheels] = start.qdot[self._wheels]
+        return ThrustBoundary(state, goals, bounds)
 
-    def _meeting(self, start: ThrustStart) -> ThrustBoundary:
+    def _meeting(self, start: RobotMotion) -> ThrustBoundary:
         """Return both ends of a motion to a target, with joints near their shape at the start."""
+        boundary = self._start(start, np.zeros(0))
+        s = state_parts(boundary.bounds)[4]
         reach = np.where(self._wheels, np.inf, _GRASP_REACH)
-        near = start.q + np.multiply.outer([-1.0, 1.0], reach)
-        velocity = np.where(self._wheels, start.qdot, np.nan)
-        state, none = self._state(start), np.zeros(0)
-        return ThrustBoundary(state, start.q, start.qdot, none, near, near, velocity, None)
+        s[:] = np.clip(s, start.q - reach, start.q + reach)
+        return boundary
 
-    def _meeting_guess(
-        self, boundary: ThrustBoundary, grapple: Grapple, time: float, height: float = 0.0
-    ) -> ThrustKnots:
-        """Return a guess at full thrust to where a target is at a time, in the shape of the start,
-        on a way that bows out to the side of the fixture.
-        """
-        frame, shape = grapple.motion.grapple([time]), boundary.shape
-        there = np.concatenate([frame.r[0], quaternion_from_matrix(frame.R[0])])
-        end = _End(base_for_hand(self.robot, self.link, shape, there), shape)
-        away = frame.R[0] @ grapple.standoff
-        away *= height * _bow_height(boundary, end) / max(float(np.linalg.norm(away)), 1e-9)
-        return self._guess(boundary, end, away)
-
-    def _require_catch(self, start: ThrustStart, grapple: Grapple) -> None:
-        robot, target = self.robot, grapple.motion
-        state = self._state(start)
+    def _require_catch(self, state: Array, grapple: Grapple) -> None:
+        robot, target, options = self.robot, grapple.motion, self.limits
         away = target.center_of_mass(0.0) - state[7:10]
         distance = float(np.linalg.norm(away))
-        leaving = float((target.velocity - state[10:]) @ away) / max(distance, 1e-9)
+        leaving = float((target.velocity - state[10:13]) @ away) / max(distance, 1e-9)
         force = self.propulsion.largest_force()
-        reach = reach_of_end_effector(robot, self.limits.lower, self.limits.upper, self.link)
-        near = distance - reach - target.arm_length
-        least = shortest_catch(near, leaving, force / robot.total_mass)
+        reach = reach_of_end_effector(robot, options.lower, options.upper, self.link)
+        near = max(distance - reach - target.arm_length, 0.0)
+        # From rest to the velocity of a body that is that near.
+        a = force / robot.total_mass
+        least = max(leaving + 2 * math.sqrt(leaving**2 / 2 + a * near), abs(leaving)) / a
         if least > grapple.horizon:
             raise UnreachableError(
                 f"The target is {distance:.3g} m away and recedes at {leaving:.3g} m/s: with a "
@@ -327,40 +319,28 @@ class ThrustPlanner:
                 Proof.LIMITS,
             )
 
-    def _boundary(self, start: ThrustStart, goal: ThrustGoal) -> tuple[ThrustBoundary, _End]:
-        robot, n = self.robot, self.robot.n
-        shape = np.full(n, np.nan) if goal.shape is None else goal.shape.copy()
-        shape[self._wheels] = np.nan
-        base, q = goal.base, np.where(np.isfinite(shape), shape, start.q)
-        if base is None and goal.end_effector is not None:
-            base = base_for_hand(robot, self.link, start.q, goal.end_effector)
-        elif base is None:
-            base = start.pose
-        given = np.isfinite(shape)
-        shapes = np.where(given, shape, np.array([[-np.inf], [np.inf]]))
-        if goal.end_effector is not None and goal.base is not None:
-            q = np.where(given, q, self._shape_at(base, goal.end_effector, q))
+    def _boundary(self, start: RobotMotion, goal: ThrustGoal) -> tuple[ThrustBoundary, Array]:
+        """Return both ends of a motion, and the shape (n,) at its end."""
+        robot, hand = self.robot, goal.end_effector
+        shape = np.full(robot.n, np.nan) if goal.shape is None else goal.shape
+        given = np.isfinite(shape) & ~self._wheels
+        q, reach = np.where(given, shape, start.q), np.where(given, 0.0, np.inf)
+        if hand is not None:
+            q = np.where(given, q, self._shape_at(goal.base, hand, q))
             # Near to this family of shapes: others may lie beyond a contact of the arm.
-            near = q + np.array([[-_END_REACH], [_END_REACH]])
-            shapes = np.where(given | self._wheels, shapes, near)
+            reach[~given & ~self._wheels] = _END_REACH
         self._require_within(q)
-        final_velocity = np.where(self._wheels, start.qdot, 0.0)
-        spin = robot.inertia_matrix(q)[3:6, 6:] @ final_velocity
-        goals = [each for each in (goal.base, goal.end_effector) if each is not None]
-        return (
-            ThrustBoundary(
-                self._state(start),
-                start.q,
-                start.qdot,
-                np.concatenate(goals) if goals else np.zeros(0),
-                np.array([[-np.inf], [np.inf]]),
-                shapes,
-                final_velocity,
-                matrix_from_quaternion(base[3:]) @ spin,
-                goal.keeps_shape,
-            ),
-            _End(base, q),
+        boundary = self._start(
+            start, goal.base if hand is None else np.concatenate([goal.base, hand])
         )
+        _, L, _, V, s, v = state_parts(boundary.bounds)
+        last = np.where(self._wheels, start.qdot, 0.0)
+        L[:, -1] = matrix_from_quaternion(goal.base[3:]) @ robot.inertia_matrix(q)[3:6, 6:] @ last
+        V[:, -1], v[:, -1], s[:, -1] = 0.0, last, np.clip(s[:, -1], q - reach, q + reach)
+        if goal.keeps_shape:
+            # Both ends are given by other rows.
+            s[:, 1:-2, given] = start.q[given]
+        return boundary, q
 
     def _shape_at(self, base: Array, hand: Array, q: Array) -> Array:
         """Return the shape (n,) near to one in which the end-effector is at a pose."""
@@ -387,28 +367,26 @@ class ThrustPlanner:
                     Proof.LIMITS,
                 )
 
-    def _guess(self, boundary: ThrustBoundary, end: _End, bow: Array) -> ThrustKnots:
-        """Return a straight line and geodesic of the base, straight ways of the joints, along a
-        quintic at full thrust; half-way ``bow`` (3,), m, beside the line.
+    def guess(self, boundary: ThrustBoundary, base: Array, end: Array, bow: Array) -> ThrustKnots:
+        """Return a straight line and geodesic of the base to a pose (7,), straight ways of the
+        joints to a shape (n,), along a quintic at full thrust; half-way ``bow`` (3,), m, beside the
+        line.
         """
         robot, N = self.robot, self.options.intervals
         u = np.linspace(0.0, 1.0, N + 1)[:, np.newaxis]
         s = u**3 * (10 + u * (6 * u - 15))
-        X0 = boundary.state[:4]
-        c0 = robot.center_of_mass(boundary.shape)
-        r0 = boundary.state[7:10] - matrix_from_quaternion(X0) @ c0
-        q = boundary.shape + s * (end.q - boundary.shape)
-        turn = attitude_error(X0, end.base[3:])
-        X = quaternion_multiply(X0, quaternions_from_rotvecs(s * turn))
-        r_WB = r0 + s * (end.base[:3] - r0) + 16 * (u * (1 - u)) ** 2 * bow
+        X0, _, r_WC, _, shape, _ = state_parts(boundary.start)
+        r0 = r_WC - matrix_from_quaternion(X0) @ robot.center_of_mass(shape)
+        q = shape + s * (end - shape)
+        X = quaternion_multiply(X0, quaternions_from_rotvecs(s * attitude_error(X0, base[3:])))
+        r_WB = r0 + s * (base[:3] - r0) + 16 * (u * (1 - u)) ** 2 * bow
         R = matrices_from_quaternions(X)
         c = robot.function("center_of_mass")(q.T).full().T
         r = r_WB + np.einsum("kij,kj->ki", R, c)
         # In one second; the time follows.
         h = 1.0 / N
         V, v = np.gradient(r, h, axis=0), np.gradient(q, h, axis=0)
-        between = quaternion_multiply(X[:-1] * [-1.0, -1.0, -1.0, 1.0], X[1:])
-        rates = rotvecs_from_quaternions(between) / h
+        rates = rotvecs_from_quaternions(quaternion_multiply(quaternion_inverse(X[:-1]), X[1:])) / h
         omega = np.vstack([rates[:1], (rates[1:] + rates[:-1]) / 2, rates[-1:]])
         H = np.array([robot.inertia_matrix(each)[3:6, 3:] for each in q])
         L_B = np.einsum("kij,kj->ki", H, np.hstack([omega, v]))
@@ -422,62 +400,8 @@ class ThrustPlanner:
         change = np.diff(v, axis=0) / h
         most = float(np.max(np.abs(change) / self.limits.acceleration, initial=0.0))
         time = max(speed, math.sqrt(most), math.sqrt(float(np.abs(wanted).max())), 1e-3)
-        levels = np.clip(wanted / time**2, self.propulsion.lowest, 1.0)
-        knots = ThrustKnots(h, X, q, v, L, r, V, change, wanted).stretched(time)
-        return replace(knots, levels=levels)
-
-    # -- bodies -------------------------------------------------------------------------------
-
-    def bows(
-        self, boundary: ThrustBoundary, path: ThrustKnots, bodies: Bodies, near: Sequence[Approach]
-    ) -> Iterator[ThrustKnots]:
-        """Yield straight guesses and clear guesses beside them, in the time of a path, the
-        straightest first.
-        """
-        r0 = boundary.state[7:10]
-        base = bodies.base_poses(path.shapes[-1:], path.quaternions[-1:], path.r_WC[-1:])
-        end = _End(np.concatenate([base.position[0], base.quaternion[0]]), path.shapes[-1])
-        along = end.base[:3] - r0
-        frame = np.linalg.svd(along[np.newaxis])[2]
-        angles = 2 * math.pi * np.arange(_BOW_DIRECTIONS) / _BOW_DIRECTIONS
-        sides = np.outer(np.cos(angles), frame[1]) + np.outer(np.sin(angles), frame[2])
-        pairs = {each.pair for each in near}
-        for height in _BOW_SHARES if bodies.is_in_the_way(near) else _BOW_SHARES[:1]:
-            found = []
-            for side in sides if height else sides[:1]:
-                guess = self._guess(boundary, end, height * _bow_height(boundary, end) * side)
-                guess = guess.stretched(max(path.duration / guess.duration, 1.0))
-                found.append((bodies.room(guess, pairs), guess))
-            best, guess = max(found, key=lambda each: each[0])
-            if best > 0:
-                yield guess
-
-    def meetings(
-        self, boundary: ThrustBoundary, grapple: Grapple, bodies: Bodies, times: Array
-    ) -> Iterator[ThrustKnots]:
-        """Yield guesses at a target at times that are clear, of each time the straightest one."""
-        for time in times.tolist():
-            for height in _BOW_SHARES:
-                guess = self._meeting_guess(boundary, grapple, time, height)
-                if guess.duration > time:
-                    break
-                guess = guess.stretched(time / guess.duration)
-                if bodies.room(guess, range(len(bodies.required))) > 0:
-                    yield guess
-                    break
-
-
-@dataclass(frozen=True)
-class _End:
-    """Pose (7,) of the base and joint positions (n,) at which a guess ends."""
-
-    base: Array
-    q: Array
-
-
-def _bow_height(boundary: ThrustBoundary, end: _End) -> float:
-    """Return the least height of a bow away from a straight line that is worth a try, m."""
-    return max(float(np.linalg.norm(end.base[:3] - boundary.state[7:10])) / 2, 0.5)
+        knots = ThrustKnots(h, np.hstack([X, L, r, V, q, v]), change, wanted).stretched(time)
+        return replace(knots, levels=np.clip(knots.levels, self.propulsion.lowest, 1.0))
 
 
 _NEAREST = Weights(0.0, 0.0, 1.0, 1.0, _COST_OF_LACK)
@@ -518,6 +442,69 @@ class _Search:
         """The knots of the last exact motion."""
         self._left = np.zeros(3) if left is None else left
         """Angular momentum of robot and target in the end, N m s."""
+
+    def _bowed(self, base: Array, shape: Array, side: Array, height: float) -> ThrustKnots:
+        """Return a guess to a pose (7,) and a shape (n,) on a way that bows out to a side (3,), by
+        a multiple of the least height that is worth a try.
+        """
+        way = base[:3] - self.boundary.start[7:10]
+        bow = height * max(float(np.linalg.norm(way)) / 2, 0.5) * side
+        return self.planner.guess(self.boundary, base, shape, bow)
+
+    def _bows(self, path: ThrustKnots, near: Sequence[Approach]) -> Iterator[ThrustKnots]:
+        """Yield straight guesses and clear guesses beside them, in the time of a path, the
+        straightest first.
+        """
+        position, X = base_poses(self.planner.robot, path.states[-1:])
+        end = np.concatenate([position[0], X[0]]), state_parts(path.states[-1])[4]
+        frame = np.linalg.svd((end[0][:3] - self.boundary.start[7:10])[np.newaxis])[2]
+        angles = 2 * math.pi * np.arange(_BOW_DIRECTIONS) / _BOW_DIRECTIONS
+        sides = np.outer(np.cos(angles), frame[1]) + np.outer(np.sin(angles), frame[2])
+        pairs = {each.pair for each in near}
+        for height in _BOW_SHARES if self.bodies.is_in_the_way(near) else _BOW_SHARES[:1]:
+            found = []
+            for side in sides if height else sides[:1]:
+                guess = self._bowed(*end, side, height)
+                guess = guess.stretched(max(path.duration / guess.duration, 1.0))
+                found.append((self.bodies.room(guess, pairs), guess))
+            best, guess = max(found, key=lambda each: each[0])
+            if best > 0:
+                yield guess
+
+    def _meeting(self, time: float, height: float = 0.0) -> ThrustKnots:
+        """Return a guess at full thrust to where a target is at a time, in the shape of the start,
+        on a way that bows out to the side of the fixture.
+        """
+        planner, grapple, shape = self.planner, self.grapple, state_parts(self.boundary.start)[4]
+        assert grapple is not None
+        frame = grapple.motion.grapple([time])
+        there = np.concatenate([frame.r[0], quaternion_from_matrix(frame.R[0])])
+        away = frame.R[0] @ grapple.standoff
+        away /= max(float(np.linalg.norm(away)), 1e-9)
+        base = base_for_hand(planner.robot, planner.link, shape, there)
+        return self._bowed(base, shape, away, height)
+
+    def first_meeting(self) -> ThrustKnots:
+        """Return the guess to where a target is as soon as the robot can be there."""
+        assert self.grapple is not None
+        latest = max(self.grapple.horizon, 2 * _MEETING_PERIOD)
+        for time in np.arange(_MEETING_PERIOD, latest, _MEETING_PERIOD).tolist():
+            guess = self._meeting(time)
+            if guess.duration <= time:
+                break
+        return guess.stretched(time / guess.duration)
+
+    def _meetings(self, times: Array) -> Iterator[ThrustKnots]:
+        """Yield guesses at a target at times that are clear, of each time the straightest one."""
+        for time in times.tolist():
+            for height in _BOW_SHARES:
+                guess = self._meeting(time, height)
+                if guess.duration > time:
+                    break
+                guess = guess.stretched(time / guess.duration)
+                if self.bodies.room(guess) > 0:
+                    yield guess
+                    break
 
     def run(self, guess: ThrustKnots) -> ThrustMotion:
         """Return the motion.
@@ -623,7 +610,7 @@ class _Search:
         for each in approaches:
             near = self.bodies.places(each, path)
             self._places[each.pair] = self._places.get(each.pair, set()) | near
-            lack = float(self.bodies.required[each.pair]) - each.distance
+            lack = self.bodies.required(each.pair) - each.distance
             before = self._room.get(each.pair)
             self._room[each.pair] = _ROOM if before is None else before + lack + _ROOM
 
@@ -644,10 +631,8 @@ class _Search:
             self._phase, best = phase, self._earliest or math.inf
             log_progress(_LOG, SearchProgress(0, 0, best, phase), f"{phase.value} a motion")
         boundary = replace(self.boundary, goals=self._goals(guess.duration))
-        limits, args = self.planner.limits, (self.stop, duration, planes, center)
-        return self._solver.solve(
-            boundary, limits, guess, weights, *args, rough=rough, corrected=corrected
-        )
+        args = boundary, guess, weights, self.stop, duration, planes, center
+        return self._solver.solve(*args, rough=rough, corrected=corrected)
 
     @property
     def _solver(self) -> ThrustSolver:
@@ -725,28 +710,28 @@ class _Search:
 
     def _end_error(self, motion: ThrustMotion) -> float:
         """Return the largest error at the end, m, rad, m/s: but for that of angular momenta."""
-        rows = self._solver.stages.end.values(motion.last_knot, self._goals(motion.duration))
+        last = np.append(motion.step, with_joints_moved(motion.final_state, motion.step / 2))
+        rows = self._solver.stages.end.values(last, self._goals(motion.duration))
         of_poses = 9 if self.kind.target else rows.numel()
         return float(np.abs(rows.full()[:of_poses]).max(initial=0.0))
 
     def _clear(self, path: ThrustKnots, near: Sequence[Approach]) -> ThrustKnots:
         """Return a path that is clear of the pairs that came near, and of all others."""
-        planner, bodies, boundary, grapple = self.planner, self.bodies, self.boundary, self.grapple
+        grapple = self.grapple
         if grapple is None:
-            guesses = itertools.chain(planner.bows(boundary, path, bodies, near), [path])
+            guesses = itertools.chain(self._bows(path, near), [path])
         else:
             latest = grapple.horizon if self._meets_any_time else path.duration + 1e-9
             times = np.arange(path.duration, latest, _MEETING_PERIOD)
             shallow = [path] if near[0].distance > -_SHALLOW else []
-            clear = planner.meetings(boundary, grapple, bodies, times)
-            guesses = itertools.chain(shallow, clear)
+            guesses = itertools.chain(shallow, self._meetings(times))
         for guess in guesses:
             self._room, self._places = {}, {}
             self._add(near, guess)
             cleared = self._cleared(guess)
             if cleared is not None:
                 return cleared
-        raise PlanningError(self._failure(bodies.reason(self._nearest or near[0])))
+        raise PlanningError(self._failure(self.bodies.reason(self._nearest or near[0])))
 
     def _cleared(self, at: ThrustKnots) -> ThrustKnots | None:
         """Return a path near one that keeps pairs apart, and all others that come too near."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import casadi as ca
@@ -17,7 +17,6 @@ from spacerobot_ros.planning.methods.optimal.multiple_shooting import (
     build_solver,
     pack_knots,
 )
-from spacerobot_ros.planning.methods.optimal.problem import MotionLimits
 from spacerobot_ros.planning.methods.optimal.transcription import ConstraintBlock
 from spacerobot_ros.planning.methods.thrust.transcription import (
     DEFECT_SIZE,
@@ -65,23 +64,32 @@ _OPTIONS: Mapping[str, Mapping[str, object]] = {
 """Options of IPOPT by its starting point."""
 
 
+def state_parts(states: Array) -> list[Array]:
+    """Return ``X, L, r, V, q, qdot`` of states (..., 13 + 2 n) as views."""
+    return np.split(states, [4, 7, 10, 13, (states.shape[-1] + 13) // 2], axis=-1)
+
+
+def with_joints_moved(states: Array, time: float) -> Array:
+    """Return states whose joints are where they would be in a time at their velocities."""
+    moved = states.copy()
+    *_, q, qdot = state_parts(moved)
+    q += time * qdot
+    return moved
+
+
 @dataclass(frozen=True)
 class ThrustKnots:
     """N intervals of ``step`` seconds: states at N + 1 knots, controls of N intervals.
 
-    ``quaternions`` (N + 1, 4) of R_WB; ``shapes``, ``velocities`` (N + 1, n) of the joints;
-    ``L_W`` (N + 1, 3) about the centre of mass, N m s; ``r_WC``, ``v_WC`` (N + 1, 3) of the centre
-    of mass, m; ``accelerations`` (N, n) and ``levels`` (N, m). A solution has the multipliers of
-    its variables and of its rows. ``defects`` (N, 12) are those of the intervals; None: zero.
+    ``states`` (N + 1, 13 + 2 n) are ``[X; L; r; V; q; qdot]``: the quaternion of R_WB, the angular
+    momentum about the centre of mass, N m s, its position and velocity, all in W, and positions and
+    velocities of the joints. ``accelerations`` (N, n) are those of the joints, ``levels`` (N, m)
+    those of the propulsion. A solution has the multipliers of its variables and of its rows.
+    ``defects`` (N, 12) are those of the intervals; None: zero.
     """
 
     step: float
-    quaternions: Array
-    shapes: Array
-    velocities: Array
-    L_W: Array
-    r_WC: Array
-    v_WC: Array
+    states: Array
     accelerations: Array
     levels: Array
     multipliers: tuple[Array, Array] | None = None
@@ -92,23 +100,14 @@ class ThrustKnots:
         """s."""
         return self.step * len(self.levels)
 
-    @property
-    def states(self) -> Array:
-        """``[X; L; r; V]`` (N + 1, 13)."""
-        return np.hstack([self.quaternions, self.L_W, self.r_WC, self.v_WC])
-
     def stretched(self, factor: float) -> ThrustKnots:
         """Return the same path in ``factor`` times its duration."""
-        return replace(
-            self,
-            step=self.step * factor,
-            velocities=self.velocities / factor,
-            L_W=self.L_W / factor,
-            v_WC=self.v_WC / factor,
-            accelerations=self.accelerations / factor**2,
-            levels=self.levels / factor**2,
-            multipliers=None,
-            defects=None,
+        X, L, r, V, q, qdot = state_parts(self.states)
+        return ThrustKnots(
+            self.step * factor,
+            np.hstack([X, L / factor, r, V / factor, q, qdot / factor]),
+            self.accelerations / factor**2,
+            self.levels / factor**2,
         )
 
 
@@ -118,30 +117,18 @@ class ThrustBoundary:
 
     Attributes
     ----------
-    state, shape, velocity
-        ``[X; L; r; V]`` (13,), positions and velocities (n,) of the joints at the start.
+    start
+        (13 + 2 n,) state at the start (:class:`ThrustKnots`).
     goals
         Values that are given at the end (:class:`.EndKind`).
-    shapes, final_shapes
-        (2, n) least and largest joint positions on the way and at the end; infinite for joints that
-        are free.
-    final_velocity, final_momentum
-        (n,) velocities of the joints, NaN for those that are free, and angular momentum (3,) at the
-        end, where the centre of mass rests: zero, except for wheels that keep spinning. None: the
-        momenta are free, too.
-    keeps_shape
-        Whether joints with a given final position hold it throughout the motion.
+    bounds
+        (2, N + 1, 13 + 2 n) least and largest states at the knots, with the vertices of the joints'
+        parabolas in place of their positions.
     """
 
-    state: Array
-    shape: Array
-    velocity: Array
+    start: Array
     goals: Array
-    shapes: Array
-    final_shapes: Array
-    final_velocity: Array
-    final_momentum: Array | None
-    keeps_shape: bool = False
+    bounds: Array
 
 
 class Weights(NamedTuple):
@@ -167,6 +154,8 @@ class ThrustSolver:
     ----------
     stages, intervals
         The functions of the problem, and the number of intervals N.
+    acceleration
+        (n,) largest accelerations of the joints.
     rows, places
         The distances of pairs that are kept apart, and where (:data:`KeptPlaces`).
     """
@@ -175,11 +164,11 @@ class ThrustSolver:
         self,
         stages: ThrustStages,
         intervals: int,
+        acceleration: Array,
         rows: Sequence[ConstraintBlock] = (),
         places: Sequence[Sequence[int]] = (),
     ) -> None:
-        self.stages, self.intervals = stages, intervals
-        self.iterations, self.converged = 0, False
+        self.stages, self._acceleration = stages, acceleration
         self.lack = 0.0
         """Distance by which pairs are nearer in the last solution than required, m."""
         self._layout, self._program = thrust_program(stages, intervals, rows, places)
@@ -198,7 +187,6 @@ class ThrustSolver:
     def solve(
         self,
         boundary: ThrustBoundary,
-        limits: MotionLimits,
         guess: ThrustKnots,
         weights: Weights,
         stop: StopRule,
@@ -215,7 +203,7 @@ class ThrustSolver:
 
         Parameters
         ----------
-        boundary, limits, guess, weights
+        boundary, guess, weights
             The problem, and the start of the solver.
         stop, duration
             Conditions on which it stops early, and bounds of the duration.
@@ -228,80 +216,55 @@ class ThrustSolver:
         corrected
             Whether the guess is a solution with other defects.
         """
-        N, layout, propulsion = self.intervals, self._layout, self.stages.propulsion
-        places = layout.knots()
-        least, most = np.full(layout.size, -np.inf), np.full(layout.size, np.inf)
-        X, s, v, L, r, V, a, u = places
-        least[0], most[0] = duration.shortest / N, duration.longest / N
-        least[X], most[X] = -1.1, 1.1
-        least[s] = np.maximum(limits.lower, boundary.shapes[0])
-        most[s] = np.minimum(limits.upper, boundary.shapes[1])
-        least[v], most[v] = -limits.velocity, limits.velocity
-        least[a], most[a] = -limits.acceleration, limits.acceleration
-        least[u], most[u] = propulsion.lowest, 1.0
-        start = np.split(boundary.state, [4, 7, 10])
-        for place, value in zip((X, L, r, V), start, strict=True):
-            least[place[0]] = most[place[0]] = value
-        least[v[0]] = most[v[0]] = boundary.velocity
-        if boundary.final_momentum is not None:
-            least[V[N]] = most[V[N]] = 0.0
-            least[L[N]] = most[L[N]] = boundary.final_momentum
-        given = np.isfinite(boundary.final_velocity)
-        least[v[N, given]] = most[v[N, given]] = boundary.final_velocity[given]
-        if layout.has_lack:
-            least[-1] = 0.0
-        least[s[N]] = np.maximum(least[s[N]], boundary.final_shapes[0])
-        most[s[N]] = np.minimum(most[s[N]], boundary.final_shapes[1])
-        if boundary.keeps_shape:
-            # Both ends are given by other rows.
-            held = np.isfinite(boundary.final_shapes[0])
-            least[s[1 : N - 1, held]] = most[s[1 : N - 1, held]] = boundary.shape[held]
-        x0 = pack_knots(
-            layout,
-            guess.step,
-            *(guess.quaternions, guess.shapes + guess.step * guess.velocities / 2),
-            *(guess.velocities, guess.L_W, guess.r_WC, guess.v_WC),
-            *(guess.accelerations, guess.levels),
-        )
+        layout, propulsion = self._layout, self.stages.propulsion
+        N, most = layout.intervals, self._acceleration
+        vertices = with_joints_moved(guess.states, guess.step / 2)
+        x0 = pack_knots(layout, guess.step, vertices, guess.accelerations, guess.levels)
         begin = {"x0": x0}
         begins = "clear" if self._rows_of_pairs else "rough" if rough else ""
         if guess.multipliers is not None:
             begins = "corrected" if corrected else "continued"
             begin |= self._known(*guess.multipliers)
+        parameters = [
+            *(state_parts(boundary.start)[4], boundary.goals),
+            propulsion.wrenches.ravel(order="F"),
+            np.zeros(DEFECT_SIZE * N) if guess.defects is None else guess.defects.ravel(),
+            *(most, np.array(weights)),
+            np.zeros(sum(layout.controls) * N)
+            if center is None
+            else np.hstack([center.accelerations, center.levels]).ravel(),
+            np.zeros(0) if planes is None else planes.ravel(),
+        ]
+        least, largest = (
+            pack_knots(layout, span / N, bounds, acceleration, levels)
+            for span, bounds, acceleration, levels in (
+                (duration.shortest, boundary.bounds[0], -most, propulsion.lowest),
+                (duration.longest, boundary.bounds[1], most, np.ones(propulsion.size)),
+            )
+        )
+        if layout.has_lack:
+            largest[-1] = np.inf
         solver = self._ipopt(begins)
         self._monitor.begin(stop)
-        defects = np.zeros((N, DEFECT_SIZE)) if guess.defects is None else guess.defects
-        parameters = np.concatenate(
-            [
-                *(boundary.shape, boundary.goals, propulsion.wrenches.ravel(order="F")),
-                *(defects.ravel(), limits.acceleration, list(weights)),
-                np.hstack([center.accelerations, center.levels]).ravel()
-                if center is not None
-                else np.zeros(a.size + u.size),
-                np.zeros(0) if planes is None else planes.ravel(),
-            ]
-        )
         result = solver(
             **begin,
             lbx=least,
-            ubx=most,
+            ubx=largest,
             lbg=self._program.lower,
             ubg=self._program.upper,
-            p=parameters,
+            p=np.concatenate(parameters),
         )
-        stats = solver.stats()
-        self.iterations, self.converged = int(stats["iter_count"]), bool(stats["success"])
-        x = result["x"].full().ravel()
-        if not self.converged:
-            if self._monitor.best is None:
-                return None
+        x, multipliers = result["x"].full().ravel(), None
+        if solver.stats()["success"]:
+            multipliers = tuple(result[each].full().ravel() for each in ("lam_x", "lam_g"))
+        elif self._monitor.best is None:
+            return None
+        else:
             x = self._monitor.best
-        X_, s_, v_, L_, r_, V_, a_, u_ = (x[place] for place in places)
-        h, self.lack = float(x[0]), float(x[-1]) if layout.has_lack else 0.0
-        known = tuple(result[each].full().ravel() for each in ("lam_x", "lam_g"))
-        multipliers = (known[0], known[1]) if self.converged else None
-        shapes = s_ - h * v_ / 2
-        return ThrustKnots(h, X_, shapes, v_, L_, r_, V_, a_, u_, multipliers, guess.defects)
+        step, (states, accelerations, levels) = float(x[0]), (x[at] for at in layout.knots())
+        self.lack = float(x[-1]) if layout.has_lack else 0.0
+        states = with_joints_moved(states, -step / 2)
+        return ThrustKnots(step, states, accelerations, levels, multipliers, guess.defects)
 
     def _known(self, of_variables: Array, of_rows: Array) -> dict[str, Array]:
         """Return the first multipliers of the solver from those of a solution: of all rows, if it

@@ -1,11 +1,11 @@
 """Motions of base and joints under thrust as a nonlinear program, by direct multiple shooting.
 
-To the attitude X, the vertices s and the velocities v of the joints' parabolas
-(:mod:`spacerobot_ros.planning.methods.optimal.transcription`) knots add the angular momentum L
-about the centre of mass, its position r and its velocity V, in W. The controls of an interval are
-the joint accelerations a and the levels u of the propulsion, whose wrench ``(f, n) = W u`` is
-constant in the base. With ``R_i``, ``c_i`` the attitude and the centre of mass in the base at the
-Gauss points tau_i of an interval,
+A knot is ``x = [X; L; r; V; s; v]``: to the attitude X, the vertices s and the velocities v of the
+joints' parabolas (:mod:`spacerobot_ros.planning.methods.optimal.transcription`) it adds the angular
+momentum L about the centre of mass, its position r and its velocity V, in W. The controls of an
+interval are the joint accelerations a and the levels u of the propulsion, whose wrench
+``(f, n) = W u`` is constant in the base. With ``R_i``, ``c_i`` the attitude and the centre of mass
+in the base at the Gauss points tau_i of an interval,
 
 ``V+ = V + h/m sum R_i f / 2``, ``r+ = r + h V + h^2/m sum (1 - tau_i) R_i f / 2``,
 ``L+ = L + h sum R_i (n - c_i x f) / 2``, ``X+ = X exp(Omega)``,
@@ -120,13 +120,12 @@ class ThrustStages:
 
 
 class EndKind(NamedTuple):
-    """Quantities given at the end: the pose of the base, that of a link (empty: none), or that the
-    link has the pose and the velocities of a target's grapple frame; then the angular momentum of
-    robot and target together may be given, too.
+    """Quantities given at the end: the pose of the base, and that of a link (empty: none), or that
+    the link has the pose and the velocities of a target's grapple frame; then the angular momentum
+    of robot and target together may be given, too.
     """
 
-    base: bool
-    link: str
+    link: str = ""
     target: bool = False
     momentum: bool = False
 
@@ -135,21 +134,26 @@ class EndKind(NamedTuple):
         """Number of parameters: poses (7 each), or the intervals, the numbers of the target
         (:meth:`.TorqueFreeMotion.numbers`), and the angular momentum (3).
         """
-        return 4 + TARGET_SIZE if self.target else 7 * (self.base + bool(self.link))
+        return 4 + TARGET_SIZE if self.target else 7 * (1 + bool(self.link))
+
+
+def _state_symbols(n: int) -> tuple[ca.SX, list[ca.SX]]:
+    """Return a knot, and ``X, L, r, V, s, v`` of it."""
+    x = ca.SX.sym("x", 13 + 2 * n)
+    return x, ca.vertsplit(x, [0, 4, 7, 10, 13, 13 + n, 13 + 2 * n])
 
 
 def _end_block(robot: SpaceRobot, kind: EndKind) -> ConstraintBlock:
-    """Return the rows of the last knot, of ``[h; X; s; v; L; r; V]``."""
-    n = robot.n
-    z, goals = ca.SX.sym("z", 1 + 4 + 2 * n + 9), ca.SX.sym("goals", kind.size)
-    h, X, s, v, L, r, V = ca.vertsplit(z, np.cumsum([0, 1, 4, n, n, 3, 3, 3]).tolist())
-    R, center_of_mass = matrix_from_quaternion(X), robot.function("center_of_mass", compile=False)
-    q = s - h * v / 2 if kind.target else s
-    reached = [ca.SX(0, 1)]
+    """Return the rows of the last knot, of ``[h; x]``."""
+    h, goals = ca.SX.sym("h"), ca.SX.sym("goals", kind.size)
+    x, (X, L, r, V, s, v) = _state_symbols(robot.n)
+    q, R = s - h * v / 2, matrix_from_quaternion(X)
+    c = robot.function("center_of_mass", compile=False)(q)
+    reached = [] if kind.target else [r - R @ c - goals[:3], relative_vector(goals[3:7], X)]
     if kind.link:
         R_all, r_all = robot.function("link_poses", compile=False)(q)
         i = robot.link_names.index(kind.link)
-        e, R_E = r_all[:, i] - center_of_mass(q), R @ R_all[:, 3 * i : 3 * i + 3]
+        e, R_E = r_all[:, i] - c, R @ R_all[:, 3 * i : 3 * i + 3]
     if kind.target:
         goal = TargetExpression.at(goals[1:-3], goals[0] * h)
         J = robot.function(f"jacobian:{kind.link}", compile=False)(q)
@@ -165,21 +169,19 @@ def _end_block(robot: SpaceRobot, kind: EndKind) -> ConstraintBlock:
             reduced = robot.total_mass * goal.mass / (robot.total_mass + goal.mass)
             orbiting = reduced * ca.cross(goal.center - r, goal.center_velocity - V)
             reached.append(L + goal.L + orbiting - goals[-3:])
-    elif kind.base:
-        reached += [r - R @ center_of_mass(s) - goals[:3], relative_vector(goals[3:7], X)]
-    if kind.link and not kind.target:
+    elif kind.link:
         turned = R_E @ matrix_from_quaternion(goals[-4:]).T
         reached += [r + R @ e - goals[-7:-4], half_angle_vector(turned)]
-    return ConstraintBlock.of("thrust_end", z, goals, ca.vertcat(*reached))
+    return ConstraintBlock.of("thrust_end", ca.vertcat(h, x), goals, ca.vertcat(*reached))
 
 
 def _interval_block(robot: SpaceRobot, levels: int) -> ConstraintBlock:
+    """Return the dynamics of an interval, of ``[h; x; a; u; x+]``."""
     n = robot.n
-    sizes = [1, 4, n, n, 3, 3, 3, n, levels, 4, n, n, 3, 3, 3]
-    z = ca.SX.sym("z", sum(sizes))
-    h, X, s, v, L, r, V, a, u, X_next, s_next, v_next, L_next, r_next, V_next = ca.vertsplit(
-        z, np.cumsum([0, *sizes]).tolist()
-    )
+    h, a, u = ca.SX.sym("h"), ca.SX.sym("a", n), ca.SX.sym("u", levels)
+    x, (X, L, r, V, s, v) = _state_symbols(n)
+    x_next, (X_next, L_next, r_next, V_next, s_next, v_next) = _state_symbols(n)
+    z = ca.vertcat(h, x, a, u, x_next)
     defect, wrenches = ca.SX.sym("defect", DEFECT_SIZE), ca.SX.sym("wrenches", 6, levels)
     points = [state_within_interval(tau, s, h * v, h * v_next) for tau in GAUSS]
     impulses = [h * momentum_in_base(tau, X, X_next, (1 - tau) * L + tau * L_next) for tau in GAUSS]
@@ -225,19 +227,16 @@ def _interval_block(robot: SpaceRobot, levels: int) -> ConstraintBlock:
 def pair_block(joints: int, distance: ca.Function) -> ConstraintBlock:
     """Return the distance of a pair from a plane at an instant of an interval, plus the lack.
 
-    ``distance`` is :func:`.support_distance`. The variables are ``[h; X; s; v; r; V; X+; v+; r+;
-    V+; lack]`` of the interval, the parameters the plane and a point, in W if one of the pair is an
-    obstacle, and the instant from 0 to 1.
+    ``distance`` is :func:`.support_distance`. The variables are ``[h; x; x+; lack]``, the
+    parameters the plane and a point, in W if one of the pair is an obstacle, and the instant from 0
+    to 1.
     """
-    n = joints
-    sizes = [1, 4, n, n, 3, 3, 4, n, 3, 3, 1]
-    z, p = ca.SX.sym("z", sum(sizes)), ca.SX.sym("p", PLANE_SIZE + 1)
-    h, X, s, v, r, V, X_next, v_next, _, V_next, lack = ca.vertsplit(
-        z, np.cumsum([0, *sizes]).tolist()
-    )
-    plane, tau = p[:PLANE_SIZE], p[PLANE_SIZE]
-    at = state_within_interval(tau, s, h * v, h * v_next)[:n]
-    if distance.size1_in(0) > n:
+    h, lack, p = ca.SX.sym("h"), ca.SX.sym("lack"), ca.SX.sym("p", PLANE_SIZE + 1)
+    x, (X, _, r, V, s, v) = _state_symbols(joints)
+    x_next, (X_next, _, _, V_next, _, v_next) = _state_symbols(joints)
+    z, plane, tau = ca.vertcat(h, x, x_next, lack), p[:PLANE_SIZE], p[PLANE_SIZE]
+    at = state_within_interval(tau, s, h * v, h * v_next)[:joints]
+    if distance.size1_in(0) > joints:
         place = r + h * (tau * V + tau**2 / 2 * (V_next - V))
         at = ca.vertcat(at, (1 - tau) * X + tau * X_next, place)
     # By the chain rule, as the distance depends on few of the variables.
@@ -272,8 +271,8 @@ def thrust_program(
     """
     n, N, propulsion = stages.joints, intervals, stages.propulsion
     m = propulsion.size
-    layout = Layout((4, n, n, 3, 3, 3), (n, m), N, bool(pairs))
-    X, s, v, L, r, V, a, u = layout.knots()
+    layout = Layout((13 + 2 * n,), (n, m), N, bool(pairs))
+    knot, a, u = layout.knots()
     x = ca.MX.sym("x", layout.size)
     goals = int(stages.end.values.size1_in(1))
     p = {
@@ -290,12 +289,11 @@ def thrust_program(
         )
     }
     zero = np.zeros((N, 1), dtype=np.int64)
-    knot = np.hstack([X, s, v, L, r, V])
     defects = ca.reshape(p["defects"], DEFECT_SIZE, N)
     placed, equalities = place_stages(
         (stages.beginning, stages.interval, stages.end),
         (
-            np.hstack([zero[:1], s[:1], v[:1]]),
+            np.hstack([zero[:1], knot[:1, 13:]]),
             np.hstack([zero, knot[:-1], a, u, knot[1:]]),
             np.hstack([zero[:1], knot[-1:]]),
         ),
@@ -307,9 +305,7 @@ def thrust_program(
         groups = np.vstack([u[:, list(each)] for each in propulsion.norms])
         placed.append(PlacedBlock.after(placed, norm, groups, ca.MX(0, 1)))
     lack = np.full((N, 1), layout.size - 1)
-    variables = np.hstack(
-        [zero, *(each[:-1] for each in (X, s, v, r, V)), *(e[1:] for e in (X, v, r, V)), lack]
-    )
+    variables = np.hstack([zero, knot[:-1], knot[1:], lack])
     ends = np.cumsum([0, *map(len, places)]).tolist()
     for block, at, (first, last) in zip(pairs, places, pairwise(ends), strict=True):
         planes = ca.reshape(p["planes"][8 * first : 8 * last], 8, last - first)
