@@ -568,14 +568,14 @@ class ControlExecutive:
             self._watch.asked[END_EFFECTOR] = self._pending[END_EFFECTOR].goal.asked
         self._pending.clear()
         if planned is not None:
-            self.controller.begin(planned.begins, planned.profile)
+            self.controller.begin(max(planned.job.begins, time), planned.job.result())
         else:
             if carried:
                 # Tasks have left the earlier reference behind.
                 self.controller.hold_here(time, state)
             self.controller.set_goals(time, state, **poses)
         if not (carried or again):
-            self._report_acceptance(None if planned is None else planned.profile)
+            self._report_acceptance(None if planned is None else planned.job.result())
             self._watch.forget_touch(time)
         self._begin_tracking(time)
         saved = goals_to_save(self.controller, self._watch.asked, self._goal_id, resumes=resumes)

@@ -27,29 +27,14 @@ class Aims(TypedDict):
 
 @dataclass(frozen=True)
 class PlannedGoals:
-    """Poses and joints of goals, the requested parts of the base pose, the planned reference, and
-    its start time, s.
+    """Pending goals, their poses and joints, the requested parts of the base pose, and the job that
+    plans their reference.
     """
-
-    aims: Aims
-    asked: frozenset[Controlled]
-    profile: PlannedReference
-    begins: float
-
-
-@dataclass(frozen=True)
-class _Plan:
-    """A reference in the making for pending goals."""
 
     pending: Mapping[str, IdentifiedGoal]
     aims: Aims
     asked: frozenset[Controlled]
     job: PlanningJob[PlannedReference]
-
-    def is_for(self, pending: Mapping[str, IdentifiedGoal]) -> bool:
-        """Whether this plan is for the given pending goals."""
-        same = (goal is pending.get(part) for part, goal in self.pending.items())
-        return len(pending) == len(self.pending) and all(same)
 
 
 class GoalPlanning:
@@ -65,7 +50,7 @@ class GoalPlanning:
         self.in_background = in_background
         self.time = 0.0
         """Total wall time of planning references, s."""
-        self._plan: _Plan | None = None
+        self._plan: PlannedGoals | None = None
         self._job: PlanningJob[PlannedReference] | None = None
         """The last job, which may still run although it is cancelled."""
         self._lead = PLANNING_TIME
@@ -77,7 +62,9 @@ class GoalPlanning:
 
     def is_for(self, pending: Mapping[str, IdentifiedGoal]) -> bool:
         """Whether a reference for these goals is being planned."""
-        return self._plan is not None and self._plan.is_for(pending)
+        if self._plan is None or self._plan.pending.keys() != pending.keys():
+            return False
+        return all(goal is pending[part] for part, goal in self._plan.pending.items())
 
     def planned(
         self,
@@ -87,7 +74,8 @@ class GoalPlanning:
         pending: Mapping[str, IdentifiedGoal],
         aims: Callable[[], tuple[Aims, frozenset[Controlled]]],
     ) -> PlannedGoals | None:
-        """Return the planned reference for pending goals, or None while it is being planned.
+        """Return pending goals with their planned reference; None while it is being planned, and
+        before it begins.
 
         ``aims`` returns the poses and joints of the goals, and the requested parts.
 
@@ -96,30 +84,33 @@ class GoalPlanning:
         PlanningError
             No motion is found.
         """
-        plan = self._plan
-        if plan is None or not self.is_for(pending):
+        if not self.is_for(pending):
             self.cancel()
-            if plan is None:
+            if self._plan is None:
                 self._lead = PLANNING_TIME
-            plan = self._begin(time, state, controller, pending, *aims())
-        if not plan.job.done:
+            self._begin(time, state, controller, pending, *aims())
+        plan = self._plan
+        assert plan is not None
+        job, waits = plan.job, self.in_background and plan.job.begins > time
+        if not job.done:
             return None
-        self.time += plan.job.wall_time
         try:
-            profile = plan.job.result()
+            job.result()
         except PlanningError:
-            self._plan = None
+            waits = False
             raise
-        begins = plan.job.begins
-        if self.in_background and -math.inf < begins < time:
+        finally:
+            if not waits:
+                self.time += job.wall_time
+                self._plan = None
+        if waits:
+            return None
+        if self.in_background and -math.inf < job.begins < time:
             # The reference has gone on: a plan from where it will be in twice the time.
             self._lead *= 2
             self._begin(time, state, controller, pending, plan.aims, plan.asked)
             return None
-        if self.in_background and begins > time:
-            return None
-        self._plan = None
-        return PlannedGoals(plan.aims, plan.asked, profile, max(begins, time))
+        return plan
 
     def _begin(
         self,
@@ -129,7 +120,7 @@ class GoalPlanning:
         pending: Mapping[str, IdentifiedGoal],
         aims: Aims,
         asked: frozenset[Controlled],
-    ) -> _Plan:
+    ) -> None:
         planner = controller.planner
         assert planner is not None
         seen, begins = state.copied(), -math.inf
@@ -142,9 +133,8 @@ class GoalPlanning:
 
         last, self._job = self._job, PlanningJob(work, begins)
         # Known before the work begins, so that it can be cancelled.
-        self._plan = plan = _Plan(dict(pending), aims, asked, self._job)
+        self._plan = PlannedGoals(dict(pending), aims, asked, self._job)
         self._job.start(in_background=self.in_background, after=last)
-        return plan
 
     def cancel(self) -> None:
         """Cancel the job; any thread may call this."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_left
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import ClassVar, NamedTuple
 
@@ -237,17 +238,12 @@ class ReferencePlanner:
             return math.inf
         shapes, base = motion.path()
         period = motion.duration / (len(shapes) - 1)
-        first = max(int(time / period), 0)
-        required = np.full(len(clearance.geometry.pairs), clearance.distance)
-
-        def is_blocked_by(last: int) -> bool:
-            part = slice(first, last + 1)
-            near = clearance.approaches(shapes[part], required, base.rows(part))
-            return any(each.place_on_obstacle is not None for each in near)
-
-        rows = range(first, len(shapes))
-        blocked = bisect_left(rows, True, key=is_blocked_by)
-        return blocked * period if blocked < len(rows) else math.inf
+        ahead = slice(max(int(time / period), 0), None)
+        geometry = clearance.geometry
+        required = np.where(geometry.with_obstacles, clearance.distance, -np.inf)
+        beyond, _ = geometry.nearest_along(shapes[ahead], base.rows(ahead), required)
+        blocked = np.flatnonzero(beyond < 0)
+        return float(blocked[0] * period) if len(blocked) else math.inf
 
     def plan(
         self, motion: GoalMotion, state: ControlState, cancellation: Cancellation

@@ -104,9 +104,6 @@ _ROOM = 4e-3
 _COST_OF_LACK = 1e3
 """Weight of a metre of missing distance of pairs."""
 
-_LARGEST_LACK = 1e-4
-"""Missing distance of pairs up to which a solution counts as clear before the exact check, m."""
-
 _MAX_ROUNDS = 6
 """Number of times that new planes are made to clear a path of pairs."""
 
@@ -424,20 +421,15 @@ class _Search:
     ) -> None:
         self.planner, self.boundary, self.kind, self.stop = planner, boundary, kind, stop
         self.bodies, self.grapple = bodies, grapple
-        options = planner.options
-        self._is_timed = options.duration > 0 or options.time_factor > 1
+        self._is_timed = False
         """Whether the duration is given, or follows from the shortest one."""
-        self._meets_any_time = grapple is not None
-        self._phase: SearchPhase | None = None
         self._earliest = self._latest = 0.0
         """When a target is met, s."""
-        self._effort_limit = (1.0 - options.reserve) * planner.robot.effort_limit
+        self._effort_limit = (1.0 - planner.options.reserve) * planner.robot.effort_limit
         self._room: dict[int, float] = {}
         """Room of the pairs that are kept apart, m."""
         self._places: dict[int, set[int]] = {}
         """Instants at which they are kept apart."""
-        self._nearest: Approach | None = None
-        """The nearest pair of the last path that was not clear."""
         self.path: ThrustKnots
         """The knots of the last exact motion."""
         self._left = np.zeros(3) if left is None else left
@@ -514,10 +506,22 @@ class _Search:
         PlanningError
             There is no motion, or none is found.
         """
-        fastest = self._fastest(guess)
+        options = self.planner.options
+        self._begin(SearchPhase.SEARCHING)
+        fastest = self._solve(guess, self._weights(guess))
         if fastest is None:
-            raise PlanningError(self._failure("no motion to the goal was found"))
-        time, self._earliest = self._time(fastest), fastest.duration
+            raise self._failure("no motion to the goal was found")
+        if 0 < options.duration < fastest.duration:
+            raise UnreachableError(
+                f"The motion takes {fastest.duration:.4g} s at least, and plan.duration is "
+                f"{options.duration:g} s: set it to more, or to 0.",
+                Proof.LIMITS,
+            )
+        self._is_timed = options.duration > 0 or options.time_factor > 1
+        time = options.duration or options.time_factor * fastest.duration
+        if self.grapple is not None:
+            time = max(min(time, self.grapple.horizon), fastest.duration)
+        self._earliest = fastest.duration
         for _ in range(_MAX_ROUNDS):
             motion = self._motion(fastest, time)
             share = motion.effort_share(self._effort_limit)
@@ -525,39 +529,37 @@ class _Search:
                 return motion
             # Efforts of a motion at rest are about as the square of its speed.
             self._earliest = motion.duration * min(1.01 * math.sqrt(share), _LARGEST_STRETCH)
-            time = max(self._earliest, time) if self._meets_any_time else self._earliest
+            time = self._earliest if self.grapple is None else max(self._earliest, time)
             self._is_timed = True
-        raise PlanningError(
-            self._failure(f"its joints need {share:.3g} times the efforts that a plan may use")
-        )
+        raise self._failure(f"its joints need {share:.3g} times the efforts that a plan may use")
 
     def run_near(self, other: _Search) -> ThrustMotion:
         """Return the motion near that of another search, in its time."""
         self._room, self._places = dict(other._room), dict(other._places)
         self._is_timed, path = True, replace(other.path, multipliers=None)
         self._earliest = self._latest = path.duration
-        planes = self._planes(path)
-        path = self._solve(path, _NEAREST, self._span(path), planes, center=path) or path
+        path = self._solve(path, _NEAREST, self._planes(path), center=path) or path
         cleared = self._cleared(path)
         if cleared is not None:
             motion = self._settled(cleared)
             if motion.effort_share(self._effort_limit) <= 1.0:
                 return motion
-        raise PlanningError(self._failure("no motion near the other one was found"))
+        raise self._failure("no motion near the other one was found")
 
     def _motion(self, fastest: ThrustKnots, time: float) -> ThrustMotion:
         """Return the exact and clear motion near the fastest one, in a time if that is given; to a
         target, by that time.
         """
-        planner, bodies = self.planner, self.bodies
+        bodies = self.bodies
+        self._begin(SearchPhase.REFINING)
         self._room, self._places, self._latest = {}, {}, time
-        at = max(self._earliest, fastest.duration) if self._meets_any_time else time
-        path = fastest.stretched(at / fastest.duration)
+        path = fastest.stretched(
+            (time if self.grapple is None else self._earliest) / fastest.duration
+        )
         if self._is_timed:
             # Roughly, for a look at what is in the way.
-            weights = self._cheap(path, _ROUNDINGS[0])
-            path = self._solve(path, weights, self._span(path), rough=True) or path
-        near = bodies.approaches(planner.motion(path))
+            path = self._solve(path, self._weights(path, _ROUNDINGS[0]), rough=True) or path
+        near = bodies.approaches(self.planner.motion(path))
         if not near:
             motion = self._exact(path)
             near = bodies.approaches(motion)
@@ -567,34 +569,14 @@ class _Search:
 
     def _settled(self, path: ThrustKnots) -> ThrustMotion:
         """Return the exact motion near a clear path, which is clear, too."""
+        self._begin(SearchPhase.REFINING)
         for _ in range(_MAX_ROUNDS):
-            motion = self._exact(path, self._planes(path))
+            motion = self._exact(path)
             near = self.bodies.approaches(motion)
             if not near:
                 return motion
             self._add(near, path)
-        raise PlanningError(self._failure(self.bodies.reason(near[0])))
-
-    def _span(self, path: ThrustKnots) -> DurationBounds:
-        """Return the bounds of the duration of a motion near a timed path: a target is met at any
-        time by the latest one, if nothing is in the way.
-        """
-        if self._meets_any_time and not self._room:
-            return DurationBounds(self._earliest, self._latest)
-        return DurationBounds(path.duration, path.duration)
-
-    def _time(self, fastest: ThrustKnots) -> float:
-        options = self.planner.options
-        if 0 < options.duration < fastest.duration:
-            raise UnreachableError(
-                f"The motion takes {fastest.duration:.4g} s at least, and plan.duration is "
-                f"{options.duration:g} s: set it to more, or to 0.",
-                Proof.LIMITS,
-            )
-        time = options.duration or options.time_factor * fastest.duration
-        if self.grapple is not None:
-            time = max(min(time, self.grapple.horizon), fastest.duration)
-        return time
+        raise self._failure(self.bodies.reason(near[0]))
 
     @property
     def _kept(self) -> KeptPlaces:
@@ -618,18 +600,21 @@ class _Search:
         self,
         guess: ThrustKnots,
         weights: Weights,
-        duration: DurationBounds,
         planes: Array | None = None,
         center: ThrustKnots | None = None,
         *,
-        phase: SearchPhase = SearchPhase.REFINING,
         rough: bool = False,
         corrected: bool = False,
     ) -> ThrustKnots | None:
+        """Return the best motion near a guess: in its time, in any time if none is given yet, and
+        to a target by the latest time if nothing is in the way.
+        """
         self.stop.cancellation.raise_if_requested()
-        if phase is not self._phase:
-            self._phase, best = phase, self._earliest or math.inf
-            log_progress(_LOG, SearchProgress(0, 0, best, phase), f"{phase.value} a motion")
+        duration = DurationBounds(guess.duration, guess.duration)
+        if not self._is_timed:
+            duration = _FREE_TIME
+        elif self.grapple is not None and center is None and not self._room:
+            duration = DurationBounds(self._earliest, self._latest)
         boundary = replace(self.boundary, goals=self._goals(guess.duration))
         args = boundary, guess, weights, self.stop, duration, planes, center
         return self._solver.solve(*args, rough=rough, corrected=corrected)
@@ -638,22 +623,16 @@ class _Search:
     def _solver(self) -> ThrustSolver:
         return self.planner.solver(self.kind, self.bodies, self._kept)
 
-    def _fastest(self, guess: ThrustKnots) -> ThrustKnots | None:
-        weights, phase = self._fast(guess), SearchPhase.SEARCHING
-        return self._solve(guess, weights, _FREE_TIME, phase=phase, rough=self._is_timed)
-
-    def _fast(self, guess: ThrustKnots) -> Weights:
-        """Return the weights of least time, in units of the guess."""
-        small = _TIME_REGULARISATION
-        return Weights(1 / guess.duration, 0.0, small, small, _COST_OF_LACK)
-
-    def _cheap(self, guess: ThrustKnots, rounding: float) -> Weights:
-        """Return the weights of least propellant, in units of the guess."""
+    def _weights(self, guess: ThrustKnots, rounding: float = 1.0) -> Weights:
+        """Return the weights of least propellant, or of least time, in units of the guess."""
+        if not self._is_timed:
+            small = _TIME_REGULARISATION
+            return Weights(1 / guess.duration, 0.0, small, small, _COST_OF_LACK)
         spent = guess.step * float(np.sum(self.planner.propulsion.cost_of(guess.levels)))
         small = _REGULARISATION
         return Weights(0.0, 1 / max(spent, 1e-12), _SMOOTHNESS, small, _COST_OF_LACK, rounding)
 
-    def _exact(self, guess: ThrustKnots, planes: Array | None = None) -> ThrustMotion:
+    def _exact(self, guess: ThrustKnots) -> ThrustMotion:
         """Return the motion of least propellant, or of least time, near a path, as it flies.
 
         Raises
@@ -661,21 +640,16 @@ class _Search:
         PlanningError
             None is found that ends at the goal.
         """
-        planner, knots = self.planner, guess
-        if self._is_timed:
-            duration = self._span(guess)
-            roundings = _ROUNDINGS[1:] if planner.propulsion.norms else (1.0,)
-            if planes is not None:
-                roundings = roundings[:1]
-            *others, last = (self._cheap(guess, each) for each in roundings)
-        else:
-            duration, others = _FREE_TIME, []
-            last = self._fast(guess)
+        planner, knots, planes = self.planner, guess, self._planes(guess)
+        roundings = _ROUNDINGS[1:] if planner.propulsion.norms else (1.0,)
+        if self._room or not self._is_timed:
+            roundings = roundings[:1]
+        *others, weights = (self._weights(guess, each) for each in roundings)
         for each in others:
-            knots = self._solve(knots, each, duration, planes) or knots
+            knots = self._solve(knots, each, planes) or knots
         center, best, error = None, None, math.inf
         for number in range(_MAX_CORRECTIONS):
-            solved = self._solve(knots, last, duration, planes, center, corrected=number > 0)
+            solved = self._solve(knots, weights, planes, center, corrected=number > 0)
             if solved is None:
                 break
             motion = planner.motion(solved)
@@ -686,18 +660,14 @@ class _Search:
                 break
             knots = replace(solved, defects=motion.defects())
             if self._is_timed and found < _NEAR_END:
-                duration = DurationBounds(knots.duration, knots.duration)
                 # The nearest controls that fly exactly: solutions of least propellant are flat.
-                last, center = _NEAREST, knots
+                weights, center = _NEAREST, knots
         if best is None:
-            raise PlanningError(self._failure("no motion to the goal was found"))
+            raise self._failure("no motion to the goal was found")
         if error > _LARGEST_END_ERROR:
-            least = planner.options.intervals
-            raise PlanningError(
-                self._failure(
-                    f"its plan ends {error:.3g} m or rad off the goal; set plan.intervals to more "
-                    f"than {least}"
-                )
+            raise self._failure(
+                f"its plan ends {error:.3g} m or rad off the goal; set plan.intervals to more than "
+                f"{planner.options.intervals}"
             )
         return best
 
@@ -717,12 +687,10 @@ class _Search:
 
     def _clear(self, path: ThrustKnots, near: Sequence[Approach]) -> ThrustKnots:
         """Return a path that is clear of the pairs that came near, and of all others."""
-        grapple = self.grapple
-        if grapple is None:
+        if self.grapple is None:
             guesses = itertools.chain(self._bows(path, near), [path])
         else:
-            latest = grapple.horizon if self._meets_any_time else path.duration + 1e-9
-            times = np.arange(path.duration, latest, _MEETING_PERIOD)
+            times = np.arange(path.duration, self.grapple.horizon, _MEETING_PERIOD)
             shallow = [path] if near[0].distance > -_SHALLOW else []
             guesses = itertools.chain(shallow, self._meetings(times))
         for guess in guesses:
@@ -731,33 +699,31 @@ class _Search:
             cleared = self._cleared(guess)
             if cleared is not None:
                 return cleared
-        raise PlanningError(self._failure(self.bodies.reason(self._nearest or near[0])))
+        raise self._failure(self.bodies.reason(near[0]))
 
     def _cleared(self, at: ThrustKnots) -> ThrustKnots | None:
         """Return a path near one that keeps pairs apart, and all others that come too near."""
         bodies = self.bodies
+        self._begin(SearchPhase.CLEARING)
         for _ in range(_MAX_ROUNDS):
-            planes = self._planes(at)
-            weights = self._cheap(at, _ROUNDINGS[0]) if self._is_timed else self._fast(at)
-            duration = self._span(at) if self._is_timed else _FREE_TIME
-            solved = self._solve(at, weights, duration, planes, phase=SearchPhase.CLEARING)
+            solved = self._solve(at, self._weights(at, _ROUNDINGS[0]), self._planes(at))
             if solved is None:
                 return None
-            if self._solver.lack > _LARGEST_LACK:
-                at = solved
-                continue
             motion = self.planner.motion(solved)
-            approaches = bodies.approaches(motion)
-            solved = replace(solved, defects=motion.defects())
-            if not approaches:
+            near, solved = bodies.approaches(motion), replace(solved, defects=motion.defects())
+            if not near:
                 return solved
-            self._nearest = approaches[0]
-            fell_in = [e.pair for e in approaches if e.distance < 0 and e.pair not in self._room]
-            self._add(approaches, solved)
+            fell_in = [e.pair for e in near if e.distance < 0 and e.pair not in self._room]
+            self._add(near, solved)
             if not fell_in or min(bodies.distances(pair, at).min() for pair in fell_in) <= 0:
                 # Else planes of these pairs are made along the path before, which is clear of them.
                 at = solved
         return None
 
-    def _failure(self, why: str) -> str:
-        return f"The goal of robot '{self.planner.robot.description.name}' is not reached: {why}."
+    def _begin(self, phase: SearchPhase) -> None:
+        progress = SearchProgress(0, 0, self._earliest or math.inf, phase)
+        log_progress(_LOG, progress, f"{phase.value} a motion")
+
+    def _failure(self, why: str) -> PlanningError:
+        name = self.planner.robot.description.name
+        return PlanningError(f"The goal of robot '{name}' is not reached: {why}.")

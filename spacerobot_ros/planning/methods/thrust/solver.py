@@ -169,8 +169,6 @@ class ThrustSolver:
         places: Sequence[Sequence[int]] = (),
     ) -> None:
         self.stages, self._acceleration = stages, acceleration
-        self.lack = 0.0
-        """Distance by which pairs are nearer in the last solution than required, m."""
         self._layout, self._program = thrust_program(stages, intervals, rows, places)
         program = self._program
         self._rows_of_pairs = sum(map(len, places))
@@ -254,17 +252,13 @@ class ThrustSolver:
             ubg=self._program.upper,
             p=np.concatenate(parameters),
         )
-        x, multipliers = result["x"].full().ravel(), None
-        if solver.stats()["success"]:
-            multipliers = tuple(result[each].full().ravel() for each in ("lam_x", "lam_g"))
-        elif self._monitor.best is None:
+        if not solver.stats()["success"]:
             return None
-        else:
-            x = self._monitor.best
+        x, *multipliers = (result[name].full().ravel() for name in ("x", "lam_x", "lam_g"))
         step, (states, accelerations, levels) = float(x[0]), (x[at] for at in layout.knots())
-        self.lack = float(x[-1]) if layout.has_lack else 0.0
         states = with_joints_moved(states, -step / 2)
-        return ThrustKnots(step, states, accelerations, levels, multipliers, guess.defects)
+        known = multipliers[0], multipliers[1]
+        return ThrustKnots(step, states, accelerations, levels, known, guess.defects)
 
     def _known(self, of_variables: Array, of_rows: Array) -> dict[str, Array]:
         """Return the first multipliers of the solver from those of a solution: of all rows, if it
