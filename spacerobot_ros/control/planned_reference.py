@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-from bisect import bisect_left
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import ClassVar, NamedTuple
 
@@ -142,24 +140,20 @@ class GrappleReference(PlannedReference):
         end = motion.at(motion.duration)
         assert end.end_effector is not None
         joints = None if start.joints is None else JointReference.at_rest(end.q)
-        goal = Reference(_pose(end.base), _pose(end.end_effector), joints)
+        base = _pose(end.base)
+        goal = Reference(base, _pose(end.end_effector), joints)
         super().__init__(start, goal, limits, motion)
         self.grapple = grapple
         frame = grapple.motion.grapple([motion.duration])
-        base = PoseReference(goal.base.position, goal.base.quaternion) if goal.base else None
-        assert base is not None
-        beside = RelativeMotionOverTime.between(frame, base.motion)
-        still = np.zeros((1, 3))
+        beside, still = RelativeMotionOverTime.between(frame, base.motion), np.zeros((1, 3))
         self._base = RelativeMotionOverTime(beside.x, still, still, beside.phi, still, still)
 
-    def relative(self, times: Array) -> RelativeMotionOverTime:
-        """Return the motion of the end-effector relative to the grapple frame at times (K,)."""
-        found = []
-        for time in np.minimum(times, self.duration).tolist():
-            frame, hand = self.grapple.motion.grapple([time]), self.motion.at(time).end_effector
-            assert hand is not None
-            found.append(RelativeMotionOverTime.between(frame, _pose(hand).motion))
-        return RelativeMotionOverTime.stacked(found)
+    def relative(self, time: float) -> RelativeMotionOverTime:
+        """Return the motion of the end-effector relative to the grapple frame at a time."""
+        time = min(time, self.duration)
+        frame, hand = self.grapple.motion.grapple([time]), self.motion.at(time).end_effector
+        assert hand is not None
+        return RelativeMotionOverTime.between(frame, _pose(hand).motion)
 
     def at(self, time: float) -> Reference:
         """Return the reference ``time`` s after its start."""
@@ -223,17 +217,16 @@ class ReferencePlanner:
                 "profile to quintic."
             )
         self._planner = ThrustPlanner(robot, propulsion, options, outputs.end_effector_link)
-        self._clearance = self._planner.clearance
 
     def use_obstacles(self, world: RobotDescription | None) -> None:
         """Plan around other obstacles from the next plan on; None: around none."""
-        self._clearance = self._planner.clearance_among(world)
+        self._planner.use_obstacles(world)
 
     def time_until_blocked(self, profile: PlannedReference, time: float) -> float:
         """Return how long a reference stays clear of obstacles, s, counted from a time after its
         start; infinite: to its end.
         """
-        clearance, motion = self._clearance, profile.motion
+        clearance, motion = self._planner.clearance, profile.motion
         if clearance is None or not clearance.has_obstacles or time >= motion.duration:
             return math.inf
         shapes, base = motion.path()
@@ -293,7 +286,6 @@ class ReferencePlanner:
 
     def _begin(self, start: Reference, state: ControlState) -> tuple[RobotMotion, Array]:
         """Return where a plan from a reference begins, and the shape (n,) there."""
-        self._planner.clearance = self._clearance
         base, joints = start.base, start.joints if self._outputs.joints else None
         assert base is not None
         R_BW = matrix_from_quaternion(base.quaternion).T

@@ -276,8 +276,8 @@ class ApproachTask:
         self._predicted, self._planned_at = planned.grapple.motion, job.begins
         self._plan, self._start, self._contact = planned, 0.0, planned.duration
         controller.begin(job.begins, planned)
-        contact, mass = job.begins + planned.duration, controller.law.robot.total_mass
-        left = float(np.linalg.norm(planned.grapple.joined_momentum(mass, planned.motion)))
+        contact = job.begins + planned.duration
+        left = float(np.linalg.norm(planned.motion.joined_momentum(planned.grapple.motion)))
         message = (
             f"Base and end-effector set out at {job.begins:.4g} s and meet the target at "
             f"{contact:.4g} s; the plan leaves {left:.4g} N m s after the grasp."

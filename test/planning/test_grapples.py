@@ -144,7 +144,7 @@ def test_a_grasp_leaves_no_angular_momentum_if_that_is_asked_for() -> None:
         orbit = reduced * np.cross(apart, of_target - h.linear / m)
         totals.append(np.linalg.norm(h.angular + spin + orbit) / np.linalg.norm(spin))
         durations.append(motion.duration)
-        planned = grapple.joined_momentum(planner.robot.total_mass, motion)
+        planned = motion.joined_momentum(grapple.motion)
         assert planned == pytest.approx(h.angular + spin + orbit, abs=1e-3)
     assert totals[0] > 1
     assert totals[1] < 0.01

@@ -71,7 +71,7 @@ def measure(name: str, count: int, boxes: int, seed: int) -> str:
             ]
             links = "".join(box(k, at, rng, size) for k, at in enumerate(middle))
             world = parse_world(f'<robot name="world"><link name="w"/>{links}</robot>')
-            planner.clearance = planner.clearance_among(world)
+            planner.use_obstacles(world)
         start = RobotMotion.at_rest(begin, folded)
         began = time.process_time()
         try:

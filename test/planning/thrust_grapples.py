@@ -63,7 +63,7 @@ def planned(rate: float, count: int, seed: int, *, detumbles: bool, bare: bool) 
                 motion = planner.plan(start, asked)
                 longer.append(motion.duration / plain.duration)
                 spins = np.linalg.norm(body.inertia.about_com @ free.R_WT.T @ free.omega)
-                joined = grapple.joined_momentum(robot.total_mass, motion)
+                joined = motion.joined_momentum(grapple.motion)
                 left.append(float(np.linalg.norm(joined) / spins))
             else:
                 motion = plain

@@ -30,8 +30,13 @@ from spacerobot_ros.planning.core.clearance import Clearance
 from spacerobot_ros.planning.methods.optimal.transcription import ConstraintBlock
 from spacerobot_ros.planning.methods.thrust.goals import Grapple, base_for_hand
 from spacerobot_ros.planning.methods.thrust.motion import EXACT_STEPS, ThrustMotion, base_poses
-from spacerobot_ros.planning.methods.thrust.solver import ThrustKnots, state_parts
-from spacerobot_ros.planning.methods.thrust.transcription import INSTANTS, KeptPlaces, pair_block
+from spacerobot_ros.planning.methods.thrust.transcription import (
+    INSTANTS,
+    KeptPlaces,
+    ThrustKnots,
+    pair_block,
+    state_parts,
+)
 
 _NO_DISTANCE = 1e3
 """m; rows of a plane this far away are always satisfied."""

@@ -8,12 +8,9 @@ import numpy as np
 
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array, RobotDescription
-from spacerobot_ros.model.grasp import combined_momenta
 from spacerobot_ros.model.rotations import compose_poses, relative_pose
 from spacerobot_ros.model.target_motion import TorqueFreeMotion
 from spacerobot_ros.planning.core.goal import end_effector_pose
-from spacerobot_ros.planning.methods.thrust.motion import ThrustMotion
-from spacerobot_ros.planning.methods.thrust.solver import state_parts
 
 
 @dataclass(frozen=True)
@@ -43,16 +40,6 @@ class Grapple:
     horizon: float = 120.0
     detumbles: bool = False
     standoff: tuple[float, ...] = (-0.3, 0.0, 0.0)
-
-    def joined_momentum(self, mass: float, motion: ThrustMotion) -> Array:
-        """Return the angular momentum (3,) of a robot of a mass (kg) and the target about their
-        centre of mass, in W, after a motion to it, N m s.
-        """
-        _, L, r, V, *_ = state_parts(motion.final_state)
-        at = self.motion.numbers(motion.duration)
-        L_T, r_T, V_T, of_target = at[5:8], at[8:11], at[11:14], float(at[14])
-        momenta = np.concatenate([mass * V, L]), np.concatenate([of_target * V_T, L_T])
-        return combined_momenta((mass, of_target), (r, r_T), momenta)[3:]
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.compilation import BufferedFunction
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.dynamics import solve_positive_definite
+from spacerobot_ros.model.grasp import combined_momenta
 from spacerobot_ros.model.integration import runge_kutta_step
 from spacerobot_ros.model.rotations import (
     matrices_from_quaternions,
@@ -24,8 +25,13 @@ from spacerobot_ros.model.symbolic_rotations import (
     quaternion_from_matrix,
     quaternion_rate,
 )
+from spacerobot_ros.model.target_motion import TorqueFreeMotion
 from spacerobot_ros.planning.methods.thrust.propulsion import Propulsion
-from spacerobot_ros.planning.methods.thrust.solver import ThrustKnots, state_parts
+from spacerobot_ros.planning.methods.thrust.transcription import (
+    ThrustKnots,
+    state_parts,
+    state_symbols,
+)
 
 EXACT_STEPS = 8
 """Steps of Runge-Kutta in an interval that is integrated exactly."""
@@ -129,7 +135,7 @@ class ThrustMotion:
     @property
     def spent(self) -> float:
         """Cost of the levels: kg of propellant of thrusters in a table, else N s."""
-        return self.step * float(np.sum(self.propulsion.cost_of(self.levels)))
+        return self.step * float(self.propulsion.cost_of(ca.DM(self.levels.T)))
 
     def _through(self, k: int, state: Array) -> Array:
         """Return the states (EXACT_STEPS, 13 + 2 n) on an interval that begins in one."""
@@ -175,6 +181,16 @@ class ThrustMotion:
         """Return shapes (K, n) and poses of the base at all instants of the exact integration."""
         return state_parts(self._grid)[4], base_poses(self._functions.robot, self._grid)
 
+    def joined_momentum(self, target: TorqueFreeMotion) -> Array:
+        """Return the angular momentum (3,) of the robot and a target, whose motion begins with this
+        one, about their centre of mass at its end, in W, N m s.
+        """
+        _, L, r, V, *_ = state_parts(self.final_state)
+        at, mass = target.numbers(self.duration), self._functions.robot.total_mass
+        L_T, r_T, V_T, of_target = at[5:8], at[8:11], at[11:14], float(at[14])
+        momenta = np.concatenate([mass * V, L]), np.concatenate([of_target * V_T, L_T])
+        return combined_momenta((mass, of_target), (r, r_T), momenta)[3:]
+
     @property
     def final_state(self) -> Array:
         """State (13 + 2 n,) at the end."""
@@ -186,8 +202,8 @@ def _sample(robot: SpaceRobot, link: str) -> ca.Function:
     without an end-effector, and efforts.
     """
     n = robot.n
-    x, qddot, wrench = (ca.SX.sym(name, k) for name, k in (("x", 13 + 2 * n), ("a", n), ("w", 6)))
-    X, L, r, V, q, qdot = ca.vertsplit(x, [0, 4, 7, 10, 13, 13 + n, 13 + 2 * n])
+    qddot, wrench = ca.SX.sym("qddot", n), ca.SX.sym("wrench", 6)
+    x, (X, L, r, V, q, qdot) = state_symbols(n)
     R, force, torque = matrix_from_quaternion(X), wrench[:3], wrench[3:]
     H = robot.function("inertia_matrix", compile=False)(q)
     c = robot.function("center_of_mass", compile=False)(q)
@@ -225,13 +241,12 @@ def _sample(robot: SpaceRobot, link: str) -> ca.Function:
 
 def _flight_rate(robot: SpaceRobot) -> ca.Function:
     """Return ``(x, [qddot; wrench]) -> x_dot``, with the wrench in the base."""
-    n = robot.n
-    x, controls = ca.SX.sym("x", 13 + 2 * n), ca.SX.sym("controls", n + 6)
-    X, L, _, V, q, qdot = ca.vertsplit(x, [0, 4, 7, 10, 13, 13 + n, 13 + 2 * n])
-    qddot, force, torque = ca.vertsplit(controls, [0, n, n + 3, n + 6])
+    x, (X, L, _, V, q, qdot) = state_symbols(robot.n)
+    qddot, force, torque = (ca.SX.sym(*each) for each in (("qddot", robot.n), ("f", 3), ("n", 3)))
     D, D_q = robot.function("locked_inertia", compile=False)(q)
     R, c = matrix_from_quaternion(X), robot.function("center_of_mass", compile=False)(q)
     omega = solve_positive_definite(D, R.T @ L - D_q @ qdot)
     turning, twisted = quaternion_rate(X, omega), R @ (torque - ca.cross(c, force))
     x_dot = ca.vertcat(turning, twisted, V, R @ force / robot.total_mass, qdot, qddot)
+    controls = ca.vertcat(qddot, force, torque)
     return ca.Function("flight_rate", [x, controls], [ca.densify(ca.cse(x_dot))])

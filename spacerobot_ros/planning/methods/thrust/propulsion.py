@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+import casadi as ca
 import numpy as np
 
 from spacerobot_ros.errors import ParameterError
@@ -89,10 +90,13 @@ class Propulsion:
         one_way = np.maximum(force.clip(0.0).sum(axis=1), -force.clip(None, 0.0).sum(axis=1))
         return float(np.linalg.norm(one_way))
 
-    def cost_of(self, levels: Array) -> Array:
-        """Return the cost per second (...) of levels (..., m)."""
-        within = [i for group in self.norms for i in group]
-        cost = np.delete(levels, within, -1) @ np.delete(self.cost, within)
+    def cost_of(self, levels: ca.MX | ca.DM, rounding: ca.MX | float = 0.0) -> ca.MX | ca.DM:
+        """Return the cost of levels (m, N) that each last for a second; norms are rounded off at a
+        level.
+        """
+        single = np.delete(np.arange(self.size), [i for group in self.norms for i in group])
+        cost = ca.sum2(ca.DM(self.cost[single]).T @ levels[single.tolist(), :])
         for group in self.norms:
-            cost = cost + self.cost[group[0]] * np.linalg.norm(levels[..., list(group)], axis=-1)
-        return np.asarray(cost)
+            sizes = ca.sqrt(ca.sum1(levels[list(group), :] ** 2) + rounding**2)
+            cost += self.cost[group[0]] * ca.sum2(sizes - rounding)
+        return cost

@@ -16,6 +16,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
+import casadi as ca
 import numpy as np
 
 from spacerobot_ros.collision import Approach
@@ -23,11 +24,7 @@ from spacerobot_ros.errors import NotFoundError, PlanningError, Proof, Unreachab
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array, Pose, RobotDescription
 from spacerobot_ros.model.grasp import RobotMotion
-from spacerobot_ros.model.inverse_kinematics import (
-    REACHED_DISTANCE,
-    FixedBaseArm,
-    is_reached,
-)
+from spacerobot_ros.model.inverse_kinematics import FixedBaseArm, is_reached
 from spacerobot_ros.model.rotations import (
     attitude_error,
     matrices_from_quaternions,
@@ -56,18 +53,16 @@ from spacerobot_ros.planning.methods.thrust.motion import (
     base_poses,
 )
 from spacerobot_ros.planning.methods.thrust.propulsion import Propulsion
-from spacerobot_ros.planning.methods.thrust.solver import (
-    ThrustBoundary,
-    ThrustKnots,
-    ThrustSolver,
-    Weights,
-    state_parts,
-    with_joints_moved,
-)
 from spacerobot_ros.planning.methods.thrust.transcription import (
     EndKind,
     KeptPlaces,
+    ThrustBoundary,
+    ThrustKnots,
+    ThrustSolver,
     ThrustStages,
+    Weights,
+    state_parts,
+    with_joints_moved,
 )
 
 _LOG = logging.getLogger(__name__)
@@ -198,10 +193,10 @@ class ThrustPlanner:
         self._solvers: dict[tuple[EndKind, KeptPlaces], ThrustSolver] = {}
         self._rows: dict[tuple[int, int], ConstraintBlock] = {}
 
-    def clearance_among(self, world: RobotDescription | None) -> Clearance | None:
-        """Return the :attr:`clearance` among other obstacles; None: among none."""
+    def use_obstacles(self, world: RobotDescription | None) -> None:
+        """Plan around other obstacles from the next plan on; None: around none."""
         described = with_world(self.robot.description, world)
-        return Clearance.wanted(described, self.options.clearance, "plan.clearance")
+        self.clearance = Clearance.wanted(described, self.options.clearance, "plan.clearance")
 
     @cached_property
     def _functions(self) -> MotionFunctions:
@@ -241,7 +236,7 @@ class ThrustPlanner:
         motion = plain.run(plain.first_meeting())
         if not grapple.detumbles:
             return motion
-        left = grapple.joined_momentum(self.robot.total_mass, motion)
+        left = motion.joined_momentum(grapple.motion)
         kind = kind._replace(momentum=True)
         for share in _SHARES_LEFT:
             search = _Search(self, boundary, kind, stop, bodies, grapple, share * left)
@@ -343,14 +338,12 @@ class ThrustPlanner:
         """Return the shape (n,) near to one in which the end-effector is at a pose."""
         poses = [Pose(matrix_from_quaternion(each[3:]), each[:3]) for each in (base, hand)]
         arm = FixedBaseArm(self.robot, self.link, poses[0])
-        found, distance = arm.nearest_shape(q, poses[1])
-        if distance > REACHED_DISTANCE:
-            found, distance, angle = arm.search_shape(q, poses[1])
-            if not is_reached(distance, angle):
-                raise NotFoundError(
-                    f"No joint positions were found that put '{self.link}' at its goal while the "
-                    f"base is at its own: {distance:.3g} m and {angle:.3g} rad remain.",
-                )
+        found, distance, angle = arm.search_shape(q, poses[1])
+        if not is_reached(distance, angle):
+            raise NotFoundError(
+                f"No joint positions were found that put '{self.link}' at its goal while the base "
+                f"is at its own: {distance:.3g} m and {angle:.3g} rad remain.",
+            )
         return found
 
     def _require_within(self, q: Array) -> None:
@@ -628,7 +621,7 @@ class _Search:
         if not self._is_timed:
             small = _TIME_REGULARISATION
             return Weights(1 / guess.duration, 0.0, small, small, _COST_OF_LACK)
-        spent = guess.step * float(np.sum(self.planner.propulsion.cost_of(guess.levels)))
+        spent = guess.step * float(self.planner.propulsion.cost_of(ca.DM(guess.levels.T)))
         small = _REGULARISATION
         return Weights(0.0, 1 / max(spent, 1e-12), _SMOOTHNESS, small, _COST_OF_LACK, rounding)
 
