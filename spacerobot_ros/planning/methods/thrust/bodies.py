@@ -7,7 +7,7 @@ transformed to W by the pose of the target at that time.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -37,6 +37,9 @@ from spacerobot_ros.planning.methods.thrust.transcription import (
     pair_block,
     state_parts,
 )
+
+_ROOM = 4e-3
+"""Distance beyond the required one at these instants: paths bend between them, m."""
 
 _NO_DISTANCE = 1e3
 """m; rows of a plane this far away are always satisfied."""
@@ -125,6 +128,8 @@ class Bodies:
             kept = Clearance(among, distance, name, obstacles_alone=True)
             first = sum(len(each.geometry.pairs) for each in self._around)
             self._around.append(_Surroundings(kept, first, grapple.motion))
+        self._kept: dict[int, tuple[float, Array]] = {}
+        """Room of the pairs that are kept apart, m, and whether they are at each instant (N K,)."""
         shape = start.q[np.newaxis]
         begin = _Samples(shape, _poses(start.pose), np.zeros(1))
         for each in self._around:
@@ -148,11 +153,6 @@ class Bodies:
         """Return the surroundings of a pair, and its number there."""
         around = next(each for each in reversed(self._around) if each.first <= number)
         return around, number - around.first
-
-    def required(self, number: int) -> float:
-        """Return the distance that is required of a pair, m."""
-        around, pair = self._pair(number)
-        return float(around.required[pair])
 
     # -- rows of the program ------------------------------------------------------------------
 
@@ -203,28 +203,43 @@ class Bodies:
             least = min(least, float(found.min()))
         return least
 
-    def places(self, approach: Approach, knots: ThrustKnots) -> set[int]:
-        """Return the instants of a path at which a pair is near, by the size of its first solid,
-        and those around its approach in an exactly integrated motion.
+    def keep(self, near: Sequence[Approach], knots: ThrustKnots) -> None:
+        """Keep more pairs apart: at the instants of a path at which they are near, by the size of
+        the first solid, and around their approaches in an exactly integrated motion. Give those
+        that are kept as much room as they lack.
         """
-        around, pair = self._pair(approach.pair)
-        first = around.geometry.solids[around.geometry.pairs[pair][0]]
-        reach = around.required[pair] + first.enclosure.bounding_radius
-        near = self.distances(approach.pair, knots) < reach
-        place = int(approach.tick / EXACT_STEPS * INSTANTS) - 1
-        near[max(place, 0) : place + 2] = True
-        return set(np.flatnonzero(near).tolist())
+        for approach in near:
+            around, pair = self._pair(approach.pair)
+            first = around.geometry.solids[around.geometry.pairs[pair][0]]
+            reach = around.required[pair] + first.enclosure.bounding_radius
+            places = self.distances(approach.pair, knots) < reach
+            place = int(approach.tick / EXACT_STEPS * INSTANTS) - 1
+            places[max(place, 0) : place + 2] = True
+            room, known = self._kept.get(approach.pair, (None, False))
+            lack = float(around.required[pair]) - approach.distance
+            more = _ROOM if room is None else room + lack + _ROOM
+            self._kept[approach.pair] = more, places | known
 
-    def planes(self, kept: KeptPlaces, room: Mapping[int, float], knots: ThrustKnots) -> Array:
-        """Return the planes (R, 8) of pairs along a path, with the room of each, m."""
+    def keep_none(self) -> None:
+        """Keep no pairs apart."""
+        self._kept = {}
+
+    @property
+    def kept(self) -> KeptPlaces:
+        """The pairs that are kept apart, and where."""
+        numbers = sorted(self._kept)
+        return tuple((k, tuple(np.flatnonzero(self._kept[k][1]).tolist())) for k in numbers)
+
+    def planes(self, knots: ThrustKnots) -> Array:
+        """Return the planes (R, 8) of the pairs that are kept apart along a path."""
         path = self._along(knots)
-        found, last = [], len(path.times) - INSTANTS
-        for number, places in kept:
+        found, last = [np.zeros((0, 8))], len(path.times) - INSTANTS
+        for number, places in self.kept:
             at = np.array(places)
             around, pair = self._pair(number)
             planes = around.planes(pair, path, at)
             at_ends = (at < INSTANTS) | (at >= last)
-            wanted = around.required[pair] + np.where(at_ends, 0.0, room[number])
+            wanted = around.required[pair] + np.where(at_ends, 0.0, self._kept[number][0])
             if around.of_hand[pair]:
                 # Boxes around the hand would touch before it does.
                 wanted[at >= last] = -np.inf

@@ -14,7 +14,7 @@ import logging
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cache, cached_property, partial
 
 import casadi as ca
 import numpy as np
@@ -59,9 +59,9 @@ from spacerobot_ros.planning.methods.thrust.transcription import (
     ThrustBoundary,
     ThrustKnots,
     ThrustSolver,
-    ThrustStages,
     Weights,
     state_parts,
+    thrust_stages,
     with_joints_moved,
 )
 
@@ -92,9 +92,6 @@ _LARGEST_END_ERROR = 1e-3
 
 _END_REACH = 0.3
 """Distance of the joints at the end from the shape that inverse kinematics finds, m or rad."""
-
-_ROOM = 4e-3
-"""Distance beyond the clearance at these instants: paths bend between them, m."""
 
 _COST_OF_LACK = 1e3
 """Weight of a metre of missing distance of pairs."""
@@ -189,7 +186,7 @@ class ThrustPlanner:
         wheels = ReactionWheels.of(robot.description)
         self._wheels = np.zeros(robot.n, dtype=bool)
         self._wheels[wheels.index] = True
-        self._stages: dict[EndKind, ThrustStages] = {}
+        self._stages = cache(partial(thrust_stages, robot, propulsion.size))
         self._solvers: dict[tuple[EndKind, KeptPlaces], ThrustSolver] = {}
         self._rows: dict[tuple[int, int], ConstraintBlock] = {}
 
@@ -248,18 +245,19 @@ class ThrustPlanner:
                 continue
         return motion
 
-    def solver(self, kind: EndKind, bodies: Bodies, kept: KeptPlaces = ()) -> ThrustSolver:
-        """Return the solver of a kind of goals, with pairs that are kept apart at some instants."""
+    def solver(self, kind: EndKind, bodies: Bodies) -> ThrustSolver:
+        """Return the solver of a kind of goals, with the pairs that are kept apart."""
+        kept = bodies.kept
         if (kind, kept) not in self._solvers:
-            if kind not in self._stages:
-                self._stages[kind] = ThrustStages.of(self.robot, self.propulsion, kind)
             for pair, _ in kept:
                 if bodies.row_key(pair) not in self._rows:
                     self._rows[bodies.row_key(pair)] = bodies.rows(pair)
-            rows = [self._rows[bodies.row_key(pair)] for pair, _ in kept]
-            intervals, acceleration = self.options.intervals, self.limits.acceleration
             self._solvers[kind, kept] = ThrustSolver(
-                self._stages[kind], intervals, acceleration, rows, [at for _, at in kept]
+                self._stages(kind),
+                self.propulsion,
+                self.options.intervals,
+                self.limits.acceleration,
+                [(self._rows[bodies.row_key(pair)], at) for pair, at in kept],
             )
         return self._solvers[kind, kept]
 
@@ -419,10 +417,6 @@ class _Search:
         self._earliest = self._latest = 0.0
         """When a target is met, s."""
         self._effort_limit = (1.0 - planner.options.reserve) * planner.robot.effort_limit
-        self._room: dict[int, float] = {}
-        """Room of the pairs that are kept apart, m."""
-        self._places: dict[int, set[int]] = {}
-        """Instants at which they are kept apart."""
         self.path: ThrustKnots
         """The knots of the last exact motion."""
         self._left = np.zeros(3) if left is None else left
@@ -456,9 +450,9 @@ class _Search:
             if best > 0:
                 yield guess
 
-    def _meeting(self, time: float, height: float = 0.0) -> ThrustKnots:
-        """Return a guess at full thrust to where a target is at a time, in the shape of the start,
-        on a way that bows out to the side of the fixture.
+    def _meeting(self, time: float, height: float = 0.0) -> ThrustKnots | None:
+        """Return a guess to where a target is at a time, in the shape of the start, on a way that
+        bows out to the side of the fixture; None: the robot is not there by then.
         """
         planner, grapple, shape = self.planner, self.grapple, state_parts(self.boundary.start)[4]
         assert grapple is not None
@@ -467,26 +461,28 @@ class _Search:
         away = frame.R[0] @ grapple.standoff
         away /= max(float(np.linalg.norm(away)), 1e-9)
         base = base_for_hand(planner.robot, planner.link, shape, there)
-        return self._bowed(base, shape, away, height)
+        guess = self._bowed(base, shape, away, height)
+        return guess.stretched(time / guess.duration) if guess.duration <= time else None
 
     def first_meeting(self) -> ThrustKnots:
         """Return the guess to where a target is as soon as the robot can be there."""
         assert self.grapple is not None
-        latest = max(self.grapple.horizon, 2 * _MEETING_PERIOD)
-        for time in np.arange(_MEETING_PERIOD, latest, _MEETING_PERIOD).tolist():
+        for time in np.arange(_MEETING_PERIOD, 2 * self.grapple.horizon, _MEETING_PERIOD).tolist():
             guess = self._meeting(time)
-            if guess.duration <= time:
-                break
-        return guess.stretched(time / guess.duration)
+            if guess is not None:
+                return guess
+        raise self._failure(f"the target is not met within {self.grapple.horizon:g} s")
 
-    def _meetings(self, times: Array) -> Iterator[ThrustKnots]:
-        """Yield guesses at a target at times that are clear, of each time the straightest one."""
-        for time in times.tolist():
+    def _meetings(self, begin: float) -> Iterator[ThrustKnots]:
+        """Yield guesses at a target that are clear, from a time on, of each time the straightest
+        one.
+        """
+        assert self.grapple is not None
+        for time in np.arange(begin, self.grapple.horizon, _MEETING_PERIOD).tolist():
             for height in _BOW_SHARES:
                 guess = self._meeting(time, height)
-                if guess.duration > time:
+                if guess is None:
                     break
-                guess = guess.stretched(time / guess.duration)
                 if self.bodies.room(guess) > 0:
                     yield guess
                     break
@@ -528,10 +524,9 @@ class _Search:
 
     def run_near(self, other: _Search) -> ThrustMotion:
         """Return the motion near that of another search, in its time."""
-        self._room, self._places = dict(other._room), dict(other._places)
         self._is_timed, path = True, replace(other.path, multipliers=None)
         self._earliest = self._latest = path.duration
-        path = self._solve(path, _NEAREST, self._planes(path), center=path) or path
+        path = self._solve(path, _NEAREST, center=path) or path
         cleared = self._cleared(path)
         if cleared is not None:
             motion = self._settled(cleared)
@@ -545,7 +540,8 @@ class _Search:
         """
         bodies = self.bodies
         self._begin(SearchPhase.REFINING)
-        self._room, self._places, self._latest = {}, {}, time
+        bodies.keep_none()
+        self._latest = time
         path = fastest.stretched(
             (time if self.grapple is None else self._earliest) / fastest.duration
         )
@@ -568,26 +564,8 @@ class _Search:
             near = self.bodies.approaches(motion)
             if not near:
                 return motion
-            self._add(near, path)
+            self.bodies.keep(near, path)
         raise self._failure(self.bodies.reason(near[0]))
-
-    @property
-    def _kept(self) -> KeptPlaces:
-        return tuple((pair, tuple(sorted(self._places[pair]))) for pair in sorted(self._places))
-
-    def _planes(self, path: ThrustKnots) -> Array | None:
-        return self.bodies.planes(self._kept, self._room, path) if self._room else None
-
-    def _add(self, approaches: Sequence[Approach], path: ThrustKnots) -> None:
-        """Keep more pairs apart, where they are near along a path, and give those that are kept as
-        much room as they lack.
-        """
-        for each in approaches:
-            near = self.bodies.places(each, path)
-            self._places[each.pair] = self._places.get(each.pair, set()) | near
-            lack = self.bodies.required(each.pair) - each.distance
-            before = self._room.get(each.pair)
-            self._room[each.pair] = _ROOM if before is None else before + lack + _ROOM
 
     def _solve(
         self,
@@ -600,21 +578,23 @@ class _Search:
         corrected: bool = False,
     ) -> ThrustKnots | None:
         """Return the best motion near a guess: in its time, in any time if none is given yet, and
-        to a target by the latest time if nothing is in the way.
+        to a target by the latest time if nothing is in the way. Planes are those along the guess,
+        unless others are given.
         """
         self.stop.cancellation.raise_if_requested()
         duration = DurationBounds(guess.duration, guess.duration)
         if not self._is_timed:
             duration = _FREE_TIME
-        elif self.grapple is not None and center is None and not self._room:
+        elif self.grapple is not None and center is None and not self.bodies.kept:
             duration = DurationBounds(self._earliest, self._latest)
         boundary = replace(self.boundary, goals=self._goals(guess.duration))
+        planes = self.bodies.planes(guess) if planes is None else planes
         args = boundary, guess, weights, self.stop, duration, planes, center
         return self._solver.solve(*args, rough=rough, corrected=corrected)
 
     @property
     def _solver(self) -> ThrustSolver:
-        return self.planner.solver(self.kind, self.bodies, self._kept)
+        return self.planner.solver(self.kind, self.bodies)
 
     def _weights(self, guess: ThrustKnots, rounding: float = 1.0) -> Weights:
         """Return the weights of least propellant, or of least time, in units of the guess."""
@@ -633,9 +613,9 @@ class _Search:
         PlanningError
             None is found that ends at the goal.
         """
-        planner, knots, planes = self.planner, guess, self._planes(guess)
+        planner, knots, planes = self.planner, guess, self.bodies.planes(guess)
         roundings = _ROUNDINGS[1:] if planner.propulsion.norms else (1.0,)
-        if self._room or not self._is_timed:
+        if len(planes) or not self._is_timed:
             roundings = roundings[:1]
         *others, weights = (self._weights(guess, each) for each in roundings)
         for each in others:
@@ -674,7 +654,7 @@ class _Search:
     def _end_error(self, motion: ThrustMotion) -> float:
         """Return the largest error at the end, m, rad, m/s: but for that of angular momenta."""
         last = np.append(motion.step, with_joints_moved(motion.final_state, motion.step / 2))
-        rows = self._solver.stages.end.values(last, self._goals(motion.duration))
+        rows = self._solver.end.values(last, self._goals(motion.duration))
         of_poses = 9 if self.kind.target else rows.numel()
         return float(np.abs(rows.full()[:of_poses]).max(initial=0.0))
 
@@ -683,12 +663,11 @@ class _Search:
         if self.grapple is None:
             guesses = itertools.chain(self._bows(path, near), [path])
         else:
-            times = np.arange(path.duration, self.grapple.horizon, _MEETING_PERIOD)
             shallow = [path] if near[0].distance > -_SHALLOW else []
-            guesses = itertools.chain(shallow, self._meetings(times))
+            guesses = itertools.chain(shallow, self._meetings(path.duration))
         for guess in guesses:
-            self._room, self._places = {}, {}
-            self._add(near, guess)
+            self.bodies.keep_none()
+            self.bodies.keep(near, guess)
             cleared = self._cleared(guess)
             if cleared is not None:
                 return cleared
@@ -699,15 +678,16 @@ class _Search:
         bodies = self.bodies
         self._begin(SearchPhase.CLEARING)
         for _ in range(_MAX_ROUNDS):
-            solved = self._solve(at, self._weights(at, _ROUNDINGS[0]), self._planes(at))
+            solved = self._solve(at, self._weights(at, _ROUNDINGS[0]))
             if solved is None:
                 return None
             motion = self.planner.motion(solved)
             near, solved = bodies.approaches(motion), replace(solved, defects=motion.defects())
             if not near:
                 return solved
-            fell_in = [e.pair for e in near if e.distance < 0 and e.pair not in self._room]
-            self._add(near, solved)
+            known = {pair for pair, _ in bodies.kept}
+            fell_in = [e.pair for e in near if e.distance < 0 and e.pair not in known]
+            bodies.keep(near, solved)
             if not fell_in or min(bodies.distances(pair, at).min() for pair in fell_in) <= 0:
                 # Else planes of these pairs are made along the path before, which is clear of them.
                 at = solved

@@ -21,7 +21,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
+from functools import cache
 from typing import NamedTuple
 
 import casadi as ca
@@ -199,57 +199,6 @@ class Weights(NamedTuple):
     rounding: float = 1.0
 
 
-@dataclass(frozen=True)
-class ThrustStages:
-    """The functions of one robot's problem, whatever the number of intervals.
-
-    Attributes
-    ----------
-    joints
-        n.
-    propulsion
-        What pushes the base.
-    beginning, interval, end
-        Rows of the first knot, of two neighbouring knots, and of the last one.
-    """
-
-    joints: int
-    propulsion: Propulsion
-    beginning: ConstraintBlock
-    interval: ConstraintBlock
-    end: ConstraintBlock
-
-    @classmethod
-    def of(cls, robot: SpaceRobot, propulsion: Propulsion, kind: EndKind) -> ThrustStages:
-        """Derive the functions of a robot's problem, or read them from the cache.
-
-        The wrenches are parameters, so the functions stay the same if thrusters break.
-        """
-        facts = [
-            source_hash(
-                *(__name__, shooting.__name__, momentum_derivatives.__module__),
-                *(solve_positive_definite.__module__, quaternion_multiply.__module__),
-                TargetExpression.__module__,
-            ),
-            robot.equations_key,
-            f"levels {propulsion.size}",
-        ]
-        return cls(
-            robot.n,
-            propulsion,
-            beginning_block(robot.n),
-            ConstraintBlock.cached(
-                "thrust",
-                facts,
-                lambda: _interval_block(robot, propulsion.size),
-                repeated=True,
-            ),
-            ConstraintBlock.cached(
-                "thrust_end", [*facts, str(kind)], lambda: _end_block(robot, kind)
-            ),
-        )
-
-
 class EndKind(NamedTuple):
     """Quantities given at the end: the pose of the base, and that of a link (empty: none), or that
     the link has the pose and the velocities of a target's grapple frame; then the angular momentum
@@ -266,6 +215,32 @@ class EndKind(NamedTuple):
         (:meth:`.TorqueFreeMotion.numbers`), and the angular momentum (3).
         """
         return 4 + TARGET_SIZE if self.target else 7 * (1 + bool(self.link))
+
+
+Stages = tuple[ConstraintBlock, ConstraintBlock, ConstraintBlock]
+"""Rows of the first knot, of two neighbouring knots, and of the last one."""
+
+
+def thrust_stages(robot: SpaceRobot, levels: int, kind: EndKind) -> Stages:
+    """Derive the functions of a robot's problem, or read them from the cache.
+
+    The wrenches of the levels are parameters, so the functions stay the same if thrusters break.
+    """
+    facts = [
+        source_hash(
+            *(__name__, shooting.__name__, momentum_derivatives.__module__),
+            *(solve_positive_definite.__module__, quaternion_multiply.__module__),
+            TargetExpression.__module__,
+        ),
+        robot.equations_key,
+        f"levels {levels}",
+    ]
+    cached = ConstraintBlock.cached
+    return (
+        beginning_block(robot.n),
+        cached("thrust", facts, lambda: _interval_block(robot, levels), repeated=True),
+        cached("thrust_end", [*facts, str(kind)], lambda: _end_block(robot, kind)),
+    )
 
 
 def state_symbols(n: int) -> tuple[ca.SX, list[ca.SX]]:
@@ -387,10 +362,10 @@ def pair_block(joints: int, distance: ca.Function) -> ConstraintBlock:
 
 
 def thrust_program(
-    stages: ThrustStages,
+    stages: Stages,
+    propulsion: Propulsion,
     intervals: int,
-    pairs: Sequence[ConstraintBlock] = (),
-    places: Sequence[Sequence[int]] = (),
+    pairs: Sequence[tuple[ConstraintBlock, Sequence[int]]] = (),
 ) -> tuple[Layout, Program]:
     """Assemble the program from the stages of a problem.
 
@@ -398,14 +373,13 @@ def thrust_program(
     wrenches (6 m,); the defects (12 N,); typical accelerations (n,); weights of the duration,
     of the propellant, of the squares of accelerations and levels, of the lack, and the level at
     which the cost of a norm is rounded off (6,); centres of the squares (n + m, N); and the planes
-    (8,) of every pair at its ``places`` (:data:`KeptPlaces`).
+    (8,) of every pair at its places (:data:`KeptPlaces`).
     """
-    n, N, propulsion = stages.joints, intervals, stages.propulsion
-    m = propulsion.size
+    n, N, m = stages[0].rows, intervals, propulsion.size
     layout = Layout((13 + 2 * n,), (n, m), N, bool(pairs))
     knot, a, u = layout.knots()
     x = ca.MX.sym("x", layout.size)
-    goals = int(stages.end.values.size1_in(1))
+    goals = int(stages[2].values.size1_in(1))
     p = {
         name: ca.MX.sym(name, size)
         for name, size in (
@@ -416,13 +390,13 @@ def thrust_program(
             ("typical", n),
             ("weights", 6),
             ("centers", (n + m) * N),
-            ("planes", 8 * sum(map(len, places))),
+            ("planes", 8 * sum(len(at) for _, at in pairs)),
         )
     }
     zero = np.zeros((N, 1), dtype=np.int64)
     defects = ca.reshape(p["defects"], DEFECT_SIZE, N)
     placed, equalities = place_stages(
-        (stages.beginning, stages.interval, stages.end),
+        stages,
         (
             np.hstack([zero[:1], knot[:1, 13:]]),
             np.hstack([zero, knot[:-1], a, u, knot[1:]]),
@@ -437,9 +411,9 @@ def thrust_program(
         placed.append(PlacedBlock.after(placed, norm, groups, ca.MX(0, 1)))
     lack = np.full((N, 1), layout.size - 1)
     variables = np.hstack([zero, knot[:-1], knot[1:], lack])
-    ends = np.cumsum([0, *map(len, places)]).tolist()
-    for block, at, (first, last) in zip(pairs, places, pairwise(ends), strict=True):
-        planes = ca.reshape(p["planes"][8 * first : 8 * last], 8, last - first)
+    ends = np.cumsum([0, *(8 * len(at) for _, at in pairs)]).tolist()
+    for (block, at), planes in zip(pairs, ca.vertsplit(p["planes"], ends), strict=False):
+        planes = ca.reshape(planes, 8, len(at))
         placed.append(PlacedBlock.after(placed, block, variables[np.array(at) // INSTANTS], planes))
     levels = ca.reshape(x[u.ravel().tolist()], m, N)
     centers = ca.reshape(p["centers"], n + m, N)
@@ -460,35 +434,34 @@ class ThrustSolver:
 
     Parameters
     ----------
-    stages, intervals
-        The functions of the problem, and the number of intervals N.
+    stages, propulsion, intervals
+        The functions of the problem, what pushes the base, and the number of intervals N.
     acceleration
         (n,) largest accelerations of the joints.
-    rows, places
+    pairs
         The distances of pairs that are kept apart, and where (:data:`KeptPlaces`).
     """
 
     def __init__(
         self,
-        stages: ThrustStages,
+        stages: Stages,
+        propulsion: Propulsion,
         intervals: int,
         acceleration: Array,
-        rows: Sequence[ConstraintBlock] = (),
-        places: Sequence[Sequence[int]] = (),
+        pairs: Sequence[tuple[ConstraintBlock, Sequence[int]]] = (),
     ) -> None:
-        self.stages, self._acceleration = stages, acceleration
-        self._layout, self._program = thrust_program(stages, intervals, rows, places)
+        self.end = stages[2]
+        """Rows of the last knot."""
+        self._propulsion, self._acceleration = propulsion, acceleration
+        self._layout, self._program = thrust_program(stages, propulsion, intervals, pairs)
         program = self._program
-        self._rows_of_pairs = sum(map(len, places))
+        self._rows_of_pairs = sum(len(at) for _, at in pairs)
         self._monitor = SolverMonitor(program.problem, program.lower, program.upper)
-        self._built: dict[str, ca.Function] = {}
-
-    def _ipopt(self, begins: str) -> ca.Function:
-        if begins not in self._built:
-            options = {"ipopt.tol": _TOLERANCE, **_OPTIONS[begins]}
-            program, monitor = self._program, self._monitor
-            self._built[begins] = build_solver("thrust", program, monitor, options)
-        return self._built[begins]
+        self._ipopt = cache(
+            lambda begins: build_solver(
+                "thrust", program, self._monitor, {"ipopt.tol": _TOLERANCE, **_OPTIONS[begins]}
+            )
+        )
 
     def solve(
         self,
@@ -497,7 +470,7 @@ class ThrustSolver:
         weights: Weights,
         stop: StopRule,
         duration: DurationBounds,
-        planes: Array | None = None,
+        planes: Array,
         center: ThrustKnots | None = None,
         *,
         rough: bool = False,
@@ -514,7 +487,7 @@ class ThrustSolver:
         stop, duration
             Conditions on which it stops early, and bounds of the duration.
         planes
-            (R, 8) planes of the pairs at their places; None: there are no pairs.
+            (R, 8) planes of the pairs at their places.
         center
             Controls whose differences are squared; None: zero.
         rough
@@ -522,7 +495,7 @@ class ThrustSolver:
         corrected
             Whether the guess is a solution with other defects.
         """
-        layout, propulsion = self._layout, self.stages.propulsion
+        layout, propulsion = self._layout, self._propulsion
         N, most = layout.intervals, self._acceleration
         vertices = with_joints_moved(guess.states, guess.step / 2)
         x0 = pack_knots(layout, guess.step, vertices, guess.accelerations, guess.levels)
@@ -539,7 +512,7 @@ class ThrustSolver:
             np.zeros(sum(layout.controls) * N)
             if center is None
             else np.hstack([center.accelerations, center.levels]).ravel(),
-            np.zeros(0) if planes is None else planes.ravel(),
+            planes.ravel(),
         ]
         least, largest = (
             pack_knots(layout, span / N, bounds, acceleration, levels)
