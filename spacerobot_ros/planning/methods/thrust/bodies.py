@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from dataclasses import replace
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -128,6 +129,8 @@ class Bodies:
             kept = Clearance(among, distance, name, obstacles_alone=True)
             first = sum(len(each.geometry.pairs) for each in self._around)
             self._around.append(_Surroundings(kept, first, grapple.motion))
+        self.rows = cache(self._derived_rows)
+        """Returns the rows of a pair, by its number."""
         self._kept: dict[int, tuple[float, Array]] = {}
         """Room of the pairs that are kept apart, m, and whether they are at each instant (N K,)."""
         shape = start.q[np.newaxis]
@@ -156,14 +159,7 @@ class Bodies:
 
     # -- rows of the program ------------------------------------------------------------------
 
-    def row_key(self, number: int) -> tuple[int, int]:
-        """Return what the rows of a pair depend on: both solids, or the first and any obstacle."""
-        around, pair = self._pair(number)
-        first, second = around.geometry.pairs[pair].tolist()
-        return first, -1 if around.geometry.with_obstacles[pair] else second
-
-    def rows(self, number: int) -> ConstraintBlock:
-        """Derive the rows of a pair."""
+    def _derived_rows(self, number: int) -> ConstraintBlock:
         around, pair = self._pair(number)
         center_of_mass = self._robot.function("center_of_mass", compile=False)
         distance = support_distance(around.geometry, pair, center_of_mass)
@@ -262,7 +258,8 @@ class Bodies:
 
     def is_in_the_way(self, near: Sequence[Approach]) -> bool:
         """Whether an obstacle or the target is among pairs."""
-        return any(self.row_key(each.pair)[1] < 0 for each in near)
+        pairs = [self._pair(each.pair) for each in near]
+        return any(around.geometry.with_obstacles[pair] for around, pair in pairs)
 
     def reason(self, approach: Approach) -> str:
         """Return a clause about a motion that is not clear."""

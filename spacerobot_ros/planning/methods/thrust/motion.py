@@ -9,7 +9,6 @@ import numpy as np
 
 from spacerobot_ros.collision import BasePoses
 from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.model.compilation import BufferedFunction
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.dynamics import solve_positive_definite
 from spacerobot_ros.model.grasp import combined_momenta
@@ -72,18 +71,15 @@ class MotionFunctions(NamedTuple):
 
     robot: SpaceRobot
     link: str
-    step: BufferedFunction
-    interval: BufferedFunction
-    sample: BufferedFunction
+    step: ca.Function
+    interval: ca.Function
+    sample: ca.Function
 
     @classmethod
     def of(cls, robot: SpaceRobot, link: str = "") -> MotionFunctions:
         """Derive the functions."""
         step = runge_kutta_step(_flight_rate(robot), attitude=slice(4))
-        interval = step.mapaccum(EXACT_STEPS)
-        return cls(
-            robot, link, *(BufferedFunction(f) for f in (step, interval, _sample(robot, link)))
-        )
+        return cls(robot, link, step, step.mapaccum(EXACT_STEPS), _sample(robot, link))
 
 
 def base_poses(robot: SpaceRobot, states: Array) -> BasePoses:
@@ -142,7 +138,7 @@ class ThrustMotion:
         begin = np.concatenate([state[:13], self._knots.states[k, 13:]])
         controls = np.tile(self._controls[k], (EXACT_STEPS, 1)).T
         t = np.full((1, EXACT_STEPS), self.step / EXACT_STEPS)
-        return np.asarray(self._functions.interval(begin, controls, t)[0].T)
+        return np.asarray(self._functions.interval(begin, controls, t).full().T)
 
     def defects(self) -> Array:
         """Return the defects (N, 12) with which the knots would be an exact flight."""
@@ -159,8 +155,9 @@ class ThrustMotion:
         t = self.step / EXACT_STEPS
         row = min(int(time / t), len(self._grid) - 2)
         controls = self._controls[row // EXACT_STEPS]
-        (state,) = self._functions.step(self._grid[row], controls, time - row * t)
-        base, hand, tau = self._functions.sample(state, controls)
+        state = self._functions.step(self._grid[row], controls, time - row * t).full().ravel()
+        numbers = self._functions.sample(state, controls)
+        base, hand, tau = (each.full().ravel() for each in numbers)
         frames = [FrameSample(*np.split(each, [3, 7, 10, 13, 16])) for each in (base, hand)]
         *_, q, qdot = state_parts(state)
         qddot, wrench = np.split(controls, [self.joints])
@@ -172,7 +169,7 @@ class ThrustMotion:
         """Return the largest ratio of a joint effort to its limit (n,)."""
         limited = np.isfinite(limit)
         controls = np.repeat(self._controls, EXACT_STEPS, axis=0)
-        efforts = self._functions.sample.function.map(len(controls))
+        efforts = self._functions.sample.map(len(controls))
         ends = (efforts(x.T, controls.T)[2].full() for x in (self._grid[:-1], self._grid[1:]))
         tau = np.abs(np.hstack(list(ends))[limited])
         return float(np.max(tau / limit[limited, np.newaxis], initial=0.0))

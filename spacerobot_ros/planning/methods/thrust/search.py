@@ -24,7 +24,7 @@ from spacerobot_ros.errors import NotFoundError, PlanningError, Proof, Unreachab
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array, Pose, RobotDescription
 from spacerobot_ros.model.grasp import RobotMotion
-from spacerobot_ros.model.inverse_kinematics import FixedBaseArm, is_reached
+from spacerobot_ros.model.inverse_kinematics import REACHED_DISTANCE, FixedBaseArm, is_reached
 from spacerobot_ros.model.rotations import (
     attitude_error,
     matrices_from_quaternions,
@@ -44,7 +44,6 @@ from spacerobot_ros.planning.core.progress import SearchPhase, SearchProgress, l
 from spacerobot_ros.planning.methods.optimal.motion_bounds import reach_of_end_effector
 from spacerobot_ros.planning.methods.optimal.multiple_shooting import DurationBounds, StopRule
 from spacerobot_ros.planning.methods.optimal.problem import MotionLimits, MotionOptions
-from spacerobot_ros.planning.methods.optimal.transcription import ConstraintBlock
 from spacerobot_ros.planning.methods.thrust.bodies import Bodies
 from spacerobot_ros.planning.methods.thrust.goals import Grapple, ThrustGoal, base_for_hand
 from spacerobot_ros.planning.methods.thrust.motion import (
@@ -95,6 +94,9 @@ _END_REACH = 0.3
 
 _COST_OF_LACK = 1e3
 """Weight of a metre of missing distance of pairs."""
+
+_LARGEST_LACK = 1e-4
+"""Missing distance of pairs up to which a solution counts as clear before the exact check, m."""
 
 _MAX_ROUNDS = 6
 """Number of times that new planes are made to clear a path of pairs."""
@@ -186,9 +188,10 @@ class ThrustPlanner:
         wheels = ReactionWheels.of(robot.description)
         self._wheels = np.zeros(robot.n, dtype=bool)
         self._wheels[wheels.index] = True
+        self.effort_limit = (1.0 - options.reserve) * robot.effort_limit
+        """(n,) efforts that a plan may use."""
         self._stages = cache(partial(thrust_stages, robot, propulsion.size))
         self._solvers: dict[tuple[EndKind, KeptPlaces], ThrustSolver] = {}
-        self._rows: dict[tuple[int, int], ConstraintBlock] = {}
 
     def use_obstacles(self, world: RobotDescription | None) -> None:
         """Plan around other obstacles from the next plan on; None: around none."""
@@ -249,15 +252,12 @@ class ThrustPlanner:
         """Return the solver of a kind of goals, with the pairs that are kept apart."""
         kept = bodies.kept
         if (kind, kept) not in self._solvers:
-            for pair, _ in kept:
-                if bodies.row_key(pair) not in self._rows:
-                    self._rows[bodies.row_key(pair)] = bodies.rows(pair)
             self._solvers[kind, kept] = ThrustSolver(
                 self._stages(kind),
                 self.propulsion,
                 self.options.intervals,
                 self.limits.acceleration,
-                [(self._rows[bodies.row_key(pair)], at) for pair, at in kept],
+                [(bodies.rows(pair), at) for pair, at in kept],
             )
         return self._solvers[kind, kept]
 
@@ -336,12 +336,14 @@ class ThrustPlanner:
         """Return the shape (n,) near to one in which the end-effector is at a pose."""
         poses = [Pose(matrix_from_quaternion(each[3:]), each[:3]) for each in (base, hand)]
         arm = FixedBaseArm(self.robot, self.link, poses[0])
-        found, distance, angle = arm.search_shape(q, poses[1])
-        if not is_reached(distance, angle):
-            raise NotFoundError(
-                f"No joint positions were found that put '{self.link}' at its goal while the base "
-                f"is at its own: {distance:.3g} m and {angle:.3g} rad remain.",
-            )
+        found, distance = arm.nearest_shape(q, poses[1])
+        if distance > REACHED_DISTANCE:
+            found, distance, angle = arm.search_shape(q, poses[1])
+            if not is_reached(distance, angle):
+                raise NotFoundError(
+                    f"No joint positions were found that put '{self.link}' at its goal while the "
+                    f"base is at its own: {distance:.3g} m and {angle:.3g} rad remain.",
+                )
         return found
 
     def _require_within(self, q: Array) -> None:
@@ -412,15 +414,14 @@ class _Search:
     ) -> None:
         self.planner, self.boundary, self.kind, self.stop = planner, boundary, kind, stop
         self.bodies, self.grapple = bodies, grapple
-        self._is_timed = False
-        """Whether the duration is given, or follows from the shortest one."""
-        self._earliest = self._latest = 0.0
-        """When a target is met, s."""
-        self._effort_limit = (1.0 - planner.options.reserve) * planner.robot.effort_limit
+        self.left = np.zeros(3) if left is None else left
+        """Angular momentum of robot and target in the end, N m s."""
         self.path: ThrustKnots
         """The knots of the last exact motion."""
-        self._left = np.zeros(3) if left is None else left
-        """Angular momentum of robot and target in the end, N m s."""
+        self.is_timed = False
+        """Whether the duration is given, or follows from the shortest one."""
+        self.earliest = self.latest = 0.0
+        """When a target is met, s."""
 
     def _bowed(self, base: Array, shape: Array, side: Array, height: float) -> ThrustKnots:
         """Return a guess to a pose (7,) and a shape (n,) on a way that bows out to a side (3,), by
@@ -466,12 +467,9 @@ class _Search:
 
     def first_meeting(self) -> ThrustKnots:
         """Return the guess to where a target is as soon as the robot can be there."""
-        assert self.grapple is not None
-        for time in np.arange(_MEETING_PERIOD, 2 * self.grapple.horizon, _MEETING_PERIOD).tolist():
-            guess = self._meeting(time)
-            if guess is not None:
-                return guess
-        raise self._failure(f"the target is not met within {self.grapple.horizon:g} s")
+        # There is one: distances grow with time, and what full thrust covers with its square.
+        guesses = map(self._meeting, itertools.count(_MEETING_PERIOD, _MEETING_PERIOD))
+        return next(guess for guess in guesses if guess is not None)
 
     def _meetings(self, begin: float) -> Iterator[ThrustKnots]:
         """Yield guesses at a target that are clear, from a time on, of each time the straightest
@@ -497,7 +495,8 @@ class _Search:
         """
         options = self.planner.options
         self._begin(SearchPhase.SEARCHING)
-        fastest = self._solve(guess, self._weights(guess))
+        is_timed = options.duration > 0 or options.time_factor > 1
+        fastest = self._solve(guess, self._weights(guess), rough=is_timed)
         if fastest is None:
             raise self._failure("no motion to the goal was found")
         if 0 < options.duration < fastest.duration:
@@ -506,31 +505,31 @@ class _Search:
                 f"{options.duration:g} s: set it to more, or to 0.",
                 Proof.LIMITS,
             )
-        self._is_timed = options.duration > 0 or options.time_factor > 1
+        self.is_timed = is_timed
         time = options.duration or options.time_factor * fastest.duration
         if self.grapple is not None:
             time = max(min(time, self.grapple.horizon), fastest.duration)
-        self._earliest = fastest.duration
+        self.earliest = fastest.duration
         for _ in range(_MAX_ROUNDS):
             motion = self._motion(fastest, time)
-            share = motion.effort_share(self._effort_limit)
+            share = motion.effort_share(self.planner.effort_limit)
             if share <= 1.0:
                 return motion
             # Efforts of a motion at rest are about as the square of its speed.
-            self._earliest = motion.duration * min(1.01 * math.sqrt(share), _LARGEST_STRETCH)
-            time = self._earliest if self.grapple is None else max(self._earliest, time)
-            self._is_timed = True
+            self.earliest = motion.duration * min(1.01 * math.sqrt(share), _LARGEST_STRETCH)
+            time = self.earliest if self.grapple is None else max(self.earliest, time)
+            self.is_timed = True
         raise self._failure(f"its joints need {share:.3g} times the efforts that a plan may use")
 
     def run_near(self, other: _Search) -> ThrustMotion:
         """Return the motion near that of another search, in its time."""
-        self._is_timed, path = True, replace(other.path, multipliers=None)
-        self._earliest = self._latest = path.duration
+        self.is_timed, path = True, replace(other.path, multipliers=None)
+        self.earliest = self.latest = path.duration
         path = self._solve(path, _NEAREST, center=path) or path
         cleared = self._cleared(path)
         if cleared is not None:
             motion = self._settled(cleared)
-            if motion.effort_share(self._effort_limit) <= 1.0:
+            if motion.effort_share(self.planner.effort_limit) <= 1.0:
                 return motion
         raise self._failure("no motion near the other one was found")
 
@@ -541,11 +540,11 @@ class _Search:
         bodies = self.bodies
         self._begin(SearchPhase.REFINING)
         bodies.keep_none()
-        self._latest = time
+        self.latest = time
         path = fastest.stretched(
-            (time if self.grapple is None else self._earliest) / fastest.duration
+            (time if self.grapple is None else self.earliest) / fastest.duration
         )
-        if self._is_timed:
+        if self.is_timed:
             # Roughly, for a look at what is in the way.
             path = self._solve(path, self._weights(path, _ROUNDINGS[0]), rough=True) or path
         near = bodies.approaches(self.planner.motion(path))
@@ -583,10 +582,10 @@ class _Search:
         """
         self.stop.cancellation.raise_if_requested()
         duration = DurationBounds(guess.duration, guess.duration)
-        if not self._is_timed:
+        if not self.is_timed:
             duration = _FREE_TIME
         elif self.grapple is not None and center is None and not self.bodies.kept:
-            duration = DurationBounds(self._earliest, self._latest)
+            duration = DurationBounds(self.earliest, self.latest)
         boundary = replace(self.boundary, goals=self._goals(guess.duration))
         planes = self.bodies.planes(guess) if planes is None else planes
         args = boundary, guess, weights, self.stop, duration, planes, center
@@ -598,7 +597,7 @@ class _Search:
 
     def _weights(self, guess: ThrustKnots, rounding: float = 1.0) -> Weights:
         """Return the weights of least propellant, or of least time, in units of the guess."""
-        if not self._is_timed:
+        if not self.is_timed:
             small = _TIME_REGULARISATION
             return Weights(1 / guess.duration, 0.0, small, small, _COST_OF_LACK)
         spent = guess.step * float(self.planner.propulsion.cost_of(ca.DM(guess.levels.T)))
@@ -615,7 +614,7 @@ class _Search:
         """
         planner, knots, planes = self.planner, guess, self.bodies.planes(guess)
         roundings = _ROUNDINGS[1:] if planner.propulsion.norms else (1.0,)
-        if len(planes) or not self._is_timed:
+        if len(planes) or not self.is_timed:
             roundings = roundings[:1]
         *others, weights = (self._weights(guess, each) for each in roundings)
         for each in others:
@@ -632,7 +631,7 @@ class _Search:
             if error < _EXACT_END:
                 break
             knots = replace(solved, defects=motion.defects())
-            if self._is_timed and found < _NEAR_END:
+            if self.is_timed and found < _NEAR_END:
                 # The nearest controls that fly exactly: solutions of least propellant are flat.
                 weights, center = _NEAREST, knots
         if best is None:
@@ -649,7 +648,7 @@ class _Search:
         if self.grapple is None:
             return self.boundary.goals
         numbers = self.grapple.motion.numbers(duration)
-        return np.concatenate([[self.planner.options.intervals], numbers, self._left])
+        return np.concatenate([[self.planner.options.intervals], numbers, self.left])
 
     def _end_error(self, motion: ThrustMotion) -> float:
         """Return the largest error at the end, m, rad, m/s: but for that of angular momenta."""
@@ -681,6 +680,9 @@ class _Search:
             solved = self._solve(at, self._weights(at, _ROUNDINGS[0]))
             if solved is None:
                 return None
+            if self._solver.lack > _LARGEST_LACK:
+                at = solved
+                continue
             motion = self.planner.motion(solved)
             near, solved = bodies.approaches(motion), replace(solved, defects=motion.defects())
             if not near:
@@ -694,7 +696,7 @@ class _Search:
         return None
 
     def _begin(self, phase: SearchPhase) -> None:
-        progress = SearchProgress(0, 0, self._earliest or math.inf, phase)
+        progress = SearchProgress(0, 0, self.earliest or math.inf, phase)
         log_progress(_LOG, progress, f"{phase.value} a motion")
 
     def _failure(self, why: str) -> PlanningError:

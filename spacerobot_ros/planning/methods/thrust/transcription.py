@@ -76,8 +76,6 @@ intervals, from 0 to N K - 1.
 """
 
 
-_TOLERANCE = 1e-6
-
 _CONTINUED = {
     "ipopt.mu_init": 1e-5,
     "ipopt.tol": 1e-5,
@@ -92,7 +90,7 @@ _CONTINUED = {
 }
 
 _OPTIONS: Mapping[str, Mapping[str, object]] = {
-    "": {},
+    "": {"ipopt.tol": 1e-6},
     # A shortest time that another time follows from, or a look at what is in the way.
     "rough": {"ipopt.tol": 1e-4, "ipopt.constr_viol_tol": 1e-5},
     # The guess is clear of its planes, or nearly so; planes made anew follow its solution.
@@ -452,15 +450,14 @@ class ThrustSolver:
     ) -> None:
         self.end = stages[2]
         """Rows of the last knot."""
+        self.lack = 0.0
+        """Distance by which pairs are nearer in the last solution than required, m."""
         self._propulsion, self._acceleration = propulsion, acceleration
         self._layout, self._program = thrust_program(stages, propulsion, intervals, pairs)
         program = self._program
-        self._rows_of_pairs = sum(len(at) for _, at in pairs)
         self._monitor = SolverMonitor(program.problem, program.lower, program.upper)
         self._ipopt = cache(
-            lambda begins: build_solver(
-                "thrust", program, self._monitor, {"ipopt.tol": _TOLERANCE, **_OPTIONS[begins]}
-            )
+            lambda begins: build_solver("thrust", program, self._monitor, _OPTIONS[begins])
         )
 
     def solve(
@@ -500,10 +497,16 @@ class ThrustSolver:
         vertices = with_joints_moved(guess.states, guess.step / 2)
         x0 = pack_knots(layout, guess.step, vertices, guess.accelerations, guess.levels)
         begin = {"x0": x0}
-        begins = "clear" if self._rows_of_pairs else "rough" if rough else ""
+        begins = "clear" if layout.has_lack else "rough" if rough else ""
         if guess.multipliers is not None:
             begins = "corrected" if corrected else "continued"
-            begin |= self._known(*guess.multipliers)
+            of_variables, of_rows = guess.multipliers
+            rows = len(self._program.lower)
+            # Of all rows, if they are the same ones, else of those without pairs.
+            same = rows if len(of_rows) == rows else rows - len(planes)
+            begin["lam_x0"] = np.zeros(layout.size)
+            begin["lam_x0"][: len(of_variables)] = of_variables[: layout.size]
+            begin["lam_g0"] = np.append(of_rows[:same], np.zeros(rows - same))
         parameters = [
             *(state_parts(boundary.start)[4], boundary.goals),
             propulsion.wrenches.ravel(order="F"),
@@ -533,21 +536,13 @@ class ThrustSolver:
             ubg=self._program.upper,
             p=np.concatenate(parameters),
         )
-        if not solver.stats()["success"]:
-            return None
-        x, *multipliers = (result[name].full().ravel() for name in ("x", "lam_x", "lam_g"))
+        x, *found = (result[name].full().ravel() for name in ("x", "lam_x", "lam_g"))
+        multipliers = (found[0], found[1]) if solver.stats()["success"] else None
+        if multipliers is None:
+            if self._monitor.best is None:
+                return None
+            x = self._monitor.best
         step, (states, accelerations, levels) = float(x[0]), (x[at] for at in layout.knots())
         states = with_joints_moved(states, -step / 2)
-        known = multipliers[0], multipliers[1]
-        return ThrustKnots(step, states, accelerations, levels, known, guess.defects)
-
-    def _known(self, of_variables: Array, of_rows: Array) -> dict[str, Array]:
-        """Return the first multipliers of the solver from those of a solution: of all rows, if it
-        has the same ones, else of those without pairs.
-        """
-        x, g = np.zeros(self._layout.size), np.zeros(len(self._program.lower))
-        shared = min(len(x), len(of_variables))
-        x[:shared] = of_variables[:shared]
-        same = len(g) if len(of_rows) == len(g) else len(g) - self._rows_of_pairs
-        g[:same] = of_rows[:same]
-        return {"lam_x0": x, "lam_g0": g}
+        self.lack = float(x[-1]) if layout.has_lack else 0.0
+        return ThrustKnots(step, states, accelerations, levels, multipliers, guess.defects)
