@@ -20,7 +20,7 @@ from spacerobot_ros.control.reference import (
     profile_numbers,
     profile_size,
 )
-from spacerobot_ros.control.state import ControlState, PoseReference
+from spacerobot_ros.control.state import ControlState, PoseReference, Reference
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.model.composite_rigid_body import state_slices
 from spacerobot_ros.model.description import Array

@@ -148,9 +148,9 @@ class GrappleReference(PlannedReference):
         beside, still = RelativeMotionOverTime.between(frame, base.motion), np.zeros((1, 3))
         self._base = RelativeMotionOverTime(beside.x, still, still, beside.phi, still, still)
 
-    def relative(self, time: float) -> RelativeMotionOverTime:
-        """Return the motion of the end-effector relative to the grapple frame at a time."""
-        time = min(time, self.duration)
+    def relative(self, times: Array) -> RelativeMotionOverTime:
+        """Return the motion of the end-effector relative to the grapple frame at one time, (1,)."""
+        time = min(float(times[0]), self.duration)
         frame, hand = self.grapple.motion.grapple([time]), self.motion.at(time).end_effector
         assert hand is not None
         return RelativeMotionOverTime.between(frame, _pose(hand).motion)
