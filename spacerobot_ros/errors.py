@@ -1,4 +1,4 @@
-"""The exceptions of this package: each has a message that a user can act on."""
+"""This package's exceptions, each with an actionable message."""
 
 import traceback
 from collections.abc import Iterable
@@ -9,9 +9,9 @@ _MAX_MESSAGE_LENGTH = 2000
 
 
 def printable(text: str) -> str:
-    """Return a text as one line without control characters.
+    """Return a string as one line without control characters.
 
-    Terminals interpret control characters, so texts from topics and bags are passed through this
+    Terminals interpret control characters, so strings from topics and bags pass through this
     function before they are shown or logged.
     """
     line = " ".join(text.splitlines())
@@ -26,12 +26,12 @@ def reason(error: Exception) -> str:
 
 
 def sentence_case(text: str) -> str:
-    """Return a text with a capital first letter, as the beginning of a sentence."""
+    """Return a string with a capital first letter, as at the beginning of a sentence."""
     return text[:1].upper() + text[1:]
 
 
 def quantity(value: float, unit: str) -> str:
-    """Return a number as text for people: three digits; a rounding error is shown as a bound.
+    """Return a number as a readable string: three digits; rounding errors are shown as a bound.
 
     m, rad, m/s and rad/s get SI prefixes: ``1.38 mm``, ``< 1 µrad``.
     """
@@ -46,18 +46,18 @@ def quantity(value: float, unit: str) -> str:
 
 
 def numbers(values: Iterable[float], digits: int = 5) -> str:
-    """Return numbers as text, with ``digits`` decimals; a rounded zero has no sign."""
+    """Format numbers with ``digits`` decimals; a rounded zero has no sign."""
     return ", ".join(f"{round(float(x), digits) + 0.0:.{digits}f}" for x in values)
 
 
 def shortened(name: str, length: int = 21) -> str:
-    """Return a name, its middle left out if it is too long for a label."""
+    """Return a name, shortened in the middle if it is too long for a label."""
     half = (length - 1) // 2
     return name if len(name) <= length else f"{name[:half]}…{name[-half:]}"
 
 
 class SpaceRobotError(Exception):
-    """Base of all errors of this package; the message is one sentence for the user.
+    """Base class of this package's errors; the message is one sentence for the user.
 
     Line breaks and control characters are replaced, and a long message is shortened.
     """
@@ -79,28 +79,28 @@ class MeshError(SpaceRobotError):
 
 
 class ParameterError(SpaceRobotError):
-    """The value of a parameter or option is refused; the message names the parameter."""
+    """The value of a parameter or option is invalid; the message names the parameter."""
 
 
 class PlanningError(SpaceRobotError):
-    """A goal is refused or cannot be reached; the message states the reason."""
+    """A goal is rejected or unreachable; the message states the reason."""
 
 
 class Proof(Enum):
-    """Kinds of proof that a goal cannot be reached."""
+    """Kinds of proof that a goal is unreachable."""
 
     LIMITS = "joint limits"
     """No joint positions within the limits reach the goal."""
 
     MOMENTUM = "momentum"
-    """The goal requires a motion of the centre of mass, which is impossible at zero momentum, or
+    """The goal requires moving the centre of mass, which is impossible at zero momentum, or
     more angular momentum than reaction wheels can store."""
 
     COLLISION = "collision"
-    """In the configuration of the goal, links are in contact or closer than the clearance."""
+    """In the goal configuration, links are in contact or closer than the clearance."""
 
     RANK = "rank"
-    """No motion of the joints rotates the base as the goal requires."""
+    """No joint motion produces the base rotation that the goal requires."""
 
 
 class UnreachableError(PlanningError):
@@ -122,11 +122,11 @@ class NotFoundError(PlanningError):
 
 
 class UnreadMeshError(PlanningError):
-    """The mesh of a collision shape cannot be read, so that its link cannot be kept clear."""
+    """A collision mesh cannot be read, so its link cannot be checked for collisions."""
 
 
 def refusal_of_all(message: str, refusals: Iterable[Exception]) -> PlanningError:
-    """Return a single refusal for a goal that several methods have refused.
+    """Return a single error for a goal that several methods have rejected.
 
     A proof by one method applies to all. Without a proof, the result is a NotFoundError if one is
     given.
@@ -149,11 +149,11 @@ class RecordingError(SpaceRobotError):
 
 
 class CommandError(SpaceRobotError):
-    """The plant refuses a command; the message states the reason."""
+    """The plant rejects a command; the message states the reason."""
 
 
 def describe_exception(error: BaseException) -> str:
-    """Return type, text and source line of an unexpected exception."""
+    """Return type, message and source line of an unexpected exception."""
     frames = traceback.extract_tb(error.__traceback__)
     place = f" ({Path(frames[-1].filename).name}, line {frames[-1].lineno})" if frames else ""
     text = " ".join(str(error).split()).rstrip(".")

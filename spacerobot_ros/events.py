@@ -1,6 +1,6 @@
-"""Events of a flight, and the conversion of events and statuses to key-value pairs.
+"""Flight events, and the conversion of events and statuses to key-value pairs.
 
-Every status and event is a diagnostic_msgs/DiagnosticStatus, whose content is pairs of texts. A
+Every status and event is a diagnostic_msgs/DiagnosticStatus, whose content is pairs of strings. A
 :class:`KeyValueFormat` describes the pairs of a class for both writing and reading.
 """
 
@@ -17,7 +17,7 @@ from spacerobot_ros.errors import SpaceRobotError
 
 @dataclass(frozen=True)
 class TextFormat:
-    """Conversion of a value to text and back."""
+    """Conversion of a value to a string and back."""
 
     write: Callable[[Any], str]
     read: Callable[[str], Any]
@@ -29,12 +29,12 @@ def number_format(specification: str) -> TextFormat:
 
 
 def choice_format(choices: type[Enum]) -> TextFormat:
-    """Return the format of a member of an enumeration."""
+    """Return the format of an enumeration member."""
     return TextFormat(lambda member: str(member.value), choices)
 
 
 def list_format(separator: str) -> TextFormat:
-    """Return the format of a tuple of texts."""
+    """Return the format of a tuple of strings."""
     return TextFormat(separator.join, lambda text: tuple(text.split(separator) if text else ()))
 
 
@@ -49,7 +49,7 @@ SECONDS = number_format(".9f")
 class KeyValueField:
     """An attribute of a status or event, and its key-value pair or pairs.
 
-    An attribute is omitted while it has the default of its class.
+    An attribute is omitted if it has its default value.
 
     Attributes
     ----------
@@ -58,14 +58,14 @@ class KeyValueField:
     format
         Format of its value.
     key
-        Key of the pair; empty: the name of the attribute.
+        Key of the pair; empty: the attribute name.
     prefix
-        For a mapping, with a pair for each item: the prefix of their keys. Empty: all pairs that no
-        earlier field uses.
+        For a mapping, with one pair per item: the key prefix. Empty: all pairs not used by earlier
+        fields.
     always
-        Whether to write the attribute even if it has its default.
+        Whether to write the attribute even if it has its default value.
     present_with
-        The attribute that must be written for this one to be written; empty: none.
+        Attribute without which this one is not written; empty: none.
     """
 
     attribute: str
@@ -85,7 +85,7 @@ class KeyValueFormat:
     Parameters
     ----------
     subject
-        Name of such a status or event in messages.
+        Name of the status or event in messages.
     described
         The fields that are written.
     """
@@ -111,9 +111,9 @@ class KeyValueFormat:
         return values
 
     def from_values(self, kind: type[_Record], values: Mapping[str, str], **given: Any) -> _Record:
-        """Return the status or event of a class from the pairs of :meth:`to_values`.
+        """Return a status or event from the pairs returned by :meth:`to_values`.
 
-        Attributes missing in the pairs are taken from ``given``, or have their defaults.
+        Attributes missing from the pairs are taken from ``given``, or have their defaults.
 
         Raises
         ------
@@ -148,7 +148,7 @@ class KeyValueFormat:
 
     @contextmanager
     def reading(self) -> Iterator[None]:
-        """Convert errors of a missing key or an unreadable value to a message for the user."""
+        """Convert errors about missing keys or unreadable values to messages for the user."""
         try:
             yield
         except (KeyError, ValueError) as error:
@@ -158,7 +158,7 @@ class KeyValueFormat:
 
 
 class EventKind(str, Enum):
-    """Kinds of events; the value is the ``event`` entry of the message."""
+    """Kinds of events; the value is the ``event`` entry in the message."""
 
     CONFIGURED = "configured"
     ACTIVATED = "activated"
@@ -176,11 +176,11 @@ class EventKind(str, Enum):
     LATCHED = "latched"
     REARMED = "rearmed"
     FAULT_INJECTED = "fault_injected"
-    """A fault begins to act."""
+    """A fault becomes active."""
     FAULT_ENDED = "fault_ended"
     FAULTS_CLEARED = "faults_cleared"
     DISTURBANCE = "disturbance"
-    """An external wrench begins to act."""
+    """An external wrench becomes active."""
     DISTURBANCE_ENDED = "disturbance_ended"
     CONTACT = "contact"
     """Two links of the robot touch; the exact plant continues through the contact."""
@@ -197,12 +197,12 @@ class EventKind(str, Enum):
     DETUMBLED = "detumbled"
 
     WHEEL_NEAR_LIMIT = "wheel_near_limit"
-    """A reaction wheel approaches its largest rate."""
+    """A reaction wheel approaches its maximum rate."""
     WHEEL_SATURATED = "wheel_saturated"
     WHEEL_FAILED = "wheel_failed"
     """A reaction wheel does not respond to its torque; control continues without it."""
     DUMP_STARTED = "dump_started"
-    """The momentum of reaction wheels is dumped by thrusters."""
+    """Thrusters dump reaction wheel momentum."""
     DUMP_ENDED = "dump_ended"
 
     GOAL_ACCEPTED = "goal_accepted"
@@ -230,7 +230,7 @@ class EventKind(str, Enum):
     NODE_SILENT = "node_silent"
     NODE_BACK = "node_back"
     NODE_RESTARTED = "node_restarted"
-    """A node has died, and the command that started it restarts it."""
+    """A node has died and is restarted by the command that started it."""
 
 
 CONTACTS = frozenset({EventKind.CONTACT, EventKind.CONTACT_ENDED})
@@ -239,7 +239,7 @@ CONTACTS = frozenset({EventKind.CONTACT, EventKind.CONTACT_ENDED})
 
 @dataclass(frozen=True)
 class Event:
-    """One change of a node's state.
+    """One change in a node's state.
 
     Attributes
     ----------
@@ -250,13 +250,13 @@ class Event:
     level
         Level of diagnostic_msgs/DiagnosticStatus: 0 OK, 1 WARN, 2 ERROR.
     time_s
-        Simulated time, s; None if the node does not know it.
+        Simulated time, s; None if unknown to the node.
     goal_id
-        The goal that the event is about; empty: none.
+        The goal to which the event refers; empty: none.
     about
         Further facts by name.
     node
-        Name of the node that reports it; empty: unknown.
+        Name of the reporting node; empty: unknown.
     """
 
     kind: EventKind
@@ -283,7 +283,7 @@ class Event:
 
     @classmethod
     def from_values(cls, values: Mapping[str, str], message: str = "", level: int = 0) -> Event:
-        """Return the event from the pairs of :meth:`to_values`.
+        """Return the event from the pairs returned by :meth:`to_values`.
 
         Raises
         ------

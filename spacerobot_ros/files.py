@@ -1,8 +1,9 @@
-"""Complete files, files that only this user can have written, and the cache.
+"""Atomic file replacement, files that only this user can have written, and the cache.
 
-A file is replaced completely or not at all, because disks get full and processes are killed. Files
-that are executed, flown or resumed are read only if no other user of the machine can have written
-them. A :class:`Cache` stores files that can be recreated in a private folder of this user; it
+Files are replaced completely or not at all, because disks may fill up and processes may be killed.
+Files
+that are executed or resumed are read only if no other user on the machine can have written
+them. A :class:`Cache` stores files that can be recreated, in a private folder of this user; it
 treats a damaged file as missing, and warns once.
 """
 
@@ -25,13 +26,13 @@ _LOG = logging.getLogger(__name__)
 _OTHERS_MAY_WRITE = stat.S_IWGRP | stat.S_IWOTH
 
 _CACHE_MAGIC = b"spacerobot_ros cache 2"
-"""Prefix of the last line of a cache file, with the number of the file format."""
+"""Prefix of the last line in a cache file, with the file format version."""
 
 _MCAP_MAGIC = b"\x89MCAP"
 _MAX_YAML_CHARACTERS = 1_000_000
 
 _MAX_YAML_VALUES = 100_000
-"""Largest number of values of a YAML text, including values repeated by aliases."""
+"""Maximum number of values in a YAML string, including values repeated by aliases."""
 
 _logged_warnings: set[str] = set()
 
@@ -58,8 +59,7 @@ def write_whole(path: Path, content: bytes, *, mode: int = 0o600) -> None:
     path, content
         The file and its new content.
     mode
-        Permissions of the file, without those that the umask forbids; by default only this user
-        may read it.
+        File permissions, masked by the umask; by default only this user may read it.
 
     Raises
     ------
@@ -80,7 +80,8 @@ def write_whole(path: Path, content: bytes, *, mode: int = 0o600) -> None:
 def write_output(path: Path, content: bytes | str, mode: int = 0o666) -> None:
     """Write a report, picture or result and create its folders, completely or not at all.
 
-    ``mode`` are the permissions of a new file; an existing file keeps its permissions. A bag is not
+    ``mode`` specifies the permissions of a new file; an existing file keeps its permissions. A bag
+    is not
     replaced, because it may be the only record of a flight. Devices and pipes are supported. Text
     is written as UTF-8.
 
@@ -107,7 +108,7 @@ def _write_output(path: Path, data: bytes, mode: int) -> None:
         with path.open("rb") as file:
             if file.read(len(_MCAP_MAGIC)) == _MCAP_MAGIC:
                 raise SpaceRobotError(
-                    f"The file {path} is a bag, which is not replaced: name another."
+                    f"The file {path} is a bag, which is not overwritten: choose another file."
                 )
     if is_device or not os.access(path.parent, os.W_OK):
         path.write_bytes(data)
@@ -121,7 +122,7 @@ def _write_output(path: Path, data: bytes, mode: int) -> None:
 
 
 def load_yaml(text: str, loader: Any = None) -> Any:
-    """Return the content of an untrusted YAML text, with limits on its size.
+    """Return the content of an untrusted YAML string, with limits on its size.
 
     Parameters
     ----------
@@ -133,8 +134,8 @@ def load_yaml(text: str, loader: Any = None) -> Any:
     Raises
     ------
     ValueError
-        The text is not YAML, is too long or too deeply nested, or its aliases expand to too many
-        values: a file of 1 kB may expand to a thousand million values.
+        The string is not YAML, is too long or too deeply nested, or its aliases expand to too many
+        values: a 1 kB file may expand to a billion values.
     """
     import yaml
 
@@ -163,8 +164,7 @@ def _limit_values(root: Any) -> None:
         count += 1
         if count > _MAX_YAML_VALUES:
             raise ValueError(
-                f"it has more than {_MAX_YAML_VALUES} values, including those that its aliases "
-                "repeat"
+                f"it has more than {_MAX_YAML_VALUES} values, including values repeated by aliases"
             )
         value = nodes.pop().value
         for child in () if isinstance(value, str) else value:
@@ -184,15 +184,14 @@ _FILE_KINDS = (
 
 
 def irregular_kind(mode: int) -> str:
-    """Return a phrase for the kind of a file that is not regular, by its mode; empty: it is
-    regular."""
+    """Return a phrase describing a non-regular file from its mode; empty for a regular file."""
     if stat.S_ISREG(mode):
         return ""
     return next((words for test, words in _FILE_KINDS if test(mode)), "no file")
 
 
 def read_regular(path: str | os.PathLike[str]) -> bytes:
-    """Return the content of a file; a pipe would block, and a device may never end.
+    """Return the content of a regular file; a pipe would block, and a device may never end.
 
     Raises
     ------
@@ -212,7 +211,7 @@ def read_private(path: Path) -> bytes:
     OSError
         It cannot be read.
     UntrustedFileError
-        It belongs to another user, or others may write it.
+        It belongs to another user, or others can write to it.
     """
     _require_own(path)
     return path.read_bytes()
@@ -225,17 +224,18 @@ def _require_own(path: Path) -> None:
         raise UntrustedFileError(f"'{path}' belongs to user {facts.st_uid}; use your own.")
     if facts.st_mode & _OTHERS_MAY_WRITE:
         raise UntrustedFileError(
-            f"others may write '{path}' (mode {stat.S_IMODE(facts.st_mode):o}); make it yours "
+            f"others can write to '{path}' (mode {stat.S_IMODE(facts.st_mode):o}); make it yours "
             f"alone with chmod go-w '{path}'."
         )
 
 
 class Cache:
-    """A folder of files that can be computed again. Its methods log warnings instead of raising.
+    """A folder of files that can be recomputed. Its methods log warnings instead of raising
+    exceptions.
 
-    The last line of a file has its key, length and SHA-256, to detect truncated files.
+    The last line of each file contains its key, length and SHA-256, to detect truncated files.
     The folder must belong to this user, and no other user may write into it, because its files are
-    executed and flown.
+    executed.
 
     Parameters
     ----------
@@ -247,7 +247,7 @@ class Cache:
         self.folder = folder
 
     def load(self, name: str, key: str) -> tuple[Path, bytes] | None:
-        """Return path and content of a file stored under this key; None without one."""
+        """Return the path and content of the file stored under this key; None without one."""
         path = self.folder / name
         if not path.is_file():
             return None
@@ -263,7 +263,7 @@ class Cache:
         return None
 
     def store(self, name: str, key: str, content: bytes) -> Path | None:
-        """Store content under a key; return its path, None if storing failed."""
+        """Store content under a key; return its path, or None if storing failed."""
         path = self.folder / name
         try:
             self.folder.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -281,13 +281,13 @@ class Cache:
     def discard(self, name: str, reason: str) -> None:
         """Delete a cached file and log the reason as a warning."""
         path = self.folder / name
-        warn_once(f"'{path}' is deleted and computed again: {reason.rstrip('.')}.")
+        warn_once(f"'{path}' is deleted and recomputed: {reason.rstrip('.')}.")
         with suppress(OSError):
             path.unlink()
 
     def _warn_of_untrusted_cache(self, error: UntrustedFileError) -> None:
         warn_once(
-            f"The cache '{self.folder}' is not used, because its files are executed and flown: "
+            f"The cache '{self.folder}' is not used, because its files are executed: "
             f"{error} (Set SPACEROBOT_CACHE_DIR to another folder.)"
         )
 
@@ -298,8 +298,8 @@ def warn_first_time(logger: logging.Logger, folder: Path, name: str, message: st
     Parameters
     ----------
     folder
-        The cache, which remembers under ``name`` that the warning was given. If it cannot, the
-        warning is given each time.
+        The cache, which stores under ``name`` that the warning was logged. If this fails, the
+        warning is logged each time.
     """
     cache = Cache(folder)
     # Installations that share a cache have a file each.

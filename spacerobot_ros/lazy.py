@@ -1,4 +1,4 @@
-"""Names and packages that are imported on first use, so that importing this package is fast."""
+"""Names and packages imported on first use, so that importing this package is fast."""
 
 from __future__ import annotations
 
@@ -31,14 +31,14 @@ def lazy_names(package: str, modules: Mapping[str, str]) -> Callable[[str], Any]
 def optional_module(
     name: str, extra: str, needed_by: str, error: type[SpaceRobotError] = SpaceRobotError
 ) -> Any:
-    """Return a module of a package that is installed by an extra of this package.
+    """Return a module from a package that is installed by one of this package's extras.
 
     Parameters
     ----------
     name, extra
         The module, and the extra in ``setup.cfg``.
     needed_by
-        Beginning of the message for users, such as "Campaigns need".
+        Beginning of the error message, such as "Campaigns need".
     error
         Class of the error.
 

@@ -1,8 +1,8 @@
-"""The measures of a flight: numbers for the whole flight, each defined once.
+"""The measures of a flight: key figures for the whole flight, each defined once.
 
 Campaigns, the summary of ``spacerobot run``, reports and the live page use them. A
 :class:`~spacerobot_ros.flight.flight.Flight` computes them from its arrays over time; SIMD lanes,
-which store only extremes and the last state, return them directly.
+which store only extreme values and the last state, return them directly.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ class Outcome(str, Enum):
 
     REACHED = "reached"
     REACHED_PARTLY = "reached_partly"
-    """Reached except for a required part of the base pose that is not controlled."""
+    """Reached except for a required base pose component that is not controlled."""
     FAILED = "failed"
     REFUSED = "refused"
     ABORTED = "aborted"
     INTERRUPTED = "interrupted"
-    """The flight ended before the goal was decided."""
+    """The flight ended before the goal did."""
 
 
 @dataclass(frozen=True)
@@ -48,14 +48,14 @@ class CaptureMeasures:
     time
         Time of the first capture, s.
     distance
-        Distance of the end-effector from the grapple frame at that time, m; without a capture, the
-        smallest in the flight.
+        Distance between end-effector and grapple frame at that time, m; without a capture, the
+        smallest during the flight.
     impulse, angular_impulse
         Norms of the impulse, N s, and of its moment at the end-effector, N m s.
     joint_impulse
-        Largest impulse of the grasp along a joint coordinate, N m s or N s.
+        Largest grasp impulse along a joint coordinate, N m s or N s.
     detumbling_time, detumbling_bound
-        Time until the robot with the target came to rest, and the shortest possible time, s.
+        Time until the robot and the target came to rest, and the shortest possible time, s.
     """
 
     captured: float = math.nan
@@ -80,12 +80,12 @@ class Measures:
     duration
         Simulated time, s.
     manoeuvre_time
-        Duration of the schedules that were flown for the goal, or of the tracking by a controller,
-        s; see :func:`flown_time`.
+        Duration of the schedules flown for the goal, or of a controller's tracking, s; see
+        :func:`flown_time`.
     error
-        Error of the last pose of the base relative to its goal; None without a goal or a pose.
+        Error of the last base pose relative to its goal; None without a goal or a pose.
     end_effector_distance, end_effector_angle
-        Last distance (m) and angle (rad) of the end-effector from its goal, the largest if there
+        Final distance (m) and angle (rad) of the end-effector from its goal, the largest if there
         are several; NaN without a goal or a pose. The angle is also NaN if the attitude is free or
         not controlled.
     peak_rate, peak_effort
@@ -93,15 +93,15 @@ class Measures:
     peak_wrench
         (2,) largest norms of the commanded force (N) and torque (N m) on the base.
     lowest, highest
-        (n,) ranges of the joint positions, m or rad.
+        (n,) joint position ranges, m or rad.
     momentum_drift
         (2,) see :func:`momentum_drift`, kg m/s and kg m^2/s.
     corrections
-        Number of plans after the first that are corrections.
+        Number of corrections: plans after the first.
     propellant
         Propellant used by the thrusters, kg; NaN without thrusters.
     plan_time, wall_time
-        Wall time of planning and of the whole flight, s; NaN if unknown.
+        Wall time for planning and for the whole flight, s; NaN if unknown.
     clearance
         Smallest distance between two links, m; a negative value is the penetration depth. Infinite
         for a robot without pairs that could touch, NaN if not measured.
@@ -131,7 +131,7 @@ class Measures:
 
 
 def momentum_change(momenta: Array, reference: Array) -> Array:
-    """Return the norms (..., 2) of the differences of linear and of angular momenta.
+    """Return the norms (..., 2) of linear and angular momentum differences.
 
     Parameters
     ----------
@@ -143,8 +143,7 @@ def momentum_change(momenta: Array, reference: Array) -> Array:
 
 
 def momentum_drift(momenta: Array, expected: Array | None = None) -> Array:
-    """Return the largest change (..., 2) of linear and angular momentum that thrust does not
-    explain.
+    """Return the largest change (..., 2) in linear and angular momentum not explained by thrust.
 
     It is ``max |m(t) - m(0)|`` over each flight, with the momenta ``m`` minus those produced by
     thrusters.
@@ -155,8 +154,8 @@ def momentum_drift(momenta: Array, expected: Array | None = None) -> Array:
         (..., N, 6) or more columns, the momenta first: kg m/s and kg m^2/s. Rows that are not
         finite are ignored.
     expected
-        (N, 6) initial momenta plus those produced by thrusters; None, or another number of rows: no
-        thrust.
+        (N, 6) initial momenta plus those produced by thrusters; If None, or if the number of rows
+        differs, no thrust is assumed.
     """
     m = momenta[..., :6]
     if expected is not None and len(expected) == len(m):
@@ -176,18 +175,18 @@ def peak(values: Array) -> Array:
 
 
 def peak_wrench(wrenches: Array) -> Array:
-    """Return the largest norms (2,) of force and torque of wrenches (N, 6); 0 without any."""
+    """Return the largest force and torque norms (2,) of wrenches (N, 6); 0 without wrenches."""
     return peak(np.linalg.norm(wrenches.reshape(-1, 2, 3), axis=2))
 
 
 def flown_time(
     statuses: Iterable[tuple[float, PlannerStatus | ControllerStatus]], end: float
 ) -> float | None:
-    """Return the time, s, that was flown for the last goal.
+    """Return the flight time for the last goal, s.
 
     With a planner it is the duration of the flown schedules
     (:func:`~spacerobot_ros.planning.execution.status.manoeuvre_time`); otherwise the time from the
-    first state that a controller tracked for its last decided goal until that decision.
+    first state that a controller tracked for its last completed goal until the goal ended.
 
     Parameters
     ----------
@@ -220,21 +219,21 @@ def flown_time(
 
 @dataclass(frozen=True)
 class Metric:
-    """A measure of a flight as a number with a unit.
+    """A flight measure as a number with a unit.
 
     Attributes
     ----------
     unit, description
-        SI unit (empty: none) and a short description, as texts for the user.
+        SI unit (empty: none) and a short description for the user.
     evaluate
-        Function of the measures and the robot. It returns a number, NaN if a flight has none; or a
-        number for each joint, (..., n) for joint measures (..., n) of several flights.
+        Function of the measures and the robot. It returns one number, NaN if not applicable; or one
+        number per joint, (..., n) for joint measures (..., n) of several flights.
     by_joint
-        Whether ``<name>.<joint>`` is the number of a joint, and ``<name>`` the worst of them.
+        Whether ``<name>.<joint>`` is the value for a joint, and ``<name>`` the worst joint value.
     smallest_is_worst
-        Whether the smallest number is the worst.
+        Whether the smallest value is the worst.
     yes_or_no
-        Whether it is 1 for yes and 0 for no.
+        Whether the value is 1 for yes and 0 for no.
     """
 
     unit: str
@@ -271,38 +270,38 @@ def _margin_metric(quantity: str, limit: str, peak_of: Callable[[Measures], Arra
 
 
 _OF_JOINTS = ("peak_rate", "peak_effort", "lowest", "highest")
-"""Fields of :class:`Measures` that have a number for each joint."""
+"""Fields of :class:`Measures` with one number per joint."""
 
 CLEARANCE = "clearance_m"
 """Name of the metric that campaigns measure only on request."""
 
 METRICS: dict[str, Metric] = {
     "position_error_m": _error_metric(
-        "distance", "m", "distance of the last true position of the base from the goal"
+        "distance", "m", "distance of the last true base position from the goal"
     ),
     "attitude_error_rad": _error_metric(
         "angle", "rad", "angle between the last true attitude of the base and the goal"
     ),
     "end_effector_position_error_m": Metric(
         "m",
-        "last distance of the end-effector from its goal, the largest if there are several",
+        "final distance of the end-effector from its goal, the largest if there are several",
         lambda m, _: m.end_effector_distance,
     ),
     "end_effector_attitude_error_rad": Metric(
         "rad",
-        "last angle of the end-effector from its goal, the largest if there are several, if its "
+        "final angle of the end-effector from its goal, the largest if there are several, if its "
         "attitude is controlled",
         lambda m, _: m.end_effector_angle,
     ),
     "duration_s": Metric("s", "simulated time of the flight", lambda m, _: m.duration),
-    "manoeuvre_time_s": Metric("s", "time flown for the last goal", lambda m, _: m.manoeuvre_time),
-    "corrections": Metric("", "corrections by a new plan", lambda m, _: float(m.corrections)),
+    "manoeuvre_time_s": Metric("s", "flight time for the last goal", lambda m, _: m.manoeuvre_time),
+    "corrections": Metric("", "number of corrections", lambda m, _: float(m.corrections)),
     "propellant_kg": Metric("kg", "propellant of the thrusters", lambda m, _: m.propellant),
     "peak_rate": Metric(
-        "m/s or rad/s", "largest rate of a joint", lambda m, _: m.peak_rate, by_joint=True
+        "m/s or rad/s", "largest joint rate", lambda m, _: m.peak_rate, by_joint=True
     ),
     "peak_effort": Metric(
-        "N or N m", "largest effort of a joint", lambda m, _: m.peak_effort, by_joint=True
+        "N or N m", "largest joint effort", lambda m, _: m.peak_effort, by_joint=True
     ),
     "peak_force_N": Metric(
         "N", "largest commanded thruster force", lambda m, _: float(m.peak_wrench[0])
@@ -312,7 +311,7 @@ METRICS: dict[str, Metric] = {
     ),
     "joint_margin": Metric(
         "m or rad",
-        "smallest distance of a joint position from its limits",
+        "smallest distance between a joint position and its limits",
         _joint_margin,
         by_joint=True,
         smallest_is_worst=True,
@@ -321,13 +320,13 @@ METRICS: dict[str, Metric] = {
     "effort_margin": _margin_metric("effort", "effort", lambda m: m.peak_effort),
     "momentum_drift": Metric(
         "kg m/s, kg m^2/s",
-        "largest change of a momentum not explained by thrust",
+        "largest momentum change not explained by thrust",
         lambda m, _: float(m.momentum_drift.max()),
     ),
     CLEARANCE: Metric(
         "m",
-        "smallest distance between two links, measured if the campaign names it; negative: the "
-        "depth of a contact",
+        "smallest distance between two links, measured if named in the campaign; negative: "
+        "penetration depth",
         lambda m, _: m.clearance,
         smallest_is_worst=True,
     ),
@@ -341,8 +340,8 @@ METRICS: dict[str, Metric] = {
     "capture_distance_m": _capture_metric(
         "distance",
         "m",
-        "distance of the end-effector from the grapple frame at the capture; without a capture, "
-        "the smallest",
+        "distance between end-effector and grapple frame at the capture; without a capture, the "
+        "smallest",
     ),
     "capture_impulse_Ns": _capture_metric("impulse", "N s", "impulse of the capture"),
     "capture_angular_impulse_Nms": _capture_metric(
@@ -351,13 +350,13 @@ METRICS: dict[str, Metric] = {
     "capture_joint_impulse": _capture_metric(
         "joint_impulse",
         "N m s or N s",
-        "largest part of the capture impulse along a joint coordinate",
+        "largest component of the capture impulse along a joint coordinate",
     ),
     "detumbling_time_s": _capture_metric(
-        "detumbling_time", "s", "time until robot and target came to rest"
+        "detumbling_time", "s", "time until the robot and the target came to rest"
     ),
     "detumbling_bound_s": _capture_metric(
-        "detumbling_bound", "s", "shortest time until rest that the torques permit"
+        "detumbling_bound", "s", "shortest time to rest with the available torques"
     ),
 }
 """Every metric by name."""

@@ -1,8 +1,9 @@
-"""Parameters: declared once, as the fields of a configuration, and checked on input.
+"""Parameters: declared once, as configuration fields, and checked on input.
 
-A configuration is a frozen dataclass whose fields are made by :func:`parameter`, :func:`group` and
-:func:`registered`. Everything else follows from it: ROS parameters, the checks of the command line
-and of :func:`spacerobot_ros.plan`, and the tables in the documentation.
+A configuration is a frozen dataclass whose fields are created by :func:`parameter`, :func:`group`
+and
+:func:`registered`. Everything else follows from it: ROS parameters, input checks on the command
+line and in :func:`spacerobot_ros.plan`, and the tables in the documentation.
 """
 
 from __future__ import annotations
@@ -30,9 +31,9 @@ _GROUP_OF_EVERY_NODE = "qos_overrides."
 
 
 def is_of_every_node(name: str) -> bool:
-    """Whether a parameter belongs to every node, besides those of the node's configuration.
+    """Whether a parameter is common to all nodes rather than part of a node's configuration.
 
-    rclpy declares them, as `ros2 param dump` and the parameters in a bag show; ``autostart`` is
+    rclpy declares them, and they appear in `ros2 param dump` and in bags; ``autostart`` is
     this package's. They are irrelevant to a flight.
     """
     return name in _OF_EVERY_NODE or name.startswith(_GROUP_OF_EVERY_NODE)
@@ -41,12 +42,12 @@ def is_of_every_node(name: str) -> bool:
 def as_numbers(
     given: Any, name: str, error: type[SpaceRobotError] = ParameterError
 ) -> npt.NDArray[np.float64]:
-    """Return given numbers as an array, of any shape.
+    """Return given numbers as an array of any shape.
 
     Raises
     ------
     SpaceRobotError
-        They are not real numbers. Its type is ``error``; its message begins with ``name``.
+        The values are not real numbers. Its type is ``error``; its message begins with ``name``.
     """
     try:
         numbers = np.asarray(given)
@@ -58,37 +59,37 @@ def as_numbers(
 
 
 _PARAMETER, _GROUP, _REGISTERED = "parameter", "group", "registered"
-"""Metadata keys of dataclass fields: one for each function that creates a field."""
+"""Metadata keys of dataclass fields: one per function that creates a field."""
 
 
 @dataclass(frozen=True)
 class Parameter:
-    """The declaration of one parameter; the type of ``default`` is the type of the parameter.
+    """The declaration of one parameter; the type of ``default`` is the parameter type.
 
     Attributes
     ----------
     name
         Full name, including its groups: ``sensors.joint_noise``.
     default
-        Value if none is set.
+        Value if the parameter is not set.
     unit, description
-        SI unit and a short description, as texts for the user.
+        SI unit and a short description for the user.
     minimum, maximum
-        Bounds of a number, or of every entry of an array.
+        Bounds on a number, or on every array entry.
     choices
-        Allowed texts; empty: any text.
+        Allowed strings; empty: any string.
     length
-        Entries of an array that is not empty; None: any number of them.
+        Length of a non-empty array; None: any length.
     read_only
-        Whether its value is fixed while the node is configured.
+        Whether the value is fixed while the node is configured.
     texts
-        Whether the array consists of texts; a single text with entries separated by line breaks or
-        semicolons is also accepted.
+        Whether the array consists of strings; a single string with entries separated by line breaks
+        or semicolons is also accepted.
     of_joints
-        Whether the array has an entry for each joint of the robot, or the text lists joints.
+        Whether the array has one entry per joint, or the string lists joints.
     by_name
         Whether entries of such an array may be given for only some joints, by name: as a mapping,
-        or as texts ``NAME:VALUE``. The value then consists of such texts.
+        or as strings ``NAME:VALUE``. The value then consists of such strings.
     """
 
     name: str
@@ -123,14 +124,14 @@ class Parameter:
             if not isinstance(value, str):
                 raise self._refusal(value, "a text")
             if "\0" in value:
-                raise self._refusal(value.replace("\0", "\\0"), "a text without NUL characters")
+                raise self._refusal(value.replace("\0", "\\0"), "a string without NUL characters")
             if self.excludes(value):
                 raise self._refusal(value, f"one of {', '.join(self.choices)}")
             return value
         return self._check_lines(value) if self.texts else self._check_numbers(value)
 
     def excludes(self, text: str) -> bool:
-        """Whether there are choices and the text is not among them."""
+        """Whether there are choices and the string is not one of them."""
         return bool(self.choices) and text not in self.choices
 
     def _check_number(self, value: Any, whole: bool) -> int | float:
@@ -143,7 +144,7 @@ class Parameter:
         if whole and value != int(value):
             raise self._refusal(value, "a whole number")
         if whole and not -(2**63) <= value < 2**63:  # ROS parameters have 64 bits.
-            raise self._refusal(float(value), "a whole number of 64 bits")
+            raise self._refusal(float(value), "a 64-bit integer")
         if not self.minimum <= value <= self.maximum:
             raise self._refusal(value, f"a number{self._range_text()}")
         if not whole and not _is_moderate(value):
@@ -158,7 +159,7 @@ class Parameter:
         try:
             numbers = tuple(float(x) for x in value)
         except (TypeError, ValueError, OverflowError):
-            by_name = ", or of texts NAME:VALUE with names of joints" if self.by_name else ""
+            by_name = ", or of strings NAME:VALUE with joint names" if self.by_name else ""
             raise self._refusal(value, f"a list of numbers{by_name}") from None
         if self.length is not None and len(numbers) not in (0, self.length):
             raise self._refusal(value, f"a list of {self.length} numbers")
@@ -223,9 +224,9 @@ def nonnegative(default: Value, description: str, unit: str = "", **attributes: 
 
 
 def group(default: Any) -> Any:
-    """Return a field that holds a configuration: its parameters are ``<field>.<parameter>``.
+    """Return a field that contains a configuration: its parameters are ``<field>.<parameter>``.
 
-    ``default`` is an instance, whose values are the defaults of the group.
+    ``default`` is an instance whose values are the group's defaults.
     """
     return field(default=default, metadata={_GROUP: True})
 
@@ -242,7 +243,7 @@ def registered(registry: Mapping[str, Any]) -> Any:
 
 
 def declared(config: type[Any] | Any) -> tuple[Parameter, ...]:
-    """Return the parameters of a configuration, in the order of their declaration.
+    """Return the parameters of a configuration, in declaration order.
 
     ``config`` is the class, or an instance whose values are the defaults.
     """
@@ -273,14 +274,14 @@ def _declared_in_class(
 
 
 def configured(kind: type[C], values: Mapping[str, Any]) -> C:
-    """Return a configuration with ``values`` by full name; omitted ones have their defaults.
+    """Return a configuration with ``values`` by full name; omitted parameters have their defaults.
 
     Values with other names are ignored; see :func:`require_known`.
 
     Raises
     ------
     ParameterError
-        A value is refused; the message names the parameter.
+        A value is invalid; the message names the parameter.
     """
     return _configured(kind(), values, "")
 
@@ -302,7 +303,7 @@ def require_known(owner: str, config: type[Any], names: Iterable[str]) -> None:
     Raises
     ------
     ParameterError
-        A name is unknown; the message says that ``owner`` has no such option.
+        A name is unknown; the message states that ``owner`` has no such option.
     """
     unknown = sorted(set(names) - {parameter.name for parameter in declared(config)})
     if unknown:

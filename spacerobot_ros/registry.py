@@ -1,4 +1,4 @@
-"""Registries of control laws, gait methods and metrics: the package's own, and those of users.
+"""Registries of control laws, gait methods and metrics: the package's own and the user's.
 
 A user's class is added to a registry in one of three ways:
 
@@ -38,13 +38,13 @@ class Registry(dict[str, type[T]]):
     Parameters
     ----------
     kind
-        Kind of the classes, for messages: ``control law``.
+        Kind of class, for messages: ``control law``.
     group
-        Group of entry points by which installed packages add classes.
+        Entry point group through which installed packages add classes.
     base
-        Base class of all of them.
+        Base class of all entries.
     own
-        The classes of this package, which cannot be replaced.
+        This package's classes, which cannot be replaced.
     reserved
         Other reserved names.
     """
@@ -65,7 +65,7 @@ class Registry(dict[str, type[T]]):
         self._own = frozenset([*self, *reserved])
 
     def register(self, entry: type[T]) -> type[T]:
-        """Add a class, replacing an earlier one with its name and file; usable as a decorator.
+        """Add a class, replacing one with the same name and file; usable as a decorator.
 
         Raises
         ------
@@ -78,15 +78,15 @@ class Registry(dict[str, type[T]]):
         return entry
 
     def load(self) -> None:
-        """Add the classes of installed packages and of the files in ``SPACEROBOT_PLUGINS``.
+        """Add the classes from installed packages and from the files in ``SPACEROBOT_PLUGINS``.
 
-        A refused entry point is omitted with a warning, because it must not affect users who do not
-        use it.
+        An invalid entry point is skipped with a warning, because it must not affect users who do
+        not use it.
 
         Raises
         ------
         ParameterError
-            A file cannot be read, or a class in it is refused.
+            A file cannot be read, or contains an invalid class.
         """
         for point in sorted(entry_points(group=self.group), key=lambda point: point.name):
             try:
@@ -148,9 +148,9 @@ def _origin(entry: type[Any]) -> str:
 
 
 def import_plugins() -> None:
-    """Import the files in ``SPACEROBOT_PLUGINS`` before anything else of this package.
+    """Import the files in ``SPACEROBOT_PLUGINS`` before anything else in this package.
 
-    They may import the whole package, which is only partly imported when a registry is. The
+    They may import the whole package, which is only partly loaded when a registry is imported. The
     registries report files that cannot be imported.
     """
     for file in _plugin_files():
@@ -164,17 +164,17 @@ def _plugin_files() -> list[Path]:
 
 
 _LOADED: list[Registry[Any]] = []
-"""Registries of this process, which also receive later plugins."""
+"""Registries in this process, which also receive later plugins."""
 
 
 def add_plugin(file: Path) -> None:
-    """Add a Python file to ``SPACEROBOT_PLUGINS`` of this process and its child processes.
+    """Add a Python file to ``SPACEROBOT_PLUGINS`` for this process and its child processes.
 
     Raises
     ------
     ParameterError
-        The file cannot be imported, or a class in it is refused. Registries that are imported later
-        raise the error then.
+        The file cannot be imported, or contains an invalid class. Registries that are imported
+        later raise the error then.
     """
     files = dict.fromkeys([*_plugin_files(), file.resolve()])
     os.environ[PLUGINS_VARIABLE] = os.pathsep.join(map(str, files))

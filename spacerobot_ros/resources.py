@@ -45,12 +45,12 @@ def share_directory() -> Path:
 
 
 def resource_names(folder: str, suffix: str) -> list[str]:
-    """Return the names, without suffix, of the files of one kind (``urdf``, ``config``)."""
+    """Return the names, without suffix, of all files of one kind (``urdf``, ``config``)."""
     return sorted(path.stem for path in (share_directory() / folder).glob(f"*{suffix}"))
 
 
 def robot_file(name: str) -> Path:
-    """Return the file of a robot, by path (URDF or xacro) or by name of a robot of this package.
+    """Return a robot's file, by path (URDF or xacro) or by the name of a packaged robot.
 
     Raises
     ------
@@ -63,8 +63,8 @@ def robot_file(name: str) -> Path:
             return path
         known = resource_names("urdf", ".urdf")
         raise ParameterError(
-            f"There is no robot '{name}': there is no such URDF file and no robot of that name "
-            f"(known: {', '.join(known)}).{suggestion(name, known)}"
+            f"There is no robot '{name}': there is no URDF file or robot with that name (known: "
+            f"{', '.join(known)}).{suggestion(name, known)}"
         )
     if Path(name).is_file():
         return Path(name)
@@ -79,11 +79,11 @@ def robot_file(name: str) -> Path:
 
 
 def is_path(name: str) -> bool:
-    """Whether the name of a robot is a file path: it has a known suffix or a folder."""
+    """Whether a robot name is a file path: it has a known suffix or a folder."""
     return Path(name).suffix in _ROBOT_SUFFIXES or len(Path(name).parts) > 1
 
 
 def suggestion(name: str, known: Iterable[str]) -> str:
-    """Return `` Did you mean ...?`` with the most similar known name; empty without one."""
+    """Return `` Did you mean ...?`` with the most similar known name, or an empty string."""
     found = get_close_matches(name, list(known), n=1)
     return f" Did you mean '{found[0]}'?" if found else ""

@@ -1,6 +1,6 @@
-"""Scenarios: ROS parameter files of a flight's nodes, with a section for its goals.
+"""Scenarios: ROS parameter files for the nodes of a flight, with a section for its goals.
 
-This module also reads parameter files and settings of the command line.
+This module also reads parameter files and command line settings.
 """
 
 from __future__ import annotations
@@ -56,12 +56,12 @@ CONFIGS: Mapping[str, type[Any]] = {
     "recorder": RecorderConfig,
     "viewer": ViewerConfig,
 }
-"""Configuration class of each node that a scenario may configure."""
+"""Configuration class of each configurable node."""
 
 NODES = tuple(CONFIGS)
 
 COMMANDERS = ("planner", "coordinated_control")
-"""Nodes that accept goals; a scenario runs those that have a section in its file."""
+"""Nodes that accept goals; a scenario runs the nodes with a section in its file."""
 
 _GOAL_KEYS = ("goal", "end_effector_goal")
 _SCENARIO_KEYS = (
@@ -77,14 +77,14 @@ _SCENARIO_KEYS = (
 
 _LONGEST_TF_PERIOD = 0.1  # wall s
 
-_OTHER_GOAL = "Flown to another goal than the scenario's"
+_OTHER_GOAL = "Flown to a goal other than the scenario's"
 
 
 @dataclass(frozen=True)
 class Published:
-    """A published figure for this scenario, to compare with the measured one.
+    """A published figure for this scenario, for comparison with the measured figure.
 
-    ``quantity`` is a key of the run's summary, or a note of the gait in the planner's status;
+    ``quantity`` is a key in the run summary, or a gait note in the planner's status;
     ``note`` comments on the printed figure (a misprint, an integration error).
     """
 
@@ -108,21 +108,21 @@ _KEYS_OF_PARTS: Mapping[Controlled, frozenset[str]] = {
     "position": frozenset({"goal_position"}),
     "attitude": frozenset({"goal_orientation", "goal_rotvec"}),
 }
-"""Keys of a scenario's section that require a part of the pose of the base."""
+"""Keys in the scenario section that require a component of the base pose."""
 
 
 @dataclass(frozen=True)
 class Scenario:
-    """The nodes of a flight with their parameters, and the goals of the flight.
+    """The nodes of a flight with their parameters, and the flight's goals.
 
     Attributes
     ----------
     name, path, description
         Name, path and description of the parameter file.
     goal, end_effector_goal
-        Goal poses of the base and of the end-effector.
+        Base and end-effector goal poses.
     commanders
-        Nodes that command the robot to the goals.
+        Nodes that command the robot.
     published, published_method
         Published figures, and the gait method to which they apply; empty: any.
     kills
@@ -130,7 +130,7 @@ class Scenario:
     in_file, overrides
         Parameters by node and full name; overrides take precedence over the file.
     has_goal
-        Whether a goal was given; otherwise ``goal`` is the start.
+        Whether a goal was given; otherwise ``goal`` is the initial pose.
     """
 
     name: str
@@ -156,7 +156,7 @@ class Scenario:
         Raises
         ------
         ParameterError
-            The node has no such parameter, or a value is refused; the message names both.
+            The node has no such parameter, or a value is invalid; the message names both.
         """
         if node not in self._configs:
             self._configs[node] = self._make_config(node)
@@ -229,16 +229,16 @@ class Scenario:
 
     @property
     def comparable(self) -> tuple[Published, ...]:
-        """The published figures, if they apply to the flown method."""
+        """The published figures, if they apply to the method used."""
         return self.published if self.published_method in ("", self.planner.method) else ()
 
     def parameters(self, node: str) -> dict[str, Value]:
-        """Return the parameters of a node in the file and the overrides, in their declared types.
+        """Return a node's parameters from the file and the overrides, in their declared types.
 
         Raises
         ------
         ParameterError
-            A parameter of the node is refused.
+            A node parameter is invalid.
         """
         values = values_of(self.config(node))
         written = self._parameters_as_written(node)
@@ -249,10 +249,10 @@ class Scenario:
         return typed
 
     def records(self, nodes: Sequence[str]) -> dict[str, dict[str, str]]:
-        """Return the metadata records of a bag of the flight, by name.
+        """Return the metadata records for a bag of the flight, by name.
 
-        ``scenario`` has name, description, goals and published figures, ``parameters/<node>`` every
-        parameter of a node as a JSON text.
+        ``scenario`` contains name, description, goals and published figures, ``parameters/<node>``
+        all parameters of a node as a JSON string.
         """
         scenario = {"name": self.name, "description": self.description}
         scenario |= {key: " ".join(map(repr, pose)) for key, pose in self._goal_poses().items()}
@@ -276,7 +276,7 @@ class Scenario:
 
     @property
     def goal_links(self) -> tuple[str, ...]:
-        """Names of the links of :attr:`end_effectors`, as in their topics."""
+        """Names of the links in :attr:`end_effectors`, as in their topics."""
         return tuple(link or DEFAULT_END_EFFECTOR for link in self.end_effectors)
 
     def _goal_poses(self) -> dict[str, list[float]]:
@@ -290,12 +290,12 @@ class Scenario:
         }
 
     def require_shape_of(self, robot: SpaceRobot) -> None:
-        """Refuse a goal whose joint positions belong to another robot.
+        """Raise an error if the goal's joint positions do not fit the robot.
 
         Raises
         ------
         GoalError
-            It has more or fewer joint positions than the robot has joints.
+            The number of joint positions differs from the number of joints.
         """
         shape = self.goal.joint_positions
         if shape is not None and len(shape) != robot.n:
@@ -305,7 +305,7 @@ class Scenario:
             )
 
     def with_overrides(self, node: str, values: Mapping[str, Any]) -> Scenario:
-        """Return the scenario with more parameters of one node set."""
+        """Return the scenario with additional parameters set for one node."""
         merged = {**self.overrides, node: {**self.overrides.get(node, {}), **values}}
         made = self._replace_fields(overrides=merged)
         made._configs.pop(node, None)
@@ -336,12 +336,12 @@ class Scenario:
     def with_method(self, method: str) -> Scenario:
         """Return the scenario with another gait method, or another control law.
 
-        If it is a law, a robot without a scenario uses a controller instead of a planner.
+        If it is a control law, a robot without a scenario uses a controller instead of a planner.
 
         Raises
         ------
         ParameterError
-            It has no planner or no controller that could use it.
+            The scenario has no planner or controller that could use it.
         """
         if method not in (*LAWS, *METHODS):
             known = [*METHODS, *LAWS]
@@ -375,14 +375,15 @@ class Scenario:
         Raises
         ------
         ParameterError
-            A text has another form, names no node, or names a commander that does not fly.
+            A string has a different format, does not name a node, or names a commander that is not
+            running.
         """
         scenario = self
         for text in texts:
             node, name, value = parse_setting(text)
             if node in COMMANDERS and node not in scenario.commanders:
                 raise ParameterError(
-                    f"'{text}' is for the node '{node}', which does not fly: the scenario "
+                    f"'{text}' is for the node '{node}', which is not running: the scenario "
                     f"'{self.name}' flies with {' and '.join(self.commanders)}."
                 )
             scenario = scenario.with_overrides(node, {name: value})
@@ -394,8 +395,8 @@ class Scenario:
         rotvec: Sequence[float] | None = None,
         rpy_deg: Sequence[float] | None = None,
     ) -> Scenario:
-        """Return the scenario with another pose (7,) or position (3,), and then another attitude
-        (3,), if given.
+        """Return the scenario with a new goal pose (7,) or position (3,), and a new attitude (3,),
+        if given.
 
         The attitude is a rotation vector (rad), or roll, pitch and yaw about fixed axes (deg). See
         :meth:`with_other_goal`.
@@ -410,7 +411,7 @@ class Scenario:
             given = Goal.checked(pose[:3], pose[3:] or goal.quaternion)
             goal = replace(goal, position=given.position, quaternion=given.quaternion)
         if rotvec is not None and rpy_deg is not None:
-            raise GoalError("The attitude of the goal is given twice, in radians and in degrees.")
+            raise GoalError("The goal attitude is given twice, in radians and in degrees.")
         if rotvec is not None:
             given = Goal.from_rotvec(goal.position.tolist(), rotvec)
             goal = replace(goal, quaternion=given.quaternion)
@@ -441,7 +442,7 @@ class Scenario:
     def with_end_effectors(
         self, goals: Sequence[EndEffectorGoal], base: frozenset[Controlled] = frozenset()
     ) -> Scenario:
-        """Return the scenario with other goals of end-effectors, and with its base goal limited to
+        """Return the scenario with other end-effector goals, and with its base goal limited to
         ``base``.
 
         Raises
@@ -501,8 +502,8 @@ def _changed(file: Path) -> float:
 
 
 def scenario_text(scenario: Scenario) -> str:
-    """Return the text of a parameter file of the scenario, with its overrides, but without
-    published figures and kills of nodes.
+    """Return the scenario as parameter file text, with its overrides, but without published figures
+    and node kills.
     """
     about: dict[str, Any] = {"description": scenario.description, **scenario._goal_poses()}
     for part, keys in _KEYS_OF_PARTS.items():
@@ -529,10 +530,10 @@ def _end_effector_values(goal: Goal) -> dict[str, list[float] | list[list[float]
 
 
 def load_scenario(name: str) -> Scenario:
-    """Return a scenario of this package by name, or of any parameter file by path.
+    """Return a packaged scenario by name, or any parameter file by path.
 
-    A file whose plant has a robot, such as a file from ``ros2 param dump``, needs no section
-    ``scenario``; the scenario then has no goal.
+    A file whose plant has a robot, such as a file from ``ros2 param dump``, needs no ``scenario``
+    section; the scenario then has no goal.
 
     Raises
     ------
@@ -612,7 +613,7 @@ def _with_world(
         file = (path.parent / world).resolve()
         load_world(file)
     except RobotDescriptionError as error:
-        raise ParameterError(f"The world of the scenario file {path} is refused: {error}") from None
+        raise ParameterError(f"The world in the scenario file {path} is invalid: {error}") from None
     return in_file | {
         node: {"world": str(file), **in_file[node]}
         for node in ("plant", "planner")
@@ -621,16 +622,16 @@ def _with_world(
 
 
 def scenario_or_robot(name: str) -> Scenario:
-    """Return a scenario by name, or one without a goal for a robot (its name or URDF file).
+    """Return a scenario by name, or a scenario without a goal for a robot (name or URDF file).
 
-    For a robot, the planner chooses the method.
+    If only a robot is given, the planner selects the method.
 
     Raises
     ------
     ParameterError
-        There is no such scenario or robot, or its file is broken.
+        There is no such scenario or robot, or its file is invalid.
     RobotDescriptionError
-        The robot is refused.
+        The robot is invalid.
     """
     path = Path(name)
     is_robot = path.suffix not in (".yaml", ".yml") and (
@@ -668,18 +669,18 @@ def _scenario_without_goal(
 
 
 def scenario_names() -> list[str]:
-    """Return the names of the scenarios of the package; scenarios with faults are last."""
+    """Return the names of the packaged scenarios; scenarios with faults are last."""
     faults = resource_names("config/faults", ".yaml")
     return [*resource_names("config", ".yaml"), *(f"faults/{name}" for name in faults)]
 
 
 def parse_kills(lines: object, where: str) -> tuple[Kill, ...]:
-    """Return the kills in lines ``NODE at SECONDS [until SECONDS]``, sorted by time.
+    """Parse kills from lines ``NODE at SECONDS [until SECONDS]``, sorted by time.
 
     Raises
     ------
     ParameterError
-        A line has another form, its node cannot be killed, or its times are not in order.
+        A line has a different format, its node cannot be killed, or its times are not in order.
     """
     if not isinstance(lines, list):
         raise ParameterError(
@@ -709,7 +710,7 @@ def _parse_published(rows: Any, path: Path) -> tuple[Published, ...]:
         )
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise ParameterError(
-            f"The section 'published' of the scenario file {path} is not "
+            f"The section 'published' in the scenario file {path} is not "
             f"quantity: {{printed: [numbers], note: text}}: {error!r}."
         ) from error
 
@@ -735,7 +736,7 @@ def _parse_goal(name: str, values: Mapping[str, Any], path: Path) -> Goal:
         hands = Goal.of_end_effectors(goals).end_effectors
         return replace(goal, end_effectors=hands, base=POSE if of_base else frozenset())
     except (GoalError, ValueError, TypeError, AttributeError) as error:
-        raise ParameterError(f"The goal of the scenario file {path} is refused: {error}") from error
+        raise ParameterError(f"The goal in the scenario file {path} is invalid: {error}") from error
 
 
 # -- parameter files and settings --------------------------------------------------------------
@@ -744,8 +745,9 @@ def _parse_goal(name: str, values: Mapping[str, Any], path: Path) -> Goal:
 def read_sections(path: Path) -> dict[str, dict[str, Any]]:
     """Return the parameters in a parameter file, by node and full name.
 
-    A section is for a node in any namespace (``/**/plant``), in one (``/robot_1/plant``), in none
-    (``plant``), or for all nodes (``/**``); if two sections set the same parameter, the later one
+    A section applies to a node in any namespace (``/**/plant``), in one namespace
+    (``/robot_1/plant``), in no namespace (``plant``), or to all nodes (``/**``); if two sections
+    set the same parameter, the later one
     takes precedence; a section for all nodes has the lowest precedence.
 
     Raises
@@ -757,9 +759,9 @@ def read_sections(path: Path) -> dict[str, dict[str, Any]]:
 
 
 def different_parameters(scenarios: Sequence[Scenario]) -> list[tuple[str, ...]]:
-    """Return each parameter that differs between the scenarios, with its unit and its values.
+    """Return each parameter that differs between the scenarios, with its unit and values.
 
-    Values are texts; ``–`` if a scenario does not set the parameter and uses its default. Robot
+    Values are texts; ``–`` if a scenario uses the default. Robot
     descriptions are omitted.
     """
     given = [{(n, p): v for n in CONFIGS for p, v in s.parameters(n).items()} for s in scenarios]
@@ -823,7 +825,7 @@ def _parameters_by_node(content: Mapping[str, Any], path: Path) -> dict[str, dic
         if not isinstance(values, dict):
             raise ParameterError(
                 f"The section '{key}' of the scenario file {path} is not 'ros__parameters:' with "
-                "the parameters under it."
+                f"parameters under it."
             )
         chosen = of_all_nodes if node == "**" else by_node.setdefault(node, {})
         chosen.update(_flatten_section(values))
@@ -838,7 +840,7 @@ def parse_setting(text: str) -> tuple[str, str, Any]:
     Raises
     ------
     ParameterError
-        The text has another form, or names no node.
+        The string has a different format, or does not name a node.
     """
     key, equals, value = text.partition("=")
     node, dot, name = key.strip().partition(".")
@@ -854,7 +856,7 @@ def parse_setting(text: str) -> tuple[str, str, Any]:
 
 
 def number_in(text: str) -> float | str:
-    """Return a text as a number if it is one; unlike in YAML, 1e-3 is a number."""
+    """Convert a string to a number if possible; unlike in YAML, 1e-3 is a number."""
     try:
         return float(text)
     except ValueError:

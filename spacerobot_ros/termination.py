@@ -2,11 +2,12 @@
 
 A process installs its guard at its first import (:func:`guarded`). SIGINT, SIGTERM and SIGHUP then
 raise :class:`Terminated` in the main thread; work that must be completed, such as a flight or a
-bag, receives a request instead (:func:`graceful_shutdown`). A second signal, at least a second
-later, ends the process at once. So does a timer if a library swallows the exception. Python handles
+bag, receives a request instead (:func:`graceful_shutdown`). A second signal, at least one second
+later, ends the process immediately. So does a timer if a library swallows the exception. Python
+handles
 signals once a call of C code has returned.
 
-On Linux the kernel signals the end of a process to the children of :func:`start_child`.
+On Linux, if a process ends, the kernel signals its children started by :func:`start_child`.
 """
 
 from __future__ import annotations
@@ -35,13 +36,13 @@ _LONGEST_UNWINDING_TIME = 1.2
 """Wall time within which the main thread must end after a signal's exception, s."""
 
 _SAME_SIGNAL_TIME = 1.0
-"""Wall time within which signals count as one, s: launcher and terminal both send one."""
+"""Wall time within which signals are treated as one, s: launcher and terminal both send one."""
 
 _TIME_AFTER_PARENT_END = 1.5
 """Wall time from the end of the parent until the kernel kills this process, s."""
 
 _PARENT_VARIABLE = "SPACEROBOT_PARENT"
-"""Environment variable of a child: process id of its parent."""
+"""Environment variable with which a child receives its parent's process id."""
 
 _PARENT_ENDED_SIGNAL = signal.SIGUSR2
 
@@ -49,7 +50,8 @@ _PR_SET_PDEATHSIG = 1
 
 
 class Terminated(KeyboardInterrupt):
-    """A signal that ends the process. Like an interrupt it passes ``except Exception``.
+    """A signal that ends the process. Like KeyboardInterrupt, it is not caught by ``except
+    Exception``.
 
     Parameters
     ----------
@@ -63,7 +65,7 @@ class Terminated(KeyboardInterrupt):
 
     @property
     def exit_code(self) -> int:
-        """Exit code by which shells report such a signal."""
+        """Exit code with which shells report this signal."""
         return 128 + self.number
 
 
@@ -95,7 +97,7 @@ class _Guard:
             self._errors, sys.stderr = None, self._errors
 
     def watch_parent(self) -> None:
-        """Make the kernel (Linux) signal the parent's end, which may be in the past."""
+        """Make the kernel (Linux) signal the parent's end, which may already have happened."""
         if not self._parent:
             return
         with suppress(ImportError, OSError, AttributeError):
@@ -142,10 +144,10 @@ _guard: _Guard | None = None
 
 @contextmanager
 def guarded() -> Iterator[bool]:
-    """End the process on signals and on the end of the parent, within this context.
+    """End the process on signals and when the parent ends, within this context.
 
-    Yields whether the guard is new: inside another guard nothing changes. Outside the main thread,
-    which alone receives signals, it has no effect.
+    Yields whether the guard is new: inside another guard it has no effect. Outside the main thread,
+    the only thread that receives signals, it has no effect.
 
     Raises
     ------
@@ -171,7 +173,7 @@ def graceful_shutdown(
 ) -> Iterator[Callable[[], bool]]:
     """Convert signals to a request while work is completed.
 
-    Yields a function that returns whether the end was requested; the work calls it regularly.
+    Yields a function that returns whether termination was requested; the work calls it regularly.
 
     Parameters
     ----------
@@ -205,12 +207,12 @@ def _on_first_signal(on_request: Callable[[], None] | None) -> Iterator[_Guard |
 
 
 def termination() -> Terminated | None:
-    """Return the signal that ends this process, None without one."""
+    """Return the signal that ends this process, or None."""
     return None if _guard is None else _guard.ending
 
 
 def announce(ending: Terminated) -> None:
-    """Write the signal that ends this process to standard error, if that is still open."""
+    """Write the signal that ends this process to standard error, if still open."""
     if _guard is not None:
         _guard.restore_stderr()
     with suppress(OSError):  # The terminal may be closed.
@@ -221,7 +223,7 @@ def announce(ending: Terminated) -> None:
 def start_child(
     words: Sequence[str], environment: Mapping[str, str] | None = None, **options: Any
 ) -> subprocess.Popen[bytes]:
-    """Start Python with arguments ``words`` as a new session, which ends with this process.
+    """Start Python with arguments ``words`` in a new session that ends with this process.
 
     The child must be guarded. ``environment`` is its environment, by default a copy of this
     process's; for ``options`` see ``subprocess.Popen``.
@@ -240,7 +242,7 @@ def _child_environment(environment: Mapping[str, str] | None = None) -> dict[str
 
 
 def end_with_parent() -> None:
-    """End a process of :mod:`multiprocessing` when its parent ends; call it in a thread."""
+    """End a :mod:`multiprocessing` process when its parent ends; call this in a thread."""
     import multiprocessing  # It takes a while, and few processes are of it.
 
     parent = multiprocessing.parent_process()
@@ -250,15 +252,15 @@ def end_with_parent() -> None:
 
 
 def end_child(process: subprocess.Popen[bytes], signals: Mapping[int, float]) -> int:
-    """End a child of :func:`start_child` and return its exit code.
+    """End a child started by :func:`start_child` and return its exit code.
 
     Parameters
     ----------
     process
         The child.
     signals
-        Signals to send one after the other, each with the longest wait for the end, s of wall time;
-        signal 0 only waits. Then the child is killed with its whole session.
+        Signals to send in turn, each with the maximum wait for the end, s of wall time; signal 0
+        only waits. Then the child is killed with its whole session.
     """
     import subprocess
 

@@ -1,4 +1,4 @@
-"""Nodes of this package and your own nodes in one executor, for your own pytest tests."""
+"""This package's nodes and your own in one executor, for your pytest tests."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ __all__ = ["Arrival", "Stack"]
 
 
 class Arrival(NamedTuple):
-    """The end of a goal: its outcome, and the commander's message."""
+    """The result of a goal: its outcome, and the commander's message."""
 
     outcome: Outcome
     message: str
@@ -42,7 +42,7 @@ class Arrival(NamedTuple):
 class Stack:
     """Nodes in one executor, in lockstep, in their own ROS domain; a context manager.
 
-    The plant starts with the first goal, once all nodes are connected. Time continues while nodes
+    The plant starts at the first goal, once all nodes are connected. Time continues while nodes
     spin.
 
     Parameters
@@ -50,17 +50,17 @@ class Stack:
     robot
         Robot or scenario (a name or a file) that configures the nodes.
     nodes
-        Names of nodes of this package, and functions or classes that take an rclpy context and
+        Names of this package's nodes, and functions or classes that take an rclpy context and
         return your own node.
     parameters
         Further parameters by node: ``{"planner": {"method": "lie_bracket"}}``.
     timeout
-        Longest wall time of a wait, s.
+        Maximum wall time to wait, s.
 
     Attributes
     ----------
     nodes
-        The nodes by name. ``executor``, ``context`` and ``domain`` are common to all nodes.
+        The nodes by name. ``executor``, ``context`` and ``domain`` are shared by all nodes.
     """
 
     def __init__(
@@ -116,7 +116,7 @@ class Stack:
         z: float | None = None,
         rotvec: npt.ArrayLike | None = None,
     ) -> Arrival:
-        """Send a goal and spin until the planner, or else the controller, decides on it.
+        """Send a goal and spin until the planner, or else the controller, completes it.
 
         ``goal`` is any goal; None: the base at ``x``, ``y``, ``z`` (m), rotated by ``rotvec``
         (rad), 0 unless given; without coordinates any position is accepted, without ``rotvec`` any

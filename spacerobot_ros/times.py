@@ -1,4 +1,4 @@
-"""Times of stamps and clocks: whole nanoseconds, split into seconds and remainder."""
+"""Stamps and clock times: whole nanoseconds, split into seconds and remainder."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ LATEST_NS = 2**31 * SECOND - 1
 """Latest time of a builtin_interfaces/Time, whose seconds have 32 bits, ns."""
 
 HEADER_STAMP = slice(4, 12)
-"""Bytes of the stamp in a serialised message that begins with a header or a time."""
+"""Stamp bytes in a serialised message that begins with a header or a time."""
 
 _TIME_LAYOUT = struct.Struct("<iI")
 
 unpack_stamp = struct.Struct(f"<{HEADER_STAMP.start}xiI").unpack_from
-"""Returns seconds and nanoseconds of the time at the beginning of a serialised message."""
+"""Unpacks seconds and nanoseconds of the time at the beginning of a serialised message."""
 
 
 @lru_cache(maxsize=1)
@@ -30,13 +30,13 @@ def stamp_bytes(time_ns: int) -> bytes:
     Raises
     ------
     SpaceRobotError
-        The time is beyond the range of stamps.
+        The time is beyond the stamp range.
     """
     try:
         return _TIME_LAYOUT.pack(*divmod(time_ns, SECOND))
     except struct.error:
         raise SpaceRobotError(
-            f"Stamps carry times up to 2^31 s (68 years), not {time_ns / SECOND:.10g} s."
+            f"Stamps support times up to 2^31 s (68 years), not {time_ns / SECOND:.10g} s."
         ) from None
 
 
@@ -49,7 +49,7 @@ def first_time_ns(raw: bytes) -> int:
 
 
 def stamp_to_ns(stamp: Any) -> int:
-    """Return the nanoseconds of a builtin_interfaces/Time or Duration object."""
+    """Return a builtin_interfaces/Time or Duration object in nanoseconds."""
     return int(stamp.sec * SECOND + stamp.nanosec)
 
 

@@ -1,7 +1,7 @@
-"""Table of all topics, from which publishers, reports and documents are generated.
+"""Table of all topics, used by publishers, reports and the documentation.
 
-For the plant's state topics the table also lists the numbers in their messages:
-the plant's publisher and the re-simulation of a bag read it. A new state topic needs an entry here
+For the plant's state topics the table also lists the values in their messages, for the plant's
+publisher and the re-simulation of bags. A new state topic needs an entry here
 and a quantity in :mod:`spacerobot_ros.simulation.sensors`.
 """
 
@@ -19,19 +19,18 @@ _MOMENTUM_LABELS = ("linear_x", "linear_y", "linear_z", "angular_x", "angular_y"
 
 @dataclass(frozen=True)
 class StateField:
-    """Adjacent numbers in the message of a state topic.
+    """Adjacent values in a state topic's message.
 
     Attributes
     ----------
     path
-        Path in the message: a number, a part that has numbers, or an array.
+        Path in the message: a number, a component with numbers, or an array.
     quantity
-        Name of the numbers in :attr:`~spacerobot_ros.simulation.sensors.ReportedState.
-        quantities`.
+        Name of the values in :attr:`~spacerobot_ros.simulation.sensors.ReportedState. quantities`.
     members
-        The numbers of the part at ``path``, in their order; empty for an array.
+        The fields of the component at ``path``, in order; empty for an array.
     array_entry_names
-        Names of the entries of an array; empty: one for each joint or other object of the topic.
+        Names of the array entries; empty: one per joint or other object of the topic.
     """
 
     path: str
@@ -41,11 +40,11 @@ class StateField:
 
     @property
     def columns(self) -> list[str]:
-        """Paths of the numbers in a message, or the path of an array."""
+        """Value paths in a message, or the path of an array."""
         return [f"{self.path}.{member}" for member in self.members] or [self.path]
 
     def labels(self, names: Sequence[str]) -> list[str]:
-        """Return a label for each number; ``names`` are the joints or thrusters."""
+        """Return a label for each value; ``names`` are the joints or thrusters."""
         if self.members:
             return self.columns
         return [entry.replace("_", " ") for entry in self.array_entry_names] or [
@@ -54,7 +53,7 @@ class StateField:
 
     @property
     def quaternion(self) -> int | None:
-        """Index of the first number of a quaternion, if there is one."""
+        """Index of the first quaternion component, if any."""
         first = "orientation.x"
         return self.members.index(first) if first in self.members else None
 
@@ -66,7 +65,7 @@ class Topic:
     Attributes
     ----------
     name
-        Name of the topic, relative to the namespace of its robot or absolute.
+        Topic name, relative to the robot's namespace or absolute.
     type
         Name of the message type, such as ``nav_msgs/msg/Odometry``.
     publishers
@@ -74,15 +73,15 @@ class Topic:
     meaning
         Description of the content.
     condition
-        Condition under which it exists; empty: always.
+        Condition under which the topic exists; empty: always.
     latched
-        Whether a late subscriber gets the last message (reliable, transient local, depth 1).
+        Whether a late subscriber receives the last message (reliable, transient local, depth 1).
     state
-        The numbers of a state of the plant; empty for other topics.
+        The values of a plant state; empty for other topics.
     frame
-        The frame of the header of a state topic: ``world`` or ``base``.
+        The frame in the header of a state topic: ``world`` or ``base``.
     array_entries_of
-        Objects to which the entries of its arrays belong: ``joints`` or ``thrusters``.
+        Objects to which the array entries belong: ``joints`` or ``thrusters``.
     every_tick
         Whether a state topic is published in every tick, or every ``base_pose_period``.
     """
@@ -140,7 +139,7 @@ _TOPIC_TABLE = (
         "base_pose",
         _POSE_STAMPED_TYPE,
         _PUBLISHED_BY_PLANT,
-        "true pose of the base link in the world, every `base_pose_period`",
+        "true base link pose in the world, every `base_pose_period`",
         state=(StateField("pose", "pose", _POSE_MEMBERS),),
         every_tick=False,
     ),
@@ -184,7 +183,7 @@ _TOPIC_TABLE = (
         _ODOMETRY_TYPE,
         _PUBLISHED_BY_PLANT,
         "measured pose of the target's root link in the world, and its twist in its own frame, "
-        "whether it floats or is held",
+        "floating or held",
         condition="`target.robot` is set",
         state=_odometry("target"),
     ),
@@ -192,7 +191,7 @@ _TOPIC_TABLE = (
         "target/odom_true",
         _ODOMETRY_TYPE,
         _PUBLISHED_BY_PLANT,
-        "true state of the target",
+        "true target state",
         condition="`target.sensors` have errors",
         state=_odometry("true_target"),
     ),
@@ -200,7 +199,7 @@ _TOPIC_TABLE = (
         "odom_true",
         _ODOMETRY_TYPE,
         _PUBLISHED_BY_PLANT,
-        "true state of the base",
+        "true base state",
         condition="the sensors have errors",
         state=_odometry("true"),
     ),
@@ -208,7 +207,7 @@ _TOPIC_TABLE = (
         "joint_states_true",
         _JOINT_STATE_TYPE,
         _PUBLISHED_BY_PLANT,
-        "true state of the joints",
+        "true joint states",
         condition="the sensors have errors",
         state=_joint_states("true"),
         frame="base",
@@ -217,15 +216,14 @@ _TOPIC_TABLE = (
         "odom",
         _ODOMETRY_TYPE,
         _PUBLISHED_BY_PLANT,
-        "measured pose of the base link in the world, and its twist in its own frame",
+        "measured base link pose in the world, and its twist in its own frame",
         state=_odometry("measured"),
     ),
     Topic(
         "joint_states",
         _JOINT_STATE_TYPE,
         _PUBLISHED_BY_PLANT,
-        "measured positions and velocities of the joints, and the efforts of their actuators in "
-        "the last tick",
+        "measured joint positions and velocities, and actuator efforts in the last tick",
         state=_joint_states("measured"),
         frame="base",
     ),
@@ -233,7 +231,7 @@ _TOPIC_TABLE = (
         "base_wrench_realised",
         _WRENCH_STAMPED_TYPE,
         _PUBLISHED_BY_PLANT,
-        "mean wrench of the thrusters in the last tick",
+        "mean thruster wrench in the last tick",
         condition="`thrusters` is set",
         state=(StateField("wrench", "thruster_wrench", _WRENCH_MEMBERS),),
         frame="base",
@@ -242,8 +240,8 @@ _TOPIC_TABLE = (
         "thrusters",
         _JOINT_STATE_TYPE,
         _PUBLISHED_BY_PLANT,
-        "by name of the thruster: total on-time (position, s), part of the last tick (velocity), "
-        "mean force in it (effort, N)",
+        "by thruster name: total on-time (position, s), fraction of the last tick (velocity), mean "
+        "force in that tick (effort, N)",
         condition="`thrusters` is set",
         state=(
             StateField("position", "thruster_on_time"),
@@ -257,15 +255,15 @@ _TOPIC_TABLE = (
         "/tf",
         _TRANSFORMS_TYPE,
         _PUBLISHED_BY_PLANT,
-        "base link in the world and links in their parents, from odom and joint_states, every "
-        "`tf_period`",
+        "base link in the world and links in their parent frames, from odom and joint_states, "
+        "every `tf_period`",
         condition="tf2_msgs is installed; in bags always",
     ),
     Topic(
         "/tf_static",
         _TRANSFORMS_TYPE,
         _PUBLISHED_BY_PLANT,
-        "links on fixed joints in their parents",
+        "links on fixed joints in their parent frames",
         condition="tf2_msgs is installed and the robot has such links; in bags always",
         latched=True,
     ),
@@ -273,14 +271,14 @@ _TOPIC_TABLE = (
         "robot_description",
         _STRING_TYPE,
         _PUBLISHED_BY_PLANT,
-        "the URDF of the robot",
+        "the robot's URDF",
         latched=True,
     ),
     Topic(
         "target/robot_description",
         _STRING_TYPE,
         _PUBLISHED_BY_PLANT,
-        "the URDF of the target",
+        "the target's URDF",
         condition="`target.robot` is set",
         latched=True,
     ),
@@ -294,7 +292,7 @@ _TOPIC_TABLE = (
         "/diagnostics",
         "diagnostic_msgs/msg/DiagnosticArray",
         ("plant", "planner", "coordinated_control", "recorder"),
-        "refused commands, limits, momentum, faults, deadlines; ignored states; silent nodes; "
+        "rejected commands, limits, momentum, faults, deadlines; ignored states; silent nodes; "
         "recorded and lost messages",
     ),
     Topic(
@@ -303,8 +301,8 @@ _TOPIC_TABLE = (
         _PUBLISHED_BY_PLANT,
         "smallest distance between two links, every `clearance_period`: `time` (s), `distance` "
         "(m; negative: penetration depth), and the links `first` and `second`; `second_is` is "
-        "`obstacle` if the second is one",
-        condition="links of the robot could touch",
+        "`obstacle` if the second is an obstacle",
+        condition="robot links could touch",
     ),
     Topic(
         "fault_injection",
@@ -316,14 +314,14 @@ _TOPIC_TABLE = (
         "disturbance_injection",
         _STRING_TYPE,
         _PUBLISHED_BY_USER,
-        "disturbances of the plant, one per line, or `clear`",
+        "disturbances for the plant, one per line, or `clear`",
     ),
     Topic(
         "obstacles",
         _STRING_TYPE,
         _PUBLISHED_BY_USER,
         "URDF of all fixed obstacles, for the planner, a controller that plans, the plant and "
-        "viewers; it replaces earlier ones; empty: none",
+        "viewers; it replaces all previous obstacles; empty: none",
         latched=True,
     ),
     Topic(
@@ -337,43 +335,43 @@ _TOPIC_TABLE = (
         "base_wrench",
         _WRENCH_STAMPED_TYPE,
         ("coordinated_control",),
-        "commanded thruster force and torque at the origin of the base link, in its frame",
+        "commanded thruster force and torque at the base link origin, in its frame",
     ),
     Topic(
         "goal_pose",
         _POSE_STAMPED_TYPE,
         _PUBLISHED_BY_USER,
-        "goal pose of the base in the world; NaN: any position, or any attitude",
+        "base goal pose in the world; NaN: any position, or any attitude",
     ),
     Topic(
         "goal_joint_states",
         _JOINT_STATE_TYPE,
         _PUBLISHED_BY_USER,
-        "final joint positions of later goals; without joints: any",
+        "final joint positions for later goals; without joints: any",
     ),
     Topic(
         "end_effector/goal_pose",
         _POSE_STAMPED_TYPE,
         _PUBLISHED_BY_USER,
-        "goal pose of the end-effector in the world; also `NAME/goal_pose` of links in the "
-        "planner's `end_effectors`. For the planner, an orientation of zeros means any attitude, "
-        "and poses with the same stamp, including the base's, are one goal",
+        "end-effector goal pose in the world; also `NAME/goal_pose` for links in the planner's "
+        "`end_effectors`. For the planner, an all-zero orientation means any attitude, and poses "
+        "with the same stamp, including the base's, form one goal",
     ),
     Topic(
         "end_effector/twist",
         _TWIST_STAMPED_TYPE,
         _PUBLISHED_BY_USER,
-        "commanded twist of the end-effector in the frame of its header: the world, the base link "
-        "or the end-effector; also `NAME/twist` of links in the planner's `end_effectors`. The "
+        "commanded end-effector twist in the frame in its header: the world, the base link or the "
+        "end-effector; also `NAME/twist` for links in the planner's `end_effectors`. The "
         "joints brake if none arrives for `twist_timeout`",
     ),
     Topic(
         "end_effector/path",
         _PATH_TYPE,
         _PUBLISHED_BY_USER,
-        "path of the end-effector in the world, straight from pose to pose; the last pose is the "
-        "goal, and the base is free; also `NAME/path` of links in the planner's "
-        "`end_effectors`. Orientations of zeros in all poses mean any attitude",
+        "end-effector path in the world, straight from pose to pose; the last pose is the goal, "
+        "and the base is free; also `NAME/path` for links in the planner's `end_effectors`. "
+        "If all orientations are zero, any attitude is accepted",
     ),
     Topic(
         "joint_reference",
@@ -399,30 +397,30 @@ _TOPIC_TABLE = (
         "planned_path",
         _PATH_TYPE,
         ("planner", "coordinated_control"),
-        "predicted path of the base",
+        "predicted base path",
         latched=True,
     ),
     Topic(
         "plant/status",
         _STATUS_TYPE,
         ("plant",),
-        "state of the plant, reason, active injected faults, and the held `payload`, on every "
-        "change; `state` is inactive, running, resting, paused, latched or failed",
+        "plant state, reason, active injected faults, and the held `payload`, on every change; "
+        "`state` is inactive, running, resting, paused, latched or failed",
         latched=True,
     ),
     Topic(
         "planner/status",
         _STATUS_TYPE,
         ("planner",),
-        "state of the planner, reason, goal and remaining error",
+        "planner state, reason, goal and remaining error",
         latched=True,
     ),
     Topic(
         "controller/status",
         _STATUS_TYPE,
         ("coordinated_control",),
-        "state of the controller, reason, goal, expected arrival (`ends_at_s`), errors, and "
-        "losses by saturation",
+        "controller state, reason, goal, expected arrival (`ends_at_s`), errors, and saturation "
+        "losses",
         latched=True,
     ),
     Topic(
@@ -430,7 +428,7 @@ _TOPIC_TABLE = (
         _STATUS_TYPE,
         ("replay",),
         "position of a replay: `state` is playing, paused or ended, `position_s` and `duration_s` "
-        "from its beginning, `rate`; on every change, and five times a second",
+        "from its beginning, `rate`; on every change, and five times per second",
         condition="a bag is replayed",
         latched=True,
     ),
@@ -438,52 +436,52 @@ _TOPIC_TABLE = (
         "replay/seek",
         "std_msgs/msg/Float64",
         _PUBLISHED_BY_USER,
-        "time from which a replay continues, s after its beginning",
+        "time at which a replay continues, s from its beginning",
         condition="a bag is replayed",
     ),
     Topic(
         "events",
         _STATUS_TYPE,
         ("plant", "planner", "coordinated_control", "recorder", "replay"),
-        "one record for each change of state: `event` is its kind, `time` simulated, `wall_time` "
-        "since the epoch (not of flights without nodes), both in s",
+        "one record per state change: `event` is its kind, `time` simulated time, `wall_time` "
+        "since the epoch (not for flights without nodes), both in s",
     ),
     Topic(
         "heartbeat",
         _STATUS_TYPE,
         ("plant", "planner", "coordinated_control", "recorder", "replay"),
-        "five times a second of wall time from every active node: `name`, `hardware_id` (its "
+        "five times per second of wall time from every active node: `name`, `hardware_id` (its "
         "role), `message` (active, busy or inactive); in bags only on request",
     ),
 )
 
 TOPICS: dict[str, Topic] = {topic.name: topic for topic in _TOPIC_TABLE}
-"""Every topic of the stack by name; topics of the plant are in the order of publication."""
+"""Every topic of the stack by name; the plant's topics are in publication order."""
 
 GLOBAL_TOPICS = ("/clock", "/tf", "/tf_static")
-"""Topics with absolute names; a stack in a namespace remaps them into the namespace."""
+"""Topics with absolute names; a stack in a namespace remaps them into it."""
 
 TOPICS_NOT_RECORDED = ("/rosout", "/parameter_events", "/transition_event", "/heartbeat")
 """Suffixes of topics that are recorded only on request."""
 
 
 def goal_topic(end_effector: str) -> str:
-    """Return the topic of the goals of an end-effector, with its name converted for topics."""
+    """Return the goal topic of an end-effector, with its name converted for topics."""
     return _name_in_topics(end_effector) + "/goal_pose"
 
 
 def twist_topic(end_effector: str) -> str:
-    """Return the topic of the twists of an end-effector."""
+    """Return the twist topic of an end-effector."""
     return _name_in_topics(end_effector) + "/twist"
 
 
 def path_topic(end_effector: str) -> str:
-    """Return the topic of the paths of an end-effector."""
+    """Return the path topic of an end-effector."""
     return _name_in_topics(end_effector) + "/path"
 
 
 def pose_topic(end_effector: str) -> Topic:
-    """Return the entry for the poses of an end-effector, with its name converted for topics."""
+    """Return the entry for an end-effector's poses, with its name converted for topics."""
     name = _name_in_topics(end_effector)
     state = StateField("pose", f"pose_of_{name}", _POSE_MEMBERS)
     return replace(TOPICS["end_effector/pose"], name=f"{name}/pose", state=(state,))
@@ -494,8 +492,8 @@ def _name_in_topics(link: str) -> str:
 
 
 def topic_named(name: str) -> Topic:
-    """Return the entry of a topic; goals, twists, paths and poses of any end-effector use the entry
-    of ``end_effector``.
+    """Return the entry for a topic; goals, twists, paths and poses of any end-effector use the
+    ``end_effector`` entry.
 
     Raises
     ------
@@ -514,8 +512,6 @@ def topic_named(name: str) -> Topic:
 
 
 def state_topics(end_effectors: Iterable[str] = ()) -> list[Topic]:
-    """Return the state topics of a plant, including the poses of these end-effectors, in the order
-    of publication.
-    """
+    """Return a plant's state topics, including these end-effectors' poses, in publication order."""
     poses = {topic.name: topic for topic in map(pose_topic, end_effectors)}
     return [topic for topic in {**poses, **TOPICS}.values() if topic.state]

@@ -114,7 +114,10 @@ def test_a_new_file_has_a_mode_and_a_bag_is_not_replaced(tmp_path: Path) -> None
     bag.write_bytes(b"\x89MCAP and more")
     with pytest.raises(SpaceRobotError) as refused:
         write_output(bag, b"x")
-    assert str(refused.value) == f"The file {bag} is a bag, which is not replaced: name another."
+    assert (
+        str(refused.value)
+        == f"The file {bag} is a bag, which is not overwritten: choose another file."
+    )
     bag.write_bytes(b"\x89MCA")
     write_output(bag, b"x")
 
@@ -157,7 +160,7 @@ def test_a_private_file_is_of_this_user_alone(
         with pytest.raises(UntrustedFileError) as refused:
             read_private(path)
         assert str(refused.value) == (
-            f"others may write '{path}' (mode {mode:o}); make it yours alone with "
+            f"others can write to '{path}' (mode {mode:o}); make it yours alone with "
             f"chmod go-w '{path}'."
         )
     path.chmod(0o600)
@@ -183,7 +186,7 @@ def test_a_cache_gives_what_was_stored_under_a_key(
         assert cache.load("x", "other") is None
     assert not path.exists()
     assert caplog.messages == [
-        f"'{path}' is deleted and computed again: it is damaged, or stored under another key."
+        f"'{path}' is deleted and recomputed: it is damaged, or stored under another key."
     ]
     damaged = cache.store("y", "key", b"content")
     assert damaged is not None

@@ -93,7 +93,7 @@ def test_times_are_split_into_seconds_and_the_rest() -> None:
     assert times.first_time_ns(beyond) == latest
     with pytest.raises(SpaceRobotError) as refused:
         times.stamp_bytes(latest + 1)
-    assert str(refused.value) == ("Stamps carry times up to 2^31 s (68 years), not 2147483648 s.")
+    assert str(refused.value) == ("Stamps support times up to 2^31 s (68 years), not 2147483648 s.")
     stamp = Time()
     times.set_stamp(stamp, 5_000_000_001)
     assert (stamp.sec, stamp.nanosec, times.stamp_to_ns(stamp)) == (5, 1, 5_000_000_001)
@@ -170,7 +170,7 @@ def test_robots_that_are_no_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     with pytest.raises(ParameterError) as refused:
         resources.robot_file("servicr")
     assert str(refused.value).startswith(
-        "There is no robot 'servicr': there is no such URDF file and no robot of that name (known: "
+        "There is no robot 'servicr': there is no URDF file or robot with that name (known: "
     )
     assert str(refused.value).endswith("Did you mean 'servicer'?")
 
@@ -351,7 +351,7 @@ def test_sections_of_files(tmp_path: Path) -> None:
         with pytest.raises(ParameterError) as refused:
             read_sections(path)
         assert str(refused.value) == (
-            f"The section 'plant' of the scenario file {path} is not 'ros__parameters:' with the "
+            f"The section 'plant' of the scenario file {path} is not 'ros__parameters:' with "
             "parameters under it."
         )
     path.write_text("[1]")
@@ -364,16 +364,16 @@ def test_sections_of_files(tmp_path: Path) -> None:
     ("goal", "sentence"),
     [
         (("goal_positon: [1, 2, 3]",), "has an unknown key 'goal_positon' in its scenario section"),
-        (("goal_position: [1, 2]",), "The goal of the scenario file"),
-        (("goal_rotvec: [1, 2]",), "The goal of the scenario file"),
+        (("goal_position: [1, 2]",), "The goal in the scenario file"),
+        (("goal_rotvec: [1, 2]",), "The goal in the scenario file"),
         (
             ("published: {a: 3}",),
-            "The section 'published' of the scenario file FILE is not quantity: {printed: "
+            "The section 'published' in the scenario file FILE is not quantity: {printed: "
             "[numbers], note: text}: ",
         ),
         (("kills: 3",), "'kills' in the file FILE is 3, not a list of lines NODE at SECONDS."),
-        (("world: none.urdf",), "The world of the scenario file FILE is refused: "),
-        (("end_effector_goals: 3",), "The goal of the scenario file FILE is refused: "),
+        (("world: none.urdf",), "The world in the scenario file FILE is invalid: "),
+        (("end_effector_goals: 3",), "The goal in the scenario file FILE is invalid: "),
     ],
 )
 def test_scenarios_that_are_refused(goal: tuple[str, ...], sentence: str, tmp_path: Path) -> None:
@@ -442,17 +442,17 @@ def test_what_a_scenario_needs_is_said(tmp_path: Path) -> None:
     with pytest.raises(ParameterError) as unused:
         found.with_settings(["coordinated_control.law=model_based"])
     assert str(unused.value) == (
-        "'coordinated_control.law=model_based' is for the node 'coordinated_control', which does "
-        "not fly: the scenario 'own' flies with planner."
+        "'coordinated_control.law=model_based' is for the node 'coordinated_control', which is "
+        "not running: the scenario 'own' flies with planner."
     )
     with pytest.raises(GoalError) as twice:
         found.with_goal(None, (0.0, 0.0, 1.0), (0.0, 0.0, 1.0))
-    assert str(twice.value) == "The attitude of the goal is given twice, in radians and in degrees."
+    assert str(twice.value) == "The goal attitude is given twice, in radians and in degrees."
     assert found.with_goal() is found
     bare = written(tmp_path, text_of(plant={"robot": ""}, planner={"ros__parameters": {}}))
     with pytest.raises(ParameterError) as refused:
         PlanningProblem.of(bare)
-    assert str(refused.value) == "The scenario 'own' names no robot; see plant.robot."
+    assert str(refused.value) == "The scenario 'own' has no robot; see plant.robot."
     with pytest.raises(ParameterError) as refused:
         found.with_overrides("plant", {"tick_rat": 1}).config("plant")
     misspelt = "Node 'plant' has no parameter 'tick_rat'. Did you mean 'tick_rate'?"

@@ -1,6 +1,6 @@
-"""The command `spacerobot`: one module a command, loaded when the command is used.
+"""The command `spacerobot`: one module per command, loaded when the command is used.
 
-Command modules import nothing heavy at their top: `spacerobot --help` loads all of them.
+Command modules import nothing heavy at module level: `spacerobot --help` loads all of them.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from spacerobot_ros.termination import Terminated, announce, guarded
 
 
 def start(prog_name: str = "spacerobot") -> NoReturn:
-    """Run the command; signals end it with one line, also during imports."""
+    """Run the command; signals end it with one line, even during imports."""
     with guarded():
         try:
             from spacerobot_ros.cli.main import main

@@ -30,13 +30,13 @@ from spacerobot_ros.errors import printable
 @bag_argument
 @format_option(
     ("csv", "parquet", "mat", "tree"),
-    "csv and parquet: a folder with a file for each topic; mat: one file for MATLAB; tree: csv "
-    "whose columns PlotJuggler shows as a tree.",
+    "csv and parquet: a folder with one file per topic; mat: one file for MATLAB; tree: csv whose "
+    "columns PlotJuggler shows as a tree.",
 )
 @out_option("Folder or file to write [BAG_csv, BAG_parquet, BAG_tree or BAG.mat].")
 @topic_option("Export only this topic, with or without the leading slash [all].")
 def export_command(bag: Path, format_name: str, out: Path | None, topics: tuple[str, ...]) -> None:
-    """Write the topics of a BAG as tables for other programs.
+    """Export the topics in a BAG as tables for other programs.
 
     Existing files and folders are not overwritten.
     """
@@ -78,32 +78,34 @@ def _parse_length(context: click.Context, option: click.Parameter, text: str) ->
     "thrusters, twist, clearance, momentum, momentum_budget and path.",
 )
 @format_option(
-    ("pdf", "svg", "png"), "Format of the files; text in PDF and SVG can be searched and edited."
+    ("pdf", "svg", "png"), "File format; text in PDF and SVG can be searched and edited."
 )
 @click.option(
     "--width",
     callback=_parse_length,
     default="88mm",
     show_default=True,
-    help="Width of a figure in mm, cm, in or pt; 88mm is one column.",
+    help="Figure width in mm, cm, in or pt; 88mm is one column.",
 )
 @click.option(
     "--style",
     type=PATH,
     metavar="FILE.mplstyle",
-    help="serif, a style file of matplotlib, or name of one of its styles: fonts, sizes, colours.",
+    help="serif, a matplotlib style file, or the name of a matplotlib style: fonts, sizes, "
+    "colours.",
 )
 @click.option("--degrees", is_flag=True, help="Show angles in degrees [rad].")
 @click.option("--events", is_flag=True, help="Show events below the time axes.")
-@out_option("Folder of the figures [BAG_figures].")
+@out_option("Folder for the figures [BAG_figures].")
 @namespace_option
 def figures_command(
     bags: tuple[Path, ...], only: str, format_name: str, out: Path | None, **options: Any
 ) -> None:
-    """Draw figures of a BAG for a paper, one file each.
+    """Draw figures for a paper from a BAG, one file each.
 
-    Several bags are drawn into the same panels. Files of the same names are replaced. Exit code 1:
-    the bags lack the data of a figure that --only names, or of all figures.
+    Several bags are drawn into the same panels. Existing files with these names are replaced. Exit
+    code 1:
+    the bags lack the data for a figure named by --only, or for all figures.
     """
     from spacerobot_ros.report import write_figures
     from spacerobot_ros.report.figures import PictureFormat
@@ -133,7 +135,7 @@ def figures_command(
     metavar="SECONDS",
     help="Start of the replay, from the first message.",
 )
-@click.option("--duration", default=0.0, metavar="SECONDS", help="How much to replay [all].")
+@click.option("--duration", default=0.0, metavar="SECONDS", help="Duration to replay [all].")
 @click.option("--loop", is_flag=True, help="Repeat the replay when it ends.")
 @topic_option("Replay only this topic [all].")
 @click.option(
@@ -146,7 +148,7 @@ def figures_command(
     default=0.0,
     type=NumberRange(min=0.0),
     metavar="[HZ]",
-    help="Publish bag time on /clock HZ times a second (100 without a number) [as recorded].",
+    help="Publish bag time on /clock HZ times per second (100 without a number) [as recorded].",
 )
 @click.option("--paused", is_flag=True, help="Begin paused.")
 @view_option
@@ -155,15 +157,15 @@ def figures_command(
     default=3.0,
     show_default=True,
     type=NumberRange(min=0.0),
-    help="Longest wait for subscribers (s).",
+    help="Maximum wait for subscribers (s).",
 )
 def replay_command(
     bag: Path, topics: tuple[str, ...], remap: tuple[str, ...], view: bool, **options: Any
 ) -> None:
-    """Publish the messages of a BAG again, at their recorded times.
+    """Republish the messages in a BAG at their recorded times.
 
-    The services /replay/pause, /replay/resume and /replay/step control it. With --view it stays
-    paused at the end until Ctrl-C, and can be played again.
+    The services /replay/pause, /replay/resume and /replay/step control it. With --view the replay
+    pauses at the end until Ctrl-C, and can be restarted.
     """
     from rclpy.parameter import Parameter
 
@@ -213,7 +215,7 @@ def report_command(
 @bag_argument
 @out_option("Bag to write [BAG-salvaged.mcap].")
 def salvage_command(bag: Path, out: Path | None) -> None:
-    """Make a complete bag from a BAG that was cut off or is damaged.
+    """Recover a complete bag from a truncated or damaged BAG.
 
     The damaged BAG is not changed.
     """
@@ -246,7 +248,7 @@ def salvage_command(bag: Path, out: Path | None) -> None:
 def verify_command(bag: Path, tolerance: float, engine: str | None) -> None:
     """Re-simulate a BAG from its commands, and compare the states.
 
-    Exit code 0: every recorded state follows from the commands; 1: one does not, states are
+    Exit code 0: every recorded state follows from the commands; 1: a state differs, states are
     missing, or the other engine differs; 2: bad input.
     """
     from spacerobot_ros.flight.second_opinion import AGREEMENT_TOLERANCE

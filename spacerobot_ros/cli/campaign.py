@@ -44,14 +44,14 @@ def campaign_command() -> None:
     type=click.Choice(_ENGINES),
     default="auto",
     show_default=True,
-    help="Engine that flies the draws.",
+    help="Flight engine.",
 )
 @click.option(
     "--workers",
     type=click.IntRange(min=0),
     default=2,
     show_default=True,
-    help="Worker processes on this machine; 0: none, fly in this process.",
+    help="Worker processes on this machine; 0: fly in this process.",
 )
 @click.option(
     "--scheduler",
@@ -59,7 +59,7 @@ def campaign_command() -> None:
     metavar="tcp://HOST:PORT",
     help="Address of a dask scheduler whose workers fly the draws.",
 )
-@out_option("Folder of the results [out/NAME].")
+@out_option("Folder for the results [out/NAME].")
 @report_option("Report to write [OUT/report.html].")
 @click.option(
     "--compare",
@@ -78,9 +78,9 @@ def fly(
     report: Path | None,
     compare: tuple[Path, Path] | None,
 ) -> None:
-    """Fly the campaign of FILE and write its dataset and report.
+    """Fly the campaign in FILE and write its dataset and report.
 
-    A FILE of 20 flights with dispersed masses and goals:
+    Example FILE for 20 flights with dispersed masses and goals:
 
     \b
       campaign:
@@ -93,17 +93,18 @@ def fly(
         criteria:
           position_error_m: {max: 0.02}
 
-    For --compare, a second file holds the second design, for example with `method: lie_bracket`
-    after the scenario. More are in examples/campaigns.
+    For --compare, the second file contains the second design, for example with `method:
+    lie_bracket` after the scenario. More are in examples/campaigns.
 
-    An interrupted campaign is continued. Exit code 0: all flights were flown; 1: every
-    flight was refused or ended by an error; 2: bad input; 130: Ctrl-C, finished flights are kept.
+    If a campaign was interrupted, it is continued. Exit code 0: all flights were flown; 1: every
+    flight was rejected or failed with an error; 2: bad input; 130: Ctrl-C, finished flights are
+    kept.
     """
     from spacerobot_ros.campaign.workers import Cluster
 
     cluster = Cluster(0 if scheduler else workers, scheduler)
     if (file is None) == (compare is None):
-        raise ParameterError("Give the FILE of a campaign, or two after --compare, not both.")
+        raise ParameterError("Give one campaign FILE, or two after --compare, not both.")
     if compare is not None:
         _compare(compare, flights, engine, cluster, out, report)
         return
@@ -118,16 +119,16 @@ def fly(
 @click.argument("folder", metavar="DIR", type=PATH)
 @report_option("Report to write [DIR/report.html].")
 def report(folder: Path, report: Path | None) -> None:
-    """Write the report of the flights in DIR again."""
+    """Rewrite the report on the flights in DIR."""
     _write_report(folder, report)
 
 
 @campaign_command.command("rerun")
 @click.argument("folder", metavar="DIR", type=PATH)
 @click.argument("number", metavar="N", type=click.IntRange(min=0))
-@bag_option("Bag to write [DIR/flight_N.mcap, or the next free].")
+@bag_option("Bag to write [DIR/flight_N.mcap, or the next free name].")
 def rerun(folder: Path, number: int, bag: Path | None) -> None:
-    """Fly flight N of DIR again, and record a bag.
+    """Repeat flight N in DIR, and record a bag.
 
     Exit code 0: the flight equals the one in the dataset; 1: it differs; 2: bad input.
     """
@@ -162,7 +163,7 @@ def _fly_campaign(
             campaign, folder, engine=engine, cluster=cluster, show=show, stopped=stopped
         )
     flown = f"{progress.flown} of {progress.total} flights"
-    click.echo(f"{campaign.name}: {flown}, {progress.flights_per_second:.3g} a second; {folder}")
+    click.echo(f"{campaign.name}: {flown}, {progress.flights_per_second:.3g} per second; {folder}")
     return folder, progress
 
 
@@ -170,7 +171,9 @@ def _require_flights(*each: Progress) -> None:
     """Exit with 1 if no draw of a campaign could be flown."""
     for progress in each:
         if progress.unflown and progress.unflown == progress.flown:
-            fail(f"None of the {progress.flown} draws could be flown: the report has the reasons.")
+            fail(
+                f"None of the {progress.flown} draws could be flown: the report lists the reasons."
+            )
 
 
 @contextmanager

@@ -47,7 +47,7 @@ if TYPE_CHECKING:
 @registered_option(
     "--method",
     registries=(METHODS, LAWS),
-    help="Gait method or control law [the scenario's].",
+    help="Gait method or control law [as in the scenario].",
 )
 @settings_option
 @bag_option("Bag to write [out/SCENARIO.mcap, or the next free name].")
@@ -59,7 +59,7 @@ if TYPE_CHECKING:
     flag_value=1.0,
     type=NumberRange(min=0.0, min_open=True),
     metavar="[FACTOR]",
-    help="Fly with the nodes on the wall clock, FACTOR times as fast (1 without a number).",
+    help="Fly with the nodes on the wall clock, at FACTOR times real time (1 without a number).",
 )
 @click.option(
     "--longest",
@@ -92,18 +92,18 @@ def run_command(
     """Fly a SCENARIO or a ROBOT to its goal, and record a bag.
 
     A SCENARIO is a name or a parameter file, a ROBOT a name or a URDF file. The flight needs ROS 2
-    only with --nodes or --realtime. In lockstep, the nodes produce equal states and commands.
+    only with --nodes or --realtime. In lockstep, the nodes produce the same states and commands.
 
     Exit code 0: the goal was reached within tolerance; 1: it was not; 2: bad input. A signal ends
-    the flight early: the bag and the summary cover it until then, and the exit code is 128 plus the
-    number of the signal, 130 after Ctrl-C.
+    the flight early: the bag and the summary cover the flight up to that time, and the exit code is
+    128 plus the signal number, 130 after Ctrl-C.
     """
     chosen = _changed_scenario(scenario, goal, method, settings, realtime)
     from spacerobot_ros.bag import free_name
     from spacerobot_ros.session.run import run_scenario
 
     if view and realtime is None:
-        raise click.UsageError("--view needs --realtime: a flight in lockstep ends too soon.")
+        raise click.UsageError("--view needs --realtime: a lockstep flight ends too soon.")
     usual = bag or Path("out") / f"{chosen.name}.mcap"
     taken, path = os.path.lexists(usual), bag or free_name(usual)
     page = viewer_if_requested(view, chosen.parameters("viewer"), settings=settings)
@@ -300,17 +300,18 @@ def _published_lines(scenario: Scenario, summary: dict[str, Any]) -> list[str]:
     is_flag=True,
     hidden=True,
     expose_value=False,
-    help="Accepted as in `run`: each node always has its own process.",
+    help="Accepted for consistency with `run`: each node always has its own process.",
 )
 @click.option(
     "--restarts",
     default=3,
     show_default=True,
     type=click.IntRange(min=0),
-    help="Restarts per minute of planner, controller and viewer if they die; 0: never.",
+    help="Maximum restarts per minute of the planner, controller or viewer after a crash; 0: "
+    "never.",
 )
 @click.option(
-    "--namespace", default="", help="Namespace of all nodes and topics, also of /clock and /tf."
+    "--namespace", default="", help="Namespace of all nodes and topics, including /clock and /tf."
 )
 @view_option
 def up_command(
@@ -325,7 +326,7 @@ def up_command(
     """Keep the nodes of a SCENARIO or a ROBOT running in real time.
 
     A SCENARIO is a name or a parameter file, a ROBOT a name or a URDF file. Each node is a process.
-    Send goals by topic or with the command spacerobot goal. Ctrl-C, SIGTERM or SIGHUP ends the
+    Send goals on topics or with the command spacerobot goal. Ctrl-C, SIGTERM or SIGHUP ends the
     nodes.
     """
     from spacerobot_ros.scenario import scenario_or_robot
@@ -364,7 +365,7 @@ def up_command(
     "--timeout",
     default=0.0,
     type=NumberRange(min=0.0),
-    help="Longest wait for the result, s of wall time; 0: no limit.",
+    help="Maximum wait for the result, s of wall time; 0: no limit.",
 )
 def goal_command(
     pose: tuple[float, ...],
@@ -379,10 +380,10 @@ def goal_command(
 ) -> None:
     """Send a goal pose to a running stack, and wait for the result.
 
-    Without X Y Z the base keeps its position, without an attitude its attitude.
-    With a goal of an end-effector the base is free, unless its pose is given too. Exit code 0: the
-    goal was reached; 1: it was not; 2: bad input; 130: Ctrl-C has ended the command, and the stack
-    still pursues the goal.
+    Without X Y Z the base keeps its position; without an attitude, its attitude.
+    With an end-effector goal the base is free, unless its pose is also given. Exit code 0: the
+    goal was reached; 1: it was not; 2: bad input; 130: Ctrl-C ended the command; the stack still
+    pursues the goal.
     """
     hands = EndEffectorOptions(poses, positions, links, paths).goals()
     turned = rotvec is not None or rpy_deg is not None
@@ -392,7 +393,7 @@ def goal_command(
         raise click.UsageError("The attitude is given twice, in radians and in degrees.")
     if hands and turned and not pose:
         raise click.UsageError(
-            "With goals of end-effectors, give the attitude of the base with its position X Y Z."
+            "With end-effector goals, give the base attitude together with the position X Y Z."
         )
     from spacerobot_ros.planning import Goal
 

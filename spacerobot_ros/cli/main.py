@@ -26,7 +26,7 @@ _COMMAND_NAMES_BY_MODULE = {
 COMMANDS: dict[str, str] = dict(
     sorted((name, module) for module, names in _COMMAND_NAMES_BY_MODULE.items() for name in names)
 )
-"""Modules by the names of their commands."""
+"""Modules by command name."""
 
 
 class CommandGroup(click.Group):
@@ -37,7 +37,7 @@ class CommandGroup(click.Group):
         return list(COMMANDS)
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        """Return a command by its name, None if there is none."""
+        """Return a command by name, or None if it does not exist."""
         if cmd_name not in COMMANDS:
             return None
         module = import_module(f"spacerobot_ros.cli.{COMMANDS[cmd_name]}")
@@ -61,7 +61,7 @@ class CommandGroup(click.Group):
     type=click.Path(exists=True, dir_okay=False, path_type=Path),
     multiple=True,
     metavar="FILE.py",
-    help="Python file with control laws or gait methods of your own, for all commands; nodes take "
+    help="Python file with your own control laws or gait methods, for all commands; nodes load "
     "such files from SPACEROBOT_PLUGINS. May be repeated.",
 )
 @click.option(
@@ -69,7 +69,8 @@ class CommandGroup(click.Group):
     "xacro_arguments",
     multiple=True,
     metavar="NAME:=VALUE",
-    help="Argument of xacro files, for all commands; nodes take them from SPACEROBOT_XACRO_ARGS. "
+    help="Argument for xacro files, for all commands; nodes take arguments from "
+    "SPACEROBOT_XACRO_ARGS. "
     "May be repeated.",
 )
 def main(plugins: tuple[Path, ...], xacro_arguments: tuple[str, ...]) -> None:

@@ -1,4 +1,4 @@
-"""Arguments and options of several commands."""
+"""Arguments and options shared by several commands."""
 
 from __future__ import annotations
 
@@ -34,11 +34,11 @@ class _TextPath(click.Path):
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         if str(value) == "-" and not (param and "--json" in param.opts):
-            self.fail("'-' is not a file here: name a file.", param, ctx)
+            self.fail("'-' is not supported here: name a file.", param, ctx)
         try:
             str(value).encode()
         except UnicodeEncodeError:
-            self.fail(f"the name {str(value)!a} has bytes that are not UTF-8.", param, ctx)
+            self.fail(f"the name {str(value)!a} contains bytes that are not UTF-8.", param, ctx)
         return super().convert(value, param, ctx)
 
 
@@ -46,10 +46,10 @@ PATH = _TextPath(path_type=Path)
 
 
 class NumberRange(click.FloatRange):
-    """Range of numbers that refuses NaN, which compares as within every range."""
+    """Number range that rejects NaN, which otherwise passes every range check."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """Return a number of the range."""
+        """Return a number within the range."""
         number = super().convert(value, param, ctx)
         if math.isnan(number):
             self.fail(f"{value} is not a number.", param, ctx)
@@ -62,7 +62,7 @@ class DefaultGroup(click.Group):
     default = ""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        """Insert the name of the default command if the first argument is not a command."""
+        """Insert the default command's name if the first argument is not a command."""
         if args and args[0] not in (*self.commands, *ctx.help_option_names):
             args = [self.default, *args]
         return super().parse_args(ctx, args)
@@ -95,7 +95,7 @@ def json_option(help: str) -> Any:
 
 
 def complete_scenario(_: click.Context, __: click.Parameter, incomplete: str) -> list[str]:
-    """Return the scenarios and robots that complete a name, for shells."""
+    """Return the scenarios and robots that complete a name, for shell completion."""
     from spacerobot_ros.resources import resource_names
     from spacerobot_ros.scenario import scenario_names
 
@@ -104,7 +104,7 @@ def complete_scenario(_: click.Context, __: click.Parameter, incomplete: str) ->
 
 
 def complete_setting(_: click.Context, __: click.Parameter, incomplete: str) -> list[str]:
-    """Return the parameters of nodes that complete a setting, for shells."""
+    """Return the node parameters that complete a setting, for shell completion."""
     from spacerobot_ros.parameters import declared
     from spacerobot_ros.scenario import CONFIGS
 
@@ -118,7 +118,7 @@ out_option = _path_option("--out", "-o", "--output")  # --output: up to version 
 report_option = _path_option("--report")
 
 namespace_option = click.option(
-    "--namespace", metavar="NAME", help="Robot of a bag that has several [the first]."
+    "--namespace", metavar="NAME", help="Robot to use in a bag with several robots [the first]."
 )
 settings_option = click.option(
     "--set",
@@ -126,7 +126,7 @@ settings_option = click.option(
     multiple=True,
     metavar="NODE.PARAMETER=VALUE",
     shell_complete=complete_setting,
-    help="Set a parameter of a node. May be repeated.",
+    help="Set a node parameter. May be repeated.",
 )
 view_option = click.option(
     "--view", is_flag=True, help="Serve a web page for watching and steering the robot."
@@ -173,7 +173,7 @@ def _attitude_options(*prefixes: str) -> Callable[..., Any]:
         nargs=3,
         type=float,
         metavar="RX RY RZ",
-        help="Attitude of the goal as a rotation vector (rad).",
+        help="Goal attitude as a rotation vector (rad).",
     )
     rpy_deg = click.option(
         *(f"--{prefix}rpy-deg" for prefix in prefixes),
@@ -181,7 +181,7 @@ def _attitude_options(*prefixes: str) -> Callable[..., Any]:
         nargs=3,
         type=float,
         metavar="ROLL PITCH YAW",
-        help="Attitude of the goal by rotations about the fixed axes x, y, z in this order (deg).",
+        help="Goal attitude as rotations about the fixed axes x, y, z in this order (deg).",
     )
     return lambda command: rotvec(rpy_deg(command))
 
@@ -192,7 +192,7 @@ _pose_option = click.option(
     nargs=7,
     type=float,
     metavar="X Y Z [QX QY QZ QW]",
-    help="Goal pose (m, quaternion), or its position with the attitude of the scenario.",
+    help="Goal pose (m, quaternion), or only its position, with the scenario's attitude.",
 )
 _position_option = click.option(
     "--goal-position",
@@ -205,10 +205,10 @@ _position_option = click.option(
 
 
 class GoalCommand(click.Command):
-    """A command whose ``--goal`` takes 3 or 7 numbers: options of click take a fixed number."""
+    """A command whose ``--goal`` takes 3 or 7 numbers: click options take a fixed number."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        """Parse the arguments, with ``--goal`` of three numbers as ``--goal-position``."""
+        """Parse the arguments, treating ``--goal`` with three numbers as ``--goal-position``."""
         args = list(args)
         for place, word in enumerate(args):
             if word == "--goal":
@@ -230,7 +230,7 @@ def _is_number(text: str) -> bool:
 
 @dataclass(frozen=True)
 class GoalOptions:
-    """Goal given by options of the command line.
+    """Goal from command line options.
 
     Attributes
     ----------
@@ -246,7 +246,7 @@ class GoalOptions:
     end_effectors: EndEffectorOptions = field(default_factory=lambda: EndEffectorOptions())
 
     def apply_to(self, scenario: Scenario) -> Scenario:
-        """Return a scenario with this goal; a rotation that looks like degrees is reported."""
+        """Return a scenario with this goal; warn about a rotation that looks like degrees."""
         if self.rotvec is not None:
             warn_of_large_angles(self.rotvec, "--goal-rpy-deg")
         scenario = scenario.with_goal(self.pose, self.rotvec, self.rpy_deg)
@@ -262,16 +262,16 @@ class GoalOptions:
 
 @dataclass(frozen=True)
 class EndEffectorOptions:
-    """Goals of end-effectors from the command line.
+    """End-effector goals from the command line.
 
     Attributes
     ----------
     poses, positions
         Poses (7,) and positions (3,), m.
     links
-        Names of their links, in the order of the poses, positions and paths; none: the default.
+        Link names, in the order of the poses, positions and paths; empty: the default link.
     paths
-        Files of paths: a line is a position or a pose.
+        Path files: each line is a position or a pose.
     """
 
     poses: Sequence[tuple[float, ...]] = ()
@@ -280,14 +280,14 @@ class EndEffectorOptions:
     paths: Sequence[Path] = ()
 
     def goals(self) -> list[EndEffectorGoal]:
-        """Return the goals; none if none is given.
+        """Return the goals, an empty list if none are given.
 
         Raises
         ------
         click.UsageError
-            There are more or fewer names than goals.
+            The numbers of names and goals differ.
         GoalError
-            One is not a position, pose or path, or a link has two.
+            A goal is not a position, pose or path, or a link has two goals.
         """
         from spacerobot_ros.planning.core.goal import EndEffectorGoal, Goal
 
@@ -295,7 +295,7 @@ class EndEffectorOptions:
         links = self.links or [""] * min(len(values), 1)
         if len(links) != len(values):
             raise click.UsageError(
-                f"{len(values)} goal(s) of end-effectors and {len(self.links)} name(s): give one "
+                f"{len(values)} end-effector goal(s) and {len(self.links)} name(s): give one "
                 "--end-effector for each --end-effector-goal, then for each "
                 "--end-effector-position, then for each --end-effector-path."
             )
@@ -316,14 +316,14 @@ def _read_path(file: Path) -> list[list[float]]:
     found = [row for row in rows if row]
     if not found or len({len(row) for row in found}) > 1:
         raise click.BadParameter(
-            f"The path {file} has lines of {sorted({len(row) for row in found})} numbers; give "
+            f"The path {file} has lines with {sorted({len(row) for row in found})} numbers; give "
             "all of them 3 (a position), or all of them 7 (a position and a quaternion)."
         )
     return found
 
 
 def goal_options(command: Callable[..., None]) -> Callable[..., None]:
-    """Add the options of a goal to a command, as its argument ``goal``."""
+    """Add the goal options to a command, as its argument ``goal``."""
 
     @wraps(command)
     def with_goal(
@@ -348,14 +348,14 @@ def goal_options(command: Callable[..., None]) -> Callable[..., None]:
 
 
 def end_effector_options(command: Callable[..., None]) -> Callable[..., None]:
-    """Add end-effector options to the options of a goal."""
+    """Add end-effector options to the goal options."""
     for option in (
         click.option(
             "--end-effector",
             "links",
             multiple=True,
             metavar="NAME",
-            help="Link of a goal of an end-effector [end_effector]. May be repeated, in the order "
+            help="Link of an end-effector goal [end_effector]. May be repeated, in the order "
             "poses, positions, paths.",
         ),
         click.option(
@@ -364,8 +364,8 @@ def end_effector_options(command: Callable[..., None]) -> Callable[..., None]:
             type=PATH,
             multiple=True,
             metavar="FILE",
-            help="Path of an end-effector for the method resolved_rate: a text file with a "
-            "position X Y Z (m) or a pose X Y Z QX QY QZ QW in each line. May be repeated.",
+            help="End-effector path for the method resolved_rate: a text file with a position "
+            "X Y Z (m) or a pose X Y Z QX QY QZ QW per line. May be repeated.",
         ),
         click.option(
             "--end-effector-position",
@@ -374,7 +374,7 @@ def end_effector_options(command: Callable[..., None]) -> Callable[..., None]:
             type=float,
             multiple=True,
             metavar="X Y Z",
-            help="Goal position of an end-effector (m) with any attitude. May be repeated.",
+            help="End-effector goal position (m) with any attitude. May be repeated.",
         ),
         click.option(
             "--end-effector-goal",
@@ -383,8 +383,8 @@ def end_effector_options(command: Callable[..., None]) -> Callable[..., None]:
             type=float,
             multiple=True,
             metavar="X Y Z QX QY QZ QW",
-            help="Goal pose of an end-effector (m, quaternion); the base is free unless its goal "
-            "is given. May be repeated.",
+            help="End-effector goal pose (m, quaternion); the base is free unless its goal is "
+            "given. May be repeated.",
         ),
     ):
         command = option(command)
@@ -392,7 +392,7 @@ def end_effector_options(command: Callable[..., None]) -> Callable[..., None]:
 
 
 def warn_of_large_angles(rotvec: Sequence[float], option_in_degrees: str) -> None:
-    """Report a rotation of more than one revolution, which may be in degrees."""
+    """Warn about a rotation of more than one revolution, which may be in degrees."""
     angle = math.hypot(*rotvec)
     if 2 * math.pi < angle < math.inf:
         click.echo(
@@ -403,7 +403,7 @@ def warn_of_large_angles(rotvec: Sequence[float], option_in_degrees: str) -> Non
 
 
 class RegisteredName(_Choice):
-    """A choice of the names in registries, which are imported on demand.
+    """A choice of names from registries, which are imported on demand.
 
     Parameters
     ----------
@@ -427,7 +427,7 @@ class RegisteredName(_Choice):
 
 
 class RegisteredOption(click.Option):
-    """An option with a name in registries, which its help lists."""
+    """An option whose value is a name from registries; the help lists the names."""
 
     def get_help_record(self, ctx: click.Context) -> tuple[str, str] | None:
         """Return the option and its help, with the names."""
@@ -437,7 +437,7 @@ class RegisteredOption(click.Option):
 
 
 def registered_option(*names: str, registries: Sequence[str], help: str) -> Any:
-    """Return an option whose value is a name in registries."""
+    """Return an option whose value is a name from registries."""
     kind = RegisteredName(*registries)
     return click.option(*names, type=kind, cls=RegisteredOption, metavar="NAME", help=help)
 
@@ -450,13 +450,13 @@ LAWS = "spacerobot_ros.control.laws.registry:LAWS"
 def viewer_if_requested(
     view: bool, parameters: Mapping[str, Any], namespace: str = "", settings: Sequence[str] = ()
 ) -> Iterator[Viewer | None]:
-    """Run the viewer beside a command if ``view``; its address is written to standard error.
+    """Run the viewer next to a command if ``view``; its address is written to standard error.
 
-    Without it ``settings``, those of ``--set``, are not to name parameters of the viewer.
+    Otherwise ``settings``, from ``--set``, must not contain viewer parameters.
     """
     for text in () if view else settings:
         if text.startswith("viewer."):
-            raise click.UsageError(f"'{text}' is a setting of the web page: add --view.")
+            raise click.UsageError(f"'{text}' is a web page setting: add --view.")
     if not view:
         yield None
         return
@@ -467,7 +467,7 @@ def viewer_if_requested(
 
 
 def picture_option(help: str) -> Any:
-    """Return the option ``--picture``; the suffix of its file must be of a known format."""
+    """Return the option ``--picture``; the file suffix must be a known format."""
 
     def checked(context: click.Context, option: click.Parameter, path: Path | None) -> Path | None:
         if path is not None:

@@ -44,10 +44,10 @@ _NO_GOAL = GoalOptions(None, None, None)
 @goal_options
 @registered_option("--method", registries=(METHODS,), help="Gait method [the scenario's].")
 @settings_option
-@json_option("Write schedule and predicted path as JSON.")
-@picture_option("Draw schedule and predicted path (.png, .svg, .pdf).")
+@json_option("Write the schedule and the predicted path as JSON.")
+@picture_option("Draw the schedule and the predicted path (.png, .svg, .pdf).")
 @click.option(
-    "--compare", "comparing", is_flag=True, help="Plan by every method, and print a table."
+    "--compare", "comparing", is_flag=True, help="Plan with every method, and print a table."
 )
 @click.option(
     "--random",
@@ -58,7 +58,7 @@ _NO_GOAL = GoalOptions(None, None, None)
 )
 @within_option((0.3, 180.0), "With --random: largest")
 @registered_option(
-    "--beside", registries=(METHODS,), help="With --random: plan them also by this method."
+    "--beside", registries=(METHODS,), help="With --random: also plan the goals with this method."
 )
 def plan_command(
     scenario: str,
@@ -72,10 +72,10 @@ def plan_command(
     within: tuple[float, float],
     beside: str | None,
 ) -> None:
-    """Plan a gait of a SCENARIO or a ROBOT without ROS.
+    """Plan a gait for a SCENARIO or a ROBOT without ROS.
 
-    The gait is simulated. Exit code 0: it ends within tolerance; 1: it does not, or the goal cannot
-    be reached; 2: bad input.
+    The gait is simulated. Exit code 0: the plan ends within tolerance; 1: it does not, or the goal
+    cannot be reached; 2: bad input.
     """
     from spacerobot_ros.flight.trials import PlanEvaluation, compare, fastest, try_method
     from spacerobot_ros.planning.core.method import BEYOND_EFFORT_LIMITS
@@ -102,7 +102,7 @@ def plan_command(
             click.echo(_clearance_line(problem, trial))
         beyond = [str(piece.notes.get(BEYOND_EFFORT_LIMITS, "")) for piece in trial.pieces]
         for clause in filter(None, dict.fromkeys(beyond)):
-            click.echo(f"warning     Efforts are beyond limits: {clause}.")
+            click.echo(f"warning     Efforts exceed limits: {clause}.")
     if json_file is not None:
         content = plan_json(problem, trial)
         if comparing:
@@ -150,13 +150,13 @@ def _clearance_line(problem: PlanningProblem, trial: PlanEvaluation) -> str:
         return f"clearance   {nearest}"
     reasons = Counter(geometry.ignored_pairs.values())
     listed = ", ".join(f"{count} {reason}" for reason, count in reasons.items())
-    return f"clearance   no pair of links is checked{listed and f' ({listed})'}"
+    return f"clearance   no link pairs are checked{listed and f' ({listed})'}"
 
 
 def problem_of_scenario(
     name: str, goal: GoalOptions = _NO_GOAL, settings: Sequence[str] = ()
 ) -> PlanningProblem:
-    """Return the planning problem of a scenario, or of a robot (a name or a URDF file) at rest.
+    """Return the planning problem for a scenario, or for a robot (a name or a URDF file) at rest.
 
     ``goal`` replaces the scenario's, ``settings`` are ``planner.parameter=value`` and
     ``plant.parameter=value``.
@@ -164,7 +164,7 @@ def problem_of_scenario(
     Raises
     ------
     ParameterError
-        There is no such scenario or robot, or a parameter is refused.
+        There is no such scenario or robot, or a parameter is invalid.
     GoalError
         The goal is not finite.
     """
@@ -179,7 +179,7 @@ def problem_of_scenario(
 
 
 def plan_json(problem: PlanningProblem, trial: PlanEvaluation) -> dict[str, Any]:
-    """Return the content of the file that ``--json`` names."""
+    """Return the content for the ``--json`` file."""
     from spacerobot_ros.model.rotations import rotvec_from_quaternion
 
     goal, path = problem.goal, trial.path

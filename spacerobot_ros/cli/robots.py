@@ -24,24 +24,26 @@ if TYPE_CHECKING:
     from spacerobot_ros.planning.core.controllability import Controllability
 
 _MAX_LISTED_JOINTS = 12
-"""Largest number of listed joints; further joints are only counted."""
+"""Maximum number of listed joints; further joints are only counted."""
 
 
 _MAX_PLAUSIBLE_RADIANS = 20.0
-"""Limit of a joint beyond which it is likely to be in degrees."""
+"""Joint limit beyond which it is probably in degrees."""
 
 _MAX_PLAUSIBLE_SPEED = 25.0
-"""Speed of a joint, rad/s, beyond which it is likely to be in degrees; fast legs reach 21."""
+"""Joint speed, rad/s, beyond which it is probably in degrees; fast legs reach 21."""
 
 _MAX_LISTED_DISTANCES = 3
 
 _MAX_LISTED_INTERVALS = 4
-"""Largest number of listed intervals of distances; of more, only number and length are listed."""
+"""Maximum number of listed distance intervals; beyond it, only number and length are listed."""
 
 
 @click.command("analyze")
 @click.argument("robot")
-@click.option("--shape", metavar="'Q1 Q2 ...'", help="Shape to analyse, m or rad [the best].")
+@click.option(
+    "--shape", metavar="'Q1 Q2 ...'", help="Configuration to analyse, m or rad [the best]."
+)
 @click.option(
     "--end-effector",
     default="",
@@ -49,8 +51,8 @@ _MAX_LISTED_INTERVALS = 4
     help="Link whose workspaces are computed [end_effector].",
 )
 @picture_option(
-    "Picture of the curvature (.png, .svg, .pdf) [out/ROBOT_curvature.png]. The picture of the "
-    "workspaces has _workspaces in its name."
+    "Curvature picture (.png, .svg, .pdf) [out/ROBOT_curvature.png]. The workspace picture "
+    "has _workspaces in its name."
 )
 @json_option("Write the findings as JSON.")
 def analyze_command(
@@ -81,7 +83,7 @@ def analyze_command(
     target = picture or Path("out") / f"{name}_curvature.png"
     drawn = draw_analysis(found, PictureFormat.of(target))
     if drawn is None:
-        click.echo(f"{'picture':<13}none: no loops of the joints rotate the base")
+        click.echo(f"{'picture':<13}none: no joint loops rotate the base")
     else:
         write_output(target, drawn)
         click.echo(f"{'picture':<13}{target}")
@@ -97,13 +99,11 @@ def _parse_shape(text: str) -> list[float]:
     try:
         return [float(word) for word in text.replace(",", " ").split()]
     except ValueError:
-        raise ParameterError(
-            f"--shape is '{text}'; it must be one number for each joint."
-        ) from None
+        raise ParameterError(f"--shape is '{text}'; it must have one number per joint.") from None
 
 
 def analysis_lines(found: Analysis) -> list[str]:
-    """Return the findings as lines that fit a screen."""
+    """Return the findings as lines that fit the screen."""
     from spacerobot_ros.planning.methods.registry import METHODS
 
     robot = found.robot
@@ -121,11 +121,11 @@ def analysis_lines(found: Analysis) -> list[str]:
 
 
 def workspace_lines(found: Analysis) -> list[str]:
-    """Return the workspaces of the end-effector as lines that fit a screen."""
+    """Return the end-effector workspaces as lines that fit the screen."""
     if not found.workspaces:
         why = "the robot has no joints"
         if not found.end_effector:
-            why = "no link is called 'end_effector': name one with --end-effector"
+            why = "no link is named 'end_effector': select one with --end-effector"
         return [f"{'workspaces':<13}none: {why}"]
     lines = []
     for each in found.workspaces:
@@ -158,7 +158,7 @@ def _intervals_text(intervals: Sequence[tuple[float, float]]) -> str:
 
 
 def analysis_json(found: Analysis) -> dict[str, Any]:
-    """Return the findings for JSON; infinite condition numbers and limits are null."""
+    """Return the findings for JSON; infinite condition numbers and limits become null."""
     robot = found.robot
     finite = _finite_conditions(found)
     return {
@@ -308,7 +308,7 @@ def _position_text(found: Analysis) -> str:
 
     count = len(sliders_of(found.robot))
     if found.sliding.controllable:
-        return f"{count} sliders with independent slots control the position of the base (paper 1)"
+        return f"{count} sliders with independent slots control the base position (paper 1)"
     return "follows from attitude and shape: the centre of mass rests"
 
 
@@ -357,15 +357,15 @@ def _distance_lines(found: Analysis) -> list[str]:
 @click.option(
     "--nearest-inertia",
     is_flag=True,
-    help="Replace impossible inertias by the nearest possible ones in NAME_possible.urdf, and "
-    "continue with it.",
+    help="Replace unphysical inertias with the nearest physical ones in NAME_possible.urdf, and "
+    "use that file.",
 )
 def new_command(robot: str, out: Path | None, nearest_inertia: bool) -> None:
     """Check your robot, plan a first rotation, and write a scenario.
 
-    URDF is a URDF or xacro file, or the name of a robot. A robot without joints flies by thrusters.
-    Exit code 0: a scenario that reaches its goal is written; 1: no method reaches one; 2: the robot
-    is refused.
+    URDF is a URDF or xacro file, or the name of a robot. A robot without joints uses thrusters.
+    Exit code 0: a scenario that reaches its goal is written; 1: no method reaches a goal; 2: the
+    robot is rejected.
     """
     from spacerobot_ros.bag import free_name
     from spacerobot_ros.cli.plan import comparison_lines
@@ -405,7 +405,7 @@ def new_command(robot: str, out: Path | None, nearest_inertia: bool) -> None:
     named = from_there if is_path(robot) else robot
     if not model.n:
         write_output(target, thruster_scenario_text(model, named))
-        click.echo(f"It has no joints and flies by thrusters. The scenario is {target}:")
+        click.echo(f"It has no joints and uses thrusters. The scenario is {target}:")
         click.echo(f"  spacerobot run {shlex.quote(str(target))}")
         return
     missing = [each.link for each in known.geometry.unread_meshes if each.is_collision_shape]
@@ -416,7 +416,7 @@ def new_command(robot: str, out: Path | None, nearest_inertia: bool) -> None:
         click.echo(line)
     best = fastest(plans)
     if best is None:
-        fail("No method reaches the goal of a first flight; no scenario is written.")
+        fail("No method reaches the goal of the first flight; no scenario is written.")
     write_output(target, scenario_text(problem, best.method, named))
     click.echo(f"\n{best.method} is the fastest: {best.duration:.4g} s. The scenario is {target}:")
     click.echo(f"  spacerobot run {shlex.quote(str(target))}")

@@ -1,4 +1,4 @@
-"""The terminal of a command: exit codes, one-sentence messages of failures, and progress."""
+"""Terminal output of a command: exit codes, one-sentence error messages, and progress."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ class ExitCode(IntEnum):
     """Success: the goal was reached within tolerance, or the bag is verified."""
 
     NOT_REACHED = 1
-    """The goal was not or cannot be reached, or the bag differs from its re-simulation."""
+    """The goal was not reached or is unreachable, or the bag differs from its re-simulation."""
 
     BAD_INPUT = 2
-    """The input is refused, or a program or package that the command needs is missing."""
+    """The input is invalid, or a required program or package is missing."""
 
     INTERRUPTED = 130
-    """The command was ended by SIGINT (Ctrl-C); other signals give 128 plus their number."""
+    """The command was ended by SIGINT (Ctrl-C); for other signals, 128 plus their number."""
 
 
 _ROS_MODULES = ("rclpy", "rosidl_parser", "ament_index_python")
@@ -48,13 +48,13 @@ def fail(message: str = "") -> NoReturn:
 
 
 def end(ending: Terminated) -> NoReturn:
-    """End a command that a signal has ended, with one line."""
+    """End a command stopped by a signal, with one line."""
     announce(ending)
     sys.exit(ending.exit_code)
 
 
 def exit_if_terminated() -> None:
-    """End a command that a signal has interrupted, after its output is written."""
+    """End a command interrupted by a signal, after its output is written."""
     ending = termination()
     if ending is not None:
         end(ending)
@@ -62,10 +62,10 @@ def exit_if_terminated() -> None:
 
 @contextmanager
 def sentences() -> Iterator[None]:
-    """Turn exceptions of this package into one sentence and an exit code.
+    """Convert this package's exceptions into one sentence and an exit code.
 
-    An unreachable goal is not bad input; every other refusal is. A signal
-    ends it with one line and 128 plus its number, even if a library has replaced its exception.
+    An unreachable goal is not bad input; all other rejections are. A signal ends the command with
+    one line and exit code 128 plus its number, even if a library has replaced its exception.
     """
     try:
         with guarded():
@@ -99,14 +99,14 @@ def sentences() -> Iterator[None]:
 
 
 _PERIOD, _PERIOD_WITHOUT_TERMINAL = 1.0, 10.0
-"""Wall time between two lines on long work, s."""
+"""Wall time between two progress lines, s."""
 
 
 class Display:
     """A progress line for long work: the task, its duration, and the best result so far.
 
-    On a terminal each line replaces the one before. Searches report from other threads and may be
-    silent for long, so a thread writes the line.
+    On a terminal each line replaces the previous line. Searches report from other threads and may
+    be silent for a long time, so a thread writes the line.
 
     Parameters
     ----------
@@ -133,7 +133,7 @@ class Display:
             self._work, self._course = "planning", f": {progress.message}"
 
     def fly(self, now: float, end: float) -> None:
-        """Show simulated time against the end of the schedule, s; 0: it is not known."""
+        """Show simulated time relative to the schedule end, s; 0: unknown."""
         if end > 0.0 or now > 0.0:
             of_end = f" of {end:.1f}" if end > 0.0 else ""
             self._work, self._course = "flying", f": {now:.1f}{of_end} s"
@@ -145,7 +145,7 @@ class Display:
                 click.echo(f"{_CLEAR}{message}", err=True)
 
     def close(self) -> None:
-        """End the lines; the last one on a terminal is cleared."""
+        """End the progress output; on a terminal the last line is cleared."""
         self._ended.set()
         self._thread.join()
 
@@ -165,7 +165,7 @@ class Display:
 
 
 _CLEAR = "\r\x1b[K"
-"""Clears the line of a terminal that was written last."""
+"""Clears the last line on a terminal."""
 
 
 @contextmanager

@@ -1,7 +1,7 @@
 """Commanders without ROS: a planner or a controller that commands a plant state by state.
 
-A commander receives messages as they arrive (goals, odom, joints, the status of the plant) and
-calls its :class:`CommanderHost` in order, with statuses, events, log lines and commands. Nodes are
+A commander receives messages as they arrive (goals, odom, joints, plant status) and calls its
+:class:`CommanderHost` in order, with statuses, events, log lines and commands. Nodes are
 hosts that convert messages; the loop without ROS is a host that passes arrays.
 """
 
@@ -58,14 +58,14 @@ if TYPE_CHECKING:
     from spacerobot_ros.planning.execution.executive import Executive
 
 _LONGEST_REPETITION = 1.0
-"""Longest simulated time between two contradictions that indicates two publishers, s."""
+"""Maximum simulated time between two contradictions that indicates two publishers, s."""
 
 _NEVER_NS = -(10**20)
 
 _REPORT_PERIOD = 1.0  # wall s, between warnings about ignored states
 
 _EQUAL_RATES = 0.05
-"""Largest relative difference between two rates that are considered equal."""
+"""Maximum relative difference between two rates that are considered equal."""
 
 _FAULT_LOG_PERIOD = 5.0  # wall s, of one kind of faulty message
 
@@ -73,10 +73,10 @@ _FAULT_LOG_PERIOD = 5.0  # wall s, of one kind of faulty message
 class Commander(ABC):
     """Base class of the commanders: planner and controller.
 
-    A commander sends commands while it is active and has the robot and the rate of the plant, and
-    only for states of the plant's present time (:class:`StampFilter`). Commands follow the rate of
-    the plant, whatever rate is configured. Goals received before the robot's description wait for
-    it. All goals are given up if the plant reports that it does not obey (:class:`PlantListener`).
+    A commander sends commands while it is active and knows the robot and the plant's rate, and only
+    for states at the plant's current time (:class:`StampFilter`). Commands follow the plant's rate
+    regardless of the configured rate. Goals received before the robot description wait for it. All
+    goals are aborted if the plant reports that it ignores commands (:class:`PlantListener`).
 
     ``goal_keys`` are the parts of the robot that goals may be for; ``pose_required``: a state waits
     for its odom; ``clock`` returns the wall time, s.
@@ -98,7 +98,7 @@ class Commander(ABC):
     ) -> None:
         self.config, self.host, self._clock = config, host, clock
         self._given = config
-        """The configuration without adaptations to robot and plant."""
+        """The configuration before adaptation to the robot and the plant."""
         self.activity = CommanderActivity.INACTIVE
         self.robot: SpaceRobot | None = None
         self.stamps = StampFilter(clock)
@@ -111,20 +111,19 @@ class Commander(ABC):
         """The robot as described, without a held body."""
         self._payload = ""
         self._held: Payload | None = None
-        """The body that the robot holds, if its text is valid."""
+        """The body that the robot holds, if its description is valid."""
         self._obstacles: str | None = None
-        """The text on the topic obstacles; None: the robot's own obstacles apply."""
+        """The URDF on the topic obstacles; None: the robot's own obstacles apply."""
         self._world: RobotDescription | None = None
-        """The obstacles of this text."""
+        """The obstacles in this URDF."""
         self._goal_file = GoalFile(config.resume_file, goal_keys)
         self._goal_ids = GoalIds()
         self._waiting_goals: dict[str, IdentifiedGoal] = {}
-        """Goals that were received before the robot's description."""
+        """Goals received before the robot description."""
         self._fly_to = FlyToGoals(self._goal_errors, self._report_aborted)
         self.inputs = InputWatch(self.states, self.plant, host.has_publisher, clock)
         self._reported_missing = self._reported_waiting = ""
-        """What the last status reported as missing, as a clause, and the waiting goal; empty:
-        nothing."""
+        """The missing topics in the last status, as a clause, and the waiting goal; empty: none."""
         self._last_status: Status | None = None
         """The last status that reported nothing missing."""
         self._ignored_reported, self._next_report = 0, 0.0
@@ -139,7 +138,7 @@ class Commander(ABC):
         return self.activity is CommanderActivity.ACTIVE
 
     def use_robot(self, robot: SpaceRobot, decoder: StateDecoder) -> None:
-        """Command this robot from now on, and accept the goals that wait for it.
+        """Set the robot to command, and accept the goals waiting for it.
 
         Raises
         ------
@@ -169,27 +168,27 @@ class Commander(ABC):
         if given and abs(rate - given) > _EQUAL_RATES * given:
             self.host.log(
                 "warning",
-                f"Parameter 'tick_rate' is {given:g} Hz, but the plant has {rate:g} Hz: "
-                f"commands follow the plant. Set it to {rate:g}, or leave it out.",
+                f"Parameter 'tick_rate' is {given:g} Hz, but the plant has {rate:g} Hz: commands "
+                f"follow the plant. Set it to {rate:g}, or omit it.",
             )
         if self.robot is not None and self.executive is not None:
             self._change_rate(self.robot)
         self.answer_latest()
 
     def drop_robot(self, why: str) -> None:
-        """Give up the goals and the robot; later goals wait for another robot."""
+        """Drop the goals and the robot; later goals wait for another robot."""
         if self.executive is not None:
             self.give_up_goals(PlantStopped(why))
             self._stop_executive()
         self.robot = self.executive = self._decoder = self._described = None
 
     def activate(self) -> None:
-        """Handle states from now on; resume the goals that an earlier process left undecided.
+        """Start handling states; resume unfinished goals from an earlier process.
 
         Raises
         ------
         ParameterError
-            The file of goals is invalid.
+            The goal file is invalid.
         """
         self.inputs.begin()
         self._reported_missing = ""
@@ -200,7 +199,7 @@ class Commander(ABC):
         self.answer()
 
     def deactivate(self, failure: str = "") -> None:
-        """Give up the goals and stop commanding, after a failure or not; keep the file of goals."""
+        """Drop the goals and stop commanding, after a failure or not; keep the goal file."""
         why = f"Aborted: {failure or 'this node was deactivated.'}"
         if self.config.resume_file:
             why += " A goal from a topic is resumed when the node is activated again."
@@ -214,21 +213,21 @@ class Commander(ABC):
     def receive_goal(
         self, key: str, sec: int, nanosec: int, read: Callable[[], Goal]
     ) -> IdentifiedGoal | None:
-        """Accept or refuse a goal; a status reports the result.
+        """Accept or reject a goal; a status reports the result.
 
         Parameters
         ----------
         key
-            Part of the robot for which the goal is.
+            Link for which the goal is.
         sec, nanosec
             Stamp of the goal's header, which identifies the goal.
         read
-            Returns the goal, or raises PlanningError with the message of the refusal.
+            Returns the goal, or raises PlanningError with the reason.
 
         Returns
         -------
         IdentifiedGoal | None
-            The goal; None: it is refused.
+            The goal; None if it is rejected.
         """
         goal_id = self._goal_ids.of(sec, nanosec)
         try:
@@ -262,12 +261,12 @@ class Commander(ABC):
         self._accept_goal(BASE_GOAL_KEY, accepted)
 
     def cancel_fly_to(self, goal_id: str) -> None:
-        """Abort the goal of an action; a goal about to be replaced ends when it is replaced."""
+        """Abort an action goal; a goal about to be replaced ends when it is replaced."""
         self._fly_to.request_abort(goal_id)
         self._abort_fly_to()
 
     def abort(self, why: str = "on request") -> str | None:
-        """Give up all goals; return a message for the client, or None without a goal."""
+        """Abort all goals; return a message for the client, or None without a goal."""
         if self._waiting_goals:
             message = f"Aborted {why}, before the robot was known."
             self._abort_waiting(message)
@@ -389,13 +388,12 @@ class Commander(ABC):
     # -- states -------------------------------------------------------------------------------
 
     def receive_odom(self, stamp_ns: int, odom: Any) -> None:
-        """Take a received odom; set it aside if its stamp is not of the present time."""
+        """Process a received odom; defer it if its stamp is not current."""
         if self.stamps.accepts_odom(stamp_ns, odom):
             self.take_odom(stamp_ns, odom)
 
     def receive_joints(self, stamp_ns: int, joints: Any) -> None:
-        """Take received joints; set them aside if they are not of the present time, and skip late
-        ones."""
+        """Process received joints; defer them if their stamp is not current, and skip late ones."""
         odoms, waiting = self.host.waiting_states()
         self._take_states(odoms, [Stamped(stamp_ns, joints), *waiting])
         if self._fly_to:
@@ -403,7 +401,7 @@ class Commander(ABC):
         self.inputs.note_state()
 
     def take_odom(self, stamp_ns: int, odom: Any) -> None:
-        """Take an odom of the present time, and handle its state if complete."""
+        """Process an odom with the current time, and handle its state if complete."""
         if self.states.put_odom(stamp_ns, odom):
             # One alone is a plant that was reset or restarted, whose status comes later.
             since = (stamp_ns - self._contradicted_ns) / SECOND
@@ -418,7 +416,7 @@ class Commander(ABC):
             self.answer()
 
     def take_joints(self, stamp_ns: int, joints: Any) -> None:
-        """Take joints of the present time, and handle their state if complete."""
+        """Process joints with the current time, and handle their state if complete."""
         self.states.put_joints(stamp_ns, joints)
         if not self.config.tick_rate:
             self._follow_rate()
@@ -428,7 +426,7 @@ class Commander(ABC):
         self.answer()
 
     def take_accepted_jump(self) -> str:
-        """Take the set-aside state once its time is accepted; call this ten times per second.
+        """Process the deferred state once its time is accepted; call this ten times per second.
 
         Return a warning about messages that were ignored, at most once a second; empty: none.
         """
@@ -451,7 +449,7 @@ class Commander(ABC):
 
     @property
     def missing(self) -> str:
-        """Clause that names the messages for which states wait; empty: none."""
+        """Clause naming the messages for which states wait; empty: none."""
         if self.robot is None:
             return "a robot on 'robot_description'"
         return self.inputs.missing(self.config.control_period)
@@ -475,7 +473,7 @@ class Commander(ABC):
             self._report_present_status()
 
     def answer_latest(self) -> None:
-        """Handle the latest received state, after work during which states have waited."""
+        """Handle the latest received state, after work during which states were waiting."""
         self._take_states(*self.host.waiting_states())
         self.answer()
 
@@ -525,7 +523,7 @@ class Commander(ABC):
             self.executive.cancel_plan()
 
     def receive_plant_status(self, status: PlantStatus, name: str = "plant") -> None:
-        """React to a status of the named plant."""
+        """React to a status from the named plant."""
         for change in self.plant.update(status, name):
             if isinstance(change, PlantStopped):
                 self.give_up_goals(change)

@@ -31,14 +31,14 @@ from spacerobot_ros.planning.execution.goal_file import BASE_GOAL_KEY, Identifie
 from spacerobot_ros.times import SECOND
 
 JOINT_REFERENCE, BASE_REFERENCE = "joint_reference", "base_reference"
-"""Topics of references for a controller; states wait for every topic with a publisher."""
+"""Reference topics for a controller; states wait for every topic with a publisher."""
 
 TARGET_ODOMETRY = "target/odom"
-"""Topic of the measured motion of the target."""
+"""Topic of the measured target motion."""
 
 _LONGEST_CHECK_PERIOD = 0.2
-"""Longest wall time that counts between two checks of waiting states, s: after a longer gap this
-process was suspended."""
+"""Maximum wall time between two checks of waiting states, s: after a longer gap this process was
+suspended."""
 
 
 @dataclass
@@ -56,15 +56,15 @@ class _ReferenceWait:
 class ControllerCommander(Commander):
     """Commands a wrench and joint efforts for every state (:class:`ControlExecutive`).
 
-    ``effort`` (n,), N m or N, and ``wrench`` (6,), N and N m in the base frame, are the values of
-    the last command.
+    ``effort`` (n,), N m or N, and ``wrench`` (6,), N and N m in the base frame, are the last
+    command's values.
 
     Parameters
     ----------
     config, host, clock
         See :class:`Commander`.
     partner_is_busy
-        Whether a planner is known to be planning for long; if so, states wait for its reference.
+        Whether a planner has announced long planning; if so, states wait for its reference.
     """
 
     config: ControllerConfig
@@ -88,21 +88,21 @@ class ControllerCommander(Commander):
         self.effort, self.wrench = np.zeros(0), np.zeros(6)
         self._target: RobotDescription | None = None
         self._target_odometry: Stamped | None = None
-        """The latest odometry of the target, until it is read."""
+        """The latest target odometry, until it is read."""
         self._published_plan: ReferenceProfile | None = None
 
     def _make_status(self, state: str, message: str, goal_id: str) -> ControllerStatus:
         return ControllerStatus(ControllerState(state), message, goal_id)
 
     def activate(self) -> None:
-        """Handle states from now on, each with the references that have a publisher."""
+        """Start handling states, each with the references that have a publisher."""
         for topic in (JOINT_REFERENCE, BASE_REFERENCE):
             self.states.require(topic, required=self.host.has_publisher(topic))
             self._references[topic] = _ReferenceWait()
         super().activate()
 
     def dump_momentum(self) -> str:
-        """Dump the momentum of the reaction wheels; return a message.
+        """Dump the reaction wheel momentum; return a message.
 
         Raises
         ------
@@ -112,12 +112,12 @@ class ControllerCommander(Commander):
         return self._active_executive().dump_momentum()
 
     def request(self, task: Task) -> str:
-        """Begin a task without a goal after it; return a message.
+        """Start a task without a subsequent goal; return a message.
 
         Raises
         ------
         CommandError
-            The task is refused; the message states the reason.
+            The task is rejected; the message states the reason.
         """
         executive = self._active_executive()
         if self.plant.refusal_of_goals:
@@ -127,7 +127,7 @@ class ControllerCommander(Commander):
                 "There is no target to approach: 'target/robot_description' has no message."
             )
         executive.request(task)
-        return f"The task '{task.value}' begins; controller/status reports its progress."
+        return f"The task '{task.value}' has started; controller/status reports its progress."
 
     def _active_executive(self) -> ControlExecutive:
         if self.executive is None or not self.active:
@@ -135,14 +135,14 @@ class ControllerCommander(Commander):
         return self.executive
 
     def use_target(self, target: RobotDescription) -> None:
-        """Take the description of the target."""
+        """Process the target description."""
         self._target = target
         if self.executive is not None:
             frame = self.config.target.grapple_frame
             self.executive.servicing.target.describe(target, frame)
 
     def receive_target(self, stamp_ns: int, message: Any) -> None:
-        """Take odometry of the target; the next state reads it if a task needs it.
+        """Store target odometry; the next state reads it if a task needs it.
 
         States do not wait for it: the motion since the last odometry is predicted.
         """
@@ -150,7 +150,7 @@ class ControllerCommander(Commander):
             self._target_odometry = Stamped(stamp_ns, message)
 
     def receive_reference(self, topic: str, stamp_ns: int, message: Any) -> None:
-        """Take a reference, and handle its state if complete."""
+        """Process a reference, and handle its state if complete."""
         self.states.put_required(topic, stamp_ns, message)
         before = self._references.get(topic)
         self._references[topic] = _ReferenceWait()
@@ -159,7 +159,8 @@ class ControllerCommander(Commander):
         self.answer()
 
     def take_odom(self, stamp_ns: int, odom: Any) -> None:
-        """Take odom of the present time, after handling a state whose reference never arrived."""
+        """Process odom with the current time, after handling a state whose reference never
+        arrived."""
         missing = self.states.missing
         if missing and self.active and self.executive is not None:
             pairing = self.states.take_overdue()
@@ -169,7 +170,7 @@ class ControllerCommander(Commander):
         super().take_odom(stamp_ns, odom)
 
     def take_accepted_jump(self) -> str:
-        """Take a set-aside state once its time is accepted, and check the waiting state."""
+        """Process a deferred state once its time is accepted, and check the waiting state."""
         warning = super().take_accepted_jump()
         if self.active:
             self._watch_waiting_state()
@@ -215,7 +216,7 @@ class ControllerCommander(Commander):
         super()._publish_status(status)
 
     def take_joints(self, stamp_ns: int, joints: Any) -> None:
-        """Take joints of the present time, after handling a state whose odom never arrived."""
+        """Process joints with the current time, after handling a state whose odom never arrived."""
         overdue = None
         if self.active and self.executive is not None and not self._waits_for_first_pose():
             overdue = self.states.take_overdue()
@@ -226,7 +227,7 @@ class ControllerCommander(Commander):
         super().take_joints(stamp_ns, joints)
 
     def rehearse(self) -> None:
-        """Rehearse a goal and a loss of the pose, so that no function is compiled in flight.
+        """Rehearse a goal and a pose loss, so that no function is compiled in flight.
 
         Otherwise compilation could keep the plant waiting longer than its ``command_timeout``.
         """
@@ -281,7 +282,8 @@ class ControllerCommander(Commander):
         if self.plant.status.actuation != "velocity":
             return ""
         return (
-            "The plant takes velocities, but this controller sends efforts and a wrench: start the "
+            "The plant expects velocities, but this controller sends efforts and a wrench: start "
+            "the "
             "plant with actuation:=effort."
         )
 
@@ -340,7 +342,7 @@ class ControllerCommander(Commander):
         try:
             stamp = decoder.decode_joints(states.joints)
         except CommandError as error:
-            self._log_fault("state", f"The state is refused: {error}")
+            self._log_fault("state", f"The state is rejected: {error}")
             return
         try:
             q, qdot, measured = decoder.q, decoder.qdot, None
@@ -353,7 +355,7 @@ class ControllerCommander(Commander):
             self._publish_plan(executive.controller.profile, stamp)
             self._forward_outputs()
         except (CommandError, NotFiniteError) as error:
-            self._log_fault("state", f"The state is refused: {error}")
+            self._log_fault("state", f"The state is rejected: {error}")
             return
         self.effort[:], self.wrench[:] = result.realised.tau, result.realised.wrench_B
         if send:

@@ -1,8 +1,8 @@
-"""Goals of actions, with feedback and results, without ROS.
+"""Action goals, with feedback and results, without ROS.
 
-The goal of an action is handled like the goal of a topic: the commander passes it to its executive,
-and statuses report its progress. :class:`FlyToGoals` keeps the goals whose clients wait, and sends
-each client exactly one result: the status that decides the goal.
+An action goal is handled like a topic goal: the commander passes it to its executive,
+and statuses report its progress. :class:`FlyToGoals` keeps the goals with waiting clients, and
+sends each client exactly one result: the final status.
 """
 
 from __future__ import annotations
@@ -21,21 +21,21 @@ from spacerobot_ros.planning.execution.status import PlannerStatus
 from spacerobot_ros.times import SECOND
 
 FEEDBACK_PERIOD_NS = SECOND // 5
-"""Shortest simulated time between two feedback messages of a goal, ns."""
+"""Minimum simulated time between two feedback messages for a goal, ns."""
 
 
 @dataclass(frozen=True)
 class FlyTo:
-    """A goal of an action.
+    """An action goal.
 
     Attributes
     ----------
     goal
-        Poses of the base and of end-effectors, and joint positions.
+        Base pose, end-effector poses, and joint positions.
     tolerance
-        Largest permissible errors; 0: the commander's parameter.
+        Maximum errors; 0: the commander's parameter.
     time_limit
-        Simulated time after which the goal is given up, s; 0: never.
+        Simulated time after which the goal is aborted, s; 0: never.
     """
 
     goal: Goal
@@ -44,7 +44,7 @@ class FlyTo:
 
     @classmethod
     def from_numbers(cls, goal: Goal, tolerance: Tolerance, time_limit: float) -> FlyTo:
-        """Return the goal of an action from received numbers.
+        """Return an action goal from received values.
 
         Raises
         ------
@@ -65,7 +65,7 @@ class FlyTo:
         return cls(goal, tolerance, time_limit)
 
     def tolerance_or(self, default: Tolerance) -> Tolerance:
-        """Return the tolerances, with defaults for those not set."""
+        """Return the tolerances, with defaults for unset values."""
         mine = self.tolerance
         return Tolerance(
             mine.position or default.position,
@@ -76,16 +76,16 @@ class FlyTo:
 
 @dataclass(frozen=True)
 class GoalErrors:
-    """Distance of a state from a goal; NaN for parts not requested or not measured.
+    """Errors of a state relative to a goal; NaN for components not requested or not measured.
 
     Attributes
     ----------
     position, attitude
-        Errors of the base, m and rad.
+        Base errors, m and rad.
     end_effector_position, end_effector_attitude
-        Largest errors of an end-effector, m and rad.
+        Largest end-effector errors, m and rad.
     joints
-        Largest error of a joint, m or rad.
+        Largest joint error, m or rad.
     """
 
     position: float = math.nan
@@ -96,12 +96,12 @@ class GoalErrors:
 
     @classmethod
     def between(cls, robot: SpaceRobot, pose: Array, q: Array, goal: Goal) -> GoalErrors:
-        """Return the errors of a base pose (7,) and joint positions (n,) to a goal of the robot.
+        """Return the errors of a base pose (7,) and joint positions (n,) relative to a goal.
 
         Raises
         ------
         GoalError
-            The robot has no link of the goal's name.
+            The robot has no link with the goal's name.
         """
         goal = goal.for_robot(robot.description)
         error = PoseError.between(pose[:3], pose[3:], goal, q, robot)
@@ -115,7 +115,7 @@ class GoalErrors:
         )
 
     def reported_by(self, status: Status) -> GoalErrors:
-        """Return the errors, replaced by those that a status reports."""
+        """Return the errors, replaced by those reported in a status."""
         if not isinstance(status, PlannerStatus):
             return self
         reported = {
@@ -135,7 +135,7 @@ class GoalErrors:
         )
 
     def values(self) -> dict[str, float]:
-        """Return the errors by their names."""
+        """Return the errors by name."""
         return {each.name: getattr(self, each.name) for each in fields(self)}
 
 
@@ -146,15 +146,15 @@ class Progress:
     Attributes
     ----------
     phase
-        Present activity for the goal.
+        Current activity for the goal.
     remaining_time
-        Predicted time until the present motion ends, s; None: there is no prediction.
+        Predicted time until the current motion ends, s; None without a prediction.
     elapsed_time
         Time since the first state after the goal was sent, s.
     stamp_ns
         Stamp of the last state, ns.
     pose
-        (7,) the measured pose of the base; None: not measured.
+        (7,) the measured base pose; None: not measured.
     errors
         Its errors.
     """
@@ -169,7 +169,7 @@ class Progress:
 
 @dataclass(frozen=True)
 class FlyToResult:
-    """Result of a goal: state and message of the deciding status, and the errors."""
+    """Result of a goal: state and message of the final status, and the errors."""
 
     outcome: str
     message: str
@@ -191,9 +191,9 @@ class _ActionGoal:
     """A goal with a client that waits for its result."""
 
     client: FlyToClient | None
-    """Client that waits for the result; None: the goal came by topic."""
+    """Client waiting for the result; None: the goal is from a topic."""
     request: FlyTo | None
-    """None: the goal is refused, or came by topic."""
+    """None: the goal is rejected, or is from a topic."""
     first_state_ns: int | None = None
     """Stamp of the first state after the goal was sent, ns."""
     last_feedback_ns: int | None = None
@@ -201,16 +201,16 @@ class _ActionGoal:
     give_up: str = ""
     """Reason to abort the goal; empty: no abort."""
     aborted: bool = False
-    """Whether the executive was asked to abort the goal."""
+    """Whether the executive was requested to abort the goal."""
 
 
 class FlyToGoals:
-    """Pursued and waiting goals, and the clients that wait for their results.
+    """Pursued and waiting goals, and the clients waiting for their results.
 
     Parameters
     ----------
     errors
-        Returns the errors of the last measured state to a goal.
+        Returns the last measured state's errors relative to a goal.
     report_aborted
         Publishes the abort of a goal (id, message), and returns this status.
     """
@@ -225,7 +225,7 @@ class FlyToGoals:
         """Goals by id, in order of arrival."""
         self._clients = 0
         self._accepted: list[str] = []
-        """Ids of accepted goals that were not refused later, from actions or topics, in order."""
+        """Ids of accepted goals that were not rejected later, from actions or topics, in order."""
 
     def __bool__(self) -> bool:
         """Whether a client waits."""
@@ -234,7 +234,7 @@ class FlyToGoals:
     def begin(
         self, goal_id: str, client: FlyToClient | None = None, request: FlyTo | None = None
     ) -> None:
-        """Follow a goal from now on; ``request`` is None if the goal of the client is refused."""
+        """Start tracking a goal; ``request`` is None if the client's goal is rejected."""
         self._served[goal_id] = _ActionGoal(client, request)
         self._clients += client is not None
 
@@ -244,7 +244,7 @@ class FlyToGoals:
         self._accepted.append(goal_id)
 
     def leave(self, goal_id: str) -> None:
-        """Stop following a goal by topic, because another commander pursues it."""
+        """Stop tracking a topic goal, because another commander pursues it."""
         self._served.pop(goal_id, None)
 
     def request_abort(self, goal_id: str, why: str = "on request") -> None:
@@ -256,9 +256,9 @@ class FlyToGoals:
     def abort_reason(self, waiting: Collection[str]) -> str:
         """Return the reason to abort all goals now; empty: no abort.
 
-        An abort gives up every goal. If a goal is about to be replaced, its abort therefore waits
-        until it is replaced or the later goal is refused: as long as ``waiting`` has the id of
-        another goal.
+        An abort ends every goal. If a goal is about to be replaced, its abort therefore waits until
+        it is replaced or the later goal is rejected: as long as ``waiting`` has the id of another
+        goal.
         """
         for goal_id, served in self._served.items():
             alone = self._accepted[-1:] == [goal_id] or set(waiting) <= {goal_id}
@@ -291,19 +291,19 @@ class FlyToGoals:
                 )
 
     def update(self, status: Status) -> None:
-        """End the goal that a status decides, if a client waits for it."""
+        """End the goal completed by a status, if a client waits for it."""
         if status.state.value == "refused" and status.goal_id in self._accepted:
             self._accepted.remove(status.goal_id)
         if status.state.decided:
             self._end(status.goal_id, status)
 
     def end_dropped_goals(self, pursued: Collection[str], why: str = "") -> None:
-        """End the goals that are no longer pursued and that no status has decided.
+        """End the goals that are no longer pursued and have no final status.
 
         Parameters
         ----------
         pursued
-            Ids of pursued goals, and of goals that a status is about to decide.
+            Ids of pursued goals, and of goals about to get their final status.
         why
             The reason, for goals not replaced by a later goal.
         """

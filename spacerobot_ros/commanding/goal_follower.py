@@ -1,4 +1,4 @@
-"""The statuses of commanders: their topics, and how to follow the statuses of one goal."""
+"""Commander statuses: their topics, and tracking the statuses of one goal."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ STATUS_TOPICS: Mapping[str, tuple[str, Callable[[Mapping[str, str], str], Status
 
 
 class GoalFollower:
-    """Follows one goal through the statuses of the commander that decides about it.
+    """Tracks one goal through its commander's statuses.
 
     Parameters
     ----------
     goal_id
-        Id of the goal; None: no goal was sent yet, so no status is about it.
+        Id of the goal; None: no goal has been sent yet, so no status refers to it.
     unnamed
-        Whether statuses without an id are also about the goal, as in bags of version 0.1.
+        Whether statuses without an id also refer to the goal, as in version 0.1 bags.
     """
 
     def __init__(self, goal_id: str | None = None, *, unnamed: bool = False) -> None:
@@ -34,16 +34,16 @@ class GoalFollower:
         self.gait: PlannerStatus | None = None
         """The planner's status at the start of its first schedule for the goal."""
         self.decision: Status | None = None
-        """The status that decided the goal; None: it is still pursued."""
+        """The goal's final status; None while it is pursued."""
 
     def is_about_goal(self, status: Status) -> bool:
-        """Whether a status is about the goal."""
+        """Whether a status refers to the goal."""
         if self.goal_id is None:
             return False
         return status.goal_id == self.goal_id or (self._unnamed and not status.goal_id)
 
     def update(self, status: Status) -> bool:
-        """Take the next status; return whether it decides the goal."""
+        """Process the next status; return whether it is the goal's final status."""
         if self.decision is not None or not self.is_about_goal(status):
             return False
         if self.gait is None and status.state is PlannerState.EXECUTING:

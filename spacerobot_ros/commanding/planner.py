@@ -1,4 +1,4 @@
-"""The planner without ROS: a setpoint of the joints for every state."""
+"""The planner without ROS: a joint setpoint for every state."""
 
 from __future__ import annotations
 
@@ -62,16 +62,16 @@ class _MeasuredState:
 
 
 class PlannerCommander(Commander):
-    """Sends a setpoint of the joints for every state (:class:`Executive`).
+    """Sends a joint setpoint for every state (:class:`Executive`).
 
     Parameters
     ----------
     config, host, clock
         See :class:`Commander`.
     method
-        Gait method; None: the method of the configuration.
+        Gait method; None: the configured method.
     long_work
-        Context for planning that takes long.
+        Context for long planning.
     """
 
     config: PlannerConfig
@@ -100,7 +100,7 @@ class PlannerCommander(Commander):
 
     @property
     def statistics(self) -> PlannerStatistics:
-        """Counts of plans and commands so far."""
+        """Number of plans and commands so far."""
         return PlannerStatistics() if self.executive is None else self.executive.statistics
 
     @property
@@ -123,7 +123,7 @@ class PlannerCommander(Commander):
         return PlanningWorker(robot, self.config, method, self._on_long_work, described)
 
     def end_schedule(self, end: TrajectoryEnd) -> None:
-        """End the present schedule, because its controller has ended it."""
+        """End the current schedule, because its controller has ended it."""
         if self.executive is not None:
             self.executive.schedule_ended(end.message, final=end.final)
 
@@ -152,7 +152,7 @@ class PlannerCommander(Commander):
         if self.config.output != "commands" or self.plant.status.actuation != "effort":
             return ""
         return (
-            "The plant takes efforts, but this planner sends velocities: start the plant with "
+            "The plant expects efforts, but this planner sends velocities: start the plant with "
             "actuation:=velocity, or the planner with output:=reference together with a "
             "coordinated_control."
         )
@@ -183,14 +183,15 @@ class PlannerCommander(Commander):
         super()._accept_goal(BASE_GOAL_KEY, goal)
 
     def receive_twist(self, link: str, frame: str, linear: Array, angular: Array) -> None:
-        """Make a link follow a twist until twists stop; if it cannot, the reason is logged.
+        """Make a link follow a twist until twists stop; if this is impossible, the reason is
+        logged.
 
         Parameters
         ----------
         link
             Name of the link.
         frame
-            Frame of both velocities: the world's, the base's, or the link's own.
+            Frame of both velocities: world, base, or the link itself.
         linear, angular
             (3,) velocity of the link's origin, m/s, and angular velocity, rad/s.
         """

@@ -1,4 +1,4 @@
-"""A commander's view of its plant: states of the present time, whole states, status.
+"""A commander's view of its plant: current states, complete states, status.
 
 Messages are opaque here: each has a stamp, in ns, and is passed on unchanged.
 """
@@ -18,7 +18,7 @@ from spacerobot_ros.simulation.status import PlantState, PlantStatus
 from spacerobot_ros.times import SECOND
 
 _NO_STAMP = -1
-"""The stamp that represents a missing message; stamps of messages are never negative."""
+"""The stamp that represents a missing message; message stamps are never negative."""
 
 
 class Stamped(NamedTuple):
@@ -34,38 +34,38 @@ _NO_MESSAGE = Stamped(_NO_STAMP, None)
 # -- states of the present time ---------------------------------------------------------------
 
 _JUMP_CONFIRMATION_TIME = 0.5
-"""Wall time without a state of the old time before a time jump is accepted, s."""
+"""Wall time without a state at the old time before a time jump is accepted, s."""
 
 _STEP_SLACK = 1.5
-"""Largest distance between two states without a loss, in steps of the plant."""
+"""Maximum distance between two states without a loss, in plant steps."""
 
 _PACE_SLACK = 2.0
-"""Largest ratio of the time of lost states to the time expected from the plant's pace."""
+"""Maximum ratio of the time of lost states to the time expected from the plant's rate."""
 
 _MEETING_TIME = 1.0
 """Wall time from the first state in which poses may come before or long after their joints, s."""
 
 _MEASURED_STEPS = 8
-"""Number of steps from which the rate of the states is computed if they are not equal."""
+"""Number of steps used to compute the state rate if they are not equal."""
 
 _STEADY = 1.2
-"""Largest ratio of two steps of a steady rate; states skipped by a busy node make steps longer."""
+"""Maximum ratio of two steps at a steady rate; states skipped by a busy node make steps longer."""
 
 _STEP_ROUNDING_NS = 1_000
-"""Largest difference between equal steps, due to stamps computed in floating point, ns."""
+"""Maximum difference between equal steps, due to stamps computed in floating point, ns."""
 
 
 class StampFilter:
-    """Separates states of the plant's present time from states stamped with another time.
+    """Separates states at the plant's current time from states with other stamps.
 
-    The steps between states, and so the rate of the plant, are derived from the stamps. A stamp is
-    of the present time if it is
+    The steps between states, and thus the plant's rate, are derived from the stamps. A stamp is
+    current if it is
 
     * equal to the previous stamp, or at most 1.5 steps after it: no message was lost;
     * further ahead by at most twice the simulated time expected for the elapsed wall time: messages
-      were lost, or this process was stopped for a while.
+      were lost, or this process was suspended.
 
-    Any other state is a *time jump*, and is set aside. If a state of the present time follows, the
+    Any other state is a *time jump*, and is deferred. If a state with the current time follows, the
     jump is ignored and counted. If none follows for 0.5 s of wall time, the time has really
     changed, for example after a restart of the plant, and the jump is accepted. A plant in lockstep
     waits that long for its command. ``clock`` returns the wall time, s.
@@ -76,22 +76,22 @@ class StampFilter:
         self._steps: deque[int] = deque(maxlen=_MEASURED_STEPS)
         """Latest steps between two states, ns."""
         self._longest_step = math.inf
-        """Largest step without a loss, ns; infinite before the second state."""
+        """Maximum step without a loss, ns; infinite before the second state."""
         self._first_ns, self._first_wall, self._wall = _NO_STAMP, 0.0, 0.0
-        """Stamp (ns) and wall time (s) of the first state of the present time; wall time (s) of the
+        """Stamp (ns) and wall time (s) of the first state at the current time; wall time (s) of the
         last."""
         self._jump = self._jump_odom = _NO_MESSAGE
         self._jump_wall = 0.0
         self.now_ns = 0
         """Stamp of the latest admitted state, ns; 0 before the first state."""
         self.ignored = 0
-        """Number of states and poses that were ignored because of their stamps."""
+        """Number of states and poses ignored because of their stamps."""
         self.last_ignored = ""
         """Message for the user about the latest ignored state."""
 
     @property
     def rate(self) -> float:
-        """Rate of the states from their stamps, Hz; 0 while there are too few."""
+        """State rate from the stamps, Hz; 0 if there are too few."""
         steps = list(self._steps)
         if len(steps) > 1 and abs(steps[-1] - steps[-2]) <= _STEP_ROUNDING_NS:
             return SECOND / steps[-1]
@@ -104,13 +104,13 @@ class StampFilter:
 
     @property
     def steady_rate(self) -> float:
-        """Rate of the states if many successive steps agree, Hz; 0 otherwise."""
+        """State rate if many successive steps agree, Hz; 0 otherwise."""
         steps = self._steps
         steady = len(steps) == _MEASURED_STEPS and max(steps) <= _STEADY * min(steps)
         return self.rate if steady else 0.0
 
     def is_present(self, stamp_ns: int, behind_ns: float = 0.0) -> bool:
-        """Whether a stamp is of the present time, and at most ``behind_ns`` before the last."""
+        """Whether a stamp is current, and at most ``behind_ns`` before the last."""
         ahead = stamp_ns - self.now_ns
         if ahead <= self._longest_step:
             return ahead >= -behind_ns
@@ -119,7 +119,7 @@ class StampFilter:
         return ahead <= self._longest_step + _PACE_SLACK * pace * (self._clock() - self._wall)
 
     def accepts_joints(self, stamp_ns: int, joints: Any) -> bool:
-        """Return whether joints are of the present time; set other joints aside."""
+        """Return whether joints have the current time; defer other joints."""
         if not self.is_present(stamp_ns):
             if self._jump.message is None:
                 self._jump_wall = self._clock()
@@ -137,9 +137,9 @@ class StampFilter:
         return True
 
     def accepts_odom(self, stamp_ns: int, odom: Any) -> bool:
-        """Return whether a pose is of the present time; set other poses aside.
+        """Return whether a pose has the current time; defer other poses.
 
-        A pose may arrive before or after the joints of its stamp.
+        A pose may arrive before or after the joints with the same stamp.
         """
         if self.is_present(stamp_ns, self._longest_step):
             return True
@@ -149,7 +149,7 @@ class StampFilter:
     def accepted_jump(self) -> tuple[Stamped | None, Stamped] | None:
         """Return the deferred odom (or None) and joints once their time is accepted.
 
-        Call this several times per second; None: no jump is accepted.
+        Call this several times per second; None if no jump is accepted.
         """
         joints, odom = self._jump, self._jump_odom
         if joints.message is None or self._clock() - self._jump_wall < _JUMP_CONFIRMATION_TIME:
@@ -178,7 +178,7 @@ class StampFilter:
             self.ignored += 1
             self.last_ignored = (
                 f"A message on '{name}' is ignored: its stamp is {abs(ahead):.4g} s "
-                f"{'ahead of' if ahead > 0 else 'behind'} the time of the states."
+                f"{'ahead of' if ahead > 0 else 'behind'} the state time."
             )
         self._jump = self._jump_odom = _NO_MESSAGE
 
@@ -190,13 +190,13 @@ class Pairing(str, Enum):
     """The messages of a state from a :class:`StateSynchroniser`."""
 
     WHOLE = "whole"
-    """Joints and odom of one stamp."""
+    """Joints and odom with one stamp."""
 
     WITHOUT_POSE = "without pose"
     """Only joints: their odom has not arrived."""
 
     LATE_POSE = "late pose"
-    """Odom of a state that was returned without odom before."""
+    """Odom of a state that was previously returned without odom."""
 
 
 class StateSynchroniser:
@@ -206,7 +206,7 @@ class StateSynchroniser:
     only to plan):
 
     * *Pose required:* a state is ready when its odom has arrived. If odom fails, this is detected
-      when the next joints arrive: the state before is then overdue (:meth:`take_overdue`). From
+      when the next joints arrive: the previous state is then overdue (:meth:`take_overdue`). From
       then on states are ready without their pose, until odom arrives again.
     * *Pose optional:* a state is ready with its joints; odom that arrives after them is returned as
       a :attr:`Pairing.LATE_POSE`.
@@ -224,17 +224,17 @@ class StateSynchroniser:
         self._odom_ns = self._joints_ns = _NO_STAMP
         self._odom_fresh = self._joints_fresh = self._without_pose = False
         self._required: dict[str, Stamped] = {}
-        """Latest messages of the topics required in addition to odom and joints."""
+        """Latest messages on the topics required in addition to odom and joints."""
 
     def require(self, topic: str, *, required: bool = True) -> None:
-        """Set whether states wait for a message on a further topic."""
+        """Set whether states wait for a message on an additional topic."""
         if not required:
             self._required.pop(topic, None)
         else:
             self._required.setdefault(topic, _NO_MESSAGE)
 
     def put_odom(self, stamp_ns: int, odom: Any) -> bool:
-        """Accept an odom; poses are measured (again).
+        """Accept an odom; poses are now measured.
 
         Return whether it contradicts the previous odom with the same stamp: if so, another node
         also publishes odom, and the state has no pose.
@@ -245,10 +245,10 @@ class StateSynchroniser:
         return contradicts
 
     def forget_pose(self) -> None:
-        """Forget the latest odom, because the plant publishes another state of the same time.
+        """Discard the latest odom, because the plant publishes another state for the same time.
 
-        A later odom of this time then neither counts as a contradiction nor as the pose of joints
-        that were returned before.
+        A later odom with this time is then neither a contradiction nor the pose for joints that
+        were returned before.
         """
         self.odom, self._odom_ns, self._odom_fresh = None, _NO_STAMP, False
         if not self._joints_fresh:
@@ -261,7 +261,7 @@ class StateSynchroniser:
 
     @property
     def missing(self) -> tuple[str, ...]:
-        """Topics for whose messages an otherwise complete state waits."""
+        """Topics for which an otherwise complete state waits."""
         if not (self._required and self._joints_fresh):
             return ()
         stamp = self._joints_ns
@@ -270,11 +270,11 @@ class StateSynchroniser:
         return tuple(name for name, given in self._required.items() if given.stamp_ns != stamp)
 
     def put_required(self, topic: str, stamp_ns: int, message: Any) -> None:
-        """Accept a message of a further topic, and require the topic from now on."""
+        """Accept a message on an additional topic, and require the topic from now on."""
         self._required[topic] = Stamped(stamp_ns, message)
 
     def latest(self, topic: str) -> Any:
-        """Return the latest message of a required topic; None before its first message."""
+        """Return the latest message on a required topic; None before its first message."""
         return self._required.get(topic, _NO_MESSAGE).message
 
     def take_ready(self) -> Pairing | None:
@@ -315,17 +315,17 @@ class StateSynchroniser:
 
 @dataclass(frozen=True)
 class PlantStopped:
-    """The plant does not obey commands.
+    """The plant ignores commands.
 
     Attributes
     ----------
     reason
         Message of the plant.
     commanded_until_ns
-        If the plant rests because no command arrived: the stamp of the last command; None: it obeys
-        no commands.
+        If the plant is at rest because no command arrived: the stamp of the last command; None: it
+        ignores all commands.
     rests_since_ns
-        Time since which it rests, if known.
+        Time since which it is at rest, if known.
     """
 
     reason: str
@@ -343,16 +343,16 @@ class PlantChange(Enum):
 
 
 class PlantListener:
-    """Follows plant/status (optional): whether the plant obeys, and its resets."""
+    """Tracks plant/status (optional): whether the plant accepts commands, and its resets."""
 
     def __init__(self) -> None:
         self.status = PlantStatus(PlantState.RUNNING)
-        """The latest status; before the first, the status of a plant that obeys."""
+        """The latest status; before the first, the status of a plant that accepts commands."""
         self._heard, self._name = False, "plant"
 
     @property
     def refusal_of_goals(self) -> str:
-        """Message on why goals are presently refused; empty: goals are accepted."""
+        """Message on why goals are currently rejected; empty: goals are accepted."""
         status = self.status
         if status.latched_fault:
             return f"'{self._name}' is latched: {status.latched_fault}; rearm it first."
@@ -367,7 +367,7 @@ class PlantListener:
 
     @property
     def has_no_command(self) -> bool:
-        """Whether no command is in force: none has arrived, or none is obeyed."""
+        """Whether no command is active: none has arrived, or commands are ignored."""
         return self.status.state is PlantState.RESTING or bool(self.refusal_of_goals)
 
     @property
@@ -376,7 +376,7 @@ class PlantListener:
         return self.status.state is PlantState.PAUSED
 
     def update(self, status: PlantStatus, name: str = "plant") -> list[PlantStopped | PlantChange]:
-        """Take the next status of the named plant; return the changes to react to.
+        """Process the next status of the named plant; return the changes to react to.
 
         Statuses may be missed; the plant's counters reveal the changes in between.
         """
@@ -414,7 +414,7 @@ def _timeout_rest(status: PlantStatus) -> PlantStopped | None:
     last = since if last is None else last
     why = status.message
     if status.reason != "timeout":
-        since, why = last, "The joints were brought to rest: no command came in time."
+        since, why = last, "The joints were brought to rest: no command arrived in time."
     if not (math.isfinite(last) and math.isfinite(since)):
         return None
     return PlantStopped(why, round(last * SECOND), round(since * SECOND))

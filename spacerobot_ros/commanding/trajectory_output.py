@@ -1,7 +1,7 @@
-"""Schedules for a FollowJointTrajectory server, one at a time, and their ends.
+"""Schedules for a FollowJointTrajectory server, one at a time, and their completion.
 
 This module is independent of ROS: a :class:`TrajectoryServer` sends and cancels, and its responses
-carry the number of their schedule. A response about a replaced or cancelled schedule is ignored.
+contain the schedule number. A response about a replaced or cancelled schedule is ignored.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _PHASES_OF_MOTION = (Phase.EXECUTING, Phase.REPLANNING, Phase.TAKING_OVER, Phase
 
 
 class ErrorCode(IntEnum):
-    """``error_code`` of a result of control_msgs/action/FollowJointTrajectory."""
+    """``error_code`` in a control_msgs/action/FollowJointTrajectory result."""
 
     SUCCESSFUL = 0
     INVALID_GOAL = -1
@@ -34,7 +34,7 @@ class ErrorCode(IntEnum):
 
 
 class Outcome(Enum):
-    """Final state of an action's goal."""
+    """Final state of an action goal."""
 
     SUCCEEDED = "succeeded"
     ABORTED = "aborted"
@@ -43,14 +43,14 @@ class Outcome(Enum):
 
 @dataclass(frozen=True)
 class TrajectoryEnd:
-    """The end of a schedule that the robot's own controller follows.
+    """The end of a schedule executed by the robot's own controller.
 
     Attributes
     ----------
     message
-        Reason for an early end, as a clause; empty: the schedule was followed to its end.
+        Reason for an early end, as a clause; empty: the schedule was completed.
     final
-        Whether a corrected schedule would end in the same way, so that none is planned.
+        Whether a correction would end in the same way, so that none is planned.
     """
 
     message: str = ""
@@ -67,11 +67,11 @@ class TrajectoryServer(Protocol):
         """Send a schedule."""
 
     def cancel(self, number: int) -> None:
-        """Cancel a schedule, whether it is already accepted or not."""
+        """Cancel a schedule, whether or not it has been accepted."""
 
 
 class TrajectoryOutput:
-    """Sends each schedule to a server, follows its result, and cancels abandoned ones.
+    """Sends each schedule to a server, evaluates its result, and cancels abandoned schedules.
 
     Parameters
     ----------
@@ -92,7 +92,7 @@ class TrajectoryOutput:
         self._sent: int | None = None
         """Number of the schedule without a result."""
         self._replaced: int | None = None
-        """Number of the schedule that the latest one replaces, until the latest is accepted."""
+        """Number of the schedule replaced by the latest, until the latest is accepted."""
         self._accepted = False
         self._watched_ns: int | None = None
         """Stamp of the first state after the latest schedule was sent, ns."""
@@ -100,7 +100,7 @@ class TrajectoryOutput:
         """Stamp of the last check for the server, ns."""
 
     def start(self, start: ScheduleStart) -> None:
-        """Send a schedule; it replaces the present schedule."""
+        """Send a schedule; it replaces the current schedule."""
         self._number += 1
         self._replaced, self._sent, self._accepted = self._sent, self._number, False
         self._watched_ns = None
@@ -136,12 +136,12 @@ class TrajectoryOutput:
         self._server.cancel(sent)
 
     def accepted(self, number: int) -> None:
-        """Record that the server now follows a schedule."""
+        """Record that the server is now executing a schedule."""
         if number == self._sent:
             self._accepted, self._replaced = True, None
 
     def rejected(self, number: int) -> None:
-        """End a schedule that the server rejects, and the schedule that it would have replaced."""
+        """End a schedule rejected by the server, and the schedule that it would have replaced."""
         if number != self._sent:
             return
         if self._replaced is not None:
@@ -173,6 +173,6 @@ def _motion_end(outcome: Outcome, code: int, text: str) -> TrajectoryEnd:
         name = ErrorCode(code).name
     except ValueError:
         name = f"error code {code}"
-    clause = f"the trajectory has ended early with {name}{told}"
+    clause = f"the trajectory ended early with {name}{told}"
     violated = code in (ErrorCode.PATH_TOLERANCE_VIOLATED, ErrorCode.GOAL_TOLERANCE_VIOLATED)
     return TrajectoryEnd(clause, final=not violated)

@@ -1,1 +1,1 @@
-"""Flights of scenarios without ROS, in which commanders respond to the states of a plant."""
+"""Scenario flights without ROS, in which commanders respond to plant states."""

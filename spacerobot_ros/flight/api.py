@@ -37,7 +37,7 @@ from spacerobot_ros.scenario import (
 )
 
 _ORIGIN = [0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]
-"""The default pose of a base."""
+"""The default base pose."""
 
 
 def fly(
@@ -67,31 +67,31 @@ def fly(
         :func:`~spacerobot_ros.scenario.load_scenario`; or a robot: its name, its URDF file, or its
         model. A name of both means the scenario.
     goal
-        Goal pose of the base; or its position (3,), m, or position and quaternion (7,). None: the
-        goal of the scenario.
+        Base goal pose; or its position (3,), m, or position and quaternion (7,). None: the
+        scenario's goal.
     position, rotvec
-        Position (3,), m, and attitude (3,), rad, as exponential coordinates; they replace those of
+        Position (3,), m, and attitude (3,), rad, as exponential coordinates; they override
         ``goal``.
     end_effector_position, end_effector_pose, end_effector
-        Goal of an end-effector, as for :func:`plan`.
+        End-effector goal, as for :func:`plan`.
     method
         A gait method or a control law; None: as in the scenario.
     law, law_options
-        A class of your own control law, and its options by name. The scenario must have a
+        Class of your own control law, and its options by name. The scenario must have a
         controller, whose gains it uses.
     seed
-        Seed of the noise of sensors and actuators.
+        Seed of the sensor and actuator noise.
     parameters
-        Parameters of the nodes by name: ``{"plant.sensors.position_noise": 0.001}``.
+        Node parameters by name: ``{"plant.sensors.position_noise": 0.001}``.
 
     Raises
     ------
     ParameterError
-        There is no such scenario, robot, method or parameter, or only nodes can fly the scenario.
+        There is no such scenario, robot, method or parameter, or the scenario requires nodes.
     GoalError
         The goal is not a pose.
     PlanningError
-        The goal is refused, as in :func:`plan`, or by the controller.
+        The goal is rejected, as in :func:`plan`, or by the controller.
     """
     hands = end_effector_goals(end_effector_position, end_effector_pose, end_effector)
     scenario = scenario_to_fly(what, goal, position, rotvec, hands)
@@ -150,33 +150,33 @@ def plan(
     Parameters
     ----------
     what
-        The model, a URDF file or the name of a robot; or a scenario, its file, or its name. A name
-        of both means the scenario if no goal is given, and the robot otherwise.
+        A robot's model, URDF file or name; or a scenario, its file, or its name. If a scenario and
+        a robot have the same name, the scenario is used if no goal is given, otherwise the robot.
     goal
-        Goal pose of the base; or its position (3,), m, or position and quaternion (7,).
+        Base goal pose; or its position (3,), m, or position and quaternion (7,).
     position, rotvec
-        Position (3,), m, and attitude (3,), rad, as exponential coordinates; they replace those of
+        Position (3,), m, and attitude (3,), rad, as exponential coordinates; they override
         ``goal``.
     end_effector_position, end_effector_pose, end_effector
-        Goal of an end-effector: its position (3,), m, or position and quaternion (7,), and the name
-        of its link; or positions or poses of several, by name. Only given parts of the base pose
-        are constrained.
+        End-effector goal: its position (3,), m, or position and quaternion (7,), and its link name;
+        or positions or poses of several end-effectors, by name. Only given components of the base
+        pose are constrained.
     method
-        Name of a gait method; None: as in the scenario. For a robot it is ``auto``, or ``optimal``
-        if method options are given.
+        Name of a gait method; None: as in the scenario. For a robot the default is ``auto``, or
+        ``optimal`` if method options are given.
     parameters
-        Parameters of the nodes by name, as for :func:`fly`, such as
+        Node parameters by name, as for :func:`fly`, such as
         ``{"planner.attitude_tolerance": 0.001}``; a robot is then handled as in :func:`fly`.
     options
-        Options of the method by name; for a robot, also other arguments of
+        Method options by name; for a robot, also other arguments of
         :func:`spacerobot_ros.planning.plan`.
 
     Raises
     ------
     PlanningError
-        The goal is refused or cannot be reached; the message says why.
+        The goal is rejected or unreachable; the message gives the reason.
     ParameterError
-        There is no such scenario, robot, method or option, or one is refused.
+        There is no such scenario, robot, method or option, or one of them is invalid.
     """
     hands = end_effector_goals(end_effector_position, end_effector_pose, end_effector)
     if parameters is not None:
@@ -237,7 +237,8 @@ def scenario_to_fly(
     rotvec: npt.ArrayLike | None = None,
     hands: Sequence[EndEffectorGoal] = (),
 ) -> Scenario:
-    """Return the scenario to fly, with the given goals; a robot alone becomes one without a goal.
+    """Return the scenario to fly, with the given goals; a robot alone becomes a scenario without a
+    goal.
 
     Raises
     ------
@@ -313,7 +314,7 @@ def _float_list(values: npt.ArrayLike, what: str) -> list[float]:
 def _with_parameters(scenario: Scenario, settings: Mapping[str, Any]) -> Scenario:
     if not isinstance(settings, Mapping):
         raise ParameterError(
-            "Parameters are given by name, as {'plant.sensors.position_noise': 0.001}, and not as "
+            "Parameters are given by name, as {'plant.sensors.position_noise': 0.001}, not as "
             f"{settings!r}."
         )
     for key, value in settings.items():

@@ -1,4 +1,4 @@
-"""The body that a robot held in a flight: times, parameters, and momentum budget."""
+"""The body held by a robot during a flight: times, parameters, and momentum budget."""
 
 from __future__ import annotations
 
@@ -43,12 +43,12 @@ _SAME_TIME = 1e-6  # s
 
 @dataclass(frozen=True)
 class HeldTarget:
-    """The target, while the robot held it.
+    """The target while held by the robot.
 
     Attributes
     ----------
     start, end
-        Times of the capture and of the release, s; the end is infinite without a release.
+        Capture and release times, s; the end is infinite without a release.
     payload
         The body, according to the target's description.
     """
@@ -60,16 +60,16 @@ class HeldTarget:
 
 @dataclass(frozen=True)
 class States:
-    """States of the robot with known base and joints.
+    """Robot states with known base and joints.
 
     Attributes
     ----------
     time
         (N,) s.
     pose, twist
-        (N, 7) and (N, 6) of the base.
+        (N, 7) base poses and (N, 6) base twists.
     q, qdot
-        (N, n) in the order of the robot's joints.
+        (N, n) in the robot's joint order.
     """
 
     time: Array
@@ -110,7 +110,7 @@ class States:
         )
 
     def between(self, start: float, end: float) -> States:
-        """Return the states from ``start`` to ``end``, s, both included."""
+        """Return the states from ``start`` to ``end``, s, inclusive."""
         inside = (self.time >= start - _SAME_TIME) & (self.time <= end + _SAME_TIME)
         return self.at(np.flatnonzero(inside))
 
@@ -120,9 +120,9 @@ class States:
 
 
 def held_bodies(flight: Flight) -> tuple[HeldTarget, ...]:
-    """Return the bodies that the robot of a flight held, one for each capture.
+    """Return the bodies held by the robot during a flight, one per capture.
 
-    The grasp pose follows from the poses of robot and target after the capture.
+    The grasp pose follows from the robot and target poses after the capture.
     """
     robot, target = flight.robot, flight.target
     if robot is None or target is None:
@@ -157,18 +157,19 @@ def _held_between(
 
 
 def momentum_budget_over_time(flight: Flight, most: int) -> Signal:
-    """Return the angular momentum of base, arm, wheels and all about the centre of mass, N m s.
+    """Return the angular momenta of base, arm, wheels and their sum about the centre of mass, N m
+    s.
 
-    The columns are :data:`BUDGET_PARTS`: norms of the parts of
+    The columns are :data:`BUDGET_PARTS`: norms of the components of
     :func:`~spacerobot_ros.control.wheels.momentum_budget`, as in controller/status, but from the
-    true states. A held body is part of the link that holds it.
+    true states. A held body is part of the holding link.
 
     Parameters
     ----------
     flight
-        The flight; without a description of its robot, or without states, the signal is empty.
+        The flight; without a robot description, or without states, the signal is empty.
     most
-        Largest number of states to evaluate.
+        Maximum number of states to evaluate.
 
     Raises
     ------
@@ -197,18 +198,18 @@ def momentum_budget_over_time(flight: Flight, most: int) -> Signal:
 
 
 def payload_estimates(flight: Flight, most: int = 600) -> tuple[PayloadEstimate, ...]:
-    """Return the estimated parameters of each body that the robot held.
+    """Return the estimated parameters of each body held by the robot.
 
-    Conservation of momentum (:mod:`.model.payload_estimation`) determines them from the measured
-    motion of base and joints, the robot's masses and the thrust; the target's description is not
-    used.
+    They are determined by conservation of momentum (:mod:`.model.payload_estimation`) from the
+    measured base and joint motion, the robot's masses and the thrust; the target's description is
+    not used.
 
     Parameters
     ----------
     flight
         The flight.
     most
-        Largest number of states used for each body.
+        Maximum number of states used per body.
 
     Raises
     ------

@@ -1,6 +1,6 @@
 """The clearance of a flight: the smallest distance between links, and to obstacles, in true states.
 
-A flight without ROS reports clearances like the plant's node: :meth:`FlightClearance.statuses`.
+A flight without ROS reports clearances like the plant node: :meth:`FlightClearance.statuses`.
 """
 
 from __future__ import annotations
@@ -20,18 +20,18 @@ from spacerobot_ros.simulation.clearance import ClearanceStatus
 
 @dataclass(frozen=True, eq=False)
 class FlightClearance:
-    """The smallest distance between links of a robot over the time of a flight.
+    """The smallest distance between robot links over the time of a flight.
 
     Attributes
     ----------
     geometry
-        The solids of the robot, with at least one pair.
+        The robot's solids, with at least one pair.
     time
         (N,) times of the states, s; at least one.
     shapes
-        (N, n) true positions of the robot's joints, m or rad.
+        (N, n) true joint positions, m or rad.
     base
-        The true poses (N,) of the base; None: there are no obstacles.
+        The true base poses (N,); None without obstacles.
     """
 
     geometry: CollisionGeometry
@@ -48,7 +48,7 @@ class FlightClearance:
         pose: tuple[Array, Array],
         mesh_of: Callable[[Shape], TriangleMesh] = shape_mesh,
     ) -> FlightClearance | None:
-        """Return the clearance of a flight; None without states, or if no pair of links is checked.
+        """Return the clearance of a flight; None without states, or if no link pair is checked.
 
         Parameters
         ----------
@@ -57,8 +57,8 @@ class FlightClearance:
         joint_names
             The names of the columns of ``q``.
         q, pose
-            Times (N,), s, and joint positions (N, n), m or rad; times (M,) and poses (M, 7) of the
-            base. If there are obstacles, only states with equal times are used.
+            Times (N,), s, and joint positions (N, n), m or rad; times (M,) and base poses (M, 7).
+            If there are obstacles, only states with equal times are used.
         mesh_of
             As for :class:`~spacerobot_ros.collision.geometry.CollisionGeometry`.
         """
@@ -101,13 +101,14 @@ class FlightClearance:
 
     @property
     def nearest_time(self) -> float:
-        """Time of the nearest approach, s."""
+        """Time of the smallest distance, s."""
         return float(np.interp(self.nearest.tick, np.arange(len(self.time)), self.time))
 
     def over_time(self, most: int) -> tuple[Array, Array]:
-        """Return times (K,), s, and the smallest distances (K,) of all pairs then, m.
+        """Return times (K,), s, and the smallest distances (K,) over all pairs, m.
 
-        These are ``most`` states at about equal intervals, and the nearest approach.
+        These are ``most`` states at about equal intervals, and the state with the smallest
+        distance.
         """
         rows = np.unique(np.linspace(0, len(self.time) - 1, most).round().astype(int))
         distances, _ = self._nearest_at(rows)

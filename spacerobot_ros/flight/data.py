@@ -1,8 +1,8 @@
 """The data of one flight: arrays over time, reports, measures and verdict.
 
-A bag need not hold everything: parts are optional. A commander judges its goal by the measured
-state, at the moment of its decision. The verdict judges by the true state at the end, with the
-errors of :attr:`FlightData.error`.
+A bag need not contain everything: all components are optional. A commander evaluates its goal with
+the measured state, at the time of its decision. The verdict uses the true state at the end, with
+the errors in :attr:`FlightData.error`.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ _QUANTITY_SIZES = {
     **dict.fromkeys(("twist", "measured_twist", "expected_momenta"), 6),
     **dict.fromkeys(("target_twist", "true_target_twist"), 6),
 }
-"""Numbers per sample by quantity; other quantities have one number per joint."""
+"""Values per sample by quantity; other quantities have one value per joint."""
 
 _TRUE_QUANTITIES = ("pose", "twist", "q", "qdot", "effort", "momentum")
 
@@ -76,7 +76,7 @@ _PARTS: frozenset[Controlled] = frozenset(("position", "attitude", "shape", "end
 
 @dataclass(frozen=True)
 class Verdict:
-    """The outcome of a flight for people, according to its last true state.
+    """The outcome of a flight in words, according to its last true state.
 
     Attributes
     ----------
@@ -86,10 +86,10 @@ class Verdict:
         The message of the commander. If the goal is reached, or not in time, the true errors with
         their tolerances.
     succeeded
-        Whether the true state reaches the goal in all controlled parts, and an automatic capture
-        has happened.
+        Whether the true state reaches all controlled components of the goal, and an automatic
+        capture has happened.
     complete
-        Whether also every part of the goal was controlled.
+        Whether every component of the goal was also controlled.
     """
 
     word: str
@@ -102,48 +102,48 @@ class Verdict:
 class FlightData:
     """The data of a flight, from :func:`spacerobot_ros.fly` or from a bag.
 
-    All arrays are copies; arrays of missing parts have no rows.
+    All arrays are copies; arrays of missing data have no rows.
 
     Attributes
     ----------
     scenario
-        The scenario that was flown.
+        The flown scenario.
     robot
-        The robot of the plant; None if a bag has no description of it.
+        The plant's robot; None if a bag has no robot description.
     joint_names
         The joints, in the order of the columns.
     series
-        All quantities of the plant by name, each with its times (s). The true ones are ``pose``
-        (N, 7), position (m) and quaternion (x, y, z, w) of the base in the world; ``twist`` (N, 6),
+        All plant quantities by name, each with its times (s). The true quantities are ``pose`` (N,
+        7), position (m) and quaternion (x, y, z, w) of the base in the world; ``twist`` (N, 6),
         its velocities in its own frame, m/s and rad/s; ``q``, ``qdot``, ``effort`` (N, n), joint
         positions (m or rad), rates and actuator efforts; ``momentum`` (N, 7), linear (kg m/s) and
-        angular momentum (kg m^2/s) in the world and kinetic energy (J). For the others see
+        angular momentum (kg m^2/s) in the world and kinetic energy (J). For other quantities see
         :attr:`quantities`.
     commands
         The commands by topic.
     statuses
-        Statuses of the commanders, each with the stamp of the state it responds to, ns.
+        Commander statuses, each with the stamp of the corresponding state, ns.
     events
         Events of the nodes.
     outcome, message
-        The outcome of the goal, and a sentence about it.
+        The goal's outcome, and a sentence about it.
     goal, end_effector_goal
-        The goals in force at the end; None: there is none.
+        The active goals at the end; None: there is none.
     goals, end_effector_goals
         All goals that were sent.
     schedules
-        The gaits that were flown, each with the stamp of its beginning, ns; empty for a bag.
+        The flown gaits, each with its start stamp, ns; empty for a bag.
     plant_statuses, diagnostics, covariances
-        Statuses of the plant, diagnostics of plant and commanders, and covariances (72,) of
-        measured pose and twist, each with the time of its first publication, ns. Empty for a bag;
+        Plant statuses, plant and commander diagnostics, and covariances (72,) of measured pose and
+        twist, each with the time of its first publication, ns. Empty for a bag;
         no covariances if sensors have no errors.
     status, gait
         The last status of the deciding commander, and the planner's status when its first gait
-        began.
+        started.
     plan_time, wall_time
-        Wall time of planning, and of the whole flight, s; NaN if unknown.
+        Wall time for planning, and for the whole flight, s; NaN if unknown.
     refusals
-        Commands that were refused: time (s), topic, reason.
+        Rejected commands: time (s), topic, reason.
     measures_clearance
         Whether the distances between links are measured: false if ``plant.clearance_period`` is 0,
         and for bags without the topic ``clearance``.
@@ -196,7 +196,7 @@ class FlightData:
 
     @property
     def twist(self) -> Array:
-        """(N, 6) true velocities of the base in its own frame, m/s and rad/s."""
+        """(N, 6) true base velocities in the base frame, m/s and rad/s."""
         return self.signal("twist").values
 
     @property
@@ -211,7 +211,7 @@ class FlightData:
 
     @property
     def effort(self) -> Array:
-        """(N, n) efforts of the joints' actuators, N or N m."""
+        """(N, n) joint actuator efforts, N or N m."""
         return self.signal("effort").values
 
     @property
@@ -221,7 +221,7 @@ class FlightData:
 
     @property
     def quantities(self) -> dict[str, Array]:
-        """The quantities without their own attribute, (N, size) each.
+        """The quantities without an attribute of their own, (N, size) each.
 
         For names see :class:`~spacerobot_ros.simulation.sensors.ReportedState`: measured states
         (only if sensors have errors), the end-effector, thrusters, expected momenta.
@@ -236,7 +236,7 @@ class FlightData:
         Raises
         ------
         RecordingError
-            The flight has no description of it.
+            The flight has no robot description.
         """
         if self.robot is None:
             raise RecordingError(
@@ -282,8 +282,8 @@ class FlightData:
 
     @cached_property
     def detumbling(self) -> dict[str, float]:
-        """The first detumbling after a capture, with the keys of ``spacerobot run --json``; empty:
-        there was none.
+        """The first detumbling after a capture, with the keys of ``spacerobot run --json``; empty
+        if there was none.
         """
         for event in self.events:
             if event.kind is EventKind.DETUMBLED:
@@ -293,7 +293,7 @@ class FlightData:
 
     @cached_property
     def capture_measures(self) -> CaptureMeasures:
-        """The measures of the capture; all are NaN if there is no target."""
+        """The capture measures; all are NaN without a target."""
         capture, detumbling = self.capture, self.detumbling
         if not capture:
             return CaptureMeasures()
@@ -352,8 +352,7 @@ class FlightData:
 
     @property
     def succeeded(self) -> bool:
-        """Whether the goal was reached, according to the true state and the capture, if there is
-        one."""
+        """Whether the goal was reached, according to the true state and the capture, if any."""
         return self.verdict.succeeded
 
     @property
@@ -373,7 +372,8 @@ class FlightData:
 
     @property
     def manoeuvre_time(self) -> float:
-        """Time flown for the goal, s, see :func:`~spacerobot_ros.measures.flown_time`; if no status
+        """Flight time for the goal, s, see :func:`~spacerobot_ros.measures.flown_time`; if no
+        status
         reports it, the duration of the flight.
         """
         reports = [(stamp_ns / SECOND, status) for stamp_ns, status in self.statuses]
@@ -383,12 +383,12 @@ class FlightData:
 
     @property
     def corrections(self) -> int:
-        """Number of corrections, which are new plans for the same goal."""
+        """Number of corrections (new plans for the same goal)."""
         return self.status.corrections if isinstance(self.status, PlannerStatus) else 0
 
     @property
     def method(self) -> str:
-        """The gait method that was flown, or the control law."""
+        """The gait method or control law used."""
         if self.gait is not None and self.gait.method:
             return self.gait.method
         scenario = self.scenario
@@ -400,8 +400,8 @@ class FlightData:
         return scenario.controller.law
 
     def tolerance(self, part: Literal["position", "attitude", "joint"]) -> float | None:
-        """Return the tolerance for a part of the goal, m or rad; None if a bag has no parameters of
-        the commander.
+        """Return the tolerance for a goal component, m or rad; None if a bag has no commander
+        parameters.
         """
         scenario, name = self.scenario, f"{part}_tolerance"
         node = "planner" if "planner" in scenario.commanders else "coordinated_control"
@@ -413,7 +413,7 @@ class FlightData:
 
     @cached_property
     def not_controlled(self) -> tuple[Controlled, ...]:
-        """Parts of the goal (base pose and shape) that the method or the law does not control."""
+        """Goal components (base pose and shape) that the method or the law does not control."""
         if self.goal is None:
             return ()
         match self.status:
@@ -433,7 +433,7 @@ class FlightData:
 
     @property
     def turns_end_effector(self) -> bool:
-        """Whether a controller controls the attitude of the end-effector."""
+        """Whether a controller controls the end-effector attitude."""
         command = self.status.command if isinstance(self.status, ControllerStatus) else None
         return command is not None and "attitude" in command.controls("end_effector")
 
@@ -445,15 +445,14 @@ class FlightData:
 
     @property
     def error(self) -> PoseError | None:
-        """Error of the last true pose relative to the goal; None without a pose or a goal of the
-        base."""
+        """Error of the last true pose relative to the goal; None without a base pose or goal."""
         goal = self.goal
         return None if goal is None or not goal.base else pose_error(self.signal("pose"), goal)
 
     @property
     def errors(self) -> Array:
-        """(N, 2) distances (m) and angles (rad) of the true poses from the final goal; no rows if
-        there is no goal of the base.
+        """(N, 2) distances (m) and angles (rad) of the true poses from the final goal; no rows
+        without a base goal.
         """
         if self.goal is None or not self.goal.base:
             return np.empty((0, 2))
@@ -467,7 +466,7 @@ class FlightData:
         """Error of the end-effector's last pose relative to its goal; None without a pose or a
         goal.
 
-        If there are several, the one with the largest distance is used.
+        If there are several end-effectors, the one with the largest distance is used.
         """
         if errors := self.end_effector_errors:
             return max(errors.values(), key=lambda error: error.distance)
@@ -475,7 +474,7 @@ class FlightData:
 
     @property
     def end_effector_errors(self) -> dict[str, PoseError]:
-        """Errors of the last true poses of the end-effectors in the planner's goal."""
+        """Errors in the last true poses of the end-effectors in the planner's goal."""
         goal, robot = self.goal, self.robot
         if goal is None or not goal.end_effectors or not len(self.q) or not len(self.pose):
             return {}
@@ -496,7 +495,8 @@ class FlightData:
 
     @property
     def planned_propellant(self) -> float | None:
-        """Propellant that the last planned reference takes, kg; None without one of thrusters."""
+        """Propellant used by the last planned reference, kg; None without such a reference for
+        thrusters."""
         key = "planned_propellant_kg"
         found = [event.about[key] for event in self.events if key in event.about]
         return float(found[-1]) if found else None
@@ -509,8 +509,8 @@ class FlightData:
 
     @cached_property
     def clearance(self) -> FlightClearance | None:
-        """The smallest distance between links over time; None if it is not measured, there are no
-        joint states, or no links could touch.
+        """The smallest distance between links over time; None if not measured, without joint
+        states, or if no links could touch.
         """
         if self.robot is None or not self.measures_clearance:
             return None
@@ -629,7 +629,7 @@ class FlightData:
             errors += f", within tolerance for less than the settling time of {settling}"
         if reached and not within and "measured_pose" in self.series:
             sentence = (
-                f"The measured pose is within tolerance of the goal; the true one is {errors}."
+                f"The measured pose is within tolerance of the goal; the true pose is {errors}."
             )
             return Verdict("Reached by the measured pose", sentence)
         controlled = frozenset(controls)

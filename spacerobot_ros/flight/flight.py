@@ -119,13 +119,13 @@ class Flight(FlightData):
     # -- views and files ----------------------------------------------------------------------
 
     def to_pandas(self, *, euler: bool = False) -> pd.DataFrame:
-        """Return a table with a row for each state, indexed by time (s).
+        """Return a table with one row per state, indexed by time (s).
 
-        Columns and their units, ``attrs["units"]``, are as in the tables of bags. Columns of
+        Columns and their units, ``attrs["units"]``, are as in bag tables. Columns of
         ``odom`` and ``joint_states`` have the true state; other columns have their topic as a
-        prefix, such as ``momentum.data[linear_x]``. Measured states that differ from the true ones
-        have the prefix ``measured``. If ``euler`` is set, the columns ``roll``, ``pitch`` and
-        ``yaw`` have the rotations of each attitude about the fixed axes x, y, z (rad).
+        prefix, such as ``momentum.data[linear_x]``. Measured states that differ from the true
+        states have the prefix ``measured``. If ``euler`` is set, the columns ``roll``, ``pitch``
+        and ``yaw`` contain each attitude's rotations about the fixed axes x, y, z (rad).
 
         Raises
         ------
@@ -165,7 +165,7 @@ class Flight(FlightData):
         }
 
     def plot(self) -> Any:
-        """Return a matplotlib figure: pose of the base and its goal, joints, efforts or rates."""
+        """Return a matplotlib figure: base pose and goal, joints, efforts or rates."""
         from spacerobot_ros.flight.views import figure
 
         return figure(self)
@@ -176,16 +176,16 @@ class Flight(FlightData):
         Parameters
         ----------
         seconds
-            Wall time of the animation.
+            Duration of the animation.
         frames
             Number of pictures, at most 1000.
 
         Raises
         ------
         ParameterError
-            A number is out of range.
+            A value is out of range.
         SpaceRobotError
-            The flight has no description of its robot.
+            The flight has no robot description.
         """
         from spacerobot_ros.flight.views import animation
 
@@ -198,7 +198,7 @@ class Flight(FlightData):
         ------
         RecordingError
             The file exists and may not be replaced, or cannot be written; or the flight has no
-            description of its robot.
+            robot description.
         """
         from spacerobot_ros.flight.saved import save_flight
 

@@ -1,17 +1,17 @@
-"""A flight in lockstep without ROS: the plant and its commanders, in the order of their nodes.
+"""A lockstep flight without ROS: the plant and its commanders, in the order of the nodes.
 
-Nodes in lockstep pass messages to each other in the order of publication. The
+Nodes in lockstep exchange messages in publication order. The
 loop makes the same calls in the same order:
 
 1. The plant reports the state of tick k.
-2. The planner responds as soon as the joint state arrives, the controller once the pose arrives,
-   too, and the planner's reference, if there is one.
-3. The first command of the tick is used; the plant steps when it has every command it waits for.
-4. The flight ends with the decision about the goal. The planner reports it before its command, so
-   the last state is that of tick k; the controller after its commands, so it is that of tick k + 1.
+2. The planner responds as soon as the joint state arrives, the controller once the pose and the
+   planner's reference, if any, have also arrived.
+3. The first command of the tick is used; the plant steps when all expected commands have arrived.
+4. The flight ends when the goal ends. The planner reports this before its command, so the last
+   state is from tick k; the controller after its commands, so the last state is from tick k + 1.
 
-Planner and controller are the same :class:`~spacerobot_ros.commanding.commander.Commander` objects
-as in the nodes, given arrays instead of messages.
+The planner and the controller are the same :class:`~spacerobot_ros.commanding.commander.Commander`
+objects as in the nodes, given arrays instead of messages.
 """
 
 from __future__ import annotations
@@ -71,15 +71,15 @@ _TICKS_PER_CLOCK_READ = 64
 
 @dataclass(frozen=True)
 class Robots:
-    """The models of a flight: the plant's model, and the models that its commanders assume."""
+    """The models in a flight: the plant's model, and the models assumed by its commanders."""
 
     plant: SpaceRobot
     planner: SpaceRobot
     controller: SpaceRobot
     description: RobotDescription | None = None
-    """Description of the plant, with the URDF to record; None: the description in its model."""
+    """Description of the plant, with the URDF to record; None: the model's own description."""
     method: GaitMethod | None = None
-    """Gait method for the planner's robot and configuration; None: it is built for this flight."""
+    """Gait method for the planner's robot and configuration; None: built for this flight."""
 
     @classmethod
     def of(
@@ -89,19 +89,19 @@ class Robots:
             config
         ),
     ) -> Robots:
-        """Build the models that a scenario names; a commander without one uses the plant's URDF.
+        """Build the models named in a scenario; a commander without a model uses the plant's URDF.
 
-        ``built`` returns the robot of a node's configuration; None if it names none.
+        ``built`` returns the robot for a node's configuration; None if not configured.
 
         Raises
         ------
         ParameterError
-            The plant has no robot, or one is refused.
+            The plant has no robot, or a robot is invalid.
         """
         plant = built("plant", scenario.plant)
         if plant is None:
             raise ParameterError(
-                f"The scenario '{scenario.name}' names no robot for its plant: set plant.robot."
+                f"The scenario '{scenario.name}' has no robot for its plant: set plant.robot."
             )
         robots = {"plant": plant, "planner": plant, "controller": plant}
         for name, node in (("planner", "planner"), ("controller", "coordinated_control")):
@@ -113,12 +113,13 @@ class Robots:
 
 
 def require_flyable(scenario: Scenario) -> None:
-    """Refuse a scenario that only nodes can fly: wall time, other processes, resumed flights.
+    """Raise an error for a scenario that requires nodes: wall time, other processes, resumed
+    flights.
 
     Raises
     ------
     ParameterError
-        Only nodes can fly the scenario; the message says how.
+        The scenario requires nodes; the message gives the command.
     """
     why = ""
     if not scenario.lockstep:
@@ -132,7 +133,7 @@ def require_flyable(scenario: Scenario) -> None:
     elif "planner" in scenario.commanders and scenario.planner.output == "trajectory":
         why = "planner.output is trajectory"
     elif len(scenario.commanders) > 1 and scenario.planner.output == "commands":
-        why = "planner and controller both command the joints"
+        why = "the planner and the controller both command the joints"
     if why:
         realtime = " --realtime" if scenario.kills and scenario.lockstep else ""
         raise ParameterError(
@@ -155,18 +156,18 @@ def fly_scenario(
     scenario
         What to fly, in lockstep.
     robots
-        The models; None: the models that the scenario names.
+        The models; None: the models named in the scenario.
     progress
-        Called with the progress of the flight; it may end it.
+        Called with the flight's progress; may end the flight.
     longest
         Simulated time after which the flight is interrupted, s.
 
     Raises
     ------
     ParameterError
-        A parameter or the robot is refused, or only nodes can fly this scenario.
+        A parameter or the robot is invalid, or the scenario requires nodes.
     GoalError
-        The joint positions of the goal belong to another robot.
+        The goal's joint positions belong to another robot.
     """
     require_flyable(scenario)
     flight = LockstepFlight(scenario, robots or Robots.of(scenario))
@@ -224,9 +225,9 @@ class LockstepFlight:
     Raises
     ------
     ParameterError
-        A parameter or the robot is refused.
+        A parameter or the robot is invalid.
     GoalError
-        The joint positions of the goal belong to another robot.
+        The goal's joint positions belong to another robot.
     """
 
     def __init__(self, scenario: Scenario, robots: Robots) -> None:
@@ -288,7 +289,7 @@ class LockstepFlight:
         progress: Progress = lambda now, end: False,
         longest: float = math.inf,
     ) -> Flight:
-        """Fly until the goal is decided; for parameters see :func:`fly_scenario`."""
+        """Fly until the goal has ended; for parameters see :func:`fly_scenario`."""
         began = time.perf_counter()
         interrupted = self._fly(progress, longest)
         return self.until_now(time.perf_counter() - began, interrupted)
@@ -322,7 +323,7 @@ class LockstepFlight:
             if self._decided is _DecisionState.BEFORE_COMMAND:
                 return ""
             if not self._commands.complete and not self._reported.sensors.dropout:
-                return f"There is no command for the state of {self.time:g} s."
+                return f"There is no command for the state at {self.time:g} s."
             ends = self._decided is not None
             if not self._step():
                 return ""
@@ -347,7 +348,7 @@ class LockstepFlight:
 
     @property
     def has_planner(self) -> bool:
-        """Whether there is a planner, whose reference a controller tracks."""
+        """Whether there is a planner whose reference a controller tracks."""
         return self._planner is not None
 
     @property
@@ -519,7 +520,7 @@ class LockstepFlight:
                 )
 
     def take_status(self, status: Status) -> None:
-        """Follow the status like the client of a mission."""
+        """Track the status like a mission client."""
         self.log.statuses.append((self._now_ns, status))
         name = "planner" if isinstance(status, PlannerStatus) else "coordinated_control"
         self._statuses[name] = StatusRecord(
@@ -534,12 +535,12 @@ class LockstepFlight:
             self._decided = self._moment
 
     def take_event(self, node: str, event: Event) -> None:
-        """Store an event of a commander; its time is the current one unless it has one."""
+        """Store a commander event; its time defaults to the current time."""
         time = self.time if event.time_s is None else event.time_s
         self.log.events.append(replace(event, time_s=time, node=node))
 
     def until_now(self, wall_time: float, interrupted: str = "") -> Flight:
-        """Return the flight so far; ``interrupted`` says why it ended early, if it did."""
+        """Return the flight so far; ``interrupted`` gives the reason for an early end, if any."""
         decision = None if self._interrupted else self._follower.decision
         outcome = Outcome.INTERRUPTED if decision is None else Outcome(decision.state.value)
         message = interrupted

@@ -32,7 +32,7 @@ class FlightLog:
     Parameters
     ----------
     plant, reported, commands
-        The plant, the quantities that it reports, and its commands.
+        The plant, its reported quantities, and its commands.
     period_ns
         Duration of a tick, ns.
     """
@@ -97,7 +97,7 @@ class FlightLog:
     def add_command(
         self, topic: str, tick: int, values: Array, setpoint: tuple[Array, Array] | None = None
     ) -> None:
-        """Add a command; commands of a planner include its setpoint, joint positions and rates."""
+        """Add a command; planner commands include the setpoint, joint positions and rates."""
         if topic not in self._commands:
             self._commands[topic] = array("q"), _GrowingTable(len(values))
         ticks, rows = self._commands[topic]
@@ -178,5 +178,5 @@ class _GrowingTable:
         return self._table[self._count - 1]
 
     def table(self) -> Array:
-        """Return all rows so far, not copied."""
+        """Return all rows so far, without copying."""
         return self._table[: self._count]

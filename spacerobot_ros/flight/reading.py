@@ -1,7 +1,7 @@
-"""Reads a flight from its bag; parts that are not in the bag stay empty.
+"""Reads a flight from its bag; data not in the bag stay empty.
 
-:func:`read_flight` reads bags of any stack; :func:`read_run` reads complete bags of ``spacerobot
-run``.
+:func:`read_flight` reads bags from any stack; :func:`read_run` reads complete bags recorded by
+``spacerobot run``.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ from spacerobot_ros.times import SECOND
 from spacerobot_ros.topics import TOPICS, StateField, Topic, goal_topic, path_topic, topic_named
 
 _SAME_CLOCK_TOLERANCE = 1.0
-"""Stamps that differ less from the log times, in s, come from the same clock."""
+"""If stamps differ by less from the log times, s, both come from the same clock."""
 
 _COMMAND_TOPICS = ("joint_commands", "base_wrench", "joint_reference")
 
@@ -52,7 +52,7 @@ _QUANTITY_TOPICS = (
     *("momentum", "end_effector_pose", "momentum_expected"),
     *("base_wrench_realised", "thrusters", "target/odom", "target/odom_true"),
 )
-"""Topics whose fields are quantities of a flight, except those with true and measured variants."""
+"""Topics whose fields are flight quantities, except those with true and measured variants."""
 
 _FLIGHT_TOPICS = (
     *("odom", "odom_true", "joint_states", "joint_states_true"),
@@ -61,20 +61,20 @@ _FLIGHT_TOPICS = (
     *(topic for topic, _ in STATUS_TOPICS.values()),
     *("events", "clearance"),
 )
-"""Topics that are read for every flight, together: one pass unpacks the bag only once."""
+"""Topics read together for every flight, so that the bag is unpacked only once."""
 
 _NO_GOAL = Goal.checked([0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0])
-"""Goal of the base if a bag has none, or leaves it free."""
+"""Base goal if a bag has none, or leaves the base free."""
 
 _ABSENT_MEANS_ZERO = (("planner", "clearance"), ("plant", "clearance_period"))
-"""Parameters that are missing in bags of earlier versions, by node: they were not in effect."""
+"""Parameters missing from bags of earlier versions, by node: they were not in effect."""
 
 WRENCH_COLUMNS = TOPICS["base_wrench_realised"].state[0].columns
 """Paths of force and torque in a wrench message."""
 
 
 class FlightBag(RecordedRobot):
-    """The topics of one robot in a bag as signals over time.
+    """One robot's topics in a bag as signals over time.
 
     Times are stamps (s), or log times if stamps come from another clock.
 
@@ -109,8 +109,8 @@ class FlightBag(RecordedRobot):
 
     @property
     def description(self) -> RobotDescription | None:
-        """The first readable description of the robot, with the obstacles received last; None if
-        there is none.
+        """The first readable robot description, with the last received obstacles; None if there is
+        none.
         """
         for text in self.bag.robot_descriptions(self.namespace):
             try:
@@ -123,8 +123,8 @@ class FlightBag(RecordedRobot):
 
     @cached_property
     def obstacles(self) -> list[tuple[int, RobotDescription | None]]:
-        """The messages on the topic obstacles, with their log times, ns; None: no obstacles. Texts
-        that nodes refuse are omitted.
+        """The messages on the topic obstacles, with their log times, ns; None: no obstacles.
+        Messages that nodes reject are omitted.
         """
         came = []
         for time_ns, message in self.messages("obstacles"):
@@ -141,15 +141,15 @@ class FlightBag(RecordedRobot):
     # -- signals ------------------------------------------------------------------------------
 
     def signal(self, name: str, fields: Sequence[str], width: int) -> Signal:
-        """Return fields of a topic over time, without messages that lack a field.
+        """Return fields of a topic over time, omitting messages that lack a field.
 
         Parameters
         ----------
         name
             The topic.
         fields
-            Paths of numbers, or of one array; joints and thrusters are ordered by their names in
-            the first message.
+            Paths of numbers, or of one array; joints and thrusters are in the order of the first
+            message.
         width
             Number of columns.
         """
@@ -167,15 +167,14 @@ class FlightBag(RecordedRobot):
         return Signal(time[order], values[order])
 
     def quantity(self, name: str, field: StateField) -> Signal:
-        """Return the numbers of a field of a state topic over time."""
+        """Return the values of a state topic's field over time."""
         width = len(field.members) or len(field.array_entry_names) or len(self.names(name))
         return self.signal(name, field.columns, width)
 
     def true_signal(self, name: str, number: int) -> Signal:
         """Return the true values of a field of ``odom`` or ``joint_states``.
 
-        They are on ``<name>_true`` while the sensors have errors, and on ``name`` before and after
-        that.
+        They are on ``<name>_true`` while sensors have errors, and on ``name`` otherwise.
         """
         measured = self.quantity(name, TOPICS[name].state[number])
         true = self.quantity(f"{name}_true", TOPICS[f"{name}_true"].state[number])
@@ -197,7 +196,7 @@ class FlightBag(RecordedRobot):
         return self.quantity(name, TOPICS[name].state[number]).between(began, ended)
 
     def series(self) -> dict[str, Signal]:
-        """Return all quantities of :attr:`Flight.series` that the bag has."""
+        """Return all quantities in :attr:`Flight.series` that the bag contains."""
         found: dict[str, Signal] = {}
         erring = "odom_true" in self
         for name, quantities in {
@@ -227,9 +226,9 @@ class FlightBag(RecordedRobot):
     # -- reports ------------------------------------------------------------------------------
 
     def statuses(self, commander: str) -> Iterator[tuple[int, Status | str]]:
-        """Yield the statuses of a commander with their log times, ns.
+        """Yield a commander's statuses with their log times, ns.
 
-        For a status of another package, only the message is returned.
+        For a status from another package, only the message is returned.
         """
         topic, read = STATUS_TOPICS[commander]
         for time_ns, recorded in self.messages(topic):
@@ -250,7 +249,7 @@ class FlightBag(RecordedRobot):
             yield time_ns, message.name, event
 
     def goals(self, topic: str) -> tuple[SentGoal, ...]:
-        """Return valid goal poses, and last poses of paths, in the frame of the odometry."""
+        """Return valid goal poses, and the last poses of paths, in the odometry frame."""
         odom = next(self.messages("odom"), None)
         world = odom[1].header.frame_id if odom is not None else ""
         goals, ids = [], GoalIds()
@@ -356,7 +355,7 @@ def namespaces(bag: Bag) -> list[str]:
 
 
 def read_flight(bag: FlightBag) -> Flight:
-    """Return a flight with all parts that its bag holds.
+    """Return a flight with all data in its bag.
 
     Raises
     ------
@@ -410,29 +409,31 @@ def read_flight(bag: FlightBag) -> Flight:
 
 
 def require_states(bag: FlightBag, flight: Flight) -> None:
-    """Refuse a bag without poses, joint states or momenta.
+    """Raise an error for a bag without poses, joint states or momenta.
 
     Raises
     ------
     RecordingError
-        It lacks one of them.
+        One of them is missing.
     """
     for topic, quantity in (("odom", "pose"), ("joint_states", "q"), ("momentum", "momentum")):
         if not len(flight.signal(quantity)):
-            raise RecordingError(f"The bag {bag.path} holds no state: nothing is on /{topic}.")
+            raise RecordingError(
+                f"The bag {bag.path} contains no states: there are no messages on /{topic}."
+            )
 
 
 def with_propellant(flight: Flight, thrusters: str, names: Sequence[str]) -> Flight:
-    """Return a flight with the quantity ``propellant`` (N, 1), kg, summed over its thrusts.
+    """Return a flight with the quantity ``propellant`` (N, 1), kg, integrated over its thrusts.
 
     Parameters
     ----------
     flight
-        A flight; it is returned unchanged if it has no thrusters, or has that quantity.
+        A flight; returned unchanged if it has no thrusters, or already has that quantity.
     thrusters
-        Source of their table, as in the plant's parameters.
+        Source of the thruster table, as in the plant's parameters.
     names
-        Names of the thrusters in the flight; if they differ from the table, there is no propellant.
+        Thruster names in the flight; if they differ from the table, propellant is not computed.
     """
     robot, series = flight.robot, flight.series
     if robot is None or "thruster_force" not in series or "propellant" in series:
@@ -470,7 +471,7 @@ def since(flight: Flight, start: float) -> Flight:
 
 
 def impulse(thrust: Signal, weights: Array) -> Signal:
-    """Return the integral over time (N, 1) of thrusts (N, m), N, weighted by (m,)."""
+    """Return the time integral (N, 1) of thrusts (N, m), N, weighted by (m,)."""
     ticks = np.diff(thrust.time, prepend=thrust.time[:1])
     total = np.cumsum(ticks * (thrust.values @ weights))
     return Signal(thrust.time, total[:, np.newaxis])
@@ -539,10 +540,10 @@ def _scenario_in_bag(bag: FlightBag) -> Scenario:
 
 
 def recorded_actuation(robot: RecordedRobot) -> str:
-    """Return the quantity in the commands of a robot in a bag: ``velocity``, ``effort``, or
+    """Return the commanded quantity for a robot in a bag: ``velocity``, ``effort``, or
     nothing.
 
-    The plant's status reports it. In bags without a status, wrenches imply efforts.
+    It is read from the plant's status. In bags without a plant status, wrenches imply efforts.
     """
     series = robot.get("plant/status")
     for _, message in reversed(list(series.messages() if series is not None else ())):
@@ -564,7 +565,7 @@ def _recorded_values(kind: type[Any], texts: Mapping[str, str]) -> dict[str, Any
 
 
 def recorded_target(robot: RecordedRobot) -> str:
-    """Return the URDF text of a robot's target in a bag; empty: there is none."""
+    """Return the URDF of a robot's target in a bag; empty without a target."""
     series = robot.get("target/robot_description")
     return "" if series is None else str(next(series.messages())[1].data)
 
@@ -581,7 +582,7 @@ def _parse_json(text: str) -> Any:
 
 
 def recorded_scenario(bag: Bag) -> Scenario:
-    """Return the scenario of a flight: parameters, goals and robot from its bag.
+    """Return a flight's scenario: parameters, goals and robot from its bag.
 
     Raises
     ------
@@ -591,8 +592,8 @@ def recorded_scenario(bag: Bag) -> Scenario:
     scenario = _scenario_in_bag(FlightBag(bag))
     if not scenario.has_goal or "plant" not in scenario.in_file:
         raise RecordingError(
-            f"The bag {bag.path} lacks the goal or the parameters of its flight, which bags of "
-            "'spacerobot run' hold."
+            f"The bag {bag.path} lacks the goal or the parameters of its flight, which bags "
+            f"recorded by 'spacerobot run' contain."
         )
     return scenario
 
@@ -615,21 +616,20 @@ def _sent_goal(about: Mapping[str, str], name: str) -> Goal | None:
 
 
 def read_run(path: str | os.PathLike[str]) -> Flight:
-    """Return the flight in a bag of ``spacerobot run``, with the same arrays as a flight without
-    ROS.
+    """Return the flight in a ``spacerobot run`` bag, with the same arrays as a flight without ROS.
 
     Raises
     ------
     RecordingError
-        There is no such bag, it is damaged, or it holds no complete flight in lockstep.
+        There is no such bag, it is damaged, or it does not contain a complete lockstep flight.
     SpaceRobotError
-        Its robot is refused.
+        Its robot is invalid.
     """
     bag = open_flight_bag(path)
     scenario = recorded_scenario(bag.bag)
     urdf = bag.urdf
     if urdf is None:
-        raise RecordingError(f"The bag {bag.path} holds no description of its robot.")
+        raise RecordingError(f"The bag {bag.path} contains no robot description.")
     robot = scenario.plant.assumed_robot(parse_robot(urdf.decode(errors="replace")))
     flight = replace(
         read_flight(bag),
@@ -641,9 +641,9 @@ def read_run(path: str | os.PathLike[str]) -> Flight:
     flight = replace(flight, goal=scenario.goal.kept_at(*np.split(flight.pose[0], [3])))
     if len(flight.pose) != len(flight.q):
         raise RecordingError(
-            f"The bag {bag.path} has {len(flight.pose)} poses of the base and {len(flight.q)} "
-            "states of the joints: its flight is incomplete."
+            f"The bag {bag.path} has {len(flight.pose)} base poses and {len(flight.q)} "
+            "joint states: its flight is incomplete."
         )
     if not flight.goals and not scenario.goal.end_effectors:
-        raise RecordingError(f"The bag {bag.path} holds no goal pose.")
+        raise RecordingError(f"The bag {bag.path} contains no goal pose.")
     return with_propellant(flight, scenario.plant.thrusters, bag.names("thrusters"))

@@ -1,6 +1,6 @@
-"""A flight as a bag, as the nodes would have published it, and as a table.
+"""A flight as a bag, as if published by the nodes, and as a table.
 
-A table has the same columns and units as the tables of the bag.
+A table has the same columns and units as the bag's tables.
 """
 
 from __future__ import annotations
@@ -56,17 +56,17 @@ from spacerobot_ros.topics import (
 from spacerobot_ros.version import __version__
 
 _GOAL_STAMP_NS = 1
-"""Stamp of the goals of a mission at time zero, ns."""
+"""Stamp of mission goals at time zero, ns."""
 
 
 _BLOCK_NS = 60 * SECOND
-"""Time span of messages made at once, ns: a whole long flight would fill the memory."""
+"""Time span of messages created at once, ns: a whole long flight would fill the memory."""
 
 _CHUNK_SIZE = 262_144
 """Chunk size before compression, bytes: larger chunks have lower fixed costs, but slow seeking."""
 
 _PUBLISHED_QOS = QosProfile(depth=100)
-"""QoS that the nodes offer on topics that are not latched."""
+"""QoS offered by the nodes on topics that are not latched."""
 
 
 @dataclass(frozen=True)
@@ -312,7 +312,7 @@ def _marker_maker(
 
 
 def topic_quantities(flight: FlightData) -> dict[str, Array]:
-    """Return all quantities by the names of the table of topics."""
+    """Return all quantities by their names in the topic table."""
     true = {"pose": flight.pose, "twist": flight.twist, "q": flight.q, "qdot": flight.qdot}
     found = {**flight.quantities, "effort": flight.effort, "momentum": flight.momentum}
     erred = "measured_pose" in flight.quantities
@@ -432,19 +432,19 @@ def _status_fields(status: Status) -> tuple[int, str, dict[str, str]]:
 
 
 _MEASURED_STATE_TOPICS = ("odom", "joint_states")
-"""Topics of a measured state; topics of the true state have the suffix ``_true``."""
+"""Topics of the measured state; topics of the true state have the suffix ``_true``."""
 
 _UNITS = {"propellant": "kg"}
-"""Units of quantities that are in no topic."""
+"""Units of quantities that are not in a topic."""
 
 
 def table_of_flight(flight: FlightData, *, euler: bool = False) -> TopicTable:
-    """Return a row for each state: the true state by the columns of ``odom`` and ``joint_states``.
+    """Return one row per state: the true state in the columns of ``odom`` and ``joint_states``.
 
     Columns of other topics have the topic as a prefix, such as ``momentum.data[linear_x]``. If
     sensors have errors, columns of the measured state have the prefix ``measured``.
 
-    ``euler``: whether to add ``roll``, ``pitch`` and ``yaw`` of attitudes.
+    ``euler``: whether to add ``roll``, ``pitch`` and ``yaw`` for attitudes.
     """
     quantities, seen = topic_quantities(flight), set(flight.quantities)
     truth: list[Field] = []

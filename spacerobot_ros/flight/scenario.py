@@ -1,4 +1,4 @@
-"""Earlier place of :mod:`spacerobot_ros.scenario`; deprecated after version 0.2."""
+"""Earlier location of :mod:`spacerobot_ros.scenario`; deprecated after version 0.2."""
 
 from spacerobot_ros.scenario import (
     COMMANDERS,

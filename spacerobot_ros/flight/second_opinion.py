@@ -1,8 +1,7 @@
-"""Comparison of a recorded flight with another engine that flies the same commands.
+"""Comparison of a recorded flight with another engine under the same commands.
 
-In each tick, the engine gets the external loads and the joint rates, or efforts and wrench, that
-the plant's actuators have realised after limits and faults; its states are compared with those in
-the bag.
+In each tick, the engine receives the external loads and the joint rates, or efforts and wrench,
+realised by the plant's actuators after limits and faults; its states are compared with the bag.
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ from spacerobot_ros.simulation.mujoco_plant import DEFAULT_INTEGRATION_STEP, Muj
 from spacerobot_ros.simulation.plant import Plant, WrappedPlant
 
 AGREEMENT_TOLERANCE = 1e-8
-"""Largest deviation, m or rad, of an engine that agrees with a flight."""
+"""Maximum deviation of an engine from a flight in agreement, m or rad."""
 
 
 @dataclass(frozen=True)
@@ -35,16 +34,15 @@ class EngineComparison:
     engine
         Name and version of the engine.
     integrator
-        Its integrator, with the longest step.
+        The engine's integrator, with its maximum step.
     ticks
-        Number of ticks that were compared.
+        Number of compared ticks.
     position, attitude, joints
-        Largest differences of the base's position, m, and attitude, rad, and of joint positions, m
-        or rad.
+        Largest differences in base position, m, base attitude, rad, and joint positions, m or rad.
     time
         Simulated time of the largest difference, s.
     stop_reason
-        Reason why the engine stopped early; empty: it flew to the end.
+        Reason why the engine stopped early; empty: the replay was completed.
     """
 
     engine: str
@@ -68,14 +66,14 @@ class EngineFlight:
     Parameters
     ----------
     plant
-        The plant at its first state.
+        The plant in its first state.
     period
         Duration of a tick, s.
 
     Raises
     ------
     SpaceRobotError
-        MuJoCo is not installed, or refuses the robot.
+        MuJoCo is not installed, or does not support the robot.
     """
 
     def __init__(self, plant: PlantWithFaults, period: float) -> None:
@@ -96,7 +94,7 @@ class EngineFlight:
         self._until = ""
 
     def fly_next_tick(self) -> None:
-        """Fly the tick that the plant has just flown."""
+        """Simulate the tick that the plant has just completed."""
         if self._until:
             return
         plant, loads = self._effort_plant, self._plant.loads
@@ -126,7 +124,7 @@ class EngineFlight:
     def comparison(
         self, ticks: npt.NDArray[np.int64], poses: Array, shapes: Array
     ) -> EngineComparison:
-        """Return the differences to the states in a bag.
+        """Return the differences from the states in a bag.
 
         Parameters
         ----------

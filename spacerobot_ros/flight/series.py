@@ -1,4 +1,4 @@
-"""Parts of a flight: quantities over time, commands, and the goals that were sent."""
+"""Flight data: quantities over time, commands, and sent goals."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from spacerobot_ros.planning.core.goal import EndEffectorGoal
 from spacerobot_ros.planning.execution.status import PlannerStatus
 
 _FLOWN_STATES = frozenset(("executing", "reached", "reached_partly", "failed", "aborted"))
-"""States of a status whose goal the robot flies to, or has flown to."""
+"""Status states whose goal is being or has been pursued."""
 
 
 @dataclass(frozen=True)
@@ -36,16 +36,16 @@ class Signal:
 
     @property
     def width(self) -> int:
-        """Number of values in a sample."""
+        """Number of values per sample."""
         return int(self.values.shape[1])
 
     def between(self, start: float, end: float) -> Signal:
-        """Return the samples from ``start`` to ``end``, both included."""
+        """Return the samples from ``start`` to ``end``, inclusive."""
         first, last = np.searchsorted(self.time, [start - 1e-9, end + 1e-9])
         return Signal(self.time[first:last], self.values[first:last])
 
     def norms(self, columns: Sequence[int]) -> Signal:
-        """Return the norms (N, 1) of some columns."""
+        """Return the norms (N, 1) of selected columns."""
         return Signal(self.time, np.linalg.norm(self.values[:, columns], axis=1, keepdims=True))
 
     def relative_to_first(self) -> Signal:
@@ -60,9 +60,9 @@ class Commands:
     Attributes
     ----------
     tick
-        (N,) tick of the state that each responds to.
+        (N,) tick of the state to which each command responds.
     values
-        (N, size) numbers that the plant or the controller uses.
+        (N, size) values used by the plant or the controller.
     setpoints
         (N, 2 n) joint positions and rates in a planner's messages; None: not known.
     """
@@ -74,7 +74,7 @@ class Commands:
 
 @dataclass(frozen=True)
 class SentGoal:
-    """A goal pose that was sent at ``time`` (s), and the id under which statuses report on it."""
+    """A goal pose sent at ``time`` (s), and its id in statuses."""
 
     time: float
     goal: Goal
@@ -89,7 +89,7 @@ def pose_error(poses: Signal, goal: Goal | None) -> PoseError | None:
 
 
 def reported_goal(status: Status, goals: Sequence[SentGoal]) -> Goal | None:
-    """Return the goal of a status: the base goal as sent, and the goals of links.
+    """Return the goal in a status: the base goal as sent, and the link goals.
 
     None for a status without a goal.
     """
@@ -123,7 +123,7 @@ def _reported_base_goal(status: Status, goals: Sequence[SentGoal]) -> Goal | Non
 
 
 def goal_at_end(statuses: Iterable[Status], goals: Sequence[SentGoal]) -> Goal | None:
-    """Return the last goal that was flown to, else the last one that was sent or reported."""
+    """Return the last pursued goal, or else the last goal that was sent or reported."""
     reported = [(each, reported_goal(each, goals)) for each in statuses]
     for status, goal in reversed(reported):
         if status.state.value in _FLOWN_STATES and goal is not None:

@@ -1,4 +1,4 @@
-"""Plans evaluated in the plant without ROS: for one goal by all methods, or for random goals."""
+"""Plans evaluated in the plant without ROS: for one goal with all methods, or for random goals."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class PlanningProblem:
     goal
         The goal.
     config
-        Parameters of the planner: control period, tolerance, options of the methods.
+        Planner parameters: control period, tolerance, method options.
     """
 
     name: str
@@ -62,19 +62,19 @@ class PlanningProblem:
 
     @classmethod
     def of(cls, scenario: Scenario) -> PlanningProblem:
-        """Return the planning problem of a scenario, for the goal of its base.
+        """Return a scenario's planning problem, for its base goal.
 
         Raises
         ------
         ParameterError
-            The scenario names no robot, or a parameter is refused.
+            The scenario has no robot, or a parameter is invalid.
         GoalError
-            The joint positions of the goal belong to another robot.
+            The goal's joint positions belong to another robot.
         """
         plant, planner = scenario.plant, scenario.planner
         name = planner.robot or plant.robot
         if not name:
-            raise ParameterError(f"The scenario '{scenario.name}' names no robot; see plant.robot.")
+            raise ParameterError(f"The scenario '{scenario.name}' has no robot; see plant.robot.")
         described = planner.described(plant.described(load_robot(robot_file(name))))
         robot = SpaceRobot(described)
         scenario.require_shape_of(robot)
@@ -106,7 +106,7 @@ class PlanningProblem:
 
 @dataclass(frozen=True)
 class PlanEvaluation:
-    """The plan of a method for a problem, and the result of its flight in the plant.
+    """A method's plan for a problem, and its flight result in the plant.
 
     Attributes
     ----------
@@ -115,17 +115,17 @@ class PlanEvaluation:
     pieces
         Successive schedules; only one, unless the method plans in stages.
     error
-        Final error of ``pose`` and joints.
+        Final error in ``pose`` and joints.
     pose
-        (7,) final pose of the base in W: position (m) and quaternion.
+        (7,) final base pose in W: position (m) and quaternion.
     limited
         Number of ticks in which the plant limited a joint.
     plan_time
-        Wall time of planning, s.
+        Planning wall time, s.
     reached
         Whether the goal was reached within the planner's tolerance.
     controls
-        The parts of the goal that the schedules control.
+        The goal components that the schedules control.
     """
 
     method: str
@@ -150,7 +150,7 @@ class PlanEvaluation:
 
     @property
     def path(self) -> BasePath:
-        """The predicted path of the base, with times from the start of the first schedule."""
+        """The predicted base path, with times from the start of the first schedule."""
         paths = [piece.path for piece in self.pieces]
         starts = np.cumsum([0.0, *(piece.duration for piece in self.pieces[:-1])])
         return BasePath(
@@ -161,7 +161,7 @@ class PlanEvaluation:
 
 
 def robot_state_of(plant: VelocityPlant) -> RobotState:
-    """Return the state of a plant."""
+    """Return a plant's state."""
     return RobotState(
         plant.pose[:3].copy(),
         plant.pose[3:].copy(),
@@ -174,12 +174,12 @@ def robot_state_of(plant: VelocityPlant) -> RobotState:
 def try_method(
     problem: PlanningProblem, name: str, method: GaitMethod | None = None
 ) -> PlanEvaluation:
-    """Plan by the named method (or a built ``method``), and fly the schedule in the plant.
+    """Plan with the named method (or a given ``method``), and fly the schedule in the plant.
 
     Raises
     ------
     PlanningError
-        The method refuses the goal.
+        The method rejects the goal.
     ParameterError
         An option does not suit the robot.
     """
@@ -215,9 +215,9 @@ def try_method(
 
 
 def compare(problem: PlanningProblem) -> dict[str, PlanEvaluation | SpaceRobotError]:
-    """Return the evaluation, or the reason for the refusal, of every method by name.
+    """Return every method's evaluation, or the reason for its rejection, by name.
 
-    Methods for end-effectors only are omitted for goals of the base.
+    Methods that support only end-effectors are omitted for base goals.
     """
     found: dict[str, PlanEvaluation | SpaceRobotError] = {}
     for name, method in METHODS.items():
@@ -242,7 +242,7 @@ def fastest(plans: Mapping[str, PlanEvaluation | SpaceRobotError]) -> PlanEvalua
 def random_goals(problem: PlanningProblem, count: int, distance: float, angle: float) -> list[Goal]:
     """Return goals within ``distance`` (m) and ``angle`` (rad) of the start, with a fixed seed.
 
-    Axes of rotation are uniformly distributed; planar robots rotate about their axis.
+    Rotation axes are uniformly distributed; planar robots rotate about their axis.
 
     Raises
     ------
@@ -276,9 +276,9 @@ def try_goals(
     methods: Sequence[str],
     show: Callable[[str], None] = lambda line: None,
 ) -> dict[str, list[PlanEvaluation | PlanningError]]:
-    """Plan every goal by every method, and return the results by method, in the order of the goals.
+    """Plan every goal with every method, and return the results by method, in goal order.
 
-    ``show`` receives a line about each.
+    ``show`` receives a line about each result.
     """
     tight = replace(
         problem.config,

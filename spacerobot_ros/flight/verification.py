@@ -1,4 +1,4 @@
-"""Re-simulates the plant of a bag under its commands, and compares the published states."""
+"""Re-simulates the plant with the commands in a bag, and compares the published states."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ TOLERANCE = 1e-9
 
 
 _MAX_TICKS_PER_STATE, _MAX_SILENT_TICKS = 10, 20_000
-"""A paused recorder leaves a gap; stamps that do not belong to a flight leave a larger one."""
+"""A paused recorder leaves a gap; stamps that do not belong to a flight leave a larger gap."""
 
 _TOPICS_COMPARED_FIRST = ("joint_states", "odom")
 """Topics to compare first: their differences explain differences in other topics."""
@@ -45,7 +45,7 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Difference:
-    """A number in the bag that does not follow from the commands, or has the largest deviation.
+    """A value in the bag that does not follow from the commands, or has the largest deviation.
 
     Attributes
     ----------
@@ -56,7 +56,7 @@ class Difference:
     recorded, expected
         Its value in the bag, and in the re-simulation.
     remark
-        Known facts about the commands that led to it: a clause in brackets, or empty.
+        Known facts about the corresponding commands: a clause in brackets, or empty.
     """
 
     time: float
@@ -80,18 +80,18 @@ class Verification:
     Attributes
     ----------
     ticks, duration
-        The part that was re-simulated; the duration in s of simulated time.
+        The re-simulated part; the duration in s of simulated time.
     messages, topics
         Number of compared messages, and their topics.
     missing
         Message about states missing according to the bag's own counts; empty: none are missing.
     second_opinion
-        The differences to another engine under the same commands, if requested.
+        The differences from another engine under the same commands, if requested.
     largest, largest_at
-        The largest deviation before the first difference, as a share of max(1, expected value), and
+        The largest deviation before the first difference, relative to max(1, expected value), and
         its location.
     difference
-        The first difference, if there is one.
+        The first difference, if any.
     """
 
     ticks: int
@@ -108,7 +108,7 @@ class Verification:
 def verify_bag(
     path: str | os.PathLike[str], tolerance: float = TOLERANCE, *, mujoco: bool = False
 ) -> Verification:
-    """Re-simulate a bag from its first state, and look for the first difference.
+    """Re-simulate a bag from its first state, and find the first difference.
 
     Parameters
     ----------
@@ -117,14 +117,14 @@ def verify_bag(
     tolerance
         Accepted deviation, absolute below 1 (SI units) and relative above.
     mujoco
-        Whether MuJoCo also flies the commands that the plant's actuators realise.
+        Whether MuJoCo also replays the commands realised by the plant's actuators.
 
     Raises
     ------
     RecordingError
-        There is no such bag, it is damaged, or it holds no flight in lockstep.
+        There is no such bag, it is damaged, or it does not contain a lockstep flight.
     SpaceRobotError
-        Its robot or its plant's parameters are refused, or MuJoCo is not installed.
+        Its robot or its plant parameters are invalid, or MuJoCo is not installed.
     """
     flight = _RecordedPlant.of(read_bag(path))
     published = _published_topics(flight)
@@ -132,7 +132,8 @@ def verify_bag(
     last = max(int(p.ticks.max()) for p in published)
     if first == last:
         raise RecordingError(
-            f"The bag {flight.path} holds the states of one tick: there is nothing to verify."
+            f"The bag {flight.path} contains the states of only one tick: there is nothing to "
+            f"verify."
         )
     states = sum(len(p.ticks) for p in published)
     if first < 0 or last - first > _MAX_SILENT_TICKS + _MAX_TICKS_PER_STATE * states:
@@ -181,12 +182,12 @@ class _RecordedPlant:
 
     @classmethod
     def of(cls, bag: Bag) -> _RecordedPlant:
-        """Read the plant of a bag, which must hold a flight of one plant in lockstep."""
+        """Read the plant from a bag, which must contain a lockstep flight of one plant."""
         recorded = _recorded_robot(bag)
         config = _plant_config(recorded)
         urdf = recorded.urdf
         if urdf is None:
-            raise RecordingError(f"The bag {bag.path} holds no description of its robot.")
+            raise RecordingError(f"The bag {bag.path} contains no robot description.")
         faults, disturbances = (
             _injections(recorded, topic, config.period_ns)
             for topic in ("fault_injection", "disturbance_injection")
@@ -204,7 +205,8 @@ class _RecordedPlant:
         return cls(recorded, config, robot, (faults, disturbances), grasps)
 
     def commands(self, source: CommandSource) -> dict[int, RecordedCommand]:
-        """Return the first command of each tick; later ones and those between ticks are stale."""
+        """Return the first command of each tick; later commands and commands between ticks are
+        stale."""
         commands: dict[int, RecordedCommand] = {}
         series = self.recorded.get(source.topic)
         if series is None:
@@ -262,8 +264,8 @@ def _recorded_robot(bag: Bag) -> RecordedRobot:
         names = ", ".join(each.namespace for each in found)
         plants = f"{len(found)} plants ({names})" if found else "no plant"
         raise RecordingError(
-            f"The bag {bag.path} holds the states of {plants}: a verification needs one "
-            "that published odom and joint_states."
+            f"The bag {bag.path} contains states of {plants}: verification needs one plant that "
+            f"published odom and joint_states."
         )
     return found[0]
 
@@ -272,8 +274,8 @@ def _plant_config(recorded: RecordedRobot) -> PlantConfig:
     bag, texts = recorded.bag, recorded.metadata.get("parameters/plant")
     if texts is None:
         raise RecordingError(
-            f"The bag {bag.path} has no parameters of its plant: bags of 'spacerobot run' hold "
-            "the plant's parameters."
+            f"The bag {bag.path} has no plant parameters: bags recorded by 'spacerobot run' "
+            f"contain them."
         )
     try:
         values = {name: json.loads(text) for name, text in texts.items()}
@@ -290,7 +292,7 @@ def _plant_config(recorded: RecordedRobot) -> PlantConfig:
     if config.time_mode != "lockstep":
         raise RecordingError(
             f"The bag {bag.path} was flown in real time, and does not record the command "
-            "that the plant held in each tick: only flights in lockstep can be verified."
+            "that the plant held in each tick: only lockstep flights can be verified."
         )
     return config
 
@@ -306,7 +308,7 @@ class _PublishedTopic:
     labels: list[str]
 
     def after(self, tick: int) -> _PublishedTopic:
-        """Omit the messages until a tick; on-times of thrusters are counted from there."""
+        """Omit the messages until a tick; thruster on-times are counted from there."""
         kept = self.ticks > tick
         values = self.values[kept]
         if self.topic.array_entries_of == "thrusters" and not kept.all():
@@ -315,7 +317,7 @@ class _PublishedTopic:
         return replace(self, ticks=self.ticks[kept], values=values)
 
     def is_determined_by(self, states: dict[str, Floats]) -> bool:
-        """Whether a re-simulation has all quantities of the topic, of the same sizes."""
+        """Whether a re-simulation has all quantities of the topic, with the same sizes."""
         names = [each.quantity for each in self.topic.state]
         if not all(name in states for name in names):
             return False
@@ -352,7 +354,7 @@ def _published_topics(flight: _RecordedPlant) -> list[_PublishedTopic]:
         if between.size:
             raise RecordingError(
                 f"A message on {series.topic} of the bag {flight.path} is stamped "
-                f"{stamps[between[0]] / SECOND:.9g} s, between the ticks of the plant in it."
+                f"{stamps[between[0]] / SECOND:.9g} s, between the plant's ticks."
             )
         named = recorded.names(topic.name) if topic.array_entries_of == "thrusters" else names
         labels = [each.labels(named) for each in topic.state]
@@ -378,7 +380,7 @@ def _missing_states(
     written, lost = (_parse_count(counts.get(name)) for name in ("messages", "messages_lost"))
     held = recorded.bag.message_count()
     if resimulation.first == 0 and written > held:
-        return f"its recorder wrote {written} messages, but it holds {held}."
+        return f"its recorder wrote {written} messages, but it contains {held}."
     states = {int(t) for p in published if p.topic.name == "joint_states" for t in p.ticks}
     lacking = {tick for tick in resimulation.commanded_ticks if tick >= resimulation.first} - states
     if len(lacking) > lost:
@@ -412,8 +414,8 @@ def _initial_state(
     needed = ("odom", "joint_states", "momentum")
     if not all(len(parts.get(name, ())) for name in needed):
         raise RecordingError(
-            f"The bag {flight.path} begins in mid-flight, and its first state lacks odom, "
-            "joint_states or momentum."
+            f"The bag {flight.path} starts mid-flight, and its first state lacks odom, "
+            f"joint_states or momentum."
         )
     n, joints = flight.robot.n, parts["joint_states"][0]
     return InitialState(
@@ -478,12 +480,11 @@ def _resimulate(
     commands = CommandValidator(plant, flight.config)
     if first and state.sensors.used:
         raise RecordingError(
-            f"The bag {flight.path} begins in mid-flight, so the noise of its sensors is unknown."
+            f"The bag {flight.path} starts mid-flight, so its sensor noise is unknown."
         )
     if first and plant.capturing is not None:
         raise RecordingError(
-            f"The bag {flight.path} begins in mid-flight, so it is unknown whether the target is "
-            "held."
+            f"The bag {flight.path} starts mid-flight, so it is unknown whether the target is held."
         )
     plant.tick = first
     if flight.config.actuation == "velocity":
@@ -497,8 +498,8 @@ def _resimulate(
     done = _Resimulation(first, last, states, frozenset(recorded[0]))
     if mujoco and plant.capturing is not None:
         raise SpaceRobotError(
-            f"The bag {flight.path} has a target, which MuJoCo does not capture: verify it without "
-            "the second engine."
+            f"The bag {flight.path} has a target, whose capture MuJoCo does not model: verify it "
+            f"without the second engine."
         )
     if mujoco:
         done.engine = EngineFlight(plant, flight.config.period_ns / SECOND)
@@ -658,7 +659,7 @@ class _Comparison:
             topic, refusal = done.refusals[before]
             name = f"{self._flight.recorded.namespace}/{topic}"
             stamp = self._format_time(before)
-            return f" (that on {name} stamped {stamp} is refused: {refusal.clause})"
+            return f" (that on {name} stamped {stamp} is rejected: {refusal.clause})"
         if tick > done.first and before not in done.commanded_ticks:
             name = f"{self._flight.recorded.namespace}/joint_commands"
             return f" (no message on {name} is stamped {self._format_time(before)})"

@@ -66,7 +66,7 @@ class Animation:
 
 
 def figure(flight: FlightData) -> Picture:
-    """Draw the pose of the base and its goal, the joints, and their efforts or rates."""
+    """Draw the base pose and its goal, the joints, and their efforts or rates."""
     efforts = flight.scenario.plant.actuation == "effort"
     wrench = flight.commands.get("base_wrench")
     thrust = wrench is not None and bool(np.any(wrench.values))

@@ -45,13 +45,13 @@ from spacerobot_ros.times import first_time_ns, stamp_bytes
 
 
 class CoordinatedControlNode(CommanderNode):
-    """Closes the loop over spacecraft and arm (paper 4): one command for every measured state.
+    """Closed-loop control of spacecraft and arm (paper 4): one command for every measured state.
 
-    ``goal_pose`` is the goal of the base, ``end_effector/goal_pose`` the goal of the end-effector.
+    ``goal_pose`` is the base goal, ``end_effector/goal_pose`` the end-effector goal.
     If a planner publishes ``joint_reference`` (or ``base_reference``), the node tracks it. Until
     there is a goal, the robot holds the pose of its first state. The node converts messages; a
     :class:`ControllerCommander` and its :class:`~spacerobot_ros.control.executive.ControlExecutive`
-    decide on goals.
+    evaluate the goals.
     """
 
     Config: ClassVar = ControllerConfig
@@ -62,9 +62,9 @@ class CoordinatedControlNode(CommanderNode):
     # -- life ---------------------------------------------------------------------------------
 
     def make_commander(self) -> ControllerCommander:
-        """Return the controller behind this node, which is independent of ROS."""
+        """Return the ROS-independent controller behind this node."""
         self._published: Any = None
-        """State and goal of the last status."""
+        """State and goal in the last status."""
         self._busy: set[str] = set()
         """Nodes that plan or compile, according to their heartbeats."""
         return ControllerCommander(self.config, self, partner_is_busy=lambda: bool(self._busy))
@@ -94,7 +94,7 @@ class CoordinatedControlNode(CommanderNode):
             self.inputs[topic] = self.create_subscription(kind, topic, take, STREAM, raw=True)
 
     def start_message(self) -> str:
-        """Return a log message with robot, law and goal topic."""
+        """Return a log message with the robot, the law and the goal topic."""
         config, topic = self.config, self.resolve_topic_name("goal_pose")
         return (
             f"Controls {described_robot(self.commander.robot)} with law '{config.law}'; goals on "
@@ -106,7 +106,7 @@ class CoordinatedControlNode(CommanderNode):
         self.commander.reconfigure(self.config)
 
     def use(self, robot: SpaceRobot) -> None:
-        """Control this robot from now on."""
+        """Set the robot to control."""
         commander = self.commander
         commander.use_robot(robot, self.decoder_of(robot))
         commander.rehearse()
@@ -142,13 +142,13 @@ class CoordinatedControlNode(CommanderNode):
     # -- outputs ------------------------------------------------------------------------------
 
     def send_command(self, stamp_ns: int) -> None:
-        """Publish wrench and efforts for the state with this stamp."""
+        """Publish the wrench and the efforts for the state with this stamp."""
         stamp = stamp_bytes(stamp_ns)
         self._base_wrench.publish(self._wrench_message.serialised(stamp))
         self._joint_commands.publish(self._joint_message.serialised(stamp))
 
     def publish_status(self, status: Status) -> None:
-        """Publish a status of the goal, and log it if something is wrong."""
+        """Publish a goal status, and log it if it is a warning or an error."""
         super().publish_status(status)
         decision = status.state, status.goal_id
         lasts, self._published = self._published == decision, decision

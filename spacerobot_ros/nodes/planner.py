@@ -45,12 +45,12 @@ from spacerobot_ros.topics import goal_topic, path_topic, twist_topic
 
 
 class PlannerNode(CommanderNode):
-    """Turns goal poses into gaits and publishes their velocities, one command for every state.
+    """Converts goal poses to gaits and publishes their velocities, one command for every state.
 
     A goal is planned from the next measured state. When its schedule has ended, the measured pose
-    is compared with the goal, and the remaining motion is planned again until the goal is reached
-    within tolerance or ``max_corrections`` are used up. The pieces of a gait that is planned piece
-    by piece (*partial* schedules) are not corrections. A new goal replaces the current one. If a
+    is compared with the goal, and the remaining motion is replanned until the goal is reached
+    within tolerance or ``max_corrections`` is reached. The segments of a gait planned segment by
+    segment (*partial* schedules) are not corrections. A new goal replaces the current one. If a
     joint does not follow, the remaining motion is planned with the other joints.
 
     A :class:`PlannerCommander` and its
@@ -62,19 +62,19 @@ class PlannerNode(CommanderNode):
     config: PlannerConfig
     commander: PlannerCommander
     _trajectories: Any = None
-    """Clients of FollowJointTrajectory, for ``output: trajectory``."""
+    """FollowJointTrajectory clients, for ``output: trajectory``."""
     _announcement: Thread | None = None
     """Publishes the latest schedule."""
 
     @property
     def statistics(self) -> PlannerStatistics:
-        """Number and time of the plans and commands so far."""
+        """Number and computation time of plans and commands so far."""
         return self.commander.statistics
 
     # -- life ---------------------------------------------------------------------------------
 
     def make_commander(self) -> PlannerCommander:
-        """Return the planner behind this node, which is independent of ROS."""
+        """Return the ROS-independent planner behind this node."""
         return PlannerCommander(self.config, self, long_work=self.long_work)
 
     def configure(self) -> None:
@@ -100,7 +100,7 @@ class PlannerNode(CommanderNode):
         self.offer("~/statistics", lambda: self.statistics.to_json())
 
     def start_message(self) -> str:
-        """Return a log message with method, robot and goal topic."""
+        """Return a log message with the method, the robot and the goal topic."""
         config, topic = self.config, self.resolve_topic_name("goal_pose")
         return (
             f"Plans by '{config.method}' for {described_robot(self.commander.robot)}; goals on "
@@ -108,7 +108,7 @@ class PlannerNode(CommanderNode):
         )
 
     def deactivate(self) -> None:
-        """Drop the current goal and stop sending commands; the goal file stays."""
+        """Drop the current goal and stop sending commands; the goal file is kept."""
         super().deactivate()
         self._await_announcement()
 
@@ -188,7 +188,7 @@ class PlannerNode(CommanderNode):
             self._commands.publish(self._message.serialised(stamp_bytes(stamp_ns)))
 
     def publish_status(self, status: Status) -> None:
-        """Publish and log a status of the goal."""
+        """Publish and log a goal status."""
         super().publish_status(status)
         self.log("warning" if status.state.level else "info", status.message)
 
@@ -203,7 +203,7 @@ class PlannerNode(CommanderNode):
         self._announcement.start()
 
     def publish_path(self, path: BasePath, stamp_ns: int) -> None:
-        """Ignore paths of references, which a planner does not have."""
+        """Ignore reference paths, which a planner does not have."""
 
     def _publish_schedule(self, start: ScheduleStart) -> None:
         schedule, stamp, frame = start.schedule, start.stamp_ns, self.config.world_frame

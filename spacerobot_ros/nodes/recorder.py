@@ -69,12 +69,12 @@ _PARAMETER_RECORD_BY_TOPIC = {
     "planner/status": "planner",
     "controller/status": "coordinated_control",
 }
-"""Record name of a node's parameters, by a topic that the node publishes.
+"""Record name for a node's parameters, by a topic published by the node.
 
-A node that publishes them is configured: its parameters keep their values."""
+If a node publishes them, it is configured: its parameters keep their values."""
 
 _UNKNOWN_NODE = "_NODE_NAME_UNKNOWN_"
-"""Node name in rmw_dds_common of a publisher that is discovered before its node."""
+"""rmw_dds_common node name of a publisher that is discovered before its node."""
 
 _QUEUE_DEPTH = 2000
 """Queue depth of subscriptions; above 5000 the events executor stops responding."""
@@ -90,7 +90,7 @@ _CHECK_PERIOD = 0.4
 _LONGEST_DRAIN = 1.2  # wall s
 
 _LOSS_LOG_PERIOD = 5.0
-"""Wall s between two log lines about lost messages."""
+"""Wall time between two log lines about lost messages, s."""
 
 
 class RecorderNode(FlightNode):
@@ -107,7 +107,7 @@ class RecorderNode(FlightNode):
         self._parameter_requests: dict[str, RemoteParameters | None] = {}
         """Names of the parameter records that are in the bag or requested from nodes."""
         self._topics_without_owner: set[str] = set()
-        """Topics whose publisher was discovered before its node; its parameters are still to be
+        """Topics whose publisher was discovered before its node, and whose parameters must still be
         requested."""
         super().__init__(name, **kwargs)
 
@@ -175,7 +175,7 @@ class RecorderNode(FlightNode):
             self.report_event(Event(EventKind.RECORDING, "Recording has begun."))
 
     def start_message(self) -> str:
-        """Return a log message with the path of the bag."""
+        """Return a log message with the bag path."""
         return f"Records into {self.recording.writer.path}." if self.recording else ""
 
     def deactivate(self) -> None:
@@ -204,7 +204,7 @@ class RecorderNode(FlightNode):
         Raises
         ------
         RecordingError
-            The disk refused the rest of the data.
+            The remaining data could not be written to disk.
         """
         for question in filter(None, self._parameter_requests.values()):
             question.close()
@@ -227,7 +227,7 @@ class RecorderNode(FlightNode):
 
     @property
     def failure(self) -> RecordingError | None:
-        """Error that has ended the recording; None without an error."""
+        """Error that ended the recording; None without an error."""
         return self.recording.failure if self.recording is not None else None
 
     def describe(self, name: str, values: dict[str, str]) -> None:
@@ -526,7 +526,7 @@ def _recording_callback(
 
 
 def loss_events(recording: Recording, topic: str) -> SubscriptionEventCallbacks:
-    """Return event callbacks of a subscription that count lost messages.
+    """Return subscription event callbacks that count lost messages.
 
     The middleware reports messages that the publisher had dropped before it could resend them; it
     does not report overflows of the subscription's own queue (Fast DDS).
@@ -567,7 +567,8 @@ def _read_descriptions(path: str) -> list[tuple[str, dict[str, str]]]:
         return [(n, {k: str(v) for k, v in values.items()}) for n, values in records.items()]
     except (OSError, ValueError, AttributeError) as error:
         raise ParameterError(
-            f"Parameter 'describe' is '{path}', which is not a JSON file of named objects: {error}."
+            f"Parameter 'describe' is '{path}', which is not a JSON file with named objects: "
+            f"{error}."
         ) from error
 
 

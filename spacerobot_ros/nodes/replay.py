@@ -37,10 +37,10 @@ _MAX_MESSAGES_AT_ONCE = 500
 _LONGEST_DELIVERY = Duration(seconds=2)
 
 _LONGEST_TIMER_PERIOD_NS = 3600 * SECOND
-"""Longest period of a timer, ns; gaps between messages in a bag may be longer."""
+"""Maximum timer period, ns; gaps between messages in a bag may be longer."""
 
 _MAX_QUEUE_DEPTH = 10_000
-"""Largest queue depth, because a bag may state any depth and the middleware allocates it."""
+"""Maximum queue depth, because a bag may request any depth and the middleware allocates it."""
 
 _CLOCK_TOPIC = "/clock"
 _STATUS_TOPIC, _SEEK_TOPIC = "replay/status", "replay/seek"
@@ -52,11 +52,11 @@ _BAD_BAG_EXIT_CODE = 2
 
 
 class ReplayNode(FlightNode):
-    """Publishes the messages of a bag as bytes, with the recorded quality of service.
+    """Publishes the messages in a bag as bytes, with the recorded quality of service.
 
-    It waits until readers are matched, divides the intervals of the log times by ``rate``, and ends
-    its process at the end of the bag. Meshes of ``robot_description`` that are not on this machine
-    are written from the bag to temporary files.
+    It waits until readers are matched, divides the log time intervals by ``rate``, and ends its
+    process at the end of the bag. Meshes in ``robot_description`` that are not on this machine are
+    written from the bag to temporary files.
 
     Services: ``~/pause`` (SetBool), ``~/resume`` and, while paused, ``~/step`` (Trigger), which
     sends the next message. A time on ``replay/seek`` sets the position, and ``replay/status``
@@ -77,7 +77,7 @@ class ReplayNode(FlightNode):
     # -- life ---------------------------------------------------------------------------------
 
     def configure(self) -> None:
-        """Open the bag and create its publishers and the services."""
+        """Open the bag and create the publishers and services."""
         # A failed configuration leaves its bag and files open.
         self.cleanup()
         config = self.config
@@ -130,7 +130,7 @@ class ReplayNode(FlightNode):
             self._begin()
 
     def start_message(self) -> str:
-        """Return a log message with bag, number of topics and rate."""
+        """Return a log message with the bag, the number of topics and the rate."""
         config = self.config
         return (
             f"Replays {len(self._outputs)} topic(s) of {config.bag} at {config.rate:g} times the "
@@ -146,14 +146,14 @@ class ReplayNode(FlightNode):
         self._playing_timers = []
 
     def cleanup(self) -> None:
-        """Close the bag, and remove the files of its meshes."""
+        """Close the bag, and remove its mesh files."""
         self._close_bag()
         meshes, self._meshes = self._meshes, None
         if meshes is not None:
             meshes.close()
 
     def destroy_node(self) -> None:
-        """Close the bag and remove the files of its meshes, in any state of the node."""
+        """Close the bag and remove its mesh files, in any node state."""
         self.cleanup()
         super().destroy_node()
 
@@ -177,7 +177,8 @@ class ReplayNode(FlightNode):
                 )
             except InvalidTopicNameException:
                 raise ParameterError(
-                    f"Topic '{topic.name}' cannot be replayed as '{name}': it is not a topic name."
+                    f"Topic '{topic.name}' cannot be replayed as '{name}': it is not a valid "
+                    f"topic name."
                 ) from None
             except SpaceRobotError as error:
                 message = f"Topic '{topic.name}' is not replayed: {error}"

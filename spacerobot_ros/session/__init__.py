@@ -1,1 +1,1 @@
-"""Sessions: scenarios flown without ROS, or by nodes in one process each."""
+"""Sessions: scenarios flown without ROS, or by nodes in separate processes."""

@@ -1,6 +1,6 @@
 """``python -m spacerobot_ros.session.child MODULE ...``: a node that ends with its supervisor.
 
-Signal handlers are set first, because importing the module of a node takes a second.
+Signal handlers are set first, because importing a node module takes a second.
 """
 
 from __future__ import annotations
@@ -13,9 +13,9 @@ from spacerobot_ros.termination import Terminated, guarded
 
 
 def run_module(name: str) -> int | None:
-    """Import the module of a node and run its ``main``; return the exit code.
+    """Import a node module and run its ``main``; return the exit code.
 
-    A signal ends the process without a traceback, also during the import.
+    A signal ends the process without a traceback, even during the import.
     """
     with guarded():
         try:

@@ -1,4 +1,4 @@
-"""Flights by nodes, to the goal of a scenario or until stopped; sending goals to running stacks."""
+"""Flights with nodes, to a scenario's goal or until stopped; sending goals to running stacks."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def ros() -> Iterator[None]:
     Raises
     ------
     SpaceRobotError
-        ROS does not start: an environment variable is refused.
+        ROS does not start: an environment variable is invalid.
     """
     use_loopback_discovery()
     level = get_logger_effective_level("")
@@ -61,15 +61,15 @@ def ros() -> Iterator[None]:
 def fly_by_nodes(
     scenario: Scenario, bag: Path, progress: Callable[[float, float], None], longest: float
 ) -> dict[str, Any]:
-    """Fly a scenario with one process per node; return the object that ``--json`` writes.
+    """Fly a scenario with one process per node; return the object written by ``--json``.
 
-    Parameters are those of :func:`~spacerobot_ros.session.run.run_scenario`. The flight is checked
+    For the parameters see :func:`~spacerobot_ros.session.run.run_scenario`. The flight is checked
     five times per second of wall time.
 
     Raises
     ------
     SpaceRobotError
-        A parameter, the robot or the recording is refused.
+        A parameter or the robot is invalid, or the bag cannot be recorded.
     """
     with ros():
         stack = MultiProcessStack(scenario, bag)
@@ -119,13 +119,13 @@ def _summary(stack: MultiProcessStack, wall_time: float) -> dict[str, Any]:
 _LONGEST_DISCOVERY = 10.0  # wall s
 
 _LONGEST_STATUS_WAIT = 1.0
-"""Wall time to wait for the status of earlier goals, before a new one is sent, s."""
+"""Wall time to wait for the status of earlier goals before sending a new goal, s."""
 
 _CHECK_PERIOD = 0.1
 
 
 _NUMBER = re.compile(r"(< )?\d[\d.]* [mµ]?(m|rad)\b")
-"""A quantity in the message of a status, which changes continually."""
+"""A continually changing quantity in a status message."""
 
 
 class _StatusPrinter:
@@ -151,12 +151,12 @@ def run_until_stopped(
     restarts: int = 0,
     supervise: Callable[[], None] = lambda: None,
 ) -> Path | None:
-    """Run the nodes of a scenario in real time until SIGINT, SIGTERM or SIGHUP; goals by topic.
+    """Run a scenario's nodes in real time until SIGINT, SIGTERM or SIGHUP; goals arrive on topics.
 
-    If planner or controller die, they are restarted, each at most ``restarts`` times a minute.
-    ``supervise`` is called five times a second.
+    If the planner or the controller dies, it is restarted, at most ``restarts`` times per minute.
+    ``supervise`` is called five times per second.
 
-    Returns the bag, which has a new name if the name was taken and ``when_exists`` is next.
+    Returns the bag, under a new name if the name was taken and ``when_exists`` is next.
 
     Raises
     ------
@@ -190,13 +190,14 @@ def send_goal(
 ) -> Outcome:
     """Send one goal pose, show its statuses, and return its outcome.
 
-    ``timeout`` is wall time in s, 0: forever. The search for a commander ends after ``timeout``, or
+    ``timeout`` is wall time in s; 0: no limit. The search for a commander ends after ``timeout``,
+    or
     after ten seconds.
 
     Raises
     ------
     SpaceRobotError
-        No commander accepts goals, or the namespace is not valid in ROS.
+        No commander accepts goals, or the namespace is not a valid ROS namespace.
     """
     namespace = checked_namespace(namespace)
     with ros():

@@ -1,4 +1,4 @@
-"""Client that sends the goals of a flight and follows their status to their outcome."""
+"""Client that sends a flight's goals and tracks their statuses until the outcome."""
 
 from __future__ import annotations
 
@@ -42,20 +42,20 @@ class MissionClient:
     Parameters
     ----------
     decider
-        The commander that decides: the planner if there is one.
+        The commander whose status is tracked: the planner if there is one.
     world_frame
         Frame of the goals.
     now
-        Returns the time for the stamps of goals, ns: the simulated time if available.
+        Returns the time for goal stamps, ns: simulated time if available.
     joint_names
-        Returns the robot's joints if a goal may require joint positions, or an earlier goal may
-        have; None: no goal of this stack does.
+        Returns the robot's joints if this or an earlier goal may require joint positions; None: no
+        goal in this stack does.
     end_effectors
         Links with goals; empty name: the default end-effector.
     paths
         The end-effectors whose goals are paths.
     name, namespace, context
-        Name, namespace and rclpy context of the node.
+        Node name, namespace and rclpy context.
     """
 
     def __init__(
@@ -73,11 +73,11 @@ class MissionClient:
     ) -> None:
         self.node: Node = rclpy.create_node(name, namespace=namespace, context=context)
         self.status: Status | None = None
-        """Last status of the commander that decides the goal."""
+        """Last status from the commander that pursues the goal."""
         self.message = ""
-        """Message of the last status, except those about another goal; empty before."""
+        """Message in the last status about this goal; empty before the first."""
         self.on_message: Callable[[str], None] = lambda message: None
-        """Called with each such message on arrival, since the next may replace it soon."""
+        """Called with each such message on arrival, since it may soon be replaced."""
         self.decider = decider
         """The commander that decides."""
         self._done = rclpy.task.Future(executor=None)
@@ -96,7 +96,7 @@ class MissionClient:
         }
         self._sends += self._end_effector_topics.values()
         self.failures: dict[str, str] = {}
-        """Messages of the nodes that have failed, by the last part of their names."""
+        """Messages from failed nodes, by the last part of their names."""
         self.node.create_subscription(DiagnosticStatus, "events", self._on_event, STREAM)
         topic, self._read = STATUS_TOPICS[decider]
         self._status_topic = self.node.create_subscription(
@@ -122,18 +122,19 @@ class MissionClient:
 
     @property
     def outcome(self) -> Outcome | None:
-        """Outcome of the goal; None before it is decided."""
+        """Outcome of the goal; None until the goal has ended."""
         return self._done.result()
 
     @property
     def ends_at(self) -> float:
-        """Simulated time at which the planner's current schedule ends, s; 0 without one."""
+        """Simulated time at which the planner's current schedule ends, s; 0 without a schedule."""
         return self.status.ends_at_s if isinstance(self.status, PlannerStatus) else 0.0
 
     def is_connected(self, readers: int = 1) -> bool:
         """Whether goals have ``readers`` subscribers, and all known subscribers are matched.
 
-        A commander may be known but not matched yet, while a viewer or a recorder is. Third-party
+        A commander may be known but not matched yet, while a viewer or a recorder is already
+        matched. Third-party
         planners need not accept joint positions.
         """
         return all(
@@ -162,7 +163,7 @@ class MissionClient:
         return bool(deciders & readers)
 
     def send(self, goal: Goal, end_effector: Goal | None = None) -> None:
-        """Publish goal poses of the base and of end-effectors, if there are any.
+        """Publish base and end-effector goal poses, if any.
 
         All share one stamp, unique to this goal; the status identifies the goal by it. A planner
         keeps required joint positions for later goals, so every goal is sent with its joint
@@ -188,7 +189,7 @@ class MissionClient:
             self._end_effector_topics[link].publish(aim)
 
     def await_delivery(self) -> None:
-        """Wait until all readers of goals have received the goal that was sent."""
+        """Wait until all subscribers have received the last goal."""
         end = time.monotonic() + _LONGEST_DELIVERY
         for publisher in self._sends:
             publisher.wait_for_all_acked(Duration(seconds=max(0.0, end - time.monotonic())))
@@ -199,9 +200,10 @@ class MissionClient:
         look: Callable[[], bool],
         period: float = _STATUS_CHECK_PERIOD,
     ) -> Outcome:
-        """Spin until the goal is decided, or until ``look``, called every ``period`` s, is true.
+        """Spin until the goal has ended, or until ``look``, called every ``period`` s, returns
+        true.
 
-        A busy events executor ignores the time limit of a spin, so a timer calls ``look``.
+        A busy events executor ignores spin timeouts, so a timer calls ``look``.
 
         Raises
         ------

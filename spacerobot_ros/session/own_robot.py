@@ -25,27 +25,27 @@ _LARGEST_FIRST_ROTATION = math.radians(5.0)  # rad
 _MAX_USUAL_LIMIT = 4 * math.pi  # rad; larger ones may be in degrees
 
 _LARGEST_SHARE_OF_DISTANCE_TO_LIMIT = 0.5
-"""Largest share of the distance to its limits that a joint uses in the first rotation."""
+"""Maximum fraction of a joint's distance to its limits used in the first rotation."""
 
 _LARGEST_COUNTED_DISTANCE_TO_LIMIT = 1.0
-"""Largest distance to a joint limit that is used, m or rad: linearisation fails beyond it."""
+"""Maximum used distance to a joint limit, m or rad: linearisation fails beyond it."""
 
 _LEAST_ROTATION_WITHOUT_LOOPS = math.radians(0.2)
-"""Smallest first rotation without loops of the joints, rad."""
+"""Smallest first rotation without joint loops, rad."""
 
 _ROTATION_TO_TOLERANCE = 50.0
 
 _LEAST_BASE_MASS_RATIO, _LARGEST_BASE_MASS_RATIO = 0.2, 500.0
-"""Usual ratios of the base's mass to the mass of all other bodies."""
+"""Usual ratios of the base mass to the mass of all other bodies."""
 
 _LEAST_USUAL_SPEED, _LARGEST_USUAL_SPEED = 1e-3, 50.0
 """Usual joint speeds, m/s or rad/s."""
 
 
 def urdf_remarks(robot: RobotDescription) -> Iterator[str]:
-    """Yield notes on unusual values of a URDF, each with a remedy.
+    """Yield notes on unusual values in a URDF, each with a remedy.
 
-    The robot can still fly; errors are refused when the file is read.
+    The robot can still fly; errors are reported when the file is read.
     """
     carried = robot.total_mass - robot.bodies[0].inertia.mass
     base = robot.bodies[0].inertia
@@ -102,7 +102,7 @@ def _unlimited_joint_remark(joint: Joint) -> str:
     if not math.isinf(joint.limits.velocity):
         return ""
     return (
-        f"The joint '{joint.name}' has no velocity limit, within which gaits are planned: give "
+        f"The joint '{joint.name}' has no velocity limit, which planning requires: give "
         f'<limit velocity="..." effort="..."/> in {joint.unit}/s and '
         f"{'N' if joint.unit == 'm' else 'N m'}."
     )
@@ -124,8 +124,8 @@ def _large_range_remark(joint: Joint) -> str:
     if joint.unit != "rad" or math.isinf(reach) or reach <= _MAX_USUAL_LIMIT:
         return ""
     return (
-        f"The joint '{joint.name}' turns from {limits.lower:.4g} to {limits.upper:.4g} rad: limits "
-        "of a URDF are in rad, not in degrees."
+        f"The joint '{joint.name}' ranges from {limits.lower:.4g} to {limits.upper:.4g} rad: URDF "
+        f"limits are in rad, not in degrees."
     )
 
 
@@ -133,8 +133,8 @@ def _missing_effort_remark(joint: Joint) -> str:
     if joint.limits.effort != 0:
         return ""
     return (
-        f"The joint '{joint.name}' has the effort limit 0: it moves under velocity commands, but "
-        'not under effort commands. Give <limit effort="..."/> in N or N m.'
+        f"The joint '{joint.name}' has the effort limit 0: it responds to velocity commands, but "
+        'not to effort commands. Give <limit effort="..."/> in N or N m.'
     )
 
 
@@ -155,7 +155,7 @@ def _visual_remarks(robot: RobotDescription) -> Iterator[str]:
         yield "No link has a <visual>: the robot is drawn as lines between its joints."
     if not robot.end_effector():
         yield (
-            "No link is called 'end_effector': for coordinated control, set the parameter "
+            "No link is named 'end_effector': for coordinated control, set the parameter "
             "end_effector_frame."
         )
 
@@ -178,9 +178,9 @@ def first_shape(robot: SpaceRobot) -> Array:
 def first_problem(
     name: str, robot: SpaceRobot, file: Path, *, clear: bool = True
 ) -> PlanningProblem:
-    """Return the problem of a small base rotation about an axis that the joints can achieve.
+    """Return the problem for a small base rotation about an axis that the joints can achieve.
 
-    ``clear``: whether the plan avoids contacts between links, which needs their meshes.
+    ``clear``: whether the plan avoids contacts between links, which requires their meshes.
 
     Raises
     ------
@@ -195,8 +195,8 @@ def first_problem(
             else "not at all"
         )
         raise PlanningError(
-            f"The joints of '{robot.description.name}' rotate its base {how}: there is no attitude "
-            "to fly to, so no scenario is written. `spacerobot analyze` says more."
+            f"The joints of '{robot.description.name}' rotate its base {how}: there is no "
+            f"attitude goal, so no scenario is written. `spacerobot analyze` says more."
         )
     shape = first_shape(robot)
     turn = first_turn(robot, shape, turning.axes)
@@ -211,11 +211,11 @@ def first_problem(
 
 
 def first_turn(robot: SpaceRobot, shape: Array, axes: Array) -> Array:
-    """Return a rotation (3,) of the base, rad, that its joints produce without loops.
+    """Return a base rotation (3,), rad, that the joints produce without loops.
 
-    It is 5 degrees about z, y or x, or about the only axis of ``axes`` (m, 3), if to first order
-    half of the joints' range around a configuration (n,) suffices. If light arms rotate the base
-    less, it is smaller, about the axis with the largest rotation.
+    It is 5 degrees about z, y or x, or about the only axis in ``axes`` (m, 3), if to first order
+    half of the joint ranges around a configuration (n,) suffices. If light arms rotate the base
+    less, the rotation is smaller, about the axis with the largest rotation.
     """
     room = np.minimum(robot.upper - shape, shape - robot.lower)
     F = robot.connection(shape)[3:] * np.minimum(room, _LARGEST_COUNTED_DISTANCE_TO_LIMIT)
@@ -237,7 +237,7 @@ def first_turn(robot: SpaceRobot, shape: Array, axes: Array) -> Array:
 
 
 def scenario_text(problem: PlanningProblem, method: str, robot_path: str) -> str:
-    """Return a parameter file that flies a problem by a method; see docs/own_robot.md."""
+    """Return a parameter file that flies a problem with a method; see docs/own_robot.md."""
     x, y, z, w = (float(value) for value in problem.goal.quaternion)
     assert problem.initial.joint_positions is not None
     shape = ", ".join(repr(float(q)) for q in problem.initial.joint_positions)
@@ -278,7 +278,7 @@ scenario:
 
 
 def thruster_scenario_text(robot: SpaceRobot, robot_path: str) -> str:
-    """Return a parameter file that moves and rotates a robot without joints by its thrusters."""
+    """Return a parameter file that moves and rotates a robot without joints with its thrusters."""
     name = robot.description.name
     return f"""\
 # The first flight of {name}, which has no joints: thrusters move and rotate it.

@@ -51,7 +51,7 @@ _LONGEST_START = 60.0  # wall s
 _RESTART_PERIOD = 60.0  # wall s, over which restarts are counted
 
 _LONGEST_END = 10.0
-"""Wall time after a signal at which a node that still runs is killed, s."""
+"""Wall time after a signal at which a running node is killed, s."""
 
 _SETTINGS_WITHOUT_SHARED_MEMORY = {"FASTDDS_BUILTIN_TRANSPORTS": "UDPv4"}
 """Settings without shared memory: Fast DDS could keep writing to a killed node's memory."""
@@ -70,10 +70,10 @@ _FASTDDS_SETTINGS = """<?xml version="1.0" encoding="UTF-8"?>
 """
 """Fast DDS settings that make writers resend lost messages after 10 ms.
 
-With the default of 3 s a lockstep plant would wait, and others would lose messages."""
+With the default of 3 s a lockstep plant would wait, and other nodes would lose messages."""
 
 _LONGEST_RECORDING_DELAY = 1.0
-"""Wall time for the recorder to receive the last messages of the plant, s."""
+"""Wall time for the recorder to receive the plant's last messages, s."""
 
 
 _LONGEST_ANSWER_AFTER_INTERRUPT = 0.5  # wall s
@@ -90,12 +90,12 @@ def namespace_arguments(namespace: str) -> list[str]:
 
 
 def checked_namespace(name: str) -> str:
-    """Return a namespace as ROS writes it, with a slash before it; empty for none.
+    """Return a namespace in ROS form, with a leading slash; empty for none.
 
     Raises
     ------
     ParameterError
-        The name is not valid in ROS.
+        The name is not a valid ROS name.
     """
     namespace = f"/{name.strip('/')}" if name.strip("/") else ""
     try:
@@ -106,7 +106,7 @@ def checked_namespace(name: str) -> str:
 
 
 class MultiProcessStack:
-    """The node processes of a scenario, and the client of their mission in this process.
+    """A scenario's node processes, and the mission client in this process.
 
     The node processes end with this process, even if it is killed. In lockstep all runs are
     identical: nothing begins until all nodes are connected, and the goal arrives before the first
@@ -119,9 +119,9 @@ class MultiProcessStack:
     bag
         File to record into; None records nothing.
     namespace
-        Of all nodes and topics, including the clock and the frames; empty for none.
+        Namespace of all nodes and topics, including the clock and the frames; empty for none.
     restarts
-        Largest number of restarts per minute of a planner or controller that dies; it continues
+        Maximum number of restarts per minute for a planner or controller that dies; it continues
         with its goal.
     show
         Shows a line about each restart to the user.
@@ -129,7 +129,7 @@ class MultiProcessStack:
     Raises
     ------
     ParameterError
-        A parameter or the namespace is refused, or the scenario kills nodes in lockstep.
+        A parameter or the namespace is invalid, or the scenario kills nodes in lockstep.
     SpaceRobotError
         A node ended at its start (the message is the last error that it wrote), or another stack
         is active in this ROS domain and namespace.
@@ -148,11 +148,11 @@ class MultiProcessStack:
         _require_flyable(scenario)
         self.scenario = scenario
         self.when_exists = scenario.parameters("recorder").get("when_exists", "refuse")
-        """Reaction to an existing bag of this name; by default it is refused."""
+        """Reaction to an existing bag with this name; by default an error."""
         self.bag = free_name(bag) if bag is not None and self.when_exists == "next" else bag
         recorder = () if bag is None else ("recorder",)
         self.names = ("plant", *scenario.commanders, *recorder)
-        """Names of the nodes, in the order of their start."""
+        """Node names, in start order."""
         for name in self.names:
             scenario.config(name)  # Invalid parameters are refused before any node runs.
         self._restarts, self._show = RestartLimit(restarts), show
@@ -203,13 +203,13 @@ class MultiProcessStack:
                 self.launch(name, autostart=False)
             # All nodes are configured at once, because building models takes long.
             self._change_states(Transition.TRANSITION_CONFIGURE, self.names)
-            self._wait_for(self._connected, "the nodes to find each other")
+            self._wait_for(self._connected, "the nodes to discover each other")
         except BaseException:
             self.close()
             raise
 
     def launch(self, name: str, **parameters: Any) -> None:
-        """Start one node of the scenario, for the first time or again, with more parameters."""
+        """Start or restart one node of the scenario, with additional parameters."""
         overrides: dict[str, Any] = dict(self.scenario.parameters(name))
         if name in COMMANDERS and self.scenario.lockstep:
             overrides["plan_in_background"] = False  # Known before the plant says so.
@@ -251,7 +251,7 @@ class MultiProcessStack:
 
     @property
     def time_ns(self) -> int:
-        """Simulated time that was last received, ns."""
+        """Last received simulated time, ns."""
         return self._time_ns
 
     @property
@@ -270,7 +270,8 @@ class MultiProcessStack:
         self._change_states(Transition.TRANSITION_ACTIVATE, ["plant"])
 
     def spin(self, look: Callable[[], bool]) -> None:
-        """Run until the goal is decided, or until ``look``, called five times a second, is true.
+        """Run until the goal has ended, or until ``look``, called five times per second, returns
+        true.
 
         Raises
         ------
@@ -298,7 +299,7 @@ class MultiProcessStack:
     def finish(self) -> None:
         """Stop time, then end all nodes; the recorder ends last and completes the bag.
 
-        A flight in real time that was interrupted ends with its joints at rest.
+        An interrupted real-time flight ends with its joints at rest.
 
         Raises
         ------
@@ -320,7 +321,7 @@ class MultiProcessStack:
                 raise SpaceRobotError(end_message(name, code, self._read_log(name)))
 
     def close(self) -> None:
-        """End all node processes that still run."""
+        """End all node processes that are still running."""
         left = [process for process in self.processes.values() if process.poll() is None]
         for process in left:
             process.send_signal(signal.SIGTERM)
@@ -332,7 +333,7 @@ class MultiProcessStack:
         self._folder.cleanup()
 
     def require_alive(self) -> None:
-        """Raise an error with the reason of the end of a node that has ended.
+        """If a node has ended, raise an error with the reason.
 
         Raises
         ------
@@ -376,7 +377,7 @@ class MultiProcessStack:
                 continue
             if not self._restarts.allows_restart(name, time.monotonic()):
                 continue
-            message = f"{self._end_message(name)} It is started again."
+            message = f"{self._end_message(name)} It is restarted."
             self.launch(name, autostart=True)
             with suppress(OSError):  # A closed terminal must not stop the robot.
                 self._show(message)
@@ -494,8 +495,8 @@ def _require_flyable(scenario: Scenario) -> None:
     goal = scenario.goal
     if goal.end_effectors and goal.base not in (frozenset(), POSE):
         raise ParameterError(
-            "Goals of end-effectors need the whole pose of the base or none: give --goal, or omit "
-            "the attitude of the base."
+            "End-effector goals need the whole base pose or none: give --goal, or omit the base "
+            "attitude."
         )
 
 
@@ -505,7 +506,7 @@ _NO_ERROR_TEXT = (
 )
 
 _LOG_PREFIX = re.compile(r"^\[(DEBUG|INFO|WARN|ERROR|FATAL)\] \[[\d.]+\] \[[^\]]*\]: ")
-"""Level, time and name before a message in the log of a node."""
+"""Level, time and name before a message in a node's log."""
 
 
 _CRASH = re.compile(r"^Fatal Python error: .*$", re.MULTILINE)
@@ -513,7 +514,7 @@ _CRASHED_AT = re.compile(r"^Current thread .*\n  File (.*)$", re.MULTILINE)
 
 
 def last_error(log: str) -> str:
-    """Return the last error in the log of a node; empty if there is none.
+    """Return the last error in a node's log; empty if there is none.
 
     It is an error that the node logged, or the last line of a traceback.
     """
@@ -529,7 +530,8 @@ def last_error(log: str) -> str:
 
 
 def end_message(name: str, code: int, log: str) -> str:
-    """Return a sentence about the end of a node: a signal and its crash, or exit code and error."""
+    """Return a sentence about a node's end: the signal and the crash, or the exit code and the
+    error."""
     if code < 0:
         # Of a signal Python logs a crash alone: other errors in the log are not its cause.
         how = f"Node '{name}' was ended by {signal.Signals(-code).name}"
@@ -541,12 +543,12 @@ def end_message(name: str, code: int, log: str) -> str:
 
 
 class RestartLimit:
-    """Limit of the restarts of processes that die.
+    """Limit on restarts of processes that die.
 
     Parameters
     ----------
     most
-        Largest number of restarts of one process within a minute.
+        Maximum number of restarts of one process within a minute.
     """
 
     def __init__(self, most: int) -> None:
@@ -561,12 +563,12 @@ class RestartLimit:
         return allowed
 
     def count_restart(self, name: str) -> str:
-        """Return a sentence about the restarts of a process, with a space before it."""
+        """Return a sentence about a process's restarts, with a leading space."""
         count = len(self._restarted.get(name, ()))
         if not count:
             return ""
         times = "once" if count == 1 else f"{count} times"
-        return f" It was started again {times} within a minute, which is the limit (--restarts)."
+        return f" It was restarted {times} within a minute, which is the limit (--restarts)."
 
 
 def node_arguments(
@@ -607,5 +609,5 @@ class KillTimeline:
 
     @property
     def away(self) -> set[str]:
-        """Names of the nodes that were killed and not started again yet."""
+        """Names of the nodes that were killed and not restarted yet."""
         return {kill.node for kill in self._away}

@@ -1,4 +1,4 @@
-"""Flies scenarios to their goals and records bags, by the loop without ROS or by nodes."""
+"""Flies scenarios to their goals and records bags, with or without ROS nodes."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ Progress = Callable[[float, float], None]
 
 @dataclass(frozen=True)
 class RunResult:
-    """Result of a run; ``summary`` is the object that ``--json`` writes."""
+    """Result of a run; ``summary`` is the object written by ``--json``."""
 
     summary: dict[str, Any]
 
@@ -34,7 +34,7 @@ class RunResult:
 
     @property
     def message(self) -> str:
-        """Sentence about the outcome of the goal."""
+        """Sentence about the goal's outcome."""
         return str(self.summary["message"])
 
     sentence = message
@@ -51,16 +51,17 @@ def run_scenario(
 ) -> RunResult:
     """Fly a scenario from its initial state to its goal, and record a bag.
 
-    The loop without ROS flies it, or, if ``nodes`` is set, the nodes in one process each. A flight
-    of ``longest`` s of simulated time is interrupted.
+    The flight runs without ROS or, if ``nodes`` is set, with the nodes in separate processes. The
+    flight is interrupted after ``longest`` s of simulated time.
 
-    SIGINT, SIGTERM and SIGHUP end the flight early; the flight until then is recorded and
+    SIGINT, SIGTERM and SIGHUP end the flight early; the flight up to that time is recorded and
     summarised. Before the flight they act as usual.
 
     Raises
     ------
     SpaceRobotError
-        A parameter, the robot or the recording is refused, or only nodes can fly the scenario.
+        A parameter or the robot is invalid, the bag cannot be recorded, or the scenario requires
+        nodes.
     """
 
     def report(now: float, end: float) -> None:

@@ -71,7 +71,7 @@ class Viewer:
         return process
 
     def announce(self) -> None:
-        """Show the address of the page, once it is served.
+        """Show the page address once the page is served.
 
         Raises
         ------
@@ -102,10 +102,10 @@ class Viewer:
         end_child(self.process, {})
         self.process = self._start()
         with suppress(OSError):  # A closed terminal must not stop the robot.
-            self._show(f"{message} It is started again.")
+            self._show(f"{message} It is restarted.")
 
     def end(self) -> None:
-        """End the viewer; a line reports if it had ended before."""
+        """End the viewer; a line reports if it had already ended."""
         if self._announced and self.process.poll() is not None:
             with suppress(OSError):
                 self._show(f"{self._end_message()}{self._restarts.count_restart('viewer')}")
@@ -120,14 +120,14 @@ class Viewer:
 def viewing(
     parameters: Mapping[str, Value], show: Callable[[str], None], namespace: str = ""
 ) -> Iterator[Viewer]:
-    """Run a viewer while the block lasts; ``show`` receives the line with its address.
+    """Run a viewer during the block; ``show`` receives the line with its address.
 
     If the viewer ends early, the block continues, and a line at the end of the block reports it.
 
     Parameters
     ----------
     parameters
-        Parameters of the viewer, by name.
+        Viewer parameters, by name.
     show
         Shows a line to the user.
     namespace
@@ -151,7 +151,7 @@ def viewing(
 
 
 def lower_priority(pid: int) -> None:
-    """Lower the priority of a process below the priority of all flight nodes."""
+    """Lower a process's priority below the priority of all flight nodes."""
     with suppress(OSError):
         os.setpriority(os.PRIO_PROCESS, pid, _NICENESS)
     # Linux may divide the processor among sessions first; niceness counts within a session only.
@@ -173,10 +173,8 @@ def _read_announcement(process: subprocess.Popen[bytes], log: Path) -> str:
             more = os.read(process.stdout.fileno(), 4096)
             if not more:
                 lines = _read_log_lines(log)
-                raise SpaceRobotError(lines[-1] if lines else "The viewer ended at its start.")
+                raise SpaceRobotError(lines[-1] if lines else "The viewer ended at startup.")
             text += more
         elif time.monotonic() > deadline:
-            raise SpaceRobotError(
-                f"The viewer has not served its page within {_LONGEST_START:g} s."
-            )
+            raise SpaceRobotError(f"The viewer did not serve its page within {_LONGEST_START:g} s.")
     return text.decode(errors="replace").strip()

@@ -83,7 +83,7 @@ def check_record(apart: NodesApart, python: WarmPython) -> None:
         return done.stdout + done.stderr
 
     # Nothing records which command a plant held in which tick of the wall clock.
-    assert "only flights in lockstep can be verified" in spacerobot("verify", bag.name, code=2)
+    assert "only lockstep flights can be verified" in spacerobot("verify", bag.name, code=2)
     spacerobot("report", bag.name)
     assert bag.with_suffix(".html").stat().st_size > 10_000
     spacerobot("figures", bag.name, "--format", "svg", "--out", "figures")

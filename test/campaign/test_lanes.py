@@ -221,7 +221,7 @@ def test_draws_that_are_no_robot_and_no_number_end_no_other_flight() -> None:
     sentence = "The value drawn for 'plant.sensors.seed' is inf."
     assert sentence in {row.reason for row in lanes_of_none.values()}
     # Some are finite, and larger than a ROS parameter can be.
-    assert any("a whole number of 64 bits" in row.reason for row in lanes_of_none.values())
+    assert any("a 64-bit integer" in row.reason for row in lanes_of_none.values())
     assert {row.outcome for row in lanes_of_none.values()} == {"error"}
     weightless = [row.reason for row in lanes.values() if not row.draw.values["mass"]]
     assert 0 < len(weightless) < 6

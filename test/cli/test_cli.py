@@ -120,7 +120,7 @@ def test_broken_scenario_file_is_named(tmp_path: Path) -> None:
     path.write_text("scenario: {ros__parameters: {goal_positon: [0, 0, 0]}}")
     assert "unknown key 'goal_positon'" in spacerobot("run", str(path)).output
     path.write_text("scenario: {ros__parameters: {goal_position: [0, 0]}}")
-    assert "is refused" in spacerobot("run", str(path)).output
+    assert "is invalid" in spacerobot("run", str(path)).output
 
 
 def test_scenarios_are_listed() -> None:
@@ -415,7 +415,7 @@ def test_a_domain_that_is_none_is_one_sentence(words: tuple[str, ...], domain: s
 def test_a_dash_is_no_file_to_write(option: str) -> None:
     ended = started("run", "sliding_masses", option, "-")
     assert ended.returncode == 2
-    assert f"Invalid value for '{option}': '-' is not a file" in ended.stderr
+    assert f"Invalid value for '{option}': '-' is not supported" in ended.stderr
     assert not Path("-").exists()
 
 
@@ -435,7 +435,7 @@ def test_a_path_that_is_no_text_is_refused(option: str) -> None:
     [
         (
             ["run", "sliding_masses", "--view"],
-            "--view needs --realtime: a flight in lockstep ends too soon.",
+            "--view needs --realtime: a lockstep flight ends too soon.",
         ),
         (
             ["goal", "1", "2", "3", "--goal-rotvec", *"001", "--goal-rpy-deg", *"001"],
@@ -443,7 +443,7 @@ def test_a_path_that_is_no_text_is_refused(option: str) -> None:
         ),
         (
             ["goal", "--goal-rotvec", *"001", "--end-effector-position", *"123"],
-            "With goals of end-effectors, give the attitude of the base with its position X Y Z.",
+            "With end-effector goals, give the base attitude together with the position X Y Z.",
         ),
         (["goal", "1", "2"], "A goal is X Y Z, or X Y Z QX QY QZ QW."),
         (["goal"], "A goal is X Y Z, or X Y Z QX QY QZ QW."),
@@ -471,7 +471,7 @@ def test_a_refused_goal_has_its_report_if_asked(tmp_path: Path) -> None:
 def test_a_campaign_is_of_one_file_or_two(words: tuple[str, ...]) -> None:
     result = CliRunner().invoke(main, list(words))
     assert result.exit_code == 2
-    assert result.stderr == "Give the FILE of a campaign, or two after --compare, not both.\n"
+    assert result.stderr == "Give one campaign FILE, or two after --compare, not both.\n"
 
 
 # -- the commands about bags, as people call them: output and exit codes -------------------------

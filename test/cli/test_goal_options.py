@@ -99,10 +99,10 @@ def test_end_effectors_have_names_in_the_order_of_poses_then_positions() -> None
 @pytest.mark.parametrize(
     ("poses", "positions", "links", "counts"),
     [
-        ((POSE,), (HAND,), ("left",), "2 goal(s) of end-effectors and 1 name(s)"),
-        ((POSE,), (), ("left", "right"), "1 goal(s) of end-effectors and 2 name(s)"),
-        ((), (), ("left",), "0 goal(s) of end-effectors and 1 name(s)"),
-        ((POSE, POSE), (), (), "2 goal(s) of end-effectors and 0 name(s)"),
+        ((POSE,), (HAND,), ("left",), "2 end-effector goal(s) and 1 name(s)"),
+        ((POSE,), (), ("left", "right"), "1 end-effector goal(s) and 2 name(s)"),
+        ((), (), ("left",), "0 end-effector goal(s) and 1 name(s)"),
+        ((POSE, POSE), (), (), "2 end-effector goal(s) and 0 name(s)"),
     ],
 )
 def test_end_effectors_with_more_or_fewer_names_are_refused(
@@ -222,7 +222,7 @@ def test_a_path_of_bytes_that_are_no_text_is_refused() -> None:
     assert PATH.convert("a", None, None) == Path("a")
     with pytest.raises(click.BadParameter) as refused:
         PATH.convert("a\udcff", None, None)
-    assert refused.value.message == "the name 'a\\udcff' has bytes that are not UTF-8."
+    assert refused.value.message == "the name 'a\\udcff' contains bytes that are not UTF-8."
 
 
 def test_paths_of_end_effectors_are_read_from_files(tmp_path: Path) -> None:

@@ -199,7 +199,7 @@ def test_the_first_turn_is_one_that_the_joints_make_without_loops(name: str) -> 
     assert off < 0.25 * np.linalg.norm(turn)
 
 
-PLAIN = "No link is called 'end_effector'"
+PLAIN = "No link is named 'end_effector'"
 """The only remark on the planar chain as it is: 120 kg carry 24 kg."""
 
 PIN_1 = ('<joint name="pin_1" type="continuous">', '<joint name="pin_1" type="revolute">')
@@ -242,8 +242,8 @@ def to_stops(lower: float, upper: float, kind: str = "revolute") -> list[tuple[s
         ([(RATES, '<limit velocity="51" effort="1"/>')], "'pin_1' moves at up to 51 rad/s"),
         ([(RATES, '<limit velocity="2" effort="0"/>')], "'pin_1' has the effort limit 0"),
         (to_stops(-12.5, 1.0), None),
-        (to_stops(-12.6, 1.0), "'pin_1' turns from -12.6 to 1 rad"),
-        (to_stops(-1.0, 12.6), "'pin_1' turns from -1 to 12.6 rad"),
+        (to_stops(-12.6, 1.0), "'pin_1' ranges from -12.6 to 1 rad"),
+        (to_stops(-1.0, 12.6), "'pin_1' ranges from -1 to 12.6 rad"),
         (to_stops(-1.0, 20.0, "prismatic"), None),
         ([("</robot>", PLATE)], "The inertia of link 'plate' is not that of a rigid body"),
         ([meshes("a.stl")], "The mesh 'a.stl' was not found"),
@@ -322,7 +322,7 @@ def test_limits_in_degrees_are_remarked() -> None:
     text = robot_file("surveyor").read_text("utf-8").replace('lower="-2.9"', 'lower="-166"')
     found = [each for each in urdf_remarks(parse_robot(text)) if "not in degrees" in each]
     assert len(found) == 1
-    assert "'shoulder_yaw' turns from -166 to 2.9 rad" in found[0]
+    assert "'shoulder_yaw' ranges from -166 to 2.9 rad" in found[0]
 
 
 def test_columns_of_the_list_of_robots_are_apart() -> None:
@@ -340,7 +340,7 @@ def test_columns_of_the_list_of_robots_are_apart() -> None:
 @pytest.mark.parametrize(
     ("limit", "code", "said"),
     [
-        ("", 1, "'pin_1' has no velocity limit, within which gaits are planned"),
+        ("", 1, "'pin_1' has no velocity limit, which planning requires"),
         (RATES.replace("2", "60"), 0, "velocity limit. The same holds for 1 other joint."),
     ],
 )

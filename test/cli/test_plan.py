@@ -325,7 +325,7 @@ def test_the_workspaces_of_paper_4(tmp_path: Path) -> None:
 def test_workspaces_need_a_link(tmp_path: Path) -> None:
     found, lines, picture = analyzed(tmp_path, "planar_chain")
     assert found["workspaces"] == []
-    assert "workspaces   none: no link is called 'end_effector': name one with" in "\n".join(lines)
+    assert "workspaces   none: no link is named 'end_effector': select one with" in "\n".join(lines)
     assert not picture.with_name("a_workspaces.png").exists()
 
 
@@ -354,7 +354,7 @@ def test_a_robot_whose_loops_turn_nothing_has_no_picture(tmp_path: Path) -> None
         (["nobody.urdf"], "no such URDF file"),
         (["three_joint_arm", "--shape", "0 1"], "The shape has 2 number(s)"),
         (["three_joint_arm", "--shape", "0 1 nan"], "The shape has 3 number(s)"),
-        (["three_joint_arm", "--shape", "0 1 two"], "it must be one number for each joint"),
+        (["three_joint_arm", "--shape", "0 1 two"], "it must have one number per joint"),
         (["planar_chain", "--end-effector", "hand"], "has no link 'hand' besides its base; its "),
         (["planar_chain", "--end-effector", "base_link"], "has no link 'base_link' besides"),
     ],

@@ -385,7 +385,7 @@ def test_the_lines_of_a_plan(monkeypatch: pytest.MonkeyPatch) -> None:
     assert result.stdout == (
         "planar_chain, square_path: 0.06 s, ends 45.6 mrad and 12.3 mm from the goal\n"
         "planned in 0.679 s\n"
-        "clearance   no pair of links is checked (1 disabled by the SRDF)\n"
+        "clearance   no link pairs are checked (1 disabled by the SRDF)\n"
     )
     silent = plan(monkeypatch, True, *PLANAR, "--set", "planner.clearance=0").stdout
     assert silent == "".join(result.stdout.splitlines(keepends=True)[:2])

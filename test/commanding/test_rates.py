@@ -174,7 +174,7 @@ def test_a_task_is_asked_of_an_active_controller() -> None:
     with pytest.raises(CommandError, match="not active"):
         rig.commander.request(Task.DETUMBLE)
     rig.begin()
-    assert_one_sentence(rig.commander.request(Task.DETUMBLE), "'detumble' begins")
+    assert_one_sentence(rig.commander.request(Task.DETUMBLE), "'detumble' has started")
     rig.state(1)
     assert rig.host.statuses[-1].task == "detumble"  # type: ignore[union-attr]
     latched = PlantStatus(PlantState.LATCHED, "Nothing moves.", "abort", "a fuse is blown")

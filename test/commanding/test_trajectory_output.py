@@ -69,19 +69,19 @@ def test_a_schedule_is_sent_and_ends_with_its_result() -> None:
 @pytest.mark.parametrize(
     ("outcome", "code", "text", "message", "final"),
     [
-        (Outcome.ABORTED, -4, "wrist off.", "the trajectory has ended early with "
+        (Outcome.ABORTED, -4, "wrist off.", "the trajectory ended early with "
          "PATH_TOLERANCE_VIOLATED: wrist off", False),
-        (Outcome.ABORTED, -5, "", "the trajectory has ended early with GOAL_TOLERANCE_VIOLATED",
+        (Outcome.ABORTED, -5, "", "the trajectory ended early with GOAL_TOLERANCE_VIOLATED",
          False),
-        (Outcome.ABORTED, -1, "", "the trajectory has ended early with INVALID_GOAL", True),
-        (Outcome.ABORTED, -2, "no wrist", "the trajectory has ended early with INVALID_JOINTS: "
+        (Outcome.ABORTED, -1, "", "the trajectory ended early with INVALID_GOAL", True),
+        (Outcome.ABORTED, -2, "no wrist", "the trajectory ended early with INVALID_JOINTS: "
          "no wrist", True),
-        (Outcome.ABORTED, -3, "", "the trajectory has ended early with OLD_HEADER_TIMESTAMP", True),
+        (Outcome.ABORTED, -3, "", "the trajectory ended early with OLD_HEADER_TIMESTAMP", True),
         (Outcome.ABORTED, 0, "", "the trajectory was aborted without an error code", True),
-        (Outcome.ABORTED, 17, "", "the trajectory has ended early with error code 17", True),
+        (Outcome.ABORTED, 17, "", "the trajectory ended early with error code 17", True),
         (Outcome.CANCELED, -4, "new goal", "another client has replaced or cancelled the "
          "trajectory: new goal", True),
-        (Outcome.SUCCEEDED, -5, "", "the trajectory has ended early with GOAL_TOLERANCE_VIOLATED",
+        (Outcome.SUCCEEDED, -5, "", "the trajectory ended early with GOAL_TOLERANCE_VIOLATED",
          False),
     ],
 )  # fmt: skip
@@ -187,4 +187,4 @@ def test_texts_of_the_server_are_one_line_without_control_characters() -> None:
     sent = Sent()
     sent.output.ended(sent.start(), Outcome.ABORTED, -6, "stop\n\x1b[31mred")
     (end,) = sent.ends
-    assert end.message == "the trajectory has ended early with error code -6: stop \ufffd[31mred"
+    assert end.message == "the trajectory ended early with error code -6: stop \ufffd[31mred"

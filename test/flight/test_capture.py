@@ -176,8 +176,8 @@ def test_mujoco_does_not_capture(bag: Path) -> None:
     with pytest.raises(SpaceRobotError) as error:
         verify_bag(bag, mujoco=True)
     assert str(error.value) == (
-        f"The bag {bag} has a target, which MuJoCo does not capture: verify it without the second "
-        "engine."
+        f"The bag {bag} has a target, whose capture MuJoCo does not model: verify it without the "
+        "second engine."
     )
 
 

@@ -315,11 +315,11 @@ def test_goals_of_named_end_effectors_leave_the_base_free_unless_it_has_one(
     [
         ({"goal_position": None}, {}, "lacks the goal or the parameters of its flight"),
         ({"goal_position": "a b c"}, {}, "lacks the goal"),
-        ({}, {"urdf": False}, "holds no description of its robot."),
-        ({}, {"states": 0}, "holds no state: nothing is on /odom."),
-        ({}, {"joints": 0}, "holds no state: nothing is on /joint_states."),
-        ({}, {"joints": 2}, "has 3 poses of the base and 2 states of the joints: its flight is"),
-        ({}, {"goals": False}, "holds no goal pose."),
+        ({}, {"urdf": False}, "contains no robot description."),
+        ({}, {"states": 0}, "contains no states: there are no messages on /odom."),
+        ({}, {"joints": 0}, "contains no states: there are no messages on /joint_states."),
+        ({}, {"joints": 2}, "has 3 base poses and 2 joint states: its flight is"),
+        ({}, {"goals": False}, "contains no goal pose."),
     ],
 )
 def test_a_run_that_is_not_whole_is_refused(

@@ -55,7 +55,7 @@ class Stranger:
 
 
 STRANGERS = {
-    "one_link": Stranger("one_link.urdf", said="It has no joints and flies by thrusters"),
+    "one_link": Stranger("one_link.urdf", said="It has no joints and uses thrusters"),
     "wheels_only": Stranger("wheels_only.urdf"),
     "rotors": Stranger("rotors.urdf"),
     "sliders_only": Stranger("sliders_only.urdf"),

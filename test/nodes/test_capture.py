@@ -244,6 +244,6 @@ def test_tasks_are_done_on_request(harness: Harness, monkeypatch: pytest.MonkeyP
     assert loop.status["task"] == "approach"
     # The handle is 0.3 m on this side of the block.
     assert "Approaching the target: the end-effector is 0.502 m" in status.message, status
-    assert asked(loop, "detumble").message.startswith("The task 'detumble' begins")
+    assert asked(loop, "detumble").message.startswith("The task 'detumble' has started")
     answer()
     harness.spin_until(lambda: loop.status.get("task") == "detumble", "the task")

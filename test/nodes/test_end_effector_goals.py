@@ -279,8 +279,8 @@ def test_stamps_may_be_left_out_and_go_on_but_not_back() -> None:
         path_poses(message, "world", "The path")
     assert_one_sentence(
         str(refusal.value),
-        "The path goes back in time: pose 3 is stamped 1.25 s, after 2.5 s; leave the "
-        "stamps out, or put the poses in order.",
+        "The path goes back in time: pose 3 is stamped 1.25 s, after 2.5 s; omit the "
+        "stamps, or put the poses in order.",
     )
     far = path_through([[1, 2, 3]], frame="moon")
     with pytest.raises(

@@ -157,7 +157,7 @@ def test_a_plant_is_another_after_its_cleanup(harness: Harness) -> None:
     (refused,) = remote.set(robot="servicer")
     assert not refused.successful
     assert "'robot'" in refused.reason
-    assert "clean it up" in refused.reason
+    assert "clean up the node" in refused.reason
     plant.trigger_deactivate()
     assert not remote.set(robot="servicer")[0].successful, "it is configured still"
     plant.trigger_cleanup()

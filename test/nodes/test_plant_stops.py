@@ -185,7 +185,7 @@ def test_a_status_of_another_node_stops_nothing_and_is_reported(harness: Harness
     topic.publish(latched_message())
     harness.spin_until(
         lambda: any(
-            "more nodes publish it" in line.msg for line in flight.probe.messages["/rosout"]
+            "more publishers than odom" in line.msg for line in flight.probe.messages["/rosout"]
         )
     )
     pause(flight, False)

@@ -338,7 +338,7 @@ def test_meshes_of_a_configuration_that_failed_are_not_those_of_the_next_bag(
     probe = harness.probe({"/robot_description": String})
     wrong = {"bag": str(with_mesh), "remap": "/stream:=/no/topic//name", "hold": True}
     replay: ReplayNode = harness.make(ReplayNode, wrong, autostart=False)
-    with pytest.raises(SpaceRobotError, match="it is not a topic name"):
+    with pytest.raises(SpaceRobotError, match="it is not a valid topic name"):
         replay.start()
     replay.set_parameters_atomically(
         [Parameter("bag", value=str(without)), Parameter("remap", value="")]

@@ -391,4 +391,4 @@ def test_a_goal_that_nobody_takes_is_reported(harness: Harness) -> None:
     stack.until(lambda: stack.move(0.25, names) or stack.page.editor.placed, "a goal is shown")
     harness.remove(stack.probe)
     stack.press(stack.page._buttons._fly)
-    stack.until(lambda: "No planner or controller receives the goal" in stack.log(), "it says so")
+    stack.until(lambda: "The goal is not received" in stack.log(), "it says so")

@@ -184,7 +184,7 @@ def test_the_world_of_a_scenario_is_that_of_plant_and_planner(tmp_path: Path) ->
     text = scenario.path.read_text("utf-8")
     file = tmp_path / "mine.yaml"
     file.write_text(text.replace("worlds/strut.urdf", "none.urdf"), "utf-8")
-    with pytest.raises(ParameterError, match=r"The world of the scenario file .* cannot be read"):
+    with pytest.raises(ParameterError, match=r"The world in the scenario file .* cannot be read"):
         load_scenario(str(file))
     file.write_text(text.replace("worlds/strut.urdf", str(robot_file("free_flyer"))), "utf-8")
     with pytest.raises(ParameterError, match='give it type="fixed"'):

@@ -380,7 +380,7 @@ def test_a_violated_tolerance_is_corrected_from_the_measured_state() -> None:
     loop = flown(ticks=16)
     loop.tick(5)
     q = loop.plant.q.copy()
-    loop.executive.schedule_ended("the trajectory has ended early with PATH_TOLERANCE_VIOLATED")
+    loop.executive.schedule_ended("the trajectory ended early with PATH_TOLERANCE_VIOLATED")
     loop.tick(2)
     told = [each for each in loop.outputs if isinstance(each, Notice)]
     assert (

@@ -300,7 +300,7 @@ def test_the_head_says_that_the_goal_is_not_that_of_the_scenario(tmp_path: Path)
         "goal_orientation": " ".join(map(str, Rotation.from_rotvec(rotvec).as_quat())),
     }
     record = {"scenario": {"name": "test", "description": "It turns by 30 degrees.", **pose}}
-    own, other = "It turns by 30 degrees.", "Flown to another goal than the scenario's"
+    own, other = "It turns by 30 degrees.", "Flown to a goal other than the scenario's"
     for goals, shown, hidden in (([(0.0, *GOAL)], own, other), ([(0.0, *FINAL)], other, own)):
         folder = tmp_path / f"{len(shown)}"
         folder.mkdir()

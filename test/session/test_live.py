@@ -132,11 +132,11 @@ def test_a_planner_that_dies_is_started_again_within_the_limit(
         os.kill(first, signal.SIGKILL)
         killed = "Node 'planner' was ended by SIGKILL."
         assert next(line for line in lines if "SIGKILL" in line).strip() == (
-            f"{killed} It is started again."
+            f"{killed} It is restarted."
         )
         os.kill(pid_of("planner", ros_domain, first), signal.SIGKILL)
         rest = "".join(lines)
-        assert f"{killed} It was started again once within a minute" in rest
+        assert f"{killed} It was restarted once within a minute" in rest
         assert robot.wait(PATIENCE) == 2
 
 
@@ -526,7 +526,7 @@ def test_a_run_takes_the_next_name_if_its_recorder_is_to(tmp_path: Path) -> None
         ("plant", {"target.sensors.rate": 1e-322}, "must be 0 or from 1e-100 to 1e[+]100"),
         ("plant", {"sensors.position_bias": [0, 1e-200, 0]}, "must be 0 or from 1e-100"),
         ("planner", {"optimal.max_base_rate": 1e-320}, "must be 0 or from 1e-100"),
-        ("plant", {"world": "a\0b"}, "a text without NUL characters"),
+        ("plant", {"world": "a\0b"}, "a string without NUL characters"),
     ],
 )
 def test_bad_parameters_are_named(

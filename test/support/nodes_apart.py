@@ -37,7 +37,7 @@ STATUS_OF = {
 }
 DECIDED = ("reached", "reached_partly", "failed", "refused", "aborted")
 _COMPLAINT = re.compile(r"^\[(WARN|ERROR|FATAL)\]|Traceback|Warning: |Error: ")
-_OF_A_BUSY_MACHINE = "Limits of the URDF have held joints back"
+_OF_A_BUSY_MACHINE = "URDF limits have restricted joints"
 """Where commands came late, joints catch up as fast as they can."""
 
 

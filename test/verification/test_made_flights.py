@@ -253,7 +253,7 @@ def test_the_refusal_of_a_command_is_named(tmp_path: Path, prefix: str) -> None:
     difference = verified(tmp_path, [RATES] * 10, commands, prefix=prefix).difference
     assert difference is not None
     assert difference.time == pytest.approx(5 * TICK)
-    assert f"that on {prefix}/joint_commands stamped 0.4 s is refused:" in difference.remark
+    assert f"that on {prefix}/joint_commands stamped 0.4 s is rejected:" in difference.remark
 
 
 def test_states_after_the_end_of_its_plant_are_differences(
@@ -286,7 +286,7 @@ def test_the_robot_of_one_plant_is_verified(tmp_path: Path) -> None:
     with made_bag(tmp_path / "two.mcap") as (bag, say):
         for prefix in ("/a", "/b"):
             Made([RATES] * 4, prefix=prefix).add(bag, say)
-    with pytest.raises(RecordingError, match=r"holds the states of 2 plants \(/a, /b\)"):
+    with pytest.raises(RecordingError, match=r"contains states of 2 plants \(/a, /b\)"):
         verify_bag(tmp_path / "two.mcap")
     alone = Made([RATES] * 4, prefix="/a").write(tmp_path / "one.mcap")
     assert verify_bag(alone).difference is None
@@ -350,7 +350,7 @@ def test_a_message_between_two_ticks_is_refused_with_its_time(tmp_path: Path) ->
         late = JointState(name=NAMES, position=[0.0] * 3, velocity=[0.0] * 3, effort=[0.0] * 3)
         say("/joint_states", stamped(late, 0.25, "base_link"), 0.25)
         say("/joint_states", stamped(late, 0.27, "base_link"), 0.27)
-    words = "is stamped 0.25 s, between the ticks of the plant in it"
+    words = "is stamped 0.25 s, between the plant's ticks"
     with pytest.raises(RecordingError, match=words):
         verify_bag(path)
 
@@ -368,7 +368,7 @@ def test_a_bag_whose_states_were_removed_is_not_verified(tmp_path: Path, kept: i
     whole = Made([RATES] * 10).write(tmp_path / "whole.mcap")
     bag = without_states(whole, tmp_path / "a.mcap", since=kept)
     if kept == 1:
-        with pytest.raises(RecordingError, match="the states of one tick: there is nothing"):
+        with pytest.raises(RecordingError, match="the states of only one tick: there is nothing"):
             verify_bag(bag)
         return
     result = verify_bag(bag)
@@ -407,7 +407,7 @@ def test_a_bag_with_fewer_messages_than_its_recorder_wrote_is_not_whole(
         Made([RATES] * 10).add(bag, say)
         bag.add_metadata("recorder", {"messages": str(held + 1), "messages_lost": str(lost)})
     missing = verify_bag(tmp_path / "b.mcap").missing
-    assert missing == f"its recorder wrote {held + 1} messages, but it holds {held}."
+    assert missing == f"its recorder wrote {held + 1} messages, but it contains {held}."
 
 
 def test_a_state_that_was_lost_on_its_way_to_the_recorder_is_counted(tmp_path: Path) -> None:
@@ -605,7 +605,7 @@ def test_a_refused_command_is_named_with_the_reason(tmp_path: Path) -> None:
     difference = verify_bag(bag).difference
     assert difference is not None
     assert difference.time == pytest.approx(121 * TICK)
-    assert "that on /joint_commands stamped 12 s is refused: a value is not finite" in str(
+    assert "that on /joint_commands stamped 12 s is rejected: a value is not finite" in str(
         difference
     )
 
@@ -688,7 +688,7 @@ def test_a_flight_under_efforts_that_begins_in_mid_flight_has_its_joint_rates(
         ({"actuation": '"magic"'}, "'magic'"),
         ({"tick_rate": "not a number"}, "cannot be used: Expecting value"),
         ({"initial_position": '"here"'}, "cannot be used"),
-        ({"tick_rate": "30.01"}, "between the ticks"),
+        ({"tick_rate": "30.01"}, "between the plant's ticks"),
     ],
 )
 def test_what_cannot_be_flown_again_is_refused(

@@ -369,22 +369,22 @@ def test_nodes_that_have_ended_are_never_green(
 
 
 def test_news_stay_ten_seconds_or_until_the_stack_has_ended(server: Server, page: Page) -> None:
-    again = Notice("Node 'planner' was ended by SIGKILL. It is started again.", 1)
+    again = Notice("Node 'planner' was ended by SIGKILL. It is restarted.", 1)
     page.update(FLYING, 1.0)
     page.announce(again)
     page.update(FLYING, 9.0)
-    assert "It is started again." in page._status.content
+    assert "It is restarted." in page._status.content
     page.update(FLYING, 11.5)
-    assert "It is started again." not in page._status.content
+    assert "It is restarted." not in page._status.content
     page.announce(again)
     page.update(FLYING, 12.0)
-    assert "It is started again." in page._status.content
+    assert "It is restarted." in page._status.content
     ended = replace(
         FLYING, absent=frozenset({"plant", "planner"}), silent={"/plant": 3.0, "/planner": 3.0}
     )
     page.update(ended, 13.0)
     assert ENDED in page._status.content
-    assert "It is started again." not in page._status.content
+    assert "It is restarted." not in page._status.content
 
 
 def test_nothing_has_ended_where_nothing_has_begun() -> None:

@@ -114,7 +114,7 @@ def test_nodes_that_die_are_started_again_and_the_page_says_so(up: Up, tmp_path:
         up.goal("--end-effector-position", "1.0", "0.6", "0.7", "--end-effector", "link_7")
         page.wait_for_text("executing")
         up.kill("planner")
-        words = "Node 'planner' was ended by SIGKILL. It is started again."
+        words = "Node 'planner' was ended by SIGKILL. It is restarted."
         up.wait_for(words)
         page.wait_for_text(words)
         # It goes on with its goal.
@@ -123,7 +123,7 @@ def test_nodes_that_die_are_started_again_and_the_page_says_so(up: Up, tmp_path:
         # The page comes back to a viewer that was killed.
         window.evaluate("window.stale = true")
         up.kill("viewer")
-        up.wait_for("Node 'viewer' was ended by SIGKILL. It is started again.")
+        up.wait_for("Node 'viewer' was ended by SIGKILL. It is restarted.")
         with suppress(AssertionError):  # A question during the change of pages has no answer.
             window.wait_for("window.stale === undefined")
         page.wait_for_text("reached", without="was ended by SIGKILL")

@@ -302,7 +302,7 @@ def test_nodes_that_die_and_the_end_of_the_stack(tmp_path: Path, ros_domain: int
         page = looked.page
         page.wait_for_text("Waiting for a goal pose.")
         up.kill("planner")
-        page.wait_for_text("Node 'planner' was ended by SIGKILL. It is started again.")
+        page.wait_for_text("Node 'planner' was ended by SIGKILL. It is restarted.")
         looked.keep("restarted")
         up.kill_until("planner", "3 times within a minute, which is the limit (--restarts).")
         assert up.process.wait(PATIENCE) == 2

@@ -37,7 +37,7 @@ def test_settings_of_a_page_that_is_not_served_are_refused() -> None:
     for command in (["up", "planar_chain"], ["run", "planar_chain", "--realtime"]):
         refused = CliRunner().invoke(main, [*command, "--set", "viewer.host=0.0.0.0"])
         assert refused.exit_code == 2
-        assert "'viewer.host=0.0.0.0' is a setting of the web page: add --view." in refused.output
+        assert "'viewer.host=0.0.0.0' is a web page setting: add --view." in refused.output
 
 
 def test_the_viewer_gives_way_to_what_flies_within_its_session_and_among_sessions() -> None:

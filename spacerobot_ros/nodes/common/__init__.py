@@ -1,1 +1,1 @@
-"""Parts shared by all nodes: life cycle, parameters, serialised messages."""
+"""Code shared by all nodes: life cycle, parameters, serialised messages."""

@@ -1,4 +1,4 @@
-"""Base class of the nodes that command a plant: it converts the messages of a commander."""
+"""Base class of the nodes that command a plant: it converts a commander's messages."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ _WAITING_STATE_CHECK_PERIOD = 0.1  # wall s
 _STATUS_LOG_PERIOD = 5.0  # wall s, of statuses that do not count
 
 _LONGEST_DIAGNOSTICS_PERIOD = 1.0
-"""Longest wall time between diagnostics in runs that need not be repeatable, s."""
+"""Maximum wall time between diagnostics in runs that need not be repeatable, s."""
 
 _STATUS_QOS = QoSProfile(
     depth=20, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
@@ -62,7 +62,8 @@ _STATUS_QOS = QoSProfile(
 
 
 class CommanderNode(FlightNode):
-    """A node around a :class:`Commander`: it converts messages and owns topics, services, timers.
+    """A node around a :class:`Commander`: it converts messages and owns topics, services and
+    timers.
 
     If no robot is configured, it uses the latest robot_description.
     """
@@ -72,7 +73,7 @@ class CommanderNode(FlightNode):
 
     config: PlannerConfig | ControllerConfig
     commander: Commander
-    """Commander of the node, created whenever the node is configured."""
+    """The node's commander, created whenever the node is configured."""
 
     goal_shape: Array | None = None
     """Joint positions (n,) required at the end of goals; None: any."""
@@ -90,15 +91,15 @@ class CommanderNode(FlightNode):
 
     @abstractmethod
     def make_commander(self) -> Commander:
-        """Return a commander with the current parameters; this node is its host."""
+        """Return a commander with the current parameters, hosted by this node."""
 
     def listen(self, status_topic: str) -> None:
-        """Subscribe to the topics that all commanders have, and use the configured robot.
+        """Subscribe to the topics common to all commanders, and use the configured robot.
 
         Raises
         ------
         SpaceRobotError
-            The robot is refused.
+            The robot is invalid.
         """
         self.commander, config = self.make_commander(), self.config
         self._status_topic = self.create_publisher(DiagnosticStatus, status_topic, LATCHED)
@@ -111,7 +112,7 @@ class CommanderNode(FlightNode):
         self._subscribe_plant_status()
         self._best_effort = config.state_reliability == "best_effort"
         self._unheard = ""
-        """Name of a state topic with a publisher of incompatible QoS."""
+        """Name of a state topic with a QoS-incompatible publisher."""
         self.inputs: dict[str, Subscription] = {}
         self._subscribe_states()
         self.create_timer(
@@ -128,7 +129,7 @@ class CommanderNode(FlightNode):
             self.use(robot)
 
     def subscribe_to_goals(self, topic: str, key: str = BASE_GOAL_KEY) -> None:
-        """Subscribe to goal poses for the base or another part of the robot."""
+        """Subscribe to goal poses for the base or another link."""
         self.create_subscription(
             PoseStamped, topic, lambda message: self._on_goal(key, message), STREAM
         )
@@ -144,7 +145,7 @@ class CommanderNode(FlightNode):
 
     @abstractmethod
     def use(self, robot: SpaceRobot) -> None:
-        """Use this robot from now on."""
+        """Set the robot."""
 
     def decoder_of(self, robot: SpaceRobot) -> MessageDecoder:
         """Return a decoder for a robot; it also merges the robot's partial joint states."""
@@ -184,7 +185,7 @@ class CommanderNode(FlightNode):
         return now_ns / SECOND if now_ns else None
 
     def on_silence(self, silence: SilenceReport) -> None:
-        """Drop all goals if the plant is silent and the parameters request it."""
+        """Drop all goals if the plant is silent and the parameters require it."""
         super().on_silence(silence)
         if self.config.watchdog_action == "abort" and not silence.over:
             self.commander.give_up_goals(PlantStopped(silence.message))
@@ -192,13 +193,13 @@ class CommanderNode(FlightNode):
     # -- the host of the commander ------------------------------------------------------------
 
     def publish_status(self, status: Status) -> None:
-        """Publish a status of the goal."""
+        """Publish a goal status."""
         name, level = self.get_fully_qualified_name(), status.state.level
         self._last_status = StatusRecord(name, level, status.message, status.to_values())
         self._status_topic.publish(self._last_status.encoded())
 
     def log(self, level: LogLevel, message: str) -> None:
-        """Write a line into the log."""
+        """Write a line to the log."""
         logger = self.get_logger()
         # Each severity has its own call, as rclpy refuses a call site with changing severity.
         match level:
@@ -254,7 +255,7 @@ class CommanderNode(FlightNode):
         self.receive(key, message, lambda: self.read_goal(key, message))
 
     def receive(self, key: str, message: PoseStamped | Path, read: Callable[[], Goal]) -> None:
-        """Pass the goal that ``read`` returns to the commander; log it if it is accepted."""
+        """Pass the goal returned by ``read`` to the commander; log it if accepted."""
         stamp, part = message.header.stamp, key.replace("_", "-")
         accepted = self.commander.receive_goal(key, stamp.sec, stamp.nanosec, read)
         if accepted is not None:
@@ -269,7 +270,7 @@ class CommanderNode(FlightNode):
         Raises
         ------
         PlanningError
-            It is refused.
+            The goal is invalid.
         """
         frame = self.config.world_frame
         if key == BASE_GOAL_KEY:
@@ -307,7 +308,7 @@ class CommanderNode(FlightNode):
         if self._statuses is not None:
             self.destroy_subscription(self._statuses)
         self._doubted = False
-        """Whether a status may have come from a node other than the plant."""
+        """Whether a status may be from a node other than the plant."""
         self._statuses = self.create_subscription(
             DiagnosticStatus,
             "plant/status",
@@ -325,7 +326,7 @@ class CommanderNode(FlightNode):
         if self._has_foreign_statuses():
             self._doubted = True
             self.get_logger().warning(
-                "plant/status: more nodes publish it than odom. It is ignored until only the plant "
+                "plant/status has more publishers than odom. It is ignored until only the plant "
                 "publishes it.",
                 throttle_duration_sec=_STATUS_LOG_PERIOD,
             )
@@ -394,7 +395,8 @@ class CommanderNode(FlightNode):
 
     def _resubscribe_best_effort(self) -> None:
         self.get_logger().info(
-            f"A publisher of '{self._unheard}' uses best effort; so does the subscription now."
+            f"A publisher of '{self._unheard}' uses best effort; the subscription is changed to "
+            f"match."
         )
         self._unheard, self._best_effort = "", True
         for topic in ("odom", "joint_states"):

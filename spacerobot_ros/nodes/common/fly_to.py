@@ -1,6 +1,6 @@
-"""Goals as actions: the servers of a commander node, and the conversion of their messages.
+"""Goals as actions: a commander node's servers, and the conversion of their messages.
 
-The types are imported at run time if installed: ``spacerobot_msgs/action/FlyTo`` of this project
+The types are imported at run time if installed: ``spacerobot_msgs/action/FlyTo`` from this project
 and ``nav2_msgs/action/NavigateToPose``.
 """
 
@@ -31,9 +31,9 @@ from spacerobot_ros.planning.core.goal import Goal, Tolerance
 from spacerobot_ros.times import SECOND
 
 _RESULT_TIMEOUT = 60
-"""Time for which a server keeps the result of a goal that has ended, s.
+"""Time for which a server keeps the result of a completed goal, s.
 
-Each kept goal makes the next ones slower.
+Each kept goal slows down later goals.
 """
 
 _NAV2_FAILURE = 9000
@@ -85,7 +85,7 @@ class FlyToAction:
         if joints.name:
             if surroundings.joint_names is None:
                 raise PlanningError(
-                    "The goal has joint positions, but no robot_description was received yet."
+                    "The goal has joint positions, but no robot_description has been received yet."
                 )
             shape = shape_of(joints, surroundings.joint_names)
         goal, frame, pose_of = None, surroundings.world_frame, surroundings.pose_of
@@ -111,7 +111,7 @@ class FlyToAction:
         return FlyTo.from_numbers(goal, tolerance, limit.sec + limit.nanosec / SECOND)
 
     def feedback(self, progress: Progress, world_frame: str) -> Any:
-        """Return the course of a goal as a message."""
+        """Return a goal's progress as a message."""
         message = self.kind.Feedback(phase=progress.phase)
         set_duration(message.remaining_time, progress.remaining_time or 0.0)
         _set_errors(message.errors, progress.errors.values())
@@ -152,7 +152,7 @@ class NavigateToPoseAction:
         )
 
     def feedback(self, progress: Progress, world_frame: str) -> Any:
-        """Return the course of a goal as a message."""
+        """Return a goal's progress as a message."""
         message = self.kind.Feedback()
         if progress.pose is not None:
             here = Goal(progress.pose[:3], progress.pose[3:])
@@ -165,7 +165,7 @@ class NavigateToPoseAction:
         return message
 
     def result(self, result: FlyToResult) -> Any:
-        """Return a result as a message; ROS 2 Humble's is empty."""
+        """Return a result as a message; in ROS 2 Humble it is empty."""
         message = self.kind.Result()
         if hasattr(message, "error_code"):
             message.error_code = 0 if result.outcome == "reached" else _NAV2_FAILURE
@@ -182,10 +182,10 @@ class _Server(ActionServer):
     """An action server whose goals end when the commander decides, not when a callback returns."""
 
     def notify_execute(self, goal_handle: ServerGoalHandle, execute_callback: Any) -> None:
-        """Do nothing: states of the plant advance the goal."""
+        """Do nothing: plant states advance the goal."""
 
     def end(self, handle: ServerGoalHandle, result: Any) -> None:
-        """Send the result of a goal in a final state to its client."""
+        """Send the result of a completed goal to its client."""
         response = self.action_type.Impl.GetResultService.Response()
         response.status, response.result = handle.status, result
         self._result_futures[bytes(handle.goal_id.uuid)].set_result(response)
@@ -205,7 +205,7 @@ class GoalClient:
         self._handle.publish_feedback(self._action.feedback(progress, self._world_frame))
 
     def end(self, result: FlyToResult) -> None:
-        """Send the result with the matching final state of ROS 2."""
+        """Send the result with the matching ROS 2 goal state."""
         handle = self._handle
         if result.outcome == "reached":
             handle.succeed()
@@ -217,7 +217,7 @@ class GoalClient:
 
 
 class GoalActions:
-    """The action servers of a commander node; they exist as long as the node.
+    """A commander node's action servers; they exist as long as the node.
 
     A client therefore receives the result of a goal that a cleanup of the node has ended. While the
     node is not configured, goals are rejected.
@@ -232,7 +232,7 @@ class GoalActions:
                 self._servers.append(self._create_server(kind(found)))
         if not self._servers:
             node.get_logger().info(
-                "Goals are accepted on topics only: actions need spacerobot_msgs or nav2_msgs, "
+                "Goals are accepted only on topics: actions need spacerobot_msgs or nav2_msgs, "
                 "and neither is installed."
             )
 

@@ -1,4 +1,4 @@
-"""Messages that several nodes make or read: types by name, diagnostics, markers, goals."""
+"""Messages created or read by several nodes: types by name, diagnostics, markers, goals."""
 
 from __future__ import annotations
 
@@ -32,13 +32,13 @@ if TYPE_CHECKING:
     from spacerobot_ros.planning.core.goal import EndEffectorGoal
 
 _MAX_KEPT_TRANSFORMS, _MAX_KEPT_STATIC_TRANSFORMS = 200, 100
-"""Numbers of stored messages of /tf and of /tf_static: a few seconds of several publishers."""
+"""Numbers of stored /tf and /tf_static messages: a few seconds from several publishers."""
 
 _MAX_CHAINED_FRAMES = 1000
-"""Largest number of frames between a frame and the world; received frames may form a cycle."""
+"""Maximum number of frames between a frame and the world; received frames may form a cycle."""
 
 _SHORTEST_QUATERNION = 1e-6
-"""Least norm of a quaternion in a message."""
+"""Minimum quaternion norm in a message."""
 
 
 def message_class(type_name: str) -> Any:
@@ -75,7 +75,7 @@ def interface_class(module: str, name: str) -> Any | None:
 
 
 def shape_message(goal: Goal, joint_names: Sequence[str]) -> JointState:
-    """Return a message with the joint positions required at a goal; empty if none are."""
+    """Return a message with the joint positions required at a goal; empty if there are none."""
     positions = goal.joint_positions
     if positions is None:
         return JointState()
@@ -85,7 +85,7 @@ def shape_message(goal: Goal, joint_names: Sequence[str]) -> JointState:
 def pose_array(position: Any, orientation: Any) -> Array | None:
     """Return the pose (7,) of a point or vector and a quaternion message, normalised.
 
-    None if a number is not finite, or the quaternion zero.
+    None if a value is not finite or the quaternion is zero.
     """
     p, o = position, orientation
     pose = np.array([p.x, p.y, p.z, o.x, o.y, o.z, o.w])
@@ -105,14 +105,14 @@ def goal_of(
 ) -> Goal:
     """Return the goal of a pose message in ``frame``, with joint positions ``shape``.
 
-    A position or an orientation with only NaN is not required.
+    An all-NaN position or orientation is not required.
 
     ``pose_of`` returns the pose (7,) of another frame in ``frame``; None if unknown.
 
     Raises
     ------
     PlanningError
-        Its frame is unknown, or it is not a pose; ``what`` names it.
+        The frame is unknown, or the message is not a pose; ``what`` names it.
     """
     from spacerobot_ros.planning import Goal  # A plant takes no goals.
 
@@ -132,12 +132,12 @@ def end_effector_goal(
     what: str,
     pose_of: Callable[[str], Array | None] = lambda frame: None,
 ) -> EndEffectorGoal:
-    """Return the goal of a link; if the orientation is all zeros, any attitude is accepted.
+    """Return a link goal; if the orientation is all zeros, any attitude is accepted.
 
     Raises
     ------
     PlanningError
-        It is not a pose, or its frame is unknown; ``what`` names it.
+        The message is not a pose, or its frame is unknown; ``what`` names it.
     """
     from spacerobot_ros.planning.core.goal import EndEffectorGoal
 
@@ -176,12 +176,12 @@ def path_poses(
     """Return the poses (K, 7) of a path message in ``frame``, or their positions (K, 3).
 
     Only positions are returned if all orientations are zeros. ``pose_of``: see :func:`goal_of`. A
-    pose without a frame is in the frame of the path.
+    pose without a frame is in the path's frame.
 
     Raises
     ------
     PlanningError
-        A frame is unknown, or the stamps of the poses decrease; ``what`` names the path.
+        A frame is unknown, or the pose stamps decrease; ``what`` names the path.
     """
     given = [each.header.frame_id or message.header.frame_id for each in message.poses]
     poses, times = np.zeros((len(given), 7)), np.zeros(len(given), dtype=np.int64)
@@ -194,7 +194,7 @@ def path_poses(
         k = int(back[0]) + 1
         raise PlanningError(
             f"{what} goes back in time: pose {k + 1} is stamped {times[k] / SECOND:.9g} s, after "
-            f"{times[k - 1] / SECOND:.9g} s; leave the stamps out, or put the poses in order."
+            f"{times[k - 1] / SECOND:.9g} s; omit the stamps, or put the poses in order."
         )
     for name in dict.fromkeys(given):
         other = _pose_of_frame(name, frame, what, pose_of)
@@ -207,7 +207,7 @@ def path_poses(
 
 
 def goal_description(part: str, goal_id: str, message: PoseStamped | Path, goal: Goal) -> str:
-    """Return one log line about a received goal."""
+    """Return a log line about a received goal."""
     frame = printable(message.header.frame_id)
     given = f", given in '{frame}'" if frame else ""
     aim = goal.end_effectors[0] if goal.end_effectors else goal
@@ -221,7 +221,7 @@ def goal_description(part: str, goal_id: str, message: PoseStamped | Path, goal:
 
 
 def shape_of(message: JointState, joint_names: Sequence[str]) -> Array:
-    """Return the joint positions (n,) of a message, in the order of the robot's joints.
+    """Return the joint positions (n,) in a message, in the robot's joint order.
 
     Raises
     ------
@@ -232,10 +232,10 @@ def shape_of(message: JointState, joint_names: Sequence[str]) -> Array:
     missing = set(joint_names) - set(values)
     if missing:
         raise PlanningError(
-            f"The goal joint positions are refused: joint '{min(missing)}' is missing."
+            f"The goal joint positions are invalid: joint '{min(missing)}' is missing."
         )
     if not np.all(np.isfinite(list(values.values()))):
-        raise PlanningError("The goal joint positions are refused: a position is not finite.")
+        raise PlanningError("The goal joint positions are invalid: a position is not finite.")
     return np.array([values[name] for name in joint_names])
 
 
@@ -248,7 +248,7 @@ def transform_class() -> Any | None:
 
 
 class KnownFrames:
-    """The frames known to a node: those of its robot's state, and those of /tf if available.
+    """The frames known to a node: from the robot's state, and from /tf if available.
 
     Messages of /tf are stored serialised and read when a frame is requested.
     """
@@ -274,7 +274,7 @@ class KnownFrames:
     def pose(self, frame: str, world: str, own: dict[str, tuple[str, Array]]) -> Array | None:
         """Return the last known pose (7,) of a frame in the world.
 
-        ``own`` maps frames to their parent and their pose in it, and overrides /tf. None: the
+        ``own`` maps frames to their parent and their pose in it, and overrides /tf. None if the
         frames are not connected.
         """
         parents = {**self._received_parents(), **own}

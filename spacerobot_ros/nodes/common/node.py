@@ -42,22 +42,23 @@ from spacerobot_ros.nodes.common.watchdog import Liveness, Role, SilenceReport
 from spacerobot_ros.parameters import Parameter, configured, declared, values_of
 
 STREAM = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
-"""QoS of states, commands and events: reliable, with a queue for readers that are briefly busy."""
+"""QoS for states, commands and events: reliable, with a queue for readers that are briefly busy."""
 
 BEST_EFFORT = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
-"""QoS of state topics from sensor drivers, which do not resend lost messages."""
+"""QoS for state topics from sensor drivers, which do not resend lost messages."""
 
 LATCHED = QoSProfile(
     depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
 )
-"""QoS that gives a late subscriber the last message: reliable, transient local, depth 1."""
+"""QoS with which a late subscriber receives the last message: reliable, transient local, depth
+1."""
 
 AUTOSTART = Parameter(
     "autostart",
     True,
-    description="configure and activate at once; false: wait for a supervisor",
+    description="configure and activate immediately; false: wait for a supervisor",
 )
-"""Parameter of every node: whether it starts by itself."""
+"""Parameter of every node: whether it starts automatically."""
 
 _STATES_THAT_CAN_SHUT_DOWN = (
     State.PRIMARY_STATE_UNCONFIGURED,
@@ -67,9 +68,9 @@ _STATES_THAT_CAN_SHUT_DOWN = (
 
 
 class FlightNode(LifecycleNode):
-    """A managed node with declared and checked parameters; every refusal names its parameter.
+    """A managed node with declared and checked parameters; every error names the parameter.
 
-    Subclasses define ``Config``, the declaration of their parameters, and the four hooks
+    Subclasses define ``Config``, which declares their parameters, and the four hooks
     :meth:`configure`, :meth:`activate`, :meth:`deactivate` and :meth:`cleanup`, which raise
     :class:`SpaceRobotError` on failure.
 
@@ -80,25 +81,25 @@ class FlightNode(LifecycleNode):
     Parameters
     ----------
     name
-        Node name; ``kwargs`` are those of ``rclpy.node.Node`` (namespace, context,
+        Node name; ``kwargs`` are passed to ``rclpy.node.Node`` (namespace, context,
         parameter_overrides, cli_args, ...).
     autostart
-        Overrides the parameter of that name.
+        Overrides the parameter with the same name.
 
     Raises
     ------
     SpaceRobotError
-        A parameter is refused, or ``autostart`` is on and the node cannot be configured.
+        A parameter is invalid, or ``autostart`` is on and the node cannot be configured.
     """
 
     Config: ClassVar[type[Any]]
     """The frozen dataclass that declares the node's parameters."""
 
     role: ClassVar[Role | None] = None
-    """Role of this node in the stack, on which other nodes depend."""
+    """Role of this node in the stack, used by other nodes."""
 
     depends_on: ClassVar[tuple[Role, ...]] = ()
-    """Roles of the nodes whose silence this node reports."""
+    """Roles of the nodes that this node monitors."""
 
     default_name: ClassVar[str] = ""
 
@@ -134,13 +135,13 @@ class FlightNode(LifecycleNode):
         Raises
         ------
         SpaceRobotError
-            A transition failed; the message says why.
+            A transition failed; the message gives the reason.
         """
         self.require_transition(self.trigger_configure)
         self.require_transition(self.trigger_activate)
 
     def require_transition(self, trigger: Callable[[], TransitionCallbackReturn]) -> None:
-        """Take a transition (``trigger_configure``, ...) that must succeed.
+        """Perform a transition (``trigger_configure``, ...) that must succeed.
 
         Raises
         ------
@@ -166,7 +167,7 @@ class FlightNode(LifecycleNode):
 
     @property
     def simulated_time_s(self) -> float | None:
-        """Simulated time, s; None if the node does not know it."""
+        """Simulated time, s; None if unknown to the node."""
         return None
 
     # -- callbacks ----------------------------------------------------------------------------
@@ -209,7 +210,7 @@ class FlightNode(LifecycleNode):
         return super().create_service(srv_type, srv_name, answer, *args, **kwargs)
 
     def offer(self, name: str, act: Callable[[], str]) -> None:
-        """Create a service without arguments that responds with the text a function returns.
+        """Create a service without arguments that responds with the string returned by a function.
 
         If the function raises CommandError, the response has its message and ``success`` false.
         """
@@ -269,9 +270,9 @@ class FlightNode(LifecycleNode):
         return [self.set_parameters_atomically([each]) for each in parameter_list]
 
     def set_parameters_atomically(self, parameter_list: list[RosParameter]) -> SetParametersResult:
-        """Set all parameters or none; most can be set only while the node is not configured.
+        """Set all parameters or none; most can be set only while the node is unconfigured.
 
-        Values are converted to the declared types if possible: a whole number to a real one. An
+        Values are converted to the declared types if possible, such as an integer to a float. An
         unchanged value is always accepted, because loading a dump sets every parameter.
         """
         try:
@@ -323,32 +324,33 @@ class FlightNode(LifecycleNode):
     # -- hooks --------------------------------------------------------------------------------
 
     def prepare(self) -> None:
-        """Create the entities that exist as long as the node, such as its status."""
+        """Create the entities that exist as long as the node, such as its status publisher."""
 
     def configure(self) -> None:
-        """Create model, publishers, subscriptions and services."""
+        """Create the model, publishers, subscriptions and services."""
 
     def activate(self) -> None:
-        """Start the work of the node."""
+        """Start the node's work."""
 
     def start_message(self) -> str:
         """Return the message that the node logs when it becomes active."""
         return f"Node '{self.get_name()}' is active."
 
     def deactivate(self) -> None:
-        """Stop the work of the node; its resources stay."""
+        """Stop the node's work, but keep its resources."""
 
     def cleanup(self) -> None:
-        """Release the resources of configure."""
+        """Release the resources created by :meth:`configure`."""
 
     def on_failure(self, message: str, error: Exception) -> None:
-        """Report in the status of the node that an error stops it; it is deactivated then."""
+        """Report in the node's status that it was stopped by an error; the node is then
+        deactivated."""
 
     def interrupt(self) -> None:
         """Cancel a long computation; called when the process must end."""
 
     def on_silence(self, silence: SilenceReport) -> None:
-        """React to a node that has become silent or is back."""
+        """React to a node that has become silent or has returned."""
         kind = EventKind.NODE_BACK if silence.over else EventKind.NODE_SILENT
         level, logger = (0 if silence.over else 2), self.get_logger()
         if silence.over:
@@ -371,12 +373,12 @@ class FlightNode(LifecycleNode):
         """Complete pending work within about a second before the node ends."""
 
     def parameters_changed(self) -> None:
-        """React to a change of live parameters; ``self.config`` has the new values."""
+        """React to changed live parameters; ``self.config`` has the new values."""
 
     # -- life cycle ---------------------------------------------------------------------------
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Call :meth:`configure`; if it fails, destroy the entities that it has created."""
+        """Call :meth:`configure`; if it fails, destroy the entities that it created."""
         self._liveness.configure(float(getattr(self.config, "watchdog_timeout", 0.0)))
         if unknown := unknown_parameters(self):
             self.get_logger().warning(printable(unknown), once=True)
@@ -388,7 +390,7 @@ class FlightNode(LifecycleNode):
         return self._report_transition(result, EventKind.CONFIGURED)
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Call :meth:`activate` and begin the heartbeats."""
+        """Call :meth:`activate` and start the heartbeats."""
         result = self._run(self.activate)
         if result is TransitionCallbackReturn.SUCCESS:
             self._liveness.begin()
@@ -494,8 +496,8 @@ class FlightNode(LifecycleNode):
         for change in changes:
             if change.name == AUTOSTART.name:
                 raise ParameterError(
-                    "Parameter 'autostart' is read once, when the node starts: change the state of "
-                    "the node instead."
+                    "Parameter 'autostart' is read once, when the node starts: change the node's "
+                    "state instead."
                 )
             declaration = self._parameters_declared.get(change.name)
             configured_now = self.lifecycle_state != State.PRIMARY_STATE_UNCONFIGURED
@@ -503,7 +505,8 @@ class FlightNode(LifecycleNode):
                 name = self.get_fully_qualified_name()
                 raise ParameterError(
                     f"Parameter '{change.name}' keeps its value while the node is configured: "
-                    f"deactivate and clean it up first (ros2 lifecycle set {name} deactivate, "
+                    f"first deactivate and clean up the node (ros2 lifecycle set {name} "
+                    f"deactivate, "
                     "then cleanup), set it, and configure and activate the node again."
                 )
 
@@ -519,7 +522,7 @@ class FlightNode(LifecycleNode):
 
 
 def described_robot(robot: SpaceRobot | None) -> str:
-    """Return name, number of joints and mass of a robot as a phrase."""
+    """Return a phrase with a robot's name, number of joints and mass."""
     if robot is None:
         return "the robot expected on robot_description"
     mass = robot.description.total_mass

@@ -1,4 +1,4 @@
-"""A node in its own process; discovery and transport for every process of the stack."""
+"""A node in its own process; discovery and transport for every process in the stack."""
 
 from __future__ import annotations
 
@@ -27,28 +27,28 @@ from spacerobot_ros.termination import Terminated, graceful_shutdown, guarded
 _LOG = logging.getLogger(__name__)
 
 _LONGEST_DELIVERY = 1.0
-"""Longest wall time to wait after a signal until readers confirm messages, s."""
+"""Maximum wall time to wait after a signal until readers confirm messages, s."""
 
 _LONGEST_END = 10.0
-"""Longest wall time from a signal to the end of the process, s."""
+"""Maximum wall time from a signal to the end of the process, s."""
 
 _LAST_DOMAIN = 232
-"""Largest ROS_DOMAIN_ID: ports of larger ones do not exist."""
+"""Largest ROS_DOMAIN_ID: larger values have no valid ports."""
 
 _DISCOVERY_CHOICES = ("ROS_AUTOMATIC_DISCOVERY_RANGE", "ROS_STATIC_PEERS", "ROS_LOCALHOST_ONLY")
 
 FASTDDS_FILE_VARIABLES = ("FASTDDS_DEFAULT_PROFILES_FILE", "FASTRTPS_DEFAULT_PROFILES_FILE")
-"""Environment variables with the settings file of Fast DDS: new and old name."""
+"""Environment variables for the Fast DDS settings file: new and old name."""
 
 _TRANSPORT_CHOICES = ("FASTDDS_BUILTIN_TRANSPORTS", *FASTDDS_FILE_VARIABLES)
 
 _turn = itertools.count(os.getpid())
-"""Consecutive tests of one process use different domains."""
+"""Consecutive tests in one process use different domains."""
 
 _SHARED_MEMORY = Path("/dev/shm")
 
 _REQUIRED_SHARED_MEMORY = 2 * 2**20
-"""Least free shared memory for a process, bytes; the middleware uses about 1 MiB."""
+"""Minimum free shared memory for a process, bytes; the middleware uses about 1 MiB."""
 
 
 def use_loopback_discovery() -> None:
@@ -72,8 +72,8 @@ def _use_sockets_without_shared_memory() -> None:
         os.environ["FASTDDS_BUILTIN_TRANSPORTS"] = "UDPv4"
         _LOG.warning(
             "%s has %d kB of usable space: messages go through sockets "
-            "(FASTDDS_BUILTIN_TRANSPORTS=UDPv4). Files that killed processes left there, "
-            "fastrtps_*, may be deleted while nothing runs.",
+            "(FASTDDS_BUILTIN_TRANSPORTS=UDPv4). fastrtps_* files left by killed processes may be "
+            "deleted while nothing runs.",
             _SHARED_MEMORY,
             free // 1024,
         )
@@ -81,7 +81,7 @@ def _use_sockets_without_shared_memory() -> None:
 
 @contextmanager
 def free_domain() -> Iterator[int]:
-    """Lock a ROS domain that no other process has locked this way; yield its number.
+    """Lock a ROS domain not locked by another process; yield its number.
 
     Raises
     ------
@@ -104,11 +104,12 @@ def free_domain() -> Iterator[int]:
 
 
 def run_node(factory: Callable[[], FlightNode], arguments: list[str] | None = None) -> int:
-    """Run one node in its own process until SIGINT, SIGTERM, SIGHUP, or the end of its parent.
+    """Run one node in its own process until SIGINT, SIGTERM, SIGHUP, or its parent's end.
 
-    The parent's end is ignored unless it requested this, which a shell or ``ros2 run`` does not.
-    Returns the exit code: 0 after a signal, 2 when the node cannot start (the message is on
-    standard error), the node's own when it ends by itself.
+    The parent's end is ignored unless the parent requested otherwise; a shell or ``ros2 run`` does
+    not.
+    Returns the exit code: 0 after a signal, 2 if the node cannot start (the message is on standard
+    error), the node's own code if it ends by itself.
 
     Raises
     ------
@@ -131,7 +132,7 @@ def start_ros(arguments: list[str] | None) -> None:
     Raises
     ------
     SpaceRobotError
-        ROS does not start: an argument, a parameter file or an environment variable is refused.
+        ROS does not start: an argument, a parameter file or an environment variable is invalid.
     """
     domain = os.environ.get("ROS_DOMAIN_ID", "")
     # The middleware ends the process for larger domain numbers.

@@ -1,4 +1,4 @@
-"""Parameters of a node as ROS parameters, and parameters of other nodes via their services."""
+"""A node's parameters as ROS parameters, and other nodes' parameters via their services."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ _MAX_CHECKS_FOR_ANSWER = 200
 """Number of checks after which a silent node is assumed to have no parameter services."""
 
 _CHECKS_UNTIL_CONNECTED = 3
-"""Number of checks before a request, while the node discovers the client. An earlier answer would
+"""Number of checks before a request, while the node discovers the client. An earlier response would
 block the node for 0.1 s and be lost."""
 
 _CHECKS_UNTIL_LOST = 50
-"""Number of checks after which an answer is considered lost by the middleware."""
+"""Number of checks after which a response is considered lost by the middleware."""
 
 
 class RemoteParameters:
@@ -35,11 +35,11 @@ class RemoteParameters:
     def __init__(self, node: Node, name: str) -> None:
         self._node, self.name = node, name
         self.values: dict[str, str] | None = None
-        """JSON text of every set parameter, by its full name; None before the answer."""
+        """JSON string of every set parameter, by full name; None before the answer."""
         self._steps = self._request_values()
 
     def look(self) -> bool:
-        """Return whether the request is over: the node has answered, or never will."""
+        """Return whether the request is complete: the node has responded, or never will."""
         return next(self._steps, True)
 
     def close(self) -> None:
@@ -113,12 +113,12 @@ def _descriptor(parameter: Parameter) -> ParameterDescriptor:
 def declare(node: Node, parameters: Sequence[Parameter]) -> dict[str, Value]:
     """Declare parameters on a node and return their checked values.
 
-    A whole number is accepted for a real parameter (``rate: 20``).
+    An integer is accepted for a float parameter (``rate: 20``).
 
     Raises
     ------
     ParameterError
-        A given value is refused; the message names the parameter.
+        A given value is invalid; the message names the parameter.
     """
     values = {}
     for parameter in parameters:
@@ -139,9 +139,9 @@ def declare(node: Node, parameters: Sequence[Parameter]) -> dict[str, Value]:
 
 
 def unknown_parameters(node: Node) -> str:
-    """Return a sentence about the parameters that were set but do not exist on a node.
+    """Return a sentence about parameters that were set but do not exist on a node.
 
-    It suggests the nearest existing name for each; empty if all are known.
+    The sentence suggests the nearest existing name for each; it is empty if all are known.
     """
     unknown = [
         name
@@ -167,15 +167,16 @@ def fix(node: Node, parameters: Iterable[Parameter], *, fixed: bool) -> None:
 def typed(
     parameters: Mapping[str, Parameter], changes: Iterable[RosParameter]
 ) -> list[RosParameter]:
-    """Return parameter changes converted to the declared types; undeclared ones unchanged.
+    """Return parameter changes converted to the declared types; undeclared parameters are
+    unchanged.
 
-    A whole number is accepted for a real parameter (``ros2 param set /plant tick_rate 50``), and an
+    An integer is accepted for a float parameter (``ros2 param set /plant tick_rate 50``), and an
     empty list for a list of any type.
 
     Raises
     ------
     ParameterError
-        A value is refused; the message names the parameter.
+        A value is invalid; the message names the parameter.
     """
     known = [(parameters.get(change.name), change) for change in changes]
     return [

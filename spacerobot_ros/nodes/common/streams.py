@@ -1,4 +1,4 @@
-"""Matched publishers and subscriptions of nodes."""
+"""Matched node publishers and subscriptions."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Matches = tuple[tuple[str, int], ...]
 
 @dataclass(frozen=True)
 class MatchedEndpoints:
-    """The endpoints of one node, except those of the middleware.
+    """The endpoints of one node, except the middleware's own.
 
     Attributes
     ----------
@@ -30,18 +30,18 @@ class MatchedEndpoints:
 
     @classmethod
     def of(cls, node: Node) -> MatchedEndpoints:
-        """Return the endpoints of a node of this process."""
+        """Return the endpoints of a node in this process."""
         readers = [(each.topic_name, each.get_subscription_count()) for each in node.publishers]
         writers = [(each.topic_name, each.get_publisher_count()) for each in node.subscriptions]
         return cls(_without_middleware(readers), _without_middleware(writers))
 
     def to_json(self) -> str:
-        """Return the endpoints as a JSON text."""
+        """Return the endpoints as a JSON string."""
         return json.dumps([self.publishers, self.subscriptions])
 
     @classmethod
     def from_json(cls, text: str) -> MatchedEndpoints:
-        """Return the endpoints of a text from :meth:`to_json`."""
+        """Return the endpoints from a string returned by :meth:`to_json`."""
         publishers, subscriptions = json.loads(text)
         return cls(_without_middleware(publishers), _without_middleware(subscriptions))
 

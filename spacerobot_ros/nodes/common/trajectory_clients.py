@@ -1,4 +1,4 @@
-"""Clients of FollowJointTrajectory, the action that sends schedules to a robot's own controller.
+"""FollowJointTrajectory clients, which send schedules to a robot's own controller.
 
 Its type ``control_msgs/action/FollowJointTrajectory`` is imported at run time.
 """
@@ -28,14 +28,14 @@ _OUTCOMES = {
 
 
 class TrajectoryClients:
-    """The FollowJointTrajectory clients of a planner node; they exist as long as the node.
+    """A planner node's FollowJointTrajectory clients; they exist as long as the node.
 
-    If a cleanup of the node destroyed them, an executor might still hold an answer for one.
+    If a node cleanup destroyed them, an executor might still hold a response for one of them.
 
     Raises
     ------
     ParameterError
-        The package of the action is not installed.
+        The action package is not installed.
     """
 
     def __init__(self, node: Any) -> None:
@@ -115,7 +115,7 @@ class _Connection:
 def joint_trajectory(schedule: GaitSchedule) -> JointTrajectory:
     """Return a schedule as a trajectory that begins when it arrives.
 
-    Its points have positions only, so that controllers interpolate linearly. This reproduces the
+    Its points have only positions, so that controllers interpolate linearly. This reproduces the
     schedule, whose velocities are constant over a tick.
     """
     message = deserialize_message(trajectory_message(schedule, 0, ""), JointTrajectory)

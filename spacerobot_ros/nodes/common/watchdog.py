@@ -1,4 +1,4 @@
-"""Heartbeats of nodes, and the detection of nodes whose heartbeats cease."""
+"""Node heartbeats, and the detection of nodes whose heartbeats stop."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ from spacerobot_ros.model.compilation import compilation_contexts
 TOPIC = "heartbeat"
 
 HEARTBEAT_PERIOD = 0.2
-"""Wall s between two heartbeats of an active node."""
+"""Wall time between two heartbeats of an active node, s."""
 
 _SILENCE_CHECK_PERIOD = 0.1  # wall s
 
 _SUSPENSION_TIME = 0.3
-"""Longest wall time between two checks unless this node itself was suspended, s."""
+"""Maximum wall time between two checks unless this node itself was suspended, s."""
 
 _REPORT_PERIOD = 1.0  # wall s, while a node is silent
 HEARTBEAT_QOS = QoSProfile(depth=20, reliability=ReliabilityPolicy.RELIABLE)
@@ -64,22 +64,22 @@ class SilenceReport:
 
     @property
     def message(self) -> str:
-        """Sentence about the silence for the user."""
+        """Message to the user about the silence."""
         if self.over:
             return f"Node '{self.name}' is back after {self.seconds:.2g} s."
         return f"Node '{self.name}' is silent for {self.seconds:.2g} s."
 
 
 class Watchdog:
-    """Finds nodes whose heartbeats cease.
+    """Detects nodes whose heartbeats stop.
 
-    A node is watched from its first heartbeat until it reports that it is inactive. While it is
-    busy, no heartbeat is expected. If this node itself was suspended, all timeouts start again.
+    A node is monitored from its first heartbeat until it reports that it is inactive. While it is
+    busy, no heartbeat is expected. If this node itself was suspended, all timeouts restart.
 
     Parameters
     ----------
     timeout
-        Wall s without a heartbeat after which a node is silent.
+        Wall time without a heartbeat after which a node is silent, s.
     clock
         Returns the wall time, s.
     """
@@ -93,7 +93,7 @@ class Watchdog:
         self._looked = clock()
 
     def hear(self, name: str, pulse: str) -> SilenceReport | None:
-        """Process a heartbeat; return the end of a silence, None if the node was not silent."""
+        """Process a heartbeat; return the end of a silence, or None if the node was not silent."""
         now, since = self._clock(), self.silent.pop(name, None)
         match pulse:
             case HeartbeatState.ACTIVE.value:
@@ -143,9 +143,9 @@ class Liveness:
         """Number of running computations that may take long."""
 
     def configure(self, timeout: float) -> None:
-        """Subscribe to heartbeats and create the publisher of diagnostics; a cleanup destroys both.
+        """Subscribe to heartbeats and create the diagnostics publisher; a cleanup destroys both.
 
-        ``timeout``: see :class:`Watchdog`; 0: nothing is watched.
+        ``timeout``: see :class:`Watchdog`; 0: nothing is monitored.
         """
         self._timeout, node = timeout, self._node
         if self._watched and timeout:
@@ -155,7 +155,7 @@ class Liveness:
             )
 
     def begin(self) -> None:
-        """Start to send heartbeats and to watch those of other nodes."""
+        """Start sending heartbeats and monitoring those of other nodes."""
         # Compiling a function on its first call counts as a long computation.
         compilation_contexts.append(self.busy)
         steady, create = Clock(clock_type=ClockType.STEADY_TIME), self._node.create_timer
@@ -178,7 +178,7 @@ class Liveness:
 
     @contextmanager
     def busy(self) -> Iterator[None]:
-        """Tell the watchdogs of other nodes that a computation may take long."""
+        """Announce to other nodes' watchdogs that a computation may take long."""
         self._busy += 1
         self._beat()
         try:

@@ -59,28 +59,28 @@ if TYPE_CHECKING:
 _READER_CHECK_PERIOD = 0.1  # wall s
 
 _MAX_UNCONFIRMED_TICKS = STREAM.depth // 2
-"""Largest number of lockstep ticks until all readers must confirm their states: a reader that is
-further behind than the publishers' queue would lose some."""
+"""Maximum number of lockstep ticks until all readers must confirm their states: a reader further
+behind than the publisher queue would lose messages."""
 
 _MAX_RATE_AT_REST = 1e-3  # m/s or rad/s
 _LONGEST_REST = 0.8  # wall s, before the process ends
 
 _REPORT_PERIOD_NS = 950_000_000
-"""Wall time after which new diagnostics are due, ns: about once a second."""
+"""Wall time after which new diagnostics are due, ns: about once per second."""
 
 _LONGEST_MARKER_PERIOD, _LONGEST_FRAME_PERIOD, _LONGEST_CLEARANCE_PERIOD = 0.5, 0.1, 0.5
-"""Longest wall time between two publications in real time, s: of markers, of /tf, of clearances."""
+"""Maximum wall time between two publications in real time, s: markers, /tf, clearances."""
 
 _CARRIED = {"velocity": "velocities", "effort": "efforts", "auto": "velocities or efforts"}
-"""Quantities that commands carry, by the parameter ``actuation``."""
+"""Commanded quantities, by the parameter ``actuation``."""
 
 
 class PlantNode(FlightNode):
-    """Integrates the momentum-conserving model and publishes the topics of a real robot.
+    """Integrates the momentum-conserving model and publishes a real robot's topics.
 
     In ``lockstep`` it publishes the state of tick k and steps when the command stamped with that
     tick has arrived. In ``realtime`` it runs on the wall clock times ``real_time_factor``, holds
-    the last command, and brings the joints to rest when that is older than ``command_timeout``.
+    the last command, and brings the joints to rest if that is older than ``command_timeout``.
     """
 
     Config: ClassVar = PlantConfig
@@ -96,7 +96,7 @@ class PlantNode(FlightNode):
         self._wall_timers: list[Timer] = []
         self._monitor: PlantMonitor | None = None
         self.status = PlantStatus(PlantState.INACTIVE)
-        """Status published last on plant/status."""
+        """Last status published on plant/status."""
         super().__init__(name, **kwargs)
 
     @property
@@ -111,7 +111,7 @@ class PlantNode(FlightNode):
 
     @property
     def state(self) -> PlantState:
-        """State of the plant: whether time runs, and whether commands act."""
+        """Plant state: whether time runs, and whether commands take effect."""
         return self.status.state
 
     @property
@@ -132,14 +132,14 @@ class PlantNode(FlightNode):
         if robot is None:
             raise ParameterError(
                 "The plant needs a robot: set parameter 'robot' to a URDF file or the name of a "
-                "robot of this package, or 'robot_description' to a URDF text."
+                "packaged robot, or 'robot_description' to a URDF string."
             )
         self._period_ns = config.period_ns
         decided = config.decided()
         # Joints that move, and thrusters, are there for efforts alone.
         self._undecided = config.actuation == "auto" and decided.actuation == "velocity"
         self._under_efforts: PlantWithFaults | None = None
-        """The plant under efforts, in its initial state, as long as it may be needed."""
+        """The effort plant in its initial state, as long as it may be needed."""
         if self._undecided:
             under_efforts = config.decided("effort")
             self._under_efforts = build_plant(robot, under_efforts)
@@ -183,7 +183,7 @@ class PlantNode(FlightNode):
                 self, robot.description, has_contact_forces=config.engine == "mujoco"
             )
         self._obstacles: str | None = None
-        """The last text on the topic obstacles; None: the robot's own obstacles are used."""
+        """The last URDF on the topic obstacles; None: the robot's own obstacles are used."""
         self.create_subscription(String, "obstacles", self._on_obstacles, LATCHED)
         for topic in (*self._readers, *(["base_wrench"] if self._undecided else [])):
             kind = message_class(TOPICS[topic].type)
@@ -308,7 +308,7 @@ class PlantNode(FlightNode):
         self._publish_changed_status()
 
     def start_message(self) -> str:
-        """Return a log message with robot, actuation, rate and time mode."""
+        """Return a log message with the robot, actuation, rate and time mode."""
         config = self.config
         pace = "in lockstep"
         if self._real_time is not None:
@@ -321,7 +321,7 @@ class PlantNode(FlightNode):
         )
 
     def on_failure(self, message: str, error: Exception) -> None:
-        """Report the failure and drop the current commands, so that none is in force after a
+        """Report the failure and drop the current commands, so that none is active after a
         restart."""
         self._stop_timers()
         self._active = PlantState.FAILED
@@ -334,7 +334,7 @@ class PlantNode(FlightNode):
         self._publish_changed_status()
 
     def drain(self, executor: EventsExecutor) -> None:
-        """Bring the joints to rest, because the commanders end as well."""
+        """Bring the joints to rest, because the commanders are also ending."""
         if self._active is not PlantState.RUNNING or self._real_time is None:
             return
         self._readers, self._undecided = {}, False  # No command counts any more.
@@ -384,8 +384,8 @@ class PlantNode(FlightNode):
         state = last_state(path, self.get_namespace().rstrip("/"))
         if state.joint_names != list(robot.joint_names):
             raise ParameterError(
-                f"Parameter 'resume_bag' is '{path}', a bag of a robot with the joints "
-                f"{', '.join(state.joint_names)}; this one has {', '.join(robot.joint_names)}."
+                f"Parameter 'resume_bag' is '{path}', a bag from a robot with the joints "
+                f"{', '.join(state.joint_names)}; this robot has {', '.join(robot.joint_names)}."
             )
         if self.config.target.given != (state.target is not None):
             other = "no target" if state.target is None else "a target"
@@ -576,7 +576,7 @@ class PlantNode(FlightNode):
                 self._publish_changed_status()
 
     def on_silence(self, silence: SilenceReport) -> None:
-        """Bring all joints to rest if a commander is silent and the parameters request it."""
+        """Bring all joints to rest if a commander is silent and the parameters require it."""
         super().on_silence(silence)
         if self.config.watchdog_action == "latch" and not silence.over:
             self.commands.latch("watchdog", f"node '{silence.name}' is silent", self.time_ns)

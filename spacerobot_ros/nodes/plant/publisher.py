@@ -1,4 +1,4 @@
-"""States and diagnostics of a plant as messages."""
+"""Plant states and diagnostics as messages."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ if TYPE_CHECKING:
 _LOG_PERIOD = 5.0  # wall s, of lines of one kind
 
 _RESTING_SHARE = 0.01
-"""Largest effort of a joint that rests on its stop, as a share of its effort limit."""
+"""Maximum effort of a joint resting on its stop, as a fraction of its effort limit."""
 
 
 class PlantReport:
@@ -66,7 +66,7 @@ class PlantReport:
         self._diagnostics.observe(self._node.commands, self._node.plant)
 
     def refused(self, source: CommandSource, refusal: Refusal) -> None:
-        """Log a refused command, which its validator has counted."""
+        """Log a rejected command, which its validator has counted."""
         sentence = self._diagnostics.note_refusal(source, refusal)
         if refusal.reason is Reason.STALE and source.stamp_ns == NO_STAMP:
             # A commander that has just begun answers a state from before it was ready.
@@ -81,7 +81,7 @@ class PlantReport:
         self._node.get_logger().error(f"{latched_text(self._node.commands.fault)}.")
 
     def timed_out(self, source: CommandSource, timeout: float) -> None:
-        """Log that a commander's commands have ceased."""
+        """Log that a commander's commands have stopped."""
         self._diagnostics.command_timeouts += 1
         self._node.get_logger().warning(
             f"No command on '{source.topic}' for {timeout:g} s: its actuators are brought to rest.",
@@ -104,7 +104,7 @@ class PlantReport:
         if not texts:
             return
         self._node.get_logger().warning(
-            f"Limits of the URDF have held joints back: {'; '.join(texts)}.",
+            f"URDF limits have restricted joints: {'; '.join(texts)}.",
             throttle_duration_sec=_LOG_PERIOD,
         )
 
@@ -139,12 +139,12 @@ class StatePublisher:
         self.rebuild()
 
     def observe(self, state: ReportedState) -> None:
-        """Publish another state from now on."""
+        """Set the published state."""
         self._state = state
         self.rebuild()
 
     def rebuild(self) -> None:
-        """Create the messages for the current quantities of the state."""
+        """Create the messages for the state's current quantities."""
         clock = TOPICS["/clock"]
         streams = [
             (topic, self._output(topic), self._template(topic))
@@ -159,7 +159,7 @@ class StatePublisher:
         self._of_target = [template for topic, _, template in streams if topic.name == _TARGET]
 
     def publish_description(self) -> None:
-        """Publish the URDFs of robot and target."""
+        """Publish the robot and target URDFs."""
         self._description.publish(String(data=self._robot.description.urdf))
         if self._state.target is not None:
             self._target_description.publish(String(data=self._state.target.urdf))
@@ -181,7 +181,7 @@ class StatePublisher:
         """Whether the state has gained a subscriber since the last call.
 
         The check takes 1 ms. If one subscription replaces another, their number stays the same; a
-        discovered one may be matched later.
+        discovered subscription may be matched later.
         """
         outputs = self._outputs.values()
         readers = frozenset(
@@ -231,7 +231,8 @@ class StatePublisher:
 class TransformPublisher:
     """Publishes the measured frames of a robot on /tf, and its fixed frames on /tf_static.
 
-    If the package ``tf2_msgs`` is missing, nothing is published; bags have the transforms anyway.
+    If the package ``tf2_msgs`` is missing, nothing is published; bags contain the transforms
+    anyway.
     """
 
     def __init__(self, node: PlantNode, robot: SpaceRobot, config: PlantConfig) -> None:
@@ -287,7 +288,7 @@ class ClearancePublisher:
         *,
         has_contact_forces: bool = False,
     ) -> ClearancePublisher | None:
-        """Return the publisher of a plant among obstacles; None if no links could touch.
+        """Return the publisher for a plant with obstacles; None if no links could touch.
 
         ``before`` is the publisher for the previous obstacles, whose topic is reused;
         ``has_contact_forces``: see :class:`.ClearanceMonitor`.
@@ -328,7 +329,7 @@ class ClearancePublisher:
 
 
 class LinkMarkers:
-    """Publishes all visuals of a robot, of its target and of obstacles as one marker array."""
+    """Publishes all visuals of the robot, its target and the obstacles as one marker array."""
 
     def __init__(self, node: PlantNode, world_frame: str) -> None:
         self._node, plant = node, node.plant

@@ -1,7 +1,8 @@
-"""Collects topics of the stack into one :class:`~spacerobot_ros.viewer.state.StackState`.
+"""Collects the stack's topics into one :class:`~spacerobot_ros.viewer.state.StackState`.
 
-The plant publishes its state hundreds or thousands of times a second; a page is drawn twenty times
-a second. A node that is not spun therefore subscribes to the streams: the middleware keeps only the
+The plant publishes its state hundreds or thousands of times per second; a page is drawn twenty
+times per second. Therefore a node that is not spun subscribes to the streams: the middleware keeps
+only the
 last message of each, which is read when the page is drawn. Subscriptions are best effort, so that
 no publisher waits for the viewer.
 """
@@ -47,7 +48,7 @@ LATEST_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 """QoS of streams: only the last message is kept, without acknowledgement."""
 
 _MAX_CALL_INTERVAL = 1.5
-"""Longest wall time between two calls unless this process was suspended, s."""
+"""Maximum wall time between two calls unless this process was suspended, s."""
 
 _TIME_UNTIL_SILENT_NODE_IS_HIDDEN = 60.0
 """Wall time after which a silent node and its last reports are no longer shown, s."""
@@ -59,12 +60,12 @@ _LONGEST_EXPECTED_DELAY_NS = SECOND
 """Wall time after which a plant is assumed to publish no expected momenta, ns."""
 
 _REFUSED = " A later goal is refused: "
-"""Text between the message about the pursued goal and the reason for a refusal."""
+"""Text between the message about the pursued goal and the reason why a later goal was refused."""
 
 _MAX_PATH_POINTS = 1000
 
 _MAX_MOTION_POINTS = 200
-"""Largest number of configurations of a planned motion: links are placed at each."""
+"""Maximum number of configurations in a planned motion: links are placed at each."""
 
 M = TypeVar("M")
 
@@ -81,7 +82,7 @@ class LatestMessage(Generic[M]):
         )
 
     def take(self) -> M | None:
-        """Return the message received since the last call; None if there is none."""
+        """Return the message received since the last call; None without a new message."""
         handle = self._subscription.handle
         with handle:
             taken = handle.take_message(self._kind, True)
@@ -96,7 +97,7 @@ class LatestMessage(Generic[M]):
 
 
 class Listener:
-    """Collects the state of the stack.
+    """Collects the stack state.
 
     The node ``streams``, which is not spun, receives states; callbacks of ``node`` receive
     statuses, goals (in ``frame``) and heartbeats. ``on_status`` is called for every status with
@@ -127,14 +128,14 @@ class Listener:
         self._beats: dict[str, _Heartbeat] = {}
         self._statuses: dict[str, Any] = {}
         self._reporters: dict[str, str] = {}
-        """Full name of the node that published a status, by kind of status."""
+        """Full name of the publishing node, by kind of status."""
         self._hidden: dict[str, str] = {}
         """Nodes whose reports are hidden, and the node whose next heartbeat shows them again."""
         self._last_call = time.monotonic()
         self._planned: Array | None = None
         self._path: _PlannedPath | None = None
         self._last_schedule: JointTrajectory | None = None
-        """It is latched, so it may arrive before the robot whose joints it moves."""
+        """It is latched, so it may arrive before the corresponding robot."""
         self._schedule: _Schedule | None = None
         self._motion: Array | None = None
         self._goals: dict[Part, Goal] = {}
@@ -162,7 +163,7 @@ class Listener:
             )
 
     def forget_state(self) -> None:
-        """Drop the received state when the robot changes."""
+        """Drop the received state if the robot changes."""
         self._pose: Array | None = None
         self._twist = np.zeros(6)
         self._stamp_s, self._came_at = 0.0, -math.inf
@@ -177,14 +178,14 @@ class Listener:
         self._clearance: ClearanceStatus | None = None
 
     def use(self, robot: RobotDescription) -> None:
-        """Start reading the joints of a robot."""
+        """Start reading a robot's joints."""
         self._names = robot.joint_names
         self.forget_state()
         if self._last_schedule is not None:
             self._on_schedule(self._last_schedule)
 
     def state(self) -> StackState:
-        """Take the received messages and return the state of the stack."""
+        """Process the received messages and return the stack state."""
         now = time.monotonic()
         self._take_streams(now)
         self._hide_long_silent_nodes(now)

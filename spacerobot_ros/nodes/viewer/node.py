@@ -74,7 +74,7 @@ from spacerobot_ros.viewer.state import (
 )
 
 ANNOUNCEMENT = "viewer      "
-"""Text before the address of the page on standard output."""
+"""Text before the page address on standard output."""
 
 _ROSOUT_QOS = QoSProfile(
     depth=100,
@@ -95,7 +95,7 @@ _SERVICE_BY_REQUEST: Mapping[Request, tuple[tuple[str, ...], str, bool | None]] 
     Request.PLAY: (("replay",), "pause", False),
     Request.HOLD: (("replay",), "pause", True),
 }
-"""For each request of the page: nodes, name of their service, and its data (None: Trigger)."""
+"""For each page request: nodes, service name, and its data (None: Trigger)."""
 
 _NODES_WITH_PARAMETERS = ("plant", "planner", "controller")
 
@@ -109,8 +109,8 @@ _MILLISECOND_NS = 1_000_000
 class ViewerNode(FlightNode):
     """Serves the page that shows and steers the robot.
 
-    It subscribes and publishes like any other tool: it works with nodes of other processes, started
-    before or after it, and with nodes that replace them. Opening the page moves nothing.
+    It subscribes and publishes like any other tool: it works with nodes in other processes, started
+    before or after it, and with restarted nodes. Opening the page does not move the robot.
     """
 
     Config: ClassVar = ViewerConfig
@@ -182,11 +182,11 @@ class ViewerNode(FlightNode):
         )
 
     def start_message(self) -> str:
-        """Return the address of the page."""
+        """Return the page address."""
         return f"Serves the page at {self.url}, drawn {self.config.update_rate:g} times a second."
 
     def deactivate(self) -> None:
-        """Stop updating the page, which keeps its content."""
+        """Stop updating the page; its content is kept."""
         self.destroy_timer(self._timer)
 
     def cleanup(self) -> None:
@@ -204,7 +204,7 @@ class ViewerNode(FlightNode):
             streams.destroy_node()
 
     def destroy_node(self) -> None:
-        """Close the page, in any state of the node."""
+        """Close the page, in any node state."""
         self.cleanup()
         super().destroy_node()
 
@@ -469,7 +469,7 @@ class ViewerNode(FlightNode):
             aim = goal.end_effectors[0].as_goal() if goal.end_effectors else goal
             self._goal_topics[part].publish(goal_message(aim, self.config.world_frame, time_ns))
         if not self._count_readers(goals):
-            self._answer("No planner or controller receives the goal: none is running.", 2)
+            self._answer("The goal is not received: no planner or controller is running.", 2)
         else:
             self._answer("Goal sent.")
             goal_id = GoalIds().of(*divmod(min(time_ns, LATEST_NS), SECOND))
