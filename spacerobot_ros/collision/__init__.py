@@ -1,4 +1,4 @@
-"""Distances between the bodies of a robot: solids, pairs, exact checks, functions for a solver."""
+"""Distances between a robot's bodies: solids, pairs, exact checks, and solver functions."""
 
 from spacerobot_ros.collision.distances import Solid
 from spacerobot_ros.collision.geometry import BasePoses, CollisionGeometry, LinkPair, ObstaclePair

@@ -1,4 +1,4 @@
-"""Distances of two solids: exact by coal, or bounds from the rounded boxes around them.
+"""Distances between two solids: exact from coal, or bounds from the rounded boxes around them.
 
 J. Pan, S. Chitta, D. Manocha, "FCL: a general purpose library for collision and proximity queries",
 ICRA, 2012; coal is its successor.
@@ -27,21 +27,21 @@ WORLD_BODY = -1
 
 @dataclass(frozen=True)
 class Solid:
-    """One convex solid of a robot or an obstacle.
+    """A convex solid of a robot or an obstacle.
 
     Attributes
     ----------
     link
         Name of its link.
     body
-        Index of the rigid body that the link is part of; 0: the base, -1: an obstacle, given in the
-        frame of the world.
+        Index of the rigid body that contains the link; 0: the base, -1: an obstacle, given in the
+        world frame.
     shape
-        Its description in the URDF.
+        URDF description of the solid.
     enclosure
-        A rounded box around it, in the frame of the link.
+        Enclosing rounded box in the link frame.
     vertices
-        (V, 3) vertices of a mesh's convex hull in the frame of the link, m; None: no mesh.
+        (V, 3) vertices of a mesh's convex hull in the link frame, m; None: no mesh.
     """
 
     link: str
@@ -156,7 +156,7 @@ class ExactDistances:
             yield compute(here, there, request, result), result, R_ab[k], r_ab[k]
 
     def placed(self) -> PlacedSolids:
-        """Return the solids for evaluation in successive states."""
+        """Return the solids for evaluation at successive states."""
         return PlacedSolids(self._geometries, self._coal)
 
 
@@ -166,7 +166,7 @@ class PlacedSolids:
     Parameters
     ----------
     geometries
-        The shapes, and their attitudes and positions in the frames of their links.
+        Shapes with their attitudes and positions in the link frames.
     coal
         The module.
     """
@@ -188,7 +188,7 @@ class PlacedSolids:
         self._placed.clear()
 
     def distance(self, first: int, second: int) -> float:
-        """Return the distance of two solids, m; negative: the penetration depth."""
+        """Return the distance between two solids, m; negative: penetration depth."""
         compute = self._computers.get((first, second))
         if compute is None:
             compute = self._coal.ComputeDistance(self._shapes[first], self._shapes[second])
@@ -228,7 +228,7 @@ class EnclosureDistances:
     def planes(
         self, first: int, R_1: Array, r_1: Array, second: int, R_2: Array, r_2: Array
     ) -> tuple[Array, Array]:
-        """Return the distances, and planes and points between the enclosures."""
+        """Return the distances between the enclosures, with planes and points."""
         one, other = self._enclosures[first], self._enclosures[second]
         return separating_planes(one, R_1, r_1, other, R_2, r_2)
 

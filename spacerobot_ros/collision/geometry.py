@@ -1,10 +1,10 @@
-"""Collision geometry: the solids of a robot, and the pairs of them that may come into contact.
+"""Collision geometry: the solids of a robot, and pairs that may come into contact.
 
-A link has the shapes of its ``<collision>`` elements, or, if it has none, those of its
-``<visual>`` elements. A mesh, closed or open, is replaced by its convex hull.
+A link uses the shapes of its ``<collision>`` elements or, if it has none, of its ``<visual>``
+elements. A mesh, closed or open, is replaced by its convex hull.
 
 A pair is omitted if its solids belong to one body or to neighbouring bodies, if an SRDF disables
-it, or if it is in contact in all of 1000 random configurations: an artefact of the drawing.
+it, or if it is in contact in all of 1000 random configurations, which is a modelling artefact.
 """
 
 from __future__ import annotations
@@ -39,14 +39,14 @@ from spacerobot_ros.model.rotations import matrices_from_quaternions
 from spacerobot_ros.model.visuals import Visual, solid_mesh
 
 _SHAPES, _SEED = 1000, 0
-"""Number of random configurations for finding pairs always in contact, and their seed."""
+"""Number of random configurations used to find pairs always in contact, and their seed."""
 
 
 _COAXIAL_TOLERANCE = 1e-9
-"""Largest offset (m) and tilt (rad) of a body of revolution from the axis of its joint."""
+"""Largest offset (m) and tilt (rad) of a body of revolution from its joint axis."""
 
 _UNKNOWN_BASE_DISTANCE = 1e9
-"""Distance of obstacles if the pose of the base is unknown, m: they are ignored."""
+"""Distance to obstacles if the base pose is unknown, m: obstacles are ignored."""
 
 
 class LinkPair(NamedTuple):
@@ -60,23 +60,23 @@ class LinkPair(NamedTuple):
 
     @property
     def subject(self) -> str:
-        """The names of both, as the subject of a sentence in lower case."""
+        """Both names, as the lower-case subject of a sentence."""
         return f"links {self}"
 
 
 class ObstaclePair(LinkPair):
-    """Names of a link and of an obstacle, which is a link of the world."""
+    """Names of a link and an obstacle, which is a link of the world."""
 
     __slots__ = ()
 
     @property
     def subject(self) -> str:
-        """The names of both, as the subject of a sentence in lower case."""
+        """Both names, as the lower-case subject of a sentence."""
         return f"link '{self.first}' and obstacle '{self.second}'"
 
 
 class BasePoses(NamedTuple):
-    """Poses of the base in the world: ``r_WB`` (N, 3), m, and quaternions (N, 4) of ``R_WB``."""
+    """Base poses in the world: ``r_WB`` (N, 3), m, and quaternions (N, 4) of ``R_WB``."""
 
     position: Array
     quaternion: Array
@@ -86,7 +86,8 @@ class BasePoses(NamedTuple):
         return BasePoses(self.position[rows], self.quaternion[rows])
 
     def between(self, before: npt.NDArray[np.int64], share: Array) -> BasePoses:
-        """Return poses (K,) interpolated by ``share`` (K, 1) from ``before`` (K,) to the next."""
+        """Return poses (K,) interpolated by ``share`` (K, 1) between ``before`` (K,) and the next
+        poses."""
         r, x = self
         position = (1 - share) * r[before] + share * r[before + 1]
         next_ = (
@@ -104,14 +105,14 @@ class BasePoses(NamedTuple):
 
 @dataclass(frozen=True)
 class UnreadMesh:
-    """A mesh that cannot be read: some contacts of its link are not detected.
+    """A mesh that cannot be read, so some contacts of its link are not detected.
 
     Attributes
     ----------
     link
         Name of its link.
     reason
-        A sentence that says why.
+        A sentence with the reason.
     is_collision_shape
         Whether the mesh belongs to a ``<collision>``, not only to a ``<visual>``.
     """
@@ -127,31 +128,31 @@ class UnreadMesh:
 
 
 Poses = tuple[Array, Array]
-"""Attitudes ``R_BL`` (N, L, 3, 3) and positions ``r_BL_B`` (N, L, 3) of the links of a robot; if
-there are obstacles, the last entry is the world."""
+"""Attitudes ``R_BL`` (N, L, 3, 3) and positions ``r_BL_B`` (N, L, 3) of robot links; if there are
+obstacles, the last entry is the world."""
 
 
 class CollisionGeometry:
-    """The solids of a robot and of the obstacles around it, and the distances between them.
+    """Solids of a robot and of the obstacles around it, and the distances between them.
 
     Parameters
     ----------
     robot
         The robot, with its world.
     mesh_of
-        Returns the triangles of a visual of the kind ``mesh`` in the frame of its link; a mesh for
-        which it raises a :class:`.MeshError` is omitted.
+        Returns the triangles of a visual of kind ``mesh`` in its link frame; if it raises a
+        :class:`.MeshError`, the mesh is omitted.
     obstacles_alone
-        Whether pairs of two links of the robot are omitted.
+        Whether to omit pairs of two robot links.
 
     Attributes
     ----------
     solids
         All solids, link by link.
     pairs
-        (P, 2) indices of the solids whose distances are checked.
+        (P, 2) indices of the solids in each checked pair.
     ignored_pairs
-        Reason why a pair of links is ignored; pairs within one body or of neighbouring bodies are
+        Reason why a pair of links is ignored; pairs on the same body or on neighbouring bodies are
         not listed.
     notes
         Notes on links whose geometry may be unexpected, one sentence each.
@@ -195,29 +196,29 @@ class CollisionGeometry:
 
     @cached_property
     def distance_function(self) -> DistanceFunction:
-        """The distances of two solids, exact if the package coal is installed."""
+        """Distances between two solids, exact if the package coal is installed."""
         # Where bounding balls never come near, the library of distances need not be imported.
         return distance_function(self.solids)
 
     @property
     def exact(self) -> bool:
-        """Whether distances are those of the shapes, not of their enclosures."""
+        """Whether distances are computed for the shapes, not for their enclosures."""
         return self.distance_function.exact
 
     @property
     def links(self) -> tuple[str, ...]:
-        """Names of the links, in the order of :meth:`poses`."""
+        """Link names, in the order of :meth:`poses`."""
         return self._kinematics.links
 
     def links_of(self, pair: int) -> LinkPair:
-        """Return the links of a pair."""
+        """Return the links in a pair."""
         first, second = (self.solids[i] for i in self.pairs[pair])
         kind = ObstaclePair if second.is_obstacle else LinkPair
         return kind(first.link, second.link)
 
     @cached_property
     def with_obstacles(self) -> npt.NDArray[np.bool_]:
-        """Whether each pair (P,) is a link and an obstacle."""
+        """Whether each pair (P,) consists of a link and an obstacle."""
         return np.array([self.solids[j].is_obstacle for _, j in self.pairs], dtype=np.bool_)
 
     def poses(self, shapes: Array, base: BasePoses | None = None) -> Poses:
@@ -227,8 +228,7 @@ class CollisionGeometry:
         ----------
         shapes
             (..., n), m or rad; with a base (N, n).
-        base
-            Poses of the base; None: obstacles are ignored.
+        base Base poses; None: obstacles are ignored.
         """
         R, r = self._kinematics.link_poses(shapes)
         if self.robot.world is None:
@@ -246,7 +246,7 @@ class CollisionGeometry:
     def nearest_point_on_obstacle(self, pair: int, shape: Array, base: BasePoses) -> Array:
         """Return the approximate point (3,) in W, m, at which a link is nearest to an obstacle.
 
-        ``shape`` is (n,), and ``base`` has one pose.
+        ``shape`` is (n,), and ``base`` has a single pose.
         """
         R, r = self.poses(shape[np.newaxis], base)
         i, j = self.pairs[pair]
@@ -256,7 +256,7 @@ class CollisionGeometry:
         return np.asarray(R_BW[0].T @ (r_BP - r_BW)[0])
 
     def lower_bounds(self, poses: Poses) -> Array:
-        """Return lower bounds (N, P), m, of the distances of all pairs, from bounding spheres."""
+        """Return lower bounds (N, P), m, on the distances of all pairs, from bounding spheres."""
         R, r = poses
         centers = r[:, self._link_of] + np.einsum(
             "nsab,sb->nsa", R[:, self._link_of], self._centers
@@ -273,7 +273,7 @@ class CollisionGeometry:
         return self.distance_function(i, R[:, a], r[:, a], j, R[:, b], r[:, b])
 
     def planes(self, pair: int, poses: Poses) -> tuple[Array, Array]:
-        """Return the distances (N,) of a pair, m, and planes and points (N, 7) between them.
+        """Return the distances (N,) of a pair, m, with planes and points (N, 7).
 
         Planes are in the frame of the first link, points in that of the second one
         (:meth:`.ExactDistances.planes`). For a link and an obstacle, planes belong to the
@@ -287,7 +287,7 @@ class CollisionGeometry:
         return self.distance_function.planes(i, R[:, a], r[:, a], j, R[:, b], r[:, b])
 
     def nearest(self, shape: Array) -> tuple[float, int] | None:
-        """Return the smallest distance at a configuration (n,), m, and its pair; None: no pairs."""
+        """Return the smallest distance in a configuration (n,), m, and its pair; None: no pairs."""
         if not len(self.pairs):
             return None
         distances, pairs = self.nearest_along(shape[np.newaxis])
@@ -319,7 +319,7 @@ class CollisionGeometry:
         return distances, pairs
 
     def distances_of_links(self, shape: Array) -> dict[LinkPair, float]:
-        """Return the distances between links in a configuration (n,), m, the smallest first."""
+        """Return the distances between links in a configuration (n,), m, smallest first."""
         poses = self.poses(shape[np.newaxis])
         found: dict[LinkPair, float] = {}
         for pair in range(len(self.pairs)):
@@ -373,13 +373,14 @@ class CollisionGeometry:
     # -- motion -------------------------------------------------------------------------------
 
     def largest_lever_arms(self, shapes: Array) -> tuple[Array, Array]:
-        """Return lever arms: solids of a pair move by at most ``reaches @ |dtheta|`` (P,), m.
+        """Return lever arms: the solids in a pair move relative to each other by at most
+        ``reaches @ |dtheta|`` (P,), m.
 
         ``reaches`` (P, m) is the largest distance of a point of the pair from each moving joint
         between the two solids, in any of the configurations (N, n). It is zero for other joints,
-        and for a joint that rotates a body of revolution, such as a reaction wheel, about its axis.
-        Also returned are the largest distances (P,) from the base for pairs with obstacles; zero
-        for others.
+        and for joints that rotate a body of revolution, such as a reaction wheel, about its axis.
+        Also return the largest distances (P,) from the base for pairs with obstacles, zero for
+        other pairs.
         """
         bodies = self.robot.bodies
         travel = np.abs(self.moving_positions(shapes)).max(axis=0)
@@ -409,7 +410,7 @@ class CollisionGeometry:
         return apart, np.where(self.with_obstacles, from_base[self.pairs[:, 0]], 0.0)
 
     def moving_positions(self, shapes: Array) -> Array:
-        """Return the positions (N, m) of all moving joints in configurations (N, n), m or rad."""
+        """Return the positions (N, m) of all moving joints for configurations (N, n), m or rad."""
         G, b = self.robot.coupling
         return np.asarray(shapes @ G.T + b)
 
@@ -497,8 +498,8 @@ def _convex_hull(points: Array) -> Any:
 def collision_visuals(
     robot: RobotDescription, mesh_of: Callable[[Shape], TriangleMesh] = shape_mesh
 ) -> tuple[Visual, ...]:
-    """Return the solids used for distances; a mesh is replaced by its convex hull, or omitted if it
-    cannot be read.
+    """Return the solids used for distances; meshes are replaced by their convex hulls, or omitted
+    if they cannot be read.
 
     See :class:`~spacerobot_ros.collision.geometry.CollisionGeometry` for ``mesh_of``.
     """
@@ -509,8 +510,8 @@ def collision_visuals(
 def obstacle_visuals(
     world: RobotDescription | None, mesh_of: Callable[[Shape], TriangleMesh] = shape_mesh
 ) -> tuple[tuple[Visual, Pose], ...]:
-    """Return the solids of obstacles used for distances, each with the pose of its link in the
-    world. See :func:`collision_visuals` for ``mesh_of``.
+    """Return the obstacle solids used for distances, each with its link pose in the world. See
+    :func:`collision_visuals` for ``mesh_of``.
     """
     if world is None:
         return ()

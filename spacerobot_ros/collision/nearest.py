@@ -1,10 +1,10 @@
-"""Nearest pairs: in successive states, fast enough for flight, and along held commands.
+"""Nearest pairs, in successive states (fast enough for flight) and along held commands.
 
 While a command is held, two solids move relative to each other by at most v per tick
-(``CollisionGeometry.largest_lever_arms``). So their distance within the tick is at least
-``(d_0 + d_1 - v) / 2``, where d_0 and d_1 are the distances at its ends. Ticks in which this bound
-is below the clearance are bisected until v is small. Relative to obstacles, the base also moves:
-within a tick, along a straight line and about one axis.
+(``CollisionGeometry.largest_lever_arms``). So their distance during the tick is at least
+``(d_0 + d_1 - v) / 2``, where d_0 and d_1 are the distances at its ends. Ticks for which this bound
+is below the clearance are bisected until v is small. For obstacles, the base motion also matters:
+within a tick, it is along a straight line and about one axis.
 """
 
 from __future__ import annotations
@@ -19,18 +19,18 @@ from spacerobot_ros.errors import quantity
 from spacerobot_ros.model.description import Array
 
 _DISTANCE_MARGIN = 1e-9
-"""Margin for rounding errors of the bounds from bounding spheres, m."""
+"""Margin for rounding errors in the bounding-sphere bounds, m."""
 
 
 class NearestPair:
-    """The smallest distance among the pairs of a robot, from the poses of its links.
+    """Smallest distance among a robot's pairs, from its link poses.
 
     Parameters
     ----------
     geometry
-        The solids and at least one pair; distances must be exact.
+        The solids, with at least one pair; distances must be exact.
     links
-        The links in the order of the poses.
+        Links in the order of the poses.
     """
 
     def __init__(self, geometry: CollisionGeometry, links: tuple[str, ...]) -> None:
@@ -100,22 +100,22 @@ _MOTION_RESOLUTION = 5e-4
 
 @dataclass(frozen=True)
 class Approach:
-    """The nearest approach of a pair.
+    """Nearest approach of a pair.
 
     Attributes
     ----------
     links
         Names of the links.
     pair
-        Index of the pair of solids in :attr:`CollisionGeometry.pairs`.
+        Index of the pair in :attr:`CollisionGeometry.pairs`.
     distance
-        m; negative: the penetration depth.
+        m; negative: penetration depth.
     tick
         Time of the approach, in ticks from the first configuration.
     shape
-        (n,) at that time, m or rad.
+        (n,) configuration at that time, m or rad.
     place_on_obstacle
-        (3,) nearest point on the obstacle in W, m; None for two links.
+        (3,) nearest obstacle point in W, m; None for two links.
     """
 
     links: LinkPair
@@ -165,7 +165,7 @@ class _Path:
 
     @property
     def lower_bounds_along_path(self) -> Array:
-        """Lower bounds (P,) of the distances along the whole path, m."""
+        """Lower bounds (P,) on the distances along the whole path, m."""
         if not len(self.largest_motions):
             return np.asarray(self.distance_bounds.min(axis=0))
         return np.asarray(
@@ -175,7 +175,7 @@ class _Path:
         )
 
     def interpolated(self, ticks: Array) -> tuple[Array, BasePoses | None]:
-        """Return shapes (K, n) and poses of the base at times (K,) in ticks."""
+        """Return shapes (K, n) and base poses at times (K,) in ticks."""
         if len(self.positions) == 1:
             return self.positions, self.base
         before = np.minimum(ticks.astype(int), len(self.positions) - 2)

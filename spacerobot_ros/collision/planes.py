@@ -1,13 +1,14 @@
-"""Distances of pairs as smooth functions of the configuration for a solver, from planes in between.
+"""Pair distances as smooth functions of the configuration for a solver, from separating planes.
 
 For two convex solids at given poses, a plane touches the first one at its point nearest to the
 second, and moves with the first. The distance of the second solid's nearest point from this plane
-equals the distance of the solids (or minus the penetration depth) at these poses, and near them to
-first order. It is exact and cheap. The planes are recomputed along every path that a solver finds.
+equals the distance between the solids (or minus the penetration depth) at these poses and, to first
+order, near them. It is exact and cheap. The planes are recomputed along every path found by a
+solver.
 
-Distances between links depend on the configuration q alone. The distance of a link from an obstacle
-also depends on the rotation X of the base since the start: at zero force the centre of mass C of
-the system rests or drifts steadily. In a frame at C with the initial attitude of the base, the
+Distances between links depend only on the configuration q. The distance of a link from an obstacle
+also depends on the rotation X of the base since the start: without external force, the system's
+centre of mass C is at rest or drifts steadily. In a frame at C with the initial base attitude, the
 point ``r_BP(q)`` of a link is at ``X (r_BP(q) - r_BC(q))``, and the obstacle is at rest.
 
 J. Schulman et al., "Motion planning with sequential convex optimization and convex collision
@@ -28,17 +29,17 @@ from spacerobot_ros.model.description import JointKind, RobotDescription
 from spacerobot_ros.model.kinematics import joint_positions
 
 PLANE_SIZE = 7
-"""Number of entries of a plane and a point."""
+"""Number of entries for a plane and a point."""
 
 
 @dataclass(frozen=True)
 class PlaneDistance:
-    """The distance of a pair from a plane between its solids, with derivatives.
+    """Distance between two solids, measured from a plane between them, with derivatives.
 
     ``w`` (7,) is the unit normal (3,) of the plane and its distance from the origin, m, in the
-    frame of the first link, and the point (3,), m, in the frame of the second link. For an obstacle
-    the plane is in the frame of the centre of mass with the initial attitude of the base, and the
-    point in the frame of the link.
+    first link frame, and the point (3,), m, in the second link frame. For an
+    obstacle, the plane is in the centre-of-mass frame with the initial base attitude, and the point
+    in the link frame.
 
     Attributes
     ----------
@@ -83,19 +84,19 @@ class PlaneDistance:
 
 
 _EDGE_ROUNDING = 0.03
-"""Smoothing of the corners of projections, m; makes the distance slightly smaller."""
+"""Smoothing of projection corners, m; makes the distance slightly smaller."""
 
 
 def support_distance(
     geometry: CollisionGeometry, pair: int, center_of_mass: ca.Function
 ) -> ca.Function:
-    """Return ``(y, plane) -> d``, m: the distance of the whole second solid from a plane.
+    """Return ``(y, plane) -> d``, m: the distance of the entire second solid from a plane.
 
     The plane is that of :class:`PlaneDistance`, whose point is not used, and ``y = q``. For an
     obstacle the plane is in W, and ``y = [q; X; r]`` (n + 7) has the rotation of the base and the
     position of the centre of mass. The solid
     is its rounded box, whose extent along the normal is ``sum h_i |n e_i| + radius``. So the
-    distance holds however it has turned, and is smaller than that of a shape within the box.
+    distance is valid for any rotation, and is smaller than that of a shape within the box.
     """
     robot, of_obstacle = geometry.robot, bool(geometry.with_obstacles[pair])
     n = len(robot.joint_names)

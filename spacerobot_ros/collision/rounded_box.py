@@ -1,10 +1,10 @@
-"""Rounded boxes, which enclose the solids of a robot, and bounds of the distances between them.
+"""Rounded boxes, which enclose the solids of a robot, and bounds on the distances between them.
 
-A rounded box is the set of all points within a radius of a box, its core. A sphere has a core of
-one point, a capsule a core of one line: so one formula bounds all distances. The gap between the
+A rounded box is the set of all points within a radius of a box, its core. The core of a sphere is a
+point, that of a capsule a line: so one formula bounds all distances. The gap between the
 projections of two convex bodies on any direction is at most their distance; along the line between
-their nearest points it is equal. The nearest points come from alternating projections; the
-directions of the separating axis theorem give the depth where cores overlap.
+their nearest points it is equal. The nearest points come from alternating projections; if cores
+overlap, the directions of the separating axis theorem give the depth.
 
 S. Gottschalk, M. Lin, D. Manocha, "OBBTree: a hierarchical structure for rapid interference
 detection", SIGGRAPH, 1996. W. Cheney, A. Goldstein, "Proximity maps for convex sets", Proceedings
@@ -24,7 +24,7 @@ _MAX_PROJECTIONS = 60
 """Number of alternating projections; the bound holds after any number."""
 
 _PARALLEL_TOLERANCE = 1e-9
-"""Length of the cross product of two unit vectors below which they count as parallel."""
+"""Length of the cross product of two unit vectors below which they are considered parallel."""
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class RoundedBox:
     Attributes
     ----------
     pose
-        Of the box in the frame of its link: origin at the centre, axes along the edges.
+        Pose of the box in its link frame: origin at the centre, axes along the edges.
     half
         (3,) half edge lengths of the core, m.
     radius
@@ -63,7 +63,7 @@ class RoundedBox:
     def around(cls, shape: Shape, vertices: Array | None = None) -> RoundedBox:
         """Return the smaller of two rounded boxes that enclose a shape.
 
-        ``vertices`` (V, 3), m, are those of a mesh in the frame of the link.
+        ``vertices`` (V, 3), m, are mesh vertices in the link frame.
         """
         match shape.kind:
             case "sphere":
@@ -104,14 +104,15 @@ def _around_points(points: Array, R: Array) -> RoundedBox:
 def separation(
     first: RoundedBox, R_1: Array, r_1: Array, second: RoundedBox, R_2: Array, r_2: Array
 ) -> Array:
-    """Return lower bounds (N,) of distances of two rounded boxes, m; negative: penetration depths.
+    """Return lower bounds (N,) on the distances between two rounded boxes, m; negative: penetration
+    depths.
 
     Parameters
     ----------
     first, second
-        The rounded boxes, in the frames of their links.
+        The rounded boxes, in their link frames.
     R_1, r_1, R_2, r_2
-        Poses of these frames in a common frame: (N, 3, 3), and (N, 3) in m.
+        Poses of these link frames in a common frame: (N, 3, 3), and (N, 3) in m.
     """
     return _widest_gaps(first, R_1, r_1, second, R_2, r_2)[0]
 
@@ -121,9 +122,9 @@ def separating_planes(
 ) -> tuple[Array, Array]:
     """Return the bounds of :func:`separation`, and planes and points (N, 7) that attain them.
 
-    A plane touches the first box. It is a unit normal toward the second box and the distance from
-    the origin, m, in the frame of the first link. The point is that of the second box nearest to
-    the plane, in the frame of its link, m. Parameters are those of :func:`separation`.
+    A plane touches the first box. It is given by a unit normal toward the second box and the
+    distance from the origin, m, in the first link frame. The point is the one on the second box
+    nearest to the plane, in its link frame, m. Parameters are as in :func:`separation`.
     """
     bounds, directions = _widest_gaps(first, R_1, r_1, second, R_2, r_2)
     on_first = _support(first, R_1, directions)
@@ -181,9 +182,9 @@ def _widest_gaps(
 def nearest_points(
     first: RoundedBox, R_1: Array, r_1: Array, second: RoundedBox, R_2: Array, r_2: Array
 ) -> Array:
-    """Return the points (N, 3) of the second core that are approximately nearest to the first box.
+    """Return the points (N, 3) on the second core that are approximately nearest to the first box.
 
-    Parameters are those of :func:`separation`.
+    Parameters are as in :func:`separation`.
     """
     c_1, c_2 = r_1 + R_1 @ first.pose.r, r_2 + R_2 @ second.pose.r
     cores = R_1 @ first.pose.R, R_2 @ second.pose.R

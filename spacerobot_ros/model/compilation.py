@@ -1,9 +1,9 @@
-"""CasADi functions as generated C, compiled once with the machine's ``cc`` and cached.
+"""CasADi functions as generated C code, compiled once by the system's ``cc`` and cached.
 
 Without a compiler, or with ``SPACEROBOT_COMPILE=0``, the same functions run in CasADi's virtual
 machine: slower, with the same formulas. Compiled objects are stored in ``SPACEROBOT_CACHE_DIR``, by
-default ``$XDG_CACHE_HOME/spacerobot_ros`` (``~/.cache/spacerobot_ros``), named by a hash of source,
-flags, compiler and C library. Only complete objects owned by this user are loaded
+default ``$XDG_CACHE_HOME/spacerobot_ros`` (``~/.cache/spacerobot_ros``), under a hash of the
+source, flags, compiler and C library. Only complete objects owned by this user are loaded
 (:class:`.Cache`).
 """
 
@@ -34,21 +34,22 @@ from spacerobot_ros.model.description import Array
 from spacerobot_ros.termination import tool
 
 _FLAGS = ("-O1", "-fPIC", "-shared", "-ffp-contract=off")
-"""Flags of all objects: with fused multiply-adds, results would depend on the processor."""
+"""Compiler flags for all objects: with fused multiply-adds, results would depend on the
+processor."""
 
 _MIN_OPERATIONS_TO_KEEP = 200
-"""Smallest number of operations of a cached function: reading it is faster than deriving it, even
+"""Smallest number of operations in a cached function: loading it is faster than deriving it, even
 if functions are derived together and only some are missing."""
 
 ANNOUNCEMENT_ATTRIBUTE = "announcement"
-"""Attribute of log records that announce a long computation."""
+"""Attribute of log records announcing a long computation."""
 
 _LOG = logging.getLogger(__name__)
 
 _Loaded = TypeVar("_Loaded")
 
 compilation_contexts: list[Callable[[], AbstractContextManager[None]]] = []
-"""Contexts around every run of the compiler, such as one in which a node reports itself busy."""
+"""Contexts entered around each compiler run, for example to report a node as busy."""
 
 
 class NoLibraryError(SpaceRobotError):
@@ -62,7 +63,7 @@ class BufferedFunction:
     ``inputs`` and ``outputs`` are numpy arrays with the shapes of the function's arguments (vectors
     are 1-D), allocated once. A call costs well under a microsecond in addition to the computation.
 
-    ``held`` is the constant value of a last argument, which is not among ``inputs``.
+    ``held`` is the constant value of the last argument, if that is not among ``inputs``.
     """
 
     evaluate: Callable[[], None]
@@ -123,14 +124,15 @@ def dense_function(
 ) -> ca.Function:
     """Return a CasADi function with dense results and shared common subexpressions.
 
-    ``inputs`` and ``outputs`` map the names of arguments and results to symbols and expressions.
+    ``inputs`` and ``outputs`` map argument and result names to symbols and expressions.
     """
     dense = ca.cse([ca.densify(output) for output in outputs.values()])
     return ca.Function(name, list(inputs.values()), dense, list(inputs), list(outputs))
 
 
 def compiled(function: ca.Function) -> ca.Function:
-    """Return the function as compiled C, or unchanged if compilation is disabled or fails."""
+    """Return the compiled function, or the function unchanged if compilation is disabled or
+    fails."""
     if not _is_compilation_enabled():
         return function
     name = function.name()
@@ -155,18 +157,18 @@ def load_library(
     libraries: Sequence[str] = (),
     language: Literal["c", "cpp"] = "c",
 ) -> _Loaded:
-    """Load the shared object of a source; it is compiled if it is not in the cache.
+    """Load the shared object for a source, compiling it first if it is not cached.
 
     Parameters
     ----------
     name
-        Prefix of the file name in the cache.
+        Prefix of the cached file's name.
     source, language
-        Text of the source, and its language.
+        Source code and its language.
     load
         Loads an object from its path; raises ``OSError`` or ``RuntimeError`` on failure.
     flags, libraries
-        Arguments of the compiler before and after the source. They are part of the key, so flags
+        Compiler arguments before and after the source. They are part of the key, so flags
         may select processor-specific instructions.
 
     Returns
@@ -181,8 +183,8 @@ def load_library(
     """
     compiler = c_compiler() if language == "c" else cxx_compiler()
     if compiler is None:
-        names = {"c": "C compiler (cc, gcc, clang or $CC)"}
-        names["cpp"] = "C++ compiler (c++, g++, clang++ or $CXX)"
+        names = {"c": "C compiler ($CC, cc, gcc or clang)"}
+        names["cpp"] = "C++ compiler ($CXX, c++, g++ or clang++)"
         raise NoLibraryError(f"no {names[language]} was found")
     words = [compiler, *_FLAGS, *flags]
     machine = [sysconfig.get_platform(), *platform.libc_ver()]
@@ -246,7 +248,7 @@ def _announce_compilation() -> None:
 
 @lru_cache
 def source_hash(*names: str) -> str:
-    """Return a hash of modules of this package and of CasADi's version, for keys of functions."""
+    """Return a hash of package modules and the CasADi version, for function keys."""
     texts = [Path(str(sys.modules[name].__file__)).read_text("utf-8") for name in names]
     return _hash_text("\n".join([ca.__version__, *texts]))
 
@@ -277,7 +279,7 @@ def cached_function(name: str, key: str, build: Callable[[], ca.Function]) -> ca
 
 
 def compilation_settings() -> tuple[str, ...]:
-    """Return the compiler and the cache's folder, on which compiled functions depend."""
+    """Return the compiler and the cache folder, on which compiled functions depend."""
     return (c_compiler() or "", str(cache_directory()))
 
 
@@ -302,7 +304,7 @@ def _compiler(*candidates: str | None) -> str | None:
 
 
 def cache_directory() -> Path:
-    """Return the folder of compiled objects (not created)."""
+    """Return the cache folder of compiled objects; it may not exist."""
     chosen = os.environ.get("SPACEROBOT_CACHE_DIR")
     if chosen:
         return Path(chosen)

@@ -8,34 +8,34 @@ whole system is ``diag(D, M 1)``.
 
 Because that inertia is block-diagonal, the base can be eliminated joint by joint. A unit rate of
 joint j gives its composite (all bodies that it carries) the momentum ``P_j = I^c_j S_j``; to cancel
-it the whole system moves by ``-B_j``, ``B_j = diag(D, M 1)^-1 P_j``. So ``S_j - B_j`` is the motion
-of the bodies outboard of joint j if the base is free, and
+it, the whole system moves by ``-B_j``, ``B_j = diag(D, M 1)^-1 P_j``. So ``S_j - B_j`` is the
+motion of the bodies outboard of joint j if the base is free, and
 
-* ``K_ij = (S_i - B_i)' P_j``: inertia matrix of the joints alone at given momentum (i carries j;
+* ``K_ij = (S_i - B_i)' P_j``: joint inertia matrix at given momentum (i carries j;
   without the ``S_i`` term if neither carries the other);
-* ``omega = D^-1 L - sum_j B_j qdot_j`` (angular parts): the base's rate at angular momentum L;
+* ``omega = D^-1 L - sum_j B_j qdot_j`` (angular parts): the base rate at angular momentum L;
 * ``K qddot = Q``, ``Q_j = tau_j - S_j' f_j + B_j' (f_0 - f_external)``, where ``f_j`` is the force
-  on composite j that the motion alone requires, at ``qddot = 0``.
+on composite j required by the motion alone, at ``qddot = 0``.
 
 For chains of up to about eight joints this takes fewer operations than the articulated-body
 algorithm, whose cost grows only linearly.
 
-:func:`state_rate` returns the motion under joint efforts and a base wrench; the total momenta are
-part of the state. The state is ``x = [q; quaternion_WB; qdot; p_W; L_W; r_WC_W]``, (2 n + 13,):
+:func:`state_rate` computes the motion under joint efforts and a base wrench, with the total momenta
+as part of the state. The state is ``x = [q; quaternion_WB; qdot; p_W; L_W; r_WC_W]``, (2 n + 13,):
 shape, attitude (x, y, z, w), joint rates, total linear momentum (kg m/s), total angular momentum
-about the system's centre of mass (kg m^2/s), and position of that centre (m), the last three in W.
-The base's twist is not a state: it follows from the momenta and the joint rates. Without thrusters
+about the system's centre of mass (kg m^2/s), and position of the centre of mass (m), the last three
+in W. The base twist is not a state: it follows from the momenta and joint rates. Without thrusters
 the momenta are therefore constant to the last bit, for any step:
 
 * ``p_W_dot = R_WB f``, ``L_W_dot = R_WB (n + (r_origin - c) x f)``, ``r_WC_W_dot = p_W / M``;
 * ``K qddot = Q`` at the ``omega_WB_B`` that the momenta imply.
 
 The command is ``[tau; f; n]``, (n + 6,): joint efforts (N or N m), then force (N) and torque (N m)
-at the origin of the base link, base components. The attitude is integrated in R^4 and normalised
+at the base link origin, base components. The attitude is integrated in R^4 and normalised
 after each Runge-Kutta step.
 
-Under external loads (:mod:`spacerobot_ros.model.external_loads`) the state has the time (s) as its
-last entry, and the command the vector of loads. For the load ``F_k`` on composite k and the
+Under external loads (:mod:`spacerobot_ros.model.external_loads`), the last entry of the state is
+the time (s), and that of the command the load vector. For the load ``F_k`` on composite k and the
 friction d, ``Q_j`` gains ``S_j' F_j - B_j' F_0 - d (K qdot)_j``; both momenta change by ``F_0``,
 the uniform gravity and the friction.
 """
@@ -67,7 +67,7 @@ def inertia_matrix(mass: float | ca.SX, D: ca.SX, D_q: ca.SX, D_qq: ca.SX) -> ca
 
 @dataclass(frozen=True)
 class SpatialInertia:
-    """Inertia at the system's centre of mass: ``mass`` (kg), ``h`` (3,) first moment of mass
+    """Inertia about the system's centre of mass: ``mass`` (kg), ``h`` (3,) first moment of mass
     (kg m), ``J`` (3, 3) second moment of mass (kg m^2; the rotational inertia is ``tr(J) 1 - J``).
     """
 
@@ -123,7 +123,7 @@ class Composites:
     """Composite rigid bodies outboard of each joint, base components; see the module for symbols.
 
     ``J[k]`` (3, 3) is the second moment of mass of body k about its own centre. ``S[j]`` (6,) is
-    the motion at unit rate of the joint that carries body j, ``P[j]`` (6,) the momentum of its
+    the unit-rate motion of the joint that carries body j, ``P[j]`` (6,) the momentum of its
     composite (both zero for the base); ``rotational`` (3, 3) is the system's rotational inertia.
     ``composite[k]`` is the inertia of body k and of all bodies that it carries.
     """
@@ -137,7 +137,7 @@ class Composites:
 
     @property
     def mass(self) -> float | ca.SX:
-        """Mass of the system, kg."""
+        """System mass, kg."""
         return self.kin.total_mass
 
     @property
@@ -147,7 +147,7 @@ class Composites:
 
     @property
     def D_q(self) -> ca.SX:
-        """Angular momentum (3, n) of unit joint rates about the centre of mass (paper 4, eq. 16a).
+        """Angular momentum (3, n) about the centre of mass per unit joint rate (paper 4, eq. 16a).
 
         This momentum does not depend on the motion of the centre of mass, so it equals the
         composites' momenta at the common point.
@@ -156,7 +156,7 @@ class Composites:
 
     @property
     def D_qq(self) -> ca.SX:
-        """Inertia matrix (n, n) of the joint rates while base and centre rest (eq. 16b)."""
+        """Joint inertia matrix (n, n) with the base and the centre of mass at rest (eq. 16b)."""
         m = self.kin.moving_body_count
         D_qq = ca.SX(m, m)
         for j in range(1, m + 1):
@@ -174,7 +174,7 @@ class Composites:
 
 
 def composites(kin: TreeKinematics) -> Composites:
-    """Add up the inertias of the bodies inward (Featherstone, table 6.2)."""
+    """Sum the body inertias inward (Featherstone, table 6.2)."""
     n, c = kin.moving_body_count, kin.r_BC_B
     J = tuple(kin.second_moment(k) for k in range(n + 1))
     composite = []
@@ -192,10 +192,10 @@ def composites(kin: TreeKinematics) -> Composites:
 
 @dataclass(frozen=True)
 class ShapeSystem:
-    """Inertia of the shape with the free base eliminated; see the module for the symbols.
+    """Shape inertia with the free base eliminated; see the module for the symbols.
 
-    ``B[j]`` (6,) belongs to the joint that carries body j (zero for the base); ``D`` is the factor
-    of the system's rotational inertia, ``K`` (n, n) the shape's inertia matrix.
+    ``B[j]`` (6,) is for the joint that carries body j (zero for the base); ``D`` is the factor
+    of the system's rotational inertia, ``K`` (n, n) the shape inertia matrix.
     """
 
     parts: Composites
@@ -204,11 +204,11 @@ class ShapeSystem:
     K: ca.SX
 
     def base_rate(self, L_B: ca.SX, qdot: ca.SX) -> ca.SX:
-        """Return ``omega_WB_B`` (3,) at the angular momentum ``L_B`` and the rates ``qdot``."""
+        """Return ``omega_WB_B`` (3,) for angular momentum ``L_B`` and joint rates ``qdot``."""
         return self.D.solve(L_B) - self._reaction(qdot)
 
     def base_acceleration(self, moment: ca.SX, qddot: ca.SX) -> ca.SX:
-        """Return the rate (3,) of ``omega_WB_B`` under a moment (3,) and ``qddot``."""
+        """Return the derivative (3,) of ``omega_WB_B`` for a moment (3,) and ``qddot``."""
         return self.D.solve(moment) - self._reaction(qddot)
 
     def _reaction(self, rates: ca.SX) -> ca.SX:
@@ -235,14 +235,14 @@ def shape_system(kin: TreeKinematics) -> ShapeSystem:
 def motion_forces(
     parts: Composites, omega: ca.SX, qdot: ca.SX, qddot: ca.SX | None = None
 ) -> tuple[ca.SX, ...]:
-    """Return ``f_k`` (6,) for every composite k: the force that its motion requires at the rates
+    """Return ``f_k`` (6,) for every composite k: the force required by its motion at the rates
     ``omega_WB_B`` (3,) and ``qdot`` (n,), constant ``omega``, and joint accelerations ``qddot``
     (n,), by default zero.
 
     Recursive Newton-Euler (Featherstone, table 5.1). If body k rotates at ``omega_k`` and
     ``alpha_k``, its point x accelerates by ``A_k x``, ``A_k = hat(alpha_k) + hat(omega_k)^2``,
-    relative to the body's origin. The base's origin is taken as unaccelerated: the terms of a
-    common acceleration in ``S_j' f_j`` and ``B_j' f_0`` cancel in ``Q_j``.
+    relative to the body's origin. The base origin is assumed unaccelerated: the terms of a common
+    acceleration in ``S_j' f_j`` and ``B_j' f_0`` cancel in ``Q_j``.
     """
     kin, qdot = parts.kin, parts.kin.spread(qdot)
     qddot = None if qddot is None else kin.spread(qddot)
@@ -320,15 +320,15 @@ def joint_efforts(
     L_B: ca.SX | None = None,
     loads: ExternalLoads | None = None,
 ) -> ca.SX:
-    """Return the efforts (n,), N or N m, of a free robot at joint rates ``qdot`` (n,) and
+    """Return the efforts (n,), N or N m, of a free robot for joint rates ``qdot`` (n,) and
     accelerations ``qddot`` (n,): inverse dynamics.
 
     ``L_B`` (3,) is the angular momentum about the system's centre of mass, kg m^2/s in base
     components; None: zero. The base rotates and accelerates such that both momenta are constant: by
-    ``-diag(D, M 1)^-1 f_0``, where ``f_0`` is the external force that the motion of the joints
-    alone would require. So ``tau_j = S_j' f_j - P_j' diag(D, M 1)^-1 f_0``, and no inertia matrix
-    of the joints is needed. At zero momentum the same path in half the time takes four times the
-    efforts. ``loads`` are external loads, if any.
+    ``-diag(D, M 1)^-1 f_0``, where ``f_0`` is the external force that the joint motion alone would
+    require. So ``tau_j = S_j' f_j - P_j' diag(D, M 1)^-1 f_0``, and no joint inertia
+    matrix is needed. At zero momentum, the same path in half the time requires four times
+    the efforts. ``loads`` are external loads, if any.
     """
     parts = composites(kin)
     D = SymmetricFactor(parts.rotational)
@@ -349,9 +349,9 @@ def joint_efforts(
 
 
 def external_force(kin: TreeKinematics, wrench_B: ca.SX) -> ca.SX:
-    """Return moment over force (6,) about the system's centre of mass of a wrench on the base.
+    """Return a base wrench as moment over force (6,) about the system's centre of mass.
 
-    ``wrench_B`` is force (N) over torque (N m) at the origin of the base link.
+    ``wrench_B`` is force (N) over torque (N m) at the base link origin.
     """
     force, torque = wrench_B[:3], wrench_B[3:]
     return ca.vertcat(torque - ca.cross(kin.r_BC_B, force), force)
@@ -390,8 +390,8 @@ def shape_equations(kin: TreeKinematics, *, loaded: bool = False) -> ca.Function
 def state_rate(kin: TreeKinematics, *, holding: bool = False, loaded: bool = False) -> ca.Function:
     """Return the function ``(x, command) -> x_dot``.
 
-    If ``holding``, it takes a third argument ``free`` (n,): 1 for a joint that moves, 0 for one
-    that is held at its present rate. If ``loaded``, external loads act.
+    If ``holding``, it takes a third argument ``free`` (n,): 1 for a moving joint, 0 for a joint
+    held at its current rate. If ``loaded``, external loads act.
     """
     x, command = _state_symbols(kin, loaded=loaded)
     free = ca.SX.sym("free", kin.n) if holding else ca.DM.ones(kin.n)
@@ -425,10 +425,10 @@ def state_rate(kin: TreeKinematics, *, holding: bool = False, loaded: bool = Fal
 
 
 def servo_rate(kin: TreeKinematics) -> ca.Function:
-    """Return the function ``(x, qdot, loads) -> x_dot`` of a robot whose servos hold ``qdot`` under
-    external loads.
+    """Return the function ``(x, qdot, loads) -> x_dot`` for a robot whose servos hold ``qdot``
+    under external loads.
 
-    ``x = [q; quaternion_WB; p_W; L_W; r_WC_W; time]``, (n + 14,); ``loads`` is the vector of
+    ``x = [q; quaternion_WB; p_W; L_W; r_WC_W; time]``, (n + 14,); ``loads`` is a vector laid out by
     :class:`.LoadLayout`.
     """
     parts = {"quaternion": 4, "p_W": 3, "L_W": 3, "r_WC_W": 3, "time": 1}

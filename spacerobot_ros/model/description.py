@@ -1,4 +1,4 @@
-"""Description of a robot: rigid links and the joints between them, as read from a URDF."""
+"""Robot description: rigid links and the joints between them, as read from a URDF."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from spacerobot_ros.model.rotations import Array as Array
 from spacerobot_ros.model.rotations import matrix_about_axis
 
 _PARALLEL_TOLERANCE = 1e-6
-"""Sine of the largest angle between axes that count as parallel."""
+"""Sine of the largest angle between axes considered parallel."""
 
 DEFAULT_END_EFFECTOR = "end_effector"
-"""Default name of the link that is the end-effector."""
+"""Default end-effector link name."""
 
 
 class JointKind(str, Enum):
-    """The joint types of URDF that a free-floating tree may have."""
+    """URDF joint types allowed in a free-floating tree."""
 
     REVOLUTE = "revolute"
     CONTINUOUS = "continuous"
@@ -33,7 +33,7 @@ class JointKind(str, Enum):
 
 @dataclass(frozen=True)
 class JointLimits:
-    """Limits of position, rate and effort of a joint (m or rad, /s, N or N m); infinite: none."""
+    """Joint position, rate and effort limits (m or rad, /s, N or N m); infinite: no limit."""
 
     lower: float = -np.inf
     upper: float = np.inf
@@ -62,7 +62,7 @@ class Inertia:
     about_com: Array = field(default_factory=lambda: np.zeros((3, 3)))
 
     def moved(self, pose: Pose) -> Inertia:
-        """Return the inertia in another frame, in which the present frame has ``pose``."""
+        """Return the inertia in another frame; ``pose`` is the pose of the current frame in it."""
         return Inertia(self.mass, pose.r + pose.R @ self.com, pose.R @ self.about_com @ pose.R.T)
 
     def __add__(self, other: Inertia) -> Inertia:
@@ -104,7 +104,7 @@ class Link:
 
 @dataclass(frozen=True)
 class Mimic:
-    """Coupling of a mimic joint: its position is ``multiplier`` times ``joint`` plus ``offset``."""
+    """Mimic joint coupling: position = ``multiplier`` times ``joint`` plus ``offset``."""
 
     joint: str
     multiplier: float
@@ -113,10 +113,11 @@ class Mimic:
 
 @dataclass(frozen=True)
 class Joint:
-    """A joint between two links; ``origin``: the child's pose at zero, ``axis``: a unit vector.
+    """A joint between two links; ``origin`` is the child's pose at joint position zero, ``axis`` a
+    unit vector.
 
-    A joint with ``mimic`` follows an independent joint: its position is not a coordinate. The child
-    of a joint with ``wheel`` is a reaction wheel.
+    A joint with ``mimic`` follows another joint: its position is not a coordinate. If
+    ``wheel`` is set, the child link is a reaction wheel.
     """
 
     name: str
@@ -131,11 +132,11 @@ class Joint:
 
     @property
     def unit(self) -> str:
-        """Unit of its position: m or rad."""
+        """Unit of the joint position: m or rad."""
         return "m" if self.kind is JointKind.PRISMATIC else "rad"
 
     def locked(self, position: float) -> Joint:
-        """Return a fixed joint that holds the child link at ``position`` of this joint."""
+        """Return a fixed joint that holds the child link at this joint's ``position``."""
         moved = Pose(r=position * self.axis)
         if self.kind is not JointKind.PRISMATIC:
             moved = Pose(matrix_about_axis(self.axis, position))
@@ -151,10 +152,11 @@ class Joint:
 
 @dataclass(frozen=True)
 class Body:
-    """A rigid body: the links that fixed joints weld together, in the frame of the first of them.
+    """A rigid body: links connected by fixed joints, in the frame of the first link.
 
     ``joint`` is the movable joint that carries the body (None for the base), ``parent`` the index
-    of the body it moves on, ``origin`` the body frame in the parent body's frame at joint zero.
+    of the parent body, ``origin`` the pose of the body frame in the parent body's frame at
+    joint position zero.
     """
 
     name: str
@@ -166,13 +168,13 @@ class Body:
 
 @dataclass(frozen=True)
 class RobotDescription:
-    """A free-floating tree of links; the root link is the base body (the spacecraft).
+    """A free-floating link tree; the root link is the base body (the spacecraft).
 
     ``bodies`` are in topological order, the base first; the movable joints are those of
     ``bodies[1:]`` that are not mimic joints, in that order. ``frames`` maps every link to its body
-    and its pose in that body. ``disabled_collisions`` are pairs of links that are not checked for
-    collision. ``world`` has the obstacles around the robot; its root link is the frame W; None:
-    none.
+    and its pose in that body. ``disabled_collisions`` are link pairs excluded from collision
+    checks. ``world`` contains the obstacles around the robot; its root link is the frame W;
+    None: none.
     """
 
     name: str
@@ -186,12 +188,12 @@ class RobotDescription:
 
     @property
     def base_link(self) -> str:
-        """Name of the root link."""
+        """Root link name."""
         return self.bodies[0].name
 
     @cached_property
     def movable_joints(self) -> tuple[Joint, ...]:
-        """The joints that are neither fixed nor mimic joints, in the order of the coordinates q."""
+        """Joints that are neither fixed nor mimic, in coordinate order."""
         return tuple(joint for joint in self.moving_joints if joint.mimic is None)
 
     @cached_property
@@ -206,7 +208,7 @@ class RobotDescription:
 
     @property
     def coupling(self) -> tuple[Array, Array]:
-        """``G`` (m, n) and ``b`` (m,): the moving joints are at ``G q + b``, m or rad."""
+        """``G`` (m, n) and ``b`` (m,): positions of the moving joints are ``G q + b``, m or rad."""
         names, moving = self.joint_names, self.moving_joints
         G, b = np.zeros((len(moving), len(names))), np.zeros(len(moving))
         for row, joint in enumerate(moving):
@@ -224,7 +226,7 @@ class RobotDescription:
 
     @property
     def wheel_names(self) -> tuple[str, ...]:
-        """Names of the joints that carry reaction wheels, in the order of the coordinates q."""
+        """Names of the reaction wheel joints, in coordinate order."""
         return tuple(joint.name for joint in self.movable_joints if joint.wheel)
 
     @property
@@ -234,7 +236,7 @@ class RobotDescription:
 
     @cached_property
     def size(self) -> float:
-        """Diameter of gyration of the whole system with all joints at zero, m."""
+        """Diameter of gyration of the whole system at zero joint positions, m."""
         poses = [Pose()]
         for body in self.bodies[1:]:
             poses.append(poses[body.parent] @ body.origin)
@@ -245,9 +247,9 @@ class RobotDescription:
         return float(2 * np.sqrt((moments / 2 + masses @ np.sum(away**2, axis=1)) / masses.sum()))
 
     def limits(self, kind: str) -> Array:
-        """Return one limit (n,) of the movable joints: lower, upper, velocity or effort.
+        """Return one kind of joint limit (n,): lower, upper, velocity or effort.
 
-        Limits of mimic joints restrict the joint that they follow, except for effort.
+        Except for effort, limits of mimic joints also restrict the joint they follow.
         """
         values: list[Any] = [getattr(joint.limits, kind) for joint in self.movable_joints]
         for joint in self.moving_joints:
@@ -268,24 +270,25 @@ class RobotDescription:
 
     def end_effector(self, link: str = "") -> str:
         """Return the name of the end-effector link: ``link`` if given, else ``end_effector`` if the
-        robot has such a link, else an empty text.
+        robot has such a link, else an empty string.
         """
         names = [each.name for each in self.links]
         return link or (DEFAULT_END_EFFECTOR if DEFAULT_END_EFFECTOR in names else "")
 
     def with_links(self, links: tuple[Link, ...]) -> RobotDescription:
-        """Return the robot with replaced links of the same names; ``urdf`` is unchanged."""
+        """Return the robot with links replaced by others of the same names; ``urdf`` is
+        unchanged."""
         return self._with_tree(links, self.joints)
 
     def with_locked(self, positions: Mapping[str, float]) -> RobotDescription:
-        """Return the robot with joints fixed at positions (m or rad) by their names.
+        """Return the robot with the named joints fixed at positions (m or rad).
 
-        Links and the other joints keep their names and their order; ``urdf`` is not changed.
+        Links and other joints keep their names and order; ``urdf`` is not changed.
 
         Raises
         ------
         KeyError
-            A name is not that of a movable joint.
+            A name does not belong to a movable joint.
         """
         unknown = set(positions) - set(self.joint_names)
         if unknown:
@@ -303,10 +306,10 @@ class RobotDescription:
         return self._with_tree(self.links, tuple(joints))
 
     def with_model_error(self, error: float, seed: int) -> RobotDescription:
-        """Return the robot with random errors of all masses and inertias.
+        """Return the robot with random errors in all masses and inertias.
 
         Each is multiplied by an independent factor, drawn uniformly from
-        ``[1 - error, 1 + error]``, two per link in the order of the links. Inertia tensors stay
+        ``[1 - error, 1 + error]``, two per link in link order. Inertia tensors stay
         physical, since their principal moments keep their ratios; centres of mass do not change.
 
         Raises
@@ -339,12 +342,12 @@ def leading_limit(limits: JointLimits, mimic: Mimic, kind: str) -> float:
 
 
 def editable_root(urdf: str) -> Element:
-    """Return the root element of a URDF text, with its comments, for editing the text.
+    """Return the root element of a URDF string, including comments, for editing.
 
     Raises
     ------
     xml.etree.ElementTree.ParseError
-        The text is not XML.
+        The string is not XML.
     """
     return fromstring(urdf, XMLParser(target=TreeBuilder(insert_comments=True)))
 
@@ -352,14 +355,14 @@ def editable_root(urdf: str) -> Element:
 def weld_links(
     links: Mapping[str, Link], joints: Sequence[Joint]
 ) -> tuple[list[Body], dict[str, tuple[int, Pose]]]:
-    """Order the tree from the root, and merge links that fixed joints weld together.
+    """Order the tree from the root, and merge links connected by fixed joints.
 
     Returns ``bodies`` and ``frames`` of a :class:`RobotDescription`.
 
     Raises
     ------
     RobotDescriptionError
-        The links and joints are not a tree.
+        The links and joints do not form a tree.
     """
     children: dict[str, list[Joint]] = {name: [] for name in links}
     parents: dict[str, str] = {}
@@ -377,12 +380,12 @@ def weld_links(
         mend = (
             f"Connect '{roots[1]}' by a joint, or remove it."
             if roots
-            else "Remove a joint of the ring: the base is not a child of any joint."
+            else "Remove a joint from the loop: the base must not be the child of any joint."
             if links
             else "Give it a <link>."
         )
         raise RobotDescriptionError(
-            f"A robot has exactly one root link (the base); found: {found}. {mend}"
+            f"A robot must have exactly one root link (the base); found: {found}. {mend}"
         )
 
     bodies = [Body(roots[0], links[roots[0]].inertia, None, -1, Pose())]
@@ -406,18 +409,19 @@ def weld_links(
     if len(frames) != len(links):
         lost = sorted(set(links) - set(frames))
         raise RobotDescriptionError(
-            f"Link '{lost[0]}' is not connected to the root: its joints form a ring. Remove one "
-            "of them, and connect the others to the robot."
+            f"Link '{lost[0]}' is not connected to the root: its joints form a loop. Remove one "
+            "of them, and connect the remaining links to the robot."
         )
     return bodies, frames
 
 
 def plane_normal(description: RobotDescription) -> Array | None:
-    """Return the unit normal (3,), base components, of the plane a robot moves in; None: spatial.
+    """Return the unit normal (3,) of a planar robot's plane of motion, base components; None:
+    spatial.
 
-    A robot is planar if it has a revolute joint, the axes of all such joints are parallel, and
-    those of all prismatic joints are perpendicular to them. Its bodies then move in parallel
-    planes of the base.
+    A robot is planar if it has a revolute joint, the axes of all such joints are parallel, and the
+    axes of all prismatic joints are perpendicular to them. All its bodies then move in parallel
+    planes fixed in the base.
     """
     normal: Array | None = None
     rotations = [np.eye(3)]

@@ -2,13 +2,12 @@
 
 Equations of motion ``H+ zddot + C+ = Q`` (paper 4, eqs 8-10 and 18-21). The independent velocities
 are ``z0dot = [v_cm; omega; qdot]``, the first two in base components (eq. 8), so that nothing
-depends on the pose of the robot. Inertias are those of composite rigid bodies
+depends on the robot pose. Inertias are composite-rigid-body inertias
 (:mod:`.composite_rigid_body`).
 
-Momentum, and the base motion that it implies. At zero total momentum the base moves only if the
-shape changes: ``[v; omega]_B = -A(q) qdot``, the mechanical connection (paper 1). A closed loop of
-the shape leaves a net motion of the base: to first order, the curvature times the area of the loop
-(paper 2).
+Momentum, and the resulting base motion. At zero total momentum, the base moves only if the
+shape changes: ``[v; omega]_B = -A(q) qdot``, the mechanical connection (paper 1). A closed shape
+loop leaves a net base motion: to first order, the curvature times the loop area (paper 2).
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ from spacerobot_ros.model.kinematics import TreeKinematics
 
 
 def point_jacobian(kin: TreeKinematics, link: str) -> ca.SX:
-    """Return ``0J+`` (6, 6 + n) of a link's frame origin, eq. (10), in base components.
+    """Return ``0J+`` (6, 6 + n) for the origin of a link frame, eq. (10), in base components.
 
     It maps ``[v_cm; omega; qdot]`` to the linear velocity of the point over the angular velocity
     of its body. ``J_12`` is the shape derivative of ``rho = sum_i v_ik,m``, which for revolute
@@ -38,7 +37,7 @@ def bias(kin: TreeKinematics, v_cm: ca.SX, omega: ca.SX, qdot: ca.SX) -> ca.SX:
     """Return ``C+`` (6 + n,) by d'Alembert: the generalised force that keeps ``z0ddot`` at zero.
 
     Outward recursion of the velocity-product accelerations, inward sum of their inertia forces.
-    Accelerations are taken relative to the system's centre of mass, whose own acceleration is
+    Accelerations are relative to the system's centre of mass, which itself accelerates by
     ``omega x v_cm``.
     """
     M, qdot = kin.total_mass, kin.spread(qdot)
@@ -108,7 +107,7 @@ def momentum_of_bodies(
     """Return linear momentum (3,), angular momentum about the system's centre of mass (3,) and
     kinetic energy, in base components, summed body by body.
 
-    This does not use ``H+``: it is the independent balance against which the motion is checked.
+    This does not use ``H+``: it is an independent check of the motion.
     """
     linear, angular, energy = ca.SX(3, 1), ca.SX(3, 1), ca.SX(0)
     qdot = kin.spread(qdot)
@@ -139,7 +138,7 @@ def base_twist(
     p_B: ca.SX,
     L_B: ca.SX,
 ) -> tuple[ca.SX, ca.SX]:
-    """Return ``(v_WB_B, omega_WB_B)`` that carry linear momentum ``p_B`` (kg m/s) and angular
+    """Return ``(v_WB_B, omega_WB_B)`` for linear momentum ``p_B`` (kg m/s) and angular
     momentum ``L_B`` about the system's centre of mass (kg m^2/s), both in base components.
 
     If both are zero, the result is ``-A(q) qdot``.
@@ -157,7 +156,7 @@ def base_twist(
 def connection(kin: TreeKinematics, inertia: Composites) -> ca.SX:
     """Return ``A(q)`` (6, n) of ``[v_WB_B; omega_WB_B] = -A(q) qdot``, zero momentum (paper 1, 3).
 
-    The lower half is ``D^-1 D_q``; the upper keeps the system's centre of mass at rest:
+    The lower half is ``D^-1 D_q``; the upper half keeps the system's centre of mass at rest:
     ``v = -omega x c - dc/dq qdot`` with ``c = r_BC_B``.
     """
     A_omega = solve_positive_definite(inertia.D, inertia.D_q)

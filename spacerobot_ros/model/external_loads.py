@@ -1,17 +1,17 @@
-"""External loads on the links of a robot: wrenches, a gravity gradient, a tilted air table.
+"""External loads on robot links: wrenches, a gravity gradient, a tilted air table.
 
-All loads of a robot form one vector (:class:`LoadLayout`); times are those of the plant. The frame
-W falls freely on a circular orbit with the mean motion n, without rotating. The orbital frame O has
-its x axis along the radius outward and its z axis along the orbit's normal, as in the equations of
-Clohessy and Wiltshire; ``R_WO`` is its attitude at time zero. With the unit vector o along the
-radius, a mass element at r from the origin of W accelerates by ``n^2 (3 o o' - 1) r``, the first
-order of an inverse-square field (Hughes, Spacecraft Attitude Dynamics, chapter 8). Body k with
-centre of mass r_k is subject to the force and the moment about this centre ::
+All loads on a robot form one vector (:class:`LoadLayout`); times are plant times. Frame W is
+in free fall on a circular orbit with mean motion n, without rotating. The orbital frame O has
+its x axis radially outward and its z axis along the orbit normal, as in the equations of
+Clohessy and Wiltshire; ``R_WO`` is the attitude of O at time zero. With the unit vector o along the
+radius, a mass element at r from the origin of W accelerates by ``n^2 (3 o o' - 1) r``, to first
+order in an inverse-square field (Hughes, Spacecraft Attitude Dynamics, chapter 8). The force on
+body k and the moment about its centre of mass r_k are ::
 
     f_k = m_k n^2 (3 o o' - 1) r_k,    n_k = 3 n^2 o x I_k o
 
-Their sum over the bodies is the moment ``3 n^2 o x D o`` about the system's centre of mass, with
-the locked inertia D, and the force ``M n^2 (3 o o' - 1) r_C`` on that centre.
+Their sum over the bodies is the moment ``3 n^2 o x D o`` about the system's centre of mass, where D
+is the locked inertia, and the force ``M n^2 (3 o o' - 1) r_C`` on that centre.
 
 On an air table all bodies have the same acceleration, and friction is proportional to momentum:
 ``f_k = -d m_k v_k``, ``n_k = -d I_k omega_k``.
@@ -35,12 +35,12 @@ from spacerobot_ros.model.symbolic_rotations import matrix_from_quaternion
 
 @dataclass(frozen=True)
 class LoadLayout:
-    """Slices of a vector of loads.
+    """Layout of a load vector.
 
     Attributes
     ----------
     links
-        Number of links L of the robot.
+        Number L of robot links.
     """
 
     links: int
@@ -57,7 +57,7 @@ class LoadLayout:
 
     @property
     def mean_motion(self) -> slice:
-        """Mean motion of the orbit, rad/s; zero: no gravity gradient."""
+        """Mean motion of the orbit, rad/s; zero disables the gravity gradient."""
         return self._after_wrenches(0, 1)
 
     @property
@@ -72,12 +72,12 @@ class LoadLayout:
 
     @property
     def friction(self) -> slice:
-        """Viscous friction of every body over its momentum, 1/s."""
+        """Viscous friction on every body per unit of its momentum, 1/s."""
         return self._after_wrenches(8, 1)
 
     @property
     def time(self) -> slice:
-        """Time at the beginning of the tick, s."""
+        """Time at the start of the tick, s."""
         return self._after_wrenches(9, 1)
 
     @property
@@ -92,16 +92,16 @@ class LoadLayout:
 
 @dataclass(frozen=True)
 class ExternalLoads:
-    """The loads of a state, as expressions in base components.
+    """Loads in a state, as expressions in base components.
 
     Attributes
     ----------
     composites
-        Moment over force (6,) about the system's centre of mass, of the wrenches and the gravity
-        gradient, on every composite: a body and all bodies that it carries.
+        Moment over force (6,) about the system's centre of mass on every composite (a body and all
+        bodies that it carries), due to the wrenches and the gravity gradient.
     gravity_W, friction
-        Uniform acceleration (3,) in W, m/s^2, and friction over momentum, 1/s. Both act in
-        proportion to mass, so they affect momenta and joints independently.
+        Uniform acceleration (3,) in W, m/s^2, and friction per momentum, 1/s. Both are
+        proportional to mass, so they affect momenta and joints independently.
     """
 
     composites: tuple[ca.SX, ...]
@@ -111,7 +111,7 @@ class ExternalLoads:
     def momentum_rates(
         self, R_WB: ca.SX, p_W: ca.SX, L_W: ca.SX, mass: float | ca.SX
     ) -> tuple[ca.SX, ca.SX]:
-        """Return the rates of both total momenta in W due to the loads, N and N m."""
+        """Return the derivatives of both total momenta due to the loads, N and N m, in W."""
         moment, force = self.composites[0][:3], self.composites[0][3:]
         return (
             R_WB @ force + mass * self.gravity_W - self.friction * p_W,
@@ -127,7 +127,7 @@ def external_loads(
     loads: ca.SX,
     time: ca.SX,
 ) -> ExternalLoads:
-    """Return the loads of a state.
+    """Return the loads in a state.
 
     Parameters
     ----------
@@ -175,10 +175,10 @@ def external_loads(
 # -- motion relative to a circular orbit ----------------------------------------------------------
 
 EARTH_GRAVITATION = 3.986004418e14
-"""Gravitational parameter of the Earth, m^3/s^2."""
+"""Earth's gravitational parameter, m^3/s^2."""
 
 EARTH_RADIUS = 6378137.0
-"""Equatorial radius of the Earth, m (WGS 84)."""
+"""Earth's equatorial radius, m (WGS 84)."""
 
 
 def mean_motion_at(altitude: float) -> float:
@@ -192,9 +192,9 @@ def mean_motion_at(altitude: float) -> float:
 def relative_motion(
     n: float, r0_O: npt.ArrayLike, v0_O: npt.ArrayLike, t: npt.ArrayLike
 ) -> tuple[Array, Array]:
-    """Return position and velocity of a free body in the orbital frame at some times.
+    """Return the position and velocity of a free body in the orbital frame at given times.
 
-    The closed solution of the equations of Clohessy and Wiltshire (1960),
+    Closed-form solution of the Clohessy-Wiltshire equations (1960),
     ``xdd = 3 n^2 x + 2 n yd``, ``ydd = -2 n xd``, ``zdd = -n^2 z``.
 
     Parameters
@@ -202,7 +202,7 @@ def relative_motion(
     n
         Mean motion, rad/s; zero: uniform motion.
     r0_O, v0_O
-        (3,) position (m) and velocity (m/s) at time zero, both relative to O and in its components.
+        (3,) position (m) and velocity (m/s) at time zero, both relative to O, in O components.
     t
         (...) times, s.
 
@@ -214,13 +214,15 @@ def relative_motion(
     Raises
     ------
     ParameterError
-        A number is not finite, or ``n`` is negative.
+        A value is not finite, or ``n`` is negative.
     """
     r0, v0, times = (np.asarray(each, dtype=float) for each in (r0_O, v0_O, t))
     if not (math.isfinite(n) and n >= 0.0):
         raise ParameterError(f"The mean motion is {n:g} rad/s; it must be finite and at least 0.")
     if not all(np.all(np.isfinite(each)) for each in (r0, v0, times)):
-        raise ParameterError("Position, velocity and times of a relative motion must be finite.")
+        raise ParameterError(
+            "The position, velocity and times of a relative motion must be finite."
+        )
     if n == 0.0:
         return r0 + times[..., np.newaxis] * v0, np.broadcast_to(v0, (*times.shape, 3)).copy()
     angle = n * times

@@ -1,20 +1,20 @@
-"""The grasp of a floating body by a floating robot: an inelastic impact.
+"""Grasp of a floating body by a floating robot, modelled as an inelastic impact.
 
 With ``z = [v_WB_B; omega_WB_B; qdot]`` (6 + n,) of the robot, ``nu`` (6,) of the body (velocity of
-its centre of mass and angular velocity) and ``L`` (6,) the impulse of the grasp on the robot, force
-over torque at the point of the grasp, all in components of the base frame B,
+its centre of mass and angular velocity) and ``L`` (6,) the grasp impulse on the robot, force over
+torque at the grasp point, all in components of the base frame B,
 
     H (z+ - z) = J' L,    M (nu+ - nu) = -G' L,    J z+ = G nu+,
 
-where H is the robot's inertia matrix, M the spatial inertia of the body, J the Jacobian of the
-end-effector and G the map of the body's twist to the same point. The joints are free: no motor or
+where H is the robot's inertia matrix, M the body's spatial inertia, J the end-effector Jacobian and
+G the map from the body's twist to the same point. The joints are free: no motor or
 brake exerts an impulse. So
 
     L = (J H^-1 J' + G M^-1 G')^-1 (G nu - J z),
 
 and the energy ``(G nu - J z)' L / 2`` is lost (Carnot). Momentum is conserved, because L acts on
-both with opposite signs. The formulation is that of Yoshida and Nenchev and of Dimitrov and
-Yoshida; see the page on the theory of captures.
+both with opposite signs. The formulation follows Yoshida and Nenchev, and Dimitrov and Yoshida; see
+the theory page on captures.
 """
 
 from __future__ import annotations
@@ -40,31 +40,31 @@ from spacerobot_ros.model.space_robot import SpaceRobot
 
 @dataclass(frozen=True)
 class Payload:
-    """A body held by a link of a robot.
+    """A body held by a robot link.
 
     Attributes
     ----------
     link
         Name of the link.
     inertia
-        Mass properties of the body in the frame of the link.
+        Mass properties of the body in the link frame.
     """
 
     link: str
     inertia: Inertia
 
     def attached_to(self, robot: SpaceRobot) -> SpaceRobot:
-        """Return the robot that holds the body: its joints, links and limits are the same.
+        """Return the robot that holds the body: joints, links and limits are unchanged.
 
         Raises
         ------
         RobotDescriptionError
-            The robot has no such link, or the inertia is not that of a rigid body.
+            The robot has no such link, or the inertia is not physical.
         """
         frames = robot.description.frames
         if self.link not in frames:
             raise RobotDescriptionError(
-                f"A body is held by the link '{self.link}', but robot '{robot.description.name}' "
+                f"The payload is held by link '{self.link}', but robot '{robot.description.name}' "
                 f"has no such link; it has {', '.join(robot.link_names)}."
             )
         body, pose = frames[self.link]
@@ -72,7 +72,7 @@ class Payload:
 
     def to_text(self) -> str:
         """Return the payload as JSON: ``link``, ``mass`` (kg), ``com`` (m), ``inertia`` (kg m^2),
-        the six entries xx, yy, zz, xy, xz, yz about the centre of mass.
+        entries xx, yy, zz, xy, xz, yz about the centre of mass.
         """
         about = self.inertia.about_com
         return json.dumps(
@@ -86,12 +86,12 @@ class Payload:
 
     @classmethod
     def from_text(cls, text: str) -> Payload:
-        """Return the payload of :meth:`to_text`.
+        """Return the payload from the output of :meth:`to_text`.
 
         Raises
         ------
         RobotDescriptionError
-            The text is not a payload.
+            The string does not describe a payload.
         """
         try:
             values = json.loads(text)
@@ -104,7 +104,7 @@ class Payload:
             return cls(str(values["link"]), Inertia(float(values["mass"]), com, about))
         except (KeyError, TypeError, ValueError, RecursionError) as error:
             raise RobotDescriptionError(
-                f"The text does not describe a held body: {error}."
+                f"The string does not describe a payload: {error}."
             ) from error
 
 
@@ -118,7 +118,7 @@ class TargetBody:
     Attributes
     ----------
     inertia
-        Mass properties in the frame T of its root link.
+        Mass properties in its root link frame T.
     grapple
         Pose of the grapple frame G in T.
     """
@@ -128,22 +128,23 @@ class TargetBody:
 
     @classmethod
     def of(cls, target: RobotDescription, grapple_frame: str) -> TargetBody:
-        """Return the body of a description, with one of its links as grapple frame.
+        """Return the body from a robot description, with one of the links as grapple frame.
 
         Raises
         ------
         RobotDescriptionError
-            It has movable joints, or no such link.
+            The description has movable joints, or no such link.
         """
         if target.joint_names:
             raise RobotDescriptionError(
-                f"The target '{target.name}' has joints that move "
-                f"({', '.join(target.joint_names)}); a target is one rigid body: make them fixed."
+                f"The target '{target.name}' has movable joints "
+                f"({', '.join(target.joint_names)}); a target must be one rigid body: make them "
+                "fixed."
             )
         if grapple_frame not in target.frames:
             raise RobotDescriptionError(
-                f"The target '{target.name}' has no link '{grapple_frame}' to grasp; it "
-                f"has {', '.join(target.frames)}: set parameter 'target.grapple_frame', or add the "
+                f"The target '{target.name}' has no link '{grapple_frame}' to grasp; its links "
+                f"are {', '.join(target.frames)}: set parameter 'target.grapple_frame', or add the "
                 "link."
             )
         return cls(target.bodies[0].inertia, target.frames[grapple_frame][1])
@@ -151,12 +152,12 @@ class TargetBody:
 
 @dataclass(frozen=True)
 class RobotMotion:
-    """A state of motion of a robot.
+    """A robot's state of motion.
 
     Attributes
     ----------
     pose
-        (7,) position ``r_WB`` in m and quaternion ``R_WB`` (x, y, z, w) of the base link.
+        (7,) base link position ``r_WB`` in m and quaternion ``R_WB`` (x, y, z, w).
     twist
         (6,) ``v_WB_B`` in m/s and ``omega_WB_B`` in rad/s.
     q, qdot
@@ -175,18 +176,18 @@ class RobotMotion:
 
     @property
     def R_WB(self) -> Array:
-        """Attitude of the base link (3, 3)."""
+        """Base link attitude (3, 3)."""
         return matrix_from_quaternion(self.pose[3:])
 
 
 @dataclass(frozen=True)
 class BodyMotion:
-    """A state of motion of a rigid body, in W.
+    """A rigid body's state of motion, in W.
 
     Attributes
     ----------
     R_WT, r_WT
-        Attitude (3, 3) and position (3,), m, of its frame T.
+        Attitude (3, 3) and position (3,), m, of the body frame T.
     v, omega
         Velocity of the origin of T (3,), m/s, and angular velocity (3,), rad/s.
     """
@@ -198,20 +199,20 @@ class BodyMotion:
 
     @classmethod
     def of(cls, pose: Array, twist: Array) -> BodyMotion:
-        """Return the motion with a pose (7,) in W and a twist (6,) in T: velocity over rate."""
+        """Return the motion from a pose (7,) in W and a twist (6,) in T, linear over angular."""
         R = matrix_from_quaternion(pose[3:])
         return cls(R, pose[:3].copy(), R @ twist[:3], R @ twist[3:])
 
     def at(self, frame: Pose) -> BodyMotion:
-        """Return the motion of a frame that is fixed to the body, with this pose in T."""
+        """Return the motion of a frame fixed to the body at this pose in T."""
         arm = self.R_WT @ frame.r
         return BodyMotion(
             self.R_WT @ frame.R, self.r_WT + arm, self.v + cross(self.omega, arm), self.omega
         )
 
     def momenta(self, inertia: Inertia) -> tuple[Array, Array]:
-        """Return linear momentum (kg m/s), and angular momentum (kg m^2/s) about the body's centre
-        of mass, in W. ``inertia`` is given in T.
+        """Return the linear momentum (kg m/s), and the angular momentum (kg m^2/s) about the body's
+        centre of mass, in W. ``inertia`` is given in T.
         """
         moving = self.at(Pose(r=inertia.com))
         return inertia.mass * moving.v, self.R_WT @ inertia.about_com @ self.R_WT.T @ self.omega
@@ -227,7 +228,7 @@ class RelativeMotion:
     Attributes
     ----------
     distance, angle
-        Between the origins (m) and between the attitudes (rad) of the two frames.
+        Distance (m) between the origins, and angle (rad) between the attitudes, of the two frames.
     speed, rate
         Relative speed of the origins (m/s), and relative angular rate (rad/s).
     """
@@ -251,19 +252,19 @@ class RelativeMotion:
 
 @dataclass(frozen=True)
 class GraspImpact:
-    """The result of a grasp.
+    """Result of a grasp.
 
     Attributes
     ----------
     twist, qdot
-        Twist of the base (6,) and joint rates (n,) after it, as in :class:`RobotMotion`.
+        Base twist (6,) and joint rates (n,) after the grasp, as in :class:`RobotMotion`.
     impulse
-        (6,) on the robot at the origin of the end-effector: N s over N m s, in W.
+        (6,) on the robot at the end-effector origin: N s over N m s, in W.
     joint_impulses
-        (n,) of the grasp on the joints, ``J_q' L``, which motors or brakes would have to apply in
-        order to keep the joint rates; N s or N m s.
+        (n,) on the joints, ``J_q' L``, which motors or brakes would have to apply to keep the joint
+        rates constant; N s or N m s.
     energy_before, energy_lost
-        Kinetic energy of both bodies before it, and its loss, J.
+        Total kinetic energy before the grasp, and the energy lost, J.
     """
 
     twist: Array
@@ -275,7 +276,7 @@ class GraspImpact:
 
 
 def frame_motion(robot: SpaceRobot, link: str, motion: RobotMotion) -> BodyMotion:
-    """Return the motion of a link's frame."""
+    """Return the motion of a link frame."""
     R_BL, r_BL = robot.link_pose(link, motion.q)
     R_WB = motion.R_WB
     twist = _jacobian_of_base_twist(robot, link, motion.q) @ _velocities(motion)
@@ -287,18 +288,18 @@ def frame_motion(robot: SpaceRobot, link: str, motion: RobotMotion) -> BodyMotio
 def grasp_impact(
     robot: SpaceRobot, link: str, motion: RobotMotion, body: BodyMotion, inertia: Inertia
 ) -> GraspImpact:
-    """Return the impact of a link that grasps a floating body, both at their present poses.
+    """Return the impact of a link that grasps a floating body, both at their current poses.
 
     Parameters
     ----------
     robot
         The robot.
     link
-        The end-effector; the impulse is given at the origin of its frame.
+        The end-effector; the impulse is given at its frame's origin.
     motion, body
         The motions before it.
     inertia
-        Mass properties of the body in its frame T.
+        Mass properties of the body in the body frame T.
     """
     q, n, R_WB = motion.q, robot.n, motion.R_WB
     to_cm = _to_velocity_of_cm(robot, q)
@@ -338,8 +339,8 @@ def combined_momenta(
     centers
         Their centres of mass in W (3,), m.
     momenta
-        Linear over angular momentum (6,) of each about its own centre of mass, in W; the result is
-        about the common centre of mass.
+        Linear over angular momentum (6,) of each system about its own centre of mass, in W; the
+        result is about the combined centre of mass.
     """
     first, second = momenta
     arm = centers[1] - centers[0]
@@ -352,9 +353,9 @@ def combined_momenta(
 def separated_momenta(
     masses: tuple[float, float], centers: tuple[Array, Array], together: Array, second: Array
 ) -> Array:
-    """Return the momenta (6,) of the first system from the combined ones and those of the second.
+    """Return the first system's momenta (6,) from the combined momenta and the second system's.
 
-    The arguments are those of :func:`combined_momenta`, which this inverts.
+    The inverse of :func:`combined_momenta`, with the same arguments.
     """
     share = masses[0] / (masses[0] + masses[1])
     linear = together[:3] - second[:3]

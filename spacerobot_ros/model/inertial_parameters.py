@@ -1,8 +1,8 @@
 """Masses, centres of mass and inertias of a robot's bodies.
 
 :class:`InertialParameters` holds their values for one robot, or for a batch of robots that differ
-in these values alone. In expressions they are either constants (:class:`MassProperties`: fewest
-operations, one compilation for each set of numbers) or entries of an argument ``p``
+only in these values. In expressions they are either constants (:class:`MassProperties`: fewest
+operations, one compilation per set of values) or entries of an argument ``p``
 (:class:`SymbolicMassProperties`: one compilation for all sets).
 """
 
@@ -19,20 +19,20 @@ from spacerobot_ros.errors import RobotDescriptionError
 from spacerobot_ros.model.description import Array, Inertia, RobotDescription
 
 TRIANGLE_SLACK = 0.01
-"""Largest relative violation of the triangle inequality by rounding of principal moments."""
+"""Largest relative violation of the triangle inequality due to rounding."""
 
 _ROUNDING_ERROR = 1e-12
 
 NUMBERS_PER_BODY = 10
-"""Numbers per body in :attr:`InertialParameters.vector`."""
+"""Values per body in :attr:`InertialParameters.vector`."""
 
 INERTIA_ENTRIES = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
-"""Row and column of each of a body's six second moments in the matrix (3, 3)."""
+"""Row and column of each of the six second moments in the (3, 3) matrix."""
 
 
 @dataclass(frozen=True)
 class InertialParameters:
-    """Mass properties of the ``bodies`` of a :class:`RobotDescription`, of one robot or a batch.
+    """Mass properties of the ``bodies`` in a :class:`RobotDescription`, for one robot or a batch.
 
     Leading dimensions (...) are the batch: none for one robot, (N,) for N robots.
 
@@ -41,10 +41,9 @@ class InertialParameters:
     masses
         (..., B) kg.
     centers
-        (..., B, 3) centres of mass in the frames of the bodies (the frame of the first link of
-        each), m.
+        (..., B, 3) centres of mass in the body frames (those of their first links), m.
     inertias
-        (..., B, 3, 3) about those centres, along the axes of those frames, kg m^2.
+        (..., B, 3, 3) about the centres of mass, along the axes of the body frames, kg m^2.
 
     Raises
     ------
@@ -66,7 +65,7 @@ class InertialParameters:
 
     @classmethod
     def of(cls, robot: RobotDescription) -> InertialParameters:
-        """Return the inertial parameters of a robot description."""
+        """Return the inertial parameters from a robot description."""
         parts = [body.inertia for body in robot.bodies]
         return cls(
             np.array([part.mass for part in parts]),
@@ -89,7 +88,7 @@ class InertialParameters:
 
     @property
     def total_mass(self) -> Array:
-        """Masses of the robots (...), kg."""
+        """Total robot masses (...), kg."""
         return np.asarray(self.masses.sum(axis=-1))
 
     def scaled(
@@ -97,9 +96,8 @@ class InertialParameters:
     ) -> InertialParameters:
         """Return the parameters with masses and inertias multiplied by factors (..., B).
 
-        Inertias have the factors of the masses (a change of density) unless separate ones are
-        given. Factors of shape (N, B), or (N, 1) for all bodies alike, turn one robot into a
-        batch.
+        Inertias use the mass factors (a change of density) unless given factors of their own.
+        Factors of shape (N, B), or (N, 1) if equal for all bodies, turn one robot into a batch.
         """
         by_mass = np.asarray(masses, dtype=float)
         by_inertia = by_mass if inertias is None else np.asarray(inertias, dtype=float)
@@ -111,7 +109,7 @@ class InertialParameters:
         )
 
     def shifted(self, offsets: npt.ArrayLike) -> InertialParameters:
-        """Return the parameters with centres of mass moved by offsets (..., B, 3), m.
+        """Return the parameters with centres of mass shifted by offsets (..., B, 3), m.
 
         The inertias about the centres of mass do not change.
         """
@@ -122,7 +120,7 @@ class InertialParameters:
         )
 
     def with_payload(self, body: int, payload: Inertia) -> InertialParameters:
-        """Return the parameters with a payload fixed to a body, given in the body's frame."""
+        """Return the parameters with a payload fixed to a body, given in the body frame."""
         own = Inertia(float(self.masses[body]), self.centers[body], self.inertias[body])
         both = own + payload
         masses, centers, inertias = (
@@ -139,9 +137,9 @@ class InertialParameters:
 
     @property
     def vector(self) -> Array:
-        """All numbers (..., 10 B) as one vector, the argument ``p`` of compiled functions.
+        """All values (..., 10 B) as one vector, the argument ``p`` of compiled functions.
 
-        For each body: mass, centre (3), second moments xx, yy, zz, xy, xz, yz.
+        For each body: mass, centre of mass (3), second moments xx, yy, zz, xy, xz, yz.
         """
         moments = self.second_moments
         six = np.stack([moments[..., i, j] for i, j in INERTIA_ENTRIES], axis=-1)
@@ -149,13 +147,13 @@ class InertialParameters:
         return rows.reshape(*self.masses.shape[:-1], -1)
 
     def require_physical(self, names: Sequence[str]) -> None:
-        """Check that masses and inertias are physical; ``names`` are those of the bodies.
+        """Check that masses and inertias are physical; ``names`` are the body names.
 
         Raises
         ------
         RobotDescriptionError
-            A number is not finite, a mass is negative, all masses are zero, or principal moments
-            are negative or break the triangle inequality.
+            A value is not finite, a mass is negative, all masses are zero, or principal moments
+            are negative or violate the triangle inequality.
         """
         finite = np.isfinite(self.vector).reshape(-1, len(names), NUMBERS_PER_BODY).all(axis=(0, 2))
         if not finite.all():
@@ -169,7 +167,7 @@ class InertialParameters:
                 "must be positive."
             )
         if not masses.sum(axis=1).all():
-            raise RobotDescriptionError("The total mass of the robot is zero.")
+            raise RobotDescriptionError("The total robot mass is zero.")
         tensors = self.inertias.reshape(-1, len(names), 3, 3)
         low, middle, high = np.moveaxis(np.linalg.eigvalsh(tensors), -1, 0)
         slack = _ROUNDING_ERROR * np.maximum(1.0, high)
@@ -178,15 +176,14 @@ class InertialParameters:
             row, body_index = np.argwhere(impossible)[0]
             moments = ", ".join(f"{each[row, body_index]:.4g}" for each in (low, middle, high))
             raise RobotDescriptionError(
-                f"The inertia of '{names[int(body_index)]}' is not that of a rigid body: its "
-                f"principal moments are {moments} kg m^2."
+                f"The inertia of '{names[int(body_index)]}' is not physical: its principal "
+                f"moments are {moments} kg m^2."
             )
 
     def apply_to_description(self, robot: RobotDescription) -> RobotDescription:
         """Return a robot description with these parameters; its ``urdf`` is unchanged.
 
-        The first link of each body gets the mass properties of the body, the links that are welded
-        to it by fixed joints get none.
+        The first link of each body gets the body's mass properties; links fixed to it get none.
         """
         of_body = {
             body.name: Inertia(float(mass), center, inertia)
@@ -201,16 +198,16 @@ class InertialParameters:
 
 
 class MassProperties:
-    """Mass properties of a robot description as constants in expressions.
+    """Mass properties from a robot description, as constants in expressions.
 
     Attributes
     ----------
     masses, total
-        Of the bodies and of the robot, kg.
+        Body masses and total robot mass, kg.
     centers
-        Centres of mass (3,) in the frames of the bodies, m.
+        Centres of mass (3,) in the body frames, m.
     inputs
-        Symbols of the mass properties by name, as last arguments of functions: none for constants.
+        Mass property symbols by name, the last function arguments; none for constants.
     """
 
     def __init__(self, robot: RobotDescription) -> None:
@@ -230,7 +227,7 @@ class MassProperties:
         """Return the second moment of mass ``tr(I)/2 1 - I`` (3, 3) of body k rotated by R, kg m^2.
 
         Along principal axes ``u``: ``J = lambda 1 + sum (lambda_u - lambda) u u'``. If ``lambda``
-        is the middle moment, a body with an axis of symmetry needs only that axis.
+        is the middle moment, a body with a symmetry axis needs only that axis.
         """
         about = self._inertias[k].about_com
         moments, axes = np.linalg.eigh(np.trace(about) / 2 * np.eye(3) - about)
@@ -242,13 +239,13 @@ class MassProperties:
 
 
 class SymbolicMassProperties(MassProperties):
-    """Mass properties as entries of a symbol ``p``.
+    """Mass properties as entries of a symbolic vector ``p``.
 
     Parameters
     ----------
     free
-        (10 B,) which entries of :attr:`.InertialParameters.vector` are in ``p``; the others are
-        zero.
+        (10 B,) mask of the entries of :attr:`.InertialParameters.vector` that are in ``p``; the
+        others are zero.
     """
 
     def __init__(self, free: npt.NDArray[np.bool_]) -> None:
@@ -270,7 +267,8 @@ class SymbolicMassProperties(MassProperties):
     def second_moment(self, k: int, R: ca.SX) -> ca.SX:
         """Return the second moment of mass (3, 3) of body k, rotated by R, kg m^2.
 
-        As for constants, with the columns of R as axes, and with terms for the products of inertia.
+        Computed as for constants, with the columns of R as axes, plus terms for products of
+        inertia.
         """
         xx, yy, zz, xy, xz, yz = ca.vertsplit(self._moments[k])
         x, y, z = ca.horzsplit(R)
@@ -284,10 +282,10 @@ class SymbolicMassProperties(MassProperties):
 
 
 def possibly_nonzero_entries(nominal: InertialParameters) -> npt.NDArray[np.bool_]:
-    """Return the entries (10 B,) of the vector that can be nonzero for robots of this structure.
+    """Return a mask (10 B,) of the vector entries that can be nonzero for robots of this structure.
 
-    All masses may. Entries of centres and products of inertia that are zero stay zero; principal
-    moments are all zero (a point mass) or all free.
+    All masses may. Centre coordinates and products of inertia that are zero stay zero; principal
+    moments are either all zero (a point mass) or all free.
     """
     rows = nominal.vector.reshape(-1, NUMBERS_PER_BODY) != 0.0
     rows[:, 0] = True
@@ -296,7 +294,7 @@ def possibly_nonzero_entries(nominal: InertialParameters) -> npt.NDArray[np.bool
 
 
 def rotational(J: ca.SX) -> ca.SX:
-    """Return the rotational inertia ``tr(J) 1 - J`` of a second moment of mass."""
+    """Return the rotational inertia ``tr(J) 1 - J`` for a second moment of mass."""
     inertia = -J
     for i in range(3):
         inertia[i, i] = J[i - 2, i - 2] + J[i - 1, i - 1]
@@ -309,7 +307,7 @@ def symmetric(matrix: ca.SX) -> ca.SX:
 
 
 def sparse_constant(array: Array) -> ca.DM:
-    """Return constants for expressions, in which zeros take no operations."""
+    """Return constants for expressions, in which zeros cost no operations."""
     return ca.sparsify(ca.DM(array))
 
 

@@ -1,4 +1,4 @@
-"""Steps of Runge-Kutta 4 under held commands, as CasADi functions."""
+"""Runge-Kutta 4 steps under held commands, as CasADi functions."""
 
 from __future__ import annotations
 
@@ -13,11 +13,12 @@ from spacerobot_ros.model.dynamics import solve_positive_definite
 from spacerobot_ros.model.symbolic_rotations import matrix_from_quaternion, quaternion_rate
 
 DEFAULT_INTEGRATION_STEP = 0.01
-"""Longest Runge-Kutta step of the attitude under held joint velocities, s."""
+"""Longest Runge-Kutta step for the attitude under held joint velocities, s."""
 
 
 def count_steps(control_period: float, integration_step: float) -> int:
-    """Return the least number of equal steps of at most ``integration_step`` s in a control period.
+    """Return the smallest number of equal steps of at most ``integration_step`` s per control
+    period.
 
     Raises
     ------
@@ -31,12 +32,12 @@ def count_steps(control_period: float, integration_step: float) -> int:
 
 
 def runge_kutta_step(rate: ca.Function, attitude: slice) -> ca.Function:
-    """Return one step ``(x, held arguments of rate, h) -> x`` of Runge-Kutta 4.
+    """Return one Runge-Kutta 4 step ``(x, held arguments of rate, h) -> x``.
 
-    A last argument ``p`` of the rate (mass properties) stays the last, after ``h``.
+    If ``p`` (mass properties) is the last argument of the rate, it stays last, after ``h``.
 
-    ``attitude`` is the slice of the quaternion in ``x``: it is integrated in R^4 and normalised
-    after the step. The four stages call one function: inlined code would be 6 % faster and take six
+    ``attitude`` is the quaternion's slice of ``x``: it is integrated in R^4 and normalised after
+    the step. The four stages call one function: inlined code would be 6 % faster but take six
     times as long to compile.
     """
     x, held = _symbols_for_inputs(rate)
@@ -55,7 +56,7 @@ def runge_kutta_step(rate: ca.Function, attitude: slice) -> ca.Function:
 def repeat_step(step: ca.Function, count: int) -> ca.Function:
     """Return ``step`` applied ``count`` times to its first argument; other arguments are held.
 
-    Each half is one function called twice: the code grows with the logarithm of ``count``.
+    Each half is one function called twice: code size grows with the logarithm of ``count``.
     """
     if count == 1:
         return step
@@ -70,14 +71,14 @@ def repeat_step(step: ca.Function, count: int) -> ca.Function:
 def attitude_step(locked_inertia: ca.Function) -> ca.Function:
     """Return one Runge-Kutta step ``(x, qdot, L_W, h) -> x`` of ``x = [q; quaternion_WB]``.
 
-    This reconstructs the base's motion from that of the joints, one held command at a time. Joint
+    This reconstructs the base motion from the joint motion, one held command at a time. Joint
     velocities are constant over the step (servos hold them), so the configuration is exact; the
-    position follows from the centre of mass. Only the attitude is integrated:
+    base position follows from the centre of mass. Only the attitude is integrated:
     ``R_WB_dot = R_WB hat(omega)``, ``omega = D^-1 (R_WB' L_W - D_q qdot)`` (paper 1, eq. 3, with an
     angular momentum that need not be zero), as a quaternion in R^4, normalised.
 
     ``locked_inertia`` is the function ``q -> (D, D_q)``; if it takes a second argument ``p`` (mass
-    properties), so does the step, as its last.
+    properties), so does the step, as its last argument.
     """
     p = [ca.SX.sym("p", locked_inertia.size1_in(1))] if locked_inertia.n_in() > 1 else []
     n = locked_inertia.size1_in(0)
@@ -100,11 +101,11 @@ def attitude_step(locked_inertia: ca.Function) -> ca.Function:
 def attitude_steps_without_momentum(locked_inertia: ca.Function, count: int) -> ca.Function:
     """Return ``count`` steps of :func:`attitude_step` at zero momentum, ``(x, qdot, h, p) -> x``.
 
-    Together they cover the time ``h``; ``locked_inertia`` has the argument ``p``.
+    Together they span the time ``h``; ``locked_inertia`` takes the argument ``p``.
 
     The body rate is then ``-D^-1 D_q qdot``, independent of the attitude: it is computed once for
-    the end of a step and the beginning of the next. That saves half of the operations; the numbers
-    are those of :func:`attitude_step`.
+    the end of one step and the start of the next. This saves half of the operations; the results
+    equal those of :func:`attitude_step`.
     """
     p = ca.SX.sym("p", locked_inertia.size1_in(1))
     n = locked_inertia.size1_in(0)

@@ -1,7 +1,7 @@
-"""Inverse kinematics of an arm on a fixed base: from the present configuration, and by a search.
+"""Inverse kinematics of an arm on a fixed base: from the current configuration, and by a search.
 
 A controller that holds its base follows a path with the arm alone; the web page checks whether the
-arm can reach a goal at all. Both use the same errors and the same Jacobian.
+arm can reach a goal. Both use the same errors and the same Jacobian.
 """
 
 from __future__ import annotations
@@ -15,25 +15,25 @@ from spacerobot_ros.model.rotations import quaternion_from_matrix, rotvec_from_q
 from spacerobot_ros.model.space_robot import SpaceRobot
 
 AXES: tuple[str, ...] = ("x", "y", "z", "rx", "ry", "rz")
-"""Components in W of a position and of a rotation."""
+"""W components of a position and a rotation."""
 
 REACHED_DISTANCE = 1e-3
-"""Error of an end-effector (m, rad) below which an arm follows its path."""
+"""End-effector error (m, rad) below which an arm is considered to follow its path."""
 
 _MAX_ITERATIONS = 30
 _DAMPING = 0.02
 _LARGEST_STEP = 0.2
-"""Iterations from the present configuration, damping, and largest joint step, m or rad."""
+"""Iterations from the current configuration, damping, and largest joint step, m or rad."""
 
 _SEARCH_STARTS = 8
-"""Number of configurations from which a search starts: the present one, and random ones."""
+"""Number of start configurations of a search: the current one and random ones."""
 
 _MAX_EVALUATIONS = 30
 
 _SEARCH_TOLERANCE = 1e-4  # m and rad
 
 _RADIAN_LENGTH = 0.5
-"""Weight of an error of one radian in a search, m."""
+"""Weight of one radian of error in a search, m."""
 
 
 class FixedBaseArm:
@@ -46,9 +46,9 @@ class FixedBaseArm:
     link
         Link of the end-effector.
     base
-        Pose of the base in W.
+        Base pose in W.
     axes
-        Controlled axes of the end-effector; default: all.
+        Controlled end-effector axes; default: all.
     """
 
     def __init__(
@@ -59,9 +59,9 @@ class FixedBaseArm:
         self._rows = [AXES.index(axis) for axis in axes]
 
     def error(self, q: Array, goal: Pose) -> tuple[Array, Array]:
-        """Return the error (m,) of the end-effector in the controlled axes, m over rad, in W.
+        """Return the end-effector error (m,) along the controlled axes, m over rad, in W.
 
-        Also returned is minus its derivative with respect to the joints (m, n).
+        Also return minus its derivative with respect to the joint positions (m, n).
         """
         robot, R_WB = self._robot, self.base.R
         R_BE, r_BE = robot.link_pose(self._link, q)
@@ -75,10 +75,10 @@ class FixedBaseArm:
         return error[self._rows], J_W[self._rows]
 
     def nearest_shape(self, q: Array, goal: Pose) -> tuple[Array, float]:
-        """Return the configuration (n,) nearest to a pose that a search from ``q`` finds.
+        """Return the configuration (n,) closest to a pose found by a search from ``q``.
 
-        Also returned is the largest remaining error, m or rad. The search uses damped least
-        squares, with steps short enough to stay on one branch of solutions.
+        Also return the largest remaining error, m or rad. The search uses damped least squares
+        with steps short enough to stay on one solution branch.
         """
         lower, upper = self._robot.lower, self._robot.upper
         distance = np.inf
@@ -93,9 +93,9 @@ class FixedBaseArm:
         return q, distance
 
     def search_shape(self, q: Array, goal: Pose) -> tuple[Array, float, float]:
-        """Return the configuration (n,) nearest to a pose within all joint limits.
+        """Return the configuration (n,) within the joint limits that is closest to a pose.
 
-        Also returned are the remaining distance and angle in the controlled axes, m and rad.
+        Also return the remaining distance and angle along the controlled axes, m and rad.
         The search starts at
         ``q`` and at random configurations; equal arguments give equal results.
         """
@@ -132,5 +132,5 @@ class FixedBaseArm:
 
 
 def is_reached(distance: float, angle: float) -> bool:
-    """Whether an arm with this error after a search, m and rad, reaches its goal."""
+    """Whether an arm reaches its goal, given its error after a search, m and rad."""
     return distance <= 2 * _SEARCH_TOLERANCE and angle <= 4 * _SEARCH_TOLERANCE

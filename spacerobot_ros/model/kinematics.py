@@ -1,9 +1,10 @@
-"""Forward kinematics of the tree in base components, symbolic and numeric (paper 4, section II).
+"""Forward kinematics of the link tree in base components, symbolic and numeric (paper 4, section
+II).
 
-The base frame B is the frame of the root link. All vectors here are expressed in B, which makes
-every quantity a function of the configuration q alone. :func:`tree_kinematics` builds the equations
-that are compiled; :class:`ForwardKinematics` needs no compilation and computes link poses for
-drawing a robot or publishing its frames.
+The base frame B is the root link frame. All vectors here are expressed in B, so every
+quantity is a function of the configuration q only. :func:`tree_kinematics` builds the equations
+that are compiled; :class:`ForwardKinematics` needs no compilation and computes link poses, to draw
+a robot or publish its frames.
 """
 
 from __future__ import annotations
@@ -36,13 +37,13 @@ from spacerobot_ros.model.symbolic_rotations import quaternion_from_matrix as sy
 
 @dataclass(frozen=True)
 class TreeKinematics:
-    """Poses, centres of mass and inertias of the bodies as functions of the shape q.
+    """Body poses, centres of mass and inertias as functions of the shape q.
 
     For body k, in base components: ``R[k]`` attitude ``R_BBk`` (paper 4: ``0T_k``), ``p[k]``
     origin, ``com[k]`` centre of mass, ``inertia[k]`` inertia about that centre, ``axis[k]`` the
-    unit vector of the joint that carries it (None for the base). ``theta`` (m,) are the positions
-    of the joints that carry ``bodies[1:]``: q, unless joints follow others (URDF's mimic).
-    ``mass_properties`` of the bodies are constants or symbols.
+    unit axis of the joint that carries it (None for the base). ``theta`` (m,) are the positions
+    of the joints that carry ``bodies[1:]``: equal to q unless there are mimic joints.
+    ``mass_properties`` are constants or symbols.
     """
 
     robot: RobotDescription
@@ -63,7 +64,7 @@ class TreeKinematics:
 
     @property
     def moving_body_count(self) -> int:
-        """Number of bodies that joints move; more than ``n`` for robots with mimic joints."""
+        """Number of bodies moved by joints; more than ``n`` for robots with mimic joints."""
         return len(self.robot.bodies) - 1
 
     def spread(self, rates: ca.SX) -> ca.SX:
@@ -71,7 +72,7 @@ class TreeKinematics:
         return self._coupling @ rates if self.robot.has_mimic_joints else rates
 
     def gather(self, forces: ca.SX) -> ca.SX:
-        """Return generalised forces (n, ...) of forces (m, ...) on the joints: ``G' forces``."""
+        """Return generalised forces (n, ...) for joint forces (m, ...): ``G' forces``."""
         return self._coupling.T @ forces if self.robot.has_mimic_joints else forces
 
     @property
@@ -89,7 +90,7 @@ class TreeKinematics:
 
     @property
     def per_mass(self) -> float | ca.SX:
-        """Inverse of the mass of the system, 1/kg."""
+        """Inverse of the system mass, 1/kg."""
         # CasADi rewrites x * (1/d) as x/d; it leaves |1/d| as it is.
         per: float | ca.SX = 1 / self.mass_properties.total
         return per if isinstance(per, float) else ca.fabs(per)
@@ -103,7 +104,7 @@ class TreeKinematics:
         return self.mass_properties.second_moment(k, self.R[k])
 
     def parent(self, k: int) -> int:
-        """Index of the parent of body k; -1 for the base."""
+        """Parent index of body k; -1 for the base."""
         return self.robot.bodies[k].parent
 
     def is_revolute(self, k: int) -> bool:
@@ -124,13 +125,14 @@ class TreeKinematics:
         return [k for k in range(len(self.robot.bodies)) if j == 0 or j in self.ancestors(k)]
 
     def frame(self, link: str) -> tuple[ca.SX, ca.SX, int]:
-        """Return attitude (3, 3), position (3,) in B, and body index, of a link's frame."""
+        """Return the attitude (3, 3), position (3,) in B, and body index of a link frame."""
         body, pose = self.robot.frames[link]
         R, r = _chain_pose(self.R[body], self.p[body], pose)
         return R, r, body
 
     def angular_jacobian(self, k: int) -> ca.SX:
-        """Return ``0F_k`` (3, n), which maps joint rates to the angular velocity of k (eq. 6)."""
+        """Return ``0F_k`` (3, n), which maps joint rates to the angular velocity of body k (eq.
+        6)."""
         F = ca.SX(3, self.moving_body_count)
         for j in self.ancestors(k):
             if self.is_revolute(j):
@@ -143,7 +145,8 @@ def _chain_pose(R: ca.SX, p: ca.SX, pose: Pose) -> tuple[ca.SX, ca.SX]:
 
 
 def joint_positions(robot: RobotDescription, q: ca.SX) -> ca.SX:
-    """Return the positions (m,) of the joints that carry ``bodies[1:]`` at coordinates q (n,)."""
+    """Return the positions (m,) of the joints that carry ``bodies[1:]``, given coordinates q
+    (n,)."""
     if not robot.has_mimic_joints:
         return q
     G, b = robot.coupling
@@ -160,7 +163,7 @@ def tree_kinematics(
     robot
         The robot.
     mass_properties
-        Mass properties of its bodies; None: the constants of its description.
+        Mass properties of the bodies; None: constants from the description.
     """
     mass_properties = mass_properties or MassProperties(robot)
     q = ca.SX.sym("q", len(robot.joint_names))
@@ -191,7 +194,7 @@ def tree_kinematics(
 
 
 def link_quaternion(description: RobotDescription, link: str, q: ca.SX) -> ca.SX:
-    """Return the quaternion (4,) of ``R_BL``, smooth in q: not computed from a matrix."""
+    """Return the quaternion (4,) of ``R_BL``, smooth in q because not computed from a matrix."""
     index, pose = description.frames[link]
     quaternion, theta = _to_constant(pose.R), joint_positions(description, q)
     while index > 0:
@@ -211,7 +214,7 @@ def _to_constant(R: Array) -> ca.DM:
 
 
 class LinkPlacement:
-    """Poses in W of frames that are fixed to links, from the poses of base and links.
+    """Poses in W of frames fixed to links, from the base pose and the link poses.
 
     Evaluated in CasADi's virtual machine: its few hundred operations take less time than one matrix
     product in numpy.
@@ -221,12 +224,12 @@ class LinkPlacement:
     links
         Number of links.
     frames
-        Index of the link of each frame, and the frame's pose in the link.
+        Link index of each frame, and the frame's pose in the link.
 
     Attributes
     ----------
     poses
-        (k, 7) positions, m, and quaternions of the frames, which :meth:`update` changes in place.
+        (k, 7) frame positions, m, and quaternions, updated in place by :meth:`update`.
     """
 
     def __init__(self, links: int, frames: Sequence[tuple[int, Pose]]) -> None:
@@ -250,9 +253,9 @@ class LinkPlacement:
         Parameters
         ----------
         base
-            (7,) pose of the base link in W.
+            (7,) base link pose in W.
         link_R, link_r
-            (3, 3 L) attitudes side by side and (3, L) positions of the links in B, m.
+            (3, 3 L) attitudes side by side and (3, L) link positions in B, m.
         """
         self._base[:], self._R[...], self._r[...] = base, link_R, link_r.reshape(self._r.shape)
         self._function.evaluate()
@@ -261,21 +264,21 @@ class LinkPlacement:
 # -- numeric ------------------------------------------------------------------------------------
 
 Frames = tuple[tuple[str, str], ...]
-"""Names of the parent link and the child link of each joint."""
+"""Names of each joint's parent and child links."""
 
 
 def joints_outward(robot: RobotDescription) -> list[Joint]:
-    """Return all joints, including fixed joints, from the base outward."""
+    """Return all joints, including fixed ones, from the base outward."""
     above = {joint.child: joint for joint in robot.joints}
     # The links of ``frames`` are in topological order.
     return [above[link] for link in robot.frames if link in above]
 
 
 class ForwardKinematics:
-    """Poses of the links of a robot from the positions of its joints.
+    """Link poses of a robot from its joint positions.
 
     Transforms are positions (m) and quaternions (x, y, z, w) side by side: (k, 7). A quaternion
-    rotates by half the angle of its joint, so it is continuous over several revolutions.
+    rotates by half the joint angle, so it is continuous over several revolutions.
 
     Parameters
     ----------
@@ -285,12 +288,12 @@ class ForwardKinematics:
     Attributes
     ----------
     links
-        Names of the links, the base link first, each after its parent.
+        Link names, the base link first, each after its parent.
     moving, fixed
         Parent and child of each moving joint, and of each fixed one.
     transforms, fixed_transforms
-        The poses of the same children in their parents: (k, 7), which :meth:`update` changes in
-        place, and (m, 7).
+        Poses of these children in their parents: (k, 7), updated in place by :meth:`update`, and
+        (m, 7).
     """
 
     def __init__(self, robot: RobotDescription) -> None:
@@ -323,11 +326,11 @@ class ForwardKinematics:
         ]
 
     def update(self, q: Array) -> None:
-        """Write the transforms at positions (n,) of the joints, m or rad."""
+        """Update the transforms for joint positions (n,), m or rad."""
         self._write_transforms(self.transforms, q)
 
     def transforms_at(self, q: Array) -> Array:
-        """Return the transforms (..., k, 7) at positions (..., n) of the joints, m or rad."""
+        """Return the transforms (..., k, 7) for joint positions (..., n), m or rad."""
         transforms = np.empty((*q.shape[:-1], *self.transforms.shape))
         self._write_transforms(transforms, q)
         return transforms
@@ -346,7 +349,7 @@ class ForwardKinematics:
         Parameters
         ----------
         q
-            Positions (..., n) of the joints, m or rad.
+            Joint positions (..., n), m or rad.
         """
         many = q.shape[:-1]
         fixed = np.broadcast_to(self.fixed_transforms, (*many, *self.fixed_transforms.shape))
@@ -366,14 +369,14 @@ class ForwardKinematics:
         Parameters
         ----------
         base, q
-            Poses (..., 7) of the base in the world, and positions (..., n) of the joints.
+            Base poses (..., 7) in the world, and joint positions (..., n).
         """
         R_BL, r_BL_B = self.link_poses(q)
         R_WB = matrices_from_quaternions(base[..., 3:])[..., None, :, :]
         return R_WB @ R_BL, base[..., None, :3] + (R_WB @ r_BL_B[..., None])[..., 0]
 
     def link_in_world(self, link: str, base: Array, q: Array) -> Array:
-        """Return the pose (7,) of a link in the world, at a base pose (7,) and ``q`` (n,)."""
+        """Return the pose (7,) of a link in the world, given a base pose (7,) and ``q`` (n,)."""
         R_WL, r_WL = self.poses_in_world(base, q)
         number = self.links.index(link)
         return np.concatenate([r_WL[number], quaternion_from_matrix(R_WL[number])])

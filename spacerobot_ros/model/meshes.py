@@ -1,6 +1,6 @@
-"""Meshes of a URDF: their files and their triangles.
+"""Meshes in a URDF: their files and triangles.
 
-:func:`shape_mesh` returns the triangles of a visual in the frame of its link::
+:func:`shape_mesh` returns the triangles of a visual in its link frame::
 
     for link in robot.links:
         for shape in link.shapes:
@@ -9,7 +9,7 @@
                 draw(mesh.vertices, mesh.faces, shape.rgba)
 
 STL and OBJ are read here; COLLADA, glTF and PLY by trimesh, if it is installed. Files, also those
-in bags, may be untrusted: sizes are bounded, and no message quotes the content of a file.
+in bags, may be untrusted: sizes are bounded, and messages do not quote file content.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ _MAX_MESH_BYTES = 100_000_000
 _MAX_TRIANGLES = 2_000_000
 
 _STL_HEADER_BYTES = 84
-"""Size of the header of a binary STL file, bytes: 80 of text, and the number of triangles."""
+"""Header size of a binary STL file, bytes: 80 of text, and the number of triangles."""
 
 _STL_TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 
@@ -49,18 +49,18 @@ Faces = npt.NDArray[np.int32]
 
 @dataclass(frozen=True)
 class TriangleMesh:
-    """Triangles: ``vertices`` (N, 3) in m, ``faces`` (M, 3) of their indices.
+    """Triangles: ``vertices`` (N, 3) in m, ``faces`` (M, 3) of vertex indices.
 
-    Seen from outside, the corners of a face are counterclockwise if they are so in the file.
+    Face corners keep their order in the file, normally counterclockwise seen from outside.
     """
 
     vertices: Array
     faces: Faces
 
     def moved(self, pose: Pose, scale: tuple[float, ...] = (1.0, 1.0, 1.0)) -> TriangleMesh:
-        """Return the mesh, scaled along its own axes, in the frame in which it has ``pose``.
+        """Return the mesh, scaled along its axes and placed at ``pose``.
 
-        If the scale mirrors the mesh, faces are reversed, so that outside stays outside.
+        If the scale mirrors the mesh, faces are reversed so that normals still point outward.
         """
         vertices = (self.vertices * np.asarray(scale)) @ pose.R.T + pose.r
         faces = self.faces if np.prod(scale) >= 0 else self.faces[:, ::-1]
@@ -69,8 +69,9 @@ class TriangleMesh:
     def coarsened(self, most: int) -> TriangleMesh:
         """Return a simplified mesh of at most ``most`` faces.
 
-        Vertices in one cell of a grid are replaced by their mean, and faces without area are
-        removed. The cells are cubes: the whole is halved as often as ``most`` allows.
+        Vertices in the same grid cell are replaced by their mean, and faces without area are
+        removed. The cells are cubes, obtained by halving the bounding cube as often as ``most``
+        allows.
         """
         if len(self.faces) <= most:
             return self
@@ -93,14 +94,14 @@ class TriangleMesh:
 
 
 def with_mesh_files(text: str, find: Callable[[str], Path | None]) -> str:
-    """Return a URDF text in which meshes are named by ``file://`` URIs.
+    """Return a URDF string with meshes referenced by ``file://`` URIs.
 
     Parameters
     ----------
     text
-        URDF; a text that is not XML is returned as it is.
+        URDF; a string that is not XML is returned unchanged.
     find
-        Returns the file of a mesh by its name in the text; None: the name stays.
+        Returns the file for a mesh name in the URDF; None: the name stays.
     """
     try:
         root = editable_root(text)
@@ -115,8 +116,7 @@ def with_mesh_files(text: str, find: Callable[[str], Path | None]) -> str:
 
 
 def mesh_beside(resource: str, folder: Path) -> Path | None:
-    """Return the file of a mesh named relative to a folder; None: its URI is
-    complete."""
+    """Return the file of a mesh given by a path relative to a folder; None: the URI is absolute."""
     scheme, mark, rest = resource.partition("://")
     if not mark:
         found = folder / resource
@@ -129,7 +129,8 @@ def mesh_beside(resource: str, folder: Path) -> Path | None:
 
 
 def mesh_file(resource: str) -> Path | None:
-    """Return the file of a mesh by its URI (``file://``, ``package://``) or path; None: not there.
+    """Return the file of a mesh given its URI (``file://``, ``package://``) or path; None: not
+    there.
 
     Packages are looked up in the ROS environment; meshes of this package need none.
     """
@@ -156,13 +157,12 @@ def _package_folder(name: str) -> Path | None:
 
 
 def shape_mesh(shape: Shape, most: int = _MAX_TRIANGLES) -> TriangleMesh:
-    """Return the triangles of a URDF's mesh in the frame of its link, with origin and scale
-    applied.
+    """Return the triangles of a URDF mesh in its link frame, with origin and scale applied.
 
     Parameters
     ----------
     shape
-        A visual of the kind ``mesh``.
+        A visual of kind ``mesh``.
     most
         A mesh with more faces is simplified (:meth:`TriangleMesh.coarsened`).
 
@@ -181,7 +181,7 @@ def shape_mesh(shape: Shape, most: int = _MAX_TRIANGLES) -> TriangleMesh:
 
 
 def read_mesh(path: str | Path) -> TriangleMesh:
-    """Read the triangles of a file, in its own frame and unit (COLLADA: in m).
+    """Read the triangles in a file, in the file's frame and unit (COLLADA: in m).
 
     Raises
     ------
@@ -217,12 +217,12 @@ def read_mesh(path: str | Path) -> TriangleMesh:
 
 
 def mesh_of_stl(data: bytes, name: str) -> TriangleMesh:
-    """Read the triangles of STL bytes, such as those of a bag.
+    """Read triangles from STL bytes, such as an attachment of a bag.
 
     Raises
     ------
     MeshError
-        The mesh is damaged or too large; the message calls it ``name``.
+        The mesh is damaged or too large; the message refers to it by ``name``.
     """
     try:
         return _require_sound_mesh(_read_stl(data))
@@ -231,7 +231,7 @@ def mesh_of_stl(data: bytes, name: str) -> TriangleMesh:
 
 
 def stl_of(mesh: TriangleMesh) -> bytes:
-    """Return a mesh as binary STL, which has no unit and whose numbers have seven digits."""
+    """Return a mesh as binary STL (unitless, seven digits of precision)."""
     corners = mesh.vertices[mesh.faces]
     made = np.zeros(len(corners), _STL_TRIANGLE)
     made["corners"] = corners
@@ -288,7 +288,7 @@ def _read_stl(data: bytes) -> TriangleMesh:
     if not data.lstrip().startswith(b"solid"):
         raise _DamagedError("it is not an STL file, or it is truncated")
     if b"endsolid" not in data:
-        raise _DamagedError("its end is missing: the file is truncated")
+        raise _DamagedError("the file is truncated")
     corners = np.array(_STL_VERTEX_PATTERN.findall(data), dtype=bytes).astype(float)
     if len(corners) % 3:
         raise _DamagedError("a triangle does not have three corners")
@@ -296,7 +296,7 @@ def _read_stl(data: bytes) -> TriangleMesh:
 
 
 def mesh_from_corners(corners: npt.NDArray[Any]) -> TriangleMesh:
-    """Return the mesh of triangles given by their corners (3 M, 3); equal corners are merged."""
+    """Return a mesh from triangle corners (3 M, 3); equal corners are merged."""
     if not len(corners):
         return TriangleMesh(np.zeros((0, 3)), np.zeros((0, 3), np.int32))
     # Adding 0.0 turns -0.0 into 0.0, so that equal numbers have equal bytes.

@@ -1,7 +1,7 @@
-"""Named functions of a robot's model, built on demand and compiled once.
+"""Named functions of a robot model, built on demand and compiled once.
 
-The mass properties of a model are constants, or the last argument ``p`` of all its functions: then
-one compilation serves all robots that differ in mass properties alone.
+A model's mass properties are constants, or the last argument ``p`` of all its functions: then one
+compilation serves all robots that differ only in mass properties.
 """
 
 from __future__ import annotations
@@ -57,14 +57,14 @@ from spacerobot_ros.model.symbolic_rotations import matrix_from_quaternion
 
 
 class ModelFunctions:
-    """All functions of one robot's model.
+    """All functions of one robot model.
 
     Parameters
     ----------
     robot
         The robot.
     mass_properties
-        Mass properties of its bodies as symbols; None: as constants.
+        Mass properties of the bodies as symbols; None: as constants.
     """
 
     def __init__(
@@ -77,15 +77,16 @@ class ModelFunctions:
         self._symbolic: dict[str, ca.Function] = {}
         self._compiled: dict[tuple[Hashable, ...], ca.Function] = {}
         self.derived: dict[Hashable, Any] = {}
-        """Cache of objects that other modules derive from the model, by key."""
+        """Cache of objects derived from the model by other modules, by key."""
 
     @classmethod
     def of(cls, robot: RobotDescription) -> ModelFunctions:
-        """Return the model with a robot's constants; equal robots in a process share it."""
+        """Return the model with a robot's mass properties as constants; equal robots in a process
+        share it."""
         return _model_of_key(_RobotKey.of(robot, robot))
 
     def function(self, name: str, *, compile: bool = True) -> ca.Function:
-        """Return a function of the model by name (the keys of ``_builders``).
+        """Return a model function by name (the keys of ``_builders``).
 
         ``compile=False`` gives the symbolic function, to build larger ones from.
         """
@@ -99,7 +100,7 @@ class ModelFunctions:
         return self.composed(name, lambda: self._symbolic[name])
 
     def composed(self, key: Hashable, build: Callable[[], ca.Function]) -> ca.Function:
-        """Return a function composed of those of the model, compiled once per key."""
+        """Return a function composed of model functions, compiled once per key."""
         place = (key, *compilation_settings())
         if place not in self._compiled:
             self._compiled[place] = compiled(build())
@@ -107,12 +108,12 @@ class ModelFunctions:
 
     @property
     def total_mass(self) -> float:
-        """Mass of the system, kg; only for models with constants."""
+        """System mass, kg; only for models with constants."""
         return float(self._kin.total_mass)
 
     @property
     def mass_inputs(self) -> dict[str, ca.SX]:
-        """The symbol ``p`` by its name; empty: the model has constants."""
+        """The symbol ``p`` by name; empty if the model has constants."""
         return self._kin.mass_properties.inputs
 
     @cached_property
@@ -338,7 +339,7 @@ class ModelFunctions:
 
 
 _MAX_SYMBOLIC_MODELS = 8
-"""Number of models in each cache; the least recently used is dropped first."""
+"""Number of models per cache; the least recently used is dropped first."""
 
 
 @dataclass(frozen=True)
@@ -359,9 +360,9 @@ def _model_of_key(equal: _RobotKey) -> ModelFunctions:
 
 
 class Composition:
-    """Composes larger functions from those of a model, in symbols of one kind (MX or SX).
+    """Composes larger functions from model functions, in symbols of one kind (MX or SX).
 
-    It passes the mass properties on: calls of the model's functions are written without ``p``, and
+    It passes the mass properties on: calls of model functions are written without ``p``, and
     :meth:`function` adds it as the last input.
     """
 
@@ -369,7 +370,7 @@ class Composition:
         self.n, self.link_names = model.n, model.link_names
         self._model = model
         self.inputs = {name: kind.sym(name, p.numel()) for name, p in model.mass_inputs.items()}
-        """The symbol ``p`` by its name; empty: the model has constants."""
+        """The symbol ``p`` by name; empty if the model has constants."""
 
     def __call__(self, name: str, *arguments: ca.MX | ca.SX | ca.DM) -> ca.MX | ca.SX:
         """Call a function of the model."""
@@ -378,13 +379,13 @@ class Composition:
 
     @property
     def total_mass(self) -> float | ca.MX | ca.SX:
-        """Mass of the system, kg."""
+        """System mass, kg."""
         return self("total_mass") if self.inputs else self._model.total_mass
 
     def function(
         self, name: str, inputs: Sequence[ca.MX | ca.SX], outputs: Sequence[ca.MX | ca.SX]
     ) -> ca.Function:
-        """Return a function of given input symbols and output expressions."""
+        """Return a function from input symbols and output expressions."""
         return ca.Function(name, [*inputs, *self.inputs.values()], list(outputs))
 
 
@@ -398,7 +399,7 @@ class SymbolicModels:
 
     @classmethod
     def of(cls, robot: RobotDescription) -> SymbolicModels:
-        """Return the models for all robots that differ from this robot in mass properties alone."""
+        """Return the models for all robots that differ from this robot only in mass properties."""
         bodies = [(body.name, body.joint, body.parent, body.origin) for body in robot.bodies]
         free = possibly_nonzero_entries(InertialParameters.of(robot))
         facts = (robot.name, bodies, robot.frames, [link.name for link in robot.links], free)

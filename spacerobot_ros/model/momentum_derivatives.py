@@ -1,16 +1,18 @@
-"""First and second derivatives of the angular momentum by the configuration, in closed form.
+"""First and second derivatives of the angular momentum with respect to the configuration, in closed
+form.
 
 At zero linear momentum the angular momentum about the centre of mass is ``L = D(q) omega + D_q(q)
 qdot`` (paper 1, eq. 3). For a vector ``eta``, ``eta' L`` is a sum over the bodies of
 ``V1' I_k V2_k``, where V1 is the motion of a rigid system that rotates at ``eta``, and V2_k the
-motion of body k at ``omega`` and ``qdot``. Spatial vectors and inertias as in
+motion of body k at ``omega`` and ``qdot``. Spatial vectors and inertias are as in
 :mod:`.composite_rigid_body`: angular part first, base components, at the system's centre of mass.
 
-Joint i moves all bodies that it carries. Seen from them, the rest of the system moves the other
-way: V1 changes by ``a_i = V1 x S_i``, and the motion V2 of the carrier of joint i by
+Joint i moves all bodies that it carries. Seen from those bodies, the rest of the system moves in
+the opposite direction: V1 changes by ``a_i = V1 x S_i``, and the motion V2 of the carrier of joint
+i by
 ``b_i = V2 x S_i``. With the momenta ``h1_i = I^c_i V1`` and ``h2_i = sum_k I_k V2_k`` of the bodies
-that joint i carries, ``S x*`` the product of motion and force, and P_j the momentum of a unit rate
-of joint j, the momenta change by
+that joint i carries, ``S x*`` the cross product of motion and force, and P_j the momentum of a unit
+rate of joint j, the momenta change by
 
 * ``y1_i = S_i x* h1_i + I^c_i a_i`` and ``y2_i = S_i x* h2_i + I^c_i b_i``,
 
@@ -24,9 +26,9 @@ They are zero for joints on different branches. All of this holds for a given mo
 of mass. To keep it at rest, subtract ``(f1_x' f2_y + f2_x' f1_y) / M``, where f1_x and f2_x are the
 derivatives of the linear momenta of both motions by the variables x and y.
 
-These formulas take a tenth of the operations of CasADi's derivatives. They are our own; the
-derivative of a subtree's momentum by its joint is from R. Featherstone, Rigid Body Dynamics
-Algorithms, 2008, section 2.9.
+These formulas need a tenth of the operations of CasADi's derivatives. They are derived here; the
+derivative of a subtree's momentum with respect to its joint is from R. Featherstone, Rigid Body
+Dynamics Algorithms, 2008, section 2.9.
 """
 
 from __future__ import annotations
@@ -59,16 +61,16 @@ class MomentumDerivatives:
 def momentum_derivatives(
     parts: Composites, omega: ca.SX, qdot: ca.SX, eta: ca.SX
 ) -> MomentumDerivatives:
-    """Return the derivatives in a configuration, at zero linear momentum.
+    """Return the derivatives at a configuration, for zero linear momentum.
 
     Parameters
     ----------
     parts
-        The composites in the configuration.
+        The composites at the configuration.
     omega, qdot
-        Rate of the base (3,) in base components, and joint rates (n,).
+        Base rate (3,) in base components, and joint rates (n,).
     eta
-        (3,) weights of the components of the momentum.
+        (3,) weights of the momentum components.
     """
     kin, S, P = parts.kin, parts.S, parts.P
     joints = range(1, kin.moving_body_count + 1)

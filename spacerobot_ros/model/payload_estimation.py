@@ -1,16 +1,17 @@
-"""The ten inertial parameters of a held body, from motion and the conservation of momentum.
+"""Estimates the ten inertial parameters of a held body from motion and momentum conservation.
 
 The momentum of a body is linear in its parameters ``phi = [m, m c, I]`` (10,): mass, first moment
-and moments of inertia about the origin of the frame L that it is given in (Atkeson, An and
+and moments of inertia about the origin of its frame L (Atkeson, An and
 Hollerbach, 1986). The robot's own momentum ``P_r`` is known from its model. Without loads other
 than the known impulse J since the first state, where the total momentum is P_0,
 
     P_r(t) + A(t) phi = P_0 + J(t),
 
-for linear momentum over angular momentum about a fixed point. P_0 is unknown, too. If columns of A
+for linear over angular momentum about a fixed point. P_0 is unknown, too. If columns of A
 are constant along a motion (such as a planar one), it does not determine all parameters; the
-undetermined ones are reported. The others are physically consistent: some rigid body has them. They
-are so if and only if the pseudo-inertia matrix ``[[tr(I)/2 1 - I, m c], [m c', m]]`` is positive
+undetermined ones are reported. The others are physically consistent: a rigid body with these
+parameters exists. This
+holds if and only if the pseudo-inertia matrix ``[[tr(I)/2 1 - I, m c], [m c', m]]`` is positive
 definite (Wensing, Kim and Slotine, 2018), which a Cholesky factor with logarithms on the diagonal
 ensures (Rucker and Wensing, 2022). The sources are cited from memory.
 """
@@ -32,50 +33,50 @@ PAYLOAD_PARAMETERS = ("m", "m cx", "m cy", "m cz", "Ixx", "Iyy", "Izz", "Ixy", "
 """Names of the parameters: kg, kg m, and kg m^2 about the origin of L."""
 
 _SMALLEST_SINGULAR_VALUE = 1e-7
-"""Smallest singular value of a direction that motion determines, relative to the largest."""
+"""Smallest singular value of a direction determined by the motion, relative to the largest."""
 
 _MIN_SIGNAL_TO_NOISE = 10.0
-"""Smallest power of a motion that determines a direction, relative to that of its errors."""
+"""Smallest signal power that determines a direction, relative to the error power."""
 
 _MIN_JERK_RATIO = 3.0
-"""Second difference above which it is taken for a jerk of the motion, relative to the median."""
+"""Second difference, relative to the median, above which it is attributed to jerk."""
 
 _WALK_SHARES = np.append(0.0, np.geomspace(1e-6, 1e6, 73))
-"""Tested ratios of the power of a random walk to that of white noise."""
+"""Tested power ratios of random walk to white noise."""
 
 _ROUNDS = 4
-"""Number of fits, which alternate between the parameters and the scatter of the momenta."""
+"""Number of fits, alternating between the parameters and the scatter of the momenta."""
 
 _MIN_UNDETERMINED_SHARE = 0.2
-"""Share of undetermined directions in a parameter above which it is undetermined."""
+"""Fraction of undetermined directions above which a parameter is undetermined."""
 
 _ROUNDING = 1e-11
 """Smallest relative error of momenta; impulses are sums over ticks."""
 
 _PRIOR_WEIGHT = 1e-6
-"""Weight of the prior of undetermined directions, relative to the largest singular value."""
+"""Prior weight of undetermined directions, relative to the largest singular value."""
 
 _MAX_NOISE_DISTANCE = 1.0
-"""Largest distance from a physical body that is taken for noise, in standard deviations."""
+"""Largest distance from a physical body that is attributed to noise, in standard deviations."""
 
 
 @dataclass(frozen=True)
 class PayloadEstimate:
-    """Estimated parameters of a body held by a link, in the frame of the link.
+    """Estimated parameters of a body held by a link, in the link frame.
 
     Attributes
     ----------
     link
         Name of the link.
     parameters
-        (10,) of :data:`PAYLOAD_PARAMETERS`; NaN if the motion does not determine a parameter.
+        (10,) of :data:`PAYLOAD_PARAMETERS`; A parameter that the motion does not determine is NaN.
     deviations
-        (10,) their standard deviations, from the scatter of the momenta.
+        (10,) standard deviations, from the scatter of the momenta.
     directions
-        (k, 10) orthonormal combinations that are not determined, each parameter in units of the
+        (k, 10) orthonormal undetermined combinations, each parameter in units of the
         robot's mass and radius of gyration.
     corrected
-        Whether the best fit is not physical, so that the nearest physical parameters are given.
+        Whether the best fit was not physical, so that the nearest physical parameters are returned.
     """
 
     link: str
@@ -109,12 +110,12 @@ def payload_parameters(inertia: Inertia) -> Array:
 
 
 def momentum_regressor(motion: BodyMotion, about: Array) -> Array:
-    """Return A (6, 10): the momenta of a body are A times its parameters.
+    """Return A (6, 10), which maps a body's parameters to its momenta.
 
     Parameters
     ----------
     motion
-        Motion of the frame L of the parameters.
+        Motion of the parameters' frame L.
     about
         (3,) reference point of the angular momentum in W, m.
     """
@@ -137,25 +138,25 @@ def estimate_payload(
 ) -> PayloadEstimate:
     """Return the parameters of a held body, by least squares with errors in all variables.
 
-    Errors of the measured velocities enter both sides of the equation. Their covariance is
-    taken from second differences, and subtracted from the normal equations. A motion without errors
-    also satisfies the equation in its differences, so nothing is lost.
+    Errors in the measured velocities enter both sides of the equation. The error covariance is
+    computed from second differences, and subtracted from the normal equations. An error-free motion
+    also satisfies the differenced equation, so no information is lost.
 
-    Errors of successive states are not independent: errors of the impulse add up. In a cosine
+    Errors of successive states are not independent: impulse errors accumulate. In a cosine
     transform over time, the modes of white noise and of a random walk are independent; each mode is
-    weighted by its variance, and the mean, which contains the unknown P_0, is omitted.
+    weighted by its inverse variance, and the mean, which contains the unknown P_0, is omitted.
 
     Parameters
     ----------
     link
         Link that holds it.
     regressors
-        (T, 3, 6, 10) of :func:`momentum_regressor` at T triples of successive states, equally
-        spaced in time; no state is in two triples.
+        (T, 3, 6, 10) from :func:`momentum_regressor` for T disjoint triples of successive states,
+        equally spaced in time.
     known
-        (T, 3, 6) momenta of the robot without the body, minus the impulse since the first state.
+        (T, 3, 6) robot momenta without the body, minus the impulse since the first state.
     mass, radius
-        Mass (kg) and radius of gyration (m) of the robot: units in which parameters are compared.
+        Mass (kg) and radius of gyration (m) of the robot, used as units to compare parameters.
     """
     unit = mass * np.array([1.0, *[radius] * 3, *[radius**2] * 6])
     rows = np.concatenate([regressors * unit, -known[..., np.newaxis]], axis=-1)

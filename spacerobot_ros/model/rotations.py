@@ -1,4 +1,5 @@
-"""Attitude with numpy: rotation matrices, unit quaternions (x, y, z, w), rotation vectors.
+"""Attitude representations in numpy: rotation matrices, unit quaternions (x, y, z, w), rotation
+vectors.
 
 A quaternion or matrix named ``R_WB`` maps vectors given in B to vectors given in W.
 """
@@ -12,11 +13,11 @@ import numpy as np
 import numpy.typing as npt
 
 Array = npt.NDArray[np.float64]
-"""The type of every vector and matrix of the package."""
+"""Type of all vectors and matrices in the package."""
 
 
 def hat(a: npt.ArrayLike) -> Array:
-    """Return the skew matrix (3, 3) with ``hat(a) @ b == cross(a, b)``."""
+    """Return the skew-symmetric matrix (3, 3): ``hat(a) @ b == cross(a, b)``."""
     x, y, z = np.asarray(a, dtype=float)
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
@@ -52,7 +53,7 @@ def matrix_about_axis(axis: npt.ArrayLike, angle: float) -> Array:
 
 
 def matrix_from_rpy(rpy: npt.ArrayLike) -> Array:
-    """Return the rotation (3, 3) of URDF's fixed-axis roll, pitch and yaw (rad)."""
+    """Return the rotation (3, 3) for URDF's fixed-axis roll, pitch and yaw (rad)."""
     (cr, cp, cy), (sr, sp, sy) = np.cos(rpy), np.sin(rpy)
     return np.array(
         [
@@ -64,9 +65,10 @@ def matrix_from_rpy(rpy: npt.ArrayLike) -> Array:
 
 
 def rpy_from_matrix(R: npt.ArrayLike) -> Array:
-    """Return roll, pitch and yaw (3,), rad, of a rotation (3, 3): :func:`matrix_from_rpy` inverted.
+    """Return roll, pitch and yaw (3,), rad, of a rotation (3, 3): the inverse of
+    :func:`matrix_from_rpy`.
 
-    If the pitch is a right angle, roll and yaw are not unique; one of the solutions is returned.
+    If the pitch is 90 degrees, roll and yaw are not unique; one of the solutions is returned.
     """
     m = np.asarray(R, dtype=float)
     yaw = math.atan2(m[1, 0], m[0, 0])
@@ -98,7 +100,7 @@ def matrices_from_quaternions(quaternions: Array) -> Array:
 def quaternion_multiply(a: npt.ArrayLike, b: npt.ArrayLike) -> Array:
     """Return the product of two quaternions (x, y, z, w): the rotation b followed by a.
 
-    Either may be an array (N, 4), and so is the product then.
+    If either is an array (N, 4), so is the product.
     """
     ax, ay, az, aw = _components(np.asarray(a, dtype=float).T)
     bx, by, bz, bw = _components(np.asarray(b, dtype=float).T)
@@ -113,7 +115,7 @@ def quaternion_multiply(a: npt.ArrayLike, b: npt.ArrayLike) -> Array:
 
 
 def quaternion_inverse(quaternion: npt.ArrayLike) -> Array:
-    """Return the inverse of a unit quaternion (4,) or of many (N, 4)."""
+    """Return the inverse of unit quaternions (..., 4)."""
     return np.asarray(quaternion, dtype=float) * np.array([-1.0, -1.0, -1.0, 1.0])
 
 
@@ -132,7 +134,7 @@ def quaternions_from_rotvecs(rotvecs: Array) -> Array:
 
 
 def rotvec_from_quaternion(quaternion: npt.ArrayLike) -> Array:
-    """Return the rotation vector (3,) in rad, of length at most pi, of a unit quaternion."""
+    """Return the rotation vector (3,) in rad, at most pi long, of a unit quaternion."""
     q = np.asarray(quaternion, dtype=float)
     if q[3] < 0:
         q = -q
@@ -142,7 +144,7 @@ def rotvec_from_quaternion(quaternion: npt.ArrayLike) -> Array:
 
 
 def rotvecs_from_quaternions(quaternions: Array) -> Array:
-    """Return the rotation vectors (N, 3) of unit quaternions (N, 4), each of length at most pi."""
+    """Return the rotation vectors (N, 3) of unit quaternions (N, 4), each at most pi long."""
     q = np.where(quaternions[:, 3:] < 0, -quaternions, quaternions)
     sine = np.linalg.norm(q[:, :3], axis=1)
     angle = 2 * np.arctan2(sine, q[:, 3])
@@ -163,7 +165,7 @@ def compose_poses(outer: Array, inner: Array) -> Array:
 
 
 def relative_pose(outer: Array, pose: Array) -> Array:
-    """Return a pose (7,) relative to the pose ``outer``, both given in one frame."""
+    """Return a pose (7,) relative to the pose ``outer``, both given in the same frame."""
     back = quaternion_inverse(outer[3:])
     position = matrix_from_quaternion(back) @ (pose[:3] - outer[:3])
     return np.concatenate([position, quaternion_multiply(back, pose[3:])])
@@ -172,9 +174,9 @@ def relative_pose(outer: Array, pose: Array) -> Array:
 def swing_angle(quaternion: npt.ArrayLike, axes: Array) -> float:
     """Return the angle, rad, between a rotation and the nearest rotation about axes (k, 3).
 
-    The rotation is a unit quaternion (x, y, z, w), the axes are orthonormal. With one axis the
-    angle is that of the swing that remains after the twist about the axis, without axes that of the
-    whole rotation.
+    The rotation is a unit quaternion (x, y, z, w); the axes are orthonormal. With one axis, this is
+    the swing angle that remains after the twist about it; without axes, the angle of the whole
+    rotation.
     """
     q = np.asarray(quaternion, dtype=float)
     about = axes @ q[:3]
@@ -188,7 +190,7 @@ def unit_quaternion(quaternion: npt.ArrayLike) -> Array:
     Raises
     ------
     ValueError
-        It is zero or not finite.
+        The quaternion is zero or not finite.
     """
     q = np.asarray(quaternion, dtype=float)
     largest = float(np.abs(q).max())
@@ -224,7 +226,7 @@ def quaternion_from_matrix(R: Array) -> Array:
 def rotation_angles(R: Array) -> Array:
     """Return the angles (...), rad, from 0 to pi, of rotation matrices (..., 3, 3).
 
-    They are computed from sine and cosine, so that small angles keep their digits.
+    They are computed from sine and cosine, so small angles stay precise.
     """
     twice_axis = np.stack(
         [

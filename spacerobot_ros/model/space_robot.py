@@ -1,6 +1,6 @@
-"""The model of one robot: its equations, compiled, as methods.
+"""Model of one robot: its compiled equations as methods.
 
-Frames: world W, base link B. Vectors with suffix ``_B`` are in base components. The shape ``q``
+Frames: world W, base link B. Vectors with the suffix ``_B`` are in base components. The shape ``q``
 (n,) is ordered as ``joint_names``. The methods return new arrays; code that runs every control
 period takes a :class:`BufferedFunction` from :meth:`SpaceRobot.buffered` and works in place.
 """
@@ -28,28 +28,28 @@ from spacerobot_ros.model.urdf import load_robot, parse_robot
 _Made = TypeVar("_Made")
 
 _MIN_RELATIVE_INERTIA = 1e-6
-"""Largest component of a joint that counts as zero in a motion without inertia."""
+"""Largest joint component that counts as zero in a motion without inertia."""
 
 _MIN_RELATIVE_COUPLING = 1e-9
-"""Smallest singular value of the connection that counts as a rotation of the base, rad per rad."""
+"""Smallest singular value of the connection that counts as a base rotation, rad per rad."""
 
 
 class SpaceRobot:
-    """Model of a free-floating robot, built once from its description.
+    """Model of a free-floating robot, built from its description.
 
     Parameters
     ----------
     description
-        The robot, as :func:`load_robot` or :func:`parse_robot` return it.
+        The robot, as returned by :func:`load_robot` or :func:`parse_robot`.
     build
-        Models of all robots that differ only in mass properties: :meth:`buffered` and
+        Model set for all robots that differ only in mass properties: :meth:`buffered` and
         :meth:`composed` functions take these as an argument and are compiled once for all of them.
-        None: the mass properties are compiled in.
+        If None, the mass properties are compiled in.
 
     Raises
     ------
     RobotDescriptionError
-        The inertia matrix of the described robot is not positive definite.
+        The robot's inertia matrix is not positive definite.
     """
 
     def __init__(self, description: RobotDescription, build: SymbolicModels | None = None) -> None:
@@ -70,24 +70,24 @@ class SpaceRobot:
 
     @classmethod
     def from_file(cls, path: str | Path) -> SpaceRobot:
-        """Read the robot of a URDF file; see :func:`load_robot`."""
+        """Read the robot from a URDF file; see :func:`load_robot`."""
         return cls(load_robot(path))
 
     @classmethod
     def from_urdf(cls, text: str) -> SpaceRobot:
-        """Read the robot of a URDF text; see :func:`parse_robot`."""
+        """Read the robot from a URDF string; see :func:`parse_robot`."""
         return cls(parse_robot(text))
 
     def with_inertial(self, parameters: InertialParameters) -> SpaceRobot:
         """Return the robot with other masses, centres of mass and inertias.
 
-        All such robots share their compiled functions. If the numbers are equal, the robot itself
-        is returned.
+        All such robots share their compiled functions. If the values are equal, the robot itself is
+        returned.
 
         Raises
         ------
         RobotDescriptionError
-            A number is not finite, a mass is negative, all masses are zero, or an inertia is not
+            A value is not finite, a mass is negative, all masses are zero, or an inertia is not
             physical.
         """
         parameters.require_physical([body.name for body in self.description.bodies])
@@ -96,11 +96,11 @@ class SpaceRobot:
         return self.with_masses_of(parameters.apply_to_description(self.description))
 
     def with_masses_of(self, description: RobotDescription) -> SpaceRobot:
-        """Return the robot with the mass properties of a description of the same structure."""
+        """Return the robot with the mass properties from a description with the same structure."""
         return SpaceRobot(description, self._build)
 
     def derived(self, description: RobotDescription) -> SpaceRobot:
-        """Return the robot of a description derived from this one's, such as its gyrostat.
+        """Return a robot from a description derived from this robot's, such as its gyrostat.
 
         If this robot shares its compiled functions with robots that differ only in mass
         properties, so does the new one.
@@ -120,11 +120,11 @@ class SpaceRobot:
     # -- quantities ---------------------------------------------------------------------------
 
     def center_of_mass(self, q: npt.ArrayLike) -> Array:
-        """Return ``r_BC_B`` (3,), m: the system's centre of mass from the base origin."""
+        """Return ``r_BC_B`` (3,), m: the system's centre of mass relative to the base origin."""
         return self._call_function("center_of_mass", q)[0]
 
     def link_pose(self, link: str, q: npt.ArrayLike) -> tuple[Array, Array]:
-        """Return ``(R_BL (3, 3), r_BL_B (3,))`` of a link's frame in the base.
+        """Return ``(R_BL (3, 3), r_BL_B (3,))`` of a link frame relative to the base.
 
         Raises
         ------
@@ -158,7 +158,8 @@ class SpaceRobot:
         wrench_B: npt.ArrayLike,
         tau: npt.ArrayLike,
     ) -> Array:
-        """Return ``z0ddot`` (6 + n,): rates of ``[v_cm; omega; qdot]``, base components (eq. 19).
+        """Return ``z0ddot`` (6 + n,): derivatives of ``[v_cm; omega; qdot]``, base components (eq.
+        19).
 
         ``wrench_B`` (6,) is force (N) over torque (N m) at the base origin, ``tau`` (n,) efforts.
         """
@@ -175,13 +176,13 @@ class SpaceRobot:
         wrench_B: npt.ArrayLike | None = None,
         tau: npt.ArrayLike | None = None,
     ) -> tuple[Array, Array]:
-        """Return ``A`` (12 + 2 n, 12 + 2 n) and ``B`` (12 + 2 n, 6 + n) of the equations of motion
-        about a state and an actuation; omitted arguments are zero.
+        """Return ``A`` (12 + 2 n, 12 + 2 n) and ``B`` (12 + 2 n, 6 + n) of the equations of motion,
+        linearised about a state and an actuation; omitted arguments are zero.
 
         ``d/dt dx = A dx + B du`` to first order, with ``dx = [dr; dtheta; dq; dv; domega; dqdot]``:
         position (m) and rotation vector (rad) of the base relative to its motion in that state,
-        joint positions, twist of the base, and joint velocities, the vectors in base components,
-        and ``du = [f; n; tau]``, the change of force, torque and efforts.
+        joint positions, base twist, and joint velocities, with vectors in base components,
+        and ``du = [f; n; tau]``, the change in force, torque and efforts.
         """
         n = self.n
         given = zip((3, 3, n, 6, n), (v_WB_B, omega_WB_B, qdot, wrench_B, tau), strict=True)
@@ -217,14 +218,14 @@ class SpaceRobot:
         return ca.Function("linearised", [q, v, omega, qdot, wrench, tau], results)
 
     def joint_efforts(self, q: npt.ArrayLike, qdot: npt.ArrayLike, qddot: npt.ArrayLike) -> Array:
-        """Return the efforts (n,), N or N m, of a motion of the joints at zero momentum.
+        """Return the efforts (n,), N or N m, for a joint motion at zero momentum.
 
         No wrench acts on the base; its motion follows from the momenta.
         """
         return self._call_function("joint_efforts", q, qdot, qddot)[0]
 
     def jacobian(self, link: str, q: npt.ArrayLike) -> Array:
-        """Return ``0J+`` (6, 6 + n) of a link's frame origin (paper 4, eq. 10), base components.
+        """Return ``0J+`` (6, 6 + n) for a link frame origin (paper 4, eq. 10), base components.
 
         It maps ``[v_cm; omega; qdot]`` to linear over angular velocity.
 
@@ -237,7 +238,7 @@ class SpaceRobot:
         return self._call_function(f"jacobian:{link}", q)[0]
 
     def generalised_jacobian(self, link: str, q: npt.ArrayLike) -> Array:
-        """Return ``J*`` (6, n) of a link's frame origin at zero momentum, base components.
+        """Return ``J*`` (6, n) for a link frame origin at zero momentum, base components.
 
         It maps ``qdot`` to linear over angular velocity in the world, while the base moves
         according to the momenta (Umetani and Yoshida's generalised Jacobian).
@@ -256,7 +257,7 @@ class SpaceRobot:
         return self._call_function("connection", q)[0].reshape((6, self.n), order="F")
 
     def reaction_null_space(self, q: npt.ArrayLike) -> Array:
-        """Return an orthonormal basis (n, k) of the joint rates that do not rotate the base.
+        """Return an orthonormal basis (n, k) of joint rates that do not rotate the base.
 
         They are the null space of the coupling inertia ``D_q`` (Nenchev, Umetani and Yoshida, 1992,
         from memory): at zero angular momentum the base keeps its attitude while the joints move at
@@ -267,7 +268,8 @@ class SpaceRobot:
         return np.asarray(Vt[rank:].T)
 
     def curvature(self, q: npt.ArrayLike) -> Array:
-        """Return ``K`` (6, n, n) of ``F = -A``: ``dF_j/dq_i - dF_i/dq_j + [F_i, F_j]``.
+        """Return the curvature ``K`` (6, n, n) of ``F = -A``:
+        ``dF_j/dq_i - dF_i/dq_j + [F_i, F_j]``.
 
         A small counter-clockwise loop in (q_i, q_j) displaces the base by ``K[:, i, j] * area``.
         """
@@ -277,7 +279,7 @@ class SpaceRobot:
     def lie_brackets(self, q: npt.ArrayLike) -> Array:
         """Return ``w`` (3, n, n), ``w[:, i, j] = omega_[Fi,Fj]``: paper 1's brackets, eq. (7).
 
-        They are minus the angular part of :meth:`curvature`.
+        The brackets are minus the angular part of :meth:`curvature`.
         """
         return -self.curvature(q)[3:]
 
@@ -303,14 +305,15 @@ class SpaceRobot:
         p_W: npt.ArrayLike = (0, 0, 0),
         L_W: npt.ArrayLike = (0, 0, 0),
     ) -> tuple[Array, Array]:
-        """Return ``(v_WB_B, omega_WB_B)`` at given joint rates and momenta (L about the CM)."""
+        """Return ``(v_WB_B, omega_WB_B)`` for joint rates and momenta (L about the centre of
+        mass)."""
         v, omega = self._call_function("base_twist", quaternion_WB, q, qdot, p_W, L_W)
         return v, omega
 
     # -- compiled functions -------------------------------------------------------------------
 
     def function(self, name: str, *, compile: bool = True) -> ca.Function:
-        """Return a function of the model by name (see :class:`.ModelFunctions`), with this robot's
+        """Return a model function by name (see :class:`.ModelFunctions`), with this robot's
         mass properties as constants.
 
         ``compile=False`` gives the symbolic function, to compose larger ones from.
@@ -318,13 +321,13 @@ class SpaceRobot:
         return self._numeric_model.function(name, compile=compile)
 
     def buffered(self, name: str) -> BufferedFunction:
-        """Return a function with its own input and output buffers, for one caller."""
+        """Return a function with its own input and output buffers, for use by one caller."""
         return BufferedFunction(self._model.function(name, compile=self._compiles), self._p)
 
     @cached_property
     def interpreted(self) -> SpaceRobot:
-        """The same robot for callers with few calls, for which compilation does not pay: functions
-        of the model run in CasADi's virtual machine, with bit-identical results.
+        """The same robot without compilation, for a few calls: model functions run in CasADi's
+        virtual machine, with bit-identical results.
         """
         robot = copy.copy(self)
         robot._buffers, robot._compiles = {}, False
@@ -334,12 +337,12 @@ class SpaceRobot:
         """Return the step under held joint velocities ``(x, qdot, L_W, h) -> x``.
 
         ``x = [q; quaternion_WB]``; the step of ``h`` seconds is taken in ``substeps``
-        Runge-Kutta steps of the attitude (see :mod:`spacerobot_ros.model.integration`).
+        Runge-Kutta attitude steps (see :mod:`spacerobot_ros.model.integration`).
         """
         return self.buffered(f"velocity_step:{substeps}")
 
     def composed(self, name: str, build: Callable[[Composition], ca.Function]) -> BufferedFunction:
-        """Return a function that ``build`` composes from MX functions of the model, with buffers.
+        """Return a buffered function that ``build`` composes from MX model functions.
 
         It is compiled once per name for all robots that differ only in mass properties, for
         evaluation in every tick.
@@ -349,7 +352,8 @@ class SpaceRobot:
         return BufferedFunction(function, self._p)
 
     def expressions(self) -> Composition:
-        """Return the model's functions as SX expressions for larger functions; see :meth:`view`."""
+        """Return the model functions as SX expressions, to build larger functions; see
+        :meth:`view`."""
         return Composition(self._model, ca.SX)
 
     def view(self, function: ca.Function, key: Hashable) -> BufferedFunction:
@@ -362,7 +366,7 @@ class SpaceRobot:
 
     def cached_object(self, key: Hashable, make: Callable[[], _Made]) -> _Made:
         """Return an object built from :meth:`expressions`, once per key for all robots that share
-        them: those with the same mass properties, or with these as an argument.
+        them: robots with equal mass properties, or with mass properties as an argument.
         """
         derived = self._model.derived
         if key not in derived:

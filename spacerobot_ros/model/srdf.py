@@ -1,7 +1,7 @@
-"""SRDF files as MoveIt writes them: pairs of links whose contacts are ignored.
+"""SRDF files as written by MoveIt: pairs of links whose contacts are ignored.
 
-The URDF text of a robot carries its pairs as SRDF elements ``<disable_collisions>``, which other
-URDF readers ignore. So nodes and bags need only the text.
+A robot's URDF contains these pairs as SRDF elements ``<disable_collisions>``, which other
+URDF readers ignore. So nodes and bags need only the URDF.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from spacerobot_ros.resources import suggestion
 
 
 def with_srdf(robot: RobotDescription, path: str | Path) -> RobotDescription:
-    """Return a robot with the disabled pairs of an SRDF file instead of its own.
+    """Return a robot with its disabled pairs replaced by those in an SRDF file.
 
     The elements ``<disable_collisions link1="..." link2="..."/>``,
     ``<disable_default_collisions link="..."/>`` and
@@ -45,21 +45,21 @@ def with_srdf(robot: RobotDescription, path: str | Path) -> RobotDescription:
 
 
 def disabled_pairs(root: Element, links: list[str], source: str) -> frozenset[frozenset[str]]:
-    """Return the pairs of links whose contacts are ignored, according to the elements of SRDF.
+    """Return the pairs of links whose contacts are ignored according to SRDF elements.
 
     Parameters
     ----------
     root
-        The root of an SRDF, or of a URDF that carries them.
+        Root of an SRDF, or of a URDF that contains SRDF elements.
     links
-        Names of the links of the robot.
+        Link names of the robot.
     source
-        Subject of the message about a link that the robot does not have.
+        Subject of the error message about an unknown link.
 
     Raises
     ------
     RobotDescriptionError
-        An element names such a link.
+        An element names an unknown link.
     """
     quiet = {
         _read_link_name(each, "link", links, source)

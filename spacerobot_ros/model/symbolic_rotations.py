@@ -1,4 +1,5 @@
-"""Attitude with CasADi: the symbolic counterpart of :mod:`spacerobot_ros.model.rotations`.
+"""Attitude representations in CasADi: the symbolic counterpart of
+:mod:`spacerobot_ros.model.rotations`.
 
 Quaternions are unit quaternions (x, y, z, w); one named ``R_WB`` or ``quaternion_WB`` maps vectors
 given in B to vectors given in W. Arguments may be SX or MX.
@@ -53,7 +54,7 @@ def quaternion_multiply(a: ca.SX, b: ca.SX) -> ca.SX:
 
 
 def relative_vector(a: ca.SX, b: ca.SX) -> ca.SX:
-    """Return the vector part (3,) of the rotation from a to b: zero at either sign of b."""
+    """Return the vector part (3,) of the rotation from a to b: zero for either sign of b."""
     return a[3] * b[:3] - b[3] * a[:3] - ca.cross(a[:3], b[:3])
 
 
@@ -62,13 +63,13 @@ _HALF_TURN_ROUNDING = 1e-9
 
 
 def half_angle_vector(R: ca.SX) -> ca.SX:
-    """Return twice the sine of half the angle of a rotation (3, 3), about its axis (3,)."""
+    """Return the axis of a rotation (3, 3) times twice the sine of half its angle (3,)."""
     vector = ca.inv_skew((R - R.T) / 2) * 2
     return vector / ca.sqrt(ca.fmax(1 + ca.trace(R), 0) + _HALF_TURN_ROUNDING)
 
 
 def quaternion_rate(quaternion: ca.SX, omega_WB_B: ca.SX) -> ca.SX:
-    """Return the rate (4,) of the quaternion of ``R_WB`` at body rate ``omega_WB_B``."""
+    """Return the derivative (4,) of the quaternion ``R_WB`` for body rate ``omega_WB_B``."""
     vector, scalar = quaternion[:3], quaternion[3]
     return 0.5 * ca.vertcat(
         scalar * omega_WB_B + ca.cross(vector, omega_WB_B), -ca.dot(vector, omega_WB_B)
@@ -83,7 +84,7 @@ def quaternion_from_rotvec(rotvec: ca.SX) -> ca.SX:
 
 
 def quaternion_from_small_rotvec(rotvec: ca.SX) -> ca.SX:
-    """Return the quaternion (4,) of a rotation vector (3,) of well under a radian.
+    """Return the quaternion (4,) of a rotation vector (3,) much shorter than a radian.
 
     A power series with an error of order six: smooth at zero, and without a square root.
     """
@@ -97,8 +98,8 @@ def quaternion_from_small_rotvec(rotvec: ca.SX) -> ca.SX:
 def rotation_error(quaternion: ca.SX, target: ca.SX) -> ca.SX:
     """Return the rotation vector (3,), rad, world components, from an attitude to its target.
 
-    It is the shortest one: its length is at most pi for either sign of the quaternions. For a
-    rotation by pi, one of the two shortest vectors is returned.
+    It is the shortest such vector: its length is at most pi for either sign of the quaternions. For
+    a rotation by pi, either of the two shortest vectors is returned.
     """
     inverse = ca.vertcat(-quaternion[:3], quaternion[3])
     error = quaternion_multiply(target, inverse)

@@ -1,4 +1,4 @@
-"""The motion of a free target, and of a frame that closes in on it, predicted over time.
+"""Predicted motion of a free target, and of a frame approaching it.
 
 If no force or torque acts on a target, its centre of mass moves at constant velocity and its
 angular momentum ``L_W`` about it is constant, so that its attitude obeys Euler's equations,
@@ -39,7 +39,7 @@ _SMALL_ANGLE = 1e-3  # rad; below it, functions of an angle are series
 
 @dataclass(frozen=True)
 class FrameMotion:
-    """Motion of a frame in W at some times (K,).
+    """Motion of a frame in W at given times (K,).
 
     Attributes
     ----------
@@ -59,11 +59,11 @@ class FrameMotion:
     alpha: Array
 
     def between_samples(self, first: int, last: int, every: int = 1) -> FrameMotion:
-        """Return the motion at times from the first up to, but not including, the last."""
+        """Return the motion at all times except the last."""
         return self.rows(slice(first, last, every))
 
     def rows(self, chosen: slice | npt.NDArray[np.int64]) -> FrameMotion:
-        """Return the motion at some of the times."""
+        """Return the motion at selected times."""
         return FrameMotion(*(getattr(self, each.name)[chosen] for each in fields(self)))
 
     def body_motion(self, k: int = 0) -> BodyMotion:
@@ -91,14 +91,14 @@ class FrameMotion:
 
 @dataclass(frozen=True)
 class RelativeMotionOverTime:
-    """Motion of a frame E relative to a frame G at some times (K,), in G.
+    """Motion of a frame E relative to a frame G at given times (K,), in G.
 
     Attributes
     ----------
     x, xdot, xddot
-        Position (K, 3), m, and its rates.
+        Position (K, 3), m, and its derivatives.
     phi, phidot, phiddot
-        Rotation vector (K, 3) of ``R_GE``, rad, and its rates.
+        Rotation vector (K, 3) of ``R_GE``, rad, and its derivatives.
     """
 
     x: Array
@@ -136,7 +136,7 @@ class RelativeMotionOverTime:
 
     @classmethod
     def between(cls, frame: FrameMotion, moving: FrameMotion) -> RelativeMotionOverTime:
-        """Return the motion of ``moving`` relative to ``frame``, both at one time (K = 1)."""
+        """Return the motion of ``moving`` relative to ``frame``, both at a single time (K = 1)."""
         R, omega = frame.R[0], frame.omega[0]
         arm = moving.r[0] - frame.r[0]
         v = moving.v[0] - frame.v[0] - cross(omega, arm)
@@ -177,18 +177,18 @@ def _jacobian_terms(phi: Array, phidot: Array) -> tuple[Array, Array, Array, Arr
 
 
 class RelativePath:
-    """A path of a frame E relative to a frame G, from a motion to rest in a pose.
+    """A path of a frame E relative to a frame G, from a given motion to rest at a pose.
 
-    Position and rotation vector are polynomials of fifth order in time.
+    Position and rotation vector are fifth-order polynomials in time.
 
     Parameters
     ----------
     start
-        The motion at the beginning (K = 1).
+        Initial motion (K = 1).
     position
-        (3,) at the end, m; the attitudes of E and G are then equal.
+        (3,) at the end, m, where the attitudes of E and G are equal.
     duration
-        Time from beginning to end, s.
+        Duration, s.
     """
 
     def __init__(self, start: RelativeMotionOverTime, position: Array, duration: float) -> None:
@@ -202,13 +202,14 @@ class RelativePath:
 
     @classmethod
     def from_rest(cls, start: Array, end: Array, duration: float) -> RelativePath:
-        """Return the path between two positions (3,), at rest at both, in the attitude of G."""
+        """Return the path between two positions (3,), at rest at both ends, with the attitude of
+        G."""
         zero = np.zeros((1, 3))
         motion = RelativeMotionOverTime(start[np.newaxis], zero, zero, zero, zero, zero)
         return cls(motion, end, duration)
 
     def at(self, times: npt.ArrayLike) -> RelativeMotionOverTime:
-        """Return the motion at times (K,), s since the beginning; at rest after the end."""
+        """Return the motion at times (K,), s since the start; at rest after the end."""
         t = np.minimum(np.asarray(times, dtype=float), self.duration)
         parts = _evaluate_polynomials(self._coefficients, t)
         rested = np.asarray(times, dtype=float) >= self.duration
@@ -253,7 +254,7 @@ class TorqueFreeMotion:
     body
         The target.
     motion
-        The state of the frame of its root link.
+        The state of its root link frame.
     """
 
     def __init__(self, body: TargetBody, motion: BodyMotion) -> None:
@@ -268,7 +269,8 @@ class TorqueFreeMotion:
         self._nodes = [quaternion_from_matrix(R)]
 
     def numbers(self, time: float) -> Array:
-        """Return all numbers of the motion from a time on, for :class:`TargetExpression`."""
+        """Return the parameters of the motion from a given time on, for
+        :class:`TargetExpression`."""
         inertia, grapple = self._body.inertia, self._body.grapple
         at = self._quaternions(np.array([time]))[0]
         r = self._r + time * self._v
@@ -278,7 +280,7 @@ class TorqueFreeMotion:
 
     @property
     def velocity(self) -> Array:
-        """Velocity (3,) of the centre of mass in W, m/s."""
+        """Centre-of-mass velocity (3,) in W, m/s."""
         return self._v
 
     @property
@@ -292,12 +294,12 @@ class TorqueFreeMotion:
 
     @property
     def grapple_in_target(self) -> Array:
-        """Pose (7,) of the grapple frame in the frame of the root link."""
+        """Grapple frame pose (7,) in the root link frame."""
         grapple = self._body.grapple
         return np.concatenate([grapple.r, quaternion_from_matrix(grapple.R)])
 
     def body_poses(self, times: npt.ArrayLike) -> tuple[Array, Array]:
-        """Return quaternions (K, 4) and positions (K, 3), m, of the root link's frame in W."""
+        """Return quaternions (K, 4) and positions (K, 3), m, of the root link frame in W."""
         t = np.asarray(times, dtype=float)
         X = self._quaternions(t)
         arm = matrices_from_quaternions(X) @ self._body.inertia.com
@@ -360,16 +362,16 @@ class TorqueFreeMotion:
 
 
 TARGET_SIZE = 28
-"""Length of the vector :meth:`TorqueFreeMotion.numbers`."""
+"""Length of the :meth:`TorqueFreeMotion.numbers` vector."""
 
 _EXPRESSION_STEPS = 4
 """Number of Runge-Kutta steps in an expression."""
 
 
 class TargetExpression(NamedTuple):
-    """A target at a time, in W: its grapple frame's attitude (3, 3), position, velocity and
-    angular velocity (3,); its mass; its centre of mass, the velocity of this centre, and the
-    angular momentum about it (3,).
+    """A target at one time, in W: its grapple frame's attitude (3, 3), position, velocity and
+    angular velocity (3,); its mass; its centre of mass, its velocity, and the angular momentum
+    about it (3,).
     """
 
     R: ca.SX
@@ -383,8 +385,8 @@ class TargetExpression(NamedTuple):
 
     @classmethod
     def at(cls, numbers: ca.SX, time: ca.SX) -> TargetExpression:
-        """Return the target at a time near that of ``numbers`` (:meth:`TorqueFreeMotion.numbers`),
-        by Euler's equations.
+        """Return the target at a time close to that of ``numbers``
+        (:meth:`TorqueFreeMotion.numbers`), by Euler's equations.
         """
         began, X, L, r, v, mass, about, arm, turn = ca.vertsplit(
             numbers, np.cumsum([0, 1, 4, 3, 3, 3, 1, 6, 3, 4]).tolist()
@@ -425,23 +427,23 @@ def _rotate_vectors(R: Array, vectors: Array) -> Array:
 
 
 class PathInWorld:
-    """A path that is short in W; relative to the rotating frame G it leads around the body.
+    """A path that is short in W; relative to the rotating frame G, it leads around the body.
 
-    The position is a polynomial of fifth order in W, from a motion to that of a point fixed in G;
-    the attitude relative to G is that of ``relative``.
+    The position is a fifth-order polynomial in W, from a given motion to that of a point fixed in
+    G; the attitude relative to G follows ``relative``.
 
     Parameters
     ----------
     relative
         The path relative to G with the same endpoints.
     target
-        The target whose grapple frame G is.
+        The target with grapple frame G.
     start
-        Time at the beginning, s since the state that the motion of the target is predicted from.
+        Start time, s since the state from which the target motion is predicted.
     moving
-        The motion in W at the beginning (K = 1).
+        Initial motion in W (K = 1).
     position
-        (3,) end of the path in G, m.
+        (3,) end point in G, m.
     """
 
     def __init__(
@@ -461,7 +463,7 @@ class PathInWorld:
         self._coefficients = _quintic(first, last, self.duration)
 
     def at(self, times: npt.ArrayLike) -> RelativeMotionOverTime:
-        """Return the motion relative to G at times (K,), s since the beginning."""
+        """Return the motion relative to G at times (K,), s since the start."""
         t = np.asarray(times, dtype=float)
         found = self._relative.at(t)
         on_way = t < self.duration

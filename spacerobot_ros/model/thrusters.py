@@ -1,4 +1,4 @@
-"""Thrusters as flight software: table, wrench allocation, pulse modulation.
+"""Thrusters in flight software: table, wrench allocation, pulse modulation.
 
 A node of a real robot can use it without a plant::
 
@@ -6,7 +6,7 @@ A node of a real robot can use it without a plant::
     modulator = ThrusterModulator(table, control_period=0.01)
     on_time = modulator.fire(wrench)  # (m,) s, for the valves; every period
 
-A table is read from ``<thruster>`` elements of a URDF, which other programs ignore, or from a YAML
+A table is read from ``<thruster>`` elements in a URDF, which other programs ignore, or from a YAML
 file; docs/theory/thrusters.md shows both.
 """
 
@@ -28,10 +28,10 @@ from spacerobot_ros.model.description import Array, Pose, RobotDescription
 from spacerobot_ros.model.rotations import matrix_from_rpy
 
 STANDARD_GRAVITY = 9.80665
-"""Acceleration that relates a specific impulse in seconds to an exhaust velocity, m/s^2."""
+"""Acceleration relating specific impulse in seconds to exhaust velocity, m/s^2."""
 
 IN_URDF = "urdf"
-"""Source of a table in the robot's URDF."""
+"""Table source: the robot's URDF."""
 
 _MAX_TABLE_NUMBER = 1e12
 """Largest number in a table, in SI units."""
@@ -46,31 +46,31 @@ _THRUSTER_KEYS = {"name", "link", "position", "rpy", "direction", "force", "min_
 
 COST_WEIGHT = 1e-5
 """Weight of the cost relative to the wrench. The cost changes the wrench by some 1e-10, which is
-restored afterwards; a much smaller weight would be lost in the rounding errors of the solver."""
+corrected afterwards; a much smaller weight would be lost in solver rounding errors."""
 
 TIE_BREAK = 0.01
-"""Largest relative change of a cost. Symmetric thrusters have many allocations of equal cost, among
-which machine-dependent rounding errors would choose."""
+"""Largest relative change of a cost. Symmetric thrusters have many allocations of equal cost, and
+machine-dependent rounding errors would select one."""
 
 _ACHIEVED_TOLERANCE = 1e-9
-"""Largest relative error of a wrench that counts as achieved."""
+"""Largest relative error for a wrench to count as achieved."""
 
 _WRENCH_WEIGHT = 1e4
-"""Weight of the achieved part of a wrench that exceeds the thrust, relative to the cost."""
+"""Weight, relative to the cost, of the achieved part of a wrench that exceeds the thrust."""
 
 _ROUNDING = 1e-9
-"""Parts of a time below this share of it count as zero."""
+"""Fractions of a time below this value count as zero."""
 
 _MIN_UNMET_WRENCH = 1e-6
-"""Smaller parts of a wrench are not counted as missing, N or N m."""
+"""Shortfalls of a wrench below this value are ignored, N or N m."""
 
 
 @dataclass(frozen=True)
 class ThrusterTable:
     """Thrusters on the base, m of them.
 
-    ``r_B`` (m, 3) are the points of application from the origin of the base link, m;
-    ``direction_B`` (m, 3) the unit vectors of the forces on the base, opposite to the plumes;
+    ``r_B`` (m, 3) are the points of application relative to the base link origin, m;
+    ``direction_B`` (m, 3) unit vectors of the forces on the base, opposite to the plumes;
     ``force`` (m,) thrusts, N; ``min_on_time`` (m,) shortest pulses, s; ``isp`` (m,) specific
     impulses, s.
     """
@@ -84,8 +84,8 @@ class ThrusterTable:
 
     @property
     def wrenches(self) -> Array:
-        """Wrenches (6, m) at full thrust, force (N) over torque (N m), at the origin of the base
-        link, in base components.
+        """Wrenches (6, m) at full thrust, force (N) over torque (N m) at the base link origin, in
+        base components.
         """
         thrust_B = self.direction_B * self.force[:, None]
         return np.vstack([thrust_B.T, np.cross(self.r_B, thrust_B).T])
@@ -101,7 +101,7 @@ class ThrusterTable:
         Raises
         ------
         ParameterError
-            There is no thruster of that name.
+            There is no thruster with that name.
         """
         if name not in self.names:
             raise ParameterError(
@@ -110,10 +110,11 @@ class ThrusterTable:
         return self.names.index(name)
 
     def missing(self, without: Sequence[str] = ()) -> str:
-        """Return the names of the wrenches that thrusters except ``without`` cannot produce; or "".
+        """Return the names of wrenches that the thrusters cannot produce without ``without``; or
+        "".
 
-        They produce every wrench if they produce both directions of the six axes with nonnegative
-        factors, because their wrenches form a convex cone.
+        They produce every wrench if they produce both directions along all six axes, because their
+        wrenches form a convex cone.
         """
         # Imported where it is used: scipy.optimize loads slowly.
         from scipy.optimize import linprog
@@ -134,25 +135,25 @@ class ThrusterTable:
 
 
 def find_thrusters(source: str, robot: RobotDescription) -> ThrusterTable:
-    """Return the table at :data:`IN_URDF` or in the YAML file of a path.
+    """Return the table from :data:`IN_URDF` or from a YAML file.
 
     Raises
     ------
     ParameterError
-        The file or a thruster in it is refused.
+        The file or a thruster in it is invalid.
     RobotDescriptionError
-        A thruster of the URDF is refused, or there is none.
+        A thruster in the URDF is invalid, or there is none.
     """
     return thrusters_of_urdf(robot) if source == IN_URDF else load_thrusters(source, robot)
 
 
 def thrusters_of_urdf(robot: RobotDescription) -> ThrusterTable:
-    """Read the ``<thruster>`` elements of the robot's URDF.
+    """Read the ``<thruster>`` elements from the robot's URDF.
 
     Raises
     ------
     RobotDescriptionError
-        There are none, or one is refused.
+        There are no thrusters, or one is invalid.
     """
     entries = []
     for element in ET.fromstring(robot.urdf.encode("utf-8")).findall("thruster"):
@@ -183,7 +184,7 @@ def load_thrusters(path: str | Path, robot: RobotDescription) -> ThrusterTable:
     Raises
     ------
     ParameterError
-        The file cannot be read, or a thruster is refused.
+        The file cannot be read, or a thruster is invalid.
     """
     try:
         content = load_yaml(read_regular(path).decode("utf-8"))
@@ -195,7 +196,7 @@ def load_thrusters(path: str | Path, robot: RobotDescription) -> ThrusterTable:
     defaults = content.get("defaults", {}) if isinstance(content, dict) else {}
     if not (isinstance(entries, list) and entries and isinstance(defaults, dict)):
         raise ParameterError(
-            f"The thruster file {path} needs a list 'thrusters'; 'defaults' must be a mapping."
+            f"The thruster file {path} must have a list 'thrusters'; 'defaults' must be a mapping."
         )
     try:
         if not all(isinstance(entry, dict) for entry in entries):
@@ -208,14 +209,15 @@ def load_thrusters(path: str | Path, robot: RobotDescription) -> ThrusterTable:
 def thruster_table(entries: Sequence[Mapping[str, Any]], robot: RobotDescription) -> ThrusterTable:
     """Check thrusters and express them in the base link.
 
-    Each has ``name``, ``position`` (m) in the frame of ``link`` (default: the base link),
-    ``direction`` of its force (default: x, like the axis of a joint) in that frame rotated by
-    ``rpy`` (rad), ``force`` (N), ``isp`` (s) and ``min_on_time`` (s, default: 0).
+    Each has ``name``, ``position`` (m) in the frame of ``link`` (default: the base link), force
+    ``direction`` (default: x, as for joint axes) in that frame rotated by ``rpy`` (rad), ``force``
+    (N), ``isp`` (s) and ``min_on_time`` (s, default: 0).
 
     Raises
     ------
     ParameterError
-        Something is missing, unknown, not finite or not positive, or a link moves on the base.
+        An entry is missing, unknown, not finite or not positive, or a link moves relative to the
+        base.
     """
     names: list[str] = []
     rows: list[Array] = []
@@ -223,7 +225,7 @@ def thruster_table(entries: Sequence[Mapping[str, Any]], robot: RobotDescription
         name = str(entry.get("name", ""))
         where = f"thruster '{name}'"
         if not name or name in names:
-            problem = "is used twice; names are unique" if name else "is missing"
+            problem = "is used twice; names must be unique" if name else "is missing"
             raise ParameterError(f"The name of {where if name else 'a thruster'} {problem}.")
         unknown = sorted(set(entry) - _THRUSTER_KEYS)
         if unknown:
@@ -240,7 +242,7 @@ def thruster_table(entries: Sequence[Mapping[str, Any]], robot: RobotDescription
         length = float(np.linalg.norm(direction))
         if length < 1e-9:
             raise ParameterError(
-                f"The direction of {where} is zero; give the direction in which it pushes."
+                f"The direction of {where} is zero; give the direction of its force."
             )
         numbers = [
             _read_number(entry, key, where, positive=key != "min_on_time")
@@ -300,22 +302,22 @@ def _read_number(entry: Mapping[str, Any], key: str, where: str, *, positive: bo
 
 @dataclass(frozen=True)
 class Allocation:
-    """Levels of the thrusters, ``levels`` (m,), and their wrench, ``achieved`` (6,)."""
+    """Thruster levels ``levels`` (m,) and their wrench ``achieved`` (6,)."""
 
     levels: Array
     achieved: Array
 
 
 class ThrusterAllocation:
-    """Distributes wrenches over thrusters that only push, at the least cost.
+    """Distributes wrenches over push-only thrusters at minimal cost.
 
     The levels solve ``wrenches @ levels = wanted`` with ``0 <= levels <= most``. They are found by
-    non-negative least squares (Lawson and Hanson) with one more row for the cost: as its weight
+    non-negative least squares (Lawson and Hanson) with an extra row for the cost: as its weight
     tends to zero, the solution tends to the cheapest exact one. If a level would exceed its
-    upper bound, a linear programme finds the largest achievable part of the wrench and its
+    upper bound, a linear programme finds the largest achievable fraction of the wrench and its
     cheapest allocation: the wrench keeps its direction, as in
-    :class:`spacerobot_ros.control.ActuatorLimits`. If a wrench is outside the cone of the
-    thrusters, the nearest wrench in the cone is allocated, with torques weighted by the mean lever.
+    :class:`spacerobot_ros.control.ActuatorLimits`. If a wrench is outside the thrusters' cone, the
+    nearest wrench in the cone is allocated, with torques weighted by the mean lever.
 
     Parameters
     ----------
@@ -342,7 +344,7 @@ class ThrusterAllocation:
         self._use(self._usable)
 
     def exclude(self, index: int) -> None:
-        """Exclude a thruster from now on."""
+        """Exclude a thruster from further use."""
         self._use(self._usable[self._usable != index])
 
     def _use(self, usable: npt.NDArray[np.int64]) -> None:
@@ -351,8 +353,8 @@ class ThrusterAllocation:
         self._extended = np.vstack([self._columns, COST_WEIGHT * self._cost[usable]])
 
     def allocate(self, wanted: Array, most: Array) -> Allocation:
-        """Return levels (m,), each within ``most`` (m,), for a wrench ``wanted`` (6,), or for the
-        achievable part of it.
+        """Return levels (m,), each within ``most`` (m,), for a wrench ``wanted`` (6,), or for its
+        achievable part.
         """
         levels = np.zeros(self._cost.size)
         target = self._weights * wanted
@@ -391,15 +393,16 @@ class ThrusterAllocation:
 
 
 class ThrusterModulator:
-    """Converts a wanted wrench into on-times of thrusters, control period by control period.
+    """Converts a desired wrench into thruster on-times, one control period at a time.
 
-    The modulation is sigma-delta with shortest pulses. ``pending_impulse`` grows by the wanted
-    wrench times the period and shrinks by the impulses of the pulses fired. It is allocated again
-    in every period, so that opposite contributions cancel. The pending impulse is therefore at most
+    The modulation is sigma-delta with minimum pulse lengths. ``pending_impulse`` grows by the
+    desired
+    wrench times the period and shrinks by the impulse of each fired pulse. It is reallocated every
+    period, so that opposite contributions cancel. The pending impulse is therefore at most
     one shortest pulse of each thruster: for ``t`` the shortest on-time and ``h`` the period,
     ``allocation <= t + h - (remaining part of a shortest pulse)`` holds in every period if the
-    wanted wrench is within the thrust. A wrench beyond the thrust is dropped, not compensated for
-    later.
+    desired wrench is achievable. Wrench beyond the available thrust is dropped, not
+    compensated for later.
 
     A pulse begins at the start of a period and may end at any time within a period.
 
@@ -408,14 +411,14 @@ class ThrusterModulator:
     table
         The thrusters.
     control_period
-        Time between two calls of :meth:`fire`, s.
+        Time between calls of :meth:`fire`, s.
     excluded
-        Names of thrusters that are never fired.
+        Names of thrusters never to be fired.
 
     Raises
     ------
     ParameterError
-        There is no thruster of an excluded name.
+        An excluded name is not that of a thruster.
     """
 
     def __init__(
@@ -427,16 +430,16 @@ class ThrusterModulator:
         # Numbers without rational relations: no sums of costs are equal either.
         tie_break = 1.0 + TIE_BREAK * np.sin(np.arange(1.0, count + 1.0) ** 2)
         self.allocation = ThrusterAllocation(self._wrenches, table.mass_flow * tie_break)
-        """How wrenches are distributed over the thrusters."""
+        """Distributes wrenches over the thrusters."""
         self._remaining = np.zeros(count)
-        """Remaining parts of shortest pulses (m,), s."""
+        """Remaining time of minimum pulses (m,), s."""
         self._open = np.zeros(count, dtype=np.bool_)
         """Whether each thruster (m,) is open between the last period and the next one."""
         self._excluded: list[str] = []
         for name in excluded:
             self.exclude(name)
         self.unmet = np.zeros(6)
-        """Part of the last wanted wrench that the thrusters could not produce, N, N m."""
+        """Part of the last desired wrench that the thrusters could not produce, N, N m."""
         self.unmet_periods = 0
         """Number of periods in which the thrusters could not produce the whole wrench."""
         self.begun = np.zeros(count, dtype=np.bool_)
@@ -444,7 +447,7 @@ class ThrusterModulator:
         self.pulses = np.zeros(count, dtype=np.int64)
         """Number of pulses of each thruster (m,) so far."""
         self.on_time = np.zeros(count)
-        """Time that each thruster (m,) was commanded on so far, s."""
+        """Total commanded on-time of each thruster (m,), s."""
         self.reset()
 
     @property
@@ -454,16 +457,16 @@ class ThrusterModulator:
 
     @property
     def propellant(self) -> float:
-        """Propellant that the commanded on-times have used, kg."""
+        """Propellant used by the commanded on-times, kg."""
         return float(self.table.mass_flow @ self.on_time)
 
     def exclude(self, name: str) -> None:
-        """Stop using a (broken) thruster; the others produce the wrench, if they can.
+        """Stop using a (broken) thruster; the others produce the wrench if possible.
 
         Raises
         ------
         ParameterError
-            There is no thruster of that name.
+            There is no thruster with that name.
         """
         self.allocation.exclude(self.table.index(name))
         self._excluded.append(name)
@@ -471,7 +474,7 @@ class ThrusterModulator:
     def reset(self) -> None:
         """Close all thrusters and drop the pending impulse; counters are kept."""
         self.pending_impulse = np.zeros(6)
-        """Impulse (6,) that was wanted and has not been fired yet, N s, N m s."""
+        """Desired impulse (6,) that has not been fired yet, N s, N m s."""
         self._remaining[:] = 0.0
         self._open[:] = False
         self.unmet[:] = 0.0
@@ -479,14 +482,13 @@ class ThrusterModulator:
 
     @property
     def begun_pulse_impulse(self) -> Array:
-        """Impulse (6,) of the remaining parts of shortest pulses that have begun, N s, N m s."""
+        """Impulse (6,) remaining in minimum pulses that have begun, N s, N m s."""
         return np.asarray(self._wrenches @ self._remaining)
 
     def fire(self, wrench: Array) -> Array:
         """Return the on-time of each thruster (m,) in the next period, s.
 
-        ``wrench`` (6,) is force (N) over torque (N m) at the origin of the base link, base
-        components.
+        ``wrench`` (6,) is force (N) over torque (N m) at the base link origin, base components.
         """
         h = self._control_period
         wanted = self.pending_impulse + h * wrench

@@ -1,8 +1,8 @@
-"""Reads URDF files and texts as :class:`.RobotDescription`.
+"""Reads URDF files and strings into :class:`.RobotDescription`.
 
-The form of the text is checked first (:func:`_checked_root`): every message names the element and
-its correction. Then links and joints are read, fixed joints are welded, and robots whose equations
-would be singular are refused.
+The syntax is checked first (:func:`_checked_root`): every message names the element and its
+correction. Then links and joints are read, links connected by fixed joints are merged, and
+robots with singular equations are rejected.
 """
 
 from __future__ import annotations
@@ -52,23 +52,23 @@ from spacerobot_ros.model.wheels import require_reaction_wheels
 from spacerobot_ros.resources import suggestion
 
 _MAX_NUMBER = 1e12
-"""Largest number (kg, m, kg m^2): larger ones are typing errors, and their squares overflow."""
+"""Largest value (kg, m, kg m^2): larger ones are typing errors, and their squares overflow."""
 
 _MAX_LINKS = 200
 
 _XACRO_CPU_TIME = 10
-"""Limit of processor time for expanding a xacro file, s; that of wall time is six times as long."""
+"""CPU time limit for expanding a xacro file, s; the wall time limit is six times as long."""
 
 XACRO_ARGUMENTS_VARIABLE = "SPACEROBOT_XACRO_ARGS"
-"""Environment variable with arguments of xacro files, ``NAME:=VALUE``, separated as in a shell."""
+"""Environment variable with xacro arguments, ``NAME:=VALUE``, separated as in a shell."""
 
 
 def load_robot(path: str | Path) -> RobotDescription:
-    """Read the robot of a URDF file, or of a xacro file (by its suffix), which is expanded.
+    """Read a robot from a URDF file, or from a xacro file (by its suffix), which is expanded.
 
     Mesh paths that are relative to the file, or in a package that is not installed and contains the
-    file, become absolute in the text of the robot. If an SRDF of the same name is in the folder,
-    contacts of its disabled pairs of links are ignored.
+    file, become absolute in the robot's URDF. If the folder contains an SRDF of the same name,
+    contacts of the link pairs disabled in it are ignored.
 
     Raises
     ------
@@ -87,14 +87,14 @@ def load_robot(path: str | Path) -> RobotDescription:
 
 
 def load_world(path: str | Path) -> RobotDescription:
-    """Read obstacles that are fixed in the world from a URDF or xacro file.
+    """Read obstacles, fixed in the world, from a URDF or xacro file.
 
-    The frame of the root link is that of the world, W. Links need no mass.
+    The root link frame is the world frame W. Links need no mass.
 
     Raises
     ------
     RobotDescriptionError
-        The file cannot be read or is not URDF, a mesh is not found, or :func:`parse_world` refuses
+        The file cannot be read or is not URDF, a mesh is not found, or :func:`parse_world` rejects
         it.
     """
     world = _loaded(Path(path), parse_world)
@@ -103,7 +103,7 @@ def load_world(path: str | Path) -> RobotDescription:
 
 
 def require_found_meshes(world: RobotDescription) -> None:
-    """Check that the meshes of obstacles are found.
+    """Check that the meshes of obstacles exist.
 
     Raises
     ------
@@ -128,7 +128,7 @@ def _loaded(path: Path, parse: Callable[[str], RobotDescription]) -> RobotDescri
     except RobotDescriptionError as error:
         remedy = ""
         if path.suffix != ".xacro" and ("<xacro:" in text or "${" in text):
-            remedy = f" To have the xacro in it expanded, name it {path.stem}.xacro."
+            remedy = f" To expand xacro in it, rename it to {path.stem}.xacro."
         raise RobotDescriptionError(f"{path}: {error}{remedy}") from error
 
 
@@ -158,7 +158,9 @@ def _expand_xacro(path: Path) -> str:
     arguments = shlex.split(os.environ.get(XACRO_ARGUMENTS_VARIABLE, ""))
     for each in arguments:
         if not each.partition(":=")[1]:
-            raise RobotDescriptionError(f"The xacro argument '{each}' is not NAME:=VALUE.")
+            raise RobotDescriptionError(
+                f"The xacro argument '{each}' is not of the form NAME:=VALUE."
+            )
     words = [xacro_files.__file__, str(path), f"{_XACRO_CPU_TIME}", *arguments]
     try:
         done = subprocess.run(
@@ -195,12 +197,12 @@ def _name_unused_arguments(path: Path, told: str) -> None:
 
 
 def parse_robot(text: str) -> RobotDescription:
-    """Read the robot of a URDF text.
+    """Read a robot from a URDF string.
 
     Raises
     ------
     RobotDescriptionError
-        The text is not URDF, or does not describe a free-floating tree of prismatic, revolute,
+        The string is not URDF, or does not describe a free-floating tree of prismatic, revolute,
         continuous and fixed joints with positive definite inertia.
     """
     description = _read_tree(text)
@@ -215,14 +217,14 @@ def parse_robot(text: str) -> RobotDescription:
 
 
 def with_held_joints(robot: RobotDescription, positions: Array | None = None) -> RobotDescription:
-    """Return a robot with locked joints: one rigid body, also in its URDF text.
+    """Return a robot with locked joints: one rigid body, also in its URDF.
 
     Parameters
     ----------
     robot
         The robot.
     positions
-        (n,) m or rad, in the order of its joints; None: zero, or the nearest limit.
+        (n,) m or rad, in joint order; None: zero, or the nearest limit.
 
     Raises
     ------
@@ -233,7 +235,7 @@ def with_held_joints(robot: RobotDescription, positions: Array | None = None) ->
     q = np.clip(0.0, *limits) if positions is None else np.asarray(positions, dtype=float)
     if q.shape != (len(names),):
         raise RobotDescriptionError(
-            f"{q.size} joint positions are given, and '{robot.name}' has {len(names)} joints"
+            f"{q.size} joint positions are given, but '{robot.name}' has {len(names)} joints"
             f"{': ' if names else ''}{', '.join(names)}."
         )
     for name, value, lower, upper in zip(names, q, *limits, strict=True):
@@ -261,12 +263,12 @@ def with_held_joints(robot: RobotDescription, positions: Array | None = None) ->
 
 
 def parse_world(text: str) -> RobotDescription:
-    """Read obstacles that are fixed in the world from a URDF text; see :func:`load_world`.
+    """Read obstacles, fixed in the world, from a URDF string; see :func:`load_world`.
 
     Raises
     ------
     RobotDescriptionError
-        The text is not URDF, has a joint that moves, or no shape.
+        The string is not URDF, has a movable joint, or has no shape.
     """
     world = _read_tree(text)
     if world.moving_joints:
@@ -277,7 +279,7 @@ def parse_world(text: str) -> RobotDescription:
         )
     if not any(link.collisions or link.shapes for link in world.links):
         raise RobotDescriptionError(
-            f"The world '{world.name}' has no obstacle: give its links <collision> or <visual> "
+            f"The world '{world.name}' has no obstacles: give its links <collision> or <visual> "
             "elements."
         )
     return world
@@ -288,8 +290,8 @@ def _read_tree(text: str) -> RobotDescription:
     root = _checked_root(text)
     if len(root.findall("link")) > _MAX_LINKS:
         raise RobotDescriptionError(
-            f"The robot description has more than {_MAX_LINKS} links: its equations would take "
-            "hours to derive."
+            f"The robot description has more than {_MAX_LINKS} links: deriving its equations "
+            "would take hours."
         )
     colours = {
         material.get("name", ""): _read_colour(color, f"material '{material.get('name', '')}'")
@@ -301,7 +303,7 @@ def _read_tree(text: str) -> RobotDescription:
         twice = sorted({name for name in names if names.count(name) > 1})
         if twice:
             raise RobotDescriptionError(
-                f"The {kind} name '{twice[0]}' is used twice; names are unique."
+                f"The {kind} name '{twice[0]}' is used twice; names must be unique."
             )
     links = {
         link.name: link for link in (_read_link(each, colours) for each in root.findall("link"))
@@ -388,7 +390,7 @@ def _read_inertia(moments: Element | None, where: str) -> Array:
 
 
 def describe_inertia_flaw(about: Array) -> str:
-    """Return a clause on impossible moments of inertia (3, 3), kg m^2; empty: none.
+    """Return a clause that describes impossible moments of inertia (3, 3), kg m^2; empty: none.
 
     It completes a message that begins with the owner of the inertia.
     """
@@ -397,18 +399,18 @@ def describe_inertia_flaw(about: Array) -> str:
         return "has a negative principal moment; check its signs."
     if high > (1 + TRIANGLE_SLACK) * (low + middle) + 1e-12:
         return (
-            f"is not that of a rigid body: its principal moments are {low:.4g}, {middle:.4g} and "
-            f"{high:.4g} kg m^2, and none can be larger than the sum of the other two. Check units "
+            f"is not physical: its principal moments are {low:.4g}, {middle:.4g} and "
+            f"{high:.4g} kg m^2, and none may exceed the sum of the other two. Check units "
             "and digits of <inertia>."
         )
     return ""
 
 
 def nearest_inertias(path: Path) -> tuple[str, dict[str, float]]:
-    """Return the URDF text of a file with a physically possible inertia for every link.
+    """Return a file's URDF with a physically possible inertia for every link.
 
-    An impossible inertia is replaced by the nearest possible one in the Frobenius norm. Also
-    returned is the relative change of the inertia of each such link in that norm.
+    An impossible inertia is replaced by the nearest possible one in the Frobenius norm. Also return
+    the relative change in inertia of each such link, in that norm.
 
     Raises
     ------
@@ -451,7 +453,7 @@ def _refuse_impossible_inertia(welded: list[Link]) -> NoReturn:
     worst = max(welded, key=excess)
     raise RobotDescriptionError(
         f"The inertia of link '{worst.name}' {describe_inertia_flaw(worst.inertia.about_com)} "
-        "`spacerobot new URDF --nearest-inertia` writes a URDF with the nearest possible one."
+        "`spacerobot new URDF --nearest-inertia` writes a URDF with the nearest possible inertia."
     )
 
 
@@ -536,7 +538,7 @@ def _read_mimic(mimic: Element | None, where: str) -> Mimic | None:
     (offset,) = _read_numbers(mimic, "offset", "0", f"<mimic> of {where}")
     if multiplier == 0:
         raise RobotDescriptionError(
-            f"The {where} mimics '{leader}' with the multiplier 0: it does not move; make it fixed."
+            f"The {where} mimics '{leader}' with multiplier 0: it does not move; make it fixed."
         )
     return Mimic(leader, float(multiplier), float(offset))
 
@@ -556,7 +558,7 @@ def _with_leaders(joints: list[Joint]) -> list[Joint]:
                 )
             if follows.joint in passed:
                 raise RobotDescriptionError(
-                    f"The joint '{joint.name}' mimics itself, through {', '.join(passed[1:])}."
+                    f"The joint '{joint.name}' mimics itself via {', '.join(passed[1:])}."
                     if passed[1:]
                     else f"The joint '{joint.name}' mimics itself."
                 )
@@ -596,7 +598,7 @@ def _without_contradicting_limits(joints: list[Joint]) -> list[Joint]:
 
 
 _NO_LIMIT = 1e4
-"""Position, m or rad, from which on a joint limit means that there is none."""
+"""Position, m or rad, from which a joint limit means no limit."""
 
 
 def _read_limits(limit: Element | None, kind: JointKind, where: str) -> JointLimits:
@@ -624,7 +626,7 @@ def _read_limits(limit: Element | None, kind: JointKind, where: str) -> JointLim
     if values["lower"] >= values["upper"]:
         raise RobotDescriptionError(
             f"The lower limit of {where} ({values['lower']}) is not below its upper limit "
-            f"({values['upper']}): it could not move; give it a range, or make it fixed."
+            f"({values['upper']}): it cannot move; give it a range, or make it fixed."
         )
     for name in ("lower", "upper"):
         if abs(values[name]) >= _NO_LIMIT:
@@ -654,8 +656,8 @@ def _require_mass(robot: RobotDescription) -> None:
         assert body.joint is not None
         if mass <= 0 and (body.joint.kind is JointKind.PRISMATIC or moment <= 0):
             raise RobotDescriptionError(
-                f"Joint '{body.joint.name}' moves link '{body.name}', which has no mass: "
-                "its motion would have no dynamics. Give it an <inertial> or make the joint fixed."
+                f"Joint '{body.joint.name}' moves link '{body.name}', which has no mass, so its "
+                "dynamics are undefined. Give it an <inertial> or make the joint fixed."
             )
 
 
@@ -672,7 +674,8 @@ _ELEMENTS_READ = {
 """Tags of the elements to read, by the tag of their parent; other elements are ignored."""
 
 _EXACT_ELEMENTS = ("origin", "mimic")
-"""Elements with optional attributes: an unknown attribute is a slip and would change the robot."""
+"""Elements with optional attributes: an unknown attribute is an error and would change the
+robot."""
 
 _GEOMETRIES = ("box", "cylinder", "sphere", "capsule", "mesh")
 _ACCEPTED_GEOMETRIES = [[name] for name in _GEOMETRIES]
@@ -711,8 +714,10 @@ _ATTRIBUTES = {
         _Attribute("upper", 1, "m or rad", needed=False),
     ),
     "mimic": (
-        _Attribute("joint", 0, "the name of the joint that it follows"),
-        _Attribute("multiplier", 1, "its position per position of the leading joint", needed=False),
+        _Attribute("joint", 0, "the name of the joint to follow"),
+        _Attribute(
+            "multiplier", 1, "ratio of its motion to that of the leading joint", needed=False
+        ),
         _Attribute("offset", 1, "m or rad", needed=False),
     ),
     "box": (_Attribute("size", 3, "m"),),
@@ -751,7 +756,7 @@ def _checked_root(text: str) -> Element:
         raise RobotDescriptionError(
             "The robot description is not valid URDF but "
             f"{_OTHER_FORMATS.get(root.tag, 'something else')}: its root element is <{root.tag}>, "
-            "and that of a URDF is <robot>. Export or convert it to URDF."
+            "but a URDF has the root element <robot>. Export or convert it to URDF."
         )
     for element in [root, *root.findall("link"), *root.findall("joint")]:
         unused = {child.tag for child in element} - set(_ELEMENTS_READ[element.tag])
@@ -763,8 +768,8 @@ def _checked_root(text: str) -> Element:
             if form not in _ACCEPTED_GEOMETRIES:
                 warn_once(
                     f"A <collision> of link '{link.get('name', '')}' is "
-                    f"{f'a <{form[0]}>' if form else 'empty'}, which is not read: give it one of "
-                    f"{', '.join(f'<{name}>' for name in _GEOMETRIES)}."
+                    f"{f'a <{form[0]}>' if form else 'empty'}, which is not supported: give it "
+                    f"one of {', '.join(f'<{name}>' for name in _GEOMETRIES)}."
                 )
                 link.remove(collision)
     ignored = {
@@ -776,8 +781,8 @@ def _checked_root(text: str) -> Element:
     if ignored:
         warn_once(
             f"The limits of {' and '.join(sorted(ignored))} in the URDF of "
-            f"'{root.get('name', '')}' are ignored; enforced are those of position, velocity and "
-            "effort."
+            f"'{root.get('name', '')}' are ignored; only position, velocity and effort limits are "
+            "enforced."
         )
     if not root.get("name"):
         raise _MalformedError("the <robot> has no name", '<robot name="...">')
@@ -819,8 +824,8 @@ def _require_type(joint: Element, where: str) -> None:
     if kind not in _JOINT_TYPES:
         raise RobotDescriptionError(
             f"The type of {where} is '{kind}'; a free-floating tree has "
-            f"{', '.join(_JOINT_TYPES[:-1])} and {_JOINT_TYPES[-1]} joints. The base floats by "
-            "itself: remove a joint that connects it to a world, and the link of that world."
+            f"{', '.join(_JOINT_TYPES[:-1])} and {_JOINT_TYPES[-1]} joints. The base floats "
+            "freely: remove any joint that connects it to a world, and that world's link."
         )
 
 
@@ -862,7 +867,7 @@ def _require_geometry(geometry: Element, where: str) -> None:
 def _require_attribute(element: Element, attribute: _Attribute, where: str) -> None:
     given = element.get(attribute.name)
     count = attribute.count
-    numbers = {0: "", 1: "a number, "}.get(count, f"{count} numbers separated by blanks, ")
+    numbers = {0: "", 1: "a number, "}.get(count, f"{count} numbers separated by spaces, ")
     remedy = f'<{element.tag} {attribute.name}="..."/>: {numbers}{attribute.meaning}'
     owner = f"the <{element.tag}> of {where}"
     if given is None:

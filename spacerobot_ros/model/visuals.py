@@ -1,8 +1,8 @@
-"""The visuals of a robot as triangles and sharp edges, for pictures, pages and the viewer.
+"""Robot visuals as triangles and sharp edges, for pictures, pages and the viewer.
 
 Pictures, pages and the viewer choose colours, cameras and backgrounds. Meshes come from files
-(:func:`meshes_from_files`) or from a bag (:func:`meshes_from_attachments`), into which a recorder
-writes the result of :func:`meshes_for_bag`; :class:`MeshFolder` writes them to files again.
+(:func:`meshes_from_files`) or from a bag (:func:`meshes_from_attachments`), to which a recorder
+adds the result of :func:`meshes_for_bag`; :class:`MeshFolder` writes them back to files.
 """
 
 from __future__ import annotations
@@ -36,10 +36,10 @@ _ROD_THICKNESS_RATIO = 0.05
 
 _SHARP_EDGE_COSINE = math.cos(math.radians(30.0))
 _MAX_FACES_IN_BAG = 20_000
-"""Largest number of faces of a mesh in a bag: 1 MB."""
+"""Largest number of mesh faces in a bag: 1 MB."""
 
 _BALL_RADIUS, _BAR_RADIUS = 0.05, 0.02
-"""Radii of the balls and bars that stand for the links and joints of a robot without visuals, m."""
+"""Radii of the balls and bars that represent the links and joints of a robot without visuals, m."""
 
 _BOX_FACES = (
     *((0, 1, 3), (0, 3, 2), (4, 6, 7), (4, 7, 5), (0, 4, 5), (0, 5, 1)),
@@ -49,7 +49,7 @@ _BOX_FACES = (
 
 @dataclass(frozen=True)
 class Edges:
-    """Lines (K, 2, 3), and the normals of the two faces adjacent to each (K, 2, 3)."""
+    """Line segments (K, 2, 3), and the normals of the two faces adjacent to each (K, 2, 3)."""
 
     lines: Array
     normals: Array
@@ -57,18 +57,18 @@ class Edges:
 
 @dataclass(frozen=True)
 class Visual:
-    """One solid or mesh of a robot.
+    """A solid or mesh of a robot.
 
     Attributes
     ----------
     link
         Name of its link.
     body
-        Index of the body that the link is part of; 0: the base.
+        Index of the body that contains the link; 0: the base.
     shape
-        Its description in the URDF.
+        Its URDF description.
     mesh
-        Its triangles in the frame of the link.
+        Its triangles in the link frame.
     """
 
     link: str
@@ -78,7 +78,7 @@ class Visual:
 
     @cached_property
     def edges(self) -> Edges:
-        """Sharp edges in the frame of the link; a rod has none."""
+        """Sharp edges in the link frame; a rod has none."""
         none = np.empty((0, 2, 3))
         return Edges(none, none) if self.is_rod else sharp_edges(self.mesh)
 
@@ -90,7 +90,8 @@ class Visual:
 
     @property
     def outline(self) -> Array:
-        """Outline of the visual in the link's frame, lines (K, 2, 3), which hide no other part."""
+        """Outline of the visual in the link frame, line segments (K, 2, 3), which hide no other
+        part."""
         shape = self.shape
         if self.is_rod:
             longest = int(np.argmax(shape.size))
@@ -108,18 +109,18 @@ class Visual:
 def visuals_of(
     robot: RobotDescription, meshes: Mapping[str, TriangleMesh], most: int
 ) -> tuple[Visual, ...]:
-    """Return all visuals of a robot that can be drawn.
+    """Return all drawable visuals of a robot.
 
-    If there are none, links are drawn as balls and offsets of joints as bars.
+    If there are none, links are drawn as balls and joint offsets as bars.
 
     Parameters
     ----------
     robot
         The robot.
     meshes
-        Triangles of meshes by their URIs, in their own frames; other meshes are omitted.
+        Mesh triangles by URI, in the mesh frames; other meshes are omitted.
     most
-        Largest number of faces of a mesh; finer ones are simplified.
+        Largest number of faces per mesh; finer meshes are simplified.
     """
     found = []
     for link in robot.links:
@@ -151,7 +152,7 @@ def _stand_in_visuals(robot: RobotDescription) -> tuple[Visual, ...]:
 
 
 def solid_mesh(shape: Shape) -> TriangleMesh:
-    """Return the triangles of a box, cylinder, sphere or capsule in the frame of its link."""
+    """Return the triangles of a box, cylinder, sphere or capsule in its link frame."""
     match shape.kind:
         case "box":
             mesh = TriangleMesh(_box_corners() * np.array(shape.size) / 2, np.array(_BOX_FACES))
@@ -193,7 +194,7 @@ def _surface_of_revolution(radii: list[float], heights: Array) -> TriangleMesh:
 
 
 def sharp_edges(mesh: TriangleMesh) -> Edges:
-    """Return the edges of a mesh at which its surface bends by more than 30 degrees, or ends."""
+    """Return the edges of a mesh where its surface bends by more than 30 degrees or ends."""
     a, b, c = np.moveaxis(mesh.vertices[mesh.faces], 1, 0)
     normals = np.cross(b - a, c - a)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
@@ -216,14 +217,14 @@ _ATTACHMENT_PREFIX = "mesh/"
 def meshes_from_files(
     robot: RobotDescription, most: int, on_error: Callable[[str], None] = lambda message: None
 ) -> dict[str, TriangleMesh]:
-    """Return the meshes of a robot that can be read on this machine, by their URIs.
+    """Return a robot's meshes that can be read on this machine, by URI.
 
     Parameters
     ----------
     robot
         The robot.
     most
-        Largest number of faces of a mesh; finer ones are simplified.
+        Largest number of faces per mesh; finer meshes are simplified.
     on_error
         Called with a message about each mesh that cannot be read.
     """
@@ -238,7 +239,7 @@ def meshes_from_files(
 
 
 def meshes_for_bag(robot: RobotDescription) -> dict[str, bytes]:
-    """Return the meshes of a robot for a bag, by attachment name, as STL of at most 1 MB each."""
+    """Return a robot's meshes for a bag, by attachment name, as STL of at most 1 MB each."""
     meshes = meshes_from_files(robot, _MAX_FACES_IN_BAG)
     return {f"{_ATTACHMENT_PREFIX}{resource}": stl_of(mesh) for resource, mesh in meshes.items()}
 
@@ -246,9 +247,9 @@ def meshes_for_bag(robot: RobotDescription) -> dict[str, bytes]:
 def meshes_from_attachments(
     robot: RobotDescription, attachments: Mapping[str, bytes]
 ) -> dict[str, TriangleMesh]:
-    """Return the meshes of a robot that are among the attachments of a bag, by their URIs.
+    """Return a robot's meshes that are attached to a bag, by URI.
 
-    No file is read, because an untrusted bag may name any file of this machine.
+    No file is read, because an untrusted bag may name any file on this machine.
     """
     found = {}
     for resource in _mesh_uris(robot):
@@ -261,12 +262,12 @@ def meshes_from_attachments(
 
 
 class MeshFolder:
-    """A folder with the meshes of a bag that this machine lacks, for programs that read files.
+    """A folder with meshes from a bag that are not on this machine, for programs that read files.
 
     Parameters
     ----------
     attachments
-        Attachments of the bag, as returned by :func:`meshes_for_bag`.
+        Bag attachments, as returned by :func:`meshes_for_bag`.
 
     Raises
     ------
@@ -280,7 +281,7 @@ class MeshFolder:
         self._files: dict[str, Path | None] = {}
 
     def urdf_with_mesh_files(self, urdf: str) -> str:
-        """Return the URDF text in which meshes that only the bag has are files of this folder.
+        """Return the URDF with meshes that exist only in the bag replaced by files in this folder.
 
         Other meshes keep their names.
         """
@@ -310,7 +311,7 @@ class MeshFolder:
 
 
 def has_meshes(attachments: Mapping[str, bytes]) -> bool:
-    """Whether a mesh is among the attachments of a bag."""
+    """Whether a mesh is attached to a bag."""
     return any(name.startswith(_ATTACHMENT_PREFIX) for name in attachments)
 
 

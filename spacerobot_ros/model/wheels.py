@@ -1,17 +1,18 @@
 """Reaction wheels: bodies of revolution on the base that spin about their axes.
 
-A wheel is the child of a continuous joint with the element ``<wheel/>``, whose ``<limit>`` has its
-largest rate and torque. Since it is a body of revolution, its angle changes nothing; only its spin
+A wheel is the child of a continuous joint with the element ``<wheel/>``, whose ``<limit>`` gives
+the largest rate and torque. Since it is a body of revolution, its angle changes nothing; only its
+spin
 matters. With ``A`` (3, k) the axes in base components, ``J`` (k,) the moments of inertia about them
 and the spins ``h = J (A' omega + qdot_w)`` (k,), the momenta of the wheels about their axes in
-inertial space, base and arm obey the equations of a robot without wheels (a gyrostat)
+inertial space, the base and the arm obey the equations of a robot without wheels (a gyrostat)
 
     M(q) z0ddot + C(q, z0dot) = Q,    base torque n = n_thrusters - A tau_w - omega x (A h),    (1)
     hdot = tau_w,                                                                              (2)
 
 where M has the wheels' masses but not their moments J about their axes (Hughes, Spacecraft Attitude
-Dynamics, chapter 3). So a law for base and arm also works for a robot with wheels, which realise a
-part of its base torque.
+Dynamics, chapter 3). So a control law for the base and the arm also works for a robot with wheels,
+which produce part of its base torque.
 """
 
 from __future__ import annotations
@@ -28,17 +29,17 @@ from spacerobot_ros.model.description import Array, Body, JointKind, RobotDescri
 _MAX_OFFSET = 1e-4  # m, of the centre of mass from the axis
 
 _MOMENTUM_ROUNDING, _LEAST_MOMENTUM = 1e-9, 1e-12
-"""Largest angular momentum left to the base by the wheels, relative and in kg m^2/s."""
+"""Largest angular momentum that the wheels may leave to the base, relative and in kg m^2/s."""
 
 _REST_SHARE = 1e-9
 
 _MAX_ASYMMETRY = 1e-3
-"""Largest difference of a wheel's inertia from that of a body of revolution, relative."""
+"""Largest relative deviation of a wheel's inertia from that of a body of revolution."""
 
 
 @dataclass(frozen=True)
 class ReactionWheels:
-    """The k wheels of a robot, in the order of its coordinates q.
+    """The k wheels of a robot, in coordinate order.
 
     Attributes
     ----------
@@ -47,15 +48,15 @@ class ReactionWheels:
     names
         Names of their joints.
     index
-        (k,) their coordinates in q.
+        (k,) wheel coordinates in q.
     other
-        (n - k,) the coordinates of the other joints.
+        (n - k,) coordinates of the other joints in q.
     axes_B
-        (3, k) unit vectors of their axes, base components.
+        (3, k) unit vectors of the wheel axes, base components.
     inertia
-        (k,) moments of inertia about them, kg m^2.
+        (k,) moments of inertia about the axes, kg m^2.
     rate, torque
-        (k,) largest rates relative to the base, rad/s, and torques of their motors, N m.
+        (k,) largest rates relative to the base, rad/s, and motor torques, N m.
     """
 
     description: RobotDescription
@@ -69,7 +70,7 @@ class ReactionWheels:
 
     @classmethod
     def of(cls, description: RobotDescription) -> ReactionWheels:
-        """Return the wheels of a robot; it may have none."""
+        """Return the wheels of a robot, which may have none."""
         names = description.wheel_names
         joints = list(description.joint_names)
         index = np.array([joints.index(name) for name in names], dtype=np.int64)
@@ -99,9 +100,9 @@ class ReactionWheels:
     def rates_for(
         self, L_B: Array, near: Array | None = None, largest: Array | None = None
     ) -> Array:
-        """Return rates (k,), rad/s, at which the wheels store an angular momentum while base and
-        arm rest. For redundant wheels they are nearest to ``near``, or the smallest ones within the
-        limits.
+        """Return rates (k,), rad/s, at which the wheels store an angular momentum while the base
+        and the arm are at rest. For redundant wheels, these are nearest to ``near``, or the
+        smallest within the limits.
 
         Parameters
         ----------
@@ -110,12 +111,12 @@ class ReactionWheels:
         near
             (k,) preferred rates of redundant wheels, rad/s; None: zero.
         largest
-            (k,) largest rates, rad/s; None: those of the wheels.
+            (k,) largest rates, rad/s; None: the wheel limits.
 
         Raises
         ------
         UnreachableError
-            No rates within the limits suffice; the message is a clause that says why.
+            No rates within the limits store it; the message is a clause that says why.
         """
         rate = self.rate if largest is None else largest
         near = np.zeros(len(self)) if near is None else near
@@ -154,7 +155,7 @@ class ReactionWheels:
 
     @cached_property
     def gyrostat(self) -> RobotDescription:
-        """The robot of eq. (1): its joints are the others, and the wheels are parts of the base
+        """The robot of eq. (1): it has only the other joints, and the wheels are part of the base,
         without moments of inertia about their axes.
         """
         links = {link.name: link for link in self.description.links}
@@ -170,12 +171,12 @@ class ReactionWheels:
 
 
 def require_reaction_wheels(robot: RobotDescription) -> None:
-    """Check that wheels are bodies of revolution on the base with limits.
+    """Check that wheels are bodies of revolution, mounted on the base, with limits.
 
     Raises
     ------
     RobotDescriptionError
-        A wheel is not; the message names its joint.
+        A wheel is invalid; the message names its joint.
     """
     followed = {joint.mimic.joint for joint in robot.moving_joints if joint.mimic is not None}
     parents = {body.parent for body in robot.bodies}
@@ -190,14 +191,14 @@ def require_reaction_wheels(robot: RobotDescription) -> None:
             flaw = "is coupled to another joint by <mimic>: a wheel spins independently"
         elif body.parent != 0:
             flaw = (
-                f"is on link '{robot.bodies[body.parent].name}', which joints move: a reaction "
-                "wheel is on the base; without <wheel> it is an ordinary joint"
+                f"is on link '{robot.bodies[body.parent].name}', which moves: a reaction wheel "
+                "must be on the base; without <wheel> it is an ordinary joint"
             )
         elif number in parents:
             flaw = "carries a joint: a reaction wheel cannot carry joints"
         elif not (0 < joint.limits.velocity < np.inf and 0 < joint.limits.effort < np.inf):
             flaw = (
-                "has no limits of rate and torque: give it "
+                "has no rate and torque limits: give it "
                 '<limit velocity="..." effort="..."/> in rad/s and N m'
             )
         else:
@@ -221,7 +222,7 @@ def _imbalance_clause(body: Body) -> str:
     symmetric = across * np.eye(3) + (spin - across) * np.outer(axis, axis)
     if np.abs(inertia.about_com - symmetric).max() > _MAX_ASYMMETRY * max(spin, across):
         return (
-            "is not balanced: its inertia is not that of a body of revolution about its axis; "
+            "is not balanced: its inertia is not rotationally symmetric about its axis; "
             "give it equal moments across the axis, and no products of inertia"
         )
     return ""

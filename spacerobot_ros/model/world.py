@@ -1,8 +1,7 @@
-"""Obstacles that are fixed in the world.
+"""Obstacles fixed in the world.
 
-The URDF text of a robot carries the obstacles around it as an element ``<world>`` with the URDF of
-the obstacles inside, which other URDF readers ignore. So nodes and bags need only the text of the
-robot.
+A robot's URDF contains the obstacles around it in an element ``<world>``, which holds the URDF of
+the obstacles and is ignored by other URDF readers. So nodes and bags need only the robot's URDF.
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ from spacerobot_ros.model.urdf import parse_world, require_found_meshes
 
 
 def with_world(robot: RobotDescription, world: RobotDescription | None) -> RobotDescription:
-    """Return a robot with the obstacles of a world (:func:`.load_world`) instead of its own.
+    """Return a robot with its obstacles replaced by those of a world (:func:`.load_world`).
 
     If the world is None, there are no obstacles.
     """
@@ -32,15 +31,14 @@ def with_world(robot: RobotDescription, world: RobotDescription | None) -> Robot
 
 
 def obstacles_from_topic(text: str) -> RobotDescription | None:
-    """Return the obstacles of a text on the topic ``obstacles``; None if it is empty.
+    """Return the obstacles from a string on the topic ``obstacles``; None if it is empty.
 
-    The text is plain URDF: nothing in it is expanded.
+    The string is plain URDF: nothing in it is expanded.
 
     Raises
     ------
     RobotDescriptionError
-        It has an element ``<world>`` or a mesh that is not found, or :func:`.parse_world` refuses
-        it.
+        The string has an element ``<world>`` or a missing mesh, or :func:`.parse_world` rejects it.
     """
     if not text.strip():
         return None
@@ -54,5 +52,5 @@ def obstacles_from_topic(text: str) -> RobotDescription | None:
 
 
 def links_with_shapes(world: RobotDescription) -> list[str]:
-    """Return the names of the links that are obstacles: those with a shape."""
+    """Return the names of the obstacle links, which are those with a shape."""
     return [each.name for each in world.links if each.collisions or each.shapes]

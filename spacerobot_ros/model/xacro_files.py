@@ -1,7 +1,7 @@
-"""Expands one xacro file, as a program: ``python xacro_files.py FILE SECONDS [NAME:=VALUE ...]``.
+"""Program that expands one xacro file: ``python xacro_files.py FILE SECONDS [NAME:=VALUE ...]``.
 
-The limits of time and memory guard against mistakes, such as a macro that calls itself. They do not
-confine the file: expressions of xacro are Python, so only files that the user names ``.xacro`` are
+The time and memory limits guard against mistakes, such as a macro that calls itself. They do not
+sandbox the file: xacro expressions are Python, so only files that the user names ``.xacro`` are
 expanded.
 
 Nothing of the package is imported here, so that it starts quickly.
@@ -16,13 +16,13 @@ from pathlib import Path
 from xml.etree.ElementTree import ParseError, parse
 
 _MAX_MEMORY = 2**30
-"""Limit of the address space, bytes."""
+"""Address space limit, bytes."""
 
 
 def package_around(name: str, folder: Path) -> Path | None:
-    """Return the folder of the package around ``folder``, or of a package next to it, by its name.
+    """Return the folder of the package around ``folder``, or of a package next to it, by name.
 
-    The name of a package is that in its ``package.xml``, or else that of its folder. None: no such
+    The package name is taken from ``package.xml``, or else from the folder. None: no such
     package.
     """
     folder = folder.resolve()
@@ -45,10 +45,10 @@ def _package_name(folder: Path) -> str:
 
 
 def main(file: str, seconds: int, arguments: Sequence[str]) -> int:
-    """Print the URDF text of a xacro file; return 1 with a reason on standard error if refused.
+    """Print the URDF from a xacro file; on failure print the reason to standard error and return 1.
 
     ``$(find NAME)`` finds the package around the file without a ROS environment.
-    ``seconds`` is the limit of processor time, ``arguments`` are those of the file, NAME:=VALUE.
+    ``seconds`` is the CPU time limit; ``arguments`` for the file are NAME:=VALUE.
     """
     resource.setrlimit(resource.RLIMIT_CPU, (seconds, seconds + 1))
     resource.setrlimit(resource.RLIMIT_AS, (_MAX_MEMORY, _MAX_MEMORY))

@@ -277,7 +277,7 @@ def test_what_no_body_weighs_is_refused(described_sliders: SpaceRobot) -> None:
         described_sliders.with_inertial(nominal.scaled([1.0, 1.0, -0.1, 1.0]))
     broken = nominal.inertias.copy()
     broken[0] = np.diag([1.0, 1.0, 2.1])
-    with pytest.raises(RobotDescriptionError, match=r"base_link.*not that of a rigid body"):
+    with pytest.raises(RobotDescriptionError, match=r"base_link.*not physical"):
         described_sliders.with_inertial(InertialParameters(nominal.masses, nominal.centers, broken))
     with pytest.raises(RobotDescriptionError, match=r"mass_1.*not finite"):
         described_sliders.with_inertial(nominal.shifted(np.diag([0.0, np.nan, 0.0, 0.0])[:, :3]))

@@ -225,7 +225,7 @@ def test_draws_that_are_no_robot_and_no_number_end_no_other_flight() -> None:
     assert {row.outcome for row in lanes_of_none.values()} == {"error"}
     weightless = [row.reason for row in lanes.values() if not row.draw.values["mass"]]
     assert 0 < len(weightless) < 6
-    assert set(weightless) == {"The total mass of the robot is zero."}
+    assert set(weightless) == {"The total robot mass is zero."}
     assert {row.engine for row in lanes.values()} == {"lanes"}
 
 

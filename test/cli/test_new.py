@@ -245,7 +245,7 @@ def to_stops(lower: float, upper: float, kind: str = "revolute") -> list[tuple[s
         (to_stops(-12.6, 1.0), "'pin_1' ranges from -12.6 to 1 rad"),
         (to_stops(-1.0, 12.6), "'pin_1' ranges from -1 to 12.6 rad"),
         (to_stops(-1.0, 20.0, "prismatic"), None),
-        ([("</robot>", PLATE)], "The inertia of link 'plate' is not that of a rigid body"),
+        ([("</robot>", PLATE)], "The inertia of link 'plate' is not physical"),
         ([meshes("a.stl")], "The mesh 'a.stl' was not found"),
         ([meshes("b.stl", "a.stl")], "The mesh 'b.stl' and 1 more was not found"),
         ([meshes("c.stl", "b.stl", "a.stl")], "The mesh 'c.stl' and 2 more was not found"),

@@ -284,5 +284,5 @@ def test_bad_numbers_are_refused(bad: tuple[Array, Array, float]) -> None:
     with pytest.raises(ParameterError) as refused:
         relative_motion(0.1, *bad)
     assert str(refused.value) == (
-        "Position, velocity and times of a relative motion must be finite."
+        "The position, velocity and times of a relative motion must be finite."
     )

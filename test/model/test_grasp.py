@@ -220,7 +220,7 @@ def test_a_payload_survives_as_a_text() -> None:
     ],
 )
 def test_a_text_that_is_no_payload_is_refused(text: str) -> None:
-    with pytest.raises(RobotDescriptionError, match=r"^The text does not describe a held body: "):
+    with pytest.raises(RobotDescriptionError, match=r"^The string does not describe a payload: "):
         Payload.from_text(text)
 
 
@@ -228,7 +228,7 @@ def test_a_payload_of_an_unknown_link_is_refused() -> None:
     with pytest.raises(RobotDescriptionError) as error:
         Payload("hand", TUMBLER).attached_to(robot_named("planar_manipulator"))
     assert str(error.value) == (
-        "A body is held by the link 'hand', but robot 'planar_manipulator' has no such link; it "
+        "The payload is held by link 'hand', but robot 'planar_manipulator' has no such link; it "
         "has base_link, link_1, link_2, end_effector."
     )
 

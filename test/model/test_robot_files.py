@@ -71,7 +71,7 @@ def test_a_xacro_file_takes_its_arguments(
     assert caplog.messages[-1].endswith("its arguments are: mass. Did you mean 'mass'?")
     refused = CliRunner().invoke(main, ["--xacro-arg", "mass=42", "analyze", str(path)])
     assert refused.exit_code == 2
-    assert refused.stderr == "The xacro argument 'mass=42' is not NAME:=VALUE.\n"
+    assert refused.stderr == "The xacro argument 'mass=42' is not of the form NAME:=VALUE.\n"
 
 
 def test_a_xacro_file_that_cannot_be_expanded_is_refused(tmp_path: Path) -> None:
@@ -86,7 +86,7 @@ HEADING = ' xmlns:xacro="http://www.ros.org/wiki/xacro"'
 
 def test_xacro_in_a_urdf_file_and_in_a_text_is_not_expanded(tmp_path: Path) -> None:
     text = urdf(mass="${3 * 14}", attribute=HEADING)
-    with pytest.raises(RobotDescriptionError, match=r"name it probe\.xacro\.$"):
+    with pytest.raises(RobotDescriptionError, match=r"rename it to probe\.xacro\.$"):
         load_robot(file_with(tmp_path, text, "probe.urdf"))
     with pytest.raises(RobotDescriptionError, match=r"'value' of the <mass> of link 'hull' has"):
         parse_robot(text)
@@ -217,7 +217,7 @@ BROKEN = {
     ),
     "an arm without mass": (
         more(MASSLESS, joint("wrist", "arm", "tool")),
-        r"'wrist' moves link 'tool', which has no mass: .* <inertial> or make the joint fixed",
+        r"'wrist' moves link 'tool', which has no mass, .* <inertial> or make the joint fixed",
     ),
     "a point on a hinge": (
         more(TOOL.replace(SOME_INERTIA, NO_INERTIA), joint("wrist", "arm", "tool")),
@@ -243,7 +243,7 @@ BROKEN = {
     ),
     "an impossible inertia": (
         urdf(ixx="3"),
-        r"inertia of link 'arm' is not that of a rigid body: .* 1, 1 and 3 kg m\^2, .* Check units",
+        r"inertia of link 'arm' is not physical: .* 1, 1 and 3 kg m\^2, .* Check units",
     ),
     "five moments": (
         changed(' ixz="0"', "", 1),
@@ -321,7 +321,7 @@ BROKEN = {
     ),
     "a floating joint": (
         changed('"revolute"', '"floating"'),
-        r"type of joint 'elbow' is 'floating'; .* The base floats by itself: remove a joint",
+        r"type of joint 'elbow' is 'floating'; .* The base floats freely: remove any joint",
     ),
     "no parent": (
         changed('<parent link="hull"/>', ""),
@@ -342,7 +342,7 @@ BROKEN = {
     ),
     "a joint twice": (
         more(TOOL, joint("elbow", "arm", "tool")),
-        r"joint name 'elbow' is used twice; names are unique",
+        r"joint name 'elbow' is used twice; names must be unique",
     ),
     # The tree.
     "two parents": (
@@ -351,11 +351,11 @@ BROKEN = {
     ),
     "a ring": (
         more(joint("back", "arm", "hull")),
-        r"exactly one root link .* found: none\. Remove a joint of the ring",
+        r"exactly one root link .* found: none\. Remove a joint from the loop",
     ),
     "a ring beside the robot": (
         more(TOOL, joint("back", "tool", "tool")),
-        r"Link 'tool' is not connected to the root: its joints form a ring\. Remove one",
+        r"Link 'tool' is not connected to the root: its joints form a loop\. Remove one",
     ),
     "two roots": (
         more(TOOL, "</robot>"),
@@ -372,11 +372,11 @@ BROKEN = {
     ),
     "a follower that stands": (
         more(TOOL, joint("wrist", "arm", "tool", '<mimic joint="elbow" multiplier="0"/>')),
-        r"'wrist' mimics 'elbow' with the multiplier 0: it does not move; make it fixed",
+        r"'wrist' mimics 'elbow' with multiplier 0: it does not move; make it fixed",
     ),
     "a follower without a leader": (
         more(TOOL, joint("wrist", "arm", "tool", "<mimic/>")),
-        r"<mimic> of joint 'wrist' has no 'joint'; write <mimic joint=.*the joint that it follows",
+        r"<mimic> of joint 'wrist' has no 'joint'; write <mimic joint=.*the joint to follow",
     ),
     # Looks.
     "a cone": (
@@ -466,11 +466,11 @@ def test_what_a_link_is_welded_to_makes_up_for_its_inertia(tmp_path: Path) -> No
     """Antennas and mounts of many a public URDF have moments that no body has."""
     impossible = TOOL.replace(SOME_INERTIA, SOME_INERTIA.replace('ixx="1"', 'ixx="0.4"'))
     text = more(impossible.replace('izz="1"', 'izz="1.5"'), joint("mount", "arm", "tool"))
-    with pytest.raises(RobotDescriptionError, match="link 'tool' is not that of a rigid body"):
+    with pytest.raises(RobotDescriptionError, match="link 'tool' is not physical"):
         load_robot(file_with(tmp_path, text))
     fixed = text.replace('name="mount" type="revolute"', 'name="mount" type="fixed"')
     robot = load_robot(file_with(tmp_path, fixed))
-    found = [each for each in urdf_remarks(robot) if "not that of a rigid body" in each]
+    found = [each for each in urdf_remarks(robot) if "not physical" in each]
     assert found == [next(each for each in found if "'tool'" in each and "welded" in each)]
 
 

@@ -376,7 +376,7 @@ def test_a_node_has_the_world_of_its_parameter(tmp_path: Path) -> None:
     robot = robot_of(RobotConfig(robot_description=URDF, world=str(file)))
     assert robot is not None
     assert robot.description.world is not None
-    with pytest.raises(ParameterError, match=r"Parameter 'world' is refused: .* cannot be read"):
+    with pytest.raises(ParameterError, match=r"Parameter 'world' is invalid: .* cannot be read"):
         robot_of(RobotConfig(robot_description=URDF, world=str(tmp_path / "none.urdf")))
 
 
@@ -476,7 +476,7 @@ EVERYTHING = """<robot name="r">
         ("limit", "effort", 1, True, "N or N m"),
         ("limit", "lower", 1, False, "m or rad"),
         ("limit", "upper", 1, False, "m or rad"),
-        ("mimic", "multiplier", 1, False, "its position per position of the leading joint"),
+        ("mimic", "multiplier", 1, False, "ratio of its motion to that of the leading joint"),
         ("mimic", "offset", 1, False, "m or rad"),
         ("box", "size", 3, True, "m"),
         ("cylinder", "radius", 1, True, "m"),
@@ -486,7 +486,7 @@ EVERYTHING = """<robot name="r">
         ("color", "rgba", 4, True, "red, green, blue and opacity, from 0 to 1"),
         ("parent", "link", 0, True, "the name of a link"),
         ("child", "link", 0, True, "the name of a link"),
-        ("mimic", "joint", 0, True, "the name of the joint that it follows"),
+        ("mimic", "joint", 0, True, "the name of the joint to follow"),
         ("mesh", "filename", 0, True, "the file of the mesh"),
     ],
 )
@@ -502,7 +502,7 @@ def test_attributes_have_their_count_of_numbers(
             parse_robot(text)
         return str(refused.value)
 
-    numbers = {0: "", 1: "a number, "}.get(count, f"{count} numbers separated by blanks, ")
+    numbers = {0: "", 1: "a number, "}.get(count, f"{count} numbers separated by spaces, ")
     remedy = f'; write <{tag} {name}="..."/>: {numbers}{meaning}.'
     if needed:
         missing = refusal("")
@@ -550,13 +550,12 @@ def test_a_payload_is_welded_to_its_body() -> None:
         ({"inertias": np.diag([1.0, 1.0, 2.02])}, None),
         (
             {"inertias": np.diag([1.0, 1.0, 2.03])},
-            "The inertia of 'body_0' is not that of a rigid body: its principal moments "
-            "are 1, 1, 2.03 kg m^2.",
+            "The inertia of 'body_0' is not physical: its principal moments are 1, 1, 2.03 kg m^2.",
         ),
         (
             {"inertias": np.diag([-1e-9, 1.0, 1.0])},
-            "The inertia of 'body_0' is not that of a rigid body: its principal moments "
-            "are -1e-09, 1, 1 kg m^2.",
+            "The inertia of 'body_0' is not physical: its principal moments are -1e-09, 1, 1 kg "
+            "m^2.",
         ),
     ],
 )
@@ -569,5 +568,5 @@ def test_masses_that_no_body_has_are_refused(changed: dict[str, Array], sentence
         batch.require_physical(NAMES)
     assert str(refused.value) == sentence
     nothing = InertialParameters(0 * ARM_MASSES.masses, ARM_MASSES.centers, ARM_MASSES.inertias)
-    with pytest.raises(RobotDescriptionError, match=r"The total mass of the robot is zero\."):
+    with pytest.raises(RobotDescriptionError, match=r"The total robot mass is zero\."):
         nothing.require_physical(NAMES)

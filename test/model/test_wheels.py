@@ -100,20 +100,20 @@ PLACE = '<origin xyz="0 0 0.1"/>'
         ),
         (
             wheel("bad", PLACE, "<wheel/>"),
-            "The wheel 'bad' has no limits of rate and torque: give it "
+            "The wheel 'bad' has no rate and torque limits: give it "
             '<limit velocity="..." effort="..."/> in rad/s and N m.',
         ),
         (
             wheel("bad", PLACE, '<limit velocity="0" effort="1"/><wheel/>'),
-            "The wheel 'bad' has no limits of rate and torque",
+            "The wheel 'bad' has no rate and torque limits",
         ),
         (
             wheel("bad", PLACE, '<limit velocity="9" effort="0"/><wheel/>'),
-            "The wheel 'bad' has no limits of rate and torque",
+            "The wheel 'bad' has no rate and torque limits",
         ),
         (
             wheel("bad", PLACE, parent="elbow_body"),
-            "The wheel 'bad' is on link 'elbow_body', which joints move: a reaction wheel is on "
+            "The wheel 'bad' is on link 'elbow_body', which moves: a reaction wheel must be on "
             "the base; without <wheel> it is an ordinary joint.",
         ),
         (
@@ -127,11 +127,11 @@ PLACE = '<origin xyz="0 0 0.1"/>'
         ),
         (
             wheel("bad", PLACE, inertia=ROUND.replace('iyy="0.02"', 'iyy="0.021"')),
-            "The wheel 'bad' is not balanced: its inertia is not that of a body of revolution",
+            "The wheel 'bad' is not balanced: its inertia is not rotationally symmetric",
         ),
         (
             wheel("bad", PLACE, inertia=ROUND.replace('ixz="0"', 'ixz="0.001"')),
-            "The wheel 'bad' is not balanced: its inertia is not that of a body of revolution",
+            "The wheel 'bad' is not balanced: its inertia is not rotationally symmetric",
         ),
         (
             wheel("bad", PLACE) + wheel("next", PLACE, LIMIT, parent="bad_body"),

@@ -443,17 +443,17 @@ LEADING_JOINT = """<link name="slide"><inertial><mass value="1"/><inertia ixx="1
     [
         (
             {"target.grapple_frame": "handle"},
-            "The target 'block' has no link 'handle' to grasp; it has block, grapple: set "
+            "The target 'block' has no link 'handle' to grasp; its links are block, grapple: set "
             "parameter 'target.grapple_frame', or add the link.",
         ),
         (
             {"target.robot_description": JOINTED, "target.joint_positions": [0.1, 0.2]},
-            "The target is refused: 2 joint positions are given, and 'tumbler' has 1 joints: "
+            "The target is refused: 2 joint positions are given, but 'tumbler' has 1 joints: "
             "ring_mount.",
         ),
         (
             {"target.joint_positions": [0.1]},
-            "The target is refused: 1 joint positions are given, and 'block' has 0 joints.",
+            "The target is refused: 1 joint positions are given, but 'block' has 0 joints.",
         ),
         (
             {"target.robot": "planar_manipulator", "target.joint_positions": [9.0, 0.0]},
