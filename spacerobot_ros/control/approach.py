@@ -1,9 +1,9 @@
-"""The approach to a target: its start time and the reference of the end-effector.
+"""Approach to a target: start time and end-effector reference.
 
 The reference is a path relative to the grapple frame, whose motion is predicted from the target's
-torque-free motion (:mod:`spacerobot_ros.model.target_motion`). The path leads from the present pose
+torque-free motion (:mod:`spacerobot_ros.model.target_motion`). The path leads from the current pose
 to a standoff; there the end-effector moves with the grapple frame for a while, then closes in along
-a straight line in that frame. At contact both have the same pose and velocity.
+a straight line in that frame. At contact, both have the same pose and velocity.
 
 The approach starts at the earliest time for which the whole reference is within its limits and the
 arm can follow it, with the base fixed, within joint limits and joint rates.
@@ -42,29 +42,30 @@ _COARSE_STRIDE = 8
 _START_PERIOD = 1.0  # s
 
 _SHORTEST_PATH, _PATH_RATIO, _LONGEST_PATH = 4.0, 1.4, 60.0
-"""Shortest duration of a path to the standoff, ratio of two that are tried, and the longest, s."""
+"""Shortest duration of a path to the standoff, ratio of successive trials, and longest, s."""
 
 _CLOSING_SHARE = 0.5
-"""Share of the largest acceleration for closing in; the grapple frame's motion needs the rest."""
+"""Fraction of the acceleration limit used for closing in; the grapple frame's motion needs the
+rest."""
 
 _STANDOFF_FACTORS = (1.0, 2.0, 3.0)
-"""Factors of the given standoff distance that are tried if the target blocks the path."""
+"""Multiples of the standoff distance tried if the target blocks the path."""
 
 _MAX_BLOCKED_PATHS = 100
 
 _ARM_RATE_SHARE = 0.9
-"""Largest joint rates on an arm's path, as a share of their limits."""
+"""Largest joint rates along an arm path, as a fraction of their limits."""
 
 
 @dataclass(frozen=True)
 class ApproachOptions:
     """Parameters of the approach to a target."""
 
-    grapple_frame: str = parameter("grapple", "link of the target that the end-effector meets")
+    grapple_frame: str = parameter("grapple", "target link that the end-effector meets")
     standoff: tuple[float, ...] = parameter(
         (-0.3, 0.0, 0.0),
-        "position of the end-effector in the grapple frame before it closes in, along the axis of "
-        "the grasp",
+        "position of the end-effector in the grapple frame before it closes in, along the grasp "
+        "axis",
         unit="m",
         minimum=-100.0,
         maximum=100.0,
@@ -75,7 +76,7 @@ class ApproachOptions:
     )
     closing_speed: float = parameter(
         0.05,
-        "largest speed of the end-effector relative to the grapple frame as it closes in",
+        "largest end-effector speed relative to the grapple frame while closing in",
         unit="m/s",
         minimum=1e-4,
     )
@@ -87,39 +88,43 @@ class ApproachOptions:
     )
     clearance: float = parameter(
         0.02,
-        "smallest distance of base and arm from the target during the approach, and of the "
-        "end-effector's body up to the standoff; 0 disables the checks",
+        "smallest distance of the base and the arm from the target during the approach, and of "
+        "the end-effector body until the standoff; 0 disables the checks",
         unit="m",
         minimum=0.0,
         maximum=100.0,
     )
     detumble: str = parameter(
         "after",
-        "when the angular momentum of robot and target is removed: before the capture, by a "
+        "when the angular momentum of the robot and the target is removed: before the capture, by "
+        "a "
         "planned approach that leaves none (profile: planned); after it, by the task 'detumble'; "
-        "none: that task is left out",
+        "none: that task is skipped",
         choices=("before", "after", "none"),
     )
     timeout: float = parameter(
-        0.5, "age of the target's odometry at which the target is lost", unit="s", minimum=0.0
+        0.5,
+        "age of the target's odometry above which the target is considered lost",
+        unit="s",
+        minimum=0.0,
     )
 
 
 @dataclass(frozen=True)
 class ApproachPlan:
-    """Times of an approach, s since the state from which it was planned, and its paths.
+    """Paths and times of an approach, s since the state from which it was planned.
 
     Attributes
     ----------
     start
-        When the end-effector sets out.
+        Departure time of the end-effector.
     path_to_standoff, path_to_contact
-        Its paths relative to the grapple frame: to the standoff, and from there to contact.
+        Paths relative to the grapple frame: to the standoff, and from there to contact.
     standoff_time
         Time at the standoff, s.
     distance
-        Smallest distance between robot and target body on the way, m; infinite if nothing can
-        touch.
+        Smallest distance between the robot and the target body during the approach, m; infinite if
+        nothing can touch.
     """
 
     start: float
@@ -135,11 +140,11 @@ class ApproachPlan:
 
     @property
     def contact(self) -> float:
-        """Time at which the end-effector has the pose of the grapple frame, s."""
+        """Time at which the end-effector reaches the grapple frame, s."""
         return self.closing_time + self.path_to_contact.duration
 
     def relative(self, times: Array) -> RelativeMotionOverTime:
-        """Return the motion relative to the grapple frame at times (K,) from the start on."""
+        """Return the motion relative to the grapple frame at times (K,) from the start."""
         out = self.path_to_standoff.at(times - self.start)
         inward = self.path_to_contact.at(np.maximum(times - self.closing_time, 0.0))
         late = (times >= self.closing_time)[:, np.newaxis]
@@ -150,7 +155,7 @@ class ApproachPlan:
 
 
 class ArmReach:
-    """Whether an arm can follow motions of its end-effector with a fixed base.
+    """Checks whether an arm on a fixed base can follow end-effector motions.
 
     ``axes`` of the end-effector ``link`` are controlled; ``rates`` are the largest ones of the
     joints (n,).
@@ -160,7 +165,7 @@ class ArmReach:
         self, robot: SpaceRobot, link: str, axes: tuple[str, ...], state: ControlState, rates: Array
     ) -> None:
         self.base = Pose(matrix_from_quaternion(state.quaternion_WB), state.r_WB.copy())
-        """Pose of the base in W."""
+        """Base pose in W."""
         self._arm = FixedBaseArm(robot, link, self.base, axes)
         self._joint_names, self._rates = robot.joint_names, rates
         self.q = state.q.copy()
@@ -171,10 +176,10 @@ class ArmReach:
         return self._arm.nearest_shape(self.q, Pose(motion.R[k], motion.r[k]))[1]
 
     def shapes_along(self, motion: FrameMotion, period: float) -> tuple[Array, str]:
-        """Return the shapes (K, n) of the arm along a motion, from its present shape, and the
-        reason if it cannot follow; empty: it can.
+        """Return the arm shapes (K, n) along a motion, from the current shape, and the reason if
+        the arm cannot follow (else empty).
 
-        ``period`` is the time between two poses of the motion, s.
+        ``period`` is the time between successive poses of the motion, s.
         """
         q, shapes = self.q, np.empty((len(motion.r), len(self.q)))
         for k in range(len(motion.r)):
@@ -205,28 +210,28 @@ def plan_approach(
 ) -> ApproachPlan:
     """Return the approach with the earliest start.
 
-    If the target body is in the way, the end-effector avoids it: along a path that is short in W,
-    to the standoff or to one at two or three times the distance; or it starts later.
+    If the target body blocks the way, the end-effector avoids it by a path that is short in W, to
+    the standoff or to one at two or three times the distance, or by a later start.
 
     Parameters
     ----------
     target
         Predicted motion of the target.
     held
-        Reference of the end-effector before the approach; if it moves, the approach starts at once.
+        End-effector reference before the approach; if it moves, the approach starts immediately.
     options, limits
-        The standoff, and the limits of references in W.
+        The standoff, and reference limits in W.
     reach
         The arm.
     axes
-        Axes of the end-effector that are controlled.
+        Controlled end-effector axes.
     clearance
-        Distances from the target body; None: the body is unknown.
+        Distances from the target body; None if the body is unknown.
 
     Raises
     ------
     PlanningError
-        No approach starts within the horizon; the message names the limit that prevents it.
+        No approach can start within the horizon; the message names the limit that prevents it.
     """
     moving = bool(held.velocity.any() or held.angular_velocity.any())
     starts = np.arange(0.0, 0.0 if moving else options.horizon, _START_PERIOD)
@@ -383,7 +388,8 @@ class _RefusalReasons:
 
 @dataclass(frozen=True)
 class NearestLinks:
-    """The smallest distance in a motion, m, with its links of robot and target and its sample."""
+    """Smallest distance during a motion, m, with the robot link, the target link and the sample
+    index."""
 
     distance: float
     links: LinkPair
@@ -391,10 +397,10 @@ class NearestLinks:
 
 
 class TargetClearance:
-    """Distances between the links of a robot and of a target.
+    """Distances between robot links and target links.
 
-    Relative to the target, its body is a fixed obstacle. The collision checks therefore take the
-    target as the robot's world, and the base pose relative to the target.
+    Relative to the target frame, the target body is a fixed obstacle. The collision checks
+    therefore use the target as the robot's world, and the base pose relative to the target.
 
     ``link`` is that of the end-effector, whose rigid body may touch the target when closing in;
     ``grapple`` is the pose of the grapple frame in the frame T of the target, and ``least`` the
@@ -424,13 +430,12 @@ class TargetClearance:
         Parameters
         ----------
         base
-            Pose of the base in W, which is fixed.
+            Pose of the fixed base in W.
         shapes
             (K, n) joint positions, m or rad.
         grapple
             Motion of the grapple frame at the same times.
-        closes
-            First sample at which the end-effector closes in.
+        closes First sample of closing in.
         """
         geometry = self._geometry
         if not len(geometry.pairs):

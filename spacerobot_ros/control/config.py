@@ -1,4 +1,4 @@
-"""The parameters of coordinated control."""
+"""Parameters of coordinated control."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from spacerobot_ros.parameters import group, nonnegative, parameter, registered
 
 @dataclass(frozen=True)
 class ErrorMargin:
-    """Margin beyond twice the distance of a goal at which growing errors abort the goal."""
+    """Margin beyond twice the goal distance at which growing errors abort the goal."""
 
     position: float = nonnegative(
         1.0,
@@ -35,42 +35,40 @@ class ErrorMargin:
     )
 
     def as_errors(self) -> OutputErrors:
-        """Return the margins: infinite if 0, and for joints, which have their own limits."""
+        """Return the margins; those given as 0, and those of joints, are infinite."""
         return OutputErrors(self.position or math.inf, self.attitude or math.inf, math.inf)
 
 
 @dataclass(frozen=True)
 class ControllerConfig(CommanderConfig):
-    """Parameters of a controller: outputs, law, limits, and criteria for goals."""
+    """Parameters of a controller: outputs, law, limits, and goal criteria."""
 
     law: str = parameter("transposed_jacobian", "control law", choices=LAWS)
-    end_effector_frame: str = parameter(
-        "", "link of the end-effector; '': 'end_effector', if it exists"
-    )
+    end_effector_frame: str = parameter("", "end-effector link; '': 'end_effector', if it exists")
     base_outputs: str = parameter(
-        "", "axes of the base that are outputs: x y z rx ry rz; if all three are '': by the robot"
+        "", "base axes used as outputs: x y z rx ry rz; if all three are '': chosen from the robot"
     )
-    end_effector_outputs: str = parameter("", "axes of the end-effector that are outputs")
+    end_effector_outputs: str = parameter("", "end-effector axes used as outputs")
     joint_outputs: str = parameter("", "joints that are outputs")
     profile: str = parameter(
         "quintic",
-        "profile of references to goals; planned: within the available thrust, around obstacles",
+        "profile of goal references; planned: within the available thrust, around obstacles",
         choices=(*PROFILES, PlannedReference.name),
     )
     plan: PlannedOptions = group(PlannedOptions())
     motion: MotionLimits = group(MotionLimits())
     use_thrusters: bool = parameter(
         True,
-        "whether the base has thrusters; false: only reaction wheels rotate it, and its position "
-        "is not controlled",
+        "whether the base has thrusters; if false, only reaction wheels rotate it, and its "
+        "position is not controlled",
     )
-    max_force: float = nonnegative(0.0, "largest force of the thrusters; 0: no limit", "N")
-    max_torque: float = nonnegative(0.0, "largest torque of the thrusters; 0: no limit", "N m")
+    max_force: float = nonnegative(0.0, "largest thruster force; 0: no limit", "N")
+    max_torque: float = nonnegative(0.0, "largest thruster torque; 0: no limit", "N m")
     joint_rates: float = nonnegative(
-        1.0, "limit of the joint rates, as a share of the URDF's; 0: no limit", maximum=1000.0
+        1.0, "joint rate limit, as a fraction of the URDF limits; 0: no limit", maximum=1000.0
     )
     estimation_time: float = nonnegative(
-        1.0, "time for which the base is estimated while odom is missing", "s"
+        1.0, "longest time for which the base state is estimated while odom is missing", "s"
     )
     reference_timeout: float = nonnegative(
         1.0,
@@ -83,7 +81,7 @@ class ControllerConfig(CommanderConfig):
     )
     time_limit: float = nonnegative(
         0.0,
-        "time after which an unreached goal fails; 0: 300 s after the end of its reference",
+        "time after which an unreached goal fails; 0: 300 s after its reference ends",
         "s",
     )
     wheels: WheelOptions = group(WheelOptions())

@@ -1,4 +1,4 @@
-"""The controller without topics: goals, references, law, limits, and missing measurements."""
+"""Controller without topics: goals, references, law, limits, and missing measurements."""
 
 from __future__ import annotations
 
@@ -64,18 +64,18 @@ from spacerobot_ros.planning.core.cancellation import Cancellation, PlanningJob
 from spacerobot_ros.planning.methods.thrust.goals import Grapple
 
 _LONGEST_MOTION = 1e9
-"""Longest duration of a reference, s, as of the longest flights."""
+"""Longest duration of a reference, s, equal to that of the longest flights."""
 
 _BRAKE_RATE = 2.0
-"""Decay rate of joint motion when the base state is unknown, 1/s."""
+"""Decay rate of joint motion if the base state is unknown, 1/s."""
 
 
 _MAX_HELD_PERIODS = 20
-"""Longest gap between two commands, in control periods; longer gaps are jumps of time."""
+"""Longest gap between commands, in control periods; longer gaps are time jumps."""
 
 
 class Mode(str, Enum):
-    """Source of the base's state."""
+    """Source of the base state."""
 
     MEASURED = "measured"
     ESTIMATED = "estimated"
@@ -83,30 +83,31 @@ class Mode(str, Enum):
 
 
 class CoordinatedController:
-    """Controls spacecraft and arm together, with a command for every state.
+    """Controls spacecraft and arm together, with one command per state.
 
-    Until a goal is set, the robot holds the pose of its first state. A goal starts a new reference
-    profile from the present reference, for the base and the end-effector together.
+    Until a goal is set, the robot holds its pose in the first state. A goal starts a new reference
+    profile from the current reference, for the base and the end-effector together.
 
     Parameters
     ----------
     law
         The control law, with its outputs.
     limits
-        Limits of thrusters and joint efforts; the excess of a command over them is reported.
+        Thruster and joint effort limits; commands that exceed them are reported.
     rates
-        Limits of joint rates; the excess over them is reported as well.
+        Joint rate limits; commands that exceed them are also reported.
     profile, motion
-        Profile and limits of references; the thrust lowers accelerations further.
+        Reference profile and limits; the available thrust lowers accelerations further.
     control_period
-        Time between two commands, s.
+        Time between commands, s.
     estimation_time
         Longest time for which the base is estimated by integration when its measurements stop
-        (paper 4, section IV), s. After it the thrusters are off and the joints are brought to rest.
+        (paper 4, section IV), s. After that, the thrusters are off and the joints are brought to
+        rest.
     wheels
-        The reaction wheels, if the robot has any; the law's robot is then its gyrostat.
+        The reaction wheels, if the robot has any; the law then controls the robot's gyrostat.
     planner
-        Plans the references of goals; None: the profile is used.
+        Planner of goal references; if None, the profile is used.
     """
 
     def __init__(
@@ -130,7 +131,7 @@ class CoordinatedController:
         self._control_period, self._estimation_time = control_period, estimation_time
         self.mode = Mode.MEASURED
         self.profile: ReferenceProfile | None = None
-        """The profile of the present goals; None before the first state."""
+        """Profile of the current goals; None before the first state."""
         self._began = 0.0
         self._followed = Reference()
         self._sent: Actuation | None = None
@@ -155,7 +156,7 @@ class CoordinatedController:
             self.wheels.reset()
 
     def take_over_goals(self, other: CoordinatedController) -> None:
-        """Pursue the goals of another controller from now on."""
+        """Pursue another controller's goals from now on."""
         self.profile, self._began = other.profile, other._began
         self._followed, self.coming_to_rest = other._followed, other.coming_to_rest
 
@@ -173,10 +174,10 @@ class CoordinatedController:
         end_effector: PoseReference | None = None,
         joints: Array | None = None,
     ) -> None:
-        """Start towards new goals; a group without a new goal keeps its earlier one.
+        """Start towards new goals; a group without a new goal keeps its previous goal.
 
         If the end-effector has had no goal since the robot was held or brought to rest, the base
-        carries it and the arm keeps its shape. The integral of the errors is reset. The reference
+        carries it and the arm keeps its shape. The error integral is reset. The reference
         follows the profile; it is not planned.
         """
         motion = self.motion_to(time, state, base=base, end_effector=end_effector, joints=joints)
@@ -191,7 +192,8 @@ class CoordinatedController:
         end_effector: PoseReference | None = None,
         joints: Array | None = None,
     ) -> GoalMotion:
-        """Return the motion from the reference at a time to the goals of :meth:`set_goals`."""
+        """Return the motion from the reference at a given time to the goals of
+        :meth:`set_goals`."""
         if self.coming_to_rest:
             self.profile, self.coming_to_rest = None, False
         start = self.reference_at(time, state)
@@ -248,7 +250,7 @@ class CoordinatedController:
             raise PlanningError(
                 f"The reference to the goal would take {duration:.3g} s, and the longest is "
                 f"{_LONGEST_MOTION:g} s: choose a nearer goal, or raise motion.speed, "
-                "motion.acceleration or the limits of the thrusters."
+                "motion.acceleration or the thruster limits."
             )
 
     def _motion_within_limits(self, state: ControlState) -> MotionLimits:
@@ -294,31 +296,31 @@ class CoordinatedController:
         return PoseReference(pose[:3], pose[3:])
 
     def restart_motion(self, time: float, state: ControlState) -> None:
-        """Restart towards the present goals from the measured pose instead of the reference."""
+        """Restart towards the current goals from the measured pose instead of the reference."""
         profile, self.profile, self.coming_to_rest = self.profile, None, False
         start = self.reference_at(time, state)
         goal, carries = (start, True) if profile is None else (profile.goal, profile.carries)
         self._begin_motion(time, state, GoalMotion(start, goal, self._motion, carries))
 
     def hold_here(self, time: float, state: ControlState) -> None:
-        """Hold the measured pose and shape; the earlier reference is dropped."""
+        """Hold the measured pose and shape; the previous reference is dropped."""
         self.profile = None
         self.set_goals(time, state)
 
     def come_to_rest(self, law: Callable[[ControlState], Actuation] | None = None) -> None:
         """Bring the whole robot to rest, at any pose, until there is a new goal or reference.
 
-        ``law`` returns the command for a state, not limited; None:
+        ``law`` returns the unlimited command for a state; None:
         :meth:`.JointRateLimits.braking_command`.
         """
         self.coming_to_rest = True
         self._to_rest = law or self.joint_rate_limits.braking_command
 
     def detumbling(self, payload: Payload | None, torque_limit: float) -> Detumbling:
-        """Return the law that brings the robot to rest by its thrusters, wheels and joints.
+        """Return the law that brings the robot to rest with its thrusters, wheels and joints.
 
-        ``payload`` is the body that the robot holds, ``torque_limit`` the largest torque of the
-        grasp, N m; 0: no limit.
+        ``payload`` is the body that the robot holds, ``torque_limit`` the largest grasp torque, N
+        m; 0: no limit.
         """
         torque, wheels = self._limits.torque, self.wheels
         if wheels is not None:
@@ -334,22 +336,22 @@ class CoordinatedController:
         return Reference.present(self.law.robot, state, link)
 
     def shift_time(self, seconds: float) -> None:
-        """Shift the start of the reference by a jump of time (s)."""
+        """Shift the reference start by a time jump (s)."""
         self._began += seconds
 
     def follow(self, reference: Reference) -> None:
-        """Track an external reference at the next command; the profile serves all other groups."""
+        """Track an external reference at the next command; other groups follow the profile."""
         self._followed = reference
         self.coming_to_rest = False
 
     @property
     def followed_end_effector(self) -> PoseReference | None:
-        """External reference of the end-effector; None: the profile's."""
+        """External end-effector reference; None: the profile's."""
         return self._followed.end_effector
 
     @property
     def has_thrusters(self) -> bool:
-        """Whether a force acts on the base."""
+        """Whether a force can act on the base."""
         return self._limits.force > 0.0
 
     def command(
@@ -357,8 +359,8 @@ class CoordinatedController:
     ) -> Saturated:
         """Return the actuation at ``time`` (s), within limits.
 
-        ``measured`` is the state, or None if the base was not measured; ``q`` and ``qdot`` (n,) are
-        the joints, which are always measured.
+        ``measured`` is the state, or None without a base measurement; ``q`` and ``qdot`` (n,) are
+        the joint positions and rates, which are always measured.
 
         Raises
         ------
@@ -425,8 +427,8 @@ class CoordinatedController:
     def limits_expression(
         self, omega: ca.SX, q: ca.SX, qdot: ca.SX, actuation: ca.SX
     ) -> tuple[ca.SX, ca.SX]:
-        """Return the part of ``[f; n; tau]`` (6 + n,) within the actuators' limits, and whether the
-        limits of joint rates lower it further, which only :meth:`apply_limits` can do.
+        """Return the part of ``[f; n; tau]`` (6 + n,) within the actuator limits, and whether joint
+        rate limits lower it further, which requires :meth:`apply_limits`.
         """
         realised = self._limits.expression(actuation)
         return realised, self.joint_rate_limits.exceeds_limits_expression(omega, q, qdot, realised)
@@ -438,11 +440,11 @@ class CoordinatedController:
 
     @property
     def time_since_measurement(self) -> float:
-        """Time since the last measurement of the base, s."""
+        """Time since the last base measurement, s."""
         return self._estimator.elapsed if self._estimator is not None else 0.0
 
     def reference_moves(self, time: float) -> bool:
-        """Whether the reference still moves at ``time`` (s)."""
+        """Whether the reference is still moving at ``time`` (s)."""
         return self.profile is not None and not self.reference_at_rest(time)
 
     def time_until_blocked(self, time: float) -> float:
@@ -461,7 +463,7 @@ class CoordinatedController:
         return None if self.profile is None else self._began + self.profile.duration
 
     def errors(self) -> OutputErrors:
-        """Return the errors of the last command's outputs from the reference."""
+        """Return the errors of the last command's outputs relative to the reference."""
         worst, error = {"position": 0.0, "attitude": 0.0, "joints": 0.0}, self.law.error.tolist()
         for kind, places in self._distances:
             worst[kind] = max(worst[kind], math.hypot(*[error[i] for i in places]))
@@ -477,11 +479,11 @@ class CoordinatedController:
         return outputs.selection.distance(outputs.errors(state, goal))
 
     def error_bounds(self, margins: OutputErrors) -> Array:
-        """Return the errors (m,) of the outputs beyond which control is lost.
+        """Return the output errors (m,) beyond which control is lost.
 
-        Call it after the first command towards the present goals. The bound is the same for all
-        outputs of a kind: a margin (m, rad) plus twice the larger of two values: the distance of
-        the reference's motion, and the largest present error plus what its rate adds until it is
+        Call this after the first command towards the current goals. The bound is the same for all
+        outputs of a kind: a margin (m, rad) plus twice the larger of two values: the distance
+        covered by the reference, and the largest current error plus what its rate adds until it is
         damped.
         """
         assert self.profile is not None
@@ -558,14 +560,14 @@ class CoordinatedController:
 
 
 def build_controller(robot: SpaceRobot, config: ControllerConfig) -> CoordinatedController:
-    """Return the controller of a robot that a configuration describes.
+    """Return the controller for a robot, as described by a configuration.
 
-    The law of a robot with reaction wheels controls its gyrostat, without the wheels as joints.
+    If the robot has reaction wheels, the law controls its gyrostat, without the wheels as joints.
 
     Raises
     ------
     ParameterError
-        The robot does not have the selected outputs, or the law cannot drive them.
+        The robot does not have the selected outputs, or the law cannot control them.
     """
     law_type = LAWS[config.law]
     thrust = config.use_thrusters
@@ -614,7 +616,7 @@ def controlled_outputs(
 ) -> OutputSelection:
     """Return the outputs selected in a configuration, or the law's default outputs.
 
-    The robot is one without wheels, or its gyrostat.
+    The robot has no wheels, or is the gyrostat.
     """
     link = robot.description.end_effector(config.end_effector_frame)
     outputs = OutputSelection(
@@ -639,7 +641,7 @@ def _require_torque(
     name, turns = robot.description.name, [axis for axis in outputs.base if axis.startswith("r")]
     if len(turns) < len(outputs.base):
         raise ParameterError(
-            f"The position of the base of robot '{name}' cannot be controlled without thrusters "
+            f"The base position of robot '{name}' cannot be controlled without thrusters "
             "(use_thrusters is false): remove x, y and z from base_outputs."
         )
     rank = 0 if wheels is None else wheels.rank

@@ -1,8 +1,9 @@
 """Detumbling: brings a robot that has captured a target to rest without overloading its grasp.
 
-The torque ``n`` about the centre of mass changes the angular momentum ``L`` of robot and target at
-most at the rate ``n_max``; so no control brings it to zero in less than ``|L0| / n_max``. A torque
-of that size against ``L`` takes exactly this time, and leaves the direction of ``L`` in W
+The torque ``n`` about the centre of mass changes the angular momentum ``L`` of the robot and the
+target at a rate of at most ``n_max``; so no control brings it to zero in less than
+``|L0| / n_max``. A torque
+of that magnitude against ``L`` takes exactly this time, and leaves the direction of ``L`` in W
 unchanged.
 """
 
@@ -25,22 +26,22 @@ from spacerobot_ros.parameters import nonnegative, parameter
 
 @dataclass(frozen=True)
 class DetumbleOptions:
-    """Limit of the load on a grasp while a robot is brought to rest, and criteria for rest."""
+    """Limit on the grasp load while a robot is brought to rest, and criteria for rest."""
 
     grapple_torque_limit: float = nonnegative(
-        0.0, "largest torque of the grasp on the target; 0: no limit", "N m"
+        0.0, "largest grasp torque on the target; 0: no limit", "N m"
     )
     rate: float = parameter(
-        0.002, "largest rate of the base and of the joints at rest", "rad/s or m/s", minimum=1e-9
+        0.002, "largest base and joint rates considered to be at rest", "rad/s or m/s", minimum=1e-9
     )
     speed: float = parameter(
-        0.002, "largest speed of the centre of mass at rest", "m/s", minimum=1e-9
+        0.002, "largest centre-of-mass speed considered to be at rest", "m/s", minimum=1e-9
     )
     settle_time: float = nonnegative(1.0, "time at rest", "s")
 
 
 def shortest_detumbling(momentum: float, torque: float) -> float:
-    """Return ``|L0| / n_max``, s: no torque of that size detumbles in less time.
+    """Return ``|L0| / n_max``, s: no torque of that magnitude detumbles in less time.
 
     Parameters
     ----------
@@ -55,9 +56,9 @@ def shortest_detumbling(momentum: float, torque: float) -> float:
 
 
 def largest_feasible_share(start: Array, change: Array, limit: float) -> float:
-    """Return the largest share ``s`` in [0, 1] with ``|start + s change| <= limit``.
+    """Return the largest fraction ``s`` in [0, 1] with ``|start + s change| <= limit``.
 
-    If there is none, return the share with the smallest norm.
+    If there is none, return the fraction with the smallest norm.
     """
     square, along = float(change @ change), float(start @ change)
     if square == 0.0:
@@ -99,24 +100,24 @@ def _grasp_wrench(robot: SpaceRobot, payload: Payload) -> ca.Function:
 
 
 class Detumbling:
-    """Brings a robot to rest with a limited torque at its grasp.
+    """Brings a robot to rest with limited grasp torque.
 
-    Angular momentum is removed first, with the largest torque against it, then linear momentum with
+    Angular momentum is removed first, with the largest opposing torque, then linear momentum with
     the remaining thrust; joints are braked. If the grasp would be overloaded, the whole command is
-    scaled down and all three decay together.
+    scaled down, and all three motions decay together.
 
     Parameters
     ----------
     robot
-        The model, with the body that the robot holds; a gyrostat if there are wheels.
+        Robot model including the held body; a gyrostat if there are wheels.
     payload
-        That body; None: the torque of the grasp is not limited.
+        That body; None: the grasp torque is not limited.
     force, torque
-        Largest force of the thrusters, N, and torque on the base, N m; infinite: no limit.
+        Largest thruster force, N, and base torque, N m; infinite: no limit.
     torque_limit
-        Largest torque of the grasp, N m; 0: no limit.
+        Largest grasp torque, N m; 0: no limit.
     control_period
-        Time for which a command is held, s.
+        Duration for which a command is held, s.
     """
 
     def __init__(
@@ -133,7 +134,7 @@ class Detumbling:
         self._limit = torque_limit or math.inf
         self._grasp = None if payload is None else BufferedFunction(_grasp_wrench(robot, payload))
         self.largest_grasp_torque = 0.0
-        """Largest torque of the grasp due to a command, N m."""
+        """Largest grasp torque due to a command, N m."""
 
     def angular_momentum(self, state: ControlState) -> Array:
         """Return the angular momentum (3,) about the centre of mass, N m s, base components."""
@@ -141,12 +142,12 @@ class Detumbling:
         return np.asarray(H[3:6, 3:6] @ state.omega_WB_B + H[3:6, 6:] @ state.qdot)
 
     def velocity(self, state: ControlState) -> Array:
-        """Return the velocity (3,) of the centre of mass, m/s, base components."""
+        """Return the centre-of-mass velocity (3,), m/s, base components."""
         J = self._robot.jacobian(self._robot.base_link, state.q)
         return np.asarray(state.v_WB_B - J[:3, 3:6] @ state.omega_WB_B - J[:3, 6:] @ state.qdot)
 
     def command(self, state: ControlState) -> Actuation:
-        """Return the wrench of the base and the joint efforts."""
+        """Return the base wrench and the joint efforts."""
         robot, r = self._robot, self._rate
         H, J = robot.inertia_matrix(state.q), robot.jacobian(robot.base_link, state.q)
         v_cm = self.velocity(state)

@@ -1,4 +1,4 @@
-"""The executive of coordinated control: it accepts, pursues, decides, aborts and saves goals."""
+"""Executive of coordinated control: accepts, pursues, decides, aborts and saves goals."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ from spacerobot_ros.planning.execution.goal_file import (
 from spacerobot_ros.times import SECOND
 
 Output = ControllerStatus | Event | PursuedGoals
-"""Output of an executive, apart from its commands."""
+"""Output of an executive other than commands."""
 
 
 class _Next(IntEnum):
@@ -58,23 +58,23 @@ class _Next(IntEnum):
 class ControlExecutive:
     """Gives a :class:`CoordinatedController` its goals, and reports their outcome.
 
-    For every state the owner calls :meth:`command`, sends the result to the actuators, and then
-    calls :meth:`evaluate`. The state of the goal is one of
+    For every state, the owner calls :meth:`command`, sends the result to the actuators, and then
+    calls :meth:`evaluate`. The goal state is one of
 
     * ``WAITING``: the base has not been measured yet.
-    * ``HOLDING``: no goal was accepted; the robot holds the pose of its first state.
-    * ``TRACKING``: a goal is pursued; ``STALLED`` while the robot makes no progress
-      (:class:`.StallMonitor`). ``REACHED`` once all errors have stayed within the tolerances for
-      the settling time after the reference has come to rest; ``FAILED`` if that does not happen
+    * ``HOLDING``: no goal was accepted; the robot holds its pose in the first state.
+    * ``TRACKING``: a goal is being pursued; ``STALLED`` while the robot makes no progress
+      (:class:`.StallMonitor`). ``REACHED`` once all errors have stayed within tolerance for the
+      settling time after the reference has come to rest; ``FAILED`` if this does not happen
       within the time limit. In both cases the robot then holds the goal.
-    * ``ABORTED``: the goal was given up; the robot holds the pose of the next measured state. After
-      a loss of control (a joint moves far beyond its rate limit, or the errors of a goal grow
-      instead of shrinking), the robot is brought to rest instead.
+    * ``ABORTED``: the goal was given up; the robot holds its pose in the next measured state. After
+    a loss of control (a joint far exceeds its rate limit, or goal errors grow instead of
+    shrinking), the robot is brought to rest instead.
 
-    :class:`.GoalMonitor` decides about a goal.
+    :class:`.GoalMonitor` decides the outcome of a goal.
 
-    While the base is not measured, the reported state is ``ESTIMATING`` or ``STOPPED`` instead, and
-    the state of the goal stays as it is. ``REFUSED`` is reported for a single goal and is not a
+    While there is no base measurement, the reported state is ``ESTIMATING`` or ``STOPPED`` instead,
+    and the goal state does not change. ``REFUSED`` is reported for a single goal; it is not a goal
     state.
     """
 
@@ -83,10 +83,10 @@ class ControlExecutive:
         config = config.for_robot(controller.law.robot.description)
         self._config = self._goal_config = config
         self._goal_tolerance: Tolerance | None = None
-        """Tolerances of the present goal; None: the parameters'."""
+        """Tolerances of the current goal; None: the parameters'."""
         self.outputs: deque[Output] = deque()
         """Outputs to publish, in order; the owner removes published outputs. A status is added when
-        the state changes, when commands begin or cease to be limited, and every ``status_period``.
+        the state changes, when commands start or stop being limited, and every ``status_period``.
         """
         self.servicing = Servicing(config)
         self._planning = GoalPlanning(in_background=config.plan_in_background)
@@ -100,14 +100,14 @@ class ControlExecutive:
         """Time of the last state, s."""
         self._next = _Next.GO_ON
         self.plant_blocked = False
-        """Whether the plant ignores commands, set by the owner. If so, each command holds the pose
-        of its state, so that the robot does not move when the plant obeys again."""
+        """Whether the plant ignores commands, set by the owner. If so, each command holds the
+        current pose, so that the robot does not move when the plant accepts commands again."""
         self._abort_message = ""
         self._pending: dict[str, IdentifiedGoal] = {}
         """Accepted goals that wait for the next measured state."""
         self._goal_state = self._reported_state = ControllerState.HOLDING
         self._goals: dict[str, IdentifiedGoal] = {}
-        """Goals that are pursued together, by part of the robot."""
+        """Goals pursued together, by frame."""
         self._goal_id = ""
         """Id of the latest goal, which statuses carry."""
         self._watch = GoalWatch()
@@ -127,12 +127,13 @@ class ControlExecutive:
         self._planning.cancel()
 
     def plan_at_once(self) -> None:
-        """Make later plans synchronously: the plant is in lockstep, and states wait for them."""
+        """Compute later plans synchronously, because the plant is in lockstep and states wait for
+        them."""
         self._planning.in_background = False
 
     @property
     def plan_time(self) -> float:
-        """Total wall time of planning references, s."""
+        """Total wall time spent planning references, s."""
         return self._planning.time
 
     def configure(self, config: ControllerConfig) -> None:
@@ -151,7 +152,7 @@ class ControlExecutive:
 
     @property
     def state(self) -> ControllerState:
-        """The state that statuses report."""
+        """State reported in status messages."""
         mode = self.controller.mode
         if not self._was_measured:
             return ControllerState.WAITING
@@ -176,11 +177,11 @@ class ControlExecutive:
 
     @property
     def waiting_goals(self) -> frozenset[str]:
-        """Ids of the goals that begin at the next measured state, or after tasks."""
+        """Ids of goals that begin at the next measured state or after tasks."""
         return frozenset(goal.goal_id for goal in self._pending.values())
 
     def progress(self, goal_id: str) -> tuple[str, float | None]:
-        """Return the present activity for a goal, and the predicted time until its end, s."""
+        """Return the current activity for a goal, and the predicted time until it ends, s."""
         task, ends = self.servicing.task, self.controller.reference_ends
         if self._planning.active and goal_id in self.waiting_goals:
             return "planning", None
@@ -191,7 +192,7 @@ class ControlExecutive:
         return self.state.value, max(0.0, ends - self._time) + self._config.settle_time
 
     def submit(self, key: str, goal: IdentifiedGoal) -> None:
-        """Accept a goal of the ``base`` or the ``end_effector``, effective from the next state.
+        """Accept a goal for the ``base`` or the ``end_effector``, effective from the next state.
 
         The other frame keeps its goal.
 
@@ -202,7 +203,7 @@ class ControlExecutive:
             self._pending[part] = each
 
     def request(self, task: Task) -> None:
-        """Begin a task at the next measured state, without a goal after it."""
+        """Begin a task at the next measured state, without a subsequent goal."""
         self._requested = (task,)
 
     def refuse(self, message: str, goal_id: str = "") -> None:
@@ -210,12 +211,12 @@ class ControlExecutive:
         self._publish_decision(ControllerState.REFUSED, message, goal_id)
 
     def resume(self, saved: Mapping[str, IdentifiedGoal]) -> None:
-        """Accept the goals that an earlier controller saved.
+        """Accept goals saved by an earlier controller.
 
         Raises
         ------
         ParameterError
-            The goals belong to another robot or law; none is accepted.
+            The goals belong to another robot or law, and none is accepted.
         """
         try:
             for key, goal in saved.items():
@@ -223,13 +224,13 @@ class ControlExecutive:
         except PlanningError as error:
             self._pending.clear()
             raise ParameterError(
-                f"Parameter 'resume_file' holds goals of another robot or law: {error}"
+                f"Parameter 'resume_file' contains goals of another robot or law: {error}"
             ) from error
 
     def abort(self, why: str = "on request") -> str:
-        """Give up every goal; the robot holds the pose of the next measured state.
+        """Abort all goals; the robot holds its pose in the next measured state.
 
-        Returns a message about the robot.
+        Returns a message that describes the robot's reaction.
         """
         self._give_up(f"Aborted {why}; the robot holds.")
         self._next = _Next.ABORT
@@ -256,13 +257,13 @@ class ControlExecutive:
         self._watch.take_contacts(contacts, time, pursues=self._pursues)
 
     def on_plant_obeying(self) -> None:
-        """Hold the pose of the next measured state, not an earlier one."""
+        """Hold the pose in the next measured state, not an earlier pose."""
         self._plan_next(_Next.HOLD)
 
     def use_obstacles(self, world: RobotDescription | None) -> None:
         """Plan around other obstacles from now on; None: around none.
 
-        A plan in progress is restarted. If the rest of the present motion comes too close to an
+        A plan in progress is restarted. If the rest of the current motion comes too close to an
         obstacle, the motion is replanned: while moving if there is time, otherwise from a held
         pose.
         """
@@ -280,8 +281,8 @@ class ControlExecutive:
             self._pending = {**self._goals, **self._pending}
 
     def reference_ended(self, remaining: Reference) -> None:
-        """Continue with the remaining references: restart the goal, or hold the measured pose if
-        there is none."""
+        """Continue with the remaining references: restart the goal or, without a goal, hold the
+        measured pose."""
         self.controller.follow(remaining)
         self._begin_anew_or_hold()
 
@@ -302,10 +303,10 @@ class ControlExecutive:
     def use_controller(
         self, controller: CoordinatedController, payload: Payload | None = None
     ) -> None:
-        """Use another controller of the same outputs, because the robot's masses have changed.
+        """Use another controller with the same outputs, because the robot's masses have changed.
 
-        The goal restarts at the next measured state; without a goal the robot continues to hold.
-        ``payload`` is the body that the robot holds from now on.
+        The goal restarts at the next measured state; without a goal, the robot continues to hold.
+        ``payload`` is the body held from now on.
         """
         controller.take_over_goals(self.controller)
         self.controller = controller
@@ -344,7 +345,7 @@ class ControlExecutive:
     ) -> Saturated:
         """Return the actuation for a state; see :meth:`CoordinatedController.command`.
 
-        ``reference`` is a planner's reference for this state; groups that it lacks are held.
+        ``reference`` is a planner's reference for this state; groups not in it are held.
 
         Raises
         ------
@@ -392,14 +393,14 @@ class ControlExecutive:
         return Saturated(wheels.actuation(result.realised), excess)
 
     def dump_momentum(self) -> str:
-        """Dump the momentum of the reaction wheels and return a message, or raise CommandError."""
+        """Dump the reaction wheel momentum and return a message, or raise CommandError."""
         if self.controller.wheels is None:
             name = self.controller.law.robot.description.name
             raise CommandError(f"Robot '{name}' has no reaction wheels.")
         return self.controller.wheels.request_dump()
 
     def evaluate(self, time: float, result: Saturated) -> None:
-        """Evaluate the errors after the command ``result``, and report a change of state."""
+        """Evaluate the errors after the command ``result``, and report state changes."""
         if self.controller.wheels is not None:
             for event in self.controller.wheels.events():
                 self.outputs.append(event)

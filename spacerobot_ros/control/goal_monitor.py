@@ -1,6 +1,6 @@
-"""Monitor of a controller's goal (reached, failed or lost), in numbers or symbols.
+"""Monitor for a controller's goal (reached, failed or lost), with numbers or symbols.
 
-The executive evaluates the monitor with numbers, state by state; SIMD lanes compile the same
+The executive evaluates the monitor numerically, state by state; SIMD lanes compile the same
 methods with CasADi symbols. Conditions are therefore numbers, 1 or 0, combined by arithmetic:
 ``a * b`` is "a and b", ``1 - a`` is "not a".
 """
@@ -18,16 +18,17 @@ Scalar = Any
 """A number or a CasADi symbol."""
 
 LOST_RATE = 1.5
-"""Ratio of a joint's rate to its rate limit above which control of the joint is lost."""
+"""Ratio of joint rate to rate limit above which control of the joint is lost."""
 
 LOST_STATES = 3
-"""Consecutive states beyond a bound after which control is lost: one may be a bad measurement."""
+"""Number of consecutive states beyond a bound after which control is lost; a single one may be a
+bad measurement."""
 
 AUTOMATIC_TIME_LIMIT = 300.0
 """Time (s) from the end of the reference after which a goal without a time limit fails."""
 
 _ROUNDING = 1e-9
-"""Largest rounding error of a sum of control periods, s."""
+"""Largest rounding error in a sum of control periods, s."""
 
 _NOT_WITHIN_TOLERANCE = -1.0
 """Value of ``within_since`` while an error is beyond its tolerance."""
@@ -47,17 +48,17 @@ class Decision(IntEnum):
 
 @dataclass
 class GoalMonitor:
-    """Summary of the states since a goal began, from which its decision follows.
+    """Summary of the states since a goal began, used for the decision.
 
     Attributes
     ----------
     started
-        Start time of the goal, s.
+        Goal start time, s.
     within_since
-        Time since which every error has been within its tolerance and the reference at rest, s; -1
-        if not.
+        Time since which all errors have been within tolerance with the reference at rest, s; -1 if
+        they are not.
     fast_states, large_error_states
-        Numbers of consecutive states in which a joint was too fast, and an error beyond its bound.
+        Numbers of consecutive states with a joint too fast, and with an error beyond its bound.
     """
 
     started: Scalar = 0.0
@@ -66,7 +67,8 @@ class GoalMonitor:
     large_error_states: Scalar = 0
 
     def begin(self, time: Scalar) -> None:
-        """Begin a goal at a time (s); the count of states with too fast joints is kept."""
+        """Begin a goal at a given time (s); the count of states with excessive joint rates is
+        kept."""
         self.started, self.within_since, self.large_error_states = time, _NOT_WITHIN_TOLERANCE, 0
 
     def restart_settling(self) -> None:
@@ -74,28 +76,29 @@ class GoalMonitor:
         self.within_since = _NOT_WITHIN_TOLERANCE
 
     def shift_time(self, seconds: Scalar) -> None:
-        """Shift the start of the goal by a jump of time (s), and restart the settling time."""
+        """Shift the goal start by a time jump (s), and restart the settling time."""
         self.started += seconds
         self.restart_settling()
 
     def check_rates(self, largest_share: Scalar) -> Scalar:
-        """Count a state whose largest joint rate, as a share of that joint's limit, is too high.
+        """Count a state whose largest joint rate, as a fraction of its limit, is too high.
 
-        Returns whether joints were beyond :data:`LOST_RATE` in :data:`LOST_STATES` states.
+        Returns whether joints exceeded :data:`LOST_RATE` in :data:`LOST_STATES` states.
         """
         self.fast_states = (largest_share > LOST_RATE) * (self.fast_states + 1)
         return self.fast_states >= LOST_STATES
 
     def check_errors(self, largest_share: Scalar) -> Scalar:
-        """Count a state whose largest error, as a share of its bound, is too large.
+        """Count a state whose largest error, as a fraction of its bound, is too large.
 
-        Returns whether errors were beyond their bounds in :data:`LOST_STATES` states.
+        Returns whether errors exceeded their bounds in :data:`LOST_STATES` states.
         """
         self.large_error_states = (largest_share > 1.0) * (self.large_error_states + 1)
         return self.large_error_states >= LOST_STATES
 
     def is_late(self, time: Scalar, ends: Scalar, config: ControllerConfig) -> Scalar:
-        """Whether a goal is late at a time (s); its reference ``ends`` at another time (s)."""
+        """Whether a goal is late at a given time (s); ``ends`` is the end time (s) of its
+        reference."""
         if config.time_limit:
             return time - self.started >= config.time_limit - _ROUNDING
         return time - ends >= AUTOMATIC_TIME_LIMIT - _ROUNDING
@@ -108,8 +111,7 @@ class GoalMonitor:
         errors: OutputErrors,
         config: ControllerConfig,
     ) -> Scalar:
-        """Return the :class:`Decision` about a goal from the errors of a state, if control is not
-        lost.
+        """Return the goal's :class:`Decision` from the errors in a state, if control is not lost.
 
         Parameters
         ----------
@@ -120,7 +122,7 @@ class GoalMonitor:
         ends
             Time at which the reference comes to rest, s.
         errors
-            Largest errors of the outputs by kind.
+            Largest output errors by kind.
         config
             Tolerances, settling time and time limit.
         """

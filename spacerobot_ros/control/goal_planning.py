@@ -1,4 +1,4 @@
-"""Planning of references, in parallel with the control loop."""
+"""Reference planning, in parallel with the control loop."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from spacerobot_ros.planning.execution.goal_file import IdentifiedGoal
 
 
 class Aims(TypedDict):
-    """Poses and joint positions that goals request; None: not requested."""
+    """Poses and joint positions requested by goals; None: not requested."""
 
     base: PoseReference | None
     end_effector: PoseReference | None
@@ -43,7 +43,7 @@ class GoalPlanning:
     Parameters
     ----------
     in_background
-        Whether a thread plans while states are handled.
+        Whether to plan in a thread while states are handled.
     """
 
     def __init__(self, *, in_background: bool) -> None:
@@ -77,7 +77,7 @@ class GoalPlanning:
         """Return pending goals with their planned reference; None while it is being planned, and
         before it begins.
 
-        ``aims`` returns the poses and joints of the goals, and the requested parts.
+        ``aims`` returns the goal poses and joints, and the requested components.
 
         Raises
         ------

@@ -1,8 +1,9 @@
-"""Limits of actuators, of joint rates, and of references.
+"""Actuator, joint rate and reference limits.
 
-A law commands forces without regard to the resulting speeds. If a goal is far away, a measurement
-is late or a thruster is stuck open, joints would exceed the rates of their motors, and rates that
-commands held for a control period can control: :class:`JointRateLimits` lowers their efforts.
+A control law commands forces without regard to the resulting speeds. If a goal is far away, a
+measurement
+is late or a thruster is stuck open, joints would exceed their motor rates, and rates controllable
+by commands held for a control period: :class:`JointRateLimits` lowers their efforts.
 """
 
 from __future__ import annotations
@@ -23,22 +24,22 @@ from spacerobot_ros.model.space_robot import SpaceRobot
 from spacerobot_ros.parameters import parameter
 
 _REFERENCE_THRUST_SHARE = 0.5
-"""Share of the thrust for references; feedback and mass errors need the rest."""
+"""Fraction of the thrust available to references; feedback and mass errors need the rest."""
 
 
 _MIN_PERIODS_TO_LIMIT = 2
-"""Shortest time for a joint to reach its rate limit, in control periods: neither the held efforts
-nor the next ones may exceed it, even if the model is slightly wrong."""
+"""Shortest time for a joint to reach its rate limit, in control periods: neither the held nor the
+next efforts may exceed the limit, even if the model is slightly wrong."""
 
 _SLOW_RATE_SHARE = 0.5
-"""Share of a joint's rate limit; if the rate after the next period is below, dynamics are not
-evaluated."""
+"""Fraction of a joint's rate limit; if the rate after the next period is below it, the dynamics are
+not evaluated."""
 
 _MOBILITY_SHAPES = 16
 
 
 _REST_RATE = 2.0
-"""Decay rate of joint rates and momenta while a robot is brought to rest, 1/s."""
+"""Decay rate of joint rates and momenta as a robot is brought to rest, 1/s."""
 
 _REST_RATE_PER_PERIOD = 0.5
 """Largest product of that decay rate and the control period."""
@@ -46,10 +47,10 @@ _REST_RATE_PER_PERIOD = 0.5
 
 @dataclass(frozen=True)
 class MotionLimits:
-    """Largest speeds and accelerations of references, of poses and of joints.
+    """Largest speeds and accelerations of pose and joint references.
 
-    ``joint_speed`` and ``joint_acceleration`` apply to every joint (m or rad, s); they are not
-    parameters of the controller node, whose goals are poses.
+    ``joint_speed`` and ``joint_acceleration`` apply to every joint (m or rad, s); the controller
+    node does not have these parameters, because its goals are poses.
 
     Raises
     ------
@@ -57,15 +58,11 @@ class MotionLimits:
         A limit is not positive; the message names it.
     """
 
-    speed: float = parameter(0.1, "largest speed of a reference", "m/s", minimum=1e-06)
-    acceleration: float = parameter(
-        0.02, "largest acceleration of a reference", "m/s^2", minimum=1e-06
-    )
-    angular_speed: float = parameter(
-        0.1, "largest angular speed of a reference", "rad/s", minimum=1e-06
-    )
+    speed: float = parameter(0.1, "largest reference speed", "m/s", minimum=1e-06)
+    acceleration: float = parameter(0.02, "largest reference acceleration", "m/s^2", minimum=1e-06)
+    angular_speed: float = parameter(0.1, "largest reference angular speed", "rad/s", minimum=1e-06)
     angular_acceleration: float = parameter(
-        0.02, "largest angular acceleration of a reference", "rad/s^2", minimum=1e-06
+        0.02, "largest reference angular acceleration", "rad/s^2", minimum=1e-06
     )
     joint_speed: float = 0.1
     joint_acceleration: float = 0.02
@@ -79,12 +76,12 @@ class MotionLimits:
     def within_thruster_limits(
         self, actuators: ActuatorLimits, robot: SpaceRobot, q: Array
     ) -> MotionLimits:
-        """Return the limits with accelerations lowered to those that the thrusters can produce.
+        """Return the limits with accelerations lowered to what the thrusters can produce.
 
         The robot is treated as one rigid body in the shape ``q`` (n,): force over total mass;
         torque over the largest moment of inertia about the centre of mass; and the torque that
-        balances the force at the base if the centre of mass is elsewhere. Without thrusters nothing
-        is lowered.
+        balances the force on the base if the centre of mass is elsewhere. Without thrusters,
+        nothing is lowered.
         """
         force, torque = (_REFERENCE_THRUST_SHARE * x for x in (actuators.force, actuators.torque))
         lever = float(np.linalg.norm(robot.center_of_mass(q)))
@@ -100,8 +97,8 @@ class MotionLimits:
 
 
 class Saturated(NamedTuple):
-    """A command within the limits of the actuators: ``realised``, and ``excess``,
-    commanded minus realised.
+    """A command within the actuator limits: ``realised``, and ``excess`` (commanded minus
+    realised).
     """
 
     realised: Actuation
@@ -109,7 +106,7 @@ class Saturated(NamedTuple):
 
     @classmethod
     def of(cls, commanded: Actuation, realised: Actuation) -> Saturated:
-        """Return the realised actuation together with its difference from the command."""
+        """Return the realised actuation and its difference from the command."""
         wrench = commanded.wrench_B - realised.wrench_B
         return cls(realised, Actuation(wrench, commanded.tau - realised.tau))
 
@@ -122,12 +119,12 @@ class Saturated(NamedTuple):
 
 @dataclass(frozen=True)
 class ActuatorLimits:
-    """Limits of the thrusters and of the joints.
+    """Thruster and joint limits.
 
     The thrusters produce any force up to ``force`` (N) and any torque up to ``torque`` (N m), both
     in Euclidean norm and independently of each other. A larger force or torque is scaled to its
-    limit, keeping its direction. Each joint produces up to its ``effort`` (n,), N m or N. A limit
-    that does not exist is infinite.
+    limit, preserving its direction. Each joint produces up to its ``effort`` (n,), N m or N.
+    Infinite means no limit.
 
     Raises
     ------
@@ -143,11 +140,11 @@ class ActuatorLimits:
         for name, value, unit in (("force", self.force, "N"), ("torque", self.torque, "N m")):
             if math.isnan(value) or value < 0:
                 raise ParameterError(
-                    f"The {name} limit of the thrusters is {value} {unit}; it must not be negative."
+                    f"The thruster {name} limit is {value} {unit}; it must not be negative."
                 )
         if not np.all(self.effort >= 0):
             raise ParameterError(
-                f"The effort limits of the joints are {self.effort.tolist()}; none may be negative."
+                f"The joint effort limits are {self.effort.tolist()}; none may be negative."
             )
 
     def apply(self, commanded: Actuation) -> Saturated:
@@ -178,22 +175,22 @@ def _smallest_positive(accelerations: list[float]) -> float:
 
 
 class JointRateLimits:
-    """Keeps joint rates within limits, using the dynamics over the next control periods.
+    """Keeps joint rates within limits by predicting the dynamics over the next control periods.
 
     The joints obey ``Js(q) qddot + Fs = tau + G(q) wrench``: the last rows of paper 4, eq. (19),
-    with the base's acceleration eliminated. If a commanded acceleration would bring a joint beyond
-    its rate within a few control periods, it is lowered, and the efforts are those of the lowered
-    accelerations. If motors are too weak to hold joints against the thrust on the base, the thrust
-    is lowered, keeping its direction.
+    with the base acceleration eliminated. If a commanded acceleration would bring a joint beyond
+    its rate within a few control periods, it is lowered, and the efforts are recomputed for the
+    lowered accelerations. If motors are too weak to hold joints against the thrust on the base, the
+    thrust is lowered, preserving its direction.
 
     Parameters
     ----------
     robot
-        The controller's model of the robot.
+        The controller's robot model.
     rates
         Largest rates (n,), m/s or rad/s; zero or infinite: no limit.
     control_period
-        Time for which a command is held, s.
+        Duration for which a command is held, s.
     """
 
     def __init__(self, robot: SpaceRobot, rates: Array, control_period: float) -> None:
@@ -213,8 +210,8 @@ class JointRateLimits:
     ) -> Actuation:
         """Return a command that keeps the joint rates within limits: the given one if possible.
 
-        ``effort`` (n,) are the largest joint efforts, N m or N, which ``given`` keeps; ``periods``
-        is the number of control periods for which it will probably be held.
+        ``effort`` (n,) are the largest joint efforts, N m or N, not exceeded by ``given``;
+        ``periods`` is the number of control periods for which the command will probably be held.
         """
         if not self._may_exceed(state.qdot, given.tau, periods):
             return given
@@ -303,7 +300,7 @@ class JointRateLimits:
 
 
 def decay_rate(control_period: float) -> float:
-    """Return the decay rate (1/s) of the motion of a robot that is brought to rest."""
+    """Return the decay rate (1/s) of motion while a robot is brought to rest."""
     return min(_REST_RATE, _REST_RATE_PER_PERIOD / control_period)
 
 

@@ -1,13 +1,13 @@
-"""The outputs z1 of a law: their selection and symbolic expressions (paper 4, eqs 22, 23, 26).
+"""Outputs z1 of a law: selection and symbolic expressions (paper 4, eqs 22, 23, 26).
 
 The independent velocities are the paper's ``z0dot = [v_cm; omega; qdot]`` (eq. 8), the first two
-in base components. The outputs are components in W of poses, and joints. The Jacobian here is eq.
-(23) without its Euler-rate matrices: attitude is a quaternion, its error a rotation vector, and
+in base components. The outputs are pose components in W, and joint positions. The Jacobian here is
+eq. (23) without its Euler-rate matrices: attitude is a quaternion, its error a rotation vector, and
 the velocity of an attitude output is a component of the angular velocity. So the representation has
 no singularity, and ``J_z`` loses rank only if the manipulator is singular.
 
-The rate of an attitude error is ``omega_des - omega``. About one fixed axis (every planar robot)
-it is the derivative of the error; in general only to first order.
+The rate of an attitude error is ``omega_des - omega``. For rotation about one fixed axis (every
+planar robot), it is the derivative of the error; in general only to first order.
 """
 
 from __future__ import annotations
@@ -46,8 +46,8 @@ _PARALLEL_TOLERANCE = 1e-6
 class OutputSelection:
     """The components of ``z1`` (paper 4, eqs 22 and 31), in this order.
 
-    ``base`` and ``end_effector``: components in W of the pose of the base link and of the link
-    ``end_effector_link``, out of :data:`AXES`; ``joints``: names of joints.
+    ``base`` and ``end_effector``: pose components in W of the base link and of
+    ``end_effector_link``, from :data:`AXES`; ``joints``: names of joints.
     """
 
     base: tuple[str, ...] = ()
@@ -64,7 +64,7 @@ class OutputSelection:
 
     @property
     def distances(self) -> tuple[tuple[str, tuple[int, ...]], ...]:
-        """Kind and indices of the outputs that form one distance, angle or joint error."""
+        """Kind and indices of the outputs that together form a distance, angle or joint error."""
         count = len(self.base)
         found: list[tuple[str, tuple[int, ...]]] = []
         for axes, first in (self.base, 0), (self.end_effector, count):
@@ -76,7 +76,7 @@ class OutputSelection:
         return (*found, *(("joints", (first + i,)) for i in range(len(self.joints))))
 
     def distance(self, errors: Array) -> OutputDistance:
-        """Return the total distance of the errors (m,) of the outputs."""
+        """Return the distances for the output errors (m,)."""
         largest = dict.fromkeys(("position", "attitude", "joints"), math.nan)
         for kind, places in self.distances:
             size = float(np.linalg.norm(errors[list(places)]))
@@ -109,7 +109,7 @@ class OutputSelection:
             _require_known("end-effector link", (self.end_effector_link,), links)
         count, freedom = len(self.labels), 6 + len(description.joint_names)
         if count == 0:
-            raise ParameterError("No output is selected: name axes of the base, or joints.")
+            raise ParameterError("No output is selected: name base axes or joints.")
         if count > freedom:
             raise ParameterError(
                 f"{count} outputs are selected; robot '{description.name}' has "
@@ -119,10 +119,10 @@ class OutputSelection:
 
 @dataclass(frozen=True)
 class OutputDistance:
-    """Distances of the outputs from a reference; NaN for kinds that are not controlled.
+    """Distances of the outputs from a reference; NaN for uncontrolled kinds.
 
-    ``position`` (m) and ``attitude`` (rad): distance and angle in the controlled axes, the larger
-    of base and end-effector; ``joints``: the largest error of a joint, m or rad.
+    ``position`` (m) and ``attitude`` (rad): distance and angle along the controlled axes, the
+    larger of base and end-effector; ``joints``: the largest joint error, m or rad.
     """
 
     position: float
@@ -138,11 +138,11 @@ def default_selection(description: RobotDescription, end_effector_link: str) -> 
     """Return the default outputs of a robot with an end-effector link (empty: none).
 
     * A planar robot (:func:`plane_normal`) whose plane is a coordinate plane of its base: the base
-      in that plane (x, y, rz for the plane x-y), and with two or more joints the position of the
-      end-effector in it. The axes are those of W, so the base must move in that plane of W.
-    * Any other robot: the whole pose of the base, and the pose (six or more joints) or the position
-      (three to five) of the end-effector.
-    * Without an end-effector, or with too few joints for one: the pose of the base and the joints.
+      in that plane (x, y, rz for the plane x-y), and, with two or more joints, the end-effector
+      position in it. The axes are those of W, so the base must move in that plane of W.
+    * Any other robot: the full base pose, and the end-effector's pose (six or more joints) or
+    position (three to five).
+    * Without an end-effector, or with fewer joints: the base pose and the joints.
 
     So there are never more outputs than degrees of freedom.
 
@@ -170,7 +170,8 @@ def default_selection(description: RobotDescription, end_effector_link: str) -> 
 
 
 _POSE_REFERENCE_SIZE = 19
-"""Numbers of a pose reference: position 3, quaternion 4, two velocities and two accelerations."""
+"""Number of values in a pose reference: position 3, quaternion 4, two velocities and two
+accelerations."""
 
 
 @dataclass(frozen=True)
@@ -194,19 +195,18 @@ class _OutputGroup:
 
 
 class OutputVector:
-    """The selected outputs of a robot, as expressions from which a law builds its function.
+    """Selected outputs of a robot, as expressions from which a law builds its function.
 
     ``m`` outputs, ``N = 6 + n`` degrees of freedom. The expressions are functions of the symbols
     ``state`` and ``reference`` (see :meth:`pack_state` and :meth:`pack_reference`):
 
-    ``model``
-        Calls the robot's functions by name.
+    ``model`` Calls robot model functions by name.
     ``q``, ``omega``, ``v_cm``, ``qdot``
-        The state in the velocities z0dot, base components.
+        The state, with velocities z0dot in base components.
     ``J_z``
         (m, N) ``z1dot = J_z z0dot``, eq. (23).
     ``bias``
-        (m,) ``Jdot_z z0dot``: the acceleration of the outputs at ``z0ddot = 0``.
+        (m,) ``Jdot_z z0dot``: the output acceleration at ``z0ddot = 0``.
     ``J_q_inverse``
         (N, N) inverse of the matrix of eq. (21): ``[f; n; tau] = J_q^-T Q``.
     ``error``, ``error_rate``
@@ -288,9 +288,9 @@ class OutputVector:
         Raises
         ------
         NotFiniteError
-            A number of it is not finite.
+            A value in it is not finite.
         ValueError
-            A part of it has the wrong length.
+            A component has the wrong length.
         """
         state.stack(memory)
         require_finite("state", memory)
@@ -301,11 +301,11 @@ class OutputVector:
         Raises
         ------
         TargetNotSetError
-            The reference lacks a group that is selected.
+            The reference lacks a selected group.
         NotFiniteError
-            A number of it is not finite.
+            A value in it is not finite.
         ValueError
-            A part of it has the wrong length.
+            A component has the wrong length.
         """
         parts: list[Array] = []
         if self.selection.base:
@@ -318,13 +318,13 @@ class OutputVector:
         require_finite("reference", memory)
 
     def without_force(self, Q: ca.SX) -> ca.SX:
-        """Return generalised forces (N,); their force on the centre of mass is zero if no actuator
-        exerts one.
+        """Return generalised forces (N,); the force on the centre of mass is zero if no actuator
+        can exert it.
         """
         return Q if self.thrust else ca.vertcat(ca.SX.zeros(3), Q[3:])
 
     def errors(self, state: ControlState, reference: Reference) -> Array:
-        """Return the errors (m,) of a state from a reference; see :meth:`pack_reference`."""
+        """Return the errors (m,) of a state relative to a reference; see :meth:`pack_reference`."""
         if self._error_function is None:
             inputs = [self.state, self.reference, *self.model.inputs.values()]
             self._error_function = ca.Function("errors", inputs, [ca.densify(self.error)])
@@ -403,10 +403,10 @@ def _joint_parts(joints: JointReference | None) -> list[Array]:
 
 
 def require_finite(name: str, memory: Array) -> None:
-    """Refuse numbers that are not finite: NotFiniteError, which names them."""
+    """Reject non-finite values: NotFiniteError, which names them."""
     # One call: the square sum of finite numbers of any sensible size is finite.
     if not math.isfinite(memory.dot(memory)):
-        raise NotFiniteError(f"The {name} holds a number that is not finite.")
+        raise NotFiniteError(f"The {name} contains a non-finite value.")
 
 
 def _require_known(kind: str, names: Sequence[str], known: Sequence[str]) -> None:

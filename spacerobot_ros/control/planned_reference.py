@@ -34,22 +34,24 @@ from spacerobot_ros.planning.methods.thrust.propulsion import Propulsion
 from spacerobot_ros.planning.methods.thrust.search import ThrustOptions, ThrustPlanner
 
 PLANNING_TIME = 2.0
-"""Time after which a plan continues a moving reference, s; doubled if planning takes longer."""
+"""Time after which a plan takes over from a moving reference, s; doubled if planning takes
+longer."""
 
 
 @dataclass(frozen=True)
 class PlannedOptions(ThrustOptions):
-    """The options of planned references."""
+    """Options of planned references."""
 
     thrusters: str = parameter(
         "",
-        "thruster table that a plan uses: 'urdf' or a YAML file; '': any wrench within "
-        "max_force and max_torque",
+        "thruster table for plans: 'urdf' or a YAML file; '': any wrench within max_force and "
+        "max_torque",
     )
 
 
 class PlannedReference(ReferenceProfile):
-    """A motion of base and joints, planned within the available thrust and around obstacles.
+    """A motion of the base and the joints, planned within the available thrust and around
+    obstacles.
 
     Parameters
     ----------
@@ -75,13 +77,13 @@ class PlannedReference(ReferenceProfile):
 
     @property
     def path(self) -> BasePath:
-        """The planned poses of the base, over the time since the start."""
+        """Planned base poses over the time since the start."""
         _, base = self.motion.path()
         return BasePath(np.linspace(0.0, self.duration, len(base.position)), *base)
 
     @property
     def propellant(self) -> float | None:
-        """The propellant that the plan takes, kg; None without a table of thrusters."""
+        """Propellant required by the plan, kg; None without a thruster table."""
         return None if self.motion.propulsion.norms else self.motion.spent
 
     def at(self, time: float) -> Reference:
@@ -101,14 +103,15 @@ class PlannedReference(ReferenceProfile):
         """Return the mean wrench and efforts of the plan over a control period that begins
         ``time`` s after its start; zero before its start and after its end.
 
-        Samples would not do: efforts jump between intervals, and joints would get other rates.
+        Samples would not suffice: efforts jump between intervals, and joints would reach other
+        rates.
 
         Parameters
         ----------
         time, period
             Time since the start, and the time for which the command is held, s.
         joint_damping
-            Friction that the law adds to the joints and that the efforts overcome, N m s/rad.
+            Joint friction added by the law and compensated for in the efforts, N m s/rad.
         """
         ends = min(time + period, self.duration)
         knot = self.motion.step * (math.floor(time / self.motion.step) + 1)
@@ -122,7 +125,7 @@ class PlannedReference(ReferenceProfile):
 
 
 class GrappleReference(PlannedReference):
-    """A planned motion to a target, then with the target.
+    """A planned motion to a target, then along with the target.
 
     Parameters
     ----------
@@ -169,7 +172,7 @@ def _pose(frame: FrameSample) -> PoseReference:
 
 
 class GoalMotion(NamedTuple):
-    """Start and goal of a motion, and its limits; ``carries``: the arm keeps its shape."""
+    """Start and goal of a motion, and its limits; ``carries``: whether the arm keeps its shape."""
 
     start: Reference
     goal: Reference
@@ -183,13 +186,13 @@ class ReferencePlanner:
     Parameters
     ----------
     robot
-        The model that the law controls, without wheels: plans do not use their torque.
+        The model controlled by the law, without wheels: plans do not use wheel torque.
     outputs
         The outputs of the law.
     limits
-        Limits of the thrusters, used if there is no thruster table.
+        Thruster limits, used if there is no thruster table.
     options
-        The options of the plan.
+        Plan options.
 
     Raises
     ------
@@ -223,8 +226,8 @@ class ReferencePlanner:
         self._planner.use_obstacles(world)
 
     def time_until_blocked(self, profile: PlannedReference, time: float) -> float:
-        """Return how long a reference stays clear of obstacles, s, counted from a time after its
-        start; infinite: to its end.
+        """Return how long a reference stays clear of obstacles, s, from a given time after its
+        start; infinite: until its end.
         """
         clearance, motion = self._planner.clearance, profile.motion
         if clearance is None or not clearance.has_obstacles or time >= motion.duration:
@@ -241,8 +244,8 @@ class ReferencePlanner:
     def plan(
         self, motion: GoalMotion, state: ControlState, cancellation: Cancellation
     ) -> PlannedReference:
-        """Return the planned reference of a motion; ``state`` provides joints that have no
-        reference.
+        """Return the planned reference for a motion; ``state`` provides the positions of joints
+        without a reference.
 
         Raises
         ------
@@ -273,7 +276,7 @@ class ReferencePlanner:
         grapple: Grapple,
         cancellation: Cancellation,
     ) -> GrappleReference:
-        """Return the planned reference to a target, whose motion begins with it.
+        """Return the planned reference to a target; the given target motion starts with the plan.
 
         Raises
         ------

@@ -1,4 +1,4 @@
-"""Reference profiles from the present poses and joints to the goals.
+"""Reference profiles from current poses and joint positions to the goals.
 
 The paper sets the goal at once (:class:`StepReference`): simple, but with the largest actuator
 command at the start. :class:`QuinticReference` moves the reference there smoothly.
@@ -46,9 +46,9 @@ class ReferenceProfile(ABC):
     Parameters
     ----------
     start
-        Present poses and joint positions; its velocities are not used.
+        Current poses and joint positions; velocities are ignored.
     goal
-        Desired poses and joint positions; groups that it lacks are not controlled.
+        Desired poses and joint positions; missing groups are not controlled.
     limits
         Largest speeds and accelerations.
     carries
@@ -82,7 +82,7 @@ class ReferenceProfile(ABC):
         """Return the reference ``time`` s after its start."""
 
     def distances(self) -> OutputErrors:
-        """Return the distances between start and goal."""
+        """Return the distances between the start and the goal."""
         start, goal, joints = self.start, self.goal, 0.0
         if start.joints is not None and goal.joints is not None:
             joints = float(np.abs(goal.joints.q - start.joints.q).max(initial=0.0))
@@ -94,7 +94,7 @@ class ReferenceProfile(ABC):
         )
 
     def lines(self) -> tuple[_PoseInterpolation | None, _PoseInterpolation | None]:
-        """Return the paths of base and end-effector, None for a group that is not controlled."""
+        """Return the base and end-effector paths; None for a group that is not controlled."""
         start, goal, base, hand = self.start, self.goal, None, None
         if start.base is not None and goal.base is not None:
             base = _PoseInterpolation(start.base, goal.base)
@@ -105,7 +105,7 @@ class ReferenceProfile(ABC):
 
 
 class StepReference(ReferenceProfile):
-    """The goal as a step, as in paper 4, section V."""
+    """Step to the goal, as in paper 4, section V."""
 
     name: ClassVar[str] = "step"
 
@@ -117,9 +117,9 @@ class StepReference(ReferenceProfile):
 class QuinticReference(ReferenceProfile):
     """Positions along straight lines, attitudes along geodesics (one fixed axis), in W.
 
-    An end-effector that the base carries rotates about the base's origin, which moves on its line.
+    An end-effector carried by the base rotates about the base origin, which moves along its line.
     All share one profile, ``s = 10 u^3 - 15 u^4 + 6 u^5`` of ``u = t / T``: rest to rest, without
-    a jump in acceleration. T is the shortest time for which all motions are within their limits:
+    acceleration jumps. T is the shortest time for which all motions are within their limits:
     the slowest sets the pace, and all reach their goals together.
     """
 
@@ -169,7 +169,7 @@ def _quintic(u: Any, T: Any) -> tuple[Any, Any, Any]:
 
 
 def profile_numbers(profile: ReferenceProfile, base: bool, end_effector: bool, n: int) -> Array:
-    """Return a profile as the numbers that :func:`profile_expression` takes.
+    """Return a profile as the values required by :func:`profile_expression`.
 
     Parameters
     ----------
@@ -178,7 +178,7 @@ def profile_numbers(profile: ReferenceProfile, base: bool, end_effector: bool, n
     base, end_effector
         Whether these poses are controlled.
     n
-        Number of joints with references; 0: joints are not controlled.
+        Number of joints with references; 0 if joints are not controlled.
     """
     start, goal = profile.start, profile.goal
     parts: list[npt.ArrayLike] = [[profile.duration]]
@@ -193,9 +193,9 @@ def profile_numbers(profile: ReferenceProfile, base: bool, end_effector: bool, n
 def profile_expression(
     numbers: ca.SX, time: ca.SX, base: bool, end_effector: bool, n: int
 ) -> ca.SX:
-    """Return :meth:`ReferenceProfile.at` as the argument of a law's function.
+    """Return :meth:`ReferenceProfile.at` as an argument of a law's function.
 
-    ``numbers`` come from :func:`profile_numbers`, ``time`` is since the start, s.
+    ``numbers`` come from :func:`profile_numbers`; ``time`` is counted from the start, s.
     """
     sizes = _profile_sizes(base, end_effector, n)
     duration, *rest = ca.vertsplit(numbers, np.cumsum([0, *sizes]).tolist())
@@ -222,7 +222,7 @@ def profile_expression(
 
 
 def profile_size(base: bool, end_effector: bool, n: int) -> int:
-    """Return the size of the array of :func:`profile_numbers`."""
+    """Return the size of the :func:`profile_numbers` array."""
     return sum(_profile_sizes(base, end_effector, n))
 
 
@@ -239,7 +239,7 @@ class HeldVelocityReference:
     Parameters
     ----------
     control_period
-        Time between two commands, s.
+        Time between commands, s.
     """
 
     def __init__(self, control_period: float) -> None:
@@ -247,7 +247,7 @@ class HeldVelocityReference:
         self._before: Array | None = None
 
     def at_command(self, position: Array, velocity: Array) -> JointReference:
-        """Return the reference at the instant of a command of positions and velocities (n,)."""
+        """Return the reference at the instant of a command with positions and velocities (n,)."""
         held = velocity.copy()
         before = self._before if self._before is not None else held
         self._before = held
@@ -292,7 +292,7 @@ class _PoseInterpolation:
 
     @property
     def numbers(self) -> list[npt.ArrayLike]:
-        """All numbers of the line, and its end pose."""
+        """All parameters of the line, and its end pose."""
         line = [self._r, self._d, self._e, self._c, self._start.quaternion, self._half_turn]
         return [*line, self._turn_W, [self.angle], self._goal.position, self._goal.quaternion]
 

@@ -1,7 +1,7 @@
 """Tasks before a goal: the approach to a target until its capture, and detumbling after it.
 
-A task sets the controller's references, state by state, until it is done or has failed. An approach
-sets the reference of the end-effector; detumbling replaces the law until the robot is at rest.
+A task sets the controller's references, state by state, until it succeeds or fails. An approach
+sets the end-effector reference; detumbling replaces the law until the robot is at rest.
 """
 
 from __future__ import annotations
@@ -45,21 +45,21 @@ replanned."""
 
 
 class Task(str, Enum):
-    """Tasks of a controller with a target, done before it pursues a goal."""
+    """Controller tasks with a target, performed before a goal is pursued."""
 
     APPROACH = "approach"
     """Bring the end-effector to the grapple frame, until the target is captured."""
     DETUMBLE = "detumble"
-    """Bring the robot to rest, whatever it holds."""
+    """Bring the robot to rest, with or without a held body."""
 
     @classmethod
     def parsed(cls, text: str) -> tuple[Task, ...]:
-        """Return the tasks in a text, separated by spaces.
+        """Return the tasks in a space-separated string.
 
         Raises
         ------
         ParameterError
-            There is no such task.
+            A task does not exist.
         """
         known = [task.value for task in cls]
         for name in text.split():
@@ -71,19 +71,19 @@ class Task(str, Enum):
 
 
 class TaskState(Enum):
-    """The state of the present task after a state of the robot."""
+    """State of the current task after a robot state."""
 
     ACTIVE = "active"
     DONE = "done"
     REFUSED = "refused"
     """It cannot begin."""
     FAILED = "failed"
-    """It was aborted after it had begun."""
+    """The task was aborted after it had begun."""
 
 
 @dataclass(frozen=True)
 class TaskProgress:
-    """The state of a task, with a sentence if it is refused or has failed."""
+    """State of a task, with a sentence if it was refused or has failed."""
 
     state: TaskState
     message: str = ""
@@ -106,7 +106,7 @@ class MeasuredTarget:
         """Time of the measurement, s."""
 
     def describe(self, target: RobotDescription, grapple_frame: str) -> None:
-        """Take the description of the target."""
+        """Set the target description."""
         self.description = target
         try:
             self.body, self.why_unknown = TargetBody.of(target, grapple_frame), ""
@@ -114,13 +114,13 @@ class MeasuredTarget:
             self.body, self.why_unknown = None, str(error)
 
     def measure(self, time: float, pose: Array, twist: Array) -> None:
-        """Take pose (7,) and twist (6,) of the root link at a time, s; the twist is in the link's
+        """Set the root link's pose (7,) and twist (6,) at a given time, s; the twist is in the link
         frame."""
         self.motion, self.time = BodyMotion.of(pose, twist), time
 
 
 _LATEST_BEGIN = 0.1
-"""Longest delay of a motion relative to its planned start, s."""
+"""Longest start delay of a motion, s."""
 
 
 class ApproachTask:
@@ -164,7 +164,7 @@ class ApproachTask:
             why = target.why_unknown.rstrip(".") or (
                 "nothing is received on 'target/odom' and 'target/robot_description'"
             )
-            return self._ended(f"the target is not known: {why}")
+            return self._ended(f"the target is unknown: {why}")
         age = time - target.time
         if age > options.timeout:
             return self._ended(f"the target is lost: its odometry is {age:.3g} s old")
@@ -192,7 +192,7 @@ class ApproachTask:
         if now > self._contact + options.patience:
             return self._ended(
                 f"the target is missed: at contact the end-effector is {self._distance_text}, and "
-                f"nothing captured it within {options.patience:g} s"
+                f"it was not captured within {options.patience:g} s"
             )
         if now >= self._start:
             moving = grapple.with_relative_motion(plan.relative(np.array([now])))
@@ -201,7 +201,7 @@ class ApproachTask:
         return _ACTIVE
 
     def close(self) -> None:
-        """Cancel the planning job and wait for its end."""
+        """Cancel the planning job and wait for it to end."""
         if self._job is not None:
             self._job.close()
             self._job = None
@@ -227,7 +227,7 @@ class ApproachTask:
     def _ended(self, why: str) -> TaskProgress:
         if self._predicted is None:
             return TaskProgress(TaskState.REFUSED, f"The approach is refused: {why}.")
-        return TaskProgress(TaskState.FAILED, f"The approach is given up: {why}.")
+        return TaskProgress(TaskState.FAILED, f"The approach is aborted: {why}.")
 
     def _is_off_prediction(self, measured: BodyMotion) -> bool:
         assert self._predicted is not None
@@ -279,7 +279,7 @@ class ApproachTask:
         contact = job.begins + planned.duration
         left = float(np.linalg.norm(planned.motion.joined_momentum(planned.grapple.motion)))
         message = (
-            f"Base and end-effector set out at {job.begins:.4g} s and meet the target at "
+            f"The base and the end-effector start at {job.begins:.4g} s and meet the target at "
             f"{contact:.4g} s; the plan leaves {left:.4g} N m s after the grasp."
         )
         about = {
@@ -393,7 +393,8 @@ class DetumblingTask:
         controller.come_to_rest(self._law.command)
         bound = shortest_detumbling(self._momentum, self._law.torque)
         message = (
-            f"The robot is brought to rest: {self._momentum:.4g} N m s take at least {bound:.4g} s."
+            f"The robot is brought to rest: {self._momentum:.4g} N m s takes at least {bound:.4g} "
+            "s."
         )
         self.events.append(Event(EventKind.DETUMBLE_STARTED, message))
 
@@ -403,7 +404,8 @@ class DetumblingTask:
         took, bound = at_rest - self._began, shortest_detumbling(self._momentum, law.torque)
         message = (
             f"The robot came to rest in {took:.4g} s; the shortest time for {self._momentum:.4g} "
-            f"N m s is {bound:.4g} s, and the grasp took up to {law.largest_grasp_torque:.4g} N m."
+            f"N m s is {bound:.4g} s, and the grasp torque was at most "
+            f"{law.largest_grasp_torque:.4g} N m."
         )
         about = {
             "took_s": f"{took:.9g}",
@@ -425,13 +427,13 @@ class Servicing:
         self._config = config
         self.target = MeasuredTarget()
         self.payload: Payload | None = None
-        """The body that the robot holds."""
+        """The held body."""
         self._remaining_tasks: list[Task] = []
         self._present: ApproachTask | DetumblingTask | None = None
         self._events: list[Event] = []
 
     def configure(self, config: ControllerConfig) -> None:
-        """Use other times from the next task on."""
+        """Use other time settings from the next task on."""
         self._config = config
 
     @property
@@ -441,14 +443,14 @@ class Servicing:
 
     @property
     def needs_target(self) -> bool:
-        """Whether measurements of the target are used, or will be."""
+        """Whether target measurements are used, or will be."""
         return (
             Task.APPROACH in (self._remaining_tasks or self.before_goals) and self.payload is None
         )
 
     @property
     def message(self) -> str:
-        """Sentence on the present task."""
+        """Sentence that describes the current task."""
         return "" if self._present is None else self._present.message
 
     def begin(self, tasks: Sequence[Task]) -> None:
@@ -468,7 +470,7 @@ class Servicing:
         self._remaining_tasks = []
 
     def hold(self, payload: Payload | None) -> None:
-        """Take over the body that the robot holds from now on."""
+        """Set the body that the robot holds from now on."""
         self.payload = payload
         if self.task is Task.DETUMBLE:
             self.restart()
@@ -481,7 +483,7 @@ class Servicing:
         *,
         in_background: bool = False,
     ) -> TaskProgress:
-        """Advance the present task; DONE after the last one. ``in_background``: a thread plans."""
+        """Advance the present task; DONE after the last task. ``in_background``: a thread plans."""
         while self._remaining_tasks:
             if self.task is not Task.APPROACH or self.payload is None:
                 if self._present is None and self.task is Task.APPROACH:

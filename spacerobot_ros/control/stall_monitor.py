@@ -1,4 +1,4 @@
-"""Reports whether a controller makes progress towards its goal, and if not, why."""
+"""Reports whether a controller makes progress towards its goal and, if not, why."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _SHORTEST_WINDOW, _LONGEST_WINDOW = 2.0, 10.0
 """Shortest and longest time over which errors are compared, s."""
 
 _LIMITED_WINDOW = 5.0
-"""The same time while commands are limited, which slows the loop, s."""
+"""Comparison time while commands are limited, which slows the loop, s."""
 
 _LEAST_WINDOW_PERIODS = 20
 """Shortest comparison time, in control periods."""
@@ -26,53 +26,54 @@ _SAMPLES = 32
 """Number of states whose errors are checked within a comparison time."""
 
 _LEAST_PROGRESS = 0.02
-"""Smallest share by which errors must shrink from one window to the next; a linear loop shrinks
-them by 0.6 in a time constant."""
+"""Smallest fraction by which errors must shrink between windows; in a linear loop they shrink by
+0.6 per time constant."""
 
 _LAG_SHARE = 0.5
-"""Largest lag of an unimpeded robot behind its reference, as a share of the distance."""
+"""Largest lag of an unimpeded robot behind its reference, as a fraction of the distance."""
 
 _LEAST_SMALLEST_TOLERANCE = 1e-9
 """Tolerance (m, rad) used instead of zero."""
 
 _STOP_SHARE = 0.005
-"""Distance at which a joint is considered at its stop, as a share of its range."""
+"""Distance, as a fraction of its range, at which a joint is considered to be at its stop."""
 
 _SINGULAR_SHARE = 0.7
-"""Share of the error in singular directions from which a singularity is the cause."""
+"""Fraction of the error in singular directions above which a singularity is taken as the cause."""
 
 
 class StallMonitor:
-    """Compares the largest error, as a share of its tolerance, between successive windows of time.
+    """Compares the largest error, as a fraction of its tolerance, between successive time windows.
 
-    A window lasts as long as the slowest error of the closed loop takes to decay to a third
-    (:meth:`.ControlLaw.slowest_decay`), within 2 to 10 s; 5 s while commands are limited. The robot
-    is stalled if the largest error shrinks from one window to the next by less than 2 %, and by
-    less than before:
+    A window is the time in which the slowest error of the closed loop decays to a third
+    (:meth:`.ControlLaw.slowest_decay`), clamped to 2 to 10 s; 5 s while commands are limited. The
+    robot
+    is stalled if the largest error shrinks from one window to the next by less than 2 % and by less
+    than before:
 
     * after the reference has come to rest, and while an error is beyond its tolerance;
     * while the reference moves, if the robot lags behind by more than half of the distance and more
       than its tolerance, and the error has not begun to shrink.
 
-    It is no longer stalled when the errors shrink again.
+    The stall ends when the errors shrink again.
     """
 
     def __init__(self) -> None:
         self.cause = ""
-        """Why the robot is stalled, as the second half of a sentence; empty: it is not."""
+        """Cause of the stall, as the second half of a sentence; empty if not stalled."""
         self.restart()
 
     def restart(self) -> None:
-        """Restart, at a new goal and after a jump of time or of the robot."""
+        """Restart, at a new goal or after a jump in time or position."""
         self.cause = ""
         self._ends = self._next_sample = -math.inf
         self._window = 0.0
         self._at_rest = False
-        """Whether the reference was at rest when the present window began."""
+        """Whether the reference was at rest when the current window began."""
         self._largest: list[float] = []
-        """Largest shares in the present and earlier windows, the latest first."""
+        """Largest fractions in the current and earlier windows, the latest first."""
         self._share = self._lag = 0.0
-        """Largest share, and lag behind the reference, in the last state."""
+        """Largest fraction, and lag behind the reference, in the last state."""
         self._samples = self._limited = 0
 
     def observe(
@@ -82,7 +83,7 @@ class StallMonitor:
         result: Saturated,
         config: ControllerConfig,
     ) -> None:
-        """Take the controller's state and its command at a time (s)."""
+        """Process the controller's state and command at a given time (s)."""
         if time < self._next_sample:
             return
         if not self._largest:
@@ -146,8 +147,8 @@ class StallMonitor:
             return cause
         if limited:
             for part, name in (
-                (result.excess.wrench_B[:3], "the force of the thrusters is at its limit"),
-                (result.excess.wrench_B[3:], "the torque on the base is at its limit"),
+                (result.excess.wrench_B[:3], "the thruster force is at its limit"),
+                (result.excess.wrench_B[3:], "the base torque is at its limit"),
             ):
                 if np.any(part):
                     return name

@@ -31,15 +31,15 @@ class TargetNotSetError(SpaceRobotError):
 
 
 class NotFiniteError(SpaceRobotError):
-    """A state or reference has a number that is not finite; no command is computed."""
+    """A state or reference contains a non-finite value; no command is computed."""
 
 
 @dataclass(frozen=True)
 class ControlState:
-    """The measured (or estimated) state of a robot.
+    """Measured (or estimated) state of a robot.
 
-    ``r_WB`` (3,) position of the base link's origin in W, m; ``quaternion_WB`` (4,) its attitude
-    (x, y, z, w), a unit quaternion; ``v_WB_B`` (3,) in m/s and ``omega_WB_B`` (3,) in rad/s, its
+    ``r_WB`` (3,) base link position in W, m; ``quaternion_WB`` (4,) base attitude
+    (x, y, z, w), a unit quaternion; ``v_WB_B`` (3,) in m/s and ``omega_WB_B`` (3,) in rad/s, base
     twist in base components; ``q``, ``qdot`` (n,) joint positions and velocities (m or rad, /s).
     """
 
@@ -52,29 +52,29 @@ class ControlState:
 
     @classmethod
     def at_rest(cls, r_WB: Array, quaternion_WB: Array, q: Array) -> ControlState:
-        """Return a state without velocities."""
+        """Return a state with zero velocities."""
         return cls(r_WB, quaternion_WB, np.zeros(3), np.zeros(3), q, np.zeros(len(q)))
 
     def stack(self, memory: Array) -> None:
-        """Write the six parts in sequence into ``memory`` (13 + 2 n,).
+        """Write the six components in sequence into ``memory`` (13 + 2 n,).
 
         Raises
         ------
         ValueError
-            A part has the wrong length.
+            A component has the wrong length.
         """
         parts = self.r_WB, self.quaternion_WB, self.v_WB_B, self.omega_WB_B, self.q, self.qdot
         np.concatenate(parts, out=memory)
 
     def copied(self) -> ControlState:
-        """Return a copy, because the memory of a state may be reused for the next one."""
+        """Return a copy, because the memory of a state may be reused for the next state."""
         memory = np.empty(13 + 2 * len(self.q))
         self.stack(memory)
         return ControlState.unstack(memory)
 
     @classmethod
     def unstack(cls, memory: Array) -> ControlState:
-        """Return a copy of the state in the memory of :meth:`stack`."""
+        """Return a copy of the state from memory written by :meth:`stack`."""
         x = memory.copy()
         joints = 13 + (len(x) - 13) // 2
         return cls(x[:3], x[3:7], x[7:10], x[10:13], x[13:joints], x[joints:])
@@ -97,20 +97,20 @@ class PoseReference:
     def with_body_twist(
         cls, position: Array, quaternion_WB: Array, v_B: Array, omega_B: Array
     ) -> PoseReference:
-        """Return the reference of a frame B from velocities in components of B, as in odometry."""
+        """Return the reference for a frame B from velocities in B components, as in odometry."""
         R_WB = matrix_from_quaternion(quaternion_WB)
         return cls(position, quaternion_WB, R_WB @ v_B, R_WB @ omega_B)
 
     @classmethod
     def of_motion(cls, motion: FrameMotion, k: int = 0) -> PoseReference:
-        """Return the motion of a frame at the k-th time as a reference."""
+        """Return a frame's motion at the k-th time as a reference."""
         numbers = (motion.v, motion.omega, motion.a, motion.alpha)
         quaternion = quaternion_from_matrix(motion.R[k])
         return cls(motion.r[k], quaternion, *(each[k] for each in numbers))
 
     @property
     def motion(self) -> FrameMotion:
-        """The reference as the motion of a frame at one time."""
+        """The reference as a frame's motion at a single time."""
         R = matrix_from_quaternion(self.quaternion)
         numbers = (self.position, self.velocity, self.angular_velocity, self.acceleration)
         return FrameMotion(*(x[np.newaxis] for x in (R, *numbers, self.angular_acceleration)))
@@ -118,7 +118,7 @@ class PoseReference:
 
 @dataclass(frozen=True)
 class JointReference:
-    """Positions, velocities and accelerations (n,) of all joints, in the order of the model."""
+    """Positions, velocities and accelerations (n,) of all joints, in model order."""
 
     q: Array
     qdot: Array
@@ -126,7 +126,7 @@ class JointReference:
 
     @classmethod
     def at_rest(cls, q: Array) -> JointReference:
-        """Return the reference that holds a shape."""
+        """Return a reference that holds a shape."""
         return cls(q, np.zeros(len(q)), np.zeros(len(q)))
 
 
@@ -134,7 +134,7 @@ class JointReference:
 class Reference:
     """Reference of the outputs; None for a group that is not controlled.
 
-    ``of_one_motion``: the poses are those that the joints move the robot through.
+    ``of_one_motion``: whether the poses result from the joint motion.
     """
 
     base: PoseReference | None = None
@@ -144,9 +144,9 @@ class Reference:
 
     @classmethod
     def present(cls, robot: SpaceRobot, state: ControlState, end_effector: str = "") -> Reference:
-        """Return the present poses and joint positions as a reference at rest.
+        """Return the current poses and joint positions as a reference at rest.
 
-        ``end_effector`` names the link of the end-effector; empty: the robot has none.
+        ``end_effector`` names the end-effector link; empty if the robot has none.
 
         Raises
         ------
@@ -164,7 +164,7 @@ class Reference:
 
 
 class Actuation(NamedTuple):
-    """``wrench_B`` (6,): thruster force (N) over torque (N m) at the origin of the base link, base
+    """``wrench_B`` (6,): thruster force (N) over torque (N m) at the base link origin, base
     components; ``tau`` (n,): joint efforts (N m or N).
     """
 
@@ -173,22 +173,23 @@ class Actuation(NamedTuple):
 
 
 class DeadReckoning:
-    """Paper 4, end of section IV: the state from integration of eq. (19) under the commands sent.
+    """Paper 4, end of section IV: the state obtained by integrating eq. (19) under the sent
+    commands.
 
     It starts from the last measured state and integrates one control period at a time under held
     actuation, with Runge-Kutta 4. Differences between the model and the real robot accumulate over
-    the time
     :attr:`elapsed`.
 
     The integrated state is that of :mod:`spacerobot_ros.model.composite_rigid_body`, with both
-    momenta and the centre of mass, which joints do not change. Measured joint positions and rates
-    replace the predicted ones, and the base rotates by the connection ``A``. Only the effect of
-    the thrusters then accumulates errors.
+    momenta and the centre of mass, which joint motion does not change. Measured joint positions and
+    rates
+    replace the predicted ones, and the base rotates by the connection ``A``. Only thruster effects
+    then accumulate errors.
 
     Parameters
     ----------
     robot
-        The controller's model of the robot.
+        The controller's robot model.
     control_period
         Duration of a step, s.
     integration_step
@@ -218,7 +219,7 @@ class DeadReckoning:
         self._q, self._quaternion, self._qdot, self._p_W, self._L_W, self._r_WC = parts
 
     def reset(self, measured: ControlState) -> None:
-        """Start at a measured state."""
+        """Start from a measured state."""
         quaternion, q, qdot = measured.quaternion_WB, measured.q, measured.qdot
         p_W, L_W, _ = self.robot.momentum(quaternion, q, measured.v_WB_B, measured.omega_WB_B, qdot)
         r_WC = measured.r_WB + matrix_from_quaternion(quaternion) @ self.robot.center_of_mass(q)
@@ -238,7 +239,8 @@ class DeadReckoning:
     ) -> ControlState:
         """Advance one control period under held actuation and return the estimate at its end.
 
-        ``q`` and ``qdot`` (n,) are the joints measured at the end of the period, if available.
+        ``q`` and ``qdot`` (n,) are the joint positions and rates measured at the end of the period,
+        if available.
         """
         self._command[:] = np.concatenate([actuation.tau, actuation.wrench_B])
         for _ in range(self._substeps):

@@ -1,4 +1,4 @@
-"""Status of a controller: the state of its goal, and the conditioning of its last command."""
+"""Controller status: goal state, and conditioning of the last command."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 
 class ControllerState(str, Enum):
-    """The value of ``state`` in controller/status."""
+    """Value of ``state`` in controller/status."""
 
     WAITING = "waiting"
     """No state has been measured yet."""
@@ -34,7 +34,7 @@ class ControllerState(str, Enum):
     """A goal is tracked, but the robot makes no progress."""
     REACHED = "reached"
     REACHED_PARTLY = "reached_partly"
-    """A requested part of the base pose is out of tolerance and not controlled."""
+    """A requested component of the base pose is out of tolerance and not controlled."""
     FAILED = "failed"
     REFUSED = "refused"
     ABORTED = "aborted"
@@ -43,7 +43,7 @@ class ControllerState(str, Enum):
 
     @property
     def decided(self) -> bool:
-        """Whether the state of the goal is final."""
+        """Whether the goal state is final."""
         return self in (
             ControllerState.REACHED,
             ControllerState.REACHED_PARTLY,
@@ -54,7 +54,7 @@ class ControllerState(str, Enum):
 
     @property
     def level(self) -> int:
-        """Level of diagnostic_msgs/DiagnosticStatus: 0 OK, 1 WARN, 2 ERROR."""
+        """diagnostic_msgs/DiagnosticStatus level: 0 OK, 1 WARN, 2 ERROR."""
         match self:
             case ControllerState.FAILED | ControllerState.REFUSED | ControllerState.STOPPED:
                 return 2
@@ -71,7 +71,7 @@ class ControllerState(str, Enum):
 
 @dataclass(frozen=True)
 class CommandReport:
-    """Report on one command of the controller.
+    """Report on one controller command.
 
     Attributes
     ----------
@@ -80,17 +80,17 @@ class CommandReport:
     singular, smallest_singular_value, damping
         See :class:`spacerobot_ros.control.LawStatus`.
     lost_force_N, lost_torque_Nm, lost_effort
-        Part of the command beyond the limits: norms for the thrusters, maximum over the joints (N
+        Excess of the command over the limits: norms for the thrusters, maximum over the joints (N
         or N m).
     errors
         Error of each output by its label, m or rad.
     wheels
-        Rate of each reaction wheel by name, as a share of its largest rate.
+        Rate of each reaction wheel by name, as a fraction of its largest rate.
     momentum
-        Angular momentum about the centre of mass, N m s: of ``base``, ``arm``, ``wheels``, and
+        Angular momentum about the centre of mass, N m s, of ``base``, ``arm``, ``wheels``, and
         their ``sum``; empty without reaction wheels.
     dumping
-        Whether the momentum of the wheels is being dumped.
+        Whether wheel momentum is being dumped.
     """
 
     law: str
@@ -125,7 +125,7 @@ class CommandReport:
         )
 
     def controls(self, part: str = "base") -> frozenset[Controlled]:
-        """Return which of position, attitude and shape the outputs control.
+        """Return which of position, attitude and shape are controlled by the outputs.
 
         ``part`` is ``base`` or ``end_effector``.
         """
@@ -143,23 +143,23 @@ class CommandReport:
 
 @dataclass(frozen=True)
 class ControllerStatus:
-    """A status of the controller, as controller/status carries it.
+    """A controller status, as published on controller/status.
 
     Attributes
     ----------
     state
         State of the goal.
     message
-        The text for the user.
+        Text for the user.
     goal_id
-        Id of the goal of this status; empty: no goal, or one without an id.
+        Goal id; empty: no goal, or a goal without an id.
     command
         Report on the last command; None before the first.
     task
-        The task before the goal: ``approach`` or ``detumble``; empty: none.
+        Task before the goal: ``approach`` or ``detumble``; empty: none.
     ends_at_s
-        Expected simulated time at which the goal is reached: end of the reference and settling, s;
-        0: unknown.
+        Expected simulated time at which the goal will be reached, including settling, s; 0:
+        unknown.
     """
 
     state: ControllerState
@@ -170,13 +170,14 @@ class ControllerStatus:
     ends_at_s: float = 0.0
 
     def to_values(self) -> dict[str, str]:
-        """Return the status as the key-value pairs of a DiagnosticStatus; numbers have 6 digits."""
+        """Return the status as the key-value pairs of a DiagnosticStatus; numbers have six
+        digits."""
         command = {} if self.command is None else _COMMAND_FORMAT.to_values(self.command)
         return _FORMAT.to_values(self) | command
 
     @classmethod
     def from_values(cls, values: Mapping[str, str], message: str = "") -> ControllerStatus:
-        """Return the status from the pairs of :meth:`to_values`.
+        """Return the status from pairs written by :meth:`to_values`.
 
         Raises
         ------
@@ -214,12 +215,12 @@ _COMMAND_FORMAT = KeyValueFormat(
 
 
 def tracking_time(states: Iterable[tuple[float, ControllerState]]) -> float | None:
-    """Return the time from the first tracked state to the last decision about a goal, s.
+    """Return the time from the first tracked state to the last goal decision, s.
 
     Parameters
     ----------
     states
-        Time (s) and state of the controller's statuses; without a tracked state or a decision the
+        Times (s) and states of the controller statuses; without a tracked state or a decision, the
         result is None.
     """
     given = list(states)

@@ -12,29 +12,30 @@ from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.rotations import matrix_from_quaternion
 
 _MAX_ROUNDING_SHARE = 1e-6
-"""Largest share of a disturbance outside the outputs that is considered rounding."""
+"""Largest fraction of a disturbance outside the outputs that is attributed to rounding."""
 
 
 def steady_errors(
     law: ControlLaw, state: ControlState, link: str, wrench_W: npt.ArrayLike
 ) -> Array:
-    """Return the steady-state errors (m,) of the outputs under a wrench on a link.
+    """Return the steady-state output errors (m,) under a wrench on a link.
 
-    At rest the actuators balance the wrench: ``[f; n; tau] = -J_q^-T Q_d``, with its generalised
-    force ``Q_d = J_link' F`` (paper 4, eqs 18 and 21). With eq. (29) the errors are
+    At rest, the actuators balance the wrench: ``[f; n; tau] = -J_q^-T Q_d``, where
+    ``Q_d = J_link' F`` is its generalised force (paper 4, eqs 18 and 21). With eq. (29) the errors
+    are
     ``e = -Kp^-1 J_z^-T Q_d``, with eq. (27) ``e = -Kp^-1 J_z H+^-1 Q_d``. An integral gain makes
-    the error of its output zero.
+    its output's error zero.
 
     Parameters
     ----------
     law
         The law with its gains.
     state
-        A state with the attitude and shape of the robot at rest.
+        A state with the robot's attitude and shape at rest.
     link
         Name of the link.
     wrench_W
-        (6,) force (N) over torque (N m) at the origin of the link's frame, in components of W.
+        (6,) force (N) over torque (N m) at the link frame origin, in W components.
 
     Returns
     -------
@@ -44,7 +45,7 @@ def steady_errors(
     Raises
     ------
     ParameterError
-        The outputs do not hold the robot against the wrench.
+        The outputs do not resist the wrench.
     KeyError
         There is no such link.
     """
@@ -60,7 +61,7 @@ def steady_errors(
     if unheld > _MAX_ROUNDING_SHARE * np.linalg.norm(balanced):
         raise ParameterError(
             f"The wrench on link '{link}' causes a motion that the outputs of the law "
-            f"'{law.name}' do not hold: there is no steady state. "
+            f"'{law.name}' do not resist: there is no steady state. "
             f"The outputs are {', '.join(law.outputs.labels)}."
         )
     errors = law.errors_under(state, pull)

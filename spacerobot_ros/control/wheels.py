@@ -1,8 +1,9 @@
-"""Flight software of reaction wheels: torque allocation, saturation, dumping, failures.
+"""Flight software for reaction wheels: torque allocation, saturation, dumping, failures.
 
-A law for base and arm commands a torque on the base of the gyrostat (:mod:`spacerobot_ros.model.
-wheels`). The wheels provide as much of it as their torques and rates allow; the thrusters, if any,
-provide the rest.
+A control law for the base and the arm commands a torque on the gyrostat's base
+(:mod:`spacerobot_ros.model.
+wheels`). The wheels provide as much of it as their torque and rate limits allow; the thrusters, if
+any, provide the rest.
 """
 
 from __future__ import annotations
@@ -29,63 +30,64 @@ _MIN_PERIODS_TO_LIMIT = 2
 _SATURATED_SHARE = 0.99
 
 _ANNOUNCEMENT_HYSTERESIS = 0.05
-"""Decrease of a wheel's rate after which it may be reported again, as share of the largest."""
+"""Decrease in a wheel's rate after which it may be reported again, as a fraction of the largest
+rate."""
 
 _DUMP_TIME = 5.0
-"""Time constant with which rates decay while momentum is dumped, s."""
+"""Time constant of the rate decay while momentum is dumped, s."""
 
 _DUMPED_SHARE = 0.02
 
 _DUMP_TORQUE_SHARE = 0.5
-"""Share of the thrusters' torque for dumping; control needs the rest."""
+"""Fraction of the thruster torque used for dumping; control needs the rest."""
 
 _MOTION_SHARE = 0.5
-"""Share of the wheels' torque and momentum for references."""
+"""Fraction of wheel torque and momentum available to references."""
 
 _FAILURE_TIME = 0.5
-"""Time at full torque after which the response of a wheel is checked, s."""
+"""Time at full torque after which a wheel's response is checked, s."""
 
 _MIN_RESPONSE_SHARE = 0.5
-"""Smallest share of the commanded impulse that an intact wheel absorbs."""
+"""Smallest fraction of the commanded impulse that an intact wheel absorbs."""
 
 _MIN_BOUND_WIDTH = 1e-12
-"""Smallest width of the solver's bounds, N m, and the share of a torque that is considered zero."""
+"""Smallest width of the solver bounds, N m, and fraction of a torque that is considered zero."""
 
 _SMOOTHING = 1e-6
-"""Weight of the torques relative to their sum, which chooses the smallest of equal allocations."""
+"""Weight of the torques relative to their sum, which selects the smallest of equivalent
+allocations."""
 
 
 @dataclass(frozen=True)
 class WheelOptions:
-    """The parameters of reaction wheels."""
+    """Parameters of reaction wheels."""
 
     warning_rate: float = parameter(
         0.9,
-        "share of a wheel's largest rate at which an event warns of saturation",
+        "fraction of a wheel's largest rate at which an event warns of saturation",
         minimum=0.01,
         maximum=1.0,
     )
     dump_rate: float = nonnegative(
         0.0,
-        "share of a wheel's largest rate at which the momentum of the wheels is dumped; 0: on "
-        "request only",
+        "fraction of a wheel's largest rate at which wheel momentum is dumped; 0: only on request",
         maximum=1.0,
     )
     excluded: str = parameter("", "joints of disabled wheels, separated by spaces")
 
 
 class WheelAllocation:
-    """Distributes a torque over wheels by least squares within bounds.
+    """Distributes a torque over wheels by bounded least squares.
 
-    The torques solve ``min |A tau - torque|`` with ``lower <= tau <= upper``; if there are several
-    solutions, it is the one with the smallest shares of the largest torques.
+    The torques solve ``min |A tau - torque|`` with ``lower <= tau <= upper``; among several
+    solutions, the one with the smallest torques relative to their limits is chosen.
 
     Parameters
     ----------
     axes
-        (3, k) axes A of the wheels.
+        (3, k) wheel axes A.
     torque
-        (k,) largest torques of their motors, N m.
+        (k,) largest motor torques, N m.
     """
 
     def __init__(self, axes: Array, torque: Array) -> None:
@@ -102,7 +104,7 @@ class WheelAllocation:
         """Number of independent axes."""
 
     def allocate(self, torque: Array, lower: Array, upper: Array) -> Array:
-        """Return the torques (k,) whose sum along the axes is nearest to ``torque`` (3,), N m."""
+        """Return the torques (k,) whose sum along the axes is closest to ``torque`` (3,), N m."""
         tau = self._torque * (self._inverse @ torque)
         if np.all((lower <= tau) & (tau <= upper)):
             return np.asarray(tau)
@@ -115,8 +117,8 @@ class WheelAllocation:
         return np.clip(self._torque * shares, lower, upper)
 
     def within(self, limits: Array) -> float:
-        """Return the largest sum that is possible along every axis within ``limits`` (k,), which
-        are torques or momenta of the wheels; zero if the wheels do not span the space.
+        """Return the largest sum achievable along every axis within ``limits`` (k,), which are
+        wheel torques or momenta; zero if the wheel axes do not span the space.
         """
         if self.rank < 3:
             return 0.0
@@ -125,7 +127,7 @@ class WheelAllocation:
 
 
 class WheelControl:
-    """The wheels of a controlled robot: measured rates, commanded torques, and events.
+    """Wheels of a controlled robot: measured rates, commanded torques, and events.
 
     ``control_period`` is the time between two commands, s, and ``thruster_torque`` the largest
     torque of the thrusters, N m; infinite: no limit, zero: there are no thrusters.
@@ -133,7 +135,7 @@ class WheelControl:
     Raises
     ------
     ParameterError
-        There is no wheel with a given name, or momentum is to be dumped without thrusters.
+        A named wheel does not exist, or momentum is to be dumped without thrusters.
     """
 
     def __init__(
@@ -160,28 +162,29 @@ class WheelControl:
                 "false: only thrusters can dump momentum; set it to 0."
             )
         self.gyrostat = robot.derived(wheels.gyrostat)
-        """The robot that the laws control."""
+        """The robot controlled by the laws."""
         self._allocate = self._make_allocation()
         self.reset()
 
     def reset(self) -> None:
-        """Forget measurements; wheels that have failed stay out of use."""
+        """Clear measurements; failed wheels stay out of use."""
         count = len(self.wheels)
         self.torque = np.zeros(count)
-        """Commanded torques (k,) of the motors, N m."""
+        """Commanded motor torques (k,), N m."""
         self.thrust = np.zeros(6)
         """Wrench (6,) for the thrusters, N and N m."""
         self.rates, self._omega = np.zeros(count), np.zeros(3)
         self._q, self._spins = np.zeros(0), np.zeros(count)
         self._announced = np.zeros(count)
-        """Rate of each wheel when last reported, as a share of the largest; zero: not reported."""
+        """Rate of each wheel when last reported, as a fraction of the largest; zero: not
+        reported."""
         self.dumping = False
         """Whether momentum is being dumped."""
         self._events: list[Event] = []
         self.reset_response_check()
 
     def reset_response_check(self) -> None:
-        """Restart the check of the wheels' response, because earlier commands were not executed."""
+        """Restart the wheel response check, because earlier commands were not executed."""
         self._asked, self._answered = np.zeros(len(self.wheels)), np.zeros(len(self.wheels))
         self._known = False
 
@@ -192,7 +195,7 @@ class WheelControl:
 
     @property
     def rank(self) -> int:
-        """Number of independent axes of the wheels in use."""
+        """Number of independent axes among the wheels in use."""
         return self._allocate.rank
 
     @property
@@ -205,7 +208,7 @@ class WheelControl:
     def observe(
         self, measured: ControlState | None, q: Array, qdot: Array
     ) -> tuple[ControlState | None, Array, Array]:
-        """Take a state of the robot; return the state of the gyrostat."""
+        """Take a robot state and return the gyrostat state."""
         wheels = self.wheels
         self._q, self.rates = q, qdot[wheels.index]
         q, qdot = q[wheels.other], qdot[wheels.other]
@@ -218,7 +221,7 @@ class WheelControl:
         return replace(measured, q=q, qdot=qdot), q, qdot
 
     def reference(self, reference: Reference | None) -> Reference | None:
-        """Return a reference of the robot as a reference of the gyrostat."""
+        """Return a robot reference as a gyrostat reference."""
         if reference is None or reference.joints is None:
             return reference
         parts = (getattr(reference.joints, name) for name in ("q", "qdot", "qddot"))
@@ -226,13 +229,13 @@ class WheelControl:
         return replace(reference, joints=joints)
 
     def shape_with_wheels(self, q: Array) -> Array:
-        """Return the shape (n,) of the robot from the joints (n - k,) of the gyrostat."""
+        """Return the robot shape (n,) from the gyrostat's joint positions (n - k,)."""
         whole = np.zeros(len(self.wheels) + len(self.wheels.other))
         whole[self.wheels.other] = q
         return whole
 
     def actuation(self, realised: Actuation) -> Actuation:
-        """Return the wrench of the thrusters, and the efforts of all joints."""
+        """Return the thruster wrench and the efforts of all joints."""
         tau = self.shape_with_wheels(realised.tau)
         tau[self.wheels.index] = self.torque
         return Actuation(self.thrust.copy(), tau)
@@ -245,9 +248,9 @@ class WheelControl:
     # -- torques ------------------------------------------------------------------------------
 
     def command_torque(self, torque: Array) -> Array:
-        """Command wheel torques for a torque (3,) on the base, N m; return the part they provide.
+        """Command wheel torques for a base torque (3,), N m; return the part they provide.
 
-        The gyroscopic torque ``omega x A h`` of the spins is compensated for.
+        The gyroscopic torque ``omega x A h`` of the spinning wheels is compensated for.
         """
         A = self.wheels.axes_B
         gyroscopic = cross(self._omega, A @ self.wheels.spins(self._omega, self.rates))
@@ -271,7 +274,7 @@ class WheelControl:
         self.torque, self.thrust = np.zeros(len(self.wheels)), np.zeros(6)
 
     def limits_with_wheels(self, motion: MotionLimits, q: Array) -> MotionLimits:
-        """Return limits of references that wheels alone can follow, for a shape (n - k,)."""
+        """Return reference limits that wheels alone can follow, for a shape (n - k,)."""
         if self.has_thrusters or self.rank < 3:
             return motion
         wheels, used = self.wheels, self._used
@@ -296,35 +299,34 @@ class WheelControl:
     # -- momentum -----------------------------------------------------------------------------
 
     def request_dump(self) -> str:
-        """Begin to dump the momentum of the wheels; return a message.
+        """Start dumping the wheel momentum and return a message.
 
         Raises
         ------
         CommandError
-            Without thrusters momentum cannot be dumped.
+            Without thrusters, momentum cannot be dumped.
         """
         if not self.has_thrusters:
             raise CommandError(
-                "There are no thrusters (use_thrusters is false) that could absorb the momentum "
-                "of the wheels."
+                "There are no thrusters (use_thrusters is false) to absorb the wheel momentum."
             )
         if self.dumping:
-            return "Momentum is being dumped already."
+            return "Momentum is already being dumped."
         if self._is_dumped:
-            return "The wheels hold no momentum."
+            return "The wheels have no momentum."
         self._begin_dump("on request")
-        return "The momentum of the wheels is dumped to the thrusters."
+        return "The wheel momentum is being dumped to the thrusters."
 
     def budget(self, q: Array, qdot: Array) -> dict[str, float]:
-        """Return the norms of the parts of :func:`momentum_budget` by name, N m s, for the joints
-        (n - k,) of the gyrostat.
+        """Return the norms of the :func:`momentum_budget` contributions by name, N m s, for the
+        gyrostat's joints (n - k,).
         """
         parts = momentum_budget(self.wheels, self.gyrostat, self._omega, q, qdot, self.rates)
         return {name: float(np.linalg.norm(part)) for name, part in parts.items()}
 
     @property
     def shares(self) -> dict[str, float]:
-        """Signed rate of each wheel as a share of its largest rate, by name."""
+        """Signed rate of each wheel as a fraction of its largest rate, by name."""
         return dict(zip(self.wheels.names, (self.rates / self.wheels.rate).tolist(), strict=True))
 
     @property
@@ -333,7 +335,7 @@ class WheelControl:
 
     def _begin_dump(self, why: str) -> None:
         self.dumping = True
-        self._add(EventKind.DUMP_STARTED, f"The momentum of the wheels is dumped {why}.", 0)
+        self._add(EventKind.DUMP_STARTED, f"The wheel momentum is being dumped {why}.", 0)
 
     def _dumping_torques(self) -> Array:
         wheels = self.wheels
@@ -351,11 +353,11 @@ class WheelControl:
         wheels, options = self.wheels, self._options
         if self.dumping and self._is_dumped:
             self.dumping = False
-            self._add(EventKind.DUMP_ENDED, "The momentum of the wheels is dumped.", 0)
+            self._add(EventKind.DUMP_ENDED, "The wheel momentum has been dumped.", 0)
         shares = np.abs(self.rates) / wheels.rate
         for i in np.flatnonzero(self._used):
             share, name = float(shares[i]), wheels.names[i]
-            turns = f"Wheel '{name}' turns at {self.rates[i]:.4g} of {wheels.rate[i]:.4g} rad/s"
+            turns = f"Wheel '{name}' rotates at {self.rates[i]:.4g} of {wheels.rate[i]:.4g} rad/s"
             if share < options.warning_rate - _ANNOUNCEMENT_HYSTERESIS:
                 self._announced[i] = 0.0
             elif share >= _SATURATED_SHARE > self._announced[i]:
@@ -372,7 +374,7 @@ class WheelControl:
                 self._begin_dump(f"because wheel '{wheels.names[fastest]}' is fast")
 
     def time_to_saturation(self, i: int) -> float:
-        """Return the time until wheel i reaches its largest rate at its present torque, s."""
+        """Return the time until wheel i reaches its largest rate at its current torque, s."""
         tau, wheels = self.torque[i], self.wheels
         if tau == 0.0:
             return math.inf
@@ -421,10 +423,10 @@ def momentum_budget(
     qdot: Array,
     rates: Array,
 ) -> dict[str, Array]:
-    """Return the parts (3,) of the angular momentum about the centre of mass by name, N m s, base
-    components.
+    """Return the contributions (3,) to the angular momentum about the centre of mass by name, N m
+    s, base components.
 
-    ``base`` is that of the gyrostat rotating with the base, its joints at rest; ``arm`` is that of
+    ``base`` is due to the gyrostat's rotation with the base, its joints at rest; ``arm`` is due to
     the gyrostat's joints (q, qdot: (n - k,)) with the base at rest; ``wheels`` is ``A h``; ``sum``
     their sum.
     """

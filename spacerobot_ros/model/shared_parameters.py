@@ -1,4 +1,4 @@
-"""Parameters that several nodes share: robot and model, watchdog, goals and tolerances."""
+"""Parameters shared by several nodes: robot and model, watchdog, goals and tolerances."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from spacerobot_ros.resources import robot_file
 from spacerobot_ros.times import SECOND
 
 DEFAULT_TICK_RATE = 20.0
-"""Default tick rate of a plant, Hz."""
+"""Default plant tick rate, Hz."""
 
 _MIN_RATE = 0.001  # Hz
 
@@ -27,7 +27,7 @@ DEFAULT_POSITION_TOLERANCE = 1e-3
 """Automatic position tolerance if no robot is known, m."""
 
 _TOLERANCE_SHARE = 1e-3
-"""Automatic position tolerance as a share of the size of a robot."""
+"""Automatic position tolerance as a fraction of the robot size."""
 
 _SMALLEST_TOLERANCE, _LARGEST_TOLERANCE = 1e-4, 1e-2
 """Bounds of automatic position tolerances, m."""
@@ -45,50 +45,54 @@ def automatic_tolerance(robot: RobotDescription) -> float:
 class RobotConfig:
     """The robot of a node."""
 
-    robot_description: str = parameter("", "URDF text of the robot; takes precedence over 'robot'")
-    robot: str = parameter(
-        "", "URDF file, or the name of a robot of this package (sliding_masses, ...)"
+    robot_description: str = parameter(
+        "", "URDF string of the robot; takes precedence over 'robot'"
     )
-    world: str = parameter("", "URDF file of fixed obstacles; '': those in the robot's description")
+    robot: str = parameter(
+        "", "URDF file, or the name of a robot in this package (sliding_masses, ...)"
+    )
+    world: str = parameter(
+        "", "URDF file with fixed obstacles; '': the obstacles in the robot's description"
+    )
 
     def described(self, robot: RobotDescription) -> RobotDescription:
-        """Return the robot with the obstacles and disabled pairs of this configuration.
+        """Return the robot with the obstacles and disabled pairs from this configuration.
 
         Raises
         ------
         ParameterError
-            The obstacles are refused.
+            The obstacles are invalid.
         """
         if not self.world:
             return robot
         try:
             return with_world(robot, load_world(self.world))
         except RobotDescriptionError as error:
-            raise ParameterError(f"Parameter 'world' is refused: {error}") from error
+            raise ParameterError(f"Parameter 'world' is invalid: {error}") from error
 
     def assumed_robot(self, robot: RobotDescription) -> RobotDescription:
-        """Return the robot with the mass properties that the configured node assumes."""
+        """Return the robot with the mass properties assumed by the configured node."""
         return robot
 
 
 @dataclass(frozen=True)
 class AssumedRobotConfig(RobotConfig):
-    """The robot of flight software, whose model may differ from the plant's."""
+    """The robot as modelled by flight software, which may differ from the plant's."""
 
     model_error: float = nonnegative(
-        0.0, "largest relative error of masses and inertias", maximum=0.9
+        0.0, "largest relative error in masses and inertias", maximum=0.9
     )
-    model_error_seed: int = nonnegative(0, "seed of these random errors")
+    model_error_seed: int = nonnegative(0, "random seed for these errors")
 
     def assumed_robot(self, robot: RobotDescription) -> RobotDescription:
-        """Return the robot with random errors of masses and inertias of up to ``model_error``."""
+        """Return the robot with random mass and inertia errors of up to ``model_error``."""
         if self.model_error > 0.0:
             return robot.with_model_error(self.model_error, self.model_error_seed)
         return robot
 
 
 def robot_of(config: RobotConfig) -> SpaceRobot | None:
-    """Return the robot that a configuration names; None: it names none.
+    """Return the robot named in a configuration; None: it names none.
 
     Raises
     ------
@@ -109,7 +113,7 @@ def robot_of(config: RobotConfig) -> SpaceRobot | None:
 
 
 def robot_from_text(text: str, config: RobotConfig) -> SpaceRobot:
-    """Return the robot of a URDF text with the mass properties that the node assumes.
+    """Return the robot from a URDF string with the mass properties assumed by the node.
 
     Raises
     ------
@@ -132,19 +136,19 @@ class WatchdogConfig:
 
     watchdog_timeout: float = nonnegative(
         0.8,
-        "wall time without a heartbeat after which a required node counts as silent; 0: never",
+        "wall time without a heartbeat after which a required node is considered silent; 0: never",
         "s",
     )
 
 
 @dataclass(frozen=True)
 class CommanderConfig(WatchdogConfig, AssumedRobotConfig):
-    """Parameters of the nodes that command a plant: rate, goals, tolerances."""
+    """Parameters of nodes that command a plant: rate, goals, tolerances."""
 
     tick_rate: float = nonnegative(
         0.0, "commands per second; 0: the plant's rate", "Hz", maximum=100000.0
     )
-    world_frame: str = parameter("world", "frame of goals without a known frame")
+    world_frame: str = parameter("world", "frame assumed for goals without a known frame")
     state_reliability: str = parameter(
         "auto",
         "reliability of the subscriptions to odom and joint_states; auto: reliable, or best "
@@ -159,27 +163,27 @@ class CommanderConfig(WatchdogConfig, AssumedRobotConfig):
     )
     position_tolerance: float = nonnegative(
         0.0,
-        "largest position error of a reached goal; 0: a thousandth of the robot's diameter of "
-        "gyration",
+        "largest position error for a goal to be reached; 0: a thousandth of the robot's diameter "
+        "of gyration",
         "m",
         read_only=False,
     )
     attitude_tolerance: float = nonnegative(
-        0.001, "largest attitude error of a reached goal", "rad", read_only=False
+        0.001, "largest attitude error for a goal to be reached", "rad", read_only=False
     )
     joint_tolerance: float = nonnegative(
-        0.001, "largest joint error of a reached goal", "m or rad", read_only=False
+        0.001, "largest joint error for a goal to be reached", "m or rad", read_only=False
     )
     resume_file: str = parameter(
-        "", "file of the present goals, from which a restarted node resumes; '': none"
+        "", "file with the current goals, from which a restarted node resumes; '': none"
     )
     plan_in_background: bool = parameter(
         True,
-        "plan in a thread while the robot keeps moving; false, or a lockstep plant: states wait "
-        "for the plan",
+        "plan in a thread while the robot keeps moving; if false, or with a lockstep plant, "
+        "states wait for the plan",
     )
     stop_when_decided: bool = parameter(
-        False, "send no commands after a goal is decided: a lockstep plant stays at that tick"
+        False, "send no commands once a goal has ended: a lockstep plant stays at that tick"
     )
     watchdog_action: str = parameter(
         "report",
@@ -195,7 +199,7 @@ class CommanderConfig(WatchdogConfig, AssumedRobotConfig):
             )
 
     def for_robot(self: Config, robot: RobotDescription) -> Config:
-        """Return the configuration with the tolerance of a robot instead of an automatic one."""
+        """Return the configuration with the automatic tolerance replaced by the robot's value."""
         if self.position_tolerance:
             return self
         return replace(self, position_tolerance=automatic_tolerance(robot))
@@ -207,5 +211,5 @@ class CommanderConfig(WatchdogConfig, AssumedRobotConfig):
 
     @property
     def control_period(self) -> float:
-        """Duration for which a command is held, a whole number of nanoseconds, s."""
+        """Duration for which a command is held, s: a whole number of nanoseconds."""
         return round(SECOND / (self.tick_rate or DEFAULT_TICK_RATE)) / SECOND

@@ -1,4 +1,4 @@
-"""Capabilities of a robot: rotations of its base by joint motions, and suitable gait methods."""
+"""Capabilities of a robot: base rotations by joint motions, and suitable gait methods."""
 
 from __future__ import annotations
 
@@ -37,35 +37,35 @@ from spacerobot_ros.planning.methods.registry import METHODS
 _CONDITION_SAMPLE_COUNT = 300
 
 _LOOP_EDGE_LENGTH = 1.0
-"""Length of loop edges for which the nominal shape is optimised, m or rad: those of area_loop."""
+"""Loop edge length for which the nominal shape is optimised, m or rad: that of area_loop."""
 
 
 @dataclass(frozen=True)
 class Analysis:
-    """The controllability of one robot, and the gait methods that suit the robot.
+    """Controllability of a robot, and the gait methods suitable for it.
 
     Attributes
     ----------
     robot
         The model.
     shape
-        (n,) the examined configuration: the given one, the best nominal one, or the middle one.
+        (n,) examined configuration: the given, best nominal or middle configuration.
     nominal
-        The three joints and their M in this configuration; None with fewer than three joints, or if
-        no loops rotate the base about three axes.
+        The three joints and their M at this configuration; None if there are fewer than three
+        joints, or if no loops rotate the base about three axes.
     at_shape, anywhere
         The span of first-order brackets at ``shape``, and at the best of many configurations.
     conditions
-        (300,) condition numbers of the best three brackets, in configurations all over the shape
+        (300,) condition numbers of the best three brackets, for configurations all over the shape
         space.
     planar, sliding
-        The tests of papers 3 and 1.
+        Results of the tests in papers 3 and 1.
     objections
-        Reason why a method does not suit the robot, by name of the method; None if it does.
+        Reason why a method is unsuitable for the robot, by method name; None if it does.
     geometry
-        The solids of the robot, and the pairs whose distances are checked.
+        The robot's solids, and the pairs whose distances are checked.
     end_effector
-        The link whose workspaces are computed; "" if none is given and the default does not exist.
+        The link whose workspaces are computed; "" if not given and the default link does not exist.
     """
 
     robot: SpaceRobot
@@ -82,9 +82,9 @@ class Analysis:
 
     @cached_property
     def workspaces(self) -> tuple[Workspaces, ...]:
-        """Workspaces of the end-effector, without and within the limits of the joints.
+        """Workspaces of the end-effector, without and with joint limits.
 
-        Empty without an end-effector or joints.
+        Empty if there are no end-effector or no joints.
         """
         if not self.end_effector or self.robot.n == 0:
             return ()
@@ -104,14 +104,14 @@ class Analysis:
 def analyze(
     robot: SpaceRobot, shape: Sequence[float] | None = None, end_effector: str = ""
 ) -> Analysis:
-    """Return the analysis of a robot at a shape (n,), or at the best shape for loops.
+    """Analyse a robot at a shape (n,), or at the best shape for loops.
 
     ``end_effector`` names the link whose workspaces are computed; "": the default one.
 
     Raises
     ------
     ParameterError
-        The shape or the link is not one of this robot.
+        The shape or the link does not belong to this robot.
     """
     link = robot.description.end_effector(end_effector)
     if link:
@@ -162,7 +162,7 @@ def _check_link(robot: SpaceRobot, link: str) -> None:
     names = [each.name for each in robot.description.links if each.name != robot.base_link]
     if link not in names:
         raise ParameterError(
-            f"Robot '{robot.description.name}' has no link '{link}' besides its base; its links "
+            f"Robot '{robot.description.name}' has no link '{link}' other than its base; its links "
             f"are {', '.join(names)}."
         )
 

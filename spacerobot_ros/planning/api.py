@@ -1,4 +1,4 @@
-"""The Python API of planning: from a robot and a goal to a gait."""
+"""Python planning API: from a robot and a goal to a gait."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from spacerobot_ros.planning.methods.registry import build_method, method_option
 from spacerobot_ros.resources import robot_file
 
 EndEffectorValues = npt.ArrayLike | Mapping[str, npt.ArrayLike]
-"""Values of the goal of one end-effector, or of several by the names of their links."""
+"""Goal values of one end-effector, or of several end-effectors by link name."""
 
 _DEFAULT_TOLERANCE = Tolerance(1e-6, 1e-6, 1e-6)
 
@@ -53,49 +53,50 @@ def plan(
 ) -> GaitSchedule:
     """Plan a gait: ``plan("sliding_masses", position=(0.3, 0, 0.1), rotvec=(0.5, 0, 0))``.
 
-    With a goal of an end-effector, ``plan("three_joint_arm", end_effector_position=(2, 1, 0.5))``,
+    With an end-effector goal, ``plan("three_joint_arm", end_effector_position=(2, 1, 0.5))``,
     the base is free except for the given parts of its pose.
 
     Parameters
     ----------
     robot
-        The model, a URDF file, or the name of a robot of this package.
+        The model, a URDF file, or the name of a robot in this package.
     goal
-        The goal; or, of the base, ``position`` (3,) in m (the origin) and ``rotvec`` (3,) in rad
-        (exponential coordinates; no rotation), and the final ``joint_positions`` (n,) in m or rad.
+        The goal; or a base goal given by ``position`` (3,) in m (default: the origin) and
+        ``rotvec`` (3,) in rad (exponential coordinates; default: no rotation), and the final
+        ``joint_positions`` (n,) in m or rad.
     end_effector_position, end_effector_pose
-        Position (3,) in m, or position and quaternion (7,), of the link ``end_effector`` (its name;
-        empty: the default one); or of several links, by name.
+        Position (3,) in m, or position and quaternion (7,), of the link ``end_effector`` (a name;
+        empty: the default end-effector); or of several links, by name.
     end_effector_path
         Positions (K, 3) in m, or positions and quaternions (K, 7), through which one end-effector
         moves on straight lines; the last one is its goal.
     start
         The start: a state, or the shape (n,) with the base at the origin of W; None: zero, or as
-        near to zero as the joint limits allow.
+        close to zero as the joint limits allow.
     linear_momentum, angular_momentum
-        (3,) each in W, kg m/s and kg m^2/s, the second about the centre of mass; None: those of the
-        start. Only ``optimal`` plans for robots that drift.
+        (3,) each in W, kg m/s and kg m^2/s; angular momentum is about the centre of mass; None: the
+        momenta of the start. Only ``optimal`` plans for robots that drift.
     method
         Name of a gait method; ``options`` are its own. None: ``resolved_rate`` for a goal with a
         path, otherwise ``optimal``.
     control_period, tolerance, integration_step
-        Duration of a command (s), largest error at the goal, and longest step of the prediction
-        (s). Use the plant's values for a flight that ends where the plan does.
+        Command duration (s), largest error at the goal, and longest prediction step (s). Use the
+        plant's values so that the flight ends where planned.
     clearance
-        Smallest distance of links during the motion, m; 0 disables collision checks. With
+        Smallest distance between links during the motion, m; 0 disables collision checks. With
         obstacles, 0 means 0.01 m.
     world
-        Obstacles that are fixed in the world (:func:`.load_world`), or their URDF file; None: those
-        that the robot carries.
+        Obstacles fixed in the world (:func:`.load_world`), or their URDF file; None: the
+        obstacles in the robot description.
 
     Raises
     ------
     PlanningError
-        The goal is refused or cannot be reached; the message says why.
+        The goal is invalid or cannot be reached; the message says why.
     ParameterError
-        The robot, the method or an option does not exist or is refused, or a momentum is refused.
+        The robot, the method or an option does not exist or is invalid, or a momentum is invalid.
     RobotDescriptionError
-        The robot or the world is refused.
+        The robot or the world is invalid.
     """
     if not isinstance(robot, SpaceRobot):
         robot = SpaceRobot.from_file(robot_file(str(robot)))
@@ -159,7 +160,7 @@ def end_effector_goals(
     *,
     path: EndEffectorValues | None = None,
 ) -> tuple[EndEffectorGoal, ...]:
-    """Return goals of end-effectors from positions, poses and paths: of one ``link``, or by name.
+    """Return end-effector goals from positions, poses and paths, for one ``link`` or by name.
 
     Raises
     ------
@@ -173,7 +174,7 @@ def end_effector_goals(
         by_link = values if isinstance(values, Mapping) else {link: values}
         if link and isinstance(values, Mapping):
             raise GoalError(
-                f"The goals of end-effectors are given by name, and '{link}' is named in addition."
+                f"The end-effector goals are given by name, but '{link}' is named in addition."
             )
         for name, numbers in by_link.items():
             if count is None:
@@ -182,9 +183,7 @@ def end_effector_goals(
             goal = EndEffectorGoal.checked(str(name), numbers)
             if len(goal.values) != count:
                 kind = "a position has 3" if count == 3 else "a pose has 7"
-                raise GoalError(
-                    f"The goal of the end-effector has {len(goal.values)} numbers; {kind}."
-                )
+                raise GoalError(f"The end-effector goal has {len(goal.values)} numbers; {kind}.")
             goals.append(goal)
     if goals:
         Goal.of_end_effectors(goals)
@@ -201,7 +200,7 @@ def _start_state(robot: SpaceRobot, start: RobotState | npt.ArrayLike | None) ->
         q = np.asarray(start, dtype=float)
     if q.shape != (robot.n,):
         raise ParameterError(
-            f"The start has {q.size} joint position(s); robot '{robot.description.name}' has "
+            f"The start has {q.size} joint position(s), but robot '{robot.description.name}' has "
             f"{robot.n} joints."
         )
     return RobotState(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), q)

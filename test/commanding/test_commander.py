@@ -411,7 +411,7 @@ def test_a_planner_plans_again_for_the_robot_with_the_body_that_it_holds(
     planner.commander.receive_plant_status(replace(CAPTURED, payload=held.to_text()))
     assert planner.commander.robot.total_mass == pytest.approx(robot.total_mass + 4.0)
     warnings = [line for level, line in planner.host.lines if level == "warning"]
-    assert warnings == ["The robot has a different mass now: the motion is planned again."]
+    assert warnings == ["The robot has a different mass now: the motion is replanned."]
     plans = planner.commander.statistics.plans
     for tick in range(5, 9):
         planner.state(tick)
@@ -433,7 +433,7 @@ def test_a_commander_that_comes_after_a_capture_knows_of_it(
     assert other.commander.robot is robot
     ((level, line),) = other.host.lines
     assert level == "error"
-    assert line.startswith("plant/status: A body is held by the link 'link_1', but robot ")
+    assert line.startswith("plant/status: The payload is held by link 'link_1', but robot ")
 
 
 # -- disturbances -----------------------------------------------------------------------------

@@ -57,8 +57,13 @@ from spacerobot_ros.simulation import EffortPlant, InitialState
 @pytest.mark.parametrize(
     ("key", "position", "rotvec", "named"),
     [
-        ("base", [0.1, 0.05, 0.051], [0.0, 0.0, 0.1], "position of the base is 0.051 m .* in z "),
-        ("base", AIM, [0.3, 0.4, 0.0], "attitude of the base is 0.5 rad .* in rx and ry "),
+        (
+            "base",
+            [0.1, 0.05, 0.051],
+            [0.0, 0.0, 0.1],
+            "position of the base is 0.051 m .* along z ",
+        ),
+        ("base", AIM, [0.3, 0.4, 0.0], "attitude of the base is 0.5 rad .* along rx and ry "),
         ("end_effector", TIP - [0, 0, 3], [0.3, 0, 0], "position of the end-effector is 3 m .* z "),
     ],
 )

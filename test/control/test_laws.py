@@ -271,7 +271,7 @@ def test_gains_may_be_matrices_of_all_outputs(seed: int) -> None:
 @pytest.mark.parametrize(
     ("matrix", "sentence"),
     [
-        ([1.0, 0.0, 0.0, 1.0], "has 4 numbers; the 5 outputs of the law .* take 25"),
+        ([1.0, 0.0, 0.0, 1.0], "has 4 values; the 5 outputs of the law .* take 25"),
         (np.triu(np.ones((5, 5))), "is not symmetric"),
         (np.diag([1.0, 1.0, 0.0, 1.0, 1.0]), "is not positive definite"),
     ],
@@ -280,7 +280,7 @@ def test_matrices_that_are_no_gains_are_refused(matrix: Any, sentence: str) -> N
     for name in ("kp_matrix", "kd_matrix"):
         numbers = np.ravel(matrix).tolist()
         config = configured(ControllerConfig, {f"gains.{name}": numbers})
-        with pytest.raises(ParameterError, match=rf"^The gains\.{name} {sentence}"):
+        with pytest.raises(ParameterError, match=rf"^Parameter 'gains\.{name}' {sentence}"):
             build_controller(load("planar_manipulator"), config)
 
 

@@ -128,7 +128,7 @@ def test_a_target_is_approached_captured_brought_to_rest_and_carried() -> None:
     assert (loop.state, loop.status.task) == ("tracking", "detumble")
     assert_one_sentence(loop.status.message, "Detumbling", "50 mrad/s")
     assert loop.kinds()[2:] == ["detumble_started"]
-    assert_one_sentence(loop.events[-1].message, "N m s take at least")
+    assert_one_sentence(loop.events[-1].message, "N m s takes at least")
     assert loop.executive.controller.coming_to_rest
     loop.answer(5)
     loop.rates = np.array([0.001, -0.002])
@@ -184,7 +184,7 @@ def test_the_reference_meets_the_grapple_frame_with_its_velocity_and_a_miss_has_
     distance = np.linalg.norm(loop.block - [0.3, 0.0, 0.0] - TIP)
     assert_one_sentence(
         loop.status.message,
-        "The approach is given up: the target is missed",
+        "The approach is aborted: the target is missed",
         "22.4 mm/s",
         "within 0.2 s",
     )
@@ -205,7 +205,7 @@ def test_without_a_target_an_approach_is_refused_and_the_robot_holds() -> None:
     loop.answer(2)
     refused = [each for each in loop.statuses if each.state is ControllerState.REFUSED]
     assert_one_sentence(
-        refused[0].message, "The approach is refused: the target is not known", "'target/odom'"
+        refused[0].message, "The approach is refused: the target is unknown", "'target/odom'"
     )
     assert refused[0].goal_id == "5"
     loop.answer(3)
@@ -248,7 +248,7 @@ def test_a_target_that_is_not_seen_any_more_is_lost() -> None:
     assert loop.state == "tracking"
     loop.answer()
     assert loop.state == "aborted"
-    assert_one_sentence(loop.status.message, "given up: the target is lost", "0.06 s old")
+    assert_one_sentence(loop.status.message, "aborted: the target is lost", "0.06 s old")
 
 
 def test_a_target_that_strays_is_approached_anew_and_one_that_leaves_is_given_up() -> None:
@@ -264,7 +264,7 @@ def test_a_target_that_strays_is_approached_anew_and_one_that_leaves_is_given_up
     loop.block[0] += 3.0
     loop.answer()
     assert loop.state == "aborted"
-    assert_one_sentence(loop.status.message, "given up: the target is out of reach")
+    assert_one_sentence(loop.status.message, "aborted: the target is out of reach")
 
 
 def test_base_and_arm_are_planned_to_a_target_and_anew_if_it_strays() -> None:
@@ -277,7 +277,7 @@ def test_base_and_arm_are_planned_to_a_target_and_anew_if_it_strays() -> None:
     loop.answer(3)
     assert loop.kinds() == ["goal_accepted", "approach_started"]
     assert_one_sentence(
-        loop.events[-1].message, "Base and end-effector set out at", "the plan leaves"
+        loop.events[-1].message, "The base and the end-effector start at", "the plan leaves"
     )
     about = loop.events[-1].about
     assert about["detumble"] == "none"

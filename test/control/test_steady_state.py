@@ -138,7 +138,7 @@ def test_wrenches_that_nothing_holds_are_refused(name: str, wrench: list[float])
         steady_errors(law, planar_start(), "link_2", wrench)
     assert str(refused.value) == (
         "The wrench on link 'link_2' causes a motion that the outputs of the law "
-        f"'{name}' do not hold: there is no steady state. "
+        f"'{name}' do not resist: there is no steady state. "
         f"The outputs are {', '.join(law.outputs.labels)}."
     )
 
@@ -230,7 +230,7 @@ def test_a_law_without_an_integral_term_says_so() -> None:
 def test_integral_gains_are_not_negative(ki: float) -> None:
     with pytest.raises(ParameterError) as refused:
         Gains(joints=GainPair(1.0, 2.0, ki))
-    assert str(refused.value) == f"The gain joints.ki is {ki}; it must be finite and not negative."
+    assert str(refused.value) == f"The gain joints.ki is {ki}; it must be finite and non-negative."
 
 
 def test_a_new_goal_and_a_reset_begin_the_integral_anew() -> None:
@@ -506,13 +506,13 @@ def test_a_robot_that_starts_slowly_is_not_stalled() -> None:
 def test_limits_that_hold_the_robot_back_are_named() -> None:
     loop = aimed(max_force=1.0)
     wait_for_stall(loop)
-    assert loop.status.message.endswith(": the force of the thrusters is at its limit.")
+    assert loop.status.message.endswith(": the thruster force is at its limit.")
     loop = ExecutiveLoop(max_torque=0.01, base_outputs="x y rz", end_effector_outputs="")
     turned = np.array([0.0, 0.0, np.sin(0.1), np.cos(0.1)])
     loop.aim(base=IdentifiedGoal(Goal(np.zeros(3), turned), "turned"))
     loop.answer()
     wait_for_stall(loop)
-    assert loop.status.message.endswith(": the torque on the base is at its limit.")
+    assert loop.status.message.endswith(": the base torque is at its limit.")
 
 
 def test_a_failure_names_the_cause() -> None:
@@ -520,9 +520,7 @@ def test_a_failure_names_the_cause() -> None:
     wait_for_stall(loop)
     loop.answer(41 * SECONDS)
     assert loop.state == "failed"
-    message = (
-        "The goal is not reached in time, as the force of the thrusters is at its limit: 0.559"
-    )
+    message = "The goal is not reached in time, as the thruster force is at its limit: 0.559"
     assert_one_sentence(loop.status.message, message)
 
 

@@ -187,7 +187,9 @@ def test_saturation_is_announced_once_before_it_comes() -> None:
     observe(wheels, [182.0, 0.0, 0.0])
     (event,) = wheels.events()
     assert (event.kind, event.level) == (EventKind.WHEEL_NEAR_LIMIT, 1)
-    assert event.message == "Wheel 'spin_c' turns at 182 of 200 rad/s, and will saturate in 1.8 s."
+    assert event.message == (
+        "Wheel 'spin_c' rotates at 182 of 200 rad/s, and will saturate in 1.8 s."
+    )
     assert event.about == {"wheel": "spin_c"}
     observe(wheels, [185.0, 0.0, 0.0])
     observe(wheels, [171.0, 0.0, 0.0])
@@ -198,14 +200,14 @@ def test_saturation_is_announced_once_before_it_comes() -> None:
     (event,) = wheels.events()
     assert (event.kind, event.level) == (EventKind.WHEEL_SATURATED, 1)
     assert event.message == (
-        "Wheel 'spin_c' turns at 198.5 of 200 rad/s: it is saturated and provides no more torque "
+        "Wheel 'spin_c' rotates at 198.5 of 200 rad/s: it is saturated and provides no more torque "
         "in this direction."
     )
     observe(wheels, [169.0, 0.0, 0.0])
     wheels.torque[:] = 0.0
     observe(wheels, [0.0, -272.0, 0.0])
     (event,) = wheels.events()
-    assert event.message == "Wheel 'spin_a' turns at -272 of 300 rad/s."
+    assert event.message == "Wheel 'spin_a' rotates at -272 of 300 rad/s."
 
 
 def test_the_time_to_saturation_is_that_at_the_present_torque() -> None:
@@ -222,11 +224,11 @@ def test_the_time_to_saturation_is_that_at_the_present_torque() -> None:
 def test_momentum_is_dumped_on_request_until_the_wheels_rest() -> None:
     wheels = control(1e9)
     observe(wheels, [10.0, -20.0, 4.1])
-    assert wheels.request_dump() == "The momentum of the wheels is dumped to the thrusters."
-    assert wheels.request_dump() == "Momentum is being dumped already."
+    assert wheels.request_dump() == "The wheel momentum is being dumped to the thrusters."
+    assert wheels.request_dump() == "Momentum is already being dumped."
     (event,) = wheels.events()
     assert (event.kind, event.message, event.level, event.about) == (
-        EventKind.DUMP_STARTED, "The momentum of the wheels is dumped on request.", 0, {},
+        EventKind.DUMP_STARTED, "The wheel momentum is being dumped on request.", 0, {},
     )  # fmt: skip
     given = wheels.command_torque(np.array([0.5, 0.5, 0.5]))
     np.testing.assert_allclose(wheels.torque, -0.03 * np.array([10.0, -20.0, 4.1]) / 5.0)
@@ -237,9 +239,9 @@ def test_momentum_is_dumped_on_request_until_the_wheels_rest() -> None:
     assert not wheels.dumping
     (event,) = wheels.events()
     assert (event.kind, event.message) == (
-        EventKind.DUMP_ENDED, "The momentum of the wheels is dumped.",
+        EventKind.DUMP_ENDED, "The wheel momentum has been dumped.",
     )  # fmt: skip
-    assert wheels.request_dump() == "The wheels hold no momentum."
+    assert wheels.request_dump() == "The wheels have no momentum."
     assert not wheels.dumping
 
 
@@ -259,7 +261,7 @@ def test_dumping_keeps_the_torques_of_motors_and_thrusters() -> None:
 def test_momentum_is_not_dumped_without_thrusters() -> None:
     wheels = control(0.0)
     observe(wheels, [100.0, 0.0, 0.0])
-    words = r"no thrusters \(use_thrusters is false\) that could absorb the momentum of the wheels"
+    words = r"no thrusters \(use_thrusters is false\) to absorb the wheel momentum"
     with pytest.raises(CommandError, match=words):
         wheels.request_dump()
     assert not wheels.dumping
@@ -272,7 +274,7 @@ def test_momentum_is_dumped_at_a_rate_that_is_set() -> None:
     observe(wheels, [0.0, -151.0, 0.0])
     assert wheels.dumping
     (event,) = wheels.events()
-    assert event.message == "The momentum of the wheels is dumped because wheel 'spin_a' is fast."
+    assert event.message == "The wheel momentum is being dumped because wheel 'spin_a' is fast."
 
 
 # -- failures ---------------------------------------------------------------------------------
@@ -447,7 +449,7 @@ def config(**changes: object) -> ControllerConfig:
     ("changes", "message"),
     [
         ({"base_outputs": "x rx"},
-         "The position of the base of robot 'gyro' cannot be controlled without thrusters "
+         "The base position of robot 'gyro' cannot be controlled without thrusters "
          "(use_thrusters is false): remove x, y and z from base_outputs."),
         ({"wheels.excluded": "spin_a"},
          "Robot 'gyro' has no thrusters (use_thrusters is false), and its reaction wheels rotate "
@@ -537,7 +539,7 @@ def test_events_and_the_budget_are_reported() -> None:
 def test_momentum_is_dumped_by_the_executive() -> None:
     loop = Loop()
     loop.tick(0.0, [50.0, 0.0, 0.0, 0.0])
-    assert "is dumped" in loop.executive.dump_momentum()
+    assert "is being dumped" in loop.executive.dump_momentum()
     sent = loop.tick(0.02, [50.0, 0.0, 0.0, 0.0])
     assert sent.tau[0] == pytest.approx(-0.3)
     np.testing.assert_allclose(sent.wrench_B[3:], WHEELS.axes_B[:, 0] * sent.tau[0], atol=1e-9)

@@ -95,7 +95,7 @@ def test_an_end_effector_is_brought_to_the_goal_of_the_caller_by_a_law() -> None
     assert abs((turn * Rotation.from_matrix(R_BE)).as_rotvec()[2]) > 0.5
     cases: tuple[tuple[dict[str, Any], str], ...] = (
         ({"end_effector_position": [1.2, 1.4, 2.0]}, "end-effector is 2 m from .* in z of"),
-        ({"goal": [0.5, 0.5, 0.2]}, "base is 0.2 m from the present one in z of the world"),
+        ({"goal": [0.5, 0.5, 0.2]}, "base is 0.2 m from the current one along z of the world"),
         ({"end_effector_position": goal, "end_effector": "link_1"}, "'link_1', which the law"),
     )
     for given, named in cases:
@@ -238,7 +238,7 @@ def test_a_robot_that_chatters_ends_with_its_cause(tmp_path: Path) -> None:
     assert turns_of_sign(flight.commands["base_wrench"].values) > 1000, "so the test is sharp"
     time, status = stalls(flight)
     assert time < 30.0
-    assert status.message.endswith(": the torque on the base is at its limit.")
+    assert status.message.endswith(": the base torque is at its limit.")
     assert len(flight.pose) / 10.0 == pytest.approx(300.0, abs=1.0), "the default limit"
 
 

@@ -380,7 +380,7 @@ def test_obstacles_that_come_in_flight_stop_it_and_may_go_again(harness: Harness
     (braking,) = [each for each in said if "the joints brake" in each]
     assert braking.startswith("Link '")
     assert "and obstacle 'crate' " in braking
-    assert braking.endswith(": the joints brake, and the remaining motion is planned again.")
+    assert braking.endswith(": the joints brake, and the remaining motion is replanned.")
     assert "The goal is not reached: " in status.message
     assert "On the way link '" in status.message
     assert "planner.clearance is 0.01 m" in status.message

@@ -416,7 +416,7 @@ def test_a_final_shape_that_is_none_is_refused(
     ("options", "reason"),
     [
         ({"nominal": [0.0, 0.0]}, r"area_loop.nominal has 2 number\(s\)"),
-        ({"nominal": [0.0, 1.0, 0.0]}, "'shoulder_pitch' at 1, and its limits"),
+        ({"nominal": [0.0, 1.0, 0.0]}, "'shoulder_pitch' at 1, but its limits"),
         ({"joints": "shoulder_yaw elbow_pitch"}, "must name three of the joints"),
         ({"joints": "shoulder_yaw elbow_pitch wrist"}, "must name three of the joints"),
         ({"joints": "elbow_pitch elbow_pitch shoulder_yaw"}, "must name three of the joints"),
@@ -449,7 +449,7 @@ def test_loops_that_turn_the_wrong_way_are_given_up_however_small(
 
     monkeypatch.setattr(NominalShapeChooser, "at", opposite)
     monkeypatch.setattr(area_loop, "edge_path", counted)
-    with pytest.raises(PlanningError, match=r"None of 6 cycles .* brings the base nearer"):
+    with pytest.raises(PlanningError, match=r"None of 6 cycles .* brings the base closer"):
         method.plan(PlanRequest(at(NOMINAL), GOAL, Tolerance(1.0, 1e-3)))
 
 

@@ -221,7 +221,7 @@ def test_the_shortest_of_those_that_plan_is_taken() -> None:
         schedule.notes["because"]
     )
     only = planned(made("a", objection="No."), made("b"))
-    assert "is the only one that plans this goal." in str(only.notes["because"])
+    assert "is the only one that can plan this goal." in str(only.notes["because"])
 
 
 def test_what_the_schedules_after_a_partial_one_take_counts() -> None:

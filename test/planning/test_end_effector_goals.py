@@ -270,9 +270,7 @@ def test_methods_of_loops_leave_the_goal_to_optimal(method: str) -> None:
     if method == "auto":
         assert planner.plan(request).method == "optimal"
     else:
-        with pytest.raises(
-            PlanningError, match=r"area_loop plans for the pose of the base.*optimal"
-        ):
+        with pytest.raises(PlanningError, match=r"area_loop plans for the base pose.*optimal"):
             planner.plan(request)
 
 

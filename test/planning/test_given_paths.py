@@ -274,7 +274,7 @@ def test_auto_takes_the_method_that_follows_paths(start: Array) -> None:
     path = start + np.array([[0.0, 0.0, 0.0], [0.004, 0.0, 0.003]])
     schedule = plan("three_joint_arm", end_effector_path={HAND: path}, start=STATE, method="auto")
     assert schedule.method == "resolved_rate"
-    assert str(schedule.notes["because"]).endswith("is the only one that plans this goal.")
+    assert str(schedule.notes["because"]).endswith("is the only one that can plan this goal.")
 
 
 # -- refusals -----------------------------------------------------------------------------------
@@ -282,19 +282,19 @@ def test_auto_takes_the_method_that_follows_paths(start: Array) -> None:
 
 @pytest.mark.parametrize("name", ["optimal", "area_loop"])
 def test_another_method_refuses_before_it_plans(name: str) -> None:
-    with pytest.raises(PlanningError, match=f"^{name} does not follow paths, and 'end_effector'"):
+    with pytest.raises(PlanningError, match=f"^{name} does not follow paths, but 'end_effector'"):
         plan("three_joint_arm", end_effector_path=SHORT, method=name)
 
 
 def test_one_end_effector_follows_a_path_and_the_base_is_free() -> None:
     paths = {HAND: SHORT}
-    with pytest.raises(PlanningError, match="moves one end-effector along a path, and the goal is"):
+    with pytest.raises(PlanningError, match="moves one end-effector along a path, but the goal is"):
         plan(
             "three_joint_arm", end_effector_path=paths, end_effector_position={"link_3": [1, 1, 1]}
         )
     with pytest.raises(PlanningError, match="also requests the pose of the base"):
         plan("three_joint_arm", end_effector_path=paths, position=[0, 0, 0])
-    with pytest.raises(GoalError, match="has 2 goals; it can have one"):
+    with pytest.raises(GoalError, match="has 2 goals; only one is allowed"):
         plan("three_joint_arm", end_effector_path=paths, end_effector_position={HAND: [1, 1, 1]})
 
 
@@ -306,7 +306,7 @@ def test_one_end_effector_follows_a_path_and_the_base_is_free() -> None:
         ([1.0, 2.0, 3.0], r"The path of 'hand' is of shape \(3,\); each of its poses has 3"),
         (np.ones((3, 4)), r"is of shape \(3, 4\)"),
         (np.ones((2, 3, 3)), r"is of shape \(2, 3, 3\)"),
-        (np.zeros((MAX_PATH_POSES + 1, 3)), "has 10001 poses; it can have at most 10000."),
+        (np.zeros((MAX_PATH_POSES + 1, 3)), "has 10001 poses; at most 10000 are allowed."),
         ([[0, 0, 0], [0, np.nan, 0]], r"Pose 2 of the path of 'hand' is \[0.0, nan, 0.0\], which"),
         ([[0, 0, 0], [0, 0, 0], [2e12, 0, 0]], "Pose 3 of .* farther than 1e\\+12 m away"),
         ([[0, 0, 0, 0, 0, 0, 1], [1, 0, 0, 0, 0, 0, 0]], "Pose 2 of .* has a zero quaternion"),

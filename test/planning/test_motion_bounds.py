@@ -425,7 +425,7 @@ def test_a_search_goes_on_where_the_fastest_manoeuvre_is_a_little_too_slow(
     few = {**QUICK, "starts": 6, "answers": 2, "intervals": 20, option: limit}
     with pytest.raises(PlanningError) as refusal:
         plan("three_joint_arm", rotvec=(0.05, 0.0, 0.0), base_position=2, **few)
-    assert f"within optimal.{option} = {limit:g} s: the fastest that was found takes 2." in str(
+    assert f"within optimal.{option} = {limit:g} s: the fastest one found takes 2." in str(
         refusal.value
     )
     assert ("was found from 6 start(s)" in str(refusal.value)) is goes_on

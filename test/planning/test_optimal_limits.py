@@ -223,7 +223,7 @@ def test_every_start_has_a_limit_of_its_own(arm: SpaceRobot) -> None:
         (
             "sliding_masses",
             {"position": [0.1, 0, 0], "joint_positions": [0, 0, 0]},
-            "put the base 0.1 m from its position",
+            "put the base 0.1 m from the goal position",
         ),
         (
             "planar_chain",
@@ -258,7 +258,7 @@ def test_two_links_turn_but_not_in_place() -> None:
 @pytest.mark.slow
 def test_a_goal_that_takes_too_long_is_refused(arm: SpaceRobot) -> None:
     with pytest.raises(
-        PlanningError, match=r"within optimal\.longest = 3 s: the fastest that was found takes \d"
+        PlanningError, match=r"within optimal\.longest = 3 s: the fastest one found takes \d"
     ):
         of_arm(arm, [0.5, 0.5, 0.5], longest=3.0, starts=2, intervals=20)
 
@@ -293,7 +293,7 @@ def test_joints_without_a_velocity_limit_are_refused_with_the_remedies() -> None
 
 
 def test_a_start_that_breaks_a_constraint_is_refused(arm: SpaceRobot) -> None:
-    with pytest.raises(PlanningError, match=r"The start violates .*: the shape enters a box"):
+    with pytest.raises(PlanningError, match=r"The start violates .*: the shape enters a keep_out"):
         of_arm(arm, [0, 0, 0.1], keep_out=[-1, -1, 1, 1, 0, 2])
 
 

@@ -109,7 +109,7 @@ def test_a_goal_of_the_end_effector_without_a_name_is_refused_by_that() -> None:
         GoalError, match=r"^The goal of the end-effector is 2 number\(s\); it needs 3"
     ):
         EndEffectorGoal.checked("", [1.0, 0.0])
-    with pytest.raises(GoalError, match=r"^The end-effector has 2 goals; it can have one\.$"):
+    with pytest.raises(GoalError, match=r"^The end-effector has 2 goals; only one is allowed\.$"):
         Goal.of_end_effectors([EndEffectorGoal.checked("", np.ones(3))] * 2)
 
 
@@ -367,9 +367,9 @@ def parabola(steps: int, acceleration: float, first: float) -> Trajectory:
         ),
         (
             {"keep_out": (1.0, 2.0, 3.0)},
-            "has 3 numbers; a box of shapes has 3 lower and 3 upper ones.",
+            "has 3 numbers; a shape box has 3 lower and 3 upper bounds.",
         ),
-        ({"keep_out": (0.0, 0.0, 0.0, 1.0, 0.0, 1.0)}, "lower bound is not below its upper."),
+        ({"keep_out": (0.0, 0.0, 0.0, 1.0, 0.0, 1.0)}, "lower bound is not below its upper bound."),
         ({"keep_out": (-9e6,) * 3 + (9e6,) * 3}, "contains all shapes of the robot."),
     ],
 )

@@ -239,7 +239,7 @@ def test_waypoints_that_lead_nowhere_are_refused(arm: tuple[GaitSchedule, Pose, 
     with pytest.raises(UnreachableError, match="in one plane"):
         planned("planar_chain", np.array([0.4, -0.9]), "segment_2", tip, waypoints=above)
     both = {"left_link_7": [1.0, 1.0, 1.0], "right_link_7": [1.0, -1.0, 1.0]}
-    with pytest.raises(PlanningError, match="are for one end-effector, and the goal is for 2"):
+    with pytest.raises(PlanningError, match="are for one end-effector, but the goal is for 2"):
         plan(
             "dual_arm",
             start=RobotState(PLACE, ATTITUDE.as_quat(), DUAL),
@@ -278,7 +278,7 @@ def test_a_joint_at_its_limit_ends_the_line() -> None:
         ),
         (
             {"end_effector_position": (1.5, 0.4, 0.3), "keep_attitude": 1},
-            "with the attitude of the base kept requires 6 .* leave out resolved_rate.keep_attit",
+            "with the base attitude kept requires 6 .* omit resolved_rate.keep_attit",
         ),
     ],
 )

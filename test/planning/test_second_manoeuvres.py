@@ -225,7 +225,7 @@ def test_a_goal_shape_is_held_against_the_limits_of_its_own_joint(
     name = robot.joint_names[joint]
     with pytest.raises(UnreachableError, match="beyond limits") as refusal:
         method.goal_shape(replace(goal_at(NEAR), joint_positions=np.array(shape)))
-    assert f"joint '{name}' at {at} rad, and its limits are {limits} rad" in str(refusal.value)
+    assert f"joint '{name}' at {at} rad, but its limits are {limits} rad" in str(refusal.value)
     within = np.array([-2.85, 2.55])
     found = method.goal_shape(replace(goal_at(NEAR), joint_positions=within))
     np.testing.assert_array_equal(found, within)

@@ -300,7 +300,7 @@ def test_fewer_than_three_links_are_refused(links: int) -> None:
             "plane",
         ),
         ('ixz="0" iyy="1"', 'ixz="0.05" iyy="1"', "products of inertia"),
-        ('<origin xyz="1 0 0"/>', '<origin xyz="1 0 0.1"/>', "outside of one plane"),
+        ('<origin xyz="1 0 0"/>', '<origin xyz="1 0 0.1"/>', "outside one plane"),
     ],
 )
 def test_what_is_not_planar_is_refused(old: str, new: str, mention: str) -> None:
@@ -339,8 +339,8 @@ def test_a_goal_out_of_the_plane_is_refused(chain: SpaceRobot, tilt: float) -> N
 @pytest.mark.parametrize(
     ("shape", "mention"),
     [
-        ([0.0], "1 joint position(s); robot 'planar_chain' has 2 joints"),
-        ([0.0, 1.2], "joint 'pin_2' at 1.2 rad, and its limits are [-1, 1] rad"),
+        ([0.0], "1 joint position(s), but robot 'planar_chain' has 2 joints"),
+        ([0.0, 1.2], "joint 'pin_2' at 1.2 rad, but its limits are [-1, 1] rad"),
         ([-1.001, 0.0], "joint 'pin_1' at -1.001 rad"),
     ],
 )

@@ -256,8 +256,8 @@ def test_links_do_not_come_too_near() -> None:
             "",
             "The frame '' of the twist is not one of 'inertial', 'base_link', 'end_eff",
         ),
-        (HAND, [0.0, np.nan, 0.0], "inertial", "The twist has a number that is not finite."),
-        (HAND, [0.0, 1e155, 0.0], "inertial", "The twist has a number beyond 1e+06 m/s"),
+        (HAND, [0.0, np.nan, 0.0], "inertial", "The twist has a non-finite value."),
+        (HAND, [0.0, 1e155, 0.0], "inertial", "The twist has a value beyond 1e+06 m/s"),
     ],
 )
 def test_twists_that_are_none_are_refused(link: str, linear: Any, frame: str, message: str) -> None:
@@ -347,8 +347,8 @@ def test_joints_that_are_too_few_are_told() -> None:
     with pytest.raises(PlanningError) as found:
         TwistFollower(robot, HAND, ResolvedRateOptions(keep_attitude=1), TICK)
     assert str(found.value) == (
-        "Robot 'planar_manipulator' has too few joints to move 'end_effector' by twists and "
-        "keep the attitude of the base."
+        "Robot 'planar_manipulator' has too few joints to move 'end_effector' by twists and keep "
+        "the base attitude."
     )
     assert not TwistFollower(robot, HAND, ResolvedRateOptions(), TICK).turns
     seven = robot_of("seven_joint_arm")

@@ -193,7 +193,7 @@ def test_other_methods_do_not_begin_with_spinning_wheels() -> None:
 
 def test_without_an_attitude_the_rates_of_wheels_are_not_known() -> None:
     robot, state, goal, _ = case(THREE, 1, 0.1)
-    with pytest.raises(PlanningError, match="give the goal an attitude"):
+    with pytest.raises(PlanningError, match="give the goal a base attitude"):
         plan(
             robot,
             rotvec=rotvec_from_quaternion(goal),
@@ -263,5 +263,5 @@ def test_guesses_keep_the_momentum_while_wheels_turn_the_base() -> None:
 def test_rates_that_are_not_finite_are_refused() -> None:
     robot, state, goal, _ = case(THREE, 1, 0.1)
     unknown = replace(state, qdot=np.full(robot.n, np.nan))
-    with pytest.raises(PlanningError, match="wheels at the start are not finite"):
+    with pytest.raises(PlanningError, match="velocities at the start are not finite"):
         plan(robot, rotvec=rotvec_from_quaternion(goal), start=unknown, base_position=2)

@@ -89,7 +89,7 @@ def test_goal_components_that_a_method_does_not_control_are_named_with_their_err
     hand = Goal.of_end_effectors([EndEffectorGoal("link_3", np.ones(3))])
     refused = Planner().answer(replace(chain, goal=hand), Cancellation())
     assert refused.verdict == Verdict.REFUSED
-    assert refused.message.startswith("area_loop plans for the pose of the base")
+    assert refused.message.startswith("area_loop plans for the base pose")
     here = replace(chain, goal=Goal.checked([0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]))
     answer = Planner().answer(here, Cancellation())
     assert answer.verdict == Verdict.REACHABLE

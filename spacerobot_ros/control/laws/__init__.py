@@ -1,1 +1,1 @@
-"""The control laws: one module each, and their registry."""
+"""Control laws, one module each, and their registry."""

@@ -1,4 +1,4 @@
-"""Control of the shape alone by joint efforts; the base floats freely."""
+"""Control of the shape only, by joint efforts; the base floats freely."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class ComputedTorqueLaw(ControlLaw):
     Here ``u = qddot_ref + Kd (qdot_ref - qdot) + Kp (q_ref - q)`` (Kp in 1/s^2, Kd in 1/s). The
     base reacts with ``omegadot = -D^-1 (D_q u + C_omega)``, the base rows of eq. (19) of paper 4
     without a wrench; inserted into the joint rows this gives ``Js = D_qq - D_q' D^-1 D_q`` and
-    ``Fs = C_q - D_q' D^-1 C_omega``. This form holds for any tree in space and any momentum; the
+    ``Fs = C_q - D_q' D^-1 C_omega``. This form holds for any spatial tree and any momentum; the
     paper's case is a planar chain without angular momentum. No wrench is commanded, so that both
     momenta are conserved.
     """
@@ -31,17 +31,17 @@ class ComputedTorqueLaw(ControlLaw):
     @classmethod
     @override
     def accepted_outputs(cls, robot: SpaceRobot, outputs: OutputSelection) -> OutputSelection:
-        """Return all the joints, in the order of q.
+        """Return all joints, in the order of q.
 
         Raises
         ------
         ParameterError
-            The outputs are not exactly all the joints: this law commands the whole shape.
+            The outputs are not exactly all joints: this law commands the whole shape.
         """
         if outputs.base or outputs.end_effector or set(outputs.joints) != set(robot.joint_names):
             raise ParameterError(
-                f"The law '{cls.name}' controls all joints and nothing else; its outputs must be "
-                f"the joints {', '.join(robot.joint_names)}."
+                f"The law '{cls.name}' controls exactly the joints; its outputs must be the "
+                f"joints {', '.join(robot.joint_names)}."
             )
         return OutputSelection(joints=robot.joint_names)
 
@@ -53,7 +53,7 @@ class ComputedTorqueLaw(ControlLaw):
 
     @override
     def results(self, symbols: dict[str, ca.SX]) -> dict[str, ca.SX]:
-        """Return the command's expressions; see :meth:`ControlLaw.results`."""
+        """Return the command expressions; see :meth:`ControlLaw.results`."""
         z1 = self.outputs
         H = z1.model("inertia_matrix", z1.q)
         C = z1.model("bias", z1.q, z1.v_cm, z1.omega, z1.qdot)

@@ -1,4 +1,5 @@
-"""Base class of control laws, which compute a wrench and joint efforts from state and reference."""
+"""Base class for control laws, which compute a wrench and joint efforts from a state and a
+reference."""
 
 from __future__ import annotations
 
@@ -26,51 +27,53 @@ from spacerobot_ros.model.space_robot import SpaceRobot
 from spacerobot_ros.parameters import configured, group, nonnegative, parameter, values_of
 
 FORCE_GAINS = "N/m or N m/rad", "N s/m or N m s/rad"
-"""Units of Kp and Kd of laws that command forces."""
+"""Units of Kp and Kd for laws that command forces."""
 
 ACCELERATION_GAINS = "1/s^2", "1/s"
-"""Units of Kp and Kd of laws that command accelerations."""
+"""Units of Kp and Kd for laws that command accelerations."""
 
 _FASTEST_DAMPING = 2.0
-"""Largest automatic Kd of accelerations, 1/s: errors decay within seconds."""
+"""Largest automatic Kd for accelerations, 1/s: errors decay within seconds."""
 
 _DAMPING_PER_PERIOD = 0.4
-"""Largest product of automatic Kd and the control period: 1 is unstable if commands come a period
-late, and 2 if they do not."""
+"""Largest product of automatic Kd and the control period: 1 is unstable if commands arrive one
+period late, and 2 if they do not."""
 
 _CRITICAL_STIFFNESS = 1 / 4
-"""Automatic Kp of accelerations over the square of Kd: critical damping."""
+"""Ratio of automatic Kp to the square of Kd, for accelerations: critical damping."""
 
 _LARGEST_GROWTH = 1.001
-"""Largest growth factor of errors per control period that is considered stable."""
+"""Largest error growth factor per control period that is considered stable."""
 
 _SINGULAR_DAMPING = 0.02
-"""Relative increase of the mobility of each output, which keeps automatic gains bounded at
+"""Relative increase in each output's mobility, which keeps automatic gains bounded at
 singularities."""
 
 
 @dataclass(frozen=True)
 class GainPair:
-    """Proportional, derivative and integral gain of each output of a group, in Kp, Kd and Ki.
+    """Proportional, derivative and integral gain for each output in a group: entries of Kp, Kd and
+    Ki.
 
-    Their units are the law's (:attr:`ControlLaw.gain_units`): a force or torque per error and per
-    error rate with ``transposed_jacobian``, an acceleration per error and per error rate with the
-    laws that use the inertia. The unit of Ki is that of Kp over seconds.
+    Their units depend on the law (:attr:`ControlLaw.gain_units`): a force or torque per error and
+    per
+    error rate with ``transposed_jacobian``, an acceleration per error and per error rate with laws
+    that use the inertia. The unit of Ki is that of Kp per second.
 
     Automatic gains depend on the robot and the control period (:meth:`ControlLaw.set_gains`).
 
-    The integral gain removes the steady-state error under constant disturbances. With the laws that
-    use the inertia, each error is stable for ``ki < kp kd``; choose much less.
+    The integral gain removes the steady-state error under constant disturbances. With laws that use
+    the inertia, each error is stable if ``ki < kp kd``; choose a much smaller value.
 
-    Commands are held for a control period. A derivative gain that removes more than the whole
+    Commands are held for one control period. A derivative gain that removes more than the whole
     velocity within one period makes the loop unstable: Kd times the period must stay well below 2
-    (with ``transposed_jacobian``, below twice the smallest inertia that the output moves, which for
-    the attitude of an end-effector is that of the last wrist link about its joint).
+    (with ``transposed_jacobian``, below twice the smallest inertia moved by the output, which for
+    end-effector attitude is that of the last wrist link about its joint).
     """
 
     kp: float = nonnegative(
         0.0,
-        "proportional gain; 0: automatic, by masses and control period. N/m or N m/rad with "
+        "proportional gain; 0: automatic, from masses and control period. N/m or N m/rad with "
         "laws that command forces (transposed_jacobian), "
         "1/s^2 with laws that command accelerations (model_based, computed_torque)",
         "by law",
@@ -79,7 +82,7 @@ class GainPair:
     )
     kd: float = nonnegative(
         0.0,
-        "derivative gain; 0: automatic, by masses and control period. N s/m or N m s/rad "
+        "derivative gain; 0: automatic, from masses and control period. N s/m or N m s/rad "
         "with laws that command forces (transposed_jacobian), "
         "1/s with laws that command accelerations (model_based, computed_torque)",
         "by law",
@@ -99,8 +102,8 @@ class GainPair:
 def _matrix_parameter(name: str) -> Any:
     return parameter(
         (),
-        f"matrix {name} of all outputs, row by row in the order of the statuses' errors, symmetric "
-        f"and positive definite; []: the {name.lower()} of the groups",
+        f"matrix {name} for all outputs, row by row in the order of the statuses' errors, "
+        f"symmetric and positive definite; []: the {name.lower()} of the groups",
         "by law",
         maximum=1e9,
         minimum=-1e9,
@@ -112,7 +115,7 @@ def _matrix_parameter(name: str) -> Any:
 class Gains:
     """Diagonals of Kp, Kd (paper 4, eqs 27 and 29) and Ki by group; 0 in Kp or Kd: automatic.
 
-    If given, ``kp_matrix`` and ``kd_matrix`` (m * m,) replace Kp and Kd of all outputs.
+    If given, ``kp_matrix`` and ``kd_matrix`` (m * m,) replace Kp and Kd for all outputs.
 
     Raises
     ------
@@ -133,8 +136,8 @@ class Gains:
             for name, value in vars(getattr(self, group_name)).items():
                 if not (math.isfinite(value) and value >= 0):
                     raise ParameterError(
-                        f"The gain {group_name}.{name} is {value}; it must be finite and not "
-                        "negative."
+                        f"The gain {group_name}.{name} is {value}; it must be finite and "
+                        "non-negative."
                     )
 
     @classmethod
@@ -144,7 +147,7 @@ class Gains:
         return cls(pair, pair, pair, pair, pair)
 
     def matrices(self, selection: OutputSelection) -> tuple[Array, Array]:
-        """Return Kp and Kd (m, m) of the selected outputs; 0 on a diagonal: automatic.
+        """Return Kp and Kd (m, m) for the selected outputs; 0 on a diagonal: automatic.
 
         Raises
         ------
@@ -158,12 +161,12 @@ class Gains:
         )
 
     def diagonals(self, selection: OutputSelection) -> tuple[Array, Array]:
-        """Return the diagonals of Kp and Kd (m,) of the selected outputs; 0: automatic."""
+        """Return the diagonals of Kp and Kd (m,) for the selected outputs; 0: automatic."""
         kp, kd = map(np.diag, self.matrices(selection))
         return kp.copy(), kd.copy()
 
     def integral_diagonal(self, selection: OutputSelection) -> Array:
-        """Return the diagonal of Ki (m,) of the selected outputs."""
+        """Return the diagonal of Ki (m,) for the selected outputs."""
         return np.array([pair.ki for pair in self._pairs(selection)])
 
     def _pairs(self, selection: OutputSelection) -> list[GainPair]:
@@ -188,14 +191,14 @@ def _checked_matrix(
     m, labels = len(selection.labels), ", ".join(selection.labels)
     if len(numbers) != m * m:
         raise ParameterError(
-            f"The gains.{name} has {len(numbers)} numbers; the {m} outputs of the law ({labels}) "
-            f"take {m * m}, row by row."
+            f"Parameter 'gains.{name}' has {len(numbers)} values; the {m} outputs of the law "
+            f"({labels}) take {m * m}, row by row."
         )
     matrix = np.reshape(numbers, (m, m)).astype(float)
     if not np.allclose(matrix, matrix.T, rtol=1e-9, atol=0.0):
-        raise ParameterError(f"The gains.{name} is not symmetric.")
+        raise ParameterError(f"Parameter 'gains.{name}' is not symmetric.")
     if np.linalg.eigvalsh(matrix).min() <= 0.0:
-        raise ParameterError(f"The gains.{name} is not positive definite.")
+        raise ParameterError(f"Parameter 'gains.{name}' is not positive definite.")
     return matrix
 
 
@@ -203,7 +206,7 @@ def _checked_matrix(
 class LawStatus:
     """Conditioning of the last command.
 
-    ``smallest_singular_value`` of ``J_z`` in SI units; ``singular``: it is below the law's
+    ``smallest_singular_value`` of ``J_z`` in SI units; ``singular``: whether it is below the law's
     threshold; ``damping``: added to that singular value in quadrature, zero if not needed.
     """
 
@@ -214,7 +217,7 @@ class LawStatus:
 
 @dataclass(frozen=True)
 class LawOptions:
-    """Options that every law has."""
+    """Options common to all laws."""
 
     singular_value_threshold: float = parameter(
         0.1,
@@ -225,9 +228,9 @@ class LawOptions:
 
 
 class ControlLaw(ABC):
-    """A function from the errors of the outputs to thruster forces and joint efforts.
+    """A function from output errors to thruster forces and joint efforts.
 
-    A law is constructed once for a robot and computes one command per control period. A subclass
+    A law is constructed once per robot and computes one command per control period. A subclass
     defines ``name``, ``gain_units`` and :meth:`results`, and if it has options, ``Options``: a
     frozen dataclass derived from :class:`LawOptions`, whose fields become the parameters
     ``<name>.<option>`` of the controller node. A line in
@@ -236,7 +239,7 @@ class ControlLaw(ABC):
     Parameters
     ----------
     robot
-        The controller's model of the robot.
+        The controller's robot model.
     outputs
         The controlled outputs; :meth:`default_outputs` returns the robot's defaults.
     gains
@@ -246,12 +249,12 @@ class ControlLaw(ABC):
     thrust
         Whether thrusters act on the base; otherwise the law commands no force.
     control_period
-        Time for which a command is held, s; longer times lower the automatic gains.
+        Duration for which a command is held, s; longer durations lower the automatic gains.
 
     Raises
     ------
     ParameterError
-        The robot does not have these outputs, the law cannot drive them, or an option is out of
+        The robot does not have these outputs, the law cannot control them, or an option is out of
         range.
     """
 
@@ -272,9 +275,9 @@ class ControlLaw(ABC):
     ) -> None:
         self.robot = robot
         self.control_period = control_period
-        """Time for which a command is held, s; 0: not known."""
+        """Duration for which a command is held, s; 0: unknown."""
         self.time = 0.0
-        """Time of the command, s; the controller sets it before each command."""
+        """Command time, s; set by the controller before each command."""
         self._damping_rate = _FASTEST_DAMPING
         """Automatic Kd per unit of mass, 1/s."""
         if control_period > 0:
@@ -312,7 +315,7 @@ class ControlLaw(ABC):
             self._in[name][:] = value
 
     def has_automatic_gains(self, gains: Gains) -> bool:
-        """Return whether some of the outputs have automatic gains that depend on the masses."""
+        """Return whether any output has automatic gains that depend on the masses."""
         force = self.gain_units != ACCELERATION_GAINS
         return force and not all(each.all() for each in gains.diagonals(self.outputs.selection))
 
@@ -341,8 +344,8 @@ class ControlLaw(ABC):
             gains = ca.vertcat(symbols["kp"], symbols["kd"])
             if ca.depends_on(results["actuation"], gains):
                 raise ParameterError(
-                    f"The law '{self.name}' has no automatic gains: set kp and kd of all "
-                    f"groups of its outputs ({', '.join(self.outputs.labels)})."
+                    f"The law '{self.name}' has no automatic gains: set kp and kd for all its "
+                    f"output groups ({', '.join(self.outputs.labels)})."
                 )
         function = dense_function(f"law_{self.name}", symbols | weights, results)
         has_integral = bool(ca.depends_on(results["actuation"], symbols["integral"]))
@@ -350,20 +353,20 @@ class ControlLaw(ABC):
 
     @property
     def follows_accelerations(self) -> bool:
-        """Whether commands include the efforts for the reference's accelerations."""
+        """Whether commands include feedforward efforts for reference accelerations."""
         return self.gain_units != FORCE_GAINS or self._weighs
 
     @property
     def joint_damping(self) -> float:
-        """Viscous friction by joint efforts in every command, N m s/rad."""
+        """Viscous joint friction included in every command, N m s/rad."""
         return 0.0
 
     def automatic_effort(self, symbols: Mapping[str, ca.SX]) -> ca.SX:
-        """Return the efforts (m,) of automatic gains, for a law that commands forces; else zeros.
+        """Return the efforts (m,) due to automatic gains if the law commands forces; else zeros.
 
         They make the errors of outputs whose ``kp`` and ``kd`` are 0 critically damped:
-        ``Htilde (z1ddot_des + Kd edot + Kp e)``, with the mass matrix ``Htilde`` of the outputs
-        (eq. 25), slightly damped so that it stays bounded at singularities.
+        ``Htilde (z1ddot_des + Kd edot + Kp e)``, with the output mass matrix ``Htilde`` (eq. 25),
+        slightly damped so that it stays bounded at singularities.
         """
         z1 = self.outputs
         if not self._weighs:
@@ -384,25 +387,25 @@ class ControlLaw(ABC):
 
     @classmethod
     def default_outputs(cls, robot: SpaceRobot, end_effector_link: str) -> OutputSelection:
-        """Return the outputs for use if none are selected; see :func:`default_selection`."""
+        """Return the outputs used if none are selected; see :func:`default_selection`."""
         return default_selection(robot.description, end_effector_link)
 
     @classmethod
     def accepted_outputs(cls, robot: SpaceRobot, outputs: OutputSelection) -> OutputSelection:
-        """Return the outputs in the form that the law controls.
+        """Return the outputs in the form controlled by the law.
 
         Raises
         ------
         ParameterError
-            The law cannot control these outputs of the robot.
+            The law cannot control these outputs.
         """
         return outputs
 
     def set_gains(self, gains: Gains) -> None:
         """Change the gains from the next command on.
 
-        Automatic gains damp every error critically, as fast as the control period permits; if the
-        law commands forces, they are scaled by the masses (:meth:`automatic_effort`).
+        Automatic gains make every error critically damped, as fast as the control period permits;
+        if the law commands forces, they are scaled by the masses (:meth:`automatic_effort`).
 
         Raises
         ------
@@ -435,7 +438,7 @@ class ControlLaw(ABC):
     def gain_arguments(self, gains: Gains) -> tuple[Array, Array]:
         """Return the arguments ``kp`` and ``kd`` (m,) of :attr:`function`.
 
-        A zero is an automatic gain, which the function computes from the masses.
+        Zero selects an automatic gain, which the function computes from the masses.
         """
         kp, kd = gains.diagonals(self.outputs.selection)
         return (kp, kd) if self.gain_units != ACCELERATION_GAINS else self._filled(kp, kd)
@@ -447,7 +450,7 @@ class ControlLaw(ABC):
         return filled_kp, np.where(kd > 0, kd, rate)
 
     def integrate_error(self, duration: float, *, limited: bool = False) -> None:
-        """Add the error of the last command, which is held for ``duration`` (s), to the integral.
+        """Add the error at the last command, held for ``duration`` (s), to the integral.
 
         If the command was ``limited``, an integral may only shrink (anti-windup).
         """
@@ -460,33 +463,33 @@ class ControlLaw(ABC):
         self._in["integral"][:] = self._ki * self._integral
 
     def start(self, time: float, start: Reference, goal: Reference) -> None:
-        """Restart the law: at ``time`` (s) the reference starts towards new goals.
+        """Restart the law: at ``time`` (s), the reference starts towards new goals.
 
         A law that keeps a state between commands initialises it here, after calling this method.
         """
         self.reset_integral()
 
     def reset_integral(self) -> None:
-        """Set the integral of the error to zero."""
+        """Reset the error integral to zero."""
         self._integral[:] = self._in["integral"][:] = 0.0
 
     @property
     def gain_diagonals(self) -> tuple[Array, Array]:
         """The diagonals of Kp and Kd (m,), in the order of ``outputs.labels``.
 
-        Automatic ones are per unit of mass or inertia.
+        Automatic gains are per unit of mass or inertia.
         """
         return self._filled(self._in["kp"], self._in["kd"])
 
     @property
     def gain_matrices(self) -> tuple[Array, Array]:
-        """Kp and Kd (m, m): :attr:`gain_diagonals` with the couplings between outputs."""
+        """Kp and Kd (m, m): :attr:`gain_diagonals` with couplings between outputs."""
         (kp, kd), (beside_p, beside_d) = self.gain_diagonals, self._couplings
         return np.diag(kp) + beside_p, np.diag(kd) + beside_d
 
     @property
     def takes_matrices(self) -> bool:
-        """Whether gains may be matrices; they act through the law's integral term."""
+        """Whether gains may be matrices, which act through the law's integral term."""
         return self._has_integral
 
     @property
@@ -495,16 +498,16 @@ class ControlLaw(ABC):
         return self._ki.copy()
 
     def command(self, state: ControlState, reference: Reference) -> Actuation:
-        """Return the wrench of the thrusters and the joint efforts, not limited.
+        """Return the thruster wrench and the joint efforts, unlimited.
 
         Raises
         ------
         TargetNotSetError
-            The reference lacks a group of the outputs.
+            The reference lacks an output group.
         NotFiniteError
-            The state or the reference contains a number that is not finite.
+            The state or the reference contains a non-finite value.
         ValueError
-            A part of the state or the reference has the wrong length.
+            A component of the state or the reference has the wrong length.
         """
         self.outputs.pack_state(state, self._in["state"])
         self.outputs.pack_reference(reference, self._in["reference"])
@@ -516,15 +519,15 @@ class ControlLaw(ABC):
         return self.actuation(reference)
 
     def slowest_decay(self) -> float:
-        """Return the decay rate (1/s) of the slowest error, near the last state at rest."""
+        """Return the decay rate (1/s) of the slowest error near the last state, at rest."""
         Kp, Kd, _ = self._acceleration_gains()
         m = self.outputs.m
         motion = np.block([[np.zeros((m, m)), np.eye(m)], [-Kp, -Kd]])
         return float(-np.linalg.eigvals(motion).real.max())
 
     def sampling_warning(self) -> str:
-        """Return the warning that errors grow, near the last state at rest, if commands
-        are held for a control period and come a period late; empty: errors decay.
+        """Return a warning if errors grow near the last state, at rest, when commands are held for
+        a control period and arrive one period late; empty if errors decay.
         """
         Kp, Kd, mobility = self._acceleration_gains()
         m, h = self.outputs.m, self.control_period
@@ -565,7 +568,7 @@ class ControlLaw(ABC):
 
     @property
     def singular_error_share(self) -> float:
-        """Share of the last error (norm, SI) in directions that no actuator moves."""
+        """Fraction of the last error (norm, SI) in directions that no actuator can move."""
         error = self._out["error"]
         U, singular_values, _ = np.linalg.svd(self._out["J_z"], full_matrices=False)
         along = U[:, singular_values < self.singular_value_threshold].T @ error
@@ -573,7 +576,7 @@ class ControlLaw(ABC):
         return float(np.linalg.norm(along)) / size if size > 0 else 0.0
 
     def errors_under(self, state: ControlState, pull: Array) -> Array:
-        """Return the errors (m,) with ``Kp e = pull`` (m,), at rest in the shape of a state."""
+        """Return the errors (m,) with ``Kp e = pull`` (m,), at rest in a state's shape."""
         kp, given = self.gain_diagonals[0], self._in["kp"]
         if not self._weighs:
             return np.asarray(np.linalg.solve(self.gain_matrices[0], pull))
@@ -583,7 +586,7 @@ class ControlLaw(ABC):
         return np.asarray(np.linalg.solve(Kp, pull))
 
     def command_per_error(self, state: ControlState) -> Array:
-        """Return the command (6 + n, m) at rest per unit of ``Kp e``, in the shape of a state."""
+        """Return the command (6 + n, m) per unit of ``Kp e``, at rest in a state's shape."""
         units = np.vstack([np.zeros(self.outputs.m), np.eye(self.outputs.m)])
         at_rest, *each = (self._evaluate_at(state, unit)["actuation"].ravel() for unit in units)
         return np.array(each).T - at_rest[:, np.newaxis]
@@ -602,7 +605,7 @@ class ControlLaw(ABC):
 
     @property
     def state(self) -> ControlState:
-        """A copy of the state at the last command."""
+        """Copy of the state at the last command."""
         return ControlState.unstack(self._in["state"])
 
     @property
@@ -618,7 +621,7 @@ class ControlLaw(ABC):
 
     @property
     def error_rate(self) -> Array:
-        """The rate of the error (m,) at the last command."""
+        """The error rate (m,) at the last command."""
         return self._out["error_rate"].copy()
 
     @property
@@ -634,18 +637,17 @@ class ControlLaw(ABC):
     def inputs(self) -> Mapping[str, npt.ArrayLike]:
         """Return the law's additional function arguments, by name, with their initial values.
 
-        They come after state, reference and gains; :meth:`actuation` may change them in
+        They follow the state, reference and gains; :meth:`actuation` may change them in
         ``self._in``.
         """
         return {}
 
     @property
     def fixed_inputs(self) -> Mapping[str, npt.ArrayLike] | None:
-        """Arguments of :attr:`function` other than state, reference and gains, if they are the
-        same in every flight; None: some depend on the flight, or the function is not the whole
-        command.
+        """Arguments of :attr:`function` other than state, reference and gains, if equal in all
+        flights; None if some depend on the flight, or if the function is not the whole command.
 
-        The latter holds if a law overrides a step of the command but not :meth:`is_complete`.
+        The latter is assumed if a law overrides a step of the command but not :meth:`is_complete`.
         """
         steps = min(map(self._owner, ("command", "actuation")))
         if steps < self._owner("is_complete"):
@@ -659,18 +661,18 @@ class ControlLaw(ABC):
         return next(place for place, each in enumerate(classes) if method in vars(each))
 
     def is_complete(self, results: Mapping[str, ca.SX]) -> ca.SX:
-        """Return whether the results of :attr:`function` are the command without further steps."""
+        """Return whether :attr:`function` computes the complete command, without further steps."""
         return ca.SX(1)
 
     @abstractmethod
     def results(self, symbols: dict[str, ca.SX]) -> dict[str, ca.SX]:
-        """Return the expressions of the law's results, other than the errors and ``J_z``, by name.
+        """Return expressions for the law's results, other than the errors and ``J_z``, by name.
 
-        ``actuation`` (6 + n,) is the command: force (N) and torque (N m) at the origin of the base
-        link in base components, then the joint efforts; other results are specific to the law.
+        ``actuation`` (6 + n,) is the command: force (N) and torque (N m) at the base link origin in
+        base components, then the joint efforts; other results are specific to the law.
         ``symbols`` has ``kp`` and ``kd`` (m,), ``integral`` (m,), to be added to ``kp`` times the
-        error, and one symbol per name of :meth:`inputs`; all others are in ``self.outputs``. A law
-        whose ``actuation`` does not depend on ``integral`` refuses integral gains.
+        error, and one symbol per name of :meth:`inputs`; all others are in ``self.outputs``. If
+        ``actuation`` does not depend on ``integral``, the law rejects integral gains.
         """
 
     def actuation(self, reference: Reference) -> Actuation:

@@ -1,4 +1,4 @@
-"""Feedback linearisation of the outputs: every output error obeys its own linear equation."""
+"""Feedback linearisation of the outputs: every output error obeys a separate linear equation."""
 
 from __future__ import annotations
 
@@ -24,11 +24,12 @@ class ModelBasedOptions(LawOptions):
     """The options of ``model_based``."""
 
     null_space_damping: float = nonnegative(
-        1.0, "decay rate of joint motion that moves no output", "1/s", maximum=1000000000.0
+        1.0, "decay rate of joint motion that does not move any output", "1/s", maximum=1000000000.0
     )
     posture_stiffness: float = nonnegative(
         0.0,
-        "pull of joints that are not outputs to the joint reference, if it moves no output",
+        "stiffness pulling non-output joints towards the joint reference, without moving any "
+        "output",
         "1/s^2",
         maximum=1000000000.0,
     )
@@ -37,24 +38,24 @@ class ModelBasedOptions(LawOptions):
 class ModelBasedLaw(ControlLaw):
     """Paper 4, eq. (27), which gives the error dynamics ``eddot + Kd edot + Kp e = 0`` (eq. 28).
 
-    In terms of the acceleration ``a = z1ddot_des + Kd edot + Kp e`` and the mobility of the outputs
+    In terms of the acceleration ``a = z1ddot_des + Kd edot + Kp e`` and the output mobility
     ``J_z H+^-1 J_z'``, whose inverse is the paper's ``Htilde`` (eq. 25) for a square J_z::
 
         Q = J_z' F + H+ xi + C+,    (J_z H+^-1 J_z') F = a - Jdot_z z0dot - J_z xi
 
     This also holds for fewer outputs than degrees of freedom: ``xi`` is the desired acceleration in
-    the null space of ``J_z``, which moves no output. It damps all velocities and optionally pulls
-    the joints to the joint reference. For a square J_z it cancels.
+    the null space of ``J_z``, which does not move any output. It damps all velocities and
+    optionally pulls the joints towards the joint reference. For a square J_z, it cancels.
 
     Near a singularity of J_z (smallest singular value ``s`` below the threshold ``t``) no bounded
-    force accelerates the singular direction ``u`` of the outputs. There the law is damped:
+    force accelerates the outputs along the singular direction ``u``. There, the law is damped:
 
     * The mobility along u, ``s^2 v' H+^-1 v`` with ``J_z' u = s v``, is raised to its value with
       ``t`` for ``s``: damping ``d = sqrt(t^2 - s^2)``, which starts from zero at the threshold.
       Accelerations along v stay bounded; other directions are unaffected.
-    * Velocity along v that the outputs no longer show, so that their Kd does not act on it, is
-      damped directly, with the largest Kd. If the reference is of one motion, motion along v
-      follows its joints instead, critically damped.
+    * Velocity along v, which the outputs no longer show, so that their Kd does not act on it, is
+    damped directly with the largest Kd. If the reference describes a single motion, motion along
+      v follows its joints instead, critically damped.
 
     Eq. (28) then holds for the other directions only, and :attr:`status` reports it.
 
@@ -62,7 +63,7 @@ class ModelBasedLaw(ControlLaw):
     ----------
     robot, outputs, gains, options
         See :class:`ControlLaw`; Kp in 1/s^2, Kd in 1/s. ``posture_stiffness`` acts if the reference
-        has joints.
+        includes joints.
     """
 
     name: ClassVar[str] = "model_based"
@@ -85,7 +86,8 @@ class ModelBasedLaw(ControlLaw):
     @property
     @override
     def fixed_inputs(self) -> Mapping[str, npt.ArrayLike] | None:
-        """The fixed arguments; None with a posture, which depends on the reference or the state."""
+        """The fixed arguments; None if there is a posture, because it depends on the reference or
+        the state."""
         return None if self.options.posture_stiffness else super().fixed_inputs
 
     @override
@@ -95,7 +97,7 @@ class ModelBasedLaw(ControlLaw):
 
     @override
     def results(self, symbols: dict[str, ca.SX]) -> dict[str, ca.SX]:
-        """Return the command's expressions; see :meth:`ControlLaw.results`."""
+        """Return the command expressions; see :meth:`ControlLaw.results`."""
         z1 = self.outputs
         H = z1.model("inertia_matrix", z1.q)
         C = z1.model("bias", z1.q, z1.v_cm, z1.omega, z1.qdot)

@@ -1,4 +1,4 @@
-"""Base class of control laws in plain numpy, which may have a state."""
+"""Base class for control laws in plain numpy, which may be stateful."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from spacerobot_ros.model.description import Array
 
 
 class NumpyLaw(ControlLaw):
-    """A law that computes its command from state and reference in Python.
+    """A law that computes its command from the state and the reference in Python.
 
     A subclass defines ``name`` and :meth:`compute`. Before each call the base class evaluates
     :attr:`error`, :attr:`error_rate` and :attr:`J_z` of the outputs; :attr:`gain_diagonals` are the
-    parameters ``gains``; :attr:`gain_matrices` include their couplings. A law with a state keeps it
-    in attributes and resets it in :meth:`start`. All engines except the lanes of campaigns support
-    such a law.
+    parameters ``gains``; :attr:`gain_matrices` include their couplings. A stateful law keeps its
+    state in attributes and resets it in :meth:`start`. All engines except the lanes of campaigns
+    support such a law.
 
     See :class:`ControlLaw` for the parameters and errors of the constructor.
     """
@@ -31,20 +31,20 @@ class NumpyLaw(ControlLaw):
 
     @abstractmethod
     def compute(self, state: ControlState, reference: Reference) -> Actuation:
-        """Return the wrench on the base and the joint efforts, not limited.
+        """Return the base wrench and the joint efforts, unlimited.
 
         Parameters
         ----------
         state
             The measured state, or the estimate while the base is not measured.
         reference
-            The present reference of base, end-effector and joints; a group that is not among the
-            outputs is None.
+            The current reference for base, end-effector and joints; a group that is not an output
+            is None.
 
         Returns
         -------
         Actuation
-            ``wrench_B`` (6,), force (N) over torque (N m) at the origin of the base link in base
+            ``wrench_B`` (6,), force (N) over torque (N m) at the base link origin in base
             components, and ``tau`` (n,), joint efforts (N or N m).
         """
 
@@ -56,7 +56,8 @@ class NumpyLaw(ControlLaw):
 
     @property
     def J_z(self) -> Array:
-        """Jacobian (m, 6 + n) of the outputs from ``[v_cm; omega; qdot]`` (paper 4, eq. 23)."""
+        """Jacobian (m, 6 + n) of the outputs with respect to ``[v_cm; omega; qdot]`` (paper 4, eq.
+        23)."""
         return self._out["J_z"].copy()
 
     @override

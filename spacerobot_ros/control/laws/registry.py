@@ -1,4 +1,4 @@
-"""The laws by name; a new law needs one file and one line here."""
+"""Laws by name; a new law needs one file and one line here."""
 
 from spacerobot_ros.control.laws.computed_torque import ComputedTorqueLaw
 from spacerobot_ros.control.laws.law import ControlLaw

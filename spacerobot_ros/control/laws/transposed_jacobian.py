@@ -1,4 +1,4 @@
-"""A PD law of the outputs through the transpose of J_z, without inertia and inverse."""
+"""A PD law for the outputs through the transpose of J_z, without inertia or inverse."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class TransposedJacobianOptions(LawOptions):
 
     joint_damping: float = nonnegative(
         0.0,
-        "viscous friction applied by joint efforts; damps motion that affects no output",
+        "viscous friction applied by joint efforts; damps motion that does not affect any output",
         "N m s/rad",
         maximum=1000000000.0,
     )
@@ -30,8 +30,8 @@ class TransposedJacobianLaw(ControlLaw):
     """Paper 4, eqs (29) and (30): ``[f; n; tau] = J_q^-T J_z' (Kp e + Kd edot)``.
 
     The product ``J_z J_q^-1`` maps the base twist and the joint rates to the output rates: the
-    masses cancel, and the law needs only the robot's geometry. It inverts no matrix that can be
-    singular: if the errors are bounded, so is the command, even near a singularity of ``J_z``.
+    masses cancel, and the law needs only the robot's geometry. No potentially singular matrix is
+    inverted: if the errors are bounded, so is the command, even near a singularity of ``J_z``.
     It has no
     acceleration feedforward. Automatic gains are matrices that depend on the masses, with
     feedforward (:meth:`.ControlLaw.automatic_effort`).
@@ -62,7 +62,7 @@ class TransposedJacobianLaw(ControlLaw):
 
     @override
     def results(self, symbols: dict[str, ca.SX]) -> dict[str, ca.SX]:
-        """Return the command's expressions; see :meth:`ControlLaw.results`."""
+        """Return the command expressions; see :meth:`ControlLaw.results`."""
         z1 = self.outputs
         effort = symbols["kp"] * z1.error + symbols["kd"] * z1.error_rate + symbols["integral"]
         effort += self.automatic_effort(symbols)

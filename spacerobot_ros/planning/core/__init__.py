@@ -1,1 +1,1 @@
-"""Types that all gait methods share: goals, states, schedules, predictions."""
+"""Types shared by all gait methods: goals, states, schedules, predictions."""

@@ -15,7 +15,7 @@ MAX_THREAD_END_TIME = 1.5
 
 
 class PlanningCancelled(PlanningError):  # noqa: N818 - a request, not a failure
-    """The caller cancelled the plan before it was found."""
+    """The caller cancelled planning before a plan was found."""
 
 
 class Cancellation:
@@ -26,7 +26,7 @@ class Cancellation:
 
     @property
     def requested(self) -> bool:
-        """Whether the plan was cancelled."""
+        """Whether planning was cancelled."""
         return self._requested
 
     def cancel(self) -> None:
@@ -34,7 +34,7 @@ class Cancellation:
         self._requested = True
 
     def raise_if_requested(self) -> None:
-        """Raise an error if the plan was cancelled.
+        """Raise an error if planning was cancelled.
 
         Raises
         ------

@@ -1,4 +1,4 @@
-"""Clearance of plans: smallest distances between the bodies of a robot, and to obstacles."""
+"""Plan clearance: smallest distances between a robot's bodies, and to obstacles."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from spacerobot_ros.model.description import Array, RobotDescription
 _LOG = logging.getLogger(__name__)
 
 DEFAULT_CLEARANCE = 0.01
-"""Smallest distance between two links of a plan, m; 0: contacts are ignored."""
+"""Smallest distance between two links in a plan, m; 0: contacts are ignored."""
 
 _CLEARANCE_OF_OBSTACLES = 0.01
 """Smallest distance if there are obstacles and none is requested, m."""
@@ -44,21 +44,22 @@ _DISTANCE_ERROR = 1e-6
 _CLEARANCE_FACTOR_FOR_LOOPS = 5.0
 
 _MIN_START_SHARE = 0.5
-"""Share of the clearance below which a start is refused: a flight that ended at the clearance may
-be slightly nearer."""
+"""Fraction of the clearance below which a start is rejected: a flight that ended at the clearance
+may be slightly closer."""
 
 
 class Clearance:
-    """The smallest distance that plans of one robot keep between its links, and from obstacles.
+    """The smallest distance that a robot's plans keep between its links, and from obstacles.
 
     Parameters
     ----------
     robot
         The robot, with its world.
     distance
-        Smallest distance of links that no joint connects, and of links and obstacles, m.
+        Smallest distance between links not connected by a joint, and between links and obstacles,
+        m.
     parameter
-        Name of its parameter, for messages.
+        Parameter name, for messages.
     obstacles_alone
         Whether distances between two links of the robot are ignored.
     """
@@ -80,7 +81,7 @@ class Clearance:
     def wanted(
         cls, robot: RobotDescription, distance: float, parameter: str = "planner.clearance"
     ) -> Clearance | None:
-        """Return the requested clearance of a robot; None for a distance of zero.
+        """Return the requested clearance for a robot; None for a distance of zero.
 
         If there are obstacles, a distance of zero means 0.01 m.
 
@@ -96,22 +97,22 @@ class Clearance:
         return cls(robot, distance, parameter) if distance else None
 
     def of(self, robot: RobotDescription) -> Clearance:
-        """Return the same clearance of another robot among the same obstacles."""
+        """Return the same clearance for another robot among the same obstacles."""
         return Clearance(replace(robot, world=self._robot.world), self.distance, self._parameter)
 
     @cached_property
     def geometry(self) -> CollisionGeometry:
-        """The solids of the robot."""
+        """Solids of the robot."""
         return CollisionGeometry(self._robot, obstacles_alone=self._obstacles_alone)
 
     @property
     def has_obstacles(self) -> bool:
-        """Whether the motion of the base matters, because there are obstacles."""
+        """Whether the base motion matters, because there are obstacles."""
         return bool(self.geometry.with_obstacles.any())
 
     @property
     def facts(self) -> Array:
-        """The numbers that plans depend on: the distance, pairs, and the solids around bodies."""
+        """The values that plans depend on: the distance, pairs, and the solids around bodies."""
         geometry = self.geometry
         solids = [each.enclosure for each in geometry.solids]
         return np.concatenate(
@@ -123,17 +124,17 @@ class Clearance:
         )
 
     def required(self, start: Array, base: BasePoses | None = None) -> Array:
-        """Return the distances (P,), m, that are required of all pairs in a motion from a start
-        (n,).
+        """Return the required distances (P,), m, of all pairs for a motion from a start (n,).
 
-        If a pair is nearer than the clearance at the start, its distance there is required. Links
-        in contact at the start are ignored (minus infinity), with a warning. ``base`` is the pose
-        of the base at the start; None: obstacles are ignored.
+        If a pair is closer than the clearance at the start, its distance there is required instead.
+        Links
+        in contact at the start are ignored (minus infinity), with a warning. ``base`` is the base
+        pose at the start; None: obstacles are ignored.
 
         Raises
         ------
         PlanningError
-            Links are much nearer at the start than the clearance, a link touches an obstacle, or
+            Links are much closer than the clearance at the start, a link touches an obstacle, or
             the mesh of a ``<collision>`` cannot be read; the message names them.
         """
         geometry = self.geometry
@@ -158,7 +159,7 @@ class Clearance:
                 remedy = "" if isinstance(links, ObstaclePair) else _SRDF_REMEDY
                 raise PlanningError(
                     f"{sentence_case(links.subject)} are {distance:.3g} m apart at the start, "
-                    f"nearer than {self._parameter} = {self.distance:g} m: make it smaller{remedy}."
+                    f"closer than {self._parameter} = {self.distance:g} m: make it smaller{remedy}."
                 )
             else:
                 required[pair] = min(self.distance, distance)
@@ -200,7 +201,7 @@ class Clearance:
         return self._keep_distances(shapes, _CLEARANCE_FACTOR_FOR_LOOPS * self.distance)
 
     def is_clear(self, shapes: Array, required: Array) -> bool:
-        """Whether links keep the ``required`` distances (P,), m, in all configurations (N, n).
+        """Whether pairs keep the ``required`` distances (P,), m, in all configurations (N, n).
 
         Obstacles do not count.
         """
@@ -226,16 +227,15 @@ class Clearance:
         required: Array | None = None,
         base: BasePoses | None = None,
     ) -> list[Approach]:
-        """Return the nearest approaches of pairs that come too near, nearest first.
+        """Return the nearest approaches of pairs that come too close, nearest first.
 
         Parameters
         ----------
         positions
             (N + 1, n) shapes at the ticks, m or rad.
         required
-            (P,) required distances, m; None: those :meth:`required` from the first shape on.
-        base
-            Poses of the base at the ticks; None: obstacles are ignored.
+            (P,) required distances, m; None: those :meth:`required` from the first shape on. base
+            Base poses at the ticks; None: obstacles are ignored.
         """
         if not len(self.geometry.pairs):
             return []
@@ -244,7 +244,8 @@ class Clearance:
         return nearest_approaches(self.geometry, positions, required, base)
 
     def clause(self, approach: Approach, control_period: float | None) -> str:
-        """Return a clause about a path that is too near; without a control period no times."""
+        """Return a clause about an approach that is too close; without a control period, no
+        times."""
         when = ""
         if control_period is not None:
             when = f" after {approach.tick * control_period:.4g} s,"
@@ -254,15 +255,15 @@ class Clearance:
         )
 
     def require_shape(self, shape: Array, required: Array, base: BasePoses | None = None) -> None:
-        """Check that links do not come too near in the shape (n,) of a goal.
+        """Check that links are not too close in the shape (n,) of a goal.
 
-        ``required`` are the distances (P,) of all pairs, m, and ``base`` is the pose of the base
-        there, if it is known.
+        ``required`` are the distances (P,) of all pairs, m, and ``base`` is the base pose there, if
+        known.
 
         Raises
         ------
         UnreachableError
-            Links are too near; the message names them.
+            Links are too close; the message names them.
         """
         found = self.approaches(shape[np.newaxis], required, base)
         if found:

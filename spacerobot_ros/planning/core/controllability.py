@@ -1,10 +1,11 @@
-"""Rotations of the base by closed motions of the joints: rank and conditioning.
+"""Base rotations by closed joint motions: rank and conditioning.
 
 A small loop in the plane of two joints rotates the base by curvature times area (papers 1 and 2).
-Three such first-order brackets that span the three axes of rotation satisfy the Lie algebra rank
-condition, and attitude and shape are controllable (paper 1, proposition 1); brackets are analytic,
-so their span at one shape is that at almost all shapes (proposition 2). The position follows from
-attitude and shape; it is also controllable if three sliders have independent slots.
+If three such first-order brackets span the three axes of rotation, they satisfy the Lie algebra
+rank condition, and attitude and shape are controllable (paper 1, proposition 1); brackets are
+analytic,
+so their span at one shape is the span at almost all shapes (proposition 2). The base position
+follows from attitude and shape; it is also controllable if three sliders have independent slots.
 """
 
 from __future__ import annotations
@@ -20,28 +21,28 @@ from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array, JointKind
 
 MAX_CONDITION = 1e6
-"""Condition number above which brackets count as linearly dependent: their directions are rounding
-errors."""
+"""Condition number above which brackets are considered linearly dependent: their directions are
+rounding errors."""
 
 ZERO_TURN_PER_AREA = 1e-12
-"""Singular values of brackets below this, rad per unit area, count as zero."""
+"""Bracket singular values below this, rad per unit area, count as zero."""
 
 _SAMPLED_SHAPE_COUNT = 24
-"""Number of sampled shapes; brackets that span at any shape span at almost all shapes."""
+"""Number of sampled shapes; brackets that span at one shape span at almost all shapes."""
 
 
 @dataclass(frozen=True)
 class Controllability:
-    """The span of the Lie brackets at one shape.
+    """Span of the Lie brackets at one shape.
 
     Attributes
     ----------
     rank, required_rank
-        Number of axes of rotation that the brackets span, and the required number.
+        Number of rotation axes spanned by the brackets, and the required number.
     singular_values
         (3,) of the best three brackets, rad per unit area (rad^2, rad m or m^2), descending.
     joints
-        The joints whose brackets they are.
+        The joints of these brackets.
     shape
         (n,) shape at which the brackets are taken, m or rad.
     message
@@ -84,7 +85,7 @@ def shape_box(robot: SpaceRobot) -> tuple[Array, Array]:
 
 
 def sample_shapes(robot: SpaceRobot, count: int) -> Array:
-    """Return shapes (count, n) spread evenly over the shape space; they depend on no seed."""
+    """Return shapes (count, n) spread evenly over the shape space; they do not depend on a seed."""
     lower, upper = shape_box(robot)
     # Multiples of independent irrational numbers are evenly spread.
     fractions = np.outer(np.arange(1, count + 1), np.sqrt(_first_primes(robot.n))) % 1.0
@@ -101,16 +102,17 @@ def curvatures(robot: SpaceRobot, shapes: Array) -> Array:
 
 
 def curvature_matrices(K: Array, joints: Sequence[int]) -> Array:
-    """Return ``M`` (..., 3, 3) of three joints from curvature (..., 3, n, n): paper 2.
+    """Return ``M`` (..., 3, 3) for three joints from the curvature (..., 3, n, n): paper 2.
 
-    Its columns are the rotations per area of the pairs (1, 2), (2, 3), (3, 1).
+    Its columns are the rotations per area for the pairs (1, 2), (2, 3), (3, 1).
     """
     i, j, k = joints
     return K[..., [i, j, k], [j, k, i]]
 
 
 def best_triple(K: Array, among: Sequence[int]) -> tuple[tuple[int, int, int], Array]:
-    """Return the three joints with the best conditioned ``M`` (3, 3), from curvature (3, n, n)."""
+    """Return the three joints with the best-conditioned ``M`` (3, 3), from the curvature (3, n,
+    n)."""
     triples = list(itertools.combinations(among, 3))
     matrices = np.array([curvature_matrices(K, triple) for triple in triples])
     values = np.linalg.svd(matrices, compute_uv=False)
@@ -129,15 +131,15 @@ def best_sampled_brackets(robot: SpaceRobot, among: Sequence[int] | None = None)
 
 
 def sliders_of(robot: SpaceRobot) -> list[int]:
-    """Return the indices of the prismatic joints."""
+    """Return the prismatic joint indices."""
     joints = robot.description.movable_joints
     return [i for i, joint in enumerate(joints) if joint.kind is JointKind.PRISMATIC]
 
 
 def slot_matrix(robot: SpaceRobot, shape: Array, sliders: Sequence[int]) -> Array:
-    """Return the motion (3, s) of the centre of mass, in B, per motion of each slider, m/m.
+    """Return the centre-of-mass motion (3, s), in B, per slider motion, m/m.
 
-    It is linear in a slider, so a unit step is exact.
+    It is linear in the slider position, so a unit step is exact.
     """
     c = robot.center_of_mass(shape)
     steps = [robot.center_of_mass(shape + np.eye(robot.n)[i]) - c for i in sliders]
@@ -145,7 +147,8 @@ def slot_matrix(robot: SpaceRobot, shape: Array, sliders: Sequence[int]) -> Arra
 
 
 def require_three_slots(robot: SpaceRobot, slots: Array) -> None:
-    """Check that sliders with slots (3, s) can move the base anywhere (paper 1, section 4.1).
+    """Check that sliders with slots (3, s) can move the base to any position (paper 1, section
+    4.1).
 
     Raises
     ------
@@ -172,7 +175,7 @@ def tilted_goal_error(robot: SpaceRobot, axis: Array, tilt: float) -> Unreachabl
 
 
 def check_sliding_masses(robot: SpaceRobot) -> Controllability:
-    """Test a robot by paper 1: three independent slots and spanning brackets of sliders."""
+    """Test a robot by paper 1: three independent slots and spanning slider brackets."""
     sliders = sliders_of(robot)
     try:
         require_three_slots(robot, slot_matrix(robot, np.mean(shape_box(robot), axis=0), sliders))
@@ -197,7 +200,7 @@ def _span_of_brackets(
     rank = int(max(_numerical_rank(row) for row in values))
     where, names = f"at the best of {len(shapes)} shapes", robot.joint_names
     if len(joints) < 3:
-        message = f"Loops of two joints of robot '{name}' rotate its base about one axis at a time."
+        message = f"Two-joint loops of robot '{name}' rotate its base about one axis at a time."
         chosen = tuple(names[i] for i in joints)
         return Controllability(
             min(rank, 1), 3, np.pad(values[0], (0, 2)), chosen, shapes[0], message
@@ -218,7 +221,7 @@ def _span_of_brackets(
     else:
         message = (
             f"First-order brackets of the joints of robot '{name}' span {rank} of the three axes "
-            f"of rotation {where}: small loops rotate the base about no other axis."
+            f"of rotation {where}: small loops do not rotate the base about other axes."
         )
     return Controllability(rank, 3, singular[best], triple, shapes[best], message)
 

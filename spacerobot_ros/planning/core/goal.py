@@ -1,4 +1,4 @@
-"""Goals, the states in which plans begin, and the error between them."""
+"""Goals, the states from which plans begin, and the error between them."""
 
 from __future__ import annotations
 
@@ -26,22 +26,21 @@ from spacerobot_ros.model.rotations import (
 from spacerobot_ros.parameters import as_numbers
 
 Controlled = Literal["position", "attitude", "shape", "end_effectors"]
-"""A part of a goal: the position and the attitude of the base, the joint positions, and the poses
-of end-effectors.
+"""A goal component: base position, base attitude, joint positions, or end-effector poses.
 """
 
 POSE: frozenset[Controlled] = frozenset({"position", "attitude"})
-"""The parts of a goal that are the pose of the base."""
+"""The goal components that form the base pose."""
 
 
 POSITION_SLACK = 0.5
-"""Share of the position tolerance by which a plan may miss an unreachable position."""
+"""Fraction of the position tolerance by which a plan may miss an unreachable position."""
 
 _MAX_COORDINATE = 1e12
-"""Largest coordinate, m or rad; a float64 resolves a millimetre up to it."""
+"""Largest coordinate, m or rad; up to this value, a float64 resolves a millimetre."""
 
 MAX_PATH_POSES = 10_000
-"""Largest number of poses of a given path: it limits the time of planning."""
+"""Largest number of poses in a given path, which limits planning time."""
 
 _MAX_ANGLE = 2e6 * np.pi
 """A million revolutions, rad: a larger angle does not resolve its attitude."""
@@ -49,20 +48,20 @@ _MAX_ANGLE = 2e6 * np.pi
 
 @dataclass(frozen=True)
 class EndEffectorGoal:
-    """A position or a pose in the world of a link E of the robot.
+    """A world position or pose for a robot link E.
 
     Attributes
     ----------
     link
-        Name of the link; empty: that of the robot's default end-effector.
+        Link name; empty: the robot's default end-effector.
     position
-        (3,) r_WE of the origin of its frame, m.
+        (3,) r_WE of the link frame origin, m.
     quaternion
         (4,) of R_WE, (x, y, z, w); None: any attitude.
     waypoints
         Waypoints before the goal, connected by straight lines: positions (K, 3), m, or poses (K, 7)
         if the goal has an attitude, which rotates along the lines. The link moves straight to the
-        first. None: the method chooses the path.
+        first waypoint. None: the method chooses the path.
     """
 
     link: str
@@ -77,7 +76,7 @@ class EndEffectorGoal:
         Raises
         ------
         GoalError
-            They are not 3 or 7 finite numbers, or the quaternion is zero.
+            The values are not 3 or 7 finite numbers, or the quaternion is zero.
         """
         name = f"'{link}'" if link else "the end-effector"
         values = as_numbers(pose, f"The goal of {name}", GoalError)
@@ -93,12 +92,12 @@ class EndEffectorGoal:
     def along(cls, link: str, poses: npt.ArrayLike) -> EndEffectorGoal:
         """Return the goal at the end of a path: positions (K, 3), m, or poses (K, 7).
 
-        A path of one pose is a goal without waypoints. Quaternions are scaled to length one.
+        A path with a single pose is a goal without waypoints. Quaternions are scaled to length one.
 
         Raises
         ------
         GoalError
-            There are no poses or too many of them, or one is not a pose.
+            There are no poses or too many, or one is invalid.
         """
         values, name = (
             as_numbers(poses, f"The goal path of '{link}'", GoalError),
@@ -113,7 +112,7 @@ class EndEffectorGoal:
             )
         if len(values) > MAX_PATH_POSES:
             raise GoalError(
-                f"{name} has {len(values)} poses; it can have at most {MAX_PATH_POSES}."
+                f"{name} has {len(values)} poses; at most {MAX_PATH_POSES} are allowed."
             )
         refused = ~(np.abs(values) <= _MAX_COORDINATE).all(axis=1)
         if refused.any():
@@ -136,7 +135,7 @@ class EndEffectorGoal:
 
     @classmethod
     def of_numbers(cls, link: str, numbers: npt.ArrayLike) -> EndEffectorGoal:
-        """Return the goal from its form in files: one position or pose, or a list of them, a path.
+        """Return the goal from its file form: a position or pose, or a path as a list of them.
 
         Raises
         ------
@@ -148,7 +147,7 @@ class EndEffectorGoal:
 
     @property
     def numbers(self) -> list[float] | list[list[float]]:
-        """The goal in the form that :meth:`of_numbers` accepts."""
+        """The goal in the form accepted by :meth:`of_numbers`."""
         return list(self.values) if self.waypoints is None else self.path_values.tolist()
 
     @property
@@ -170,8 +169,8 @@ class EndEffectorGoal:
 
     @property
     def values(self) -> tuple[float, ...]:
-        """Position (3,), or position and quaternion (7,), of the goal itself, as accepted by
-        :meth:`checked`.
+        """Position (3,), or position and quaternion (7,), of the goal without waypoints, as
+        accepted by :meth:`checked`.
         """
         attitude = [] if self.quaternion is None else self.quaternion.tolist()
         return (*self.position.tolist(), *attitude)
@@ -179,7 +178,7 @@ class EndEffectorGoal:
 
 @dataclass(frozen=True)
 class Goal:
-    """A pose of the base link in the world, the final shape of the joints, and end-effectors.
+    """A goal: base link pose in the world, final joint shape, and end-effector goals.
 
     Attributes
     ----------
@@ -188,15 +187,15 @@ class Goal:
     quaternion
         (4,) of R_WB, (x, y, z, w).
     joint_positions
-        (n,) in the order of the robot's joints, m or rad; None: the method chooses.
+        (n,) in robot joint order, m or rad; None: the method chooses.
     end_effectors
-        Goals of links, at most one for each link.
+        End-effector goals, at most one per link.
     base
-        The requested parts of the pose of the base. With end-effectors, any or none of them may be
+        Requested components of the base pose. With end-effectors, any or none of them may be
         requested; the motion determines the others.
     asked
-        The parts of the pose of the base that the sender has given as numbers. Others are those of
-        the start (:meth:`kept_at`), and are not needed for the goal to be reached.
+        Base pose components given explicitly by the sender. Other components are
+        kept from the start (:meth:`kept_at`), and are not required for the goal to be reached.
     """
 
     position: Array
@@ -215,12 +214,13 @@ class Goal:
         quaternion: npt.ArrayLike | None = None,
         joint_positions: npt.ArrayLike | None = None,
     ) -> Goal:
-        """Return a goal of end-effectors; the base is free except for the given parts of its pose.
+        """Return an end-effector goal; the base is free except for the given components of its
+        pose.
 
         Raises
         ------
         GoalError
-            A link has two goals or there is no goal, or a list is refused by :meth:`checked`.
+            A link has two goals or there is no goal, or a list is rejected by :meth:`checked`.
         """
         goals = tuple(end_effectors)
         if not goals:
@@ -256,7 +256,7 @@ class Goal:
         r = as_numbers(position, "The goal position", GoalError)
         q = as_numbers(quaternion, "The goal orientation", GoalError)
         if r.shape != (3,) or q.shape != (4,):
-            raise GoalError("A goal has three numbers of position and four of orientation.")
+            raise GoalError("A goal has three position and four orientation values.")
         if not np.all(np.isfinite(r)):
             raise GoalError(f"The goal position {r.tolist()} is not finite.")
         if np.abs(r).max() > _MAX_COORDINATE:
@@ -294,12 +294,13 @@ class Goal:
         quaternion: Sequence[float],
         joint_positions: npt.ArrayLike | None = None,
     ) -> Goal:
-        """Return the goal of a message, as :meth:`checked`; a part of NaN is not requested.
+        """Return the goal from a message, as :meth:`checked`; a component that is NaN is not
+        requested.
 
         Raises
         ------
         GoalError
-            See :meth:`checked`; or all of the pose is NaN.
+            See :meth:`checked`; or the entire pose is NaN.
         """
         parts: dict[Controlled, Sequence[float]] = {"position": position, "attitude": quaternion}
         asked = frozenset(part for part, numbers in parts.items() if not np.isnan(numbers).all())
@@ -332,7 +333,7 @@ class Goal:
 
     @classmethod
     def from_rpy(cls, position: npt.ArrayLike, rpy_deg: npt.ArrayLike) -> Goal:
-        """Return the goal at a position (m) after roll, pitch and yaw about fixed axes (deg).
+        """Return the goal at a position (m) with fixed-axis roll, pitch and yaw (deg).
 
         Raises
         ------
@@ -345,12 +346,13 @@ class Goal:
         return cls.checked(position, quaternion_from_matrix(matrix_from_rpy(np.radians(angles))))
 
     def for_robot(self, robot: RobotDescription) -> Goal:
-        """Return the goal with the names of its end-effectors; an empty name is the default one.
+        """Return the goal with end-effector names resolved; an empty name is the default
+        end-effector.
 
         Raises
         ------
         GoalError
-            The robot has no such link, or it is the base, or a link has two goals.
+            The robot has no such link, the link is the base, or a link has two goals.
         """
         names = ", ".join(each.name for each in robot.links[1:])
         remedy = f": name one of its links {names}" if names else ", nor any other than its base"
@@ -364,8 +366,7 @@ class Goal:
                 )
             if link == robot.base_link:
                 raise GoalError(
-                    f"The goal is for '{link}', which is the base: give its pose as the goal of "
-                    "the base."
+                    f"The goal is for '{link}', which is the base: give its pose as the base goal."
                 )
             if link not in robot.frames:
                 raise GoalError(
@@ -377,9 +378,9 @@ class Goal:
         return replace(self, end_effectors=tuple(sorted(goals, key=lambda each: each.link)))
 
     def joined_with(self, other: Goal) -> Goal:
-        """Return the goal with the parts of another one, which takes precedence.
+        """Return the goal merged with another goal, which takes precedence.
 
-        If both are goals for the base only, the other one is returned.
+        If both are base goals only, the other goal is returned.
         """
         if not self.end_effectors and not other.end_effectors:
             return other
@@ -389,7 +390,7 @@ class Goal:
         return replace(of_base, joint_positions=shape, end_effectors=tuple(links.values()))
 
     def kept_at(self, position: Array, quaternion: Array) -> Goal:
-        """Return the goal with the parts that are not requested taken from a pose of the base."""
+        """Return the goal with components that are not requested taken from a base pose."""
         if self.asked == POSE or not self.base:
             return self
         return replace(
@@ -409,7 +410,7 @@ class Goal:
         return frozenset(each.link for each in self.end_effectors if each.waypoints is not None)
 
     def displaced(self, by: Array) -> Goal:
-        """Return the goal with all its places (3,) displaced in W, m."""
+        """Return the goal with all its positions displaced by a vector (3,) in W, m."""
         hands = tuple(each.displaced(by) for each in self.end_effectors)
         return replace(self, position=self.position + by, end_effectors=hands)
 
@@ -433,12 +434,12 @@ def _require_one_goal_each(goals: Iterable[EndEffectorGoal]) -> None:
     for link, count in Counter(each.link for each in goals).items():
         if count > 1:
             name = f" '{link}'" if link else ""
-            raise GoalError(f"The end-effector{name} has {count} goals; it can have one.")
+            raise GoalError(f"The end-effector{name} has {count} goals; only one is allowed.")
 
 
 @dataclass(frozen=True)
 class RobotState:
-    """The state of a robot.
+    """State of a robot.
 
     Attributes
     ----------
@@ -447,10 +448,10 @@ class RobotState:
     q
         (n,) joint positions, m or rad.
     linear_momentum, angular_momentum
-        (3,) each in W, the second about the centre of mass of the system; kg m/s and kg m^2/s.
+        (3,) each in W, kg m/s and kg m^2/s; angular momentum is about the system's centre of mass.
     qdot
-        (n,) joint velocities, m/s or rad/s; None: zero. Plans from rest use those of reaction
-        wheels, which spin while the other joints rest.
+        (n,) joint velocities, m/s or rad/s; None: zero. Plans from rest use only those of reaction
+        wheels, which may spin while the other joints are at rest.
     """
 
     position: Array
@@ -463,19 +464,19 @@ class RobotState:
 
 @dataclass(frozen=True)
 class PoseError:
-    """The remaining error of a pose and a shape to a goal.
+    """Remaining error between a pose and shape and a goal.
 
     Attributes
     ----------
     position
         (3,) from the base to its goal, in W, m.
     rotvec
-        (3,) rotation vector from the attitude to that of the goal, in B, rad.
+        (3,) rotation vector from the attitude to the goal attitude, in B, rad.
     shape
-        (n,) from the joint positions to those of the goal, m or rad; empty if the goal has none.
+        (n,) from the joint positions to the goal positions, m or rad; empty if the goal has none.
     end_effectors
-        The same for each end-effector of the goal: from its pose, in W and in its own frame; the
-        rotation is zero if the goal is a position only.
+        The same for each end-effector in the goal, from its pose, in W and in its own frame; the
+        rotation is zero for a position-only goal.
     """
 
     position: Array
@@ -492,9 +493,9 @@ class PoseError:
         q: Array | None = None,
         robot: SpaceRobot | None = None,
     ) -> PoseError:
-        """Return the error from a pose, and from the shape ``q`` (n,) if given, to the goal.
+        """Return the error between a pose, and the shape ``q`` (n,) if given, and the goal.
 
-        The errors of end-effectors require the shape and the robot.
+        End-effector errors require the shape and the robot.
         """
         shape = np.zeros(0)
         hands: tuple[PoseError, ...] = ()
@@ -511,7 +512,7 @@ class PoseError:
 
     @classmethod
     def of_link(cls, pose: Array, goal: Goal | EndEffectorGoal) -> PoseError:
-        """Return the error from the pose (7,) of a link in the world to its goal."""
+        """Return the error from a link's pose (7,) in the world to its goal."""
         turn = np.zeros(3)
         if goal.quaternion is not None:
             turn = attitude_error(pose[3:], goal.quaternion)
@@ -529,7 +530,7 @@ class PoseError:
 
     @property
     def max_joint_error(self) -> float:
-        """Largest joint error, m or rad; zero for a goal without shape."""
+        """Largest joint error, m or rad; zero for a goal without a shape."""
         return float(np.abs(self.shape).max(initial=0.0))
 
     @property
@@ -539,7 +540,7 @@ class PoseError:
 
     @property
     def largest_end_effector_angle(self) -> float:
-        """Largest angle of an end-effector from its goal, rad; zero if the goal has none."""
+        """Largest angle between an end-effector and its goal, rad; zero if the goal has none."""
         return max((each.angle for each in self.end_effectors), default=0.0)
 
 
@@ -548,7 +549,7 @@ def end_effector_pose(
 ) -> tuple[Array, Array]:
     """Return the pose of a link: r_WE (3,), m, and the quaternion (4,) of R_WE.
 
-    ``position`` (3,), ``quaternion`` (4,) and ``q`` (n,) are the pose of the base and the shape.
+    ``position`` (3,), ``quaternion`` (4,) and ``q`` (n,) are the base pose and the shape.
 
     Raises
     ------
@@ -561,7 +562,7 @@ def end_effector_pose(
 
 
 def uncontrolled_parts(goal: Goal, controls: frozenset[Controlled]) -> tuple[Controlled, ...]:
-    """Return the parts of base and shape that a goal requests and that are not in ``controls``."""
+    """Return the base and shape components requested by a goal but not in ``controls``."""
     asked: list[Controlled] = [part for part in ("position", "attitude") if part in goal.base]
     if goal.joint_positions is not None:
         asked.append("shape")
@@ -571,8 +572,8 @@ def uncontrolled_parts(goal: Goal, controls: frozenset[Controlled]) -> tuple[Con
 def missed_parts(
     goal: Goal, error: PoseError, controls: frozenset[Controlled], tolerance: Tolerance
 ) -> dict[str, str]:
-    """Return the requested parts of the base that are out of tolerance and not controlled, each
-    with its error and unit.
+    """Return the requested base components that are out of tolerance and not controlled, each with
+    its error and unit.
     """
     errors: dict[Controlled, tuple[float, float, str]] = {
         "position": (error.distance, tolerance.position, "m"),
@@ -586,7 +587,7 @@ def missed_parts(
 
 
 def missed_turn(angle: float, tolerance: Tolerance) -> dict[str, str]:
-    """Return a missed attitude (rad) of an end-effector in the form of :func:`missed_parts`."""
+    """Return a missed end-effector attitude (rad) in the form of :func:`missed_parts`."""
     return {"end-effector's attitude": f"{angle:.3g} rad"} if angle > tolerance.attitude else {}
 
 
@@ -599,9 +600,9 @@ def reached_message(remaining: str, missed: Mapping[str, str]) -> str:
 
 @dataclass(frozen=True)
 class Tolerance:
-    """Largest errors of a reached goal: ``position`` m, ``attitude`` rad, joints m or rad.
+    """Largest errors for a goal to be reached: ``position`` m, ``attitude`` rad, joints m or rad.
 
-    Those of the pose apply to the base and to end-effectors.
+    Pose tolerances apply to the base and to end-effectors.
     """
 
     position: float
@@ -609,15 +610,15 @@ class Tolerance:
     shape: float = 1e-3
 
     def require_control(self, goal: Goal, controls: frozenset[Controlled], who: str) -> None:
-        """Refuse a goal with these tolerances (0: none) if ``who`` does not control one of its
-        parts.
+        """Reject a goal with these tolerances (0: none) if ``who`` does not control one of its
+        components.
 
-        ``controls`` are the parts of the goal that ``who``, a method or a law, controls.
+        ``controls`` are the goal components controlled by ``who``, a method or a law.
 
         Raises
         ------
         GoalError
-            There is a tolerance for a part of the goal that is not controlled.
+            A tolerance is given for a goal component that is not controlled.
         """
         given = {"position": self.position, "attitude": self.attitude, "shape": self.shape}
         missing = [part for part in uncontrolled_parts(goal, controls) if given[part]]
@@ -629,7 +630,7 @@ class Tolerance:
             )
 
     def admits(self, error: PoseError, controls: frozenset[Controlled] = POSE) -> bool:
-        """Whether an error is within tolerance in all controlled parts of the goal."""
+        """Whether an error is within tolerance in all controlled goal components."""
         return (
             ("position" not in controls or error.distance <= self.position)
             and ("attitude" not in controls or error.angle <= self.attitude)
@@ -649,4 +650,4 @@ class Tolerance:
 
 
 NO_TOLERANCE = Tolerance(0.0, 0.0, 0.0)
-"""Tolerances of a sender who has given none."""
+"""Tolerances if the sender has given none."""

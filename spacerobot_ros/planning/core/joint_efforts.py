@@ -1,4 +1,4 @@
-"""Joint efforts of held commands, compared with their limits."""
+"""Joint efforts under held commands, compared with their limits."""
 
 from __future__ import annotations
 
@@ -13,27 +13,27 @@ from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
 
 _MAX_EXCESS = 1e-6
-"""Share of a limit by which rounding errors may exceed it."""
+"""Fraction of a limit by which rounding errors may exceed it."""
 
 _MAX_CHECKED_TICKS = 4000
-"""Number of ticks up to which the efforts of all of them are compared with limits."""
+"""Number of ticks up to which all efforts are compared with the limits."""
 
 
 class JointEfforts:
-    """The efforts of one robot whose joints follow held commands, and their limits.
+    """Efforts of a robot whose joints follow held commands, and their limits.
 
-    Between two commands the joints have the mean of their velocities and the acceleration that
-    leads from one to the other in a control period. The efforts follow from inverse dynamics
-    (:func:`.joint_efforts` of the model), as in the plant under velocity actuation.
+    Between two commands, the joints have their mean velocity, and the acceleration that changes one
+    into the other within a control period. The efforts follow from inverse dynamics
+    (the model's :func:`.joint_efforts`), as in the plant under velocity actuation.
 
     Parameters
     ----------
     robot
         The model.
     limit
-        (n,) largest effort of every joint in a motion, N or N m; infinite: any.
+        (n,) largest effort of every joint in a motion, N or N m; infinite: no limit.
     control_period
-        Duration of a command, s.
+        Command duration, s.
     """
 
     def __init__(self, robot: SpaceRobot, limit: Array, control_period: float) -> None:
@@ -50,7 +50,7 @@ class JointEfforts:
         L_B: Array | None = None,
         after: Array | float = 0.0,
     ) -> Array:
-        """Return the efforts of held commands over their limits (N + 1, n), at the ticks.
+        """Return the efforts under held commands relative to their limits (N + 1, n), at the ticks.
 
         ``positions`` (N + 1, n) are the shapes at the ticks; the velocities ``velocity`` and
         ``after`` (n,) are held before and after. ``L_B`` (N + 1, 3) is the angular momentum about
@@ -65,10 +65,10 @@ class JointEfforts:
         L_B: Array | None = None,
         after: Array | float = 0.0,
     ) -> float:
-        """Return the factor by which held commands must be slowed down; at most 1: they need not
-        be.
+        """Return the factor by which held commands must be slowed down; no slowdown is needed if at
+        most 1.
 
-        Arguments are those of :meth:`shares`. For a robot that drifts it is an estimate, as its
+        Arguments are as in :meth:`shares`. For a drifting robot this is an estimate, as the
         efforts are not quadratic in the speed.
         """
         shares = self.shares(positions, velocity, L_B, after)
@@ -81,9 +81,9 @@ class JointEfforts:
         L_B: Array | None = None,
         after: Array | float = 0.0,
     ) -> str:
-        """Return the clause that says which joints take more than their limits; empty: none.
+        """Return a clause that names the joints exceeding their effort limits; empty: none.
 
-        Arguments are those of :meth:`shares`. If there are many ticks, only those with the largest
+        Arguments are as in :meth:`shares`. If there are many ticks, only those with the largest
         accelerations and some in between are checked.
         """
         rates, changes = self._rates(positions, velocity, after)
@@ -141,9 +141,9 @@ class JointEfforts:
 
 
 def given_effort_limits(robot: SpaceRobot) -> Array | None:
-    """Return the effort limits (n,) of the URDF; None if it has none.
+    """Return the URDF effort limits (n,); None if the URDF has none.
 
-    A limit of zero means that the limit is unknown, since nothing could move under it.
+    A limit of zero means an unknown limit, since nothing could move under it.
     """
     limit = np.where(robot.effort_limit > 0, robot.effort_limit, np.inf)
     return limit if np.isfinite(limit).any() else None

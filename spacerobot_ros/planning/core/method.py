@@ -1,4 +1,4 @@
-"""The interface of gait methods: from a request to a schedule, or to a refusal."""
+"""Interface of gait methods: from a request to a schedule or an error."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from spacerobot_ros.planning.core.schedule import BasePath, GaitSchedule, Notes
 _REST_MOMENTUM = 1e-9  # per mass: m/s and m^2/s
 
 END_EFFECTOR_METHOD = "optimal"
-"""Name of the method that plans for goals of end-effectors."""
+"""Name of the method that plans for end-effector goals."""
 
 PATH_METHOD = "resolved_rate"
 """Name of the method that moves end-effectors along given paths."""
@@ -43,15 +43,15 @@ _LIMIT_SLACK = 1e-9  # m or rad
 
 @dataclass(frozen=True)
 class InitialMotion:
-    """Motion of the joints at the beginning of a gait.
+    """Joint motion at the start of a gait.
 
     Attributes
     ----------
     velocity
-        (n,) joint velocities that are held until then, m/s or rad/s.
+        (n,) joint velocities held until then, m/s or rad/s.
     remaining
-        (M + 1, n) shapes at the ticks of the present plan from there on, to rest; the gait begins
-        in the first one.
+        (M + 1, n) shapes at the remaining ticks of the current plan, until rest; the gait begins at
+        the first one.
     """
 
     velocity: Array
@@ -60,24 +60,24 @@ class InitialMotion:
 
 @dataclass(frozen=True)
 class PlanRequest:
-    """The arguments of a plan, in addition to the robot and the options of the method.
+    """Arguments of a plan, in addition to the robot and the method options.
 
     Attributes
     ----------
     state
-        The state in which the gait begins.
+        The state from which the gait begins.
     goal
         The goal at which it ends.
     tolerance
         Largest errors at the goal.
     correction
-        Whether an earlier schedule for the same goal has just ended: the remaining error is small,
-        and options that fix the size of the first manoeuvre do not apply.
+        Whether an earlier schedule for the same goal has just ended: then the remaining error is
+        small, and options that fix the size of the first manoeuvre do not apply.
     previous
-        The last executed schedule for the same goal, None for the first. ``auto`` keeps its
+        The last executed schedule for the same goal; None for the first. ``auto`` keeps its
         method, and methods that plan piece by piece continue from its ``progress``.
     motion
-        Motion of the joints at the beginning of the gait; None: they rest. Only methods that
+        Joint motion at the start of the gait; None: they rest. Only methods that
         declare ``starts_in_motion`` receive it.
     """
 
@@ -91,17 +91,17 @@ class PlanRequest:
 
 @dataclass(frozen=True)
 class EmptyOptions:
-    """The options class of a method without options."""
+    """Options class for a method without options."""
 
 
 BEYOND_EFFORT_LIMITS = "beyond_effort_limits"
-"""Name of the note about joints that take more than their effort limits."""
+"""Name of the note about joints that exceed their effort limits."""
 
 NO_JOINTS = (
     "Robot '{}' has no joints that could move its base. If it has thrusters, "
     "coordinated_control flies it; with `profile: planned` it plans the motion."
 )
-"""Refusal of a robot by methods, with its name."""
+"""Message for rejecting a robot, with its name."""
 
 
 class GaitMethod(ABC):
@@ -115,31 +115,32 @@ class GaitMethod(ABC):
     robot
         The model.
     control_period
-        Duration of a command, s.
+        Command duration, s.
     integration_step
-        Longest Runge-Kutta step of the predicted attitude, s; use the plant's for equal results.
+        Longest Runge-Kutta step for the predicted attitude, s; use the plant's value for equal
+        results.
     options
         An instance of the method's ``Options``; None: the defaults.
     clearance
-        Smallest distance that schedules keep between links; None: any.
+        Smallest distance between links in schedules; None: any.
 
     Attributes
     ----------
     name
-        Name in the registry, and of the group of parameters ``<name>.<option>``.
+        Registry name, and name of the parameter group ``<name>.<option>``.
     controls
-        The parts of a goal that the method's schedules control. A method that selects among others
-        states them in each schedule only.
+        Goal components controlled by the method's schedules. A method that selects among others
+        sets them only in each schedule.
     plans_for_base, plans_for_end_effectors
-        Whether it plans for goals of the base, and for goals of end-effectors.
+        Whether it plans for base goals, and for end-effector goals.
     follows_paths
         Whether it moves end-effectors along given paths.
     repeats_cycles
-        Whether its gaits repeat a cycle of the shape, which reports then show.
+        Whether its gaits repeat a shape cycle, which reports then show.
     starts_in_motion
-        Whether its gaits may begin while the joints move (``PlanRequest.motion``).
+        Whether its gaits may begin with moving joints (``PlanRequest.motion``).
     Options
-        A frozen dataclass, whose fields are declared by :mod:`spacerobot_ros.parameters`.
+        A frozen dataclass with fields declared by :mod:`spacerobot_ros.parameters`.
 
     Raises
     ------
@@ -178,9 +179,9 @@ class GaitMethod(ABC):
             self._setup_refusal = refusal
 
     def setup(self) -> None:  # noqa: B027 - methods that delegate have nothing to set up here
-        """Compute all attributes that depend only on robot and options; called once.
+        """Compute all attributes that depend only on the robot and the options; called once.
 
-        A `PlanningError` refuses the robot: :meth:`require_rest` raises it for every goal.
+        A `PlanningError` rejects the robot: :meth:`require_rest` raises it for every goal.
         """
 
     @cached_property
@@ -195,7 +196,7 @@ class GaitMethod(ABC):
 
     @classmethod  # noqa: B027 - any robot is suitable by default
     def require_suitable(cls, robot: SpaceRobot) -> None:
-        """Refuse a robot for which the method cannot plan any goal, whatever its options.
+        """Reject a robot for which the method cannot plan any goal, regardless of options.
 
         Raises
         ------
@@ -205,14 +206,14 @@ class GaitMethod(ABC):
 
     @abstractmethod
     def plan(self, request: PlanRequest, cancellation: Cancellation = NEVER) -> GaitSchedule:
-        """Return a gait for a request that ends at rest; equal requests have equal gaits.
+        """Return a gait for a request that ends at rest; equal requests yield equal gaits.
 
         Raises
         ------
         PlanningError
             The method cannot reach the goal; the message says why.
         PlanningCancelled
-            The cancellation was requested meanwhile.
+            Cancellation was requested meanwhile.
         """
 
     def schedule_of(
@@ -232,14 +233,15 @@ class GaitMethod(ABC):
     ) -> GaitSchedule:
         """Return shapes (N + 1, n) at the ticks as a schedule of this method.
 
-        ``velocity`` and ``end_velocities`` (n,) are held before and after. Efforts beyond the
-        limits of the URDF are noted; ``L_B`` (N + 1, 3) is the angular momentum in the base
-        for them (:class:`JointEfforts`).
+        ``velocity`` and ``end_velocities`` (n,) are held before and after. Efforts beyond the URDF
+        limits are noted; ``L_B`` (N + 1, 3) is the angular momentum in the base for
+        this check (:class:`JointEfforts`).
 
         Raises
         ------
         PlanningError
-            Links come too near to each other or to obstacles; ``is_clear``: this has been checked.
+            Links come too close to each other or to obstacles; ``is_clear``: whether this has
+            already been checked.
         """
         if not self.plans_for_end_effectors:
             self.require_goal_of_base(goal)
@@ -293,12 +295,12 @@ class GaitMethod(ABC):
         return notes
 
     def goal_shape(self, goal: Goal) -> Array | None:
-        """Return the goal shape (n,) within the joint limits, None for a goal without shape.
+        """Return the goal shape (n,) within the joint limits; None for a goal without a shape.
 
         Raises
         ------
         GoalError
-            The shape is that of another robot.
+            The shape belongs to another robot.
         UnreachableError
             The shape is beyond the joint limits.
         """
@@ -307,7 +309,7 @@ class GaitMethod(ABC):
             return None
         if len(wanted) != robot.n:
             raise GoalError(
-                f"The goal shape has {len(wanted)} joint position(s); robot "
+                f"The goal shape has {len(wanted)} joint position(s), but robot "
                 f"'{robot.description.name}' has {robot.n} joints."
             )
         beyond = np.maximum(robot.lower - wanted, wanted - robot.upper)
@@ -316,8 +318,8 @@ class GaitMethod(ABC):
             joint = robot.description.movable_joints[worst]
             raise UnreachableError(
                 f"The goal shape is beyond limits: joint '{joint.name}' at "
-                f"{wanted[worst]:.4g} {joint.unit}, and its limits are "
-                f"[{robot.lower[worst]:.4g}, {robot.upper[worst]:.4g}] {joint.unit}.",
+                f"{wanted[worst]:.4g} {joint.unit}, but its limits are [{robot.lower[worst]:.4g}, "
+                f"{robot.upper[worst]:.4g}] {joint.unit}.",
                 Proof.LIMITS,
             )
         return np.clip(wanted, robot.lower, robot.upper)
@@ -331,12 +333,12 @@ class GaitMethod(ABC):
         return shape
 
     def require_goal_of_base(self, goal: Goal) -> None:
-        """Refuse a goal of end-effectors, or of a path: PlanningError."""
+        """Reject end-effector goals or path goals: PlanningError."""
         self._require_no_path(goal)
         if goal.end_effectors:
             names = " and ".join(f"'{each.link}'" for each in goal.end_effectors)
             raise PlanningError(
-                f"{self.name} plans for the pose of the base, and the goal is for {names}: "
+                f"{self.name} plans for the base pose, but the goal is for {names}: "
                 f"{END_EFFECTOR_METHOD} plans for end-effectors."
             )
 
@@ -344,7 +346,7 @@ class GaitMethod(ABC):
         for each in goal.end_effectors:
             if each.waypoints is not None:
                 raise PlanningError(
-                    f"{self.name} does not follow paths, and '{each.link}' is to follow one: "
+                    f"{self.name} does not follow paths, but '{each.link}' must follow one: "
                     f"{PATH_METHOD} does."
                 )
 
@@ -382,24 +384,24 @@ class GaitMethod(ABC):
             raise PlanningError(str(self._setup_refusal))
 
     def require_rest(self, state: RobotState) -> None:
-        """Refuse an unsuitable robot, and a robot whose total momentum is not zero."""
+        """Reject unsuitable robots, and robots with nonzero total momentum."""
         self._require_suitable_setup()
         p, L = np.linalg.norm(state.linear_momentum), np.linalg.norm(state.angular_momentum)
         if max(p, L) > _REST_MOMENTUM * self.robot.total_mass:
             raise PlanningError(
                 "The robot drifts: its total momentum is not zero "
-                f"({p:.3g} kg m/s, {L:.3g} kg m^2/s), and {self.name} plans for zero momentum, "
+                f"({p:.3g} kg m/s, {L:.3g} kg m^2/s), but {self.name} plans for zero momentum, "
                 "which joint motions cannot establish; optimal plans for robots that drift."
             )
         wheels = ReactionWheels.of(self.robot.description)
         if state.qdot is not None and wheels.are_spinning(state.qdot):
             raise PlanningError(
-                f"Reaction wheels spin, and {self.name} begins with all joints at rest; optimal "
+                f"Reaction wheels spin, but {self.name} begins with all joints at rest; optimal "
                 "plans from spinning wheels."
             )
 
     def significant(self, momentum: Array) -> Array:
-        """Return a total momentum (3,), kg m/s or kg m^2/s; zero if it counts as zero."""
+        """Return a total momentum (3,), kg m/s or kg m^2/s; zero if it is negligible."""
         if np.linalg.norm(momentum) > _REST_MOMENTUM * self.robot.total_mass:
             return momentum
         return np.zeros(3)

@@ -1,4 +1,4 @@
-"""The base motion of a gait, predicted by the plant's integration steps."""
+"""Base motion of a gait, predicted by the plant's integration steps."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from spacerobot_ros.planning.core.goal import RobotState
 from spacerobot_ros.planning.core.schedule import BasePath
 
 _MIN_PATH_POSES = 200
-"""Smallest number of poses of a predicted base path; a path has at most twice as many."""
+"""Smallest number of poses in a predicted base path; a path has at most twice as many."""
 
 _LARGE_ERROR, _MAX_HALVINGS = 1e-7, 8
 """Integration error, rad, above which its extrapolation is off by more than a nanoradian, and the
-largest number of halvings of its steps."""
+largest number of step halvings."""
 
 
 def coasting_positions(
@@ -50,16 +50,16 @@ def coasting_positions(
 
 
 class BasePrediction:
-    """Predicts attitude and position of the base under held joint velocities.
+    """Predicts base attitude and position under held joint velocities.
 
     Parameters
     ----------
     robot
         The model.
     control_period
-        Duration of a command, s.
+        Command duration, s.
     integration_step
-        Longest Runge-Kutta step of the attitude, s; use the plant's for equal results.
+        Longest Runge-Kutta step for the attitude, s; use the plant's value for equal results.
 
     Raises
     ------
@@ -74,15 +74,15 @@ class BasePrediction:
         self._step = robot.velocity_step(substeps)
 
     def attitudes(self, positions: Array, quaternion: Array, L_W: Array) -> Array:
-        """Return the attitude (N + 1, 4) at every tick of the shapes ``positions`` (N + 1, n)."""
+        """Return the attitude (N + 1, 4) at every tick for the shapes ``positions`` (N + 1, n)."""
         return self._integrate(positions, quaternion, L_W, self._control_period)
 
     def true_end(self, positions: Array, attitudes: Array, L_W: Array) -> Array:
-        """Return the attitude (4,) at the end of the shapes (N + 1, n), independent of their speed.
+        """Return the attitude (4,) at the end of the shapes (N + 1, n), independent of speed.
 
-        The ``attitudes`` (N + 1, 4) are those of the plant's steps. Their error, which is of order
-        four, is estimated with halved steps (Richardson extrapolation); while it is large, steps
-        are halved again.
+        ``attitudes`` (N + 1, 4) come from the plant's steps. Their fourth-order error is
+        estimated with halved steps (Richardson extrapolation); while it is large, steps are halved
+        again.
         """
         coarse, path, period = attitudes[-1], positions, self._control_period
         for _ in range(_MAX_HALVINGS):
@@ -120,9 +120,9 @@ class BasePrediction:
     def poses(
         self, state: RobotState, positions: Array, attitudes: Array | None = None
     ) -> BasePoses:
-        """Return the poses of the base at every tick of the shapes (N + 1, n), at zero momentum.
+        """Return the base poses at every tick for the shapes (N + 1, n), at zero momentum.
 
-        ``attitudes`` (N + 1, 4) are those at the ticks, if they are known already.
+        ``attitudes`` (N + 1, 4) at the ticks may be given if already known.
         """
         if attitudes is None:
             attitudes = self.attitudes(positions, state.quaternion, np.zeros(3))
@@ -133,9 +133,9 @@ class BasePrediction:
         return BasePoses(r_WC - np.einsum("nab,nb->na", R_WB, centers), attitudes)
 
     def path(self, state: RobotState, positions: Array, attitudes: Array | None = None) -> BasePath:
-        """Return the base path of the shapes ``positions`` (N + 1, n), at some of the ticks.
+        """Return the base path for the shapes ``positions`` (N + 1, n), at some of the ticks.
 
-        ``attitudes`` (N + 1, 4) are those at the ticks, if they are known already.
+        ``attitudes`` (N + 1, 4) at the ticks may be given if already known.
         """
         if attitudes is None:
             attitudes = self.attitudes(positions, state.quaternion, state.angular_momentum)

@@ -1,7 +1,7 @@
-"""Progress of searches, and announcements of other long work.
+"""Search progress, and announcements of other long-running work.
 
-A search writes its progress into the log, in a record that :func:`report_progress` finds. So it
-passes through methods that do not handle it, and out of planning threads.
+A search writes its progress to the log, in a record recognised by :func:`report_progress`. So the
+progress passes through methods that do not handle it, and out of planning threads.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ _PACKAGE = "spacerobot_ros"
 
 
 class SearchPhase(Enum):
-    """Phase of a search: it searches for solutions, refines them, removes contacts, and shortens
-    the result.
+    """Phase of a search: finding solutions, refining them, removing contacts, and shortening the
+    result.
     """
 
     SEARCHING = "searching"
@@ -37,14 +37,14 @@ class SearchProgress:
     Attributes
     ----------
     starts, max_starts
-        Number of initial guesses tried so far, and the largest number: a search ends sooner if
-        enough solutions agree. 0 and 0: the search does not count them.
+        Number of initial guesses tried so far, and the largest number: a search ends earlier if
+        enough solutions agree. 0 and 0 if the search does not count them.
     best_s
-        Duration of the best manoeuvre so far, s; infinite before the first.
+        Duration of the best manoeuvre so far, s; infinite before the first one.
     phase
         What the search does.
     elapsed_s
-        Wall time since it began, s.
+        Wall time since the search began, s.
     """
 
     starts: int
@@ -55,7 +55,7 @@ class SearchProgress:
 
     @property
     def message(self) -> str:
-        """The progress as a message, without a full stop."""
+        """Progress message without a full stop."""
         best = f"best {self.best_s:.4g} s" if math.isfinite(self.best_s) else "none found yet"
         starts = f"start {self.starts} of at most {self.max_starts}, "
         counted = self.phase is SearchPhase.SEARCHING and self.max_starts > 0
@@ -71,7 +71,7 @@ def log_progress(logger: logging.Logger, progress: SearchProgress, line: str) ->
 def report_progress(
     show: Callable[[SearchProgress], None], announce: Callable[[str], None] = lambda message: None
 ) -> Iterator[None]:
-    """Call functions with the progress of the searches that run in this context, in any thread.
+    """Call functions with the progress of searches running in this context, in any thread.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""The result of planning: the shape at every tick, and the predicted base path."""
+"""Planning result: the shape at every tick, and the predicted base path."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from spacerobot_ros.model.description import Array
 from spacerobot_ros.planning.core.goal import POSE, Controlled, Goal, PoseError
 
 Notes = dict[str, list[float] | float | str]
-"""Named results of a method, for reports."""
+"""Named method results, for reports."""
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,8 @@ class BasePath:
     quaternion: Array
 
     def at(self, times: Array) -> tuple[Array, Array]:
-        """Return positions (N, 3) and quaternions (N, 4) at times (N,), s, on straight lines."""
+        """Return positions (N, 3) and quaternions (N, 4) at times (N,), s, interpolated
+        linearly."""
         signs = np.cumprod(
             np.sign((self.quaternion[1:] * self.quaternion[:-1]).sum(axis=1) + 1e-300)
         )
@@ -45,31 +46,31 @@ class GaitSchedule:
     Attributes
     ----------
     method
-        Registry name of the method that made it.
+        Registry name of the method that produced it.
     joint_names
-        Names of the joints, the columns of ``positions``.
+        Joint names, the columns of ``positions``.
     control_period
         s.
     positions
-        (N + 1, n) shape at the ticks 0..N, m or rad.
+        (N + 1, n) shapes at ticks 0..N, m or rad.
     end_velocities
-        (n,) joint velocities that are held from the end on, m/s or rad/s: reaction wheels that have
-        taken up momentum keep spinning. None: all joints rest.
+        (n,) joint velocities held after the end, m/s or rad/s: reaction wheels that have absorbed
+        momentum keep spinning. None: all joints rest.
     path
-        Predicted base path at instants of the method's choice, the first and the last included.
+        Predicted base path at instants chosen by the method, including the first and the last.
     goal
-        The goal that it was planned for.
+        The goal for which it was planned.
     notes
-        Named results of the method, for reports (with the symbols of its paper).
+        Named results of the method, for reports (with its paper's symbols).
     partial
-        Whether it ends short of the goal by design: the next piece is planned from the pose
+        Whether it intentionally ends short of the goal: the next part is planned from the pose
         measured at its end.
     remaining
-        Expected duration of the schedules after a partial one until the goal is reached, s.
+        Expected duration of the schedules after a partial schedule until the goal is reached, s.
     controls
-        The parts of the goal that it controls; its result is evaluated by these.
+        Goal components that it controls; its result is evaluated by these.
     progress
-        State of its method for the next schedule to the same goal, of a method-specific type; see
+        State of the method for the next schedule to the same goal, of a method-specific type; see
         ``PlanRequest.previous``.
     """
 
@@ -107,12 +108,12 @@ class GaitSchedule:
 
     @property
     def duration(self) -> float:
-        """Time the gait takes, s."""
+        """Gait duration, s."""
         return self.ticks * self.control_period
 
     @property
     def expected_duration(self) -> float:
-        """Expected time until the goal is reached, with all later schedules for it, s."""
+        """Expected time until the goal is reached, including all later schedules for it, s."""
         return self.duration + self.remaining
 
     @cached_property
@@ -133,16 +134,16 @@ def straight_motion(
 ) -> Array:
     """Return the shapes (N + 1, n) at the ticks from ``start`` (n,) through ``ends``.
 
-    Every leg is a straight line of the shape, from rest to rest (paper 3, section III): under
-    ``u = (2 pi D / T^2) sin(2 pi t / T)``, eqs (12) to (18), a leg D is travelled as
+    Every leg is a straight line in shape space, from rest to rest (paper 3, section III): under
+    ``u = (2 pi D / T^2) sin(2 pi t / T)``, eqs (12) to (18), a leg D is traversed as
     ``D (t/T - sin(2 pi t/T) / (2 pi))``, whose peak speed is twice the mean. The ends are shapes
-    (n,) with the durations of the legs to them, s. A leg takes a whole number of ticks, more if a
-    joint is slow, none if nothing moves.
+    (n,), each with the duration of the leg to it, s. A leg takes a whole number of ticks, more if a
+    joint is slow, zero if nothing moves.
 
     Raises
     ------
     PlanningError
-        All legs together take more than ``longest`` s.
+        The legs together take more than ``longest`` s.
     """
     starts = [start, *(end for end, _ in ends)]
     legs = [

@@ -1,15 +1,16 @@
 """Path-independent and path-dependent workspaces of an end-effector while the base floats.
 
-At zero momentum the generalised Jacobian ``J*(q)`` maps joint rates to the velocity of the
-end-effector. If it loses rank, no rates move the end-effector in some direction: a dynamic
-singularity. Whether it does depends on the shape. So does the distance of the end-effector from the
-system's centre of mass, which rests, while the base may have any attitude. A distance that some
-singular shape has is therefore *path-dependent*: whether the robot is singular there depends on the
-path that led there. Distances that no singular shape has are *path-independent* (Papadopoulos and
-Dubowsky; paper 4, section V).
+At zero momentum, the generalised Jacobian ``J*(q)`` maps joint rates to the velocity of the
+end-effector. If it loses rank, there is a direction in which no rates move the end-effector: a
+dynamic singularity. Whether it does depends on the shape. So does the distance of the end-effector
+from the
+system's centre of mass, which is at rest, while the base may have any attitude. A distance attained
+by some singular shape is therefore *path-dependent*: whether the robot is singular there depends on
+the path that led there. Distances not attained by any singular shape are *path-independent*
+(Papadopoulos and Dubowsky; paper 4, section V).
 
-Singular shapes are solutions ``(q, u)`` of ``J*(q)^T u = 0, |u| = 1``, with the direction ``u`` in
-which nothing moves. Starting from seeded shapes all over the shape space, Gauss-Newton finds the
+Singular shapes are solutions ``(q, u)`` of ``J*(q)^T u = 0, |u| = 1``, where ``u`` is the direction
+of no motion. Starting from seeded shapes all over the shape space, Gauss-Newton finds the
 nearest solutions; from each, curves of solutions are followed to larger and to smaller distances.
 Distances change continuously on a curve, so all between its ends are path-dependent.
 """
@@ -27,42 +28,43 @@ from spacerobot_ros.planning.core.controllability import sample_shapes, shape_bo
 
 _SEED = 20
 _SAMPLED_SHAPES = 48
-"""Number of shapes from which to search for singular ones, and of shapes examined for the reach."""
+"""Number of start shapes in the search for singular shapes, and of shapes examined for the
+reach."""
 
 _EXTREME_STARTS = 3
 _NEWTON_STEPS, _LONGEST_NEWTON_STEP = 40, 0.5
 _WALK_STEPS, _LONGEST_STEP, _SHORTEST_STEP = 60, 0.25, 1e-4
-"""Steps along curves of singular shapes, rad (or m) of the joint that moves most."""
+"""Steps along curves of singular shapes, rad (or m) of the fastest joint."""
 
 _ZERO_RESIDUAL = 1e-9
-"""Error of the dimensionless equations of a singular shape that counts as zero."""
+"""Residual of the dimensionless singularity equations that counts as zero."""
 
 _ZERO_RATE = 1e-6
-"""Singular value of J* over the reach that counts as zero."""
+"""Singular value of J*, relative to the reach, that counts as zero."""
 
 _MAX_CLOSED_GAP = 2e-3
-"""Gaps between path-dependent distances below this share of the reach are closed: curves end on
-either side of a distance at which others begin."""
+"""Gaps between path-dependent distances smaller than this fraction of the reach are closed: curves
+end on either side of a distance at which others begin."""
 
 Interval = tuple[float, float]
 
 
 @dataclass(frozen=True)
 class Workspaces:
-    """Distances of a link's origin from the centre of mass, m, by the kind of workspace.
+    """Distances of a link's origin from the centre of mass, m, by workspace type.
 
     Attributes
     ----------
     link
         The link.
     within_limits
-        Whether joint limits are enforced; if not, revolute joints have none.
+        Whether joint limits are enforced; if not, revolute joints are unlimited.
     distance_range
         The smallest and the largest distance.
     path_dependent
-        Closed intervals of distances at which a singular shape puts the link, in ascending order.
+        Closed intervals of link distances attained by singular shapes, in ascending order.
     dimensions
-        Of the space in which the joints move the link at zero momentum: 2 in a plane.
+        Dimension of the space in which the joints move the link at zero momentum: 2 in a plane.
     singular_shapes
         Number of singular shapes from which the intervals were found.
     """
@@ -76,7 +78,7 @@ class Workspaces:
 
     @property
     def path_independent(self) -> tuple[Interval, ...]:
-        """The intervals of the reach between the path-dependent ones, in ascending order."""
+        """Intervals of the reach between the path-dependent ones, in ascending order."""
         nearest, farthest = self.distance_range
         ends = [nearest, *np.ravel(self.path_dependent).tolist(), farthest]
         gaps = zip(ends[::2], ends[1::2], strict=True)
@@ -85,12 +87,12 @@ class Workspaces:
 
 
 def workspaces(robot: SpaceRobot, link: str) -> tuple[Workspaces, ...]:
-    """Return the workspaces of a link's origin at zero momentum: without limits of revolute joints,
-    and then within the limits if there are any.
+    """Return the workspaces of a link's origin at zero momentum: without revolute joint limits and,
+    if there are limits, also within them.
 
-    Every interval consists of distances of singular shapes that were found, except for gaps of less
-    than 0.2 % of the reach. The intervals are complete only if the seeded shapes lead to all curves
-    of singular shapes: with two joints in a plane each curve is met many times.
+    Except for gaps of less than 0.2 % of the reach, every interval consists of distances of the
+    singular shapes found. The intervals are complete only if the seeded shapes lead to all curves
+    of singular shapes: with two joints in a plane, each curve is found many times.
 
     Raises
     ------
@@ -245,8 +247,8 @@ class _Search:
         self._lower, self._upper = np.append(lower, -m), np.append(upper, m)
 
     def intervals(self, shapes: Array) -> tuple[list[Interval], int]:
-        """Return the intervals of distances of the singular shapes found from shapes (K, n), and
-        the number of singular shapes.
+        """Return the distance intervals of the singular shapes found from shapes (K, n), and the
+        number of singular shapes.
         """
         z = self._project_to_singular_shapes(self._equations.starts(shapes), _NEWTON_STEPS)
         g, _, _, _ = self._equations.evaluate(z)

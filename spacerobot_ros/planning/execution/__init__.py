@@ -1,1 +1,2 @@
-"""From goals to setpoints: the executive, its planning worker and trajectory tracker; no ROS."""
+"""From goals to setpoints, without ROS: the executive, its planning worker and its trajectory
+tracker."""

@@ -1,4 +1,4 @@
-"""The parameters of the planner."""
+"""Planner parameters."""
 
 from __future__ import annotations
 
@@ -16,25 +16,25 @@ from spacerobot_ros.planning.methods.optimal import OptimalGait
 from spacerobot_ros.planning.methods.registry import METHODS
 
 _BACKGROUND_REPLAN_PERIOD = 2.0
-"""Default of ``replan_period`` if plans are made in the background, s."""
+"""Default ``replan_period`` if planning runs in the background, s."""
 
 
 @dataclass(frozen=True)
 class PlannerConfig(CommanderConfig):
-    """Parameters of planning, of tracking schedules, and of corrections."""
+    """Parameters for planning, schedule tracking, and corrections."""
 
     method: str = parameter("auto", "gait method", choices=METHODS)
-    integration_step: float = parameter(0.01, "longest step of the prediction", "s", minimum=1e-06)
+    integration_step: float = parameter(0.01, "longest prediction step", "s", minimum=1e-06)
     end_effectors: tuple[str, ...] = parameter(
         (),
-        "links with goals on NAME/goal_pose and paths on NAME/path, in addition to the link "
-        "end_effector",
+        "links that accept goals on NAME/goal_pose and paths on NAME/path, in addition to the "
+        "link end_effector",
         texts=True,
     )
     output: str = parameter(
         "commands",
-        "joint_commands (velocities) for the plant, joint_reference for a controller, or schedules "
-        "for the FollowJointTrajectory server of a robot",
+        "joint_commands (velocities) for the plant, joint_reference for a controller, or "
+        "schedules for a robot's FollowJointTrajectory server",
         choices=("commands", "reference", "trajectory"),
     )
     trajectory_action: str = parameter(
@@ -43,20 +43,20 @@ class PlannerConfig(CommanderConfig):
     )
     clearance: float = nonnegative(
         DEFAULT_CLEARANCE,
-        "smallest distance that plans keep between links that no joint connects; 0 disables "
-        "collision checks",
+        "smallest distance in plans between links not connected by a joint; 0 disables collision "
+        "checks",
         "m",
         maximum=1000.0,
     )
     srdf: str = parameter(
-        "", "SRDF file with pairs of links that are not checked; '': NAME.srdf next to the URDF"
+        "", "SRDF file with link pairs excluded from checks; '': NAME.srdf next to the URDF"
     )
     max_corrections: int = nonnegative(
-        3, "new plans after the first", maximum=1000, read_only=False
+        3, "number of new plans after the first", maximum=1000, read_only=False
     )
     abort_time: float = parameter(
         1.0,
-        "duration of the braking along the planned path, after ~/abort or for another goal",
+        "duration of braking along the planned path, after ~/abort or for another goal",
         "s",
         minimum=0.01,
         maximum=1000.0,
@@ -70,73 +70,76 @@ class PlannerConfig(CommanderConfig):
     )
     takeover_time: float = nonnegative(
         1.0,
-        "time along the present schedule before a plan for another goal takes over in motion, if "
+        "time along the current schedule before a plan for another goal takes over in motion, if "
         "the method supports it; 0: the joints brake first",
         "s",
         maximum=1000.0,
     )
     replan_period: float = parameter(
         -1.0,
-        "period of planning the remaining motion again without a stop, if the method supports it; "
-        "0: never, -1: 2 s with plan_in_background, else never",
+        "period at which the remaining motion is replanned without a stop, if the method supports "
+        "it; 0: never, -1: 2 s with plan_in_background, else never",
         "s",
         minimum=-1.0,
         maximum=1e6,
     )
     drift_position: float = nonnegative(
         0.0,
-        "tracking error of the base beyond which the remaining motion is planned again; 0: any",
+        "base tracking error beyond which the remaining motion is replanned; 0: never",
         "m",
     )
     drift_attitude: float = nonnegative(0.0, "likewise", "rad")
     shape_gain: float = nonnegative(
-        2.0, "feedback gain on joint positions while tracking", "1/s", maximum=1000.0
+        2.0, "feedback gain for joint positions while tracking", "1/s", maximum=1000.0
     )
     shape_deadband: float = nonnegative(
-        0.0, "joint position errors up to this are not fed back, as noise", "m or rad"
+        0.0,
+        "joint position errors up to this value are treated as noise and not fed back",
+        "m or rad",
     )
     averaging: int = parameter(
         1,
-        "measured states at rest that are averaged to plan and to evaluate",
+        "number of measured states at rest that are averaged for planning and evaluation",
         minimum=1,
         maximum=1000000.0,
     )
     rest_tolerance: float = nonnegative(
-        0.0, "measured rates up to this count as rest; 0: none", "m/s or rad/s"
+        0.0, "measured rates up to this value count as rest; 0: none", "m/s or rad/s"
     )
     stuck_ticks: int = nonnegative(
         40,
-        "ticks of commanded motion after which a joint that does not follow is stuck; 0: never",
+        "ticks of commanded motion after which a joint that does not follow is considered stuck; "
+        "0: never",
         maximum=1000000.0,
     )
     options: Mapping[str, Any] = registered(METHODS)
 
     def described(self, robot: RobotDescription) -> RobotDescription:
-        """Return the robot with the disabled pairs of the SRDF, among the obstacles."""
+        """Return the robot with the pairs disabled in the SRDF, and with the obstacles."""
         robot = super().described(robot)
         return with_srdf(robot, self.srdf) if self.srdf else robot
 
     @property
     def goal_links(self) -> tuple[str, ...]:
-        """Names of the links that take goals.
+        """Names of the links that accept goals.
 
-        If a controller moves the robot, goals of its end-effector are for the controller.
+        If a controller moves the robot, end-effector goals are for the controller.
         """
         default = [DEFAULT_END_EFFECTOR] if self.output != "reference" else []
         return tuple(dict.fromkeys((*default, *self.end_effectors)))
 
     @property
     def replanning(self) -> float:
-        """Time after which the remaining motion is planned again, s; 0: never."""
+        """Time after which the remaining motion is replanned, s; 0: never."""
         if self.replan_period >= 0:
             return self.replan_period
         return _BACKGROUND_REPLAN_PERIOD if self.plan_in_background else 0.0
 
     @property
     def method_options(self) -> Mapping[str, Any]:
-        """The options of the methods by name; defaults depend on the output.
+        """Method options by name; defaults depend on the output.
 
-        If a controller is given a reference, efforts are reserved for its feedback.
+        If the output is a controller reference, efforts are reserved for feedback.
         """
         optimal = self.options.get(OptimalGait.name, OptimalGait.Options())
         if self.output != "reference" or optimal.effort_limits != 0:
@@ -145,6 +148,6 @@ class PlannerConfig(CommanderConfig):
 
     @property
     def tolerance(self) -> Tolerance:
-        """Largest errors at which a goal is reached."""
+        """Largest errors at which a goal counts as reached."""
         position = self.position_tolerance or DEFAULT_POSITION_TOLERANCE
         return Tolerance(position, self.attitude_tolerance, self.joint_tolerance)

@@ -1,9 +1,9 @@
-"""The planner's state machine: from goals and measured states to setpoints, without ROS.
+"""Planner state machine: from goals and measured states to setpoints, without ROS.
 
 :meth:`Executive.update` is called for every measured state. ``docs/planner_state_machine.md`` has
 the phases, the events that change them, and the table of all transitions.
 
-Other modules do the work of a phase: :mod:`.tracker` computes the commands along a schedule,
+Other modules do the work of the phases: :mod:`.tracker` computes the commands along a schedule,
 :mod:`.worker` makes plans, :mod:`.state_average` averages measured states, and
 :mod:`.path_deviation` compares the measured base with its predicted path.
 """
@@ -61,18 +61,18 @@ from spacerobot_ros.planning.execution.worker import (
 from spacerobot_ros.times import SECOND
 
 _MAX_IN_MOTION_ATTEMPTS = 2
-"""Largest number of plans in motion for one goal: each takes over twice as late as the one
-before."""
+"""Largest number of plans in motion for one goal; each takes over twice as late as the previous
+one."""
 
 
 class Executive:
     """Brings a robot to successive goals, with a setpoint for every state.
 
-    If the worker plans at once, the measured state waits for its plan, and a plan that is requested
+    If the worker plans synchronously, the measured state waits for its plan, and a plan requested
     while the joints move begins with braking. If it plans in the background, the joints brake to
     rest before a plan is requested, and hold their shape until it is available. If the methods of
-    both schedules allow it, neither happens: a plan takes over in motion at a later tick. That tick
-    depends on parameters and on the stamp of the request, not on the planning time.
+    both schedules allow it, no braking is needed: a plan takes over in motion at a later tick. That
+    tick depends on parameters and on the stamp of the request, not on the planning time.
 
     Parameters
     ----------
@@ -85,13 +85,13 @@ class Executive:
         self._average = StateAverage(robot, config.averaging, config.rest_tolerance)
         self._tracker = TrajectoryTracker(robot, config)
         self.phase = Phase.IDLE
-        """The present phase; :meth:`_change_phase` alone changes it."""
+        """The current phase; changed only by :meth:`_change_phase`."""
         self.outputs: deque[Output] = deque()
         """Outputs to publish and log, in order; the owner removes published outputs."""
         self.plant_rests = False
-        """Whether the plant reports that no command is in force, as set by the owner."""
+        """Whether the plant reports that no command is in effect, as set by the owner."""
         self._stamp_ns = 0
-        """Stamp of the state that :meth:`update` processes, ns."""
+        """Stamp of the state being processed by :meth:`update`, ns."""
         self._new_goal: IdentifiedGoal | None = None
         self._in_motion_attempts = 0
         self._job: PlanJob | None = None
@@ -100,7 +100,7 @@ class Executive:
         """The result of the job, which waits for its tick (``TAKING_OVER``)."""
         self._active_goal: ActiveGoal | None = None
         self._replan_ns = 0
-        """Stamp from which on the remaining motion is planned again, ns."""
+        """Stamp from which the remaining motion is replanned, ns."""
         self._commanded_from_ns = 0
         """Stamp of the first state of the present schedule or plan, ns."""
         self.statistics = PlannerStatistics()
@@ -120,7 +120,7 @@ class Executive:
     # -- requests of the owner ----------------------------------------------------------------
 
     def propose_goal(self, identified: IdentifiedGoal) -> None:
-        """Plan for a goal from the next measured states; the goal replaces any other goal."""
+        """Plan for a goal from the next measured states; it replaces any other goal."""
         self._new_goal, self._in_motion_attempts = identified, 0
         self._average.restart()
         match self.phase:
@@ -131,12 +131,12 @@ class Executive:
                 self._change_phase(Event.NEW_GOAL, Phase.EXECUTING)
 
     def propose_twist(self, twist: TwistCommand) -> None:
-        """Let an end-effector follow a twist from the next state on, until twists stop.
+        """Make an end-effector follow a twist from the next state on, until twists stop.
 
         Raises
         ------
         PlanningError
-            A goal is pursued, or the twist is refused by :class:`Teleoperation`.
+            A goal is pursued, or the twist is rejected by :class:`Teleoperation`.
         """
         if self.phase not in (Phase.IDLE, Phase.TELEOPERATING) or self._new_goal is not None:
             self._teleoperation.refuse(self._stamp_ns)
@@ -158,9 +158,9 @@ class Executive:
         return frozenset(goal.goal_id for goal in goals if goal is not None)
 
     def progress(self, goal_id: str) -> tuple[str, float | None]:
-        """Return the present work on a goal, and the expected time until its end, s.
+        """Return the current activity for a goal, and the expected time until it ends, s.
 
-        None: no schedule leads to the goal yet.
+        None if no schedule leads to the goal yet.
         """
         active, planned = self._active_goal, self._planned_goal
         if active is not None and active.identified.goal_id == goal_id:
@@ -171,7 +171,7 @@ class Executive:
         return Phase.MEASURING.value, None
 
     def abort(self, why: str = "on request") -> str | None:
-        """Give up all goals and come to rest.
+        """Abort all goals and come to rest.
 
         Returns a message about the joints; None if there is no goal.
         """
@@ -202,11 +202,11 @@ class Executive:
     def plant_stopped(
         self, why: str, commanded_until_ns: int | None = None, rests_since_ns: int = 0
     ) -> bool:
-        """Give up every goal at once, because the plant no longer obeys commands.
+        """Abort all goals immediately, because the plant no longer obeys commands.
 
-        If it rests because no commands arrived, a goal continues if nothing was commanded for it
-        until then, or if its plan took so long that no state was processed. A goal that was to
-        replace it is planned for from rest.
+        If the plant rests because no commands arrived, a goal continues if nothing had been
+        commanded for it, or if planning took so long that no state was processed. A goal that was
+        to replace another one is planned from rest.
         """
         successor = None
         if commanded_until_ns is not None:
@@ -249,15 +249,15 @@ class Executive:
         self._tracker.end_by_result()
 
     def configure(self, config: PlannerConfig) -> None:
-        """Use other tolerances and corrections from now on."""
+        """Use other tolerances and correction settings from now on."""
         self.config = config
 
     def on_plant_obeying(self) -> None:
-        """Do nothing: the next goal begins from the measured state anyway."""
+        """Do nothing: the next goal starts from the measured state anyway."""
 
     def plant_reset(self) -> None:
-        """Plan again for the present goal, if any, because the state of the robot has changed."""
-        self._plan_again("The plant was reset: the motion is planned again.")
+        """Replan for the current goal, if any, because the robot state has changed."""
+        self._plan_again("The plant was reset: the motion is replanned.")
 
     def use_robot(
         self, robot: SpaceRobot, worker: PlanningWorker, config: PlannerConfig | None = None
@@ -269,7 +269,7 @@ class Executive:
         what = (
             "The robot has a different mass" if config is None else "The plant has a different rate"
         )
-        self._plan_again(f"{what} now: the motion is planned again.")
+        self._plan_again(f"{what} now: the motion is replanned.")
         self._worker.close()
         self._robot, self._worker = robot, worker
         self._average = StateAverage(robot, self.config.averaging, self.config.rest_tolerance)
@@ -310,7 +310,7 @@ class Executive:
             if clause:
                 message = (
                     f"{sentence_case(clause)}: the joints brake, and the remaining motion is "
-                    "planned again."
+                    "replanned."
                 )
                 self._add_notice(Severity.WARNING, message)
                 self.outputs.append(active.status(PlannerState.EXECUTING, message))
@@ -332,11 +332,11 @@ class Executive:
         self._add_notice(Severity.WARNING, message)
 
     def cancel_plan(self) -> None:
-        """Cancel the plan that the worker computes; any thread may call this."""
+        """Cancel the plan that the worker is computing; any thread may call this."""
         self._worker.cancel()
 
     def stop(self) -> None:
-        """Give up all goals at once, without a status, and wait for the worker to end."""
+        """Abort all goals immediately, without a status, and wait for the worker to end."""
         self._tracker.stop()
         self._forget_goals()
         self._worker.close()
@@ -361,7 +361,7 @@ class Executive:
             if tracker.is_active:
                 self._handle_time_jump(stamp)
             elif self.phase is Phase.TELEOPERATING:
-                self._end_teleoperation(Event.TIME_JUMPED, "The time of the states has jumped.")
+                self._end_teleoperation(Event.TIME_JUMPED, "The state time has jumped.")
         self._stamp_ns = stamp
         if tracker.has_ended(stamp, q):
             self._end_schedule(stamp)
@@ -509,7 +509,7 @@ class Executive:
         try:
             state = self._average.state()
         except PlanningError as reason:
-            self._add_notice(Severity.WARNING, f"The path is not known: {reason}")
+            self._add_notice(Severity.WARNING, f"The path is unknown: {reason}")
             return
         error = None if corrected else self._tracker.path_check.error(state)
         if error is None:
@@ -671,8 +671,8 @@ class Executive:
         if isinstance(result, Postponed):
             self._add_notice(
                 Severity.INFO,
-                f"The plan came {result.late:.3g} s after its start, while the robot drifts: it is "
-                "repeated with a later start.",
+                f"The plan came {result.late:.3g} s after its start, while the robot drifts: "
+                "planning is repeated with a later start.",
             )
             return
         job, self._job = self._job, None
@@ -804,7 +804,7 @@ class Executive:
         before, now = self._stamp_ns / SECOND, stamp_ns / SECOND
         self._add_notice(
             Severity.WARNING,
-            f"The time of the states has jumped from {before:.9g} s to {now:.9g} s, for which no "
+            f"The state time has jumped from {before:.9g} s to {now:.9g} s, for which no "
             "motion is planned.",
         )
 

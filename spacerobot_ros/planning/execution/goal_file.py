@@ -1,4 +1,4 @@
-"""Goals with ids, and the file from which a restarted commander reads its goals."""
+"""Goals with ids, and the file from which a restarted commander loads its goals."""
 
 from __future__ import annotations
 
@@ -21,27 +21,27 @@ from spacerobot_ros.planning.core.goal import (
 )
 
 BASE_GOAL_KEY = "base"
-"""Key of the goal of the base in the file."""
+"""Key of the base goal in the file."""
 
 
 @dataclass(frozen=True)
 class IdentifiedGoal:
-    """A goal and its id in statuses.
+    """A goal and its id in status messages.
 
     Attributes
     ----------
     goal
         The goal.
     goal_id
-        Its id; empty if unknown.
+        Goal id; empty if unknown.
     tolerance
-        Its tolerance; None: those of the commander's parameters.
+        Its tolerance; None: the commander's parameters.
     resumes
-        Whether a restarted commander continues it. A goal of an action is not continued: its client
-        is told that it has ended when the commander stops.
+        Whether a restarted commander continues it. An action goal is not continued: its client is
+        notified of its end when the commander stops.
     required
-        The tolerances that its sender has given, 0: none. A goal with a tolerance for a part that
-        the method or the law does not control is refused.
+        Tolerances given by the sender; 0: none. A goal with a tolerance for a component
+        that the method or law does not control is rejected.
     """
 
     goal: Goal
@@ -51,19 +51,19 @@ class IdentifiedGoal:
     required: Tolerance = NO_TOLERANCE
 
     def kept_at(self, position: Array, quaternion: Array) -> IdentifiedGoal:
-        """Return it with the goal of :meth:`Goal.kept_at`."""
+        """Return this with the goal from :meth:`Goal.kept_at`."""
         return replace(self, goal=self.goal.kept_at(position, quaternion))
 
 
 @dataclass(frozen=True)
 class PursuedGoals:
-    """Report of an executive: the goals that it pursues from now on, by part of the robot."""
+    """Report from an executive: the goals pursued from now on, by frame."""
 
     goals: Mapping[str, IdentifiedGoal]
 
 
 class GoalIds:
-    """Assigns ids to the goal poses that a node receives."""
+    """Assigns ids to the goal poses received by a node."""
 
     def __init__(self) -> None:
         self._unstamped = 0
@@ -81,27 +81,27 @@ class GoalIds:
 
 
 class GoalFile:
-    """A file with the present goals of a commander; reached and abandoned goals are removed.
+    """A file with a commander's current goals; reached and abandoned goals are removed.
 
-    A commander that is restarted loads them and continues. The reports of an executive update the
-    file: :meth:`pursue` and :meth:`end`.
+    A restarted commander loads them and continues. An executive's reports update the file:
+    :meth:`pursue` and :meth:`end`.
 
     Parameters
     ----------
     path
         The file; empty: nothing is saved and nothing is loaded.
     keys
-        Allowed keys of goals; a file with other keys is refused.
+        Allowed goal keys; a file with other keys is rejected.
     """
 
     def __init__(self, path: str, keys: tuple[str, ...] = (BASE_GOAL_KEY,)) -> None:
         self._path = Path(path) if path else None
         self._keys = keys
         self._ids: frozenset[str] = frozenset()
-        """Ids of the goals in the file."""
+        """Goal ids in the file."""
 
     def pursue(self, pursued: PursuedGoals) -> str:
-        """Save goals; return a message if they cannot be saved, else an empty text."""
+        """Save goals; return a message if they cannot be saved, else an empty string."""
         try:
             self.save(pursued.goals)
         except ParameterError as error:
@@ -109,12 +109,12 @@ class GoalFile:
         return ""
 
     def end(self, goal_id: str, *, refused: bool) -> None:
-        """Delete the file when a goal is decided, unless another goal is refused."""
+        """Delete the file when a goal has ended, unless another goal was refused."""
         if self._ids and (goal_id in self._ids or not refused):
             self.delete()
 
     def save(self, goals: Mapping[str, IdentifiedGoal]) -> None:
-        """Replace the content of the file with the goals to resume, in one atomic step.
+        """Atomically replace the file content with the goals to resume.
 
         Raises
         ------
@@ -139,19 +139,19 @@ class GoalFile:
             ) from error
 
     def delete(self) -> None:
-        """Delete the file: its goals are reached, failed or given up."""
+        """Delete the file, because its goals were reached, failed or aborted."""
         self._ids = frozenset()
         if self._path is not None:
             with suppress(OSError):
                 self._path.unlink()
 
     def load(self) -> dict[str, IdentifiedGoal]:
-        """Return the goals that a commander pursued at its end; empty without a file.
+        """Return the goals that a commander was pursuing when it ended; empty without a file.
 
         Raises
         ------
         ParameterError
-            The file has other content, or other users could have written it.
+            The file has invalid content, or other users could have written it.
         """
         if self._path is None:
             return {}
@@ -163,12 +163,12 @@ class GoalFile:
             return {}
         except UntrustedFileError as error:
             raise ParameterError(
-                f"Parameter 'resume_file' is '{self._path}', whose goal is refused: {error}"
+                f"Parameter 'resume_file' is '{self._path}', whose goal is invalid: {error}"
             ) from error
         except (OSError, ValueError, RecursionError, PlanningError) as error:
             why = str(error).rstrip(".")
             raise ParameterError(
-                f"Parameter 'resume_file' is '{self._path}', which holds no goals: {why}."
+                f"Parameter 'resume_file' is '{self._path}', which contains no valid goals: {why}."
             ) from error
 
     def _parse_goals(self, text: str) -> dict[str, IdentifiedGoal]:
@@ -194,7 +194,8 @@ class GoalFile:
 
 
 def decode_goal(entry: Mapping[str, Any]) -> Goal:
-    """Return the goal of an entry of :func:`encode_goal`; `KeyError` or `TypeError`: it is none."""
+    """Return the goal from an entry made by :func:`encode_goal`; raises `KeyError` or `TypeError`
+    if it is invalid."""
     goal = Goal.checked(entry["position"], entry["quaternion"], entry["joint_positions"])
     asked = entry.get("asked", POSE)
     goal = replace(goal, asked=frozenset(part for part in POSE if part in asked))
@@ -206,7 +207,7 @@ def decode_goal(entry: Mapping[str, Any]) -> Goal:
 
 
 def encode_goal(identified: IdentifiedGoal) -> dict[str, Any]:
-    """Return a goal as values that JSON has."""
+    """Return a goal as JSON-compatible values."""
     goal = identified.goal
     shape = goal.joint_positions
     entry: dict[str, Any] = {

@@ -1,10 +1,10 @@
 """Deviation of the measured base from its predicted path, and the mass errors that explain it.
 
-At zero momentum the rotation of the base depends on the path of the shape and on ratios of masses
-and inertias alone. A rotation that differs from the prediction indicates errors of these in the
-model. To first order the deviation of the base path is linear in their relative errors: each is
-multiplied by a sensitivity of the path. Linear least squares over many noisy poses, with a prior on
-the errors, give the estimate (one step of Gauss-Newton about the model).
+At zero momentum, the base rotation depends only on the shape path and on ratios of masses and
+inertias. A rotation that differs from the prediction indicates errors in these model
+parameters. To first order, the deviation of the base path is linear in their relative errors, each
+multiplied by a path sensitivity. Linear least squares over many noisy poses, with a prior on
+the errors, yield the estimate (one Gauss-Newton step about the model).
 """
 
 from __future__ import annotations
@@ -41,24 +41,24 @@ _MAX_EVALUATED_SHAPES = 48
 _DIFFERENCE_STEP = 1e-6
 
 _PRIOR_DEVIATION = 0.1
-"""Prior standard deviation of the relative errors of masses and inertias."""
+"""Prior standard deviation of relative mass and inertia errors."""
 
 _POSE_NOISE = 1e-3
 """Standard deviation of each component of a measured pose, m or rad."""
 
 _MAX_PLAUSIBLE_ERROR = 6 * _PRIOR_DEVIATION
-"""Largest relative error of masses and inertias that is plausible; larger estimates have another
-cause, such as a jump of the measurements."""
+"""Largest plausible relative mass or inertia error; larger estimates have another cause, such as a
+jump in the measurements."""
 
 _NEAR_SHARES, _AIM_SHARES = (0.6, 0.8), (0.4, 0.6)
-"""Two shares of the tolerances each, for early and late in a motion: the remaining motion is
-planned again if its expected error exceeds the first, and the new plan may end within the second.
-Base rotations that are left until late in a motion take a long time."""
+"""Two fractions of the tolerances each, for early and late in a motion: the remaining motion is
+replanned if its expected error exceeds the first, and the new plan may end within the second.
+Base rotations left until late in a motion take a long time."""
 
 
 @dataclass(frozen=True)
 class TrackingError:
-    """Deviation of the base from the path that its schedule predicts: m, rad."""
+    """Deviation of the base from the path predicted by its schedule: m, rad."""
 
     distance: float
     angle: float
@@ -68,25 +68,26 @@ class TrackingError:
 
 
 class PathCheck:
-    """Compares measured states with the predicted base path of a schedule.
+    """Compares measured states with a schedule's predicted base path.
 
-    The methods require a state that is :meth:`due`.
+    The methods require a :meth:`due` state.
 
     Parameters
     ----------
     robot
         The model.
     schedule
-        The schedule that is tracked.
+        The tracked schedule.
     start_ns
-        Stamp of its first tick, ns.
+        Stamp of the schedule's first tick, ns.
     config
-        Parameters of the planner: bounds of the tracking error, and the deadband of shapes.
+        Planner parameters: tracking error bounds, and the shape deadband.
     average
         Number of measured poses whose mean deviation from the path is used for plans in motion; 0:
         none.
     sensitivity, masses
-        Derivatives of the path by errors of masses, and their estimate: see :class:`PathDeviation`.
+        Derivatives of the path with respect to mass errors, and their estimate: see
+        :class:`PathDeviation`.
     """
 
     def __init__(
@@ -128,7 +129,7 @@ class PathCheck:
         )
 
     def error(self, state: RobotState) -> TrackingError | None:
-        """Return the tracking error of a state, None if it is within its bounds."""
+        """Return the tracking error in a state; None if within bounds."""
         k = self._next_pose
         turn = attitude_error(state.quaternion, self._path.quaternion[k])
         distance = float(np.linalg.norm(state.position - self._path.position[k]))
@@ -153,21 +154,21 @@ class PathCheck:
 
     @property
     def end(self) -> tuple[Array, Array]:
-        """End of the path by the mean deviation: position (3,), attitude (4,)."""
+        """End of the path according to the mean deviation: position (3,), attitude (4,)."""
         return self._deviation.end(self._next_pose)
 
     @property
     def expected_end(self) -> tuple[Array, Array]:
-        """End of the path with the estimated errors of masses: position (3,), attitude (4,)."""
+        """End of the path according to the estimated mass errors: position (3,), attitude (4,)."""
         return self._deviation.expected_end(self._next_pose)
 
     def shift_goal(
         self, goal: Goal, within: Tolerance, controls: frozenset[Controlled], *, late: bool
     ) -> Goal | None:
-        """Return the goal of a new plan; None if the path is expected to end near its goal.
+        """Return the goal for a new plan; None if the path is expected to end close to its goal.
 
-        Plans are made with the masses of the URDF. So the goal is shifted by the error that is
-        expected from the estimated masses, as far as it exceeds a share of the tolerance.
+        Plans use the URDF masses. So the goal is shifted by the error expected
+        from the estimated masses, as far as it exceeds a fraction of the tolerance.
         """
         last = self._positions[-1]
         error = PoseError.between(*self.expected_end, goal, last, self._robot)
@@ -200,9 +201,9 @@ def _excess_share(error: float, allowed: float) -> float:
 class PathDeviation:
     """Mean deviation of the latest measured base poses from a predicted path.
 
-    At zero momentum the base follows the path of the shape, seen from its own pose: a base that is
-    off the predicted path by a rotation and a displacement continues on that path, rotated and
-    displaced.
+    At zero momentum, the base motion relative to its own pose depends only on the shape path: a
+    base that is off the predicted path by a rotation and a displacement continues on that path,
+    rotated and displaced.
 
     Parameters
     ----------
@@ -211,10 +212,10 @@ class PathDeviation:
     count
         Measurements to average.
     sensitivity
-        (K, 6, P) derivatives of the path by errors of masses and inertias, as
-        :class:`PathSensitivity` returns them; None: these errors are not estimated.
+        (K, 6, P) derivatives of the path with respect to mass and inertia errors, as returned by
+        :class:`PathSensitivity`; None if these errors are not estimated.
     masses
-        The estimate of these errors, which the measurements improve.
+        Estimate of these errors, improved by the measurements.
     """
 
     def __init__(
@@ -236,7 +237,7 @@ class PathDeviation:
         """Add a measured position (3,) and attitude (4,) at instant k of the path.
 
         ``lag`` (6,) is the part of its deviation, displacement (m) and rotation vector (rad) in W,
-        that comes from joints which lag behind the schedule. It vanishes when they catch up, so it
+        due to joints lagging behind the schedule. It vanishes when they catch up, so it
         is excluded from the mean deviation.
         """
         predicted = self._path.quaternion[k]
@@ -263,7 +264,7 @@ class PathDeviation:
         )
 
     def expected_end(self, k: int) -> tuple[Array, Array]:
-        """Return the end of the path by the estimated errors of masses: (3,) and (4,)."""
+        """Return the end of the path according to the estimated mass errors: (3,) and (4,)."""
         position, quaternion = self.end(k)
         more = self._deviation_by_masses(k, -1)
         turn = quaternion_from_rotvec(more[3:])
@@ -289,15 +290,14 @@ class PathDeviation:
 
 
 class PathSensitivity:
-    """Derivatives of a base path by P parameters: relative errors of masses and inertias.
+    """Derivatives of a base path with respect to P parameters: relative mass and inertia errors.
 
-    The first P / 2 are those of the masses of the bodies, the others those of their inertia
-    tensors.
+    The first P / 2 are errors in the body masses, the others in the inertia tensors.
 
     Parameters
     ----------
     robot
-        The model by which the path is predicted.
+        The model used to predict the path.
     """
 
     def __init__(self, robot: SpaceRobot) -> None:
@@ -341,9 +341,8 @@ class PathSensitivity:
     def path_derivatives(self, schedule: GaitSchedule) -> Array:
         """Return the derivatives (K, 6, P) of the K poses of a schedule's predicted path.
 
-        The first three components are those of the position, m, the others those of the attitude
-        (rotation vector, rad), all in W. The derivatives of the first pose are zero, because it is
-        measured.
+        The first three components are position, m, the others attitude (rotation vector, rad), all
+        in W. The derivatives of the first pose are zero, because it is measured.
         """
         path = schedule.path
         knots = len(path.time)
@@ -376,17 +375,17 @@ def _interpolate(at: Array, known: Array, values: Array) -> Array:
 
 
 class MassEstimate:
-    """Estimate of the relative errors of masses and inertias (P,), from deviations of base paths.
+    """Estimate of relative mass and inertia errors (P,) from base path deviations.
 
-    The first pose of each path is measured with an error. So each path has an unknown constant
+    The first pose of each path has a measurement error. So each path has an unknown constant
     offset, which is eliminated from the normal equations. Deviations that only implausible errors
-    explain (such as those of a failing sensor) are ignored: the estimate is zero, and their path is
-    discarded.
+    would explain (such as those from a failing sensor) are ignored: the estimate is zero, and the
+    path is discarded.
 
     Parameters
     ----------
     count
-        P, the number of parameters.
+        Number of parameters P.
     """
 
     def __init__(self, count: int) -> None:
@@ -404,13 +403,13 @@ class MassEstimate:
         self._errors = None
 
     def begin_path(self) -> None:
-        """Begin another path, and keep the information of the earlier paths."""
+        """Begin another path, keeping the information from earlier paths."""
         if self.errors.any():
             self._information, self._vector = self._normal_equations()
         self._clear_path()
 
     def add(self, sensitivity: Array, deviation: Array) -> None:
-        """Add the deviation (6,) of a pose at which the path has the sensitivity (6, P)."""
+        """Add the deviation (6,) of a pose with path sensitivity (6, P)."""
         self._poses += 1
         self._sum_J += sensitivity
         self._sum_y += deviation
@@ -420,7 +419,7 @@ class MassEstimate:
 
     @property
     def errors(self) -> Array:
-        """The relative errors (P,) of masses, then of inertias."""
+        """Relative errors (P,) in masses, then in inertias."""
         if self._errors is None:
             errors = np.asarray(np.linalg.solve(*self._normal_equations()))
             plausible = np.abs(errors).max(initial=0.0) <= _MAX_PLAUSIBLE_ERROR

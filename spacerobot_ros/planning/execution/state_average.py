@@ -1,4 +1,4 @@
-"""Measured states, and the state of a robot at rest as the average of its measured states."""
+"""Measured states, and the state of a robot at rest as their average."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ _REST_RATE = 1e-9  # m/s or rad/s
 
 
 class BaseMeasurement(NamedTuple):
-    """The part of a measured state besides stamp and shape: ``pose`` (7,), ``twist`` (6,) of the
-    base, ``qdot`` (n,)."""
+    """Components of a measured state other than stamp and shape: ``pose`` (7,), ``twist`` (6,) of
+    the base, ``qdot`` (n,)."""
 
     pose: Array
     twist: Array
@@ -30,26 +30,26 @@ class BaseMeasurement(NamedTuple):
 
 
 class MeasuredState(Protocol):
-    """A measured state: the joints, and the base if it was measured at the same time."""
+    """A measured state: the joints and, if measured at the same time, the base."""
 
     @property
     def stamp_ns(self) -> int:
-        """Time of the measurement, ns."""
+        """Measurement time, ns."""
 
     @property
     def q(self) -> Array:
         """Shape (n,), m or rad."""
 
     def base(self) -> BaseMeasurement | None:
-        """Return base and rates; None if the base was not measured with the joints."""
+        """Return base and rates; None if the base was not measured together with the joints."""
 
 
 class StateAverage:
     """Averages measured states, and estimates the total momenta from states at rest.
 
-    While joints move, the momentum of a robot with uncertain masses is uncertain; at rest it
-    follows from the base alone, and without thrust it is constant. So the momenta of a state are
-    the last ones measured at rest, if any.
+    While joints move, the momentum of a robot with uncertain masses is uncertain; at rest, it
+    follows from the base motion alone, and without thrust it is constant. So the last momenta
+    measured at rest, if any, are used for a state.
 
     Parameters
     ----------
@@ -58,8 +58,8 @@ class StateAverage:
     count
         States to average.
     rest_tolerance
-        Averaged rates of base and joints up to this count as noise about rest, m/s or rad/s; the
-        momentum is then zero. 0: every measured momentum is used.
+        Averaged base and joint rates up to this value are treated as noise about rest, m/s or
+        rad/s, with zero momentum. 0: every measured momentum is used.
     """
 
     def __init__(self, robot: SpaceRobot, count: int = 1, rest_tolerance: float = 0.0) -> None:
@@ -79,20 +79,20 @@ class StateAverage:
 
     @property
     def complete(self) -> bool:
-        """Whether the average has as many states as requested."""
+        """Whether the average includes as many states as requested."""
         return self.count >= self._full_count
 
     def restart(self) -> None:
-        """Forget the states, but keep the momenta."""
+        """Discard the states, but keep the momenta."""
         self._poses, self._rates, self._shapes = [], [], []
 
     def forget(self) -> None:
-        """Forget the states and the momenta, because the state of the robot has changed."""
+        """Discard the states and the momenta, because the robot state has changed."""
         self.restart()
         self._momenta = None
 
     def add(self, pose: Array, twist: Array, q: Array, qdot: Array) -> None:
-        """Add a state: pose (7,), twist (6,), shape and its rates (n,), as plants report them."""
+        """Add a state: pose (7,), twist (6,), shape and joint rates (n,), as reported by plants."""
         self._poses.append(pose.copy())
         self._rates.append(np.concatenate([twist, qdot]))
         self._shapes.append(q.copy())
@@ -108,7 +108,7 @@ class StateAverage:
         return True
 
     def state(self) -> RobotState:
-        """Return the average of at least one state.
+        """Return the average of the states, of which there must be at least one.
 
         Raises
         ------

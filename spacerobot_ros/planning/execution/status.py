@@ -1,4 +1,4 @@
-"""Outputs of a planner: the status of its goal, notices, schedules, and statistics."""
+"""Planner outputs: goal status, notices, schedules, and statistics."""
 
 from __future__ import annotations
 
@@ -39,16 +39,16 @@ _LATE_TIME_SHARE = 1 / 3
 
 
 class PlannerState(str, Enum):
-    """The value of ``state`` in planner/status."""
+    """Value of ``state`` in planner/status."""
 
     WAITING = "waiting"
-    """States, or the robot, are missing."""
+    """States or the robot description are missing."""
     IDLE = "idle"
     PLANNING = "planning"
     EXECUTING = "executing"
     REACHED = "reached"
     REACHED_PARTLY = "reached_partly"
-    """A requested part of the base is out of tolerance, and not controlled."""
+    """A requested base component is out of tolerance and not controlled."""
     FAILED = "failed"
     REFUSED = "refused"
     ABORTED = "aborted"
@@ -56,7 +56,7 @@ class PlannerState(str, Enum):
 
     @property
     def decided(self) -> bool:
-        """Whether the goal of the status is decided: it is no longer pursued."""
+        """Whether the goal has ended and is no longer pursued."""
         return self in (
             *(PlannerState.REACHED, PlannerState.REACHED_PARTLY, PlannerState.FAILED),
             *(PlannerState.REFUSED, PlannerState.ABORTED),
@@ -64,7 +64,7 @@ class PlannerState(str, Enum):
 
     @property
     def level(self) -> int:
-        """Level of diagnostic_msgs/DiagnosticStatus: 0 OK, 1 WARN, 2 ERROR."""
+        """diagnostic_msgs/DiagnosticStatus level: 0 OK, 1 WARN, 2 ERROR."""
         if self in (PlannerState.FAILED, PlannerState.REFUSED):
             return 2
         return 1 if self in (PlannerState.ABORTED, PlannerState.REACHED_PARTLY) else 0
@@ -72,44 +72,44 @@ class PlannerState(str, Enum):
 
 @dataclass(frozen=True)
 class PlannerStatus:
-    """A status of the planner, as published on planner/status.
+    """A planner status, as published on planner/status.
 
     Attributes
     ----------
     state
         State of the goal.
     message
-        The text for the user.
+        Text for the user.
     goal_id
-        Id of the goal that the status is about; empty: none, or a goal without an id.
+        Goal id; empty: no goal, or a goal without an id.
     goal
-        (7,) its position in m and quaternion (x, y, z, w); empty if it is not reported.
+        (7,) goal position in m and quaternion (x, y, z, w); empty if not reported.
     corrections
-        New plans after the first for this goal that count as corrections.
+        Number of new plans for this goal after the first that count as corrections.
     end_effector_goals
-        Goals of end-effectors by link: a position (3,), m, or position and quaternion (7,).
+        End-effector goals by link: a position (3,), m, or position and quaternion (7,).
     end_effector_waypoints
-        Numbers of waypoints on given paths to these goals, by link.
+        Number of waypoints on the given paths to these goals, by link.
     end_effector_position_error_m, end_effector_attitude_error_rad
-        Largest remaining errors of end-effectors; None if they have no goals, or were not
+        Largest remaining end-effector errors; None if end-effectors have no goals, or were not
         evaluated.
     position_error_m, attitude_error_rad
         Remaining error of the measured base pose; None if it was not evaluated.
     manoeuvre_time_s
-        Duration of all schedules for the goal so far, without the parts that later ones cut off; 0:
+        Duration of all schedules for the goal so far, without parts replaced by later ones; 0:
         none.
     ends_at_s
         Simulated time at which the latest schedule ends; 0: none.
     remaining_s
-        Expected duration of later schedules until the goal is reached; 0: none is needed.
+        Expected duration of later schedules until the goal is reached; 0: none needed.
     method
-        Gait method of the schedule that begins; empty: none begins.
+        Gait method of the starting schedule; empty if none starts.
     duration_s
         Its duration.
     notes
-        Results of the method by name.
+        Method results by name.
     not_controlled
-        Parts of the goal that the method of the latest schedule does not control.
+        Goal components not controlled by the method of the latest schedule.
     """
 
     state: PlannerState
@@ -163,7 +163,8 @@ class PlannerStatus:
         )
 
     def to_values(self) -> dict[str, str]:
-        """Return the status as the key-value pairs of a DiagnosticStatus; numbers have 9 digits."""
+        """Return the status as the key-value pairs of a DiagnosticStatus; numbers have nine
+        digits."""
         return _FORMAT.to_values(self)
 
     @classmethod
@@ -173,7 +174,7 @@ class PlannerStatus:
         Raises
         ------
         SpaceRobotError
-            The values are not a status of a planner.
+            The values are not a planner status.
         """
         return _FORMAT.from_values(cls, values, message=message)
 
@@ -200,7 +201,7 @@ _PARTS = TextFormat(
     " ".join,
     lambda text: tuple(part for part in ("position", "attitude", "shape") if part in text.split()),
 )
-"""The parts of a goal that a method may leave uncontrolled; unknown words are omitted."""
+"""Goal components that a method may leave uncontrolled; unknown words are omitted."""
 
 _FORMAT = KeyValueFormat(
     "status of a planner",
@@ -234,7 +235,7 @@ class Severity(Enum):
 
 @dataclass(frozen=True)
 class Notice:
-    """A message for the log."""
+    """A log message."""
 
     severity: Severity
     message: str
@@ -242,7 +243,7 @@ class Notice:
 
 @dataclass(frozen=True)
 class ScheduleStart:
-    """The start of a schedule: the schedule, and the stamp of its first tick, ns."""
+    """Start of a schedule: the schedule, and the stamp of its first tick, ns."""
 
     schedule: GaitSchedule
     stamp_ns: int
@@ -300,16 +301,16 @@ Output = PlannerStatus | ScheduleStart | Notice | Transition | FlightEvent | Pur
 
 @dataclass
 class PlannerStatistics:
-    """Counts of plans and commands, for benchmarks and summaries.
+    """Plan and command counts, for benchmarks and summaries.
 
     Attributes
     ----------
     plan_time_s
-        Wall time that planning took for the present goal.
+        Wall time spent planning for the current goal.
     plans
-        Plans that were made or refused for the present goal.
+        Number of plans made or rejected for the current goal.
     commands_published
-        Commands since the node was configured.
+        Number of commands since the node was configured.
     """
 
     plan_time_s: float = 0.0
@@ -317,12 +318,12 @@ class PlannerStatistics:
     commands_published: int = 0
 
     def to_json(self) -> str:
-        """Return the message of the service ``~/statistics``."""
+        """Return the response message of the service ``~/statistics``."""
         return json.dumps(asdict(self))
 
     @classmethod
     def from_json(cls, text: str) -> PlannerStatistics:
-        """Return the statistics in a message of the service ``~/statistics``."""
+        """Return the statistics from a response message of the service ``~/statistics``."""
         return cls(**json.loads(text))
 
 
@@ -436,10 +437,10 @@ def describe_remaining_error(
     tolerance: Tolerance | None = None,
     goal: Goal | None = None,
 ) -> str:
-    """Return a clause with the remaining error in the parts of the goal that are controlled.
+    """Return a clause with the remaining error in the controlled goal components.
 
-    If a tolerance is given, it names that of each part; if a goal is given, also the parts that are
-    not controlled.
+    If tolerances are given, the clause includes them; if a goal is given, it also names the
+    uncontrolled components.
     """
     parts: dict[Controlled, str] = {
         "position": quantity(error.distance, "m"),
@@ -478,8 +479,8 @@ def describe_remaining_error(
 def manoeuvre_time(statuses: Iterable[tuple[float, PlannerStatus]], end_s: float) -> float | None:
     """Return the duration of the flown schedules for the last goal, s.
 
-    It is the planner's value, minus the rest of the last schedule if the flight was cut off. If the
-    planner has no value, as after an abort, it is that of :func:`time_to_end`.
+    This is the planner's value, minus the rest of the last schedule if the flight was cut off. If
+    the planner has no value, as after an abort, it is the result of :func:`time_to_end`.
 
     Parameters
     ----------
@@ -508,16 +509,16 @@ def manoeuvre_time(statuses: Iterable[tuple[float, PlannerStatus]], end_s: float
 
 
 def time_to_end(statuses: Iterable[tuple[float, PlannerStatus]], end_s: float) -> float | None:
-    """Return the time, s, from the beginning of the first schedule for the last goal to the end.
+    """Return the time, s, from the start of the first schedule for the last goal to the end.
 
-    Waiting in between, such as for a restarted planner, is included.
+    Waiting times, such as for a restarted planner, are included.
 
     Parameters
     ----------
     statuses
         Time (s) and status, in order of time.
     end_s
-        When the flight ended, s; used if no status reports that the goal was decided.
+        End time of the flight, s; used if no status reports that the goal has ended.
 
     Returns
     -------

@@ -1,9 +1,9 @@
-"""Teleoperation: joint rates that give an end-effector a twist while the base floats.
+"""Teleoperation: joint rates for an end-effector twist while the base floats.
 
-At zero momentum the generalised Jacobian ``J*(q)`` maps the rates of the joints to the twist of an
-end-effector (Umetani and Yoshida), so ``qdot = J*^+ [v; omega]``: the smallest rates that give the
-twist, each joint relative to its velocity limit. With ``keep_attitude``, ``-A qdot = 0`` is also
-required of the base's rotation, so the rates lie in the reaction null space.
+At zero momentum, the generalised Jacobian ``J*(q)`` maps joint rates to the twist of an
+end-effector (Umetani and Yoshida), so ``qdot = J*^+ [v; omega]``: the smallest rates that produce
+the twist, each relative to the joint's velocity limit. With ``keep_attitude``, the base rotation
+``-A qdot = 0`` is also required, so the rates lie in the reaction null space.
 """
 
 from __future__ import annotations
@@ -43,20 +43,20 @@ _SLOW_PROGRESS_RATE = 2 * MIN_PROGRESS_RATE
 """Progress below which the end-effector slows down before a singularity."""
 
 _LOOK_AHEAD = 1e-3
-"""Motion of the fastest joint after which the progress is checked again, rad."""
+"""Motion of the fastest joint after which progress is checked again, rad."""
 
 _TRIED_SPEED_SHARES = (1.0, 0.5, 0.25, 0.0)
-"""Shares of the rates that are tried if links come too near; with the last one the joints brake."""
+"""Fractions of the rates tried if links come too close; with the last one, the joints brake."""
 
 _MAX_TWIST = 1e6
-"""Largest number of a twist, m/s or rad/s: squares of much larger ones overflow."""
+"""Largest value in a twist, m/s or rad/s: squares of much larger values overflow."""
 
 _MIDPOINT_STEPS = 2
 _ROUNDING = 1e-12
 
 
 class TwistFrame(Enum):
-    """The frame in which the components of a twist are given."""
+    """Frame of the components of a twist."""
 
     WORLD = "world"
     BASE = "base"
@@ -65,7 +65,7 @@ class TwistFrame(Enum):
 
 @dataclass(frozen=True)
 class TwistCommand:
-    """The wanted twist of a link's origin, relative to the world.
+    """Desired twist of a link origin, relative to the world.
 
     Attributes
     ----------
@@ -86,12 +86,12 @@ class TwistCommand:
     def checked(
         cls, robot: SpaceRobot, link: str, linear: Array, angular: Array, frame: str, world: str
     ) -> TwistCommand:
-        """Return a twist in the frame of a name; ``world`` is the world frame.
+        """Return a twist in the named frame; ``world`` is the world frame.
 
         Raises
         ------
         PlanningError
-            The link, the frame or a number is refused.
+            The link, the frame or a value is invalid.
         """
         description = robot.description
         if link not in description.frames or link == description.base_link:
@@ -107,13 +107,13 @@ class TwistCommand:
             names = "', '".join(frames)
             raise PlanningError(f"The frame '{frame}' of the twist is not one of '{names}'.")
         if not (np.all(np.isfinite(linear)) and np.all(np.isfinite(angular))):
-            raise PlanningError("The twist has a number that is not finite.")
+            raise PlanningError("The twist has a non-finite value.")
         if max(np.abs(linear).max(), np.abs(angular).max()) > _MAX_TWIST:
-            raise PlanningError(f"The twist has a number beyond {_MAX_TWIST:g} m/s or rad/s.")
+            raise PlanningError(f"The twist has a value beyond {_MAX_TWIST:g} m/s or rad/s.")
         return cls(link, np.asarray(linear, float), np.asarray(angular, float), found)
 
     def in_base(self, R_WB: Array, R_BE: Array) -> tuple[Array, Array]:
-        """Return both velocities (3,) in components of the base."""
+        """Return both velocities (3,) in base components."""
         R = {
             TwistFrame.WORLD: R_WB.T,
             TwistFrame.BASE: np.eye(3),
@@ -123,10 +123,12 @@ class TwistCommand:
 
 
 class TwistStep(NamedTuple):
-    """The result of one state while an end-effector follows twists.
+    """Result for one state while an end-effector follows twists.
 
-    ``rates`` (n,) are those of the joints; None: they keep their shape. ``message`` is for the
-    status, empty if there is nothing new. ``ended``: the joints rest, and twists are over.
+    ``rates`` (n,) are the joint rates; None if the joints hold their shape. ``message`` is for
+    the
+    status, empty if there is nothing new. ``ended``: whether the joints are at rest and twists have
+    ended.
     """
 
     rates: Array | None
@@ -142,28 +144,28 @@ class _Following:
     twist: TwistCommand | None
     """The last one; None: the joints brake."""
     received_ns: int
-    """Stamp of the state before it, ns."""
+    """Stamp of the state before the twist, ns."""
     reported: str | None = None
-    """Beginning of the reason that was reported last; empty: the twist is followed."""
+    """Start of the last reported reason; empty: the twist is followed."""
     limited_ns: int = 0
-    """Stamp of the last state at which it was not followed, ns."""
+    """Stamp of the last state at which the twist was not followed, ns."""
     pose: Array | None = None
-    """(7,) the last measured pose of the base."""
+    """(7,) last measured base pose."""
     pose_ns: int = 0
     """Stamp of that state, ns."""
 
 
 class Teleoperation:
-    """End-effectors that follow twists, one at a time, until none has arrived for
+    """End-effectors that follow twists, one at a time, until no twist has arrived for
     ``twist_timeout``.
 
-    After a refusal, and after an abort, twists are refused until none has come for that time: so an
-    operator who keeps sending does not cause unexpected motion.
+    After a refusal or an abort, twists are rejected until none has arrived for that time, so that
+    an operator who keeps sending does not cause unexpected motion.
 
     Parameters
     ----------
     robot, config
-        The model, and the parameters of the planner.
+        The model, and the planner parameters.
     clearance
         Distances that are kept; None: any.
     """
@@ -177,22 +179,22 @@ class Teleoperation:
         """By link."""
         self._following: _Following | None = None
         self._refused_ns: int | None = None
-        """Stamp of the state before the last twist that was refused, ns."""
+        """Stamp of the state before the last rejected twist, ns."""
 
     def use_clearance(self, clearance: Clearance | None) -> None:
-        """Keep other distances from now on."""
+        """Use other clearances from now on."""
         self._clearance = clearance
         self._followers.clear()
         if self._following is not None:
             self._following.follower = self._follower_of(self._following.follower.link)
 
     def receive(self, twist: TwistCommand, stamp_ns: int) -> None:
-        """Follow a twist from the next state on; ``stamp_ns`` is the stamp of the state before it.
+        """Follow a twist from the next state on; ``stamp_ns`` is the stamp of the previous state.
 
         Raises
         ------
         PlanningError
-            The twist is refused; the message says why.
+            The twist is rejected; the message says why.
         """
         refused, following = self._refused_ns, self._following
         try:
@@ -214,11 +216,11 @@ class Teleoperation:
             following.twist, following.received_ns = twist, stamp_ns
 
     def refuse(self, stamp_ns: int) -> None:
-        """Note that a twist after the state of a stamp is refused."""
+        """Record that a twist after the state with this stamp was rejected."""
         self._refused_ns = stamp_ns
 
     def abort(self, stamp_ns: int) -> None:
-        """Let the joints brake, and refuse the twists that still arrive."""
+        """Brake the joints, and reject twists that still arrive."""
         self.refuse(stamp_ns)
         if self._following is not None:
             self._following.twist = None
@@ -237,15 +239,15 @@ class Teleoperation:
         return self._followers[link]
 
     def keep_base_pose(self, measured: MeasuredState) -> None:
-        """Keep the pose of a base that is measured."""
+        """Store the measured base pose."""
         following, base = self._following, measured.base()
         if following is not None and base is not None and np.all(np.isfinite(base.pose)):
             following.pose, following.pose_ns = base.pose, measured.stamp_ns
 
     def step(self, measured: MeasuredState, before: Array, *, goal_waits: bool) -> TwistStep:
-        """Return the result of a state: braking if the twist is stale or a goal waits.
+        """Return the result for a state: braking if the twist is stale or a goal is waiting.
 
-        ``before`` (n,) are the rates that were commanded last.
+        ``before`` (n,) are the last commanded rates.
         """
         following, stamp, q = self._following, measured.stamp_ns, measured.q
         assert following is not None
@@ -280,11 +282,11 @@ class Teleoperation:
 
 
 class TwistFollower:
-    """Rates of the joints for twists of one link, within all limits.
+    """Joint rates for twists of one link, within all limits.
 
-    The rotation follows the twist if the joints have enough freedom; otherwise only the origin of
-    the link does. The robot slows down and stops before a dynamic singularity, before the
-    limits of its joints, and before links come too near; a twist that leads away is followed.
+    The rotation follows the twist if the joints have enough freedom; otherwise only the link origin
+    does. The robot slows down and stops before a dynamic singularity, before joint limits,
+    and before links come too close; a twist that leads away is followed.
 
     Parameters
     ----------
@@ -293,16 +295,16 @@ class TwistFollower:
     link
         The link.
     options
-        Of ``resolved_rate``: limits of the motion, and whether the base keeps its attitude.
+        Options of ``resolved_rate``: motion limits, and whether the base keeps its attitude.
     control_period
-        Duration of a command, s.
+        Command duration, s.
     clearance
         Distances that are kept; None: any.
 
     Raises
     ------
     PlanningError
-        The joints cannot move the link according to twists.
+        The joints cannot move the link by twists.
     """
 
     def __init__(
@@ -320,14 +322,14 @@ class TwistFollower:
         self._keeps_attitude = options.keep_attitude == 1
         self._clearance = clearance
         self._required: Array | None = None
-        """Distances (P,) that pairs of bodies keep from the first shape on, m."""
+        """Distances (P,) kept between pairs of bodies from the first shape on, m."""
         turning = BaseRotations.of(robot)
         axes = turning.axes if turning.loops_turn_base else np.zeros((0, 3))
         (directions,) = EndEffectorRows(robot, [(link, True)], axes).directions
         self._displacements, self._rotations = directions.displacements, directions.rotations
         kept = len(axes) if self._keeps_attitude else 0
         if len(self._displacements) + kept > robot.n or not len(self._displacements):
-            still = " and keep the attitude of the base" if kept else ""
+            still = " and keep the base attitude" if kept else ""
             raise PlanningError(
                 f"Robot '{robot.description.name}' has too few joints to move '{link}' by "
                 f"twists{still}."
@@ -345,18 +347,13 @@ class TwistFollower:
     def rates(
         self, twist: TwistCommand | None, pose: Array, q: Array, before: Array
     ) -> tuple[Array, str]:
-        """Return the rates (n,) of the next tick, and why the twist is not followed.
+        """Return the rates (n,) for the next tick, and the reason if the twist is not followed.
 
         Parameters
         ----------
         twist
-            The wanted twist; None: rest.
-        pose
-            (7,) of the base: position, m, and quaternion.
-        q
-            (n,) shape, m or rad.
-        before
-            (n,) rates that were commanded last.
+            The wanted twist; None: rest. pose (7,) of the base: position, m, and quaternion. q (n,)
+            shape, m or rad. before (n,) last commanded rates.
         """
         wanted, reason = np.zeros(len(q)), ""
         if twist is not None:

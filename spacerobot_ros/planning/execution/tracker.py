@@ -1,4 +1,4 @@
-"""Tracks schedules: from a schedule and the measured shape to the setpoint of every tick.
+"""Tracks schedules: from a schedule and the measured shape to the setpoint at every tick.
 
 Joints that do not follow their commands are detected.
 """
@@ -32,10 +32,10 @@ _MAX_SETTLING_TIME = 5.0  # s
 
 @dataclass(frozen=True)
 class Setpoint:
-    """Command of the joints; the tracker changes the arrays in place.
+    """Joint command; the tracker changes the arrays in place.
 
-    ``position`` (n,) is the wanted shape now, m or rad; ``velocity`` (n,) is held until the next
-    tick, m/s or rad/s.
+    ``position`` (n,) is the current desired shape, m or rad; ``velocity`` (n,) is held until the
+    next tick, m/s or rad/s.
     """
 
     position: Array
@@ -44,16 +44,16 @@ class Setpoint:
 
 @dataclass(frozen=True)
 class TakeOver:
-    """A tick of a schedule at which another schedule takes over.
+    """A schedule tick at which another schedule takes over.
 
     Attributes
     ----------
     stamp_ns
         Its stamp, ns.
     shapes
-        (K + 1, n) from the tick now to that tick, m or rad.
+        (K + 1, n) from the current tick to that tick, m or rad.
     motion
-        Motion of the joints at that tick.
+        Joint motion at that tick.
     """
 
     stamp_ns: int
@@ -62,7 +62,7 @@ class TakeOver:
 
 
 class ScheduleFollower:
-    """Follows one schedule by stamps, so that a missed tick does not delay later ones.
+    """Follows one schedule by time stamps, so that a missed tick does not delay later ones.
 
     Parameters
     ----------
@@ -73,7 +73,7 @@ class ScheduleFollower:
     shape_gain
         Feedback gain from shape error to velocity, 1/s.
     deadband
-        Shape errors up to this are noise and not fed back, m or rad.
+        Shape errors up to this value are noise and not fed back, m or rad.
     """
 
     def __init__(
@@ -106,7 +106,7 @@ class ScheduleFollower:
         return not far or late > _MAX_SETTLING_TIME * SECOND
 
     def is_overdue(self, stamp_ns: int) -> bool:
-        """Whether the schedule has been over for longer than any settling takes."""
+        """Whether the schedule has been over for longer than any settling time."""
         return stamp_ns - self._end_ns > _MAX_SETTLING_TIME * SECOND
 
     def covers(self, stamp_ns: int) -> bool:
@@ -144,18 +144,18 @@ class ScheduleFollower:
 
 
 class BrakingFollower:
-    """Slows down along a schedule, to rest on its path.
+    """Slows down along a schedule and comes to rest on its path.
 
-    The gait's time runs at the rate ``1 - t/T``: the shape stays on the gait's path, and so does
-    the base, whose path at zero momentum does not depend on speed. Wheels that keep spinning after
-    the schedule change to their final rates, which stop the base at its goal.
+    Gait time runs at the rate ``1 - t/T``: the shape stays on the gait's path and, since the base
+    path at zero momentum does not depend on speed, so does the base. Wheels that keep spinning
+    after the schedule change to their final rates, which bring the base to rest at its goal.
 
     Parameters
     ----------
     follower
         Of the schedule until then.
     stamp_ns
-        When the braking begins, ns.
+        Start of braking, ns.
     duration
         T, s; the gait continues for half of it.
     """
@@ -174,7 +174,7 @@ class BrakingFollower:
         return (stamp_ns - self._stamp_ns) / SECOND >= self._duration
 
     def command(self, stamp_ns: int, q: Array, position: Array, velocity: Array) -> None:
-        """Write the wanted shape now (n,) and the velocities to hold from now (n,)."""
+        """Write the current desired shape (n,) and the velocities to hold from now on (n,)."""
         since = (stamp_ns - self._stamp_ns) / SECOND
         position[:] = self._shape_after(since)
         tick = self.schedule.control_period
@@ -183,7 +183,8 @@ class BrakingFollower:
         )
 
     def shapes(self, stamp_ns: int) -> Array:
-        """Return the wanted shapes (N + 1, n) at the ticks from now until the joints rest."""
+        """Return the desired shapes (N + 1, n) at the ticks from now until the joints are at
+        rest."""
         tick = self.schedule.control_period
         since = (stamp_ns - self._stamp_ns) / SECOND
         ticks = max(1, math.ceil((self._duration - since) / tick - 1e-9))
@@ -216,7 +217,7 @@ class BrakingFollower:
 
 
 class TrajectoryTracker:
-    """Tracks successive schedules, and holds the shape between schedules.
+    """Tracks successive schedules, and holds the shape between them.
 
     Parameters
     ----------
@@ -238,10 +239,10 @@ class TrajectoryTracker:
         self._has_result = False
         self._follower: ScheduleFollower | BrakingFollower | None = None
         self._holds_position = False
-        """Whether the position of the setpoint is the shape to hold."""
+        """Whether the setpoint position is the shape to hold."""
         self._wheels = ReactionWheels.of(robot.description).index
         self._spins = False
-        """Whether the velocities of wheels in the setpoint are those to keep."""
+        """Whether the wheel velocities in the setpoint are to be kept."""
         self.use_robot(robot)
         band = 2 * config.shape_deadband
         self._stuck_watch = StuckJointWatch(
@@ -253,7 +254,7 @@ class TrajectoryTracker:
         )
 
     def use_robot(self, robot: SpaceRobot) -> None:
-        """Track the later schedules with a robot that has the same joints but other masses."""
+        """Track later schedules with a robot that has the same joints but other masses."""
         self._robot = robot
         self._sensitivity = PathSensitivity(robot) if self._config.replanning > 0 else None
         self._mass_estimate = MassEstimate(
@@ -271,9 +272,9 @@ class TrajectoryTracker:
         return isinstance(self._follower, BrakingFollower)
 
     def start(self, schedule: GaitSchedule, stamp_ns: int, average: int = 0) -> None:
-        """Track a schedule whose first tick has this stamp.
+        """Track a schedule with this stamp for its first tick.
 
-        ``average`` measured poses are averaged for plans that begin in motion; 0: none are wanted.
+        ``average`` measured poses are averaged for plans that begin in motion; 0: none.
         """
         config, self._has_result = self._config, False
         gain = config.shape_gain if self._commands_plant else 0.0
@@ -291,16 +292,16 @@ class TrajectoryTracker:
         self._follower = self._begin_braking(stamp_ns)
 
     def braking_shapes(self, stamp_ns: int) -> Array | None:
-        """Return the shapes (N + 1, n) at the ticks of a braking that starts now; None at rest."""
+        """Return the shapes (N + 1, n) at the ticks if braking started now; None at rest."""
         follower = self._begin_braking(stamp_ns)
         return None if follower is None else follower.shapes(stamp_ns)
 
     def rates_after_braking(self) -> Array | None:
-        """Return the velocities (n,) that are held after a braking; None: zero."""
+        """Return the velocities (n,) held after braking; None: zero."""
         return None if self._follower is None else self._follower.schedule.end_velocities
 
     def wheel_rates(self, state: RobotState) -> Array | None:
-        """Return the velocities (n,) of wheels in a measured state; None without wheels."""
+        """Return the wheel velocities (n,) in a measured state; None without wheels."""
         if not len(self._wheels) or state.qdot is None:
             return None
         rates = np.zeros(len(state.q))
@@ -315,8 +316,8 @@ class TrajectoryTracker:
     def take_over(self, stamp_ns: int, q: Array, after: float) -> TakeOver | None:
         """Return the tick, at least ``after`` s from now, at which a plan may take over.
 
-        Its first shape is the wanted one, except for joints whose measured position in ``q`` (n,)
-        is off by more than noise. None if no schedule is tracked, or it is over by then.
+        Its first shape is the desired one, except for joints whose measured position in ``q`` (n,)
+        is off by more than noise. None if no schedule is tracked, or if it is over by then.
         """
         if not isinstance(self._follower, ScheduleFollower):
             return None
@@ -337,7 +338,8 @@ class TrajectoryTracker:
         return self._follower is not None and self._follower.has_ended(stamp_ns, q)
 
     def end_by_result(self) -> None:
-        """Let the schedule end at the next state: the controller that follows it has ended it."""
+        """End the schedule at the next state, because the controller that follows it has ended
+        it."""
         self._has_result = True
 
     def stop(self, *, at_last_shape: bool = False) -> None:
@@ -356,10 +358,10 @@ class TrajectoryTracker:
         return isinstance(self._follower, ScheduleFollower) and self.path_check.due(stamp_ns)
 
     def track(self, stamp_ns: int, q: Array, *, obeyed: bool = True) -> list[int]:
-        """Write the setpoint for the present shape ``q`` (n,); return the stuck joints.
+        """Write the setpoint for the current shape ``q`` (n,), and return the stuck joints.
 
-        If the shape is not finite, the setpoint is rest. While no command is in force at the plant
-        (``obeyed`` is false), joints that do not move do not count as stuck.
+        If the shape is not finite, the setpoint is rest. While no command is in effect at the plant
+        (``obeyed`` is false), joints that do not move are not considered stuck.
         """
         assert self._follower is not None
         position, velocity = self.setpoint.position, self.setpoint.velocity
@@ -376,7 +378,7 @@ class TrajectoryTracker:
         return self._stuck_watch.find_stuck(q, position, velocity)
 
     def follow_velocity(self, q: Array, velocity: Array) -> None:
-        """Write a setpoint of velocities (n,) that follow no schedule."""
+        """Write a setpoint with velocities (n,) that do not follow a schedule."""
         setpoint = self.setpoint
         if self._commands_plant or not self._holds_position:
             setpoint.position[:] = q
@@ -388,11 +390,12 @@ class TrajectoryTracker:
 
     @property
     def needs_wheel_rates(self) -> bool:
-        """Whether :meth:`hold` needs measured rates: there are wheels, and none were commanded."""
+        """Whether :meth:`hold` needs measured rates, because there are wheels without commanded
+        rates."""
         return bool(len(self._wheels)) and not self._spins
 
     def forget_wheels(self) -> None:
-        """Keep the measured rates of wheels next, not the commanded ones."""
+        """Use the measured wheel rates next, not the commanded ones."""
         self._spins = False
 
     def hold(self, q: Array, qdot: Array | None = None, *, obeyed: bool = True) -> None:
@@ -422,14 +425,14 @@ class TrajectoryTracker:
 _STUCK_SHARE = 0.05
 
 _MIN_FOLLOWED_SHARE = 0.5
-"""Share of the commanded range above which a joint counts as following its commands. In between it
-is slow, or noise hides its motion."""
+"""Fraction of the commanded range above which a joint is considered to follow its commands. In
+between, it is slow, or its motion is hidden by noise."""
 
 _MAX_STANDSTILL_WINDOWS = 8
-"""Number of windows without motion of any joint before joints count as stuck."""
+"""Number of windows without any joint motion before joints are considered stuck."""
 
 _CHECK_PERIOD = 16
-"""Ticks between two checks while all joints follow: a check takes time."""
+"""Ticks between checks while all joints follow, because a check takes time."""
 
 _MIN_JOINT_ERROR = 1e-6  # m or rad
 
@@ -438,22 +441,22 @@ class StuckJointWatch:
     """Watches the joints while a schedule is tracked, tick by tick.
 
     For every joint, the range of positions since it last followed is compared with the commanded
-    range. A joint is stuck if it was commanded to move in N ticks or more and the first range is a
-    small part of the second. So joints that are not commanded to move, slow joints, and noisy
+    range. A joint is stuck if it was commanded to move in at least N ticks and the first range is a
+    small fraction of the second. So joints that are not commanded to move, slow joints, and noisy
     measurements are not mistaken for stuck joints. If no joint moves at all, or none has moved for
-    half of N ticks although several were commanded to, they are watched for longer: a plant that is
-    restarted takes a while to receive commands.
+    half of N ticks although several were commanded to, they are watched for longer, because a
+    restarted plant takes a while to receive commands.
 
     Parameters
     ----------
     joints
         Their number.
     ticks
-        N; 0: joints are never stuck.
+        N; 0: joints are never considered stuck.
     control_period
-        Duration of a command, s.
+        Command duration, s.
     band
-        Shape errors up to this are noise, m or rad.
+        Shape errors up to this value are noise, m or rad.
     """
 
     def __init__(self, joints: int, ticks: int, control_period: float, band: float = 0.0) -> None:
@@ -474,9 +477,9 @@ class StuckJointWatch:
         self._standstill_ticks = 0
 
     def find_stuck(self, q: Array, wanted: Array, velocity: Array) -> list[int]:
-        """Return the indices of the joints that are stuck since this tick, usually none.
+        """Return the indices of joints considered stuck from this tick on, usually none.
 
-        ``q`` and ``wanted`` (n,) are the measured and the wanted shape now, ``velocity`` (n,) the
+        ``q`` and ``wanted`` (n,) are the current measured and desired shapes, ``velocity`` (n,) the
         command until the next tick.
         """
         if not self._suspicious:

@@ -1,4 +1,5 @@
-"""Plans on request: at once while time stands still, or in a thread while states are processed."""
+"""Plans on request: synchronously while time is stopped, or in a thread while states are
+processed."""
 
 from __future__ import annotations
 
@@ -34,8 +35,8 @@ from spacerobot_ros.planning.methods.remaining_joints import RemainingJointsGait
 from spacerobot_ros.times import SECOND
 
 _COASTING_TIME, _COASTING_FACTOR = 2.0, 2.0
-"""Rest at the start of a plan in the background if the robot drifts, s, and, if it was too short,
-the factor of the time from its start to the end of planning."""
+"""Rest period at the start of a background plan if the robot drifts, s, and, if it was too short,
+the factor applied to the time from its start to the end of planning."""
 
 _MAX_COASTING_TIME = 600.0
 """Longest such time, s."""
@@ -73,20 +74,20 @@ class PlanningTask:
     Attributes
     ----------
     request
-        The request, from the measured state.
+        The request, starting from the measured state.
     stuck_joint_positions
-        Positions of the joints to plan without, m or rad, by name.
+        Positions of joints excluded from planning, m or rad, by name.
     required
-        Parts of the goal that a plan without them must control.
+        Goal components that a plan without these joints must control.
     braking
-        (K + 1, n) shapes at the ticks, m or rad, while the joints brake before the gait, or rest
-        while the base drifts; None: the gait begins at once.
+        (K + 1, n) shapes at the ticks, m or rad, while the joints brake before the gait, or are at
+        rest while the base drifts; None: the gait begins immediately.
     rates_after_braking
-        (n,) velocities that are held from there on, m/s or rad/s: those of reaction wheels; None:
+        (n,) velocities held from there on, m/s or rad/s, for reaction wheels; None:
         zero.
     take_over
-        Tick at which the plan takes over from a schedule that is tracked until then; None: it
-        begins at rest, or with the braking. The state of the request is the present one.
+        Tick at which the plan takes over from the schedule tracked until then; None: it
+        begins at rest, or with braking. The request's state is the current state.
     """
 
     request: PlanRequest
@@ -99,7 +100,7 @@ class PlanningTask:
 
 @dataclass(frozen=True)
 class Planned:
-    """A plan, the wall time for planning, s, and the stamp of its first tick, ns."""
+    """A plan, the wall time spent planning, s, and the stamp of its first tick, ns."""
 
     schedule: GaitSchedule
     wall_time: float
@@ -119,7 +120,8 @@ class Planned:
 
 @dataclass(frozen=True)
 class Postponed:
-    """A plan that was ready too late, by a time in s, and is repeated with a later start."""
+    """A plan that was ready too late, and by how much, s; planning is repeated with a later
+    start."""
 
     late: float
     wall_time: float
@@ -127,7 +129,7 @@ class Postponed:
 
 @dataclass(frozen=True)
 class Refused:
-    """The reason of a refused plan, as a message, and the wall time for planning, s."""
+    """The reason for a failed plan, as a message, and the wall time spent planning, s."""
 
     reason: str
     wall_time: float = 0.0
@@ -146,7 +148,8 @@ class _Coasting:
     duration: float
 
     def task(self, period: float) -> PlanningTask:
-        """Return the task of a plan that begins with the rest, in control periods, s."""
+        """Return the task for a plan that begins with the rest period; the control period is in
+        s."""
         ticks, state = math.ceil(self.duration / period - 1e-9), self.planned.request.state
         shapes = np.tile(state.q, (ticks + 1, 1))
         if self.planned.rates_after_braking is not None:
@@ -157,12 +160,13 @@ class _Coasting:
 
 
 class PlanningWorker:
-    """Plans with the method of a planner, one plan at a time.
+    """Plans with a planner's method, one plan at a time.
 
-    With ``plan_in_background`` a thread plans: CasADi and numpy release Python's lock for most of
-    it. A robot that drifts moves during planning: its plans begin with a rest, which is longer the
-    next time if planning took longer. The thread uses the robot's functions, whose buffers are
-    shared: as long as the worker is :attr:`busy`, nothing else may use them.
+    With ``plan_in_background`` a thread plans: CasADi and numpy release Python's global interpreter
+    lock for most of the time. A robot that drifts moves during planning: its plans begin with a
+    rest period, which is
+    extended for the next plan if planning took longer. The thread uses the robot's functions, whose
+    buffers are shared: while the worker is :attr:`busy`, nothing else may use them.
 
     Parameters
     ----------
@@ -171,11 +175,11 @@ class PlanningWorker:
     config
         Of the planner.
     method
-        The method with all joints; None: the one that the configuration names.
+        Planning method that uses all joints; None: the method named in the configuration.
     long_work
-        Returns the context in which a plan is made at once.
+        Returns the context for synchronous planning.
     described
-        The robot among its present obstacles; None: as the model describes it.
+        The robot with its current obstacles; None: as described by the model.
 
     Raises
     ------
@@ -193,7 +197,7 @@ class PlanningWorker:
     ) -> None:
         self._robot, self._config, self._long_work = robot, config, long_work
         self.plans_in_background = config.plan_in_background
-        """Whether plans are made in a thread."""
+        """Whether planning runs in a thread."""
         self.clearance = Clearance.wanted(described or robot.description, config.clearance)
         """Distances that plans keep; None: any."""
         self._method = method or build_method(
@@ -208,11 +212,11 @@ class PlanningWorker:
         """The latest method without stuck joints, and its task."""
         self._job: PlanningJob[GaitSchedule] | None = None
         self._coasting: _Coasting | None = None
-        """Rest at the beginning of the requested plan, because the base drifts meanwhile."""
+        """Rest period at the start of the requested plan, because the base drifts meanwhile."""
 
     @property
     def is_busy(self) -> bool:
-        """Whether a plan is in progress, its result waits, or its thread still runs."""
+        """Whether a plan is in progress, its result is waiting, or its thread is still running."""
         return self._job is not None
 
     def is_free(self) -> bool:
@@ -233,7 +237,7 @@ class PlanningWorker:
         return self._method.starts_in_motion and maker.starts_in_motion
 
     def submit(self, task: PlanningTask, stamp_ns: int) -> None:
-        """Make a plan from the state of a stamp: at once, or in a thread."""
+        """Make a plan from the state with this stamp, synchronously or in a thread."""
         self._coasting = None
         at_rest = task.braking is None and task.take_over is None
         if at_rest and self.plans_in_background and self._drifts(task.request.state):
@@ -249,10 +253,10 @@ class PlanningWorker:
             self._job.start(in_background=self.plans_in_background)
 
     def poll(self, stamp_ns: int) -> Planned | Refused | Postponed | None:
-        """Return the result at a state of a stamp; None until the plan has ended, or if it was
-        cancelled.
+        """Return the result at the state with this stamp; None until the plan has ended, or if it
+        was cancelled.
 
-        Unexpected errors of the method are raised here.
+        Unexpected method errors are raised here.
         """
         result, coasting = self.take_result(), self._coasting
         if not isinstance(result, Planned):
@@ -287,7 +291,7 @@ class PlanningWorker:
             return Refused(str(refusal), job.wall_time)
 
     def cancel(self) -> None:
-        """Cancel the present plan, which then has no result."""
+        """Cancel the current plan, which then has no result."""
         job = self._job  # Another thread may clear the attribute meanwhile.
         if job is not None:
             job.cancel()
@@ -298,9 +302,9 @@ class PlanningWorker:
             self._job.close()
 
     def approach_ahead(self, schedule: GaitSchedule, begins: float, now: float) -> str:
-        """Return the clause that says where the rest of a schedule comes too near to obstacles.
+        """Return a clause that says where the rest of a schedule comes too close to obstacles.
 
-        ``begins`` and ``now`` are times, s. Empty: nowhere, or there are no obstacles.
+        ``begins`` and ``now`` are times, s. Empty if nowhere, or if there are no obstacles.
         """
         if self.clearance is None or not self.clearance.has_obstacles:
             return ""

@@ -1,1 +1,1 @@
-"""The gait methods: one module each, and their registry."""
+"""Gait methods, one module each, and their registry."""

@@ -1,14 +1,14 @@
-"""Closed motions of three joints rotate a spacecraft about three axes: paper 2.
+"""Closed motions of three joints that rotate a spacecraft about three axes: paper 2.
 
 Small loops around a nominal shape rotate the base by ``dTheta = M S``: M (3, 3) the curvature of
-the connection for the joint pairs (1, 2), (2, 3), (3, 1), S the areas that the loop encloses in
-their planes. Each cycle corrects the share k of the remaining rotation, ``S = k M^-1 dTheta``; the
-first-order error is left to the next cycle, which begins from the measured attitude.
+the connection for the joint pairs (1, 2), (2, 3), (3, 1), S the areas enclosed by the loop in their
+planes. Each cycle corrects the fraction k of the remaining rotation, ``S = k M^-1 dTheta``;
+the first-order error is corrected in the next cycle, which begins from the measured attitude.
 
-All edges are straight lines of the shape from rest to rest: the rotation of the base depends on the
-path alone, and held commands move along it.
+All edges are straight lines in shape space, from rest to rest: the base rotation depends only on
+the path, and held commands follow it.
 
-Loops go along joint axes and enclose given areas (figure 5) in the planes of the joints (1, 2),
+Loops run along joint axes and enclose given areas (figure 5) in the planes of joints (1, 2),
 (2, 3) and (3, 1); an area is positive if the path is counter-clockwise. Six edges of a box enclose
 all three at once, rectangles one by one.
 """
@@ -40,22 +40,24 @@ from spacerobot_ros.planning.methods.nominal_shape import (
 )
 
 _MAX_SHRINKS = 14
-"""Attempts for a cycle on which links come too near to each other, each half as large as before.
+"""Attempts for a cycle in which links come too close to each other, each half as large as the one
+before.
 """
 
 _MAX_CYCLE_TRIALS = 6
-"""Attempts for a cycle that would not bring the base nearer, each half as large as before."""
+"""Attempts for a cycle that would not bring the base closer, each half as large as the one
+before."""
 
 _MAX_CYCLE_SHARE = 1.0 - 1e-9
-"""Share k of the remaining rotation above which one cycle corrects all of it."""
+"""Fraction k of the remaining rotation above which one cycle corrects all of it."""
 
 _NEGLIGIBLE_AREA_SHARE = 1e-3
-"""Share of the largest area below which an area counts as zero: a later cycle corrects it."""
+"""Fraction of the largest area below which an area counts as zero: a later cycle corrects it."""
 
 _IDENTITY = np.array([0.0, 0.0, 0.0, 1.0])
 
 LegEnds = list[tuple[Array, float]]
-"""Ends (n,) of straight legs, and the durations of the legs, s."""
+"""End shapes (n,) of straight legs, and leg durations, s."""
 
 
 @dataclass(frozen=True)
@@ -63,24 +65,24 @@ class AreaLoopOptions:
     """The options of ``area_loop``."""
 
     k: float = parameter(
-        0.15, "share of the remaining rotation that one cycle corrects", minimum=1e-3, maximum=1.0
+        0.15, "fraction of the remaining rotation corrected by one cycle", minimum=1e-3, maximum=1.0
     )
     edge_time: float = parameter(
-        4.0, "duration of an edge; slow joints take longer", "s", minimum=1e-3, maximum=1e9
+        4.0, "duration of an edge; longer for slow joints", "s", minimum=1e-3, maximum=1e9
     )
     largest_edge: float = parameter(
         1.0, "longest edge of a loop", "m or rad", minimum=1e-3, maximum=10.0
     )
     nominal: tuple[float, ...] = parameter(
         (),
-        "nominal shape, all joints; []: the best",
+        "nominal shape of all joints; []: the best",
         "m or rad",
         minimum=-1e6,
         maximum=1e6,
         of_joints=True,
     )
     joints: str = parameter(
-        "", "the three joints, separated by spaces; '': the best three", of_joints=True
+        "", "names of the three joints, separated by spaces; '': the best three", of_joints=True
     )
     cycles_per_plan: int = parameter(
         1, "cycles before the attitude is measured again", minimum=1, maximum=10000
@@ -95,10 +97,10 @@ class AreaLoopOptions:
 
 @dataclass(frozen=True)
 class AreaLoopProgress:
-    """Progress of a goal, from which its next schedule continues.
+    """Progress towards a goal, from which its next schedule continues.
 
-    ``nominal`` is the chosen nominal shape, ``cycles`` the number of cycles flown at the end of
-    the schedule.
+    ``nominal`` is the chosen nominal shape, ``cycles`` the number of cycles flown by the end of the
+    schedule.
     """
 
     nominal: NominalShape
@@ -106,10 +108,10 @@ class AreaLoopProgress:
 
 
 class AreaLoopGait(GaitMethod):
-    """Controls attitude and final shape of a robot with three or more joints of any kind.
+    """Controls the attitude and final shape of a robot with three or more joints of any kind.
 
-    The base's position follows from both (the centre of mass rests) and cannot be chosen. A
-    schedule is one cycle, or ``cycles_per_plan`` of them as predicted.
+    The base position follows from both (the centre of mass is at rest) and cannot be chosen. A
+    schedule is one cycle, or ``cycles_per_plan`` predicted cycles.
     """
 
     name: ClassVar[str] = "area_loop"
@@ -120,7 +122,7 @@ class AreaLoopGait(GaitMethod):
 
     @override
     def setup(self) -> None:
-        """Compute what depends on robot and options only; see :meth:`GaitMethod.setup`."""
+        """Compute what depends only on the robot and the options; see :meth:`GaitMethod.setup`."""
         robot, chosen = self.robot, self.options
         self._nominal = NominalShapeChooser(
             robot,
@@ -134,7 +136,7 @@ class AreaLoopGait(GaitMethod):
     @classmethod
     @override
     def require_suitable(cls, robot: SpaceRobot) -> None:
-        """Refuse robots whose base cannot be rotated about three axes by loops of three joints."""
+        """Reject robots whose base cannot be rotated about three axes by loops of three joints."""
         if robot.n < 3:
             raise PlanningError(
                 f"area_loop needs three joints (paper 2); robot '{robot.description.name}' has "
@@ -144,10 +146,10 @@ class AreaLoopGait(GaitMethod):
 
     @override
     def plan(self, request: PlanRequest, cancellation: Cancellation = NEVER) -> GaitSchedule:
-        """Plan the way to the nominal shape and the next cycle; see :meth:`GaitMethod.plan`.
+        """Plan the path to the nominal shape and the next cycle; see :meth:`GaitMethod.plan`.
 
         The schedule is ``partial`` unless its own prediction reaches the goal. ``most_cycles`` and
-        ``longest`` bound the cycles for the goal, including those before (``request.previous``).
+        ``longest`` bound the cycles for the goal, including earlier ones (``request.previous``).
         """
         state, goal, tolerance = request.state, request.goal, request.tolerance
         self.require_rest(state)
@@ -274,7 +276,7 @@ class AreaLoopGait(GaitMethod):
             raise PlanningError(
                 f"None of {_MAX_CYCLE_TRIALS} cycles of area_loop around the nominal shape "
                 f"{np.round(nominal.shape, 4).tolist()}, each half as large as the one before, "
-                f"brings the base nearer to its goal than {missing:.3g} rad."
+                f"brings the base closer to its goal than {missing:.3g} rad."
             )
         duration = (len(after.positions) - len(gait.positions)) * self.control_period
         if cycles * duration > self.options.longest:
@@ -423,7 +425,7 @@ class _PlannedMotion:
 
 @dataclass(frozen=True)
 class EdgePath:
-    """Closed polygons that the shape follows one after the other.
+    """Closed polygons that the shape follows in succession.
 
     Attributes
     ----------
@@ -431,7 +433,7 @@ class EdgePath:
         Each (V, 3): the vertices in the order of travel, the first again at the end; the centre of
         their bounding box is the origin.
     edge_ratio
-        Largest ratio of an edge to the longest allowed one.
+        Largest ratio of an edge to the longest allowed edge.
     """
 
     loops: tuple[Array, ...]
@@ -448,7 +450,8 @@ class EdgePath:
 def edge_path(areas: Array, longest: Array) -> EdgePath:
     """Return the path around ``areas`` (3,), with edges of at most ``longest`` (3,) if possible.
 
-    The cube-like path is used if its edges are short enough, or shorter than those of rectangles.
+    The cube-like path is used if its edges are short enough, or shorter than those of the
+    rectangles.
     If the areas are too large, ``excess`` is above 1; edges scale with the square root of the
     areas.
     """

@@ -1,4 +1,4 @@
-"""``auto``: the shortest manoeuvre of all methods that suit the robot, compared goal by goal."""
+"""``auto``: the shortest manoeuvre among all suitable methods, compared for each goal."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ from spacerobot_ros.planning.core.schedule import GaitSchedule
 
 
 class AutoGait(GaitMethod):
-    """Plans by all methods that suit the robot, and returns the shortest manoeuvre.
+    """Plans with all methods that suit the robot, and returns the shortest manoeuvre.
 
     If a method that suits the robot controls the position, methods that do not are omitted. A
-    manoeuvre that ends off the goal, or controls less of it than another, is taken only if there
-    is no better one. A goal keeps the method of the schedule flown for it before, as long as that
-    method finds a plan. A schedule is that of the chosen method, except for its notes.
+    manoeuvre that ends off the goal, or controls less of it than another, is selected only if there
+    is no better one. A goal keeps the method of the last schedule flown for it, as long as that
+    method finds a plan. A schedule is the chosen method's schedule, except for its notes.
 
     Parameters
     ----------
@@ -65,16 +65,18 @@ class AutoGait(GaitMethod):
 
     @override
     def plan(self, request: PlanRequest, cancellation: Cancellation = NEVER) -> GaitSchedule:
-        """Plan by all suitable methods, and return the best plan; see :meth:`GaitMethod.plan`.
+        """Plan with all suitable methods, and return the best plan; see :meth:`GaitMethod.plan`.
 
-        ``notes`` name the method that is taken (``chosen``), the reason (``because``), and the
+        ``notes`` name the selected method (``chosen``), the reason (``because``), and the
         results of all methods (``compared``).
 
         Raises
         ------
         PlanningError
-            No method plans; the messages of all of them say why. It is an `UnreachableError` if one
-            of them proves it, else a `NotFoundError` if one of them searched.
+            No method finds a plan; the message contains all their reasons. It is an
+            `UnreachableError` if one
+            method proves that the goal is unreachable, else a `NotFoundError` if one method
+            searched.
         """
         if not self.robot.n:
             raise PlanningError(NO_JOINTS.format(self.robot.description.name))
@@ -110,7 +112,7 @@ class AutoGait(GaitMethod):
         because = f"{chosen} suits robot '{self.robot.description.name}' and " + (
             f"plans the shortest of {len(results)} manoeuvres to this goal."
             if len(results) > 1
-            else "is the only one that plans this goal."
+            else "is the only one that can plan this goal."
         )
         return _add_notes(results[chosen].schedule, chosen, because, results, refusals)
 
@@ -126,7 +128,9 @@ class AutoGait(GaitMethod):
             if name in refusals:
                 names_by_reason.setdefault(str(refusals[name]), []).append(name)
         reasons = " ".join(f"{', '.join(each)}: {why}" for why, each in names_by_reason.items())
-        message = f"No method plans this goal of robot '{self.robot.description.name}'. {reasons}"
+        message = (
+            f"No method can plan this goal for robot '{self.robot.description.name}'. {reasons}"
+        )
         return refusal_of_all(message, of_goal)
 
     def _comparable_methods(self, refusals: dict[str, SpaceRobotError]) -> list[str]:

@@ -1,11 +1,11 @@
-"""Planar robots, and the rotation of their base by a path of shapes: paper 3's geometric phase.
+"""Planar robots, and their base rotation along a path in shape space: paper 3's geometric phase.
 
 A planar robot's joints all rotate about parallel axes, and nothing tilts its base. The attitude is
-one angle theta about the axis of the robot. At zero angular momentum
-``theta_dot = -s(psi)' psi_dot`` (eq. 3), where ``s_i = N_i / D`` is the component about the axis of
-the mechanical connection, ``D`` the inertia of the locked robot about the axis and ``N_i`` its
-coupling to joint i. The rotation along a path of shapes is the line integral of ``-s`` (eq. 11): it
-depends on the path and not on the speed.
+a single angle theta about the robot axis. At zero angular momentum
+``theta_dot = -s(psi)' psi_dot`` (eq. 3), where ``s_i = N_i / D`` is the mechanical connection's
+component about the axis, ``D`` the locked robot's inertia about the axis, and ``N_i`` its coupling
+to joint i. The rotation along a shape path is the line integral of ``-s`` (eq. 11): it
+depends on the path, not on the speed.
 
 Small loops rotate the base most where the curvature is largest (remark 2). Boxes (2, 2) are lower
 over upper bounds of two joints, rad.
@@ -30,13 +30,13 @@ from spacerobot_ros.planning.core.controllability import (
 )
 
 _MAX_AXIS_TILT = 1e-5
-"""Largest tilt of an axis of a planar robot, and rotation about other axes per radian of a joint:
-the rounding error of angles with six digits."""
+"""Largest axis tilt of a planar robot, and rotation about other axes per radian of a joint: the
+rounding error of angles with six digits."""
 
 _SAMPLED_SHAPE_COUNT = 8
 
 _MAX_PANEL_ANGLE = 0.5
-"""Longest piece of a leg that one Gauss rule integrates, rad."""
+"""Longest part of a leg integrated by one Gauss rule, rad."""
 
 _GAUSS_NODES, _GAUSS_WEIGHTS = np.polynomial.legendre.leggauss(10)
 _GAUSS_NODES, _GAUSS_WEIGHTS = (_GAUSS_NODES + 1) / 2, _GAUSS_WEIGHTS / 2
@@ -55,7 +55,7 @@ _GRID_REFINEMENTS = 8
 _MAX_PEAKS = 4
 
 _EQUAL_PEAK_TOLERANCE = 1e-4
-"""Relative difference below which peaks of the curvature count as equal."""
+"""Relative difference below which curvature peaks are considered equal."""
 
 _EQUAL_DISTANCE_TOLERANCE = 1e-2  # rad
 
@@ -64,9 +64,9 @@ _NEIGHBOUR_OFFSETS = np.array([[x, y] for x in (0.0, -1.0, 1.0) for y in (0.0, -
 
 
 def planar_axis(robot: SpaceRobot) -> Array:
-    """Return the axis (3,) of a planar robot of three links, a unit vector in base components.
+    """Return the axis (3,) of a planar robot with three links, a unit vector in base components.
 
-    Its largest component is positive, whatever the orientation of the joints.
+    Its largest component is positive, regardless of joint orientation.
 
     Raises
     ------
@@ -76,17 +76,16 @@ def planar_axis(robot: SpaceRobot) -> Array:
     name, bodies = robot.description.name, robot.description.bodies
     if len(bodies) < 3:
         raise PlanningError(
-            f"Robot '{name}' has {len(bodies)} link(s) that move against each other: with fewer "
-            "than three, loops of the joints do not reorient a planar robot (paper 3, section "
-            "III)."
+            f"Robot '{name}' has {len(bodies)} link(s) that move relative to each other: with "
+            "fewer than three, joint loops do not reorient a planar robot (paper 3, section III)."
         )
     axes: list[Array] = []
     rotations = [np.eye(3)]
     for body, joint in zip(bodies[1:], robot.description.moving_joints, strict=True):
         if joint.kind is JointKind.PRISMATIC:
             raise PlanningError(
-                f"Robot '{name}' is not planar in the sense of paper 3: joint '{joint.name}' "
-                "slides, and all joints must rotate about parallel axes."
+                f"Robot '{name}' is not planar in the sense of paper 3: joint '{joint.name}' is "
+                "prismatic, but all joints must rotate about parallel axes."
             )
         # Turns about parallel axes do not move the axes, so one shape suffices for the test.
         rotations.append(rotations[body.parent] @ body.origin.R)
@@ -115,13 +114,13 @@ def _require_turn_about(robot: SpaceRobot, axis: Array) -> None:
         raise PlanningError(
             f"Robot '{robot.description.name}' is not planar: joint "
             f"'{robot.joint_names[worst[1]]}' also rotates the base about axes other than its own, "
-            f"by up to {tilts[worst]:.2g} rad per rad; the causes are mass centres outside of one "
+            f"by up to {tilts[worst]:.2g} rad per rad; the causes are centres of mass outside one "
             "plane, or products of inertia."
         )
 
 
 def check_planar_chain(robot: SpaceRobot) -> Controllability:
-    """Test a robot by paper 3: a planar robot of three or more links, with curvature."""
+    """Test a robot by paper 3: a planar robot with three or more links and nonzero curvature."""
     names, rest = robot.joint_names, np.zeros(robot.n)
     try:
         phase = PlanarPhase(robot)
@@ -141,13 +140,13 @@ def check_planar_chain(robot: SpaceRobot) -> Controllability:
         "(paper 3)."
     )
     if largest <= ZERO_TURN_PER_AREA:
-        message = f"Loops of the joints of robot '{robot.description.name}' do not rotate its base."
+        message = f"Joint loops of robot '{robot.description.name}' do not rotate its base."
     values = np.array([largest, 0.0, 0.0])
     return Controllability(int(largest > ZERO_TURN_PER_AREA), 1, values, pair, shape, message)
 
 
 class PlanarPhase:
-    """Rotations of the base of a planar robot about its axis, rad, by paths of the shape.
+    """Base rotations of a planar robot about its axis, rad, along shape paths.
 
     Parameters
     ----------
@@ -171,11 +170,13 @@ class PlanarPhase:
         self._N_D = ca.Function("N_D", [psi], [ca.densify(N_D)])
 
     def turns_by_legs(self, starts: Array, ends: Array) -> Array:
-        """Return the rotations (L,) along straight legs of the shape, starts and ends (L, n)."""
+        """Return the rotations (L,) along straight legs in shape space, from starts to ends (L,
+        n)."""
         return _integrate_legs(self._connection_row, starts, ends)
 
     def plane(self, psi: Array, i: int, j: int) -> PhasePlane:
-        """Return the phase in the plane of joints i and j, the others at rest in ``psi`` (n,)."""
+        """Return the phase in the plane of joints i and j, with the others at rest in ``psi``
+        (n,)."""
         shapes = np.tile(psi, (9, 1))
         shapes[:, i], shapes[:, j] = np.repeat(_FITTED_ANGLES, 3), np.tile(_FITTED_ANGLES, 3)
         samples = self._N_D(shapes.T).full()[[i, j, -1]].reshape(3, 3, 3)
@@ -189,9 +190,9 @@ class PlanarPhase:
 
 
 class PhasePlane:
-    """Rotations of the base by two joints, in closed form.
+    """Base rotations by two joints, in closed form.
 
-    Each joint rotates one rigid part of the robot relative to the other, and ``N_i``, ``N_j`` and
+    Each joint rotates one rigid part of the robot relative to the rest, and ``N_i``, ``N_j`` and
     ``D`` are sums of products of two vectors, each fixed in some body. They are trigonometric
     polynomials of degree one in either angle: ``f = h(psi_i)' C h(psi_j)`` with
     ``h(x) = [1, cos x, sin x]``.
@@ -206,8 +207,7 @@ class PhasePlane:
         self._C = coefficients
 
     def curvature(self, points: Array) -> Array:
-        """Return the rotation of the base per area of small loops, 1/rad, (...), at points (...,
-        2).
+        """Return the base rotation per area of small loops, 1/rad, (...), at points (..., 2).
 
         Loops are counter-clockwise in the plane (psi_i, psi_j): it is ``-H``, eq. (10), with
         ``H = ds_j/dpsi_i - ds_i/dpsi_j``.
@@ -219,7 +219,7 @@ class PhasePlane:
         return np.asarray((N_i_j * D - N_i * D_j - N_j_i * D + N_j * D_i) / D**2)
 
     def turns_by_squares(self, centres: Array, sides: Array) -> Array:
-        """Return the rotations (R,) of the base by counter-clockwise squares, centres (R, 2)."""
+        """Return the base rotations (R,) by counter-clockwise squares with centres (R, 2)."""
         corners = square_corners(centres, sides)
         ends = np.roll(corners, -1, axis=1)
         legs = _integrate_legs(self._connection_row, corners.reshape(-1, 2), ends.reshape(-1, 2))
@@ -257,10 +257,10 @@ def _integrate_legs(s: Callable[[Array], Array], starts: Array, ends: Array) -> 
 
 
 def centre_box(at: Array, lower: Array, upper: Array) -> Array:
-    """Return the box that holds every distinct point within the limits (2,) once.
+    """Return the box that contains every distinct point within the limits (2,) once.
 
-    Shapes repeat after a revolution: a joint whose range is larger has all its points within half a
-    revolution of ``at`` (2,), or of the end of its range nearest to ``at``.
+    Shapes repeat after a revolution: for a joint with a larger range, all points are within half a
+    revolution of ``at`` (2,), or of a point half a revolution from the range end nearest to ``at``.
     """
     width = np.minimum(upper - lower, 2 * math.pi)
     start = np.clip(at - width / 2, lower, upper - width)
@@ -270,7 +270,7 @@ def centre_box(at: Array, lower: Array, upper: Array) -> Array:
 def curvature_peaks(plane: PhasePlane, at: Array, boxes: Array) -> Array:
     """Return the points (R, 2) of the largest |curvature| in boxes (R, 2, 2).
 
-    Among equally good points, it is the one nearest to ``at`` (2,).
+    Among equally good points, the one nearest to ``at`` (2,) is returned.
     """
     # Boxes of joints without limits do not depend on the size of the square.
     flat, row = np.unique(boxes.reshape(-1, 4), axis=0, return_inverse=True)

@@ -1,11 +1,12 @@
-"""Sliding masses, first-order Lie brackets: the manoeuvre of paper 1, section 5.
+"""Sliding masses and first-order Lie brackets: the manoeuvre of paper 1, section 5.
 
 Step 1 finds the final shape ``zf`` that puts the base at the goal position (eq. 9). Step 2 slides
 the masses there (eq. 10). Step 3 rotates the base by n equal cycles of three frequencies whose
 brackets add up to the remaining rotation.
 
-The plant holds each command for a tick, so the sliders trace polygons inside the smooth curves.
-Their area is smaller by ``sin(x)/x``, ``x`` the phase per tick; the amplitudes compensate for it.
+The plant holds each command for one tick, so the sliders trace polygons inside the smooth curves.
+Their area is smaller by ``sin(x)/x``, where ``x`` is the phase per tick; the amplitudes compensate
+for this.
 """
 
 from __future__ import annotations
@@ -44,10 +45,10 @@ from spacerobot_ros.planning.core.schedule import BasePath, GaitSchedule, Notes
 _MIN_CYCLE_TICKS = 12
 _MAX_REFINEMENTS = 20
 _SHRINK_FACTOR = 1.4
-"""Factor by which a cycle on which links come too near is reduced."""
+"""Reduction factor for a cycle in which links come too close."""
 
 _PATH_POSES_PER_STEP = 100
-"""Smallest number of poses of the predicted path in a step; a step has at most twice as many."""
+"""Smallest number of predicted path poses in a step; a step has at most twice as many."""
 
 _ZERO_ROTATION_ANGLE = 1e-9
 _ZERO_MOTION = 1e-9
@@ -61,14 +62,16 @@ class LieBracketOptions:
         100.0, "duration of step 2, the slide to the final shape", "s", minimum=1e-3, maximum=1e9
     )
     n1: int = parameter(
-        10, "periods of the sin^2 velocity profile in step 2", minimum=1, maximum=10000
+        10, "number of periods of the sin^2 velocity profile in step 2", minimum=1, maximum=10000
     )
     cycle_period: float = parameter(
         3.0, "duration of one cycle of step 3, (tf - t1) / n", "s", minimum=1e-3, maximum=1e9
     )
-    cycles: int = nonnegative(0, "n, the number of cycles of step 3; 0: by loop_area", maximum=1e8)
+    cycles: int = nonnegative(
+        0, "n, the number of cycles of step 3; 0: determined by loop_area", maximum=1e8
+    )
     loop_area: float = parameter(
-        0.04, "|alpha| / n when cycles is 0", "m^2", minimum=1e-9, maximum=1e9
+        0.04, "|alpha| / n if cycles is 0", "m^2", minimum=1e-9, maximum=1e9
     )
     a22_ratio: float = parameter(
         1.0, "free amplitude a22 over sqrt(|a22 b12|); 1: balanced", minimum=1e-3, maximum=1e9
@@ -82,7 +85,8 @@ class LieBracketOptions:
 
 
 class LieBracketGait(GaitMethod):
-    """Controls position and attitude of a base with three or more sliders; slots may be offset."""
+    """Controls the position and attitude of a base with three or more sliders; slots may be
+    offset."""
 
     name: ClassVar[str] = "lie_bracket"
     repeats_cycles: ClassVar[bool] = True
@@ -91,7 +95,7 @@ class LieBracketGait(GaitMethod):
 
     @override
     def setup(self) -> None:
-        """Compute what depends on robot and options only; see :meth:`GaitMethod.setup`."""
+        """Compute what depends only on the robot and the options; see :meth:`GaitMethod.setup`."""
         robot = self.robot
         # A cycle is a whole number of ticks, so all cycles have the same commands and rotation.
         self.ticks_a_cycle = max(
@@ -102,7 +106,7 @@ class LieBracketGait(GaitMethod):
     @classmethod
     @override
     def require_suitable(cls, robot: SpaceRobot) -> None:
-        """Refuse robots whose sliders violate the conditions of paper 1."""
+        """Reject robots whose sliders violate the conditions of paper 1."""
         check_sliding_masses(robot).require()
 
     @override
@@ -130,16 +134,17 @@ class LieBracketGait(GaitMethod):
         return self.schedule_of(goal, positions, path, symbols | notes, is_clear=is_clear)
 
     def final_shape(self, state: RobotState, goal: Goal, enough: float = 0.0) -> Array:
-        """Step 1: the shape ``zf`` (n,) that solves eq. (9), nearest to the present one.
+        """Step 1: the shape ``zf`` (n,) that solves eq. (9), nearest to the current one.
 
-        If strokes are too short, it may miss the position by ``enough``, m.
+        If strokes are too short, the shape may miss the position by ``enough``, m.
 
         Raises
         ------
         UnreachableError
-            ``zf`` is beyond a stroke, and the robot has sliders only.
+            ``zf`` exceeds a stroke, and the robot has only sliders.
         PlanningError
-            ``zf`` is beyond a stroke of another robot, or there are no three independent slots.
+            ``zf`` exceeds a stroke of another kind of robot, or there are no three independent
+            slots.
         """
         robot = self.robot
         R0, Rf = matrix_from_quaternion(state.quaternion), matrix_from_quaternion(goal.quaternion)
@@ -181,13 +186,13 @@ class LieBracketGait(GaitMethod):
             worst = int(np.argmax(np.maximum(lower - z, z - upper)))
             name = self.robot.joint_names[self.sliders[worst]]
             message = (
-                f"The goal is beyond stroke: it needs joint '{name}' at {z[worst]:.4g} m, and its "
+                f"The goal is beyond stroke: it needs joint '{name}' at {z[worst]:.4g} m, but its "
                 f"stroke is [{lower[worst]:.4g}, {upper[worst]:.4g}] m."
             )
         else:
             message = (
-                f"The goal is beyond stroke: {len(self.sliders)} sliders put the base no nearer "
-                f"than {gap:.3g} m to it."
+                f"The goal is beyond stroke: {len(self.sliders)} sliders bring the base no closer "
+                f"to it than {gap:.3g} m."
             )
         # Other joints could move the centre of mass, but this method holds them.
         if len(self.sliders) < self.robot.n or self.robot.description.has_mimic_joints:
@@ -309,7 +314,7 @@ class LieBracketGait(GaitMethod):
         while True:
             if n * self.ticks_a_cycle * self.control_period > longest:
                 if too_near:
-                    raise PlanningError(f"In loops of the sliders, {too_near}.")
+                    raise PlanningError(f"In slider loops, {too_near}.")
                 raise PlanningError(
                     f"The rotation would take more than {longest:.6g} s within the strokes and "
                     f"rates of the sliders at the final shape {np.round(z_f, 4).tolist()}; "

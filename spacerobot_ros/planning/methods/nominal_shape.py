@@ -1,8 +1,8 @@
-"""The nominal shape of the area loops: where three joints rotate the base best (paper 2).
+"""Nominal shape for area loops: where three joints rotate the base best (paper 2).
 
-Loops go around the nominal shape. It is good if the curvature matrix M is well conditioned,
+Loops run around the nominal shape. It is good if the curvature matrix M is well conditioned,
 rotations are large, and limits leave room for edges: the measure is the smallest singular value of
-M times the largest areas, the rotation about the worst axis by the largest loops.
+M times the largest areas, that is, the rotation about the worst axis by the largest loops.
 """
 
 from __future__ import annotations
@@ -33,11 +33,12 @@ _GRID_POINTS = {1: 11, 2: 7}
 """Points per joint of the first grid, by the number of triples; 5 for more triples."""
 
 _MAX_TRIPLES, _SAMPLED_SHAPE_COUNT = 8, 48
-"""Largest number of triples of joints to examine closely, and of shapes to choose them at."""
+"""Largest number of joint triples to examine closely, and of shapes at which to choose them."""
 
 _GRID_REFINEMENTS = 10
 _EQUAL_MEASURE_TOLERANCE = 1e-6
-"""Relative difference below which shapes are equally good; the most central shape wins."""
+"""Relative difference below which shapes are considered equally good; the most central shape is
+chosen."""
 
 _MIN_EDGE = 1e-4  # m or rad
 
@@ -48,7 +49,7 @@ _NEIGHBOUR_OFFSETS = np.array(list(itertools.product((0.0, -1.0, 1.0), repeat=3)
 
 
 _BOX_SHARES = (1.0, 0.5, 0.25, 0.125)
-"""Edges of the boxes in which links keep the clearance, as shares of the longest edges of loops."""
+"""Edges of the boxes in which links keep the clearance, as fractions of the longest loop edges."""
 
 _BOX_GRID_POINTS = 7
 
@@ -63,7 +64,7 @@ LoopRoomTest = Callable[[Array], npt.NDArray[np.bool_]]
 
 @dataclass(frozen=True)
 class NominalShape:
-    """A shape, and the three joints whose loops go around it.
+    """A shape, and the three joints whose loops run around it.
 
     Attributes
     ----------
@@ -72,10 +73,9 @@ class NominalShape:
     joints
         Indices of the three.
     M
-        (3, 3) rotation of the base, rad, base components, per area of the pairs (1, 2), (2, 3), (3,
-        1).
+        (3, 3) base rotation, rad, base components, per area of the pairs (1, 2), (2, 3), (3, 1).
     longest
-        (3,) longest edges that fit into the joint limits, m or rad.
+        (3,) longest edges that fit within the joint limits, m or rad.
     """
 
     shape: Array
@@ -95,7 +95,7 @@ class NominalShape:
 
 
 class NominalShapeChooser:
-    """Chooses the nominal shapes of one robot.
+    """Chooses nominal shapes for a robot.
 
     Parameters
     ----------
@@ -106,14 +106,14 @@ class NominalShapeChooser:
     joints
         Names of the three joints, separated by spaces; empty: the best three.
     nominal
-        The shape (n,), m or rad; empty: the best one.
+        The nominal shape (n,), m or rad; empty: the best shape.
     is_roomy
-        Returns for shapes (N, n) whether links have room to move (N,); None: everywhere.
+        Returns whether (N,) links have room to move at shapes (N, n); None: everywhere.
 
     Raises
     ------
     ParameterError
-        ``joints`` does not name three joints, or ``nominal`` is not a shape of the robot.
+        ``joints`` does not name three joints, or ``nominal`` is not a valid shape.
     """
 
     def __init__(
@@ -138,7 +138,8 @@ class NominalShapeChooser:
     def at(self, q: Array, kept: NominalShape | None = None) -> NominalShape:
         """Return the nominal shape to use from shape ``q`` (n,).
 
-        The other joints rest; ``kept``, an earlier choice, is returned if they have not moved.
+        The other joints rest; ``kept``, an earlier choice, is returned if the other joints have not
+        moved.
 
         Raises
         ------
@@ -151,8 +152,8 @@ class NominalShapeChooser:
         """Yield other nominal shapes from shape ``q`` (n,), around which loops have room.
 
         All shapes in a box around one keep the clearance (``is_clear``). The edges of the first box
-        are as long as edges of loops may be, those of the next half as long, and so on. None is
-        yielded if users have given the nominal shape.
+        are as long as loop edges may be, those of the next box half as long, and so on. Nothing is
+        yielded if the user has specified the nominal shape.
         """
         if self._given_shape is not None:
             return
@@ -164,7 +165,8 @@ class NominalShapeChooser:
                 yield found
 
     def move_to_nearest_turn(self, nominal: NominalShape, q: Array) -> NominalShape:
-        """Return the nominal shape with unlimited joints moved by revolutions to near ``q``."""
+        """Return the nominal shape with unlimited joints moved by whole revolutions close to
+        ``q``."""
         turns = np.where(self._repeating, np.round((q - nominal.shape) / (2 * math.pi)), 0.0)
         return replace(nominal, shape=nominal.shape + 2 * math.pi * turns)
 
@@ -204,9 +206,9 @@ class NominalShapeChooser:
 def nominal_at_shape(
     robot: SpaceRobot, shape: Array, triples: Sequence[tuple[int, int, int]], largest_edge: float
 ) -> NominalShape:
-    """Return a given shape (n,) with the best of the triples of joints.
+    """Return a given shape (n,) with the best joint triple.
 
-    Boxes that do not fit around it are moved into the limits; see :class:`NominalShape`.
+    Boxes that do not fit around it are shifted into the limits; see :class:`NominalShape`.
     """
     K = curvatures(robot, shape[np.newaxis])[0]
     lower, upper = robot.lower, robot.upper
@@ -224,10 +226,10 @@ def best_nominal(
     largest_edge: float,
     is_roomy: LoopRoomTest | None = None,
 ) -> NominalShape:
-    """Return the best nominal shape over all triples; other joints are those of ``held`` (n,).
+    """Return the best nominal shape over all triples; other joints are as in ``held`` (n,).
 
-    Boxes of the longest edges around it fit into the limits. Links have room there (``is_roomy``)
-    if they have room anywhere.
+    Boxes with the longest edges around it fit within the limits. Links have room there
+    (``is_roomy``) if they have room anywhere.
     """
     triples = _select_best_triples(robot, triples, largest_edge)
     points = _GRID_POINTS.get(len(triples), 5)
@@ -248,10 +250,10 @@ def nominal_with_clearance(
     share: float,
     is_clear: ClearanceTest,
 ) -> NominalShape | None:
-    """Return the best nominal shape of a grid around which links keep the clearance, or None.
+    """Return the best nominal shape on a grid around which links keep the clearance, or None.
 
-    They keep it in a box with a share of the longest edges, which bounds the edges of its loops.
-    The other joints are those of ``held`` (n,).
+    They keep it in a box with a fraction of the longest edges, which bounds the loop edges.
+    Other joints are as in ``held`` (n,).
     """
     ranked: list[tuple[float, NominalShape]] = []
     for triple in _select_best_triples(robot, triples, largest_edge):
@@ -375,7 +377,7 @@ def _require_shape(robot: SpaceRobot, shape: Array) -> Array:
     if outside.size:
         i = int(outside[0])
         raise ParameterError(
-            f"area_loop.nominal has joint '{robot.joint_names[i]}' at {shape[i]:.4g}, and its "
+            f"area_loop.nominal has joint '{robot.joint_names[i]}' at {shape[i]:.4g}, but its "
             f"limits are [{robot.lower[i]:.4g}, {robot.upper[i]:.4g}]."
         )
     return shape

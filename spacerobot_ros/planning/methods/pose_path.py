@@ -1,6 +1,6 @@
-"""Given paths of an end-effector: straight lines through poses, rounded at their corners.
+"""Given end-effector paths: straight lines through poses, rounded at the corners.
 
-Within a distance ``d`` of a corner both lines are blended: the position is ``c - a l_1 + b l_2``,
+Within a distance ``d`` of a corner, both lines are blended: the position is ``c - a l_1 + b l_2``,
 with the lines ``l_1`` and ``l_2`` to and from the corner ``c``, ``a = (1 - t)^2 d / |l_1|``, and
 ``b = t^2 d / |l_2|``, for t from 0 to 1. The tangent is continuous, and the position is at most
 ``d / 4`` off the lines. The attitude is blended in the same way, by rotations.
@@ -27,15 +27,15 @@ from spacerobot_ros.model.rotations import (
 )
 
 MAX_CORNERS = 500
-"""Largest number of corners of a path: it limits the planning time."""
+"""Largest number of corners in a path, which limits planning time."""
 
 _SAME_POSE = 1e-10  # m or rad
 
 _MIN_BLEND_COSINE = -0.5
-"""Cosine of the largest angle of a corner that is rounded; beyond it the motion stops there."""
+"""Cosine of the largest corner angle that is rounded; at sharper corners, the motion stops."""
 
 _BLEND_PARTS = 4
-"""Parts of a blend between whose ends the path is checked."""
+"""Number of parts of a blend between whose ends the path is checked."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ class PosePath:
 
     @classmethod
     def from_poses(cls, positions: Array, quaternions: Array) -> PosePath:
-        """Return the path through poses; equal ones in succession count as one."""
+        """Return the path through poses; equal successive poses count as one."""
         path = cls(positions, quaternions)
         kept = np.append(True, path.lengths > _SAME_POSE)
         return path if kept.all() else cls(positions[kept], quaternions[kept])
@@ -75,16 +75,16 @@ class PosePath:
 
     @cached_property
     def lengths(self) -> Array:
-        """(K - 1,) of each line: metres and radians together."""
+        """(K - 1,) length of each line: metres plus radians."""
         return np.asarray(np.linalg.norm(self.chords, axis=1) + np.linalg.norm(self.turns, axis=1))
 
     @cached_property
     def lengths_at_poses(self) -> Array:
-        """(K,) length of the path up to each pose, metres and radians together."""
+        """(K,) path length up to each pose: metres plus radians."""
         return np.append(0.0, np.cumsum(self.lengths))
 
     def remaining_after(self, length: float) -> PosePath:
-        """Return the rest of the path after some of its length; at its end it is one pose."""
+        """Return the rest of the path after part of its length; at the end, it is a single pose."""
         length = min(max(length, 0.0), float(self.lengths_at_poses[-1]))
         if len(self.positions) == 1:
             return self
@@ -105,10 +105,10 @@ class PosePath:
         )
 
     def simplified(self, tolerance: float) -> PosePath:
-        """Return a path through fewer of the poses, off the others by at most a tolerance.
+        """Return a path through fewer poses that deviates from the others by at most a tolerance.
 
-        ``tolerance`` is in m and rad. (Douglas and Peucker; positions are compared at equal shares
-        of the length, so that a path there and back is preserved.)
+        ``tolerance`` is in m and rad. (Douglas and Peucker; positions are compared at equal
+        fractions of the length, so that a path there and back is preserved.)
 
         Raises
         ------
@@ -155,7 +155,8 @@ class PosePath:
         return np.asarray(np.maximum(off, np.linalg.norm(left, axis=1)))
 
     def split_at_reversals(self, tolerance: float) -> Iterator[PosePath]:
-        """Yield the parts between stops: at sharp corners, or at each if there is no tolerance."""
+        """Yield the parts between stops, which are at sharp corners, or at every corner if there is
+        no tolerance."""
         directions = np.hstack([self.chords, self.turns])
         size = np.linalg.norm(directions, axis=1)
         cosines = (directions[1:] * directions[:-1]).sum(axis=1) / (size[1:] * size[:-1])
@@ -165,25 +166,25 @@ class PosePath:
 
 
 class RoundedPath:
-    """The way along a path with rounded corners: displacement and rotation from its start.
+    """Motion along a path with rounded corners: displacement and rotation from its start.
 
     Parameters
     ----------
     path
-        The path, of two poses or more.
+        The path, with at least two poses.
     tolerance
-        Largest distance of the way from the lines, m, and of its attitudes, rad.
+        Largest deviation from the lines, m, and from their attitudes, rad.
     before, total_length
-        Length before its start, and of the whole path, m, for messages.
+        Length before its start, and length of the whole path, m, for messages.
 
     Attributes
     ----------
     length
-        Of the lines together, m.
+        Total length of the lines, m.
     is_straight
         Whether it is one straight line.
     curvature_breaks
-        Shares of the way at which its curvature changes.
+        Fractions of the way at which its curvature changes.
     """
 
     def __init__(
@@ -196,27 +197,27 @@ class RoundedPath:
         self.is_straight = len(path.positions) == 2
         near = np.minimum(path.lengths[1:], path.lengths[:-1]) / 2
         self._blends = np.concatenate([[0.0], np.minimum(near, 4 * tolerance), [0.0]])
-        """(K,) distances from the corners at which their blends begin and end."""
+        """(K,) distances from the corners at which blends begin and end."""
         parts = np.linspace(-1.0, 1.0, _BLEND_PARTS + 1)
         inner = slice(1, -1)
         marks = path.lengths_at_poses[inner, np.newaxis] + np.outer(self._blends[inner], parts)
         self.curvature_breaks = np.unique(marks) / self._total
 
     def displacement(self, share: float) -> Array:
-        """Return the displacement (3,) after a share of the way, m."""
+        """Return the displacement (3,) after a fraction of the way, m."""
         base, before, after, a, b, _, _ = self._blend_at(share)
         chords, start = self._path.chords, self._path.positions[0]
         place = self._path.positions[base] - start
         return np.asarray(place - a * chords[before] + b * chords[after])
 
     def displacement_derivative(self, share: float) -> Array:
-        """Return the derivative (3,) of the displacement with respect to the share."""
+        """Return the derivative (3,) of the displacement with respect to the fraction."""
         _, before, after, _, _, a_rate, b_rate = self._blend_at(share)
         chords = self._path.chords
         return np.asarray(b_rate * chords[after] - a_rate * chords[before])
 
     def rotation(self, share: float) -> Array:
-        """Return the rotation (4,) since the start after a share of the way."""
+        """Return the rotation (4,) since the start after a fraction of the way."""
         base, before, after, a, b, _, _ = self._blend_at(share)
         path = self._path
         to_base = quaternion_multiply(
@@ -226,14 +227,14 @@ class RoundedPath:
         return quaternion_multiply(quaternion_from_rotvec(b * path.turns[after]), back)
 
     def rotation_derivative(self, share: float) -> Array:
-        """Return the angular velocity (3,) by the share, rad."""
+        """Return the angular velocity (3,) with respect to the fraction, rad."""
         _, before, after, _, b, a_rate, b_rate = self._blend_at(share)
         turns = self._path.turns
         carried = matrix_from_quaternion(quaternion_from_rotvec(b * turns[after]))
         return np.asarray(b_rate * turns[after] - a_rate * (carried @ turns[before]))
 
     def travelled_length(self, share: float) -> float:
-        """Return the length of the whole path, m, after a share of the way."""
+        """Return the length along the whole path, m, after a fraction of the way."""
         return self._length_before + float(
             np.interp(share * self._total, self._path.lengths_at_poses, self._metres_at_poses)
         )

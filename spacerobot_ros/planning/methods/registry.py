@@ -1,4 +1,4 @@
-"""The methods by name: a new one is one file and one line here."""
+"""Methods by name; a new method needs one file and one line here."""
 
 from __future__ import annotations
 
@@ -42,10 +42,9 @@ def build_method(
     options: Mapping[str, Any],
     clearance: Clearance | None = None,
 ) -> GaitMethod:
-    """Return a method for a robot; ``options`` holds instances of ``Options`` by method.
+    """Return a method for a robot; ``options`` contains instances of ``Options`` by method.
 
-    A method that is not among them uses its defaults. Schedules keep the clearance, if there is
-    one.
+    A method not in it uses its defaults. Schedules keep the clearance, if given.
 
     Raises
     ------
@@ -69,12 +68,12 @@ def build_method(
 
 
 def method_options(name: str, values: Mapping[str, Any]) -> Any:
-    """Return the ``Options`` of a method from values by name, with defaults for missing names.
+    """Return a method's ``Options`` from values by name, with defaults for missing names.
 
     Raises
     ------
     ParameterError
-        There is no such method or option, or a value is refused.
+        There is no such method or option, or a value is invalid.
     """
     if name not in METHODS:
         raise ParameterError(f"There is no gait method '{name}'; there are: {', '.join(METHODS)}.")

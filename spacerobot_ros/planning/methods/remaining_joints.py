@@ -41,22 +41,22 @@ class _RemainingProgress:
 
 
 class RemainingJointsGait(GaitMethod):
-    """Plans for a robot with stuck joints, each of which welds two bodies together.
+    """Plans for a robot with stuck joints, each of which fixes two bodies together.
 
-    Its schedules have every joint; the stuck ones rest.
+    Its schedules include every joint; stuck joints are at rest.
 
     Parameters
     ----------
     robot, control_period, integration_step
         As for any :class:`GaitMethod`.
     stuck
-        Positions of the joints that do not move, m or rad, by name: the model is the robot with
-        these joints fixed there.
+        Positions of the stuck joints, m or rad, by name: the model is the robot with these joints
+        fixed there.
     method, options
-        The method for the remaining joints, as for :func:`build_method`; if it refuses, ``auto`` is
-        tried.
+        The method for the remaining joints, as for :func:`build_method`; if it rejects the robot,
+        ``auto`` is tried.
     required
-        Parts of the goal that a schedule must control.
+        Goal components that a schedule must control.
     clearance
         As for any :class:`GaitMethod`.
     """

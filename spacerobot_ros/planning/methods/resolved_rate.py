@@ -1,16 +1,16 @@
-"""End-effectors along given lines while the base floats: resolved-rate motion.
+"""Resolved-rate motion of end-effectors along given lines while the base floats.
 
-At zero momentum the generalised Jacobian ``J*(q)`` maps the rates of the joints to the velocity of
+At zero momentum, the generalised Jacobian ``J*(q)`` maps joint rates to the velocity of
 an end-effector in the world (Umetani and Yoshida). The rates that move it along a line (straight,
-through waypoints, or a given path) are ``qdot = J*^+ xdot``. If ``J*`` loses rank, no rates do: a
-dynamic singularity. Whether the line meets one depends on the shape alone, which depends on
-the path that led there (paper 4, section V; path-dependent workspaces).
+through waypoints, or a given path) are ``qdot = J*^+ xdot``. If ``J*`` loses rank, there are no
+such rates: a dynamic singularity. Whether the line meets one depends only on the shape, which
+depends on the path that led there (paper 4, section V; path-dependent workspaces).
 
-The path is parametrised by its length, not by time: its tangent is a vector of the null space of
-``[J*, -x']``, which is finite up to the singularity, where the progress on the line becomes zero.
-The motion along the path is the fastest within the limits of velocity and acceleration (a linear
-program in the squares of the speed). Held commands move the shape on straight lines between ticks,
-so the shape at each tick is corrected until the end-effectors are on their lines.
+The path is parametrised by its length, not by time: its tangent is a vector in the null space of
+``[J*, -x']``, which is finite up to the singularity, where the progress along the line becomes
+zero. The motion along the path is the fastest within the velocity and acceleration limits (a linear
+program in the squared speed). Held commands move the shape along straight lines between
+ticks, so the shape at each tick is corrected until the end-effectors are on their lines.
 """
 
 from __future__ import annotations
@@ -58,13 +58,13 @@ from spacerobot_ros.planning.methods.optimal.problem import MotionLimits, Motion
 from spacerobot_ros.planning.methods.pose_path import PosePath, RoundedPath
 
 _TRACE_STEP = 0.02
-"""Longest step along a path of the joints, rad of the fastest one."""
+"""Longest step along a joint path, rad of the fastest joint."""
 
 _MIN_TRACE_STEPS = 20
 
 MIN_PROGRESS_RATE = 0.01
-"""Progress on the line below which a singularity is near: in reaches of the end-effector, per
-radian of the fastest joint."""
+"""Progress along the line below which a singularity is near, in end-effector reaches per radian of
+the fastest joint."""
 
 _ZERO_PROGRESS_RATE = 1e-8
 """Progress below which the path has reached the singularity."""
@@ -72,22 +72,22 @@ _ZERO_PROGRESS_RATE = 1e-8
 _SINGULARITY_STEP_SHARE = 0.25
 
 _KNOT_TOLERANCE = 1e-6
-"""Share of the way within which a jump of its curvature counts as passed."""
+"""Fraction of the way within which a curvature jump counts as passed."""
 
 _ZERO_DISTANCE = 1e-10  # m or rad
 
 _SAMPLED_SHAPES = 8
-"""Shapes in general position at which the freedom of the joints is examined."""
+"""Number of shapes in general position at which the joints' freedom is examined."""
 
 _PATH_LENGTH_SAMPLES = 200
 _TIMING_INTERVALS = 160
 _MAX_TIMING_INTERVALS = 1600
 
 _USED_ACCELERATION_SHARE = 0.99
-"""Share of the limits of acceleration for the path; corrections at the ticks may use the rest."""
+"""Fraction of the acceleration limits for the path; corrections at the ticks may use the rest."""
 
 _MAX_CORRECTION_ITERATIONS = 8
-"""Newton steps at a tick, and attempts to keep the limits with more ticks."""
+"""Newton steps per tick, and attempts to satisfy the limits with more ticks."""
 
 _LIMIT_ROUNDING = 1e-9
 """Largest excess over a limit: relative, or in joint coordinates."""
@@ -99,13 +99,13 @@ class ResolvedRateOptions(MotionOptions):
 
     keep_attitude: int = nonnegative(
         0,
-        "1: the base keeps its attitude (reaction null space), 0: its attitude is free",
+        "1: the base keeps its attitude (reaction null space), 0: base attitude is free",
         maximum=1,
     )
     waypoints: tuple[float, ...] = parameter(
         (),
-        "positions x, y, z in the world, one after the other, of a smooth path of the "
-        "end-effector to its goal; []: a straight line",
+        "successive positions x, y, z in the world on a smooth end-effector path to its goal; []: "
+        "a straight line",
         "m",
         minimum=-1e9,
         maximum=1e9,
@@ -113,7 +113,7 @@ class ResolvedRateOptions(MotionOptions):
     as_far_as_possible: int = nonnegative(
         0,
         "if a line meets a singularity, a joint limit or a contact: 1: stop shortly before, 0: "
-        "refuse the goal",
+        "reject the goal",
         maximum=1,
     )
     corner_tolerance: float = nonnegative(
@@ -152,23 +152,23 @@ class _SmoothPath:
         self._rate = self._place.derivative()
 
     def displacement(self, share: float) -> Array:
-        """Return the displacement (3,) after a share of the way."""
+        """Return the displacement (3,) after a fraction of the way."""
         return np.asarray(self._place(share))
 
     def displacement_derivative(self, share: float) -> Array:
-        """Return the derivative (3,) of the displacement by the share."""
+        """Return the derivative (3,) of the displacement with respect to the fraction."""
         return np.asarray(self._rate(share))
 
     def rotation(self, share: float) -> Array:
-        """Return the rotation (4,) since the start after a share of the way."""
+        """Return the rotation (4,) since the start after a fraction of the way."""
         return quaternion_from_rotvec(share * self._turn)
 
     def rotation_derivative(self, share: float) -> Array:
-        """Return the angular velocity (3,) by the share, rad."""
+        """Return the angular velocity (3,) with respect to the fraction, rad."""
         return self._turn
 
     def travelled_length(self, share: float) -> float:
-        """Return the length of the way, m, after a share of it."""
+        """Return the length of the way, m, after a fraction of it."""
         return share * self.length
 
 
@@ -189,7 +189,8 @@ class _LinkPath:
     path_from_start: _SmoothPath | RoundedPath
 
     def tracking_error(self, R: Array, r: Array, progress: float) -> Array:
-        """Return the errors (k + l,) of a pose to that after a share ``progress`` of the line."""
+        """Return the errors (k + l,) from a pose to that at the fraction ``progress`` of the
+        line."""
         target = quaternion_multiply(self.path_from_start.rotation(progress), self.start_attitude)
         found = quaternion_inverse(quaternion_from_matrix(R))
         rotation = rotvec_from_quaternion(quaternion_multiply(target, found))
@@ -244,7 +245,7 @@ class _LinkPaths:
         return np.asarray(np.concatenate(rates) * self._row_scales)
 
     def jacobian(self, q: Array, X: Array) -> Array:
-        """Return the rows (m, n) of J* in B_0, for a shape and a rotation (4,) of the base."""
+        """Return the rows (m, n) of J* in B_0, for a shape and a base rotation (4,)."""
         R_X = matrix_from_quaternion(X)
         rows = []
         for line in self._lines:
@@ -253,11 +254,11 @@ class _LinkPaths:
         return np.vstack(rows)
 
     def scaled_jacobian(self, q: Array, X: Array) -> Array:
-        """Return :meth:`jacobian` in radians of the fastest joint."""
+        """Return :meth:`jacobian` per radian of the fastest joint."""
         return np.asarray(self._row_scales[:, np.newaxis] * self.jacobian(q, X) * self.joint_scales)
 
     def least_correction(self, q: Array, X: Array, progress: float) -> tuple[Array, float]:
-        """Return the least motion (n,) of the joints to the lines, and the scaled error."""
+        """Return the least joint motion (n,) to the lines, and the scaled error."""
         R_X, missing = matrix_from_quaternion(X), []
         r_BC = self._robot.center_of_mass(q)
         for line in self._lines:
@@ -268,7 +269,7 @@ class _LinkPaths:
         return self.joint_scales * least, float(np.linalg.norm(miss))
 
     def tangent(self, q: Array, X: Array, share: float) -> tuple[Array, Array, float]:
-        """Return the path's tangent: (n,) of the shape, (4,) of the rotation, and the progress."""
+        """Return the path's tangent: Shape (n,), rotation (4,), and progress."""
         M = np.column_stack(
             [self.scaled_jacobian(q, X), -self._scaled_derivative(share) / self.length]
         )
@@ -283,7 +284,7 @@ class _LinkPaths:
         return u, X_rate, progress
 
     def singularity_measure(self, q: Array, X: Array) -> tuple[str, float]:
-        """Return the number that becomes zero at a singularity, with its name."""
+        """Return the value that becomes zero at a singularity, with its name."""
         J = self.jacobian(q, X)
         if J.shape[0] == J.shape[1]:
             return "|det J*|", abs(float(np.linalg.det(J)))
@@ -305,20 +306,20 @@ class _LinkPaths:
 
 @dataclass(frozen=True)
 class JointPath:
-    """A path of the shape that moves end-effectors along their lines.
+    """A shape path that moves end-effectors along their lines.
 
     Attributes
     ----------
     arc_length
-        (K,) length of the path of the joints so far, rad of the fastest joint.
+        (K,) length of the joint path so far, rad of the fastest joint.
     shapes
         (K, n) shapes, m or rad.
     turns
-        (K, 4) attitudes of the base relative to that at the start.
+        (K, 4) base attitudes relative to the initial attitude.
     path_fractions
-        (K,) shares of the lines, 0 to 1.
+        (K,) fractions of the lines, 0 to 1.
     progress_rate
-        (K,) progress on the lines per length of the path of the joints; zero at a singularity.
+        (K,) progress along the lines per length of the joint path; zero at a singularity.
     """
 
     arc_length: Array
@@ -329,11 +330,11 @@ class JointPath:
 
     @property
     def is_complete(self) -> bool:
-        """Whether the path leads to the ends of the lines."""
+        """Whether the path reaches the ends of the lines."""
         return bool(self.path_fractions[-1] == 1.0)
 
     def truncated(self, last: int) -> JointPath:
-        """Return the path up to and including one of its places."""
+        """Return the path up to and including one of its points."""
         parts = {each.name: getattr(self, each.name)[: last + 1] for each in fields(self)}
         return JointPath(**parts)
 
@@ -432,7 +433,7 @@ def _fastest_speeds(slopes: Array, bends: Array, limits: MotionLimits, interval:
         method="highs",
     )
     if found.x is None:
-        raise PlanningError("No motion along the line within the limits of the joints was found.")
+        raise PlanningError("No motion along the line was found within the joint limits.")
     return np.maximum(np.asarray(found.x, dtype=float), 0.0) * unit
 
 
@@ -462,7 +463,7 @@ class _TimedPath:
         return cls(path, time, speed, float(interval))
 
     def at_ticks(self, ticks: int) -> tuple[Array, Array]:
-        """Return the shapes (ticks + 1, n) and shares of the lines at equal intervals of time."""
+        """Return the shapes (ticks + 1, n) and fractions of the lines at equal time intervals."""
         from scipy.interpolate import CubicSpline
 
         t = np.linspace(0.0, self.time[-1], ticks + 1)
@@ -482,14 +483,14 @@ class _TimedPath:
 
 @dataclass(frozen=True)
 class PathProgress:
-    """How a schedule follows a given path.
+    """Progress of a schedule along a given path.
 
     Attributes
     ----------
     route
-        The path in W, from the place of the end-effector at the start.
+        The path in W, from the initial end-effector pose.
     travelled_lengths
-        (M + 1,) length of the route that is completed at the last M + 1 ticks, metres and radians.
+        (M + 1,) length of the route completed at the last M + 1 ticks, metres plus radians.
     """
 
     route: PosePath
@@ -499,9 +500,9 @@ class PathProgress:
 class ResolvedRateGait(GaitMethod):
     """End-effectors on straight lines, or along paths, to their goals, with the base free.
 
-    From rest to rest, as fast as the limits of the joints allow. Positions, or poses with a
-    rotation about one axis, of one end-effector or of several at once; along a given path, of one.
-    Lines that meet a dynamic singularity, a limit of a joint or a contact are refused, or followed
+    From rest to rest, as fast as the joint limits allow. Handles positions, or poses with a
+    rotation about one axis, of one end-effector or several at once; along a given path, only one.
+    Lines that meet a dynamic singularity, a joint limit or a contact are rejected, or followed
     until shortly before; ``optimal`` reaches most of their ends.
     """
 
@@ -516,7 +517,7 @@ class ResolvedRateGait(GaitMethod):
 
     @override
     def setup(self) -> None:
-        """Compute what depends on robot and options only; see :meth:`GaitMethod.setup`."""
+        """Compute what depends only on the robot and the options; see :meth:`GaitMethod.setup`."""
         self._limits = MotionLimits.of(self.robot, self.options, self.name)
         if len(self.options.waypoints) % 3:
             raise ParameterError(
@@ -527,7 +528,7 @@ class ResolvedRateGait(GaitMethod):
     @classmethod
     @override
     def require_suitable(cls, robot: SpaceRobot) -> None:
-        """Refuse robots without joints; see :meth:`GaitMethod.require_suitable`."""
+        """Reject robots without joints; see :meth:`GaitMethod.require_suitable`."""
         if robot.n == 0:
             name = robot.description.name
             raise PlanningError(f"Robot '{name}' has no joints that could move an end-effector.")
@@ -583,7 +584,7 @@ class ResolvedRateGait(GaitMethod):
         state, goal = request.state, request.goal
         if len(goal.end_effectors) > 1:
             raise PlanningError(
-                f"{self.name} moves one end-effector along a path, and the goal is for "
+                f"{self.name} moves one end-effector along a path, but the goal is for "
                 f"{len(goal.end_effectors)}: send their paths one after the other."
             )
         (aim,) = goal.end_effectors
@@ -663,9 +664,9 @@ class ResolvedRateGait(GaitMethod):
     def path(self, request: PlanRequest, cancellation: Cancellation = NEVER) -> JointPath:
         """Return the path along the lines of a goal, to their ends or to a singularity.
 
-        A path of the goal is ignored: the lines lead straight to its end.
+        A path in the goal is ignored: the lines lead straight to its end.
 
-        The result does not depend on the limits of the joints, which may end the motion earlier.
+        The result does not depend on joint limits, which may end the motion earlier.
 
         Raises
         ------
@@ -684,21 +685,21 @@ class ResolvedRateGait(GaitMethod):
             return np.zeros((0, 3))
         if len(goal.end_effectors) > 1:
             raise PlanningError(
-                f"{self.name}.waypoints are for one end-effector, and the goal is for "
-                f"{len(goal.end_effectors)}: give a goal of one, or leave them out."
+                f"{self.name}.waypoints are for one end-effector, but the goal is for "
+                f"{len(goal.end_effectors)}: give a goal for one, or omit the waypoints."
             )
         return np.reshape(self.options.waypoints, (-1, 3))
 
     def _require_goal_of_end_effectors(self, goal: Goal) -> None:
         if not goal.end_effectors:
             raise PlanningError(
-                f"{self.name} moves end-effectors along straight lines, and the goal is for the "
+                f"{self.name} moves end-effectors along straight lines, but the goal is for the "
                 "base: use optimal for it."
             )
         if goal.base or goal.joint_positions is not None:
             part = "the pose of the base" if goal.base else "joint positions"
             raise PlanningError(
-                f"{self.name} moves the joints along the line of the end-effector, and the goal "
+                f"{self.name} moves the joints along the line of the end-effector, but the goal "
                 f"also requests {part}: use optimal for both."
             )
 
@@ -767,10 +768,10 @@ class ResolvedRateGait(GaitMethod):
         wanted = len(matrices[0])
         if rank < wanted:
             names = " and ".join(f"'{each.link}'" for each in goal.end_effectors)
-            still = " with the attitude of the base kept" if self.options.keep_attitude else ""
-            less = ", or leave out resolved_rate.keep_attitude" if still else ""
+            still = " with the base attitude kept" if self.options.keep_attitude else ""
+            less = ", or omit resolved_rate.keep_attitude" if still else ""
             raise PlanningError(
-                f"The line of {names}{still} requires {wanted} independent coordinates, and the "
+                f"The line of {names}{still} requires {wanted} independent coordinates, but the "
                 f"joints of robot '{self.robot.description.name}' move no more than {rank}: "
                 f"request a position instead of a pose{less}."
             )
@@ -797,7 +798,7 @@ class ResolvedRateGait(GaitMethod):
         name, value = lines.singularity_measure(path.shapes[nearest], path.turns[nearest])
         first = lines.singularity_measure(path.shapes[0], path.turns[0])[1]
         shape = ", ".join(f"{x:.6g}" for x in path.shapes[nearest])
-        meets, least, there = "meets", "zero", "no rates of the joints continue the line"
+        meets, least, there = "meets", "zero", "no joint rates continue the line"
         if path.is_complete:
             meets, least = "comes near to", f"{value:.3g}"
             there = "the joints would have to move fast for little progress"
@@ -822,7 +823,7 @@ class ResolvedRateGait(GaitMethod):
                 return positions
             ticks = max(ticks + 1, math.ceil(ticks * factor))
         raise PlanningError(
-            f"Held commands of {period:g} s on the line do not keep the limits of the joints: a "
+            f"Held commands of {period:g} s along the line violate the joint limits: a "
             "higher tick_rate of the planner may help, or lower limits."
         )
 

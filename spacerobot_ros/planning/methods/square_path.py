@@ -1,17 +1,16 @@
-"""Planar chains, square paths in shape space: the reorientation of paper 3, section III.
+"""Square paths in shape space for planar chains: the reorientation of paper 3, section III.
 
-Step 1 brings the shape to the wanted one, ``psi_e``. Step 2 moves to the nearest corner of a
-square, step 3 goes around the square, step 4 returns along the path of step 2. The geometric phase
-of the square is the rotation of the base that remains after step 1; steps 2 and 4 cancel.
+Step 1 moves to the desired shape ``psi_e``. Step 2 moves to the nearest corner of a
+square, step 3 runs around the square, step 4 returns along the path of step 2. The geometric phase
+of the square is the base rotation that remains after step 1; steps 2 and 4 cancel.
 
-Every leg is a straight line of the shape from rest to rest; the paper's laws also start from joint
-rates that are not zero (its property 3), for which this method does not plan. The plant holds each
+Every leg is a straight line in shape space, from rest to rest; the paper's laws also start from
+nonzero joint rates (its property 3), for which this method does not plan. The plant holds each
 velocity for a tick: the shape then moves along the same straight lines with other speeds within a
-tick, and the geometric phase, which depends on the path alone, is that of the smooth motion
-exactly.
+tick, and the geometric phase, which depends only on the path, is exactly that of the smooth motion.
 
 The side ``z*`` of the square solves ``phase(z*) = wanted phase``; its centre ``psi*`` is where the
-curvature is largest, remark 2, among the centres around which it fits into the joint limits.
+curvature is largest, remark 2, among the centres around which it fits within the joint limits.
 """
 
 from __future__ import annotations
@@ -45,19 +44,20 @@ from spacerobot_ros.planning.methods.geometric_phase import (
 )
 
 _MIN_CORRECTED_SHARE = 0.1
-"""Share of the tolerance below which a remaining rotation is not corrected."""
+"""Fraction of the tolerance below which a remaining rotation is not corrected."""
 
 _ZERO_ROTATION_ANGLE = 1e-9
 
 _MAX_SIDE = math.pi
-"""rad. Over a revolution of both joints the curvature has mean zero: beyond about half a revolution
-a larger square adds curvature of the other sign."""
+"""rad. Over a revolution of both joints, the curvature has zero mean: beyond about half a
+revolution, a larger square adds curvature of opposite sign."""
 
 _SIDE_SAMPLES = 8
 """Number of tried sides between zero and the largest side that fits."""
 
 _USED_RANGE_SHARE = 1.0 - 1e-9
-"""Share of the free range used by the largest square: rounding must not put a corner beyond it."""
+"""Fraction of the free range used by the largest square: rounding must not put a corner beyond
+it."""
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,7 @@ class SquarePathOptions:
     )
     t3: float = parameter(
         20.0,
-        "end of step 3, one loop; more loops take as long each",
+        "end of step 3, one loop; each further loop takes as long",
         "s",
         minimum=1e-3,
         maximum=1e9,
@@ -89,7 +89,7 @@ class SquarePathOptions:
         0.0, "second coordinate of a given centre", "rad", minimum=-1000.0, maximum=1000.0
     )
     check_position: int = nonnegative(
-        0, "1: refuse goals whose position differs from the predicted one", maximum=1
+        0, "1: reject goals whose position differs from the predicted one", maximum=1
     )
     longest: float = parameter(3600.0, "longest permitted manoeuvre", "s", minimum=1.0, maximum=1e9)
 
@@ -140,9 +140,9 @@ class _SquareFamily:
 
 
 class SquarePathGait(GaitMethod):
-    """Controls attitude and shape of planar trees of three or more links with revolute joints.
+    """Controls the attitude and shape of planar trees with three or more links and revolute joints.
 
-    The base's position follows from both (the centre of mass rests) and cannot be chosen.
+    The base position follows from both (the centre of mass is at rest) and cannot be chosen.
     """
 
     name: ClassVar[str] = "square_path"
@@ -153,7 +153,7 @@ class SquarePathGait(GaitMethod):
 
     @override
     def setup(self) -> None:
-        """Compute what depends on robot and options only; see :meth:`GaitMethod.setup`."""
+        """Compute what depends only on the robot and the options; see :meth:`GaitMethod.setup`."""
         robot, chosen = self.robot, self.options
         t1, t2, t3, t4 = chosen.t1, chosen.t2, chosen.t3, chosen.t4
         instants = (0.0, t1, t2, t3, t4)
@@ -171,7 +171,7 @@ class SquarePathGait(GaitMethod):
     @classmethod
     @override
     def require_suitable(cls, robot: SpaceRobot) -> None:
-        """Refuse robots that are not planar, or have fewer than three links."""
+        """Reject robots that are not planar, or have fewer than three links."""
         planar_axis(robot)
 
     @override
@@ -203,8 +203,9 @@ class SquarePathGait(GaitMethod):
         if self.options.check_position and left.distance > tolerance.position:
             raise PlanningError(
                 f"The base will be at {np.round(path.position[-1], 4).tolist()} m, "
-                f"{left.distance:.3g} m from the goal position: without thrust, attitude and shape "
-                "determine where the base is; with check_position 0 the goal position is ignored."
+                f"{left.distance:.3g} m from the goal position: without thrust, attitude and "
+                "shape determine the base position; with check_position 0, the goal position is "
+                "ignored."
             )
         notes: Notes = {
             "psi_e": psi_e.tolist(),
@@ -322,7 +323,7 @@ class SquarePathGait(GaitMethod):
         if self._centre is not None:
             given = f" around the given centre {np.round(self._centre, 4).tolist()} rad"
         if largest is None:
-            return f"No square loop{given} fits into the joint limits."
+            return f"No square loop{given} fits within the joint limits."
         i, j = largest.pair
         names = self.robot.joint_names
         most = (

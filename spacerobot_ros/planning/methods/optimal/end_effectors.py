@@ -1,16 +1,17 @@
-"""End-effectors at the end of a motion: conditions on the last shape and attitude.
+"""End-effectors at the end of a motion: conditions on the final shape and attitude.
 
-At zero momentum the centre of mass C of the system rests, so the last shape q and the rotation X of
-the base since the start place every link E: relative to C, in the initial attitude B_0 of the base,
+At zero momentum, the system's centre of mass C is at rest, so the final shape q and the base
+rotation X since the start determine the pose of every link E: relative to C, in the initial
+attitude B_0 of the base,
 
 ``r_CE = X (r_BE(q) - r_BC(q))``,  ``R = X R_BE(q)``.
 
-A goal of an end-effector is a value of the first, or of both; the position of the base is treated
-as that of the base link. These are :class:`EndEffectorRows` of the optimal control problem, only
-along directions in which the joints can move the link. Its guesses end in shapes that inverse
-kinematics finds (:meth:`EndEffectorSpecification.boundary_conditions`), each with the rotation of
-the base on the direct path there (Umetani and Yoshida's generalised Jacobian), because the solver
-finds only the nearest minimum, and every family of shapes has its own.
+An end-effector goal is a value of the first, or of both; the base position is treated as that of
+the base link. These are :class:`EndEffectorRows` of the optimal control problem, only
+along directions in which the joints can move the link. Its guesses end in shapes found by inverse
+kinematics (:meth:`EndEffectorSpecification.boundary_conditions`), each with the base rotation along
+the direct path there (Umetani and Yoshida's generalised Jacobian), because the solver
+finds only the nearest minimum, and every family of shapes has a minimum of its own.
 """
 
 from __future__ import annotations
@@ -60,44 +61,45 @@ _SAMPLED_SHAPES = 8
 _SINGULAR_VALUE_TOLERANCE = 1e-7
 
 _MIN_MOTION = 1e-9
-"""Motion of a link per metre or radian of the joints that counts as zero, m or rad."""
+"""Link motion per metre or radian of the joints that counts as zero, m or rad."""
 
 _PARAMETERS_PER_LINK = 7
 """Number of values of a link's goal: r_CE and a quaternion."""
 
 _STARTS, _ADDITIONAL_STARTS = 16, 96
-"""Start shapes of inverse kinematics, and additional ones if none of these succeeds."""
+"""Number of start shapes for inverse kinematics, and of additional ones if none succeeds."""
 
 _ITERATIONS = 40
 """Steps of inverse kinematics."""
 
 _DAMPING = 1e-4
-"""Damping of the least squares of a step, relative to the largest entry of their matrix."""
+"""Least-squares damping in a step, relative to the largest matrix entry."""
 
 _END_ERROR = 2e-3
-"""Error of a shape that may be the end of a guess, m or rad: the solver brings it to the goal."""
+"""Largest error of a shape used as the end of a guess, m or rad: the solver brings it to the
+goal."""
 
 _DIRECT_PATH_STEPS = 12
 
 _MAX_STEP = 0.5  # m or rad
 
 _POSSIBLE_ENDS = 6
-"""Number of ends that guesses of the search have in turn."""
+"""Number of ends that the guesses of a search use in turn."""
 
 _MIN_END_DIFFERENCE = 0.05
-"""Ends nearer than this, as shares of the joints' ranges, count as equal."""
+"""Ends closer than this, as fractions of the joint ranges, are considered equal."""
 
 _DAMPING_OF_EXACT_ENDS = 1e-9
-"""The same if ends must meet their goals exactly."""
+"""Same threshold if ends must meet their goals exactly."""
 
 _GIVEN_SHAPE_ERROR = 1e-9
-"""Smallest error at which given joint positions contradict a goal of an end-effector, m or rad."""
+"""Smallest error at which given joint positions contradict an end-effector goal, m or rad."""
 
 
 @dataclass(frozen=True)
 class LinkDirections:
     """Directions, in B_0, along which the joints move a link: (k, 3) of its origin, (l, 3) of its
-    rotation; no rows of rotation if any attitude is allowed.
+    rotation; no rotation rows if any attitude is allowed.
     """
 
     link: str
@@ -106,16 +108,16 @@ class LinkDirections:
 
 
 class EndEffectorRows:
-    """Rows that vanish if links of one robot are at their goals.
+    """Rows that vanish if a robot's links are at their goals.
 
     Parameters
     ----------
     robot
         The model.
     links
-        Links, each with whether its attitude is part of the goal.
+        Links, each with a flag whether its attitude is part of the goal.
     axes
-        (m, 3) directions in the base about which loops of the joints rotate it.
+        (m, 3) directions in the base about which joint loops rotate it.
     """
 
     def __init__(self, robot: SpaceRobot, links: Sequence[tuple[str, bool]], axes: Array) -> None:
@@ -126,12 +128,13 @@ class EndEffectorRows:
 
     @cached_property
     def turn(self) -> ca.Function:
-        """How a step of the shape rotates the base (:func:`.turn_function`)."""
+        """Base rotation by a shape step (:func:`.turn_function`)."""
         return turn_function(self.robot)
 
     @cached_property
     def function(self) -> ca.Function:
-        """The rows, of SX: rotation (4,) of the base, shape (n,) and parameters (:meth:`pack`)."""
+        """The rows, a function of SX base rotation (4,), shape (n,) and parameters
+        (:meth:`pack`)."""
         X, q = ca.SX.sym("X", 4), ca.SX.sym("q", self.robot.n)
         parameters = ca.SX.sym("p", self.parameters)
         center = self.robot.function("center_of_mass", compile=False)(q)
@@ -149,7 +152,7 @@ class EndEffectorRows:
         return ca.Function("end_effectors", [X, q, parameters], [ca.vertcat(*rows)])
 
     def pack(self, state: RobotState, goals: Sequence[EndEffectorGoal]) -> Array:
-        """Return the parameters (7 k,) of goals: r_CE and the quaternion of E, both in B_0."""
+        """Return the goal parameters (7 k,): r_CE and the quaternion of E, both in B_0."""
         R_WB = matrix_from_quaternion(state.quaternion)
         r_WC = state.position + R_WB @ self.robot.center_of_mass(state.q)
         from_start = quaternion_inverse(state.quaternion)
@@ -176,8 +179,8 @@ class EndEffectorRows:
     def evaluate(self, X: Array, q: Array, parameters: Array) -> tuple[Array, Array, Array]:
         """Return rows (K, m) and their derivatives (K, m, 3) and (K, m, n) at K ends.
 
-        The derivatives are with respect to a rotation of the base, in its components, and to the
-        shape; ``X`` (K, 4) and ``q`` (K, n).
+        The derivatives are with respect to a base rotation, in base components, and to the shape;
+        ``X`` (K, 4) and ``q`` (K, n).
         """
         K = len(q)
         p = np.repeat(parameters[:, np.newaxis], K, axis=1)
@@ -197,9 +200,9 @@ class EndEffectorRows:
         return attitudes_along(self.turn, shapes, steps, steps)[:, -1]
 
     def rank(self, fixed_attitude: bool) -> tuple[int, int]:
-        """Return how many of the rows the joints move independently, and how many rows there are.
+        """Return how many of the rows the joints can move independently, and the number of rows.
 
-        They are counted at shapes in general position, with the attitude of the base given or free.
+        They are counted at shapes in general position, with the base attitude given or free.
         """
         shapes, turns = self._samples()
         nowhere = np.tile([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0], len(self.links))
@@ -211,14 +214,14 @@ class EndEffectorRows:
     def require_directions(
         self, state: RobotState, goals: Sequence[EndEffectorGoal], tolerance: tuple[float, float]
     ) -> None:
-        """Refuse goals off the directions in which the links can move.
+        """Reject goals off the directions in which the links can move.
 
-        ``tolerance`` is that of positions, m, and of attitudes, rad.
+        ``tolerance`` applies to positions, m, and attitudes, rad.
 
         Raises
         ------
         UnreachableError
-            The goal needs a motion of a link off these directions.
+            The goal requires link motion off these directions.
         """
         R_WB = matrix_from_quaternion(state.quaternion)
         name = self.robot.description.name
@@ -232,7 +235,7 @@ class EndEffectorRows:
                 where = {0: "does not move", 1: "moves along one line", 2: "moves in one plane"}
                 raise UnreachableError(
                     f"The end-effector '{each.link}' of robot '{name}' "
-                    f"{where[len(each.displacements)]} whatever the joints do, and its goal is "
+                    f"{where[len(each.displacements)]} for any joint motion, but its goal is "
                     f"{beside:.3g} m away from there.",
                     Proof.RANK,
                 )
@@ -245,7 +248,7 @@ class EndEffectorRows:
                 where = {0: "does not rotate", 1: "rotates about one axis"}
                 raise UnreachableError(
                     f"The end-effector '{each.link}' of robot '{name}' "
-                    f"{where[len(each.rotations)]} whatever the joints do, and its goal is tilted "
+                    f"{where[len(each.rotations)]} for any joint motion, but its goal is tilted "
                     f"by {swing:.3g} rad from there.",
                     Proof.RANK,
                 )
@@ -288,19 +291,20 @@ def _span(vectors: Array) -> Array:
 
 @dataclass(frozen=True)
 class EndEffectorSpecification:
-    """The parts of goals of end-effectors that one robot's manoeuvres reach.
+    """End-effector goal components reached by one robot's manoeuvres.
 
     Attributes
     ----------
     rows
-        Rows of the end-effectors, and of the base link if its position is requested.
+        Rows for the end-effectors, and for the base link if its position is requested.
     base
         How the joints rotate the base.
     attitude, position, shape
-        Whether attitude and position of the base, and joint positions are parts of the goal.
+        Whether base attitude, base position and joint positions are part of the goal.
     overdetermined
-        Whether the goal has more coordinates than the joints move independently. Hardly any such
-        goal can be reached, and only in single shapes, which inverse kinematics finds before the
+        Whether the goal has more coordinates than the joints can move independently. Hardly any
+        such
+        goal can be reached, and only in isolated shapes, which inverse kinematics finds before the
         motion is planned.
     """
 
@@ -313,12 +317,12 @@ class EndEffectorSpecification:
 
     @classmethod
     def of(cls, robot: SpaceRobot, base: GoalSpecification, goal: Goal) -> EndEffectorSpecification:
-        """Return the specification for goals with the parts of this one.
+        """Return the specification for goals with the components of this goal.
 
         Raises
         ------
         GoalError
-            There is no such link, or it is the base.
+            The link does not exist, or is the base.
         """
         goal = goal.for_robot(robot.description)
         attitude, position = "attitude" in goal.base, "position" in goal.base
@@ -333,7 +337,7 @@ class EndEffectorSpecification:
 
     @staticmethod
     def key(goal: Goal) -> tuple[object, ...]:
-        """Return a key that is the same for goals with the same parts."""
+        """Return a key that is equal for goals with the same components."""
         links = ((each.link, each.quaternion is not None) for each in goal.end_effectors)
         return (*links, goal.base, goal.joint_positions is not None)
 
@@ -354,16 +358,16 @@ class EndEffectorSpecification:
 
     @property
     def axes(self) -> Array:
-        """Directions (m, 3) in the base along which its attitude must be reached."""
+        """Directions (m, 3) in the base along which the base attitude must be reached."""
         if self.ends_in_one_shape:
             return self.rows.axes
         return self.base.base_rotations.axes if self.attitude else np.zeros((0, 3))
 
     @property
     def rows_at_end(self) -> EndEffectorRows | None:
-        """The rows of the optimal control problem; none if it ends in one shape.
+        """Rows of the optimal control problem; none if it ends in a single shape.
 
-        The attitude that belongs to the shape is then that of the goal.
+        The goal attitude is then the one that belongs to the shape.
         """
         return None if self.ends_in_one_shape else self.rows
 
@@ -376,14 +380,14 @@ class EndEffectorSpecification:
     ) -> BoundaryConditions:
         """Return the boundary conditions of a request, with possible ends for guesses.
 
-        The arguments are those of :meth:`GoalSpecification.boundary_conditions`.
+        The arguments are as in :meth:`GoalSpecification.boundary_conditions`.
 
         Raises
         ------
         UnreachableError
-            A part of the goal is out of the robot's reach.
+            A goal component is out of the robot's reach.
         NotFoundError
-            No shape with the end-effectors at their goals was found.
+            No shape that puts the end-effectors at their goals was found.
         PlanningError
             The method does not plan for such a goal.
         """
@@ -457,8 +461,8 @@ class EndEffectorSpecification:
         values, _, _ = self.rows.evaluate(X[np.newaxis], shape[np.newaxis], parameters)
         if np.abs(values).max(initial=0.0) > most:
             raise UnreachableError(
-                f"With the joint positions of the goal no attitude of the base puts the "
-                f"end-effectors nearer than {np.linalg.norm(values):.3g} m or rad to their goals: "
+                f"With the goal's joint positions, no base attitude puts the end-effectors closer "
+                f"than {np.linalg.norm(values):.3g} m or rad to their goals: "
                 "the centre of mass stays where it is. Leave the joint positions out.",
                 Proof.MOMENTUM,
             )
@@ -527,12 +531,12 @@ class EndEffectorSpecification:
         robot = self.rows.robot.description.name
         names = " and ".join(f"'{link}'" for link, _ in self.rows.links)
         remedy = (
-            "A nearer goal, a position instead of a pose, or more freedom of the base may help."
+            "A closer goal, a position instead of a pose, or more freedom for the base may help."
         )
         if self.overdetermined:
             rank, count = self.rows.rank(self.attitude)
             remedy = (
-                f"The goal requires {count} independent coordinates, and the joints move no more "
+                f"The goal requires {count} independent coordinates, but the joints move no more "
                 f"than {rank}: request a position instead of a pose, or less of the base."
             )
         return NotFoundError(

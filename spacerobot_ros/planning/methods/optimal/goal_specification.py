@@ -1,7 +1,7 @@
-"""Goal specification: the parts of a goal to be reached, and whether the joints can reach them.
+"""Goal specification: the goal components to be reached, and whether the joints can reach them.
 
 At zero momentum ``omega_WB_B = F(q) qdot``. If all columns of F are along one axis, the base
-rotates about that axis only. Otherwise the brackets of the columns span all rotations, provided
+rotates only about that axis. Otherwise the brackets of the columns span all rotations, provided
 that the curvature of the connection is not zero everywhere (paper 1, section 4).
 """
 
@@ -47,12 +47,12 @@ _SINGULAR_VALUE_TOLERANCE = 1e-7
 _AXIS_TOLERANCE = 1e-6
 
 _MIN_BASE_TURN = 1e-12
-"""Rotation of the base per metre or radian of the joints that counts as zero, rad."""
+"""Base rotation per metre or radian of the joints that counts as zero, rad."""
 
 _MAX_SHAPE_GUESSES = 8
 
 _INTEGRATION_STEPS, _INTEGRATION_ERROR = 1000, 1e-5
-"""Steps of the integration of the rotation by one joint, and its largest error, rad."""
+"""Integration steps for the rotation by one joint, and the largest error, rad."""
 
 _JOINT_LIMIT_ROUNDING = 1e-9  # m or rad
 
@@ -64,14 +64,14 @@ _POSITION_TOLERANCE = 1e-10  # m
 
 @dataclass(frozen=True)
 class GoalSpecification:
-    """The parts of goals that manoeuvres of one robot control.
+    """Goal components controlled by one robot's manoeuvres.
 
     Attributes
     ----------
     position, attitude
         Whether these are controlled.
     same_shape
-        Whether goals without a shape end in the shape at the start.
+        Whether goals without a shape end in the initial shape.
     base_rotations
         How the joints rotate the base.
     """
@@ -83,7 +83,7 @@ class GoalSpecification:
 
     @classmethod
     def of(cls, robot: SpaceRobot, options: OptimalOptions) -> GoalSpecification:
-        """Return the goal specification of a robot by the options."""
+        """Return a robot's goal specification according to the options."""
         position = options.base_position == 1
         if options.base_position == 0:
             position = slides_anywhere(robot)
@@ -110,12 +110,12 @@ class GoalSpecification:
         return self.base_rotations.axes if self.attitude else np.zeros((0, 3))
 
     def require_suitable(self, robot: SpaceRobot) -> None:
-        """Refuse a robot that can reach no goal in the controlled parts.
+        """Reject a robot that cannot reach any goal in the controlled components.
 
         Raises
         ------
         PlanningError
-            The robot can reach none; the message says why.
+            The robot cannot reach any; the message says why.
         """
         name = robot.description.name
         if robot.n == 0:
@@ -123,8 +123,8 @@ class GoalSpecification:
         if self.attitude and self.base_rotations.turns_base and not len(self.base_rotations.axes):
             raise PlanningError(
                 f"The attitude of robot '{name}' is uncontrollable: its joints rotate its base "
-                "along one curve of attitudes only; with "
-                "optimal.base_attitude 0 the attitude of the goal is ignored."
+                "along one curve of attitudes only; with optimal.base_attitude 0, the goal "
+                "attitude is ignored."
             )
 
     def boundary_conditions(
@@ -139,16 +139,16 @@ class GoalSpecification:
         Parameters
         ----------
         robot, request, limits
-            The model, the request, and the limits of its motion.
+            The model, the request, and the motion limits.
         shape
             (n,) of the goal, within the joint limits; None: any.
 
         Raises
         ------
         UnreachableError
-            A part of the goal is out of the robot's reach.
+            A goal component is out of the robot's reach.
         NotFoundError
-            No shape with the base at its goal was found.
+            No shape that puts the base at its goal was found.
         PlanningError
             The method does not plan for such a goal.
         """
@@ -173,7 +173,7 @@ class GoalSpecification:
             return BoundaryConditions(state.q, turn, likely, shape)
         if not self.attitude:
             raise PlanningError(
-                "The position of the base depends on its attitude: optimal reaches it together "
+                "The base position depends on its attitude: optimal reaches it together "
                 "with the attitude (optimal.base_attitude 1)."
             )
         # The centre of mass r + R c(q) is fixed, which determines c(q_f).
@@ -184,7 +184,8 @@ class GoalSpecification:
             miss = float(np.linalg.norm(robot.center_of_mass(shape) - center))
             if miss > tolerance.position:
                 raise UnreachableError(
-                    f"Attitude and shape of the goal put the base {miss:.3g} m from its position: "
+                    f"The goal attitude and shape put the base {miss:.3g} m from the goal "
+                    "position: "
                     "without thrust the centre of mass stays where it is. Leave the shape out, or "
                     "ignore the position with optimal.base_position 2.",
                     Proof.MOMENTUM,
@@ -200,7 +201,8 @@ class GoalSpecification:
         return BoundaryConditions(state.q, turn, likely, center=center)
 
     def require_turning_with_drift(self, robot: SpaceRobot, state: RobotState) -> None:
-        """Refuse drifting robots whose joints rotate the base about no axis or about another one.
+        """Reject drifting robots whose joints do not rotate the base, or rotate it about another
+        axis.
 
         Raises
         ------
@@ -226,12 +228,12 @@ class GoalSpecification:
             if off > _AXIS_TOLERANCE:
                 raise PlanningError(
                     f"{drifts}, which rotates its base about an axis other than that of its "
-                    "joints: no joint motion stops that. With "
-                    "optimal.base_attitude 0 the attitude of the goal is ignored."
+                    "joints: no joint motion stops that. With optimal.base_attitude 0, the goal "
+                    "attitude is ignored."
                 )
 
     def require_reachable_turn(self, robot: SpaceRobot, turn: Array, tolerance: float) -> None:
-        """Refuse attitudes that the joints cannot reach."""
+        """Reject attitudes that the joints cannot reach."""
         axes, name = self.base_rotations.axes, robot.description.name
         tilt = swing_angle(turn, axes)
         if tilt > max(tolerance, _ZERO_ROTATION_ANGLE):
@@ -267,18 +269,18 @@ class GoalSpecification:
 
 @dataclass(frozen=True)
 class BaseRotations:
-    """The rotations of the base that motions of the joints cause.
+    """Base rotations caused by joint motions.
 
     Attributes
     ----------
     axes
         (m, 3) in base components: one unit vector for a planar robot, the unit matrix if all
-        attitudes can be reached, none if the joints do not rotate the base or only back and forth
-        along one curve of attitudes.
+        attitudes can be reached, none if the joints do not rotate the base, or only back and forth
+        along one attitude curve.
     turns_base
         Whether joints rotate the base at all.
     loops_turn_base
-        Whether closed loops of the shape rotate it.
+        Whether closed shape loops rotate the base.
     """
 
     axes: Array
@@ -339,7 +341,7 @@ def _require_within_one_joint(
 
 
 def slides_anywhere(robot: SpaceRobot) -> bool:
-    """Whether sliders can put the base anywhere: their slots are along three directions."""
+    """Whether sliders can put the base anywhere, because their slots are along three directions."""
     try:
         require_three_slots(
             robot, slot_matrix(robot, np.mean(shape_box(robot), axis=0), sliders_of(robot))
@@ -358,14 +360,14 @@ def center_rate(robot: SpaceRobot, q: Array) -> Array:
 def shape_for_center(
     robot: SpaceRobot, limits: MotionLimits, start: Array, wanted: Array, enough: float
 ) -> Array:
-    """Return the shape (n,), near ``start``, whose centre of mass is at ``wanted`` (3,), m, in B.
+    """Return the shape (n,) near ``start`` whose centre of mass is at ``wanted`` (3,), m, in B.
 
-    If there is none, it may be ``enough`` (m) off.
+    If there is none, the centre of mass may be off by ``enough``, m.
 
     Raises
     ------
     UnreachableError
-        There is none within the limits: the base cannot reach the goal position.
+        There is no such shape within the limits: the base cannot reach the goal position.
     NotFoundError
         None was found.
     """
@@ -433,11 +435,11 @@ def _unreachable_center_error(
             f"No shape of '{name}' that puts the base at the goal position was found from "
             f"{_MAX_SHAPE_GUESSES} starts: without thrust the centre of mass stays where it is, "
             "and the nearest shape that was found puts the base "
-            f"{distance:.3g} m from it. A nearer position, "
-            "another attitude, or optimal.base_position 2, which ignores the position, may help."
+            f"{distance:.3g} m from it. A closer position, another attitude, or "
+            "optimal.base_position 2, which ignores the position, may help."
         )
     return UnreachableError(
         "The goal position is out of reach: without thrust the centre of mass stays where it is, "
-        f"and the joints of '{name}' put the base no nearer than {gap:.3g} m to it.",
+        f"and the joints of '{name}' bring the base no closer to it than {gap:.3g} m.",
         Proof.LIMITS,
     )

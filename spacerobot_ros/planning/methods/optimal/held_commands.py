@@ -1,17 +1,19 @@
-"""Converts smooth trajectories to commands held for a tick that end at the goal exactly.
+"""Converts smooth trajectories to commands, each held for a tick, that end exactly at the goal.
 
-The shapes at the ticks are points of the trajectory; between them the shape moves along chords,
-with velocities that are means over a tick. So joints, velocities and accelerations keep their
-limits, but the areas of the chords' loops are not quite those of the curves, nor is the solution's
-attitude that of the plant's integration. Newton's method adds a few smooth waves to the path until
-the plant's own prediction ends on the goal. The first variation of the final attitude is
+The shapes at the ticks are points on the trajectory; between them, the shape moves along chords,
+with velocities averaged over a tick. So joints, velocities and accelerations stay within
+their limits, but chord loops enclose slightly different areas than the curves, and the solution's
+attitude differs slightly from the plant's integration. Newton's method adds a few smooth waves to
+the path until
+the plant's own prediction ends at the goal. The first variation of the final attitude is
 
 ``eta = R_f' sum_k R_k K(q_k)(dq_k, q_k' dt)``,  K the curvature of the connection,
 
 for a change ``dq`` that vanishes at both ends, and more terms if the robot drifts
-(:class:`DriftVariation`). If that needs more speed or acceleration than the limits allow, a
-quadratic program finds the smallest change of the commands that keeps them. Its unknowns are the
-changes of all shapes at the ticks; the end is linear in them to first order, and a few successive
+(:class:`DriftVariation`). If this needs more speed or acceleration than the limits allow, a
+quadratic program finds the smallest change in the commands that stays within them. Its unknowns are
+the
+changes in all shapes at the ticks; to first order, the end is linear in them, and a few successive
 programs reach it (sequential quadratic programming). Otherwise the manoeuvre takes a few
 ticks longer.
 
@@ -55,14 +57,14 @@ _WAVES_PER_JOINT = 6
 _ATTITUDE_TOLERANCE = 1e-11  # rad
 _MAX_NEWTON_STEPS = 25
 _MAX_STRETCH_FACTOR = 1.25
-"""Largest factor that stretches a manoeuvre to keep its limits; otherwise other starts are
+"""Largest factor by which a manoeuvre is stretched to meet its limits; beyond it, other starts are
 better."""
 
 _MAX_PROGRAMS = 4
-"""Number of durations, in ticks, for which all shapes are changed in turn to keep the limits."""
+"""Number of durations, in ticks, tried in turn with all shapes changed to meet the limits."""
 
 _PROGRAM_STRETCH = 1.01
-"""Factor between them, rounded up to a tick."""
+"""Factor between these durations, rounded up to a tick."""
 
 _MAX_PROGRAMS_IN_TURN = 6
 _FIT_TOLERANCE = 1e-5
@@ -72,18 +74,18 @@ _MIN_SMOOTH_TICKS = 20
 """Smallest number of ticks of a smooth manoeuvre; shorter manoeuvres are polygons."""
 
 _TICK_ROUNDING = 0.02
-"""Share of a tick by which a solver's duration may miss a whole number of ticks."""
+"""Fraction of a tick by which a solver's duration may miss a whole number of ticks."""
 
 _LIMIT_ROUNDING = 1e-9
 
 _FADING_ZONE = 0.02
-"""Distance from the ends of a joint's range, in half ranges, within which waves are smaller."""
+"""Distance from the ends of a joint's range, in half ranges, within which waves are reduced."""
 
 
 @dataclass(frozen=True)
 class HeldCommands:
-    """Shapes ``positions`` (N + 1, n) at the ticks, and the attitudes ``quaternions`` (N + 1, 4)
-    that they cause, from the initial one.
+    """Shapes ``positions`` (N + 1, n) at the ticks, and the resulting attitudes ``quaternions`` (N
+    + 1, 4), relative to the initial attitude.
     """
 
     positions: Array
@@ -97,13 +99,13 @@ class ManoeuvreModel:
     Attributes
     ----------
     robot, prediction, control_period
-        The model, the prediction of the base motion, and the duration of a command, s.
+        The model, the base motion prediction, and the command duration, s.
     axes
         (m, 3) directions in the base along which the attitude is reached.
     constraints, efforts, distances
-        Constraints of the path; efforts, distances None: unlimited.
+        Path constraints; efforts and distances are unlimited if None.
     end_effectors
-        Rows of the end-effectors that must be reached; None: none.
+        Rows for the end-effector goals that must be reached; None: none.
     """
 
     robot: SpaceRobot
@@ -124,12 +126,12 @@ class ManoeuvreModel:
         fixed: bool = False,
         before: Array | float | None = None,
     ) -> HeldCommands | None:
-        """Return the commands of a trajectory that end in the shape and attitude of the goal.
+        """Return commands for a trajectory that end at the goal shape and attitude.
 
-        They take the trajectory's time, rounded up to ticks, or longer if needed to keep the limits
+        They take the trajectory's time, rounded up to ticks, or longer if required by the limits
         (``fixed``: not longer); None if none are found. If the boundary conditions leave the last
-        shape free, it is the trajectory's, or one near to it. ``before`` are the velocities (n,)
-        that are held until then; None: those of the boundary conditions.
+        shape free, it is the trajectory's, or close to it. ``before`` are the velocities (n,)
+        held until then; None: as in the boundary conditions.
         """
         before = boundary.velocity if before is None else before
         final = np.clip(trajectory.shapes[-1], limits.lower, limits.upper)
@@ -248,10 +250,11 @@ class ManoeuvreModel:
     def corrected_end(
         self, trajectory: Trajectory, boundary: BoundaryConditions, ticks: int
     ) -> BoundaryConditions:
-        """Return boundary conditions whose solution ends at the goal as commands of ``ticks``.
+        """Return boundary conditions whose solution ends at the goal when converted to commands of
+        ``ticks``.
 
-        The goal attitude is rotated by the difference between the end of a trajectory and that of
-        its commands. If the robot drifts, the solver's attitude is of order two only.
+        The goal attitude is rotated by the difference between the end attitudes of a trajectory and
+        of its commands. If the robot drifts, the solver's attitude is only of second order.
         """
         reached = self._attitudes(trajectory.at_ticks(ticks), boundary)[-1]
         error = quaternion_from_rotvec(attitude_error(reached, trajectory.quaternions[-1]))
@@ -379,14 +382,14 @@ def _speeds_and_half_ranges(q: Array, limits: MotionLimits) -> tuple[Array, Arra
 
 
 class DriftVariation:
-    """The first variation of the attitude of a robot whose angular momentum is not zero.
+    """First variation of the attitude of a robot with nonzero angular momentum.
 
     With ``w = D^-1 (L_B - D_q q')``, ``L_B = R' L``, ``A = D^-1 D_q`` and ``xi = R (eta + A dq)``,
 
     ``xi' = R (K(dq, q') + G dq + D^-1 (L_B x R' xi))``,
     ``G dq = d(D^-1 L_B)/dq dq + (D^-1 L_B) x A dq - D^-1 (L_B x A dq)``,
 
-    where K is the curvature, as it is at zero momentum.
+    where K is the curvature as at zero momentum.
     """
 
     def __init__(self, robot: SpaceRobot) -> None:
@@ -400,10 +403,10 @@ class DriftVariation:
         self._n = robot.n
 
     def carried(self, shapes: Array, L_B: Array, R: Array, turned: Array, duration: float) -> Array:
-        """Return xi (K, 3, n) at the end of K steps of a duration, s, by the changes dq of each.
+        """Return xi (K, 3, n) at the end of K steps of a duration, s, due to the change dq in each.
 
-        ``shapes`` (K, n), ``L_B`` (K, 3) and ``R`` (K, 3, 3) are those of the steps, and ``turned``
-        (K, 3, n) the contribution of curvature to xi in each.
+        ``shapes`` (K, n), ``L_B`` (K, 3) and ``R`` (K, 3, 3) are the values at the steps, and
+        ``turned`` (K, 3, n) the contribution of curvature to xi in each.
         """
         columns = (each.full().T for each in self._function(shapes.T, L_B.T))
         G, M = (each.reshape(len(shapes), -1, 3).transpose(0, 2, 1) for each in columns)
@@ -422,7 +425,7 @@ class DriftVariation:
 # -- the least change of commands -----------------------------------------------------------------
 
 _LIMIT_RESERVE = 1e-4
-"""Share of velocity and acceleration limits that is reserved for the last, small correction."""
+"""Fraction of the velocity and acceleration limits reserved for the last, small correction."""
 
 _OPTIONS = {
     "error_on_fail": False,
@@ -450,20 +453,22 @@ def least_change(
     *,
     moves_end: bool,
 ) -> Array | None:
-    """Return the smallest change (N + 1, n) of shapes at ticks such that they keep all limits.
+    """Return the smallest change (N + 1, n) in the shapes at ticks such that all limits are
+    satisfied.
 
     Parameters
     ----------
     positions
         (N + 1, n) shapes at the ticks, m or rad; the first one is fixed.
     rows, error
-        (m, N + 1, n) derivatives of m numbers at the end by the shapes, and their change (m,).
+        (m, N + 1, n) derivatives of m end values with respect to the shapes, and their required
+        change (m,).
     limits
         Limits of the joints.
     period
         Between ticks, s.
     before, after
-        (n,) velocities that are held until the start, and from the end on.
+        (n,) velocities held until the start, and after the end.
     moves_end
         Whether the last shape may change.
 

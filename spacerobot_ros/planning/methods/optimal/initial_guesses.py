@@ -1,10 +1,11 @@
-"""Initial guesses of the search for a manoeuvre: loops on the direct path.
+"""Initial guesses for the manoeuvre search: loops on the direct path.
 
-A path that only goes from one shape to the other is a saddle: to first order no small change of it
-rotates the base differently. So guesses are the direct path with loops, sized such that their areas
-times the curvature are about the wanted rotation. The loops are those of the papers, a cycle of
-three frequencies (paper 1, section 5) and a square (paper 3, section III), and random trigonometric
-ones.
+A path that leads directly from one shape to the other is a saddle: to first order, no small path
+change alters the base rotation. So guesses are the direct path with loops, sized such that their
+areas
+times the curvature are about the desired rotation. The loops are taken from the papers, a cycle of
+three frequencies (paper 1, section 5) and a square (paper 3, section III), or are random and
+trigonometric.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ from spacerobot_ros.planning.methods.optimal.problem import (
 )
 
 _CANDIDATES_PER_GUESS = 24
-"""Number of random loops of one kind, of which the nearest to the goal is the guess."""
+"""Number of random loops of one kind, of which the one closest to the goal becomes the guess."""
 
 _MIN_LOOP_SIZE = 0.1
 """Smallest size of loops on the path to a possible end, in half ranges, after the first guess."""
@@ -44,10 +45,10 @@ _MIN_LOOP_SIZE = 0.1
 _MAX_RANGE_SHARE = 0.85
 
 _MAX_COASTING_SHARE = 0.6
-"""Largest share of a guess in which the joints rest first while the base drifts."""
+"""Largest fraction of a guess during which the joints rest first while the base drifts."""
 
 _LEAST_TURN_TIME, _TURN_STRETCHES = 0.5, tuple(1.15**k for k in range(16))
-"""Shortest guess with reaction wheels, s, and the factors by which others are longer."""
+"""Shortest guess with reaction wheels, s, and the factors by which other guesses are longer."""
 
 _TURNED_GUESSES = 3
 
@@ -65,11 +66,11 @@ class InitialGuesses:
     Parameters
     ----------
     turn
-        Function of a step (:func:`turn_function`), drifting if there is an angular momentum.
+        Step function (:func:`turn_function`), for drifting robots if there is angular momentum.
     curvature
-        Function ``q -> K`` of the model.
+        Model function ``q -> K``.
     angular_momentum
-        (3,) total, in the base at the start, kg m^2/s; None: zero.
+        (3,) total angular momentum, in the initial base frame, kg m^2/s; None: zero.
     """
 
     def __init__(
@@ -123,8 +124,8 @@ class InitialGuesses:
     ) -> Iterator[Trajectory]:
         """Yield guesses in which reaction wheels rotate the base to its goal.
 
-        The base rotates about a fixed axis, in either direction, from its present rate to rest; the
-        other joints move to their last shape, later with loops on the way; and the wheel rates
+        The base rotates about a fixed axis, in either direction, from its current rate to rest; the
+        other joints move to their final shape, later with loops on the way; and the wheel rates
         follow from the momentum.
         """
         direct = self._direct_path(boundary.start, boundary.likely_final_shape)
@@ -323,7 +324,7 @@ class InitialGuesses:
     def with_initial_velocity(
         self, guess: Trajectory, velocity: Array, limits: MotionLimits
     ) -> Trajectory:
-        """Return a guess from rest, changed so that it begins with a velocity (n,)."""
+        """Return a guess from rest, modified to begin with a velocity (n,)."""
         brakes = float((np.abs(velocity) / limits.acceleration).max(initial=0.0))
         back = min(guess.duration, _BRAKING_TIME_FACTOR * brakes)
         if back == 0:

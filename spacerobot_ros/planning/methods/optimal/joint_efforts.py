@@ -1,8 +1,9 @@
-"""Joint efforts of a motion, and their limits.
+"""Joint efforts during a motion, and their limits.
 
-The efforts of held commands (:class:`.JointEfforts`) are those of servos that follow them; if the
-plant is driven by efforts, they are a controller's command without its feedback. At zero momentum
-efforts are quadratic in the speed: a motion whose efforts are f^2 times their limits keeps the
+The efforts under held commands (:class:`.JointEfforts`) are those of servos that follow the
+commands; if the plant is driven by efforts, they are a controller's command without feedback. At
+zero momentum,
+efforts are quadratic in the speed: a motion whose efforts are f^2 times their limits satisfies the
 limits if it takes f times as long.
 """
 
@@ -25,18 +26,18 @@ from spacerobot_ros.planning.methods.optimal.problem import (
 )
 
 _PLANNED_EFFORT_SHARE = 0.98
-"""Share of the limits that a solution uses: the rest is for changes of its path."""
+"""Fraction of the limits that a solution uses: the rest is for path changes."""
 
 
 class LimitedEfforts(JointEfforts):
-    """The efforts of one robot, within limits that manoeuvres keep.
+    """Efforts of one robot, with limits that manoeuvres must satisfy.
 
-    Parameters are those of :class:`JointEfforts`.
+    Parameters are as in :class:`JointEfforts`.
 
     Raises
     ------
     ParameterError
-        The effort limit of a joint is not positive.
+        A joint effort limit is not positive.
     """
 
     def __init__(self, robot: SpaceRobot, limit: Array, control_period: float) -> None:
@@ -44,7 +45,7 @@ class LimitedEfforts(JointEfforts):
             if not value > 0:
                 raise ParameterError(
                     f"Joint '{name}' is limited to an effort of {value:g}, which moves nothing; "
-                    "with optimal.effort_limits 2 efforts are not limited."
+                    "with optimal.effort_limits 2, efforts are not limited."
                 )
         super().__init__(robot, limit, control_period)
 
@@ -52,7 +53,7 @@ class LimitedEfforts(JointEfforts):
     def of(
         cls, robot: SpaceRobot, options: OptimalOptions, control_period: float
     ) -> LimitedEfforts | None:
-        """Return the efforts that the options limit; None: none."""
+        """Return the efforts limited by the options; None: none."""
         if options.effort_limits == 2:
             return None
         limit = robot.effort_limit.copy()

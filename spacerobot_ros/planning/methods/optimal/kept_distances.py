@@ -1,10 +1,10 @@
-"""Pairs of links, and of links and obstacles, that a solver keeps apart: only those that come near
-in a solution without them.
+"""Pairs of links, and of links and obstacles, that a solver keeps apart: only those that come too
+close in a solution without them.
 
-Rows for all pairs would be expensive, and few of them matter. So a problem is solved without any
-first. If the exact check finds links too near in held commands, their pairs get rows: their
-distances from planes between them (:mod:`spacerobot_ros.collision.planes`), which are valid only
-near the path for which they are made.
+Rows for all pairs would be expensive, and few of them matter. So a problem is first solved without
+any. If the exact check finds links too close under held commands, rows are added for their pairs:
+their distances from planes between them (:mod:`spacerobot_ros.collision.planes`), which are valid
+only near the path for which they were computed.
 """
 
 from __future__ import annotations
@@ -30,32 +30,32 @@ from spacerobot_ros.planning.methods.optimal.problem import (
 )
 
 _INITIAL_MARGIN = 2e-3
-"""Room beyond the clearance that a pair is given: held commands change the path, m."""
+"""Room beyond the clearance that is added for a pair, because held commands change the path, m."""
 
 _NO_TURN = np.array([0.0, 0.0, 0.0, 1.0])
 
 _MIN_INSTANTS = 80
-"""Smallest number of instants of a manoeuvre at which links are kept apart: between the knots of a
-coarse grid they would come too near."""
+"""Smallest number of instants in a manoeuvre at which links are kept apart: between the knots of a
+coarse grid, they would come too close."""
 
 _SHARE_OF_ENDS = 0.1
-"""Share of a path at an end with a given shape where pairs need not have room."""
+"""Fraction of a path, at an end with a given shape, where pairs need not have room."""
 
 
 def instants_of(intervals: int) -> int:
-    """Return at how many instants of each interval pairs are kept apart."""
+    """Return the number of instants per interval at which pairs are kept apart."""
     return max(2, math.ceil(_MIN_INSTANTS / intervals))
 
 
 class DistanceLibrary:
-    """The rows of pairs of one robot, derived when they are needed.
+    """Rows for one robot's pairs, derived on demand.
 
     Parameters
     ----------
     clearance
         The clearance of plans.
     robot, prediction
-        The model, and the prediction of the base motion.
+        The model, and the base motion prediction.
     """
 
     def __init__(self, clearance: Clearance, robot: SpaceRobot, prediction: BasePrediction) -> None:
@@ -72,14 +72,14 @@ class DistanceLibrary:
         return [self._rows[pair] for pair in pairs]
 
     def begin(self, boundary: BoundaryConditions, *, turn_is_known: bool) -> KeptDistances:
-        """Return the pairs that are kept apart between two ends: none yet.
+        """Return the pairs to keep apart between two ends: none initially.
 
-        ``turn_is_known``: the rotation of the base at the end is that of the boundary conditions.
+        ``turn_is_known``: the base rotation at the end is given by the boundary conditions.
 
         Raises
         ------
         PlanningError
-            Links are too near at an end.
+            Links are too close at an end.
         """
         start = boundary.start[np.newaxis]
         required = self.clearance.required(
@@ -96,9 +96,9 @@ class DistanceLibrary:
     def base_poses(
         self, boundary: BoundaryConditions, shapes: Array, turns: Array
     ) -> BasePoses | None:
-        """Return the poses of the base at shapes (K, n) and rotations (K, 4) since the start.
+        """Return the base poses at shapes (K, n) and rotations (K, 4) since the start.
 
-        None: there are no obstacles, so the base does not matter.
+        None if there are no obstacles, so that the base does not matter.
         """
         if boundary.state is None or not self.clearance.has_obstacles:
             return None
@@ -106,7 +106,7 @@ class DistanceLibrary:
         return self._prediction.poses(boundary.state, shapes, attitudes)
 
     def planes(self, boundary: BoundaryConditions, pair: int, poses: Poses) -> tuple[Array, Array]:
-        """Return the distances (K,) of a pair, m, and its planes (K, 7) in the form of rows."""
+        """Return the distances (K,) of a pair, m, and its planes (K, 7) in row form."""
         geometry = self.clearance.geometry
         distances, planes = geometry.planes(pair, poses)
         if geometry.with_obstacles[pair]:
@@ -121,7 +121,7 @@ class DistanceLibrary:
 
 
 class KeptDistances:
-    """The pairs that are kept apart in one search, each by planes along a path.
+    """Pairs kept apart in one search, each by planes along a path.
 
     Parameters
     ----------
@@ -145,15 +145,16 @@ class KeptDistances:
         return tuple(sorted(self._room))
 
     def approaches(self, positions: Array, turns: Array) -> list[Approach]:
-        """Return the pairs that come too near along held commands (N + 1, n), nearest first.
+        """Return the pairs that come too close along held commands (N + 1, n), nearest first.
 
-        ``turns`` (N + 1, 4) are the rotations of the base since the start.
+        ``turns`` (N + 1, 4) are the base rotations since the start.
         """
         base = self._library.base_poses(self._boundary, positions, turns)
         return self._library.clearance.approaches(positions, self._required, base)
 
     def message(self, approach: Approach, control_period: float | None) -> str:
-        """Return a clause about a path that comes too near; without a control period no times."""
+        """Return a clause about an approach that is too close; without a control period, no
+        times."""
         return self._library.clearance.clause(approach, control_period)
 
     def anew(self) -> KeptDistances:
@@ -161,12 +162,12 @@ class KeptDistances:
         return KeptDistances(self._library, self._boundary, self._required)
 
     def add(self, near: Sequence[Approach]) -> None:
-        """Add pairs that have come too near."""
+        """Add pairs that came too close."""
         for each in near:
             self._room.setdefault(each.pair, _INITIAL_MARGIN)
 
     def widen(self, near: Sequence[Approach]) -> None:
-        """Add pairs that have come too near; pairs already kept apart get the room they lack."""
+        """Add pairs that came too close; pairs already kept apart get the room they lack."""
         kept = set(self._room)
         self.add(near)
         for each in near:
@@ -174,8 +175,8 @@ class KeptDistances:
                 self._room[each.pair] += self._required[each.pair] - each.distance
 
     def along(self, path: Trajectory) -> tuple[Array, Array]:
-        """Return shapes (N K, n) and rotations (N K, 4) of the base since the start at the K
-        instants of all N intervals at which pairs are kept apart.
+        """Return shapes (N K, n) and base rotations (N K, 4) since the start at the K instants of
+        all N intervals at which pairs are kept apart.
         """
         intervals = len(path.shapes) - 1
         instants, X = instants_of(intervals), path.quaternions[:, np.newaxis]
@@ -185,7 +186,7 @@ class KeptDistances:
         return path.at_ticks(intervals * instants)[1:], turns.reshape(-1, 4)
 
     def approaches_of(self, path: Trajectory) -> list[Approach]:
-        """Return the pairs that come too near along a path, nearest first."""
+        """Return the pairs that come too close along a path, nearest first."""
         shapes, turns = self.along(path)
         return self.approaches(
             np.vstack([path.shapes[:1], shapes]), np.vstack([path.quaternions[:1], turns])
@@ -194,11 +195,11 @@ class KeptDistances:
     def within(
         self, limits: MotionLimits, path: Trajectory, *, pushing: bool = False
     ) -> MotionLimits:
-        """Return limits with planes between all pairs at all instants of N intervals of a path.
+        """Return limits with planes between all pairs at all instants in N intervals of a path.
 
-        Planes are shifted by the required distances of pairs plus their room, or by their present
-        distances if these are smaller: so a clear path satisfies its own planes. ``pushing``: pairs
-        must have their room, except at the ends, whose shapes are given.
+        Planes are shifted by the required distances of pairs plus their room, or by the current
+        distances if smaller: so a clear path satisfies its own planes. ``pushing``:
+        whether pairs must have their room, except at the ends, whose shapes are given.
         """
         if not self.pairs:
             return limits

@@ -1,7 +1,7 @@
-"""Time-optimal manoeuvres within real limits, for any free-floating robot.
+"""Time-optimal manoeuvres within real limits for any free-floating robot.
 
 The manoeuvre is the solution of an optimal control problem (:mod:`.multiple_shooting`) that starts
-from guesses with loops (:mod:`.initial_guesses`), converted to held commands that end on the goal
+from guesses with loops (:mod:`.initial_guesses`), converted to held commands that end at the goal
 (:mod:`.held_commands`).
 """
 
@@ -68,7 +68,8 @@ from spacerobot_ros.planning.methods.optimal.search import (
 from spacerobot_ros.version import __version__
 
 _MAX_STARTS_IN_MOTION = 12
-"""Largest number of guesses for a manoeuvre from moving joints, which do not stop meanwhile."""
+"""Largest number of guesses for a manoeuvre that starts with moving joints, which keep moving
+meanwhile."""
 
 _ZERO_ERROR = 1e-10
 """Largest error that counts as zero: the robot is at the goal; rad, m and joint coordinates."""
@@ -76,24 +77,25 @@ _ZERO_ERROR = 1e-10
 _ACTIVE_LIMIT_SHARE = 0.95
 
 _MAX_MOVING_AIMS = 4
-"""Largest number of fastest manoeuvres, each to the place of the goal at the end of the previous
-one, relative to a coasting centre of mass."""
+"""Largest number of fastest manoeuvres, each to the goal location at the end of the previous one,
+relative to a drifting centre of mass."""
 
 _MOVING_AIM_FACTORS = (1.05, 1.2, 1.5)
-"""Factors of the last duration at which a manoeuvre is planned if they do not agree."""
+"""Multiples of the last duration at which a manoeuvre is planned if the durations do not agree."""
 
 _STARTS_BEFORE_COASTING = 8
 """Guesses without a solution after which a robot that drifts coasts with its joints at rest, and
 those for the rotation that remains when its base passes the goal."""
 
 _STARTS_AFTER_COASTING = 3
-"""Guesses without a solution after which the next pass of the goal is tried."""
+"""Number of guesses without a solution after which the next pass of the goal is tried."""
 
 _MAX_ANGLE_WITHOUT_COASTING = math.radians(40.0)
-"""Largest angle by which the drifting base may rotate during a manoeuvre that begins at once."""
+"""Largest angle by which the drifting base may rotate during a manoeuvre that begins
+immediately."""
 
 _COASTING_ANGLE = math.radians(5.0)
-"""Angle between attitudes at which to check whether the base passes the goal."""
+"""Angle between the attitudes at which passes of the goal are checked."""
 
 _COASTING_TURNS = 4.0
 
@@ -101,14 +103,15 @@ _MAX_COASTING_ENDS = 3
 """Largest number of tried instants at which the coasting base passes the goal."""
 
 _MAX_DURATION_RATIO = 2.5
-"""Longest time of a manoeuvre that ends at a pass, as multiple of that at zero momentum."""
+"""Longest duration of a manoeuvre that ends at a pass, as a multiple of that at zero momentum."""
 
 _STARTS_BEFORE_FASTEST = 2
-"""Guesses without a manoeuvre in the requested time after which the fastest one is searched for."""
+"""Number of guesses without a manoeuvre in the requested time after which the fastest manoeuvre is
+searched for."""
 
 _MAX_FASTEST_RATIO = 1.25
-"""Largest ratio of the duration of the fastest manoeuvre found to the requested time at which the
-search continues: there may be a faster one, but not so much faster."""
+"""Largest ratio of the fastest duration found to the requested time at which the search continues:
+there may be a faster manoeuvre, but not so much faster."""
 
 _LIMIT_ROUNDING = 1e-8
 
@@ -133,7 +136,7 @@ class _BaseMotion:
     positions: Array
 
     def state_at(self, state: RobotState, tick: int) -> RobotState:
-        """Return a state with the pose of the base at a tick."""
+        """Return a state with the base pose at a tick."""
         return replace(state, position=self.positions[tick], quaternion=self.attitudes[tick])
 
 
@@ -150,18 +153,18 @@ class _GoalKind:
 
     @cached_property
     def within_efforts(self) -> ManoeuvreSearch:
-        """The search with effort limits: most manoeuvres of most robots do not need them."""
+        """The search with effort limits, which most manoeuvres of most robots do not need."""
         return ManoeuvreSearch(self.model)
 
 
 class OptimalGait(GaitMethod):
     """Minimum time, or least effort in a given time, from rest to rest.
 
-    It reaches the attitude; the position if sliders can put the base anywhere, or if the options
-    request it; and the final shape if the goal has one. For goals of end-effectors it reaches
-    these, and the requested parts of the pose of the base. The search has a budget of starts and of
-    steps of the solver, so equal requests have equal schedules on any machine, idle or busy, unless
-    the user also limits its wall time.
+    It reaches the attitude; the position, if sliders can put the base anywhere or the options
+    request it; and the final shape, if the goal has one. For end-effector goals, it reaches these
+    and the requested components of the base pose. The search has a budget of starts and
+    solver steps, so equal requests yield equal schedules on any machine, idle or busy, unless the
+    user also limits its wall time.
     """
 
     name: ClassVar[str] = "optimal"
@@ -172,7 +175,7 @@ class OptimalGait(GaitMethod):
 
     @override
     def setup(self) -> None:
-        """Compute what depends on robot and options only; see :meth:`GaitMethod.setup`."""
+        """Compute what depends only on the robot and the options; see :meth:`GaitMethod.setup`."""
         # A plan calls the model's functions a few times each.
         self.robot = robot = self.robot.interpreted
         chosen = self.options
@@ -217,16 +220,16 @@ class OptimalGait(GaitMethod):
     @classmethod
     @override
     def require_suitable(cls, robot: SpaceRobot) -> None:
-        """Refuse robots that cannot rotate their base; see :meth:`GaitMethod.require_suitable`."""
+        """Reject robots that cannot rotate their base; see :meth:`GaitMethod.require_suitable`."""
         GoalSpecification.of(robot, OptimalOptions()).require_suitable(robot)
 
     @override
     def plan(self, request: PlanRequest, cancellation: Cancellation = NEVER) -> GaitSchedule:
         """Plan within the search budget; see :meth:`GaitMethod.plan`.
 
-        A correction takes the smallest motion instead of the fastest, and may use the margins. If
-        the centre of mass coasts, goal positions are planned for in its frame, in which they move:
-        their place at the end of the manoeuvre depends on its duration.
+        A correction uses the smallest motion instead of the fastest, and may use the margins. If
+        the centre of mass drifts, planning uses its frame, in which goal positions move: their
+        location at the end of the manoeuvre depends on its duration.
         """
         self._require_suitable_setup()
         # Measured shapes may be a little beyond the joint limits.
@@ -267,7 +270,7 @@ class OptimalGait(GaitMethod):
         """Return velocities (n,) of the joints with those of wheels alone; none where they rest."""
         rates, index = np.zeros(self.robot.n), self._wheels.index
         if qdot is not None and not np.all(np.isfinite(qdot[index])):
-            raise PlanningError("The velocities of the wheels at the start are not finite.")
+            raise PlanningError("The wheel velocities at the start are not finite.")
         if qdot is not None and self._wheels.are_spinning(qdot):
             rates[index] = qdot[index]
         return rates
@@ -305,8 +308,8 @@ class OptimalGait(GaitMethod):
             if not len(axes):
                 raise PlanningError(
                     f"The robot has an angular momentum of {np.linalg.norm(L_B):.3g} kg m^2/s, "
-                    "which its wheels take up depending on its final attitude: give the goal "
-                    "an attitude of the base (with optimal.base_attitude 1)."
+                    "which its wheels absorb depending on the final attitude: give the goal a "
+                    "base attitude (with optimal.base_attitude 1)."
                 )
             L_B = matrix_from_quaternion(boundary.goal_rotation).T @ L_B
         try:
@@ -314,7 +317,7 @@ class OptimalGait(GaitMethod):
         except UnreachableError as clause:
             raise UnreachableError(
                 f"The wheels cannot hold the angular momentum of {np.linalg.norm(L_B):.4g} kg "
-                f"m^2/s that the robot has at the attitude of the goal: {clause}. Without thrust "
+                f"m^2/s that the robot has at the goal attitude: {clause}. Without thrust "
                 "the momentum is constant: dump it with thrusters, or choose another attitude.",
                 clause.proof,
             ) from None
@@ -336,7 +339,7 @@ class OptimalGait(GaitMethod):
         if self._has_obstacles:
             raise PlanningError(
                 f"The robot drifts: its centre of mass moves at {np.linalg.norm(velocity):.3g} "
-                "m/s, and optimal plans around obstacles only if it rests."
+                "m/s, but optimal plans around obstacles only if it is at rest."
             )
         in_frame = replace(request, state=replace(state, linear_momentum=np.zeros(3)))
         if not goal.end_effectors and "position" not in self._specification.controls:
@@ -344,9 +347,9 @@ class OptimalGait(GaitMethod):
         if goal.joint_positions is not None and not goal.end_effectors:
             raise PlanningError(
                 "The robot drifts: its centre of mass moves at "
-                f"{np.linalg.norm(velocity):.3g} m/s, so with attitude and shape of the goal, the "
-                "base is at its position at one instant at most. Omit the shape, or ignore the "
-                "position with optimal.base_position 2."
+                f"{np.linalg.norm(velocity):.3g} m/s, so with the goal attitude and shape, the "
+                "base is at the goal position at one instant at most. Omit the shape, or ignore "
+                "the position with optimal.base_position 2."
             )
 
         def plan_for_end(end: float, duration: float | None) -> GaitSchedule:
@@ -375,8 +378,8 @@ class OptimalGait(GaitMethod):
             except PlanningError as reason:
                 refusal = str(reason)
         raise NotFoundError(
-            "The robot drifts, and no manoeuvre was found that ends where the goal then is, "
-            f"relative to the centre of mass: {refusal}"
+            "The robot drifts, and no manoeuvre was found that ends at the goal's location at "
+            f"that time, relative to the centre of mass: {refusal}"
         )
 
     def _plan_about_center(
@@ -526,7 +529,7 @@ class OptimalGait(GaitMethod):
                 refusal = f" {reason}"
         raise NotFoundError(
             f"No manoeuvre to the goal was found within optimal.{name} = {given:g} s: the fastest "
-            f"that was found takes {fastest:.6g} s. Allow more time.{refusal}"
+            f"one found takes {fastest:.6g} s. Allow more time.{refusal}"
         )
 
     def _begin_now(self, task: SearchProblem) -> _PlanResult:
@@ -550,7 +553,7 @@ class OptimalGait(GaitMethod):
         if found.cut_short:
             notes["cut_short"] = (
                 f"The search used up optimal.time_budget, {self.options.time_budget:g} s, after "
-                f"{found.starts} start(s); a longer one may find a faster manoeuvre."
+                f"{found.starts} start(s); a larger budget may find a faster manoeuvre."
             )
         return _PlanResult(found, found.held.positions, notes)
 

@@ -1,22 +1,25 @@
-"""Bounds proved before a search: where the base can be, and how long a manoeuvre takes.
+"""Bounds proved before a search: on base positions, and on manoeuvre durations.
 
-:class:`CenterReach` bounds the centre of mass in the base, which proves that goals beyond are out
-of reach. Without thrust the centre of mass rests in the world, so a pose of the base determines it
-in the base. Sliders whose directions are fixed in the base move it along straight slots, exactly.
-Everything that rotates is in a ball around the first joint that rotates it (triangle inequality
-over the links behind that joint). The sum of both is a convex set that holds the centre of mass in
-all shapes; for robots that have only such sliders it is the set of all centres of mass.
+:class:`CenterReach` bounds the centre of mass in the base, which proves that goals beyond the bound
+are out of reach. Without thrust, the centre of mass is at rest in the world, so a base pose
+determines it
+in the base. Sliders with directions fixed in the base move it along straight slots, exactly.
+Everything that rotates stays within a ball around the first joint that rotates it (triangle
+inequality over the links beyond that joint). The sum of both is a convex set that contains the
+centre of mass
+for all shapes; for robots with only such sliders, it is the set of all centres of mass.
 
-:class:`ConnectionBounds` bounds the motion of the base by each joint. While one joint moves and the
-others rest, the robot is two rigid bodies of masses ``m_P`` and ``m_D``, inboard and outboard of
-the joint. With the locked inertia ``H`` about the centre of mass, and the angular momentum about it
-``h_i`` that the joint causes at unit rate while the base rests, the base rotates at ``-H^-1 h_i``.
-The distances of the centres of mass from the joint bound ``|h_i|`` in all shapes, and the least
+:class:`ConnectionBounds` bounds the base motion caused by each joint. While one joint moves and the
+others are at rest, the robot consists of two rigid bodies with masses ``m_P`` and ``m_D``, inboard
+and outboard of
+the joint. With the locked inertia ``H`` about the centre of mass, and the angular momentum ``h_i``
+about it due to the joint at unit rate with the base at rest, the base rotates at ``-H^-1 h_i``.
+The distances of the centres of mass from the joint bound ``|h_i|`` for all shapes, and the smallest
 principal moments of all bodies bound ``H`` from below. The energy is another bound: the energy of
-the base's motion is missing outboard of the joint, ``omega . (H + I_base) omega <= M_ii``. The
+the base motion is missing outboard of the joint, ``omega . (H + I_base) omega <= M_ii``. The
 smaller bound counts.
 
-:class:`DurationBound` follows from both, and from the largest travel of a joint in a given time. No
+:class:`DurationBound` follows from both, and from the largest joint travel in a given time. No
 shape is sampled.
 """
 
@@ -37,7 +40,7 @@ from spacerobot_ros.planning.core.method import PlanRequest
 from spacerobot_ros.planning.methods.optimal.problem import BoundaryConditions, MotionLimits
 
 _BOUND_ROUNDING = 1e-6
-"""Relative rounding error of a bound: manoeuvres miss their goals by less than that."""
+"""Relative rounding error of a bound: manoeuvres miss their goals by less than this."""
 
 _BISECTIONS, _LONGEST = 32, 1e10
 """Number of bisections for a shortest time, and the longest time searched for, s."""
@@ -45,10 +48,10 @@ _BISECTIONS, _LONGEST = 32, 1e10
 _WITHIN = "within the velocity and acceleration limits"
 
 _PARALLEL = 1e-12
-"""Sine of the angle between two directions below which they count as equal."""
+"""Sine of the angle between two directions below which they are considered equal."""
 
 _MIN_SLIDER_RANGE = 1e-12
-"""Bounds of a slider differ at least by this, m: the solver needs room between them."""
+"""Slider bounds differ by at least this, m: the solver needs room between them."""
 
 
 @dataclass(frozen=True)
@@ -62,7 +65,7 @@ class CenterReach:
     slider_directions
         (3, s) motion of the centre of mass with each slider of fixed direction, m/m.
     lower, upper
-        (s,) ends of their ranges, m.
+        (s,) ends of the slider ranges, m.
     radius
         Of the ball, m.
     """
@@ -75,7 +78,7 @@ class CenterReach:
 
     @classmethod
     def of(cls, robot: SpaceRobot, lower: Array, upper: Array) -> CenterReach:
-        """Return the set of a robot whose joints keep within ``lower`` and ``upper`` (n,)."""
+        """Return the set for a robot with joints between ``lower`` and ``upper`` (n,)."""
         bodies = robot.description.bodies
         if robot.description.has_mimic_joints:
             lower, upper = moving_joint_ranges(robot, lower, upper)
@@ -100,7 +103,7 @@ class CenterReach:
         return cls(origin / total, slots, lower[sliders], upper[sliders], radius / total)
 
     def distance_outside(self, point: Array) -> float:
-        """Return the distance of a point (3,) from the set, m: no shape comes nearer."""
+        """Return the distance of a point (3,) from the set, m: no shape comes closer."""
         if not np.isfinite(self.radius):
             return 0.0
         beside = point - self.origin
@@ -117,7 +120,7 @@ class CenterReach:
 
 
 def moving_joint_ranges(robot: SpaceRobot, lower: Array, upper: Array) -> tuple[Array, Array]:
-    """Return ranges (m,) of all moving joints, each by itself: a larger set than that of (n,)."""
+    """Return independent ranges (m,) of all moving joints: a larger set than that of (n,)."""
     G, offsets = robot.description.coupling
     leaders = np.argmax(np.abs(G), axis=1)
     factors = G[np.arange(len(G)), leaders]
@@ -139,7 +142,7 @@ class _FrameBounds:
     radius: float
 
     def of_child(self, index: int, body: Body, lower: float, upper: float) -> _FrameBounds:
-        """Return the place of a body outboard of this one, carried by a joint with these limits."""
+        """Return the set for a body outboard of this one, carried by a joint with these limits."""
         assert body.joint is not None
         slides = body.joint.kind is JointKind.PRISMATIC
         if self.R is None:
@@ -154,12 +157,12 @@ class _FrameBounds:
 
 @dataclass(frozen=True)
 class ConnectionBounds:
-    """Bounds of the motion of the base at zero momentum, for all shapes within the joint limits.
+    """Bounds on the base motion at zero momentum, for all shapes within the joint limits.
 
     Attributes
     ----------
     turn
-        (n,) largest rotation of the base by each joint, rad per rad or m; infinite: not known.
+        (n,) largest base rotation by each joint, rad per rad or m; infinite: unknown.
     center
         (n,) largest displacement of the centre of mass in the base, m per rad or m.
     inertia
@@ -172,7 +175,7 @@ class ConnectionBounds:
     inertia: float
 
     def drift(self, boundary: BoundaryConditions) -> float:
-        """Return the largest rate of the base with its joints at rest, rad/s."""
+        """Return the largest base rate with the joints at rest, rad/s."""
         momentum = float(np.linalg.norm(boundary.angular_momentum))
         return momentum / self.inertia if momentum > 0 else 0.0
 
@@ -206,12 +209,12 @@ class ConnectionBounds:
 
 @dataclass(frozen=True)
 class LinkBounds:
-    """Bounds of the motion of a link at zero momentum, for all shapes within the joint limits.
+    """Bounds on the motion of a link at zero momentum, for all shapes within the joint limits.
 
     Attributes
     ----------
     turn
-        (n,) largest rotation of the link by each joint, rad per rad or m.
+        (n,) largest link rotation by each joint, rad per rad or m.
     place
         (n,) largest displacement of its origin, m per rad or m.
     distance
@@ -269,9 +272,9 @@ class _Tree:
         return float(sum(masses[k] * distance for k, distance in apart) / sum(masses))
 
     def moved_by(self, joint: int, *, planar: bool) -> tuple[float, float, float]:
-        """Return bounds of the angular momentum ``h`` about the centre of mass (kg m^2/s), of the
-        inertia ``M`` (kg m^2 or kg) and of the displacement of the centre of mass (m), at unit rate
-        of the joint that carries a body.
+        """Return bounds on the angular momentum ``h`` about the centre of mass (kg m^2/s), of the
+        inertia ``M`` (kg m^2 or kg) and the centre-of-mass displacement (m), at unit rate of the
+        joint that carries a body.
         """
         body = self.bodies[joint]
         assert body.joint is not None
@@ -308,7 +311,7 @@ class _Tree:
 
     def chain(self, body: int, point: Array) -> tuple[Array, Array]:
         """Return the largest rotation (rad/rad) and displacement (m/rad or m/m) of a ``point`` (3,)
-        of a body by each moving joint (m,) while the base rests.
+        of a body by each moving joint (m,) with the base at rest.
         """
         turning, levers = (np.zeros(len(self.bodies) - 1) for _ in range(2))
         way = 0.0
@@ -326,7 +329,7 @@ class _Tree:
         self, at: int, point: Array, came_from: int, measured: Array
     ) -> Iterator[tuple[int, float]]:
         """Yield the largest distances, m, of centres of mass from a ``point`` (3,) of body ``at``,
-        for this body and all that are reached from it, except through ``came_from``.
+        for this body and all bodies reached from it, except through ``came_from``.
 
         The matrix ``measured`` (3, 3) multiplies vectors in this body before their norms are taken.
         """
@@ -363,8 +366,8 @@ def reach_of_end_effector(robot: SpaceRobot, lower: Array, upper: Array, link: s
 
 @dataclass(frozen=True)
 class Demand:
-    """A motion that takes time: ``weights`` times the travels of the joints, plus ``drift`` times
-    the duration, must be at least ``amount``.
+    """A motion that takes time: ``weights`` times the joint travels, plus ``drift`` times the
+    duration, must be at least ``amount``.
 
     Attributes
     ----------
@@ -386,12 +389,12 @@ class Demand:
 
 @dataclass(frozen=True)
 class DurationBound:
-    """A lower bound of the duration of all manoeuvres to a goal.
+    """A lower bound on the duration of all manoeuvres to a goal.
 
     Attributes
     ----------
     seconds
-        The duration, a multiple of the control period.
+        Duration, a multiple of the control period.
     reason
         The motion that requires it, as a clause.
     """
@@ -413,22 +416,18 @@ class DurationBound:
         base_rate_limit: float = 0.0,
         demands: Iterable[Demand] = (),
     ) -> DurationBound:
-        """Return the bound for commands that are held for ``period`` s.
+        """Return the bound for commands held for ``period`` s.
 
         Parameters
         ----------
         boundary, limits
-            Ends of the manoeuvre, and limits of the joints.
-        axes
-            (m, 3) axes of the base along which the attitude at the end is given.
-        connection
-            Bounds of the motion of the base.
+            Ends of the manoeuvre, and joint limits. axes (m, 3) base axes along which the final
+            attitude is given. connection Bounds on the base motion.
         final_is_given
-            Whether the last shape of the boundary conditions is the only one at the goal.
+            Whether the last shape in the boundary conditions is the only one at the goal.
         base_rate_limit
             Largest rate of the base, rad/s; 0: any.
-        demands
-            Further ones.
+        demands Further demands.
         """
         demands = list(demands)
         angle = _least_turn(boundary.goal_rotation, axes)
@@ -478,7 +477,7 @@ def link_demands(
     boundary: BoundaryConditions,
     connection: ConnectionBounds,
 ) -> Iterator[Demand]:
-    """Yield the motions of the end-effectors to the goals of a request, minus its tolerances."""
+    """Yield the end-effector motions to the goals in a request, minus its tolerances."""
     state, tolerance, drift = request.state, request.tolerance, connection.drift(boundary)
     for goal in request.goal.end_effectors:
         of_link = connection.of_link(robot, goal.link)

@@ -26,10 +26,10 @@ from spacerobot_ros.planning.methods.optimal.transcription import (
 )
 
 _FEASIBILITY_TOLERANCE = 1e-4
-"""Violation of the constraints below which an iterate counts as a trajectory, SI units."""
+"""Constraint violation below which an iterate counts as a trajectory, SI units."""
 
 _INFEASIBLE = "Infeasible_Problem_Detected"
-"""The solver's status if it ends at a minimum of the violation of the constraints."""
+"""Solver status if it ends at a minimum of the constraint violation."""
 
 TOLERANCE = 1e-5
 """Durations within a thousandth of a control period, for manoeuvres of some seconds."""
@@ -57,30 +57,31 @@ _IPOPT_OPTIONS = {
 
 
 _WARM_OPTIONS = {"ipopt.mu_init": 3e-3, "ipopt.bound_push": 1e-3, "ipopt.bound_frac": 1e-3}
-"""With distances: the guess is a solution without some of them; the solver must stay near it."""
+"""With distances: the guess is a solution without some of the distances; the solver must stay near
+it."""
 
 _REFINING_OPTIONS = {"ipopt.mu_init": 1e-3}
 """The guess is a solution on a coarser grid."""
 
 _WARM_STRETCH = 1.5
-"""With distances: factor of the time of the guess. At full speed velocities and accelerations are
-at their limits, which leaves the solver no room to go around."""
+"""With distances: factor applied to the guess duration. At full speed, velocities and accelerations
+are at their limits, which leaves the solver no room to move around obstacles."""
 
 _LARGEST_REACH, _LARGEST_REACH_SHARE = 0.3, 0.15
-"""Largest reach of a neighbourhood, rad or m, and as a share of a joint's range."""
+"""Largest reach of a neighbourhood, rad or m, and as a fraction of a joint's range."""
 
 _COST_OF_LACK = 300.0
-"""Cost of missing distance, in durations or efforts of the guess per m."""
+"""Cost of missing distance per m, in durations or efforts of the guess."""
 
 
 @dataclass(frozen=True)
 class StopRule:
-    """Conditions on which a solver stops before it has converged.
+    """Conditions on which a solver stops before convergence.
 
     Attributes
     ----------
     iterations
-        Largest number of its steps.
+        Largest number of solver steps.
     cancellation
         Stops it at its next iterate.
     is_over
@@ -97,7 +98,7 @@ class StopRule:
 
 @dataclass(frozen=True)
 class DurationBounds:
-    """Bounds of the duration of a trajectory, s."""
+    """Bounds on the duration of a trajectory, s."""
 
     shortest: float
     longest: float
@@ -115,9 +116,9 @@ class Neighbourhood:
     Attributes
     ----------
     reach
-        (n,) largest change of the shape anywhere on the path, m or rad.
+        (n,) largest shape change anywhere on the path, m or rad.
     largest_lack
-        Distance by which links may be nearer than required, m. Its cost is high, so that it
+        Distance by which links may be closer than required, m. Its cost is high, so that it
         vanishes if the solver finds a path.
     """
 
@@ -128,7 +129,8 @@ class Neighbourhood:
     def within(
         cls, limits: MotionLimits, share: float = 1.0, largest_lack: float = 0.0
     ) -> Neighbourhood:
-        """Return the neighbourhood of a share of the largest reach of joints with some limits."""
+        """Return the neighbourhood with a fraction of the largest reach of joints with given
+        limits."""
         width = limits.upper - limits.lower
         return cls(share * np.minimum(_LARGEST_REACH, _LARGEST_REACH_SHARE * width), largest_lack)
 
@@ -139,23 +141,24 @@ class MultipleShooting:
     Parameters
     ----------
     stages, intervals
-        The functions of the problem, and the number of intervals N.
+        Problem functions, and number of intervals N.
     tolerance
-        Of the optimality conditions, at which the solver ends.
+        Tolerance on the optimality conditions at which the solver stops.
     """
 
     def __init__(self, stages: Stages, intervals: int, tolerance: float = TOLERANCE) -> None:
         self.intervals = intervals
         self.iterations, self.converged = 0, False
-        """Number of the solver's steps for its last solution, and whether the solver converged."""
+        """Number of solver steps for the last solution, and whether the solver converged."""
         self.lack = 0.0
-        """Distance by which links are nearer in its last solution than required, m."""
+        """Distance by which links are closer than required in the last solution, m."""
         self.turn = stages.rotation_of_step
         self._drifting = stages.drifting
         self._program = program(stages, intervals)
         self._layout = Layout.of(stages, intervals)
         self.nonzeros = int(self._program.jac_g.nnz_out(1))
-        """Nonzeros of the constraints' Jacobian, in proportion to which a step takes time."""
+        """Number of nonzeros in the constraint Jacobian; the time of a step is proportional to
+        it."""
         self._monitor = SolverMonitor(
             self._program.problem, self._program.lower, self._program.upper
         )
@@ -184,8 +187,8 @@ class MultipleShooting:
     ) -> Trajectory | None:
         """Return the fastest trajectory near ``guess``; None if none.
 
-        For a fixed time it is the one of least effort: of the least mean square of the
-        accelerations, divided by the joints' speeds.
+        For a fixed time, it is the one of least effort, with the least mean square of accelerations
+        divided by joint speeds.
 
         Parameters
         ----------
@@ -193,8 +196,7 @@ class MultipleShooting:
             The problem, and the start of the solver.
         stop
             Conditions on which the solver stops early.
-        duration
-            Its bounds.
+        duration Bounds on the duration.
         near
             Neighbourhood of the guess for the solution; None: anywhere.
         refining
@@ -266,7 +268,7 @@ class MultipleShooting:
 def build_solver(
     name: str, program: Program, monitor: SolverMonitor, options: Mapping[str, object]
 ) -> ca.Function:
-    """Return IPOPT for a program, with options in addition to those of all solvers."""
+    """Return an IPOPT solver for a program, with options in addition to the common ones."""
     # The solver's matrices are small: threads of its linear algebra would wait for each other.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     derivatives = {"jac_g": program.jac_g, "hess_lag": program.hess_lag}
@@ -307,7 +309,8 @@ def _pack_parameters(
 
 
 def pack_knots(layout: Layout, step: float, *knots: Array) -> Array:
-    """Return the variables of a step and of the parts of all knots (:meth:`.Layout.knots`)."""
+    """Return the variables for a step and for the components of all knots
+    (:meth:`.Layout.knots`)."""
     x = np.zeros(layout.size)
     x[0] = step
     for places, values in zip(layout.knots(), knots, strict=True):
@@ -327,7 +330,7 @@ class SolverMonitor(ca.Callback):
         self.construct("watch", {})
 
     def begin(self, stop: StopRule) -> None:
-        """Forget the iterates of earlier solves; stop the next one by a rule."""
+        """Discard the iterates of earlier solves, and set the stop conditions of the next solve."""
         self.best, self._least, self._stop, self._iterates = None, math.inf, stop, 0
 
     def get_n_in(self) -> int:
@@ -335,15 +338,15 @@ class SolverMonitor(ca.Callback):
         return int(ca.nlpsol_n_out())
 
     def get_n_out(self) -> int:
-        """Return one: whether to stop."""
+        """Return one, the number of outputs: whether to stop."""
         return 1
 
     def get_sparsity_in(self, i: int) -> ca.Sparsity:
-        """Return the size of a report."""
+        """Return the size of an output."""
         return ca.Sparsity.dense(self._sizes[ca.nlpsol_out(i)])
 
     def has_eval_buffer(self) -> bool:
-        """Return True, as iterates are read from the solver's memory: there are thousands."""
+        """Return True, because the thousands of iterates are read from the solver's memory."""
         return True
 
     def eval_buffer(

@@ -1,4 +1,4 @@
-"""The optimal control problem: options, boundary conditions, constraints, and trajectories."""
+"""Optimal control problem: options, boundary conditions, constraints, and trajectories."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from spacerobot_ros.resources import suggestion
 
 @dataclass(frozen=True)
 class MotionOptions:
-    """Options of methods that keep velocities and accelerations of the joints within limits."""
+    """Options for methods that keep joint velocities and accelerations within limits."""
 
     max_velocity: tuple[float, ...] = parameter(
         (),
-        "speed limit of every joint, if below the URDF's; []: the URDF's",
+        "speed limit of every joint, if below the URDF limit; []: the URDF limit",
         unit="m/s or rad/s",
         minimum=0.0,
         maximum=1e9,
@@ -34,7 +34,7 @@ class MotionOptions:
     )
     max_acceleration: tuple[float, ...] = parameter(
         (),
-        "acceleration limit of every joint; []: by ramp_time",
+        "acceleration limit of every joint; []: determined by ramp_time",
         unit="m/s^2 or rad/s^2",
         minimum=0.0,
         maximum=1e9,
@@ -56,21 +56,21 @@ class OptimalOptions(MotionOptions):
 
     duration: float = parameter(
         0.0,
-        "duration of a manoeuvre of least effort; 0: as fast as possible",
+        "duration of a least-effort manoeuvre; 0: as fast as possible",
         unit="s",
         minimum=0.0,
         maximum=1e9,
     )
     effort_limits: int = parameter(
         0,
-        "effort limits of the joints: 0: enforced if such a manoeuvre is found, with "
+        "joint effort limits: 0: enforced if such a manoeuvre is found, with "
         "effort_reserve if a controller tracks it, 1: enforced, with effort_reserve, 2: ignored",
         minimum=0,
         maximum=2,
     )
     max_effort: tuple[float, ...] = parameter(
         (),
-        "effort limit of every joint, below the URDF's; []: the URDF's",
+        "effort limit of every joint, below the URDF limit; []: the URDF limit",
         unit="N or N m",
         minimum=0.0,
         maximum=1e12,
@@ -79,13 +79,13 @@ class OptimalOptions(MotionOptions):
     )
     effort_reserve: float = parameter(
         0.15,
-        "share of the effort limits reserved for the controller's feedback",
+        "fraction of the effort limits reserved for the controller's feedback",
         minimum=0.0,
         maximum=0.95,
     )
     joint_margin: tuple[float, ...] = parameter(
         (),
-        "distance of every joint to its limits, not in corrections; []: none",
+        "margin of every joint to its limits, except in corrections; []: none",
         unit="m or rad",
         minimum=0.0,
         maximum=1e9,
@@ -98,16 +98,16 @@ class OptimalOptions(MotionOptions):
     base_attitude: int = parameter(1, "1: reached, 0: ignored", minimum=0, maximum=1)
     final_shape: int = parameter(
         0,
-        "final joint positions of goals without them: 0: any, 1: the present ones",
+        "final joint positions if the goal has none: 0: any, 1: the current ones",
         minimum=0,
         maximum=1,
     )
     max_base_rate: float = parameter(
-        0.0, "largest rate of the base; 0: no limit", unit="rad/s", minimum=0.0, maximum=1e9
+        0.0, "largest base rate; 0: no limit", unit="rad/s", minimum=0.0, maximum=1e9
     )
     keep_axis: tuple[float, ...] = parameter(
         (),
-        "axis of the base that stays away from keep_direction; []: none",
+        "base axis that stays away from keep_direction; []: none",
         minimum=-1e9,
         maximum=1e9,
     )
@@ -129,19 +129,19 @@ class OptimalOptions(MotionOptions):
         maximum=1e9,
     )
     intervals: int = parameter(
-        80, "steps of the optimal control problem", minimum=10, maximum=10000
+        80, "number of steps in the optimal control problem", minimum=10, maximum=10000
     )
     starts: int = parameter(24, "largest number of guesses", minimum=1, maximum=10000)
     answers: int = parameter(
         16,
-        "solutions to find, unless enough starts agree; several are computed on a coarse grid, "
-        "and the best is refined",
+        "number of solutions to find, unless enough starts agree; several are computed on a "
+        "coarse grid, and the best is refined",
         minimum=1,
         maximum=10000,
     )
     agreeing: int = parameter(
         3,
-        "starts that must find the best solution to end the search; 0: not used",
+        "number of starts that must find the best solution to end the search; 0: not used",
         minimum=0,
         maximum=10000,
     )
@@ -150,8 +150,8 @@ class OptimalOptions(MotionOptions):
     )
     time_budget: float = parameter(
         0.0,
-        "wall time to search, 5 times that if nothing is found; 0: no limit. If it ends the "
-        "search, the plan depends on the load of the machine",
+        "wall time for the search, five times as long if nothing is found; 0: no limit. If it "
+        "ends the search, the plan depends on the machine load",
         unit="s",
         minimum=0.0,
         maximum=1e9,
@@ -163,7 +163,7 @@ class OptimalOptions(MotionOptions):
 
 
 _UNLIMITED_HALF_RANGE = np.pi
-"""Half of the range that a guess uses for an unlimited joint, rad or m."""
+"""Half of the range used by a guess for an unlimited joint, rad or m."""
 
 _SMOOTH_BODY_EXPONENT = 8
 
@@ -171,11 +171,11 @@ _UNBOUNDED_FROM = 1e6
 """Bounds of a box beyond this, m or rad, are ignored for joints without limits."""
 
 _CONSTRAINT_RESERVE = 0.02
-"""Distance of a solution from its path constraints, relative: they are imposed only at steps."""
+"""Relative margin of a solution from its path constraints, which are imposed only at steps."""
 
 
 class UnusableCandidateError(PlanningError):
-    """A solution or a state is not usable; the message is a clause that says why."""
+    """A solution or state is unusable; the message is a clause that says why."""
 
 
 @dataclass(frozen=True)
@@ -195,27 +195,27 @@ class BoundaryConditions:
     start
         (n,) first shape, m or rad.
     goal_rotation
-        (4,) quaternion of the goal attitude relative to the initial one.
+        (4,) quaternion of the goal attitude relative to the initial attitude.
     likely_final_shape
-        (n,) last shape as far as it is known before the search.
+        (n,) last shape, as far as known before the search.
     final
-        (n,) last shape; None: any. That of a reaction wheel is NaN: any.
+        (n,) last shape; None: any. NaN for reaction wheels: any position.
     center
-        (3,) centre of mass of the system in the base at the end, m; None: anywhere.
+        (3,) system's centre of mass in the base at the end, m; None: anywhere.
     direction
-        (3,) kept direction of the path constraints, in the initial base frame.
+        (3,) kept direction in the path constraints, in the initial base frame.
     velocity
-        (n,) first velocities of the joints, m/s or rad/s; a number applies to all.
+        (n,) initial joint velocities, m/s or rad/s; a scalar applies to all.
     final_velocity
-        (n,) velocities that the joints keep from the end on, rad/s or m/s.
+        (n,) velocities that the joints keep after the end, rad/s or m/s.
     end_effectors
         (7 k,) goals of k links (:meth:`.EndEffectorRows.pack`).
     possible_ends
-        Ends of the guesses, in turn; none: the likely shape, and the rotation.
+        Ends used for the guesses in turn; none: the likely shape, and the rotation.
     state
-        The state at the start.
+        State at the start.
     angular_momentum
-        (3,) total, about the centre of mass, in the base at the start, kg m^2/s.
+        (3,) total angular momentum about the centre of mass, in the initial base frame, kg m^2/s.
     """
 
     start: Array
@@ -238,7 +238,8 @@ class BoundaryConditions:
 
     @property
     def is_timed(self) -> bool:
-        """Whether the end depends on the duration: the robot drifts, or joints move at an end."""
+        """Whether the end depends on the duration, because the robot drifts or joints move at an
+        end."""
         return self.drifts or bool(np.any(self.velocity) or np.any(self.final_velocity))
 
     def momenta_in_base(self, quaternions: Array) -> Array | None:
@@ -253,9 +254,9 @@ class BoundaryConditions:
 
 @dataclass(frozen=True)
 class MotionLimits:
-    """Bounds (n,) of the joints: ``lower`` and ``upper`` in m or rad, ``velocity`` per second,
-    ``acceleration`` per second squared; ``distances`` (N, M) are the planes that keep pairs of
-    links apart in N intervals (:meth:`.KeptDistances.within`).
+    """Joint bounds (n,): ``lower`` and ``upper`` in m or rad, ``velocity`` per second,
+    ``acceleration`` per second squared; ``distances`` (N, M) are the planes that keep link pairs
+    apart in N intervals (:meth:`.KeptDistances.within`).
     """
 
     lower: Array
@@ -266,10 +267,10 @@ class MotionLimits:
 
     @classmethod
     def of(cls, robot: SpaceRobot, options: MotionOptions, method: str = "optimal") -> MotionLimits:
-        """Return the robot's own limits, narrowed by the options of a method.
+        """Return the robot's limits, narrowed by a method's options.
 
-        Without ``max_acceleration``, that of reaction wheels is the acceleration by their motor
-        torque while the base rests.
+        Without ``max_acceleration``, the acceleration limit of reaction wheels is that due to their
+        motor torque with the base at rest.
 
         Raises
         ------
@@ -302,9 +303,9 @@ class MotionLimits:
         return cls(robot.lower.copy(), robot.upper.copy(), velocity, acceleration)
 
     def within(self, margin: Array, *shapes: Array) -> MotionLimits:
-        """Return limits that keep ``margin`` (n,) from the ends of the joints' ranges.
+        """Return limits narrowed by ``margin`` (n,) from the ends of the joint ranges.
 
-        Given shapes (n,) are admitted in any case.
+        The given shapes (n,) are always admitted.
         """
         # Where two margins overlap the joint keeps to the middle of its range.
         with np.errstate(invalid="ignore"):
@@ -319,7 +320,7 @@ class MotionLimits:
         )
 
     def joint_ranges(self, q: Array) -> tuple[Array, Array]:
-        """Return middle and half width (n,) of the range, finite around ``q`` (n,)."""
+        """Return the middle and the half width (n,) of the range, finite around ``q`` (n,)."""
         lower = np.maximum(self.lower, q - 2 * _UNLIMITED_HALF_RANGE)
         upper = np.minimum(self.upper, q + 2 * _UNLIMITED_HALF_RANGE)
         middle = np.where(np.isfinite(self.lower) & np.isfinite(self.upper), (lower + upper) / 2, q)
@@ -336,8 +337,8 @@ class MotionLimits:
 
         ``positions`` (N + 1, n) are the shapes at ticks of ``period`` seconds; the velocities
         ``velocity`` and ``after`` (n,) are held before and after. The factor is at most 1 if
-        velocities and accelerations keep their limits; the overrun is the largest distance of a
-        joint beyond its limits, m or rad.
+        velocities and accelerations are within their limits; the overrun is the largest distance of
+        a joint beyond its limits, m or rad.
         """
         speed, change = self.limit_shares(positions, period, velocity, after)
         beyond = np.maximum(self.lower - positions, positions - self.upper)
@@ -351,9 +352,9 @@ class MotionLimits:
         velocity: Array | float = 0.0,
         after: Array | float = 0.0,
     ) -> tuple[Array, Array]:
-        """Return velocities (N + 2, n) and accelerations (N + 1, n) as shares of their limits.
+        """Return velocities (N + 2, n) and accelerations (N + 1, n) as fractions of their limits.
 
-        Arguments are those of :meth:`excess`.
+        Arguments are as in :meth:`excess`.
         """
         ends = np.zeros((2, positions.shape[1]))
         ends[0], ends[1] = velocity, after
@@ -421,7 +422,7 @@ class _SmoothBody:
             or upper[i] < min(robot.upper[i], _UNBOUNDED_FROM)
         ]
         if not bounded:
-            raise ParameterError("A box of optimal.keep_out contains all shapes of the robot.")
+            raise ParameterError("A box in optimal.keep_out contains all shapes of the robot.")
         # No joint gets beyond its limits, so a distant side may move to a finite distance.
         width = robot.upper - robot.lower
         lower = np.maximum(lower, robot.lower - width)[bounded]
@@ -431,20 +432,20 @@ class _SmoothBody:
 
 @dataclass(frozen=True)
 class PathConstraints:
-    """Bounds on the path; each is absent by default.
+    """Path bounds; each is absent by default.
 
     Attributes
     ----------
     base_rate_limit
-        Largest rate of the base, rad/s; 0: any.
+        Largest base rate, rad/s; 0: no limit.
     axis_B, direction_W, cone_half_angle
-        The direction ``axis_B`` (3,), fixed in the base, stays out of the cone of half angle
+        The direction ``axis_B`` (3,), fixed in the base, stays out of the cone with half angle
         ``cone_half_angle`` (rad) around ``direction_W`` (3,), like an instrument that must not see
         the Sun.
     keep_out_boxes
-        (K, 2, n) lower and upper corners of boxes of shapes that the joints must not enter.
+        (K, 2, n) lower and upper corners of shape boxes that the joints must not enter.
     smooth_keep_out_bodies
-        The smooth bodies that replace the boxes in the program.
+        Smooth bodies that replace the boxes in the program.
     """
 
     base_rate_limit: float = 0.0
@@ -467,27 +468,27 @@ class PathConstraints:
         direction = _unit_direction("direction", options.keep_direction)
         if len({axis is None, direction is None, options.keep_angle == 0}) > 1:
             raise ParameterError(
-                "A direction that is kept away requires all of optimal.keep_axis, "
+                "A direction to keep away from requires all of optimal.keep_axis, "
                 "optimal.keep_direction and optimal.keep_angle."
             )
         joints, boxes = robot.n, options.keep_out
         if len(boxes) % (2 * joints or 1):
             raise ParameterError(
-                f"optimal.keep_out has {len(boxes)} numbers; a box of shapes has {joints} lower "
-                f"and {joints} upper ones."
+                f"optimal.keep_out has {len(boxes)} numbers; a shape box has {joints} lower and "
+                f"{joints} upper bounds."
             )
         corners = np.reshape(np.asarray(boxes, dtype=float), (-1, 2, max(joints, 1)))
         if np.any(corners[:, 0] >= corners[:, 1]):
             raise ParameterError(
-                "optimal.keep_out has a box whose lower bound is not below its upper."
+                "optimal.keep_out has a box whose lower bound is not below its upper bound."
             )
         bodies = tuple(_SmoothBody.of(robot, *box) for box in corners)
         return cls(options.max_base_rate, axis, direction, options.keep_angle, corners, bodies)
 
     def symbolic(self, q: ca.SX, quaternion: ca.SX, direction: ca.SX) -> ca.SX:
-        """Return the inequality constraints, not negative, at a shape and an attitude.
+        """Return the inequality constraints (nonnegative if satisfied) at a shape and an attitude.
 
-        ``direction`` (3,) is the kept direction in the frame that the quaternion refers to.
+        ``direction`` (3,) is the kept direction in the quaternion's reference frame.
         """
         rows = [ca.SX(0, 1)]
         for body in self.smooth_keep_out_bodies:
@@ -511,7 +512,7 @@ class PathConstraints:
             inside = np.all((positions > box[0]) & (positions < box[1]), axis=1)
             if inside.any():
                 raise UnusableCandidateError(
-                    f"the shape enters a box of keep_out at {np.argmax(inside) * period:.4g} s"
+                    f"the shape enters a keep_out box at {np.argmax(inside) * period:.4g} s"
                 )
         if self.axis_B is not None and self.direction_W is not None:
             seen = [
@@ -530,17 +531,18 @@ class PathConstraints:
 
     @property
     def imposed_base_rate(self) -> float:
-        """The bound on the base rate at the steps of a solution, rad/s."""
+        """Base rate bound at the steps of a solution, rad/s."""
         return self.base_rate_limit * (1 - _CONSTRAINT_RESERVE)
 
     def excess_rate(self, quaternions: Array, period: float) -> float:
-        """Return the largest base rate between attitudes (N + 1, 4) over the bound; 0: none."""
+        """Return the ratio of the largest base rate between attitudes (N + 1, 4) to the bound; 0:
+        no bound."""
         if self.base_rate_limit == 0:
             return 0.0
         return _largest_base_rate(quaternions, period) / self.base_rate_limit
 
     def slowed(self, guess: Trajectory) -> Trajectory:
-        """Return a guess slowed to the bound on the base rate."""
+        """Return a guess slowed to satisfy the base rate bound."""
         if self.base_rate_limit == 0:
             return guess
         fastest = _largest_base_rate(guess.quaternions, guess.step)
@@ -574,14 +576,14 @@ def per_joint(
     default: Array,
     method: str = "optimal",
 ) -> Array:
-    """Return the list of a method's option as (n,) numbers.
+    """Return a list-valued method option as (n,) numbers.
 
-    ``default`` (n,) are the values of joints that a list of texts ``NAME:VALUE`` does not name.
+    ``default`` (n,) are the values for joints not named in a list of strings ``NAME:VALUE``.
 
     Raises
     ------
     ParameterError
-        A list of numbers has the wrong length, or a name is not that of a joint.
+        A list of numbers has the wrong length, or a name is not a joint name.
     """
     names = robot.joint_names
     if any(isinstance(each, str) for each in values):

@@ -1,4 +1,4 @@
-"""The search for the fastest manoeuvre, from guesses to held commands, in the order of this file.
+"""Search for the fastest manoeuvre, from guesses to held commands, in the order of this file.
 
 1. **Guesses**: the direct path with loops; in motion, the remainder of the motion comes first.
 2. **Coarse solutions**: guesses are solved on a coarse grid, at a small part of the cost of the
@@ -10,7 +10,7 @@
 5. **Clear**: if held commands bring links too near to each other or to obstacles, clear paths are
    searched for near them, then near other solutions, then near guesses, and made faster.
 
-Each step is a few methods of :class:`ManoeuvreSearch`.
+Each step consists of a few methods of :class:`ManoeuvreSearch`.
 
 J. Schulman et al., "Motion planning with sequential convex optimization and convex collision
 checking", International Journal of Robotics Research 33, 2014, clear paths in steps that are
@@ -73,7 +73,7 @@ _MIN_TICKS = 2
 """Smallest number of ticks of a manoeuvre: one to start, another one to stop."""
 
 _GENTLE_TICKS, _GENTLE_TIME = 20, 1.0
-"""Ticks or time, s, of a gentle manoeuvre, whichever is less: it corrects a small error, and a
+"""Ticks or time, s, of a gentle manoeuvre, whichever is less: it corrects a small error, whereas a
 faster one would leave a larger error."""
 
 _GENTLE_DURATION_FACTOR = 4.0
@@ -98,65 +98,66 @@ _SAME_COST_TOLERANCE, _AGREEING_COST_TOLERANCE = 1e-3, 3e-3
 agree: the coarse grid and the solver's tolerance cause such differences."""
 
 _MAX_ITERATIONS_OF_STOPS = 120
-"""Steps of the solver from a guess in which wheels stop the base: most take twenty."""
+"""Solver steps from a guess in which wheels stop the base: most take twenty."""
 
 _MAX_FULL_GRID_STARTS = 3
 """Number of other paths that are made clear on the full grid alone: it costs the most."""
 
 _ADDITIONAL_TICKS, _ADDITIONAL_SHARES_OF_STOPS = (0, 0, 1, 3, 7), (0.03, 0.08)
-"""Control periods that are added if held commands miss the goal or a limit (the second time, the
-end is corrected), and shares of the duration if wheels stop the base: they use their torque all
-the time."""
+"""Control periods added if held commands miss the goal or a limit (the second time, the end is
+corrected), and fractions of the duration if wheels stop the base, because they use their torque
+throughout."""
 
 _HELD_SHARE = 0.99
 """Share of velocity and acceleration limits for solutions in whole ticks from rest: the rest is for
 held commands. Without it, wheels that stop a base take twice the CPU."""
 
 _HELD_REACH_SHARE = 0.3
-"""Share of the largest reach by which a clear path may change in a solution in whole ticks."""
+"""Fraction of the largest reach by which a clear path may change in a solution in whole ticks."""
 
 _CLEARING_TIME_FACTOR, _RESAMPLED_TIME_FACTOR = 2.0, 1.2
-"""Ratios of the time of a path to be made clear to that of a path in collision, and to that of a
-clear path on a coarse grid: slow joints leave room to go around."""
+"""Time ratios of a path to be made clear to a path in collision, and to a clear path on a coarse
+grid: slow joints leave room to move around obstacles."""
 
 _MAX_CLEARING_ITERATIONS = 80
-"""Largest number of solver steps between paths for which planes are made: more steps diverge."""
+"""Largest number of solver steps between paths for which planes are computed: more steps
+diverge."""
 
 _MAX_CLEARING_ROUNDS, _MAX_SHORTENING_ROUNDS = 15, 10
-"""Largest number of paths on the way to a clear one, and from there to a fast one: most take a few,
-but a servicer's plan is not found in seven."""
+"""Largest number of paths on the way to a clear path, and from there to a fast one: most take a
+few, but a servicer's plan is not found in seven."""
 
 _MIN_LARGEST_LACK, _LACK_PER_DEPTH = 0.1, 2.0
-"""Distance by which links on the way to a clear path may be nearer than required, m: at least, and
-as a multiple of their penetration depth."""
+"""Distance by which links on the way to a clear path may be closer than required, m: a minimum, and
+a multiple of their penetration depth."""
 
 _MAX_WORK_PER_ITERATION, _WORK_FACTOR_WITHOUT_PATH = 8e4, 3.0
-"""Largest work on clear paths, in nonzeros of Jacobians over all steps of the solver, for each step
-that ``optimal.iterations`` allows from one guess, and its factor if there is no clear path yet:
+"""Largest work on clear paths, in Jacobian nonzeros over all solver steps, per step that
+``optimal.iterations`` allows from one guess, and its factor if there is no clear path yet:
 12 and 36 s of an idle core (0.5 us a nonzero). With 1.25e5 two arms took 40 s for the same plan."""
 
 _MIN_SHORTENING_ROUNDS = 3
-"""Paths on the way to a fast one that are tried in any case."""
+"""Number of paths on the way to a fast one that are always tried."""
 
 _NO_LACK = 1e-3
 """Missing distance below which all planes are kept, m."""
 
 _PROGRESS_SHARE = 0.9
-"""Largest ratio of the missing distance to that two paths before at which there is progress."""
+"""Largest ratio of the missing distance to that two paths earlier that counts as progress."""
 
 _MIN_GAIN = 0.01
-"""Relative gain of time below which a clear path is no longer made faster, at the full reach."""
+"""Relative time gain below which a clear path is no longer made faster, at the full reach."""
 
 _REACH_DIVISOR, _REACH_FACTOR, _MIN_REACH_SHARE = 3.0, 2.0, 0.02
-"""Divisor of the reach if a faster path is not clear, its factor if it is, and the share of the
+"""Divisor of the reach if a faster path is not clear, its factor if it is, and the fraction of the
 largest reach at which paths are no longer made faster."""
 
 _REACH_FROM_GUESS = 4.0
-"""Factor of the largest reach from a guess, which is far from the goal."""
+"""Factor applied to the largest reach from a guess, which is far from the goal."""
 
 _MAX_CLEAR_STARTS, _MAX_CLEAR_STARTS_IN_MOTION, _CLEAR_ANSWERS = 16, 1, 2
-"""Guesses near whose solutions manoeuvres that keep clear are looked for at most (in motion, unless
-the base drifts, the rest of the motion is the one: from rest, after braking, others are found
+"""Largest number of guesses whose solutions are searched nearby for clear manoeuvres (in motion,
+unless the base drifts, only the rest of the motion: from rest, after braking, others are found
 sooner), and the number of clear paths on a coarse grid that ends the search. With 8 guesses a plan
 of a quadruped took 40 % longer."""
 
@@ -166,7 +167,7 @@ _REPORT_PERIOD = 1.0
 
 @dataclass(frozen=True)
 class Manoeuvre:
-    """A found manoeuvre, as held commands with results of its search.
+    """A manoeuvre found, as held commands with search results.
 
     Attributes
     ----------
@@ -175,11 +176,11 @@ class Manoeuvre:
     duration
         s.
     solution
-        The trajectory that was converted to held commands.
+        Trajectory converted to held commands.
     starts
         Guesses that were tried.
     cut_short
-        Whether the wall time was used up before the search had come to its end.
+        Whether the wall time was used up before the search was complete.
     """
 
     held: HeldCommands
@@ -191,14 +192,14 @@ class Manoeuvre:
 
 @dataclass(frozen=True)
 class SearchClock:
-    """The wall time of a plan, which all its searches share.
+    """Wall time of a plan, shared by all its searches.
 
     Attributes
     ----------
     budget
         s; 0: no limit.
     began
-        ``time.monotonic()``, s, at the beginning.
+        ``time.monotonic()``, s, at the start.
     """
 
     budget: float = 0.0
@@ -328,7 +329,8 @@ class _SearchState:
     _reported: float = 0.0
 
     def is_over(self, *, found: bool) -> bool:
-        """Whether wall time or work on clear paths is used up; ``found``: there is such a path."""
+        """Whether the wall time or the work on clear paths is used up; ``found``: whether there is
+        such a path."""
         most = _MAX_WORK_PER_ITERATION * self.problem.options.iterations
         if not found:
             most *= _WORK_FACTOR_WITHOUT_PATH
@@ -353,13 +355,13 @@ class _SearchState:
         return StopRule(iterations, problem.cancellation, is_over, watch)
 
     def begin(self, phase: SearchPhase) -> None:
-        """Begin a phase, and report it."""
+        """Begin a phase and report it."""
         if phase is not self.phase:
             self.phase = phase
             self.report("begun")
 
     def report(self, result: str, duration: float = math.inf) -> None:
-        """Report a result; ``duration``, s, is that of a path which may be the best."""
+        """Report a result; ``duration``, s, is that of a path that may be the best."""
         self.best = min(self.best, duration)
         self._reported = elapsed = self.problem.clock.elapsed
         phase, most = self.phase or SearchPhase.SEARCHING, self.problem.options.starts
@@ -368,7 +370,7 @@ class _SearchState:
 
     @contextmanager
     def attempt(self) -> Iterator[None]:
-        """Note the reason why there is no manoeuvre, instead of raising an error."""
+        """Record the reason why there is no manoeuvre, instead of raising an error."""
         try:
             yield
         except UnusableCandidateError as reason:
@@ -393,12 +395,12 @@ class _Apart(NamedTuple):
 
 
 class ManoeuvreSearch:
-    """Searches for manoeuvres of one robot.
+    """Searches for a robot's manoeuvres.
 
     Parameters
     ----------
     model
-        Model and constraints of the manoeuvres.
+        Model and constraints for the manoeuvres.
     """
 
     def __init__(self, model: ManoeuvreModel) -> None:
@@ -415,7 +417,7 @@ class ManoeuvreSearch:
         NotFoundError
             None was found.
         PlanningError
-            No manoeuvre is as short as requested, or links are too near at an end.
+            No manoeuvre is as short as requested, or links are too close at an end.
         PlanningCancelled
             The search was cancelled.
         """
@@ -892,7 +894,7 @@ class ManoeuvreSearch:
         if solution is None:
             state.report(f"{pairs}, {_NO_PATH_FOUND}")
             raise UnusableCandidateError(_NO_PATH_FOUND)
-        lack = f"{1e3 * solver.lack:.3g} mm too near"
+        lack = f"{1e3 * solver.lack:.3g} mm too close"
         state.report(f"{pairs}, {solution.duration:.6g} s, {lack}")
         return solution, solver.lack
 

@@ -1,24 +1,26 @@
 """Direct multiple shooting: the optimal control problem as a nonlinear program, stage by stage.
 
-Knots k = 0..N carry the attitude X, the joint velocity v and the vertex s; the control of interval
+Knots k = 0..N contain the attitude X, the joint velocity v and the vertex s; the control of
+interval
 k is its constant joint acceleration a; all intervals take the same time h, which is free. The
 shape runs along a parabola in each interval, from ``q_k = s_k - h v_k / 2`` to ``q_{k+1}``, whose
-tangents at both ends meet in the vertex ``s_k``. As the parabola lies in the triangle of the three,
-simple bounds on s keep the joint limits between the knots, too. The dynamics are
+tangents at both ends meet in the vertex ``s_k``. As the parabola lies in the triangle of these
+three points, simple bounds on s enforce the joint limits also between the knots. The dynamics are
 
 ``v+ = v + h a``, ``s+ = s + h v+``, ``X+ = X exp(Omega(s, h v, h v+))``.
 
-Omega is the Magnus expansion, order four, of the rates at two Gauss points of the interval; at zero
-momentum, ``D(q) w + D_q(q) u = 0`` (paper 1, eq. 3). So the attitude follows from the path of the
-shape, whatever its speed, and the base's position needs no state: the centre of mass rests, and the
-last shape and attitude determine it.
+Omega is the fourth-order Magnus expansion of the rates at two Gauss points of the interval; at zero
+momentum, ``D(q) w + D_q(q) u = 0`` (paper 1, eq. 3). So the attitude follows from the shape path at
+any speed, and the base position needs no state: the centre of mass is at rest, and the final shape
+and attitude determine the position.
 
 If a robot drifts, its angular momentum L about the centre of mass is constant in the world, so
-``D(q) w + D_q(q) u = h X' L_0``, with L_0 in the base at the start. X at a Gauss point is the
-weighted mean of the quaternions at both knots, normalised, which makes the attitude of order two.
-These functions differ from those at zero momentum, and are derived only if a robot drifts.
+``D(q) w + D_q(q) u = h X' L_0``, with L_0 in the initial base frame. X at a Gauss point is the
+weighted mean of the quaternions at both knots, normalised, which makes the attitude second-order
+accurate.
+These functions differ from the ones at zero momentum, and are derived only if a robot drifts.
 
-All stages have the same functions. Their derivatives are derived once, and inserted into the
+All stages have the same functions. Their derivatives are computed once, and inserted into the
 program's sparse matrices.
 
 Method: H. G. Bock and K. J. Plitt, "A multiple shooting algorithm for direct solution of optimal
@@ -58,14 +60,14 @@ _DIRECTION_SIZE = 3
 """Size of the kept direction, the first parameter of an interval."""
 
 _LEAST_MULTIPLIER = 3e-2
-"""Multiplier below which a distance has no effect: durations or efforts, of about one, per m."""
+"""Multiplier below which a distance has no effect, in durations or efforts (of about one) per m."""
 
 Indices = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True)
 class ConstraintBlock:
-    """Rows of the program that depend on few variables z, with their derivatives.
+    """Program rows that depend on few variables z, with their derivatives.
 
     ``values`` is ``(z, p) -> g``, ``jacobian`` ``(z, p) -> g, J`` and ``hessian``
     ``(z, p, lambda) -> H``, the upper triangle of the Hessian of ``lambda' g``.
@@ -96,9 +98,9 @@ class ConstraintBlock:
         *,
         repeated: bool = False,
     ) -> ConstraintBlock:
-        """Return a block from the cache, or derive it; ``facts`` are all that it depends on.
+        """Return a block from the cache, or derive it; ``facts`` are everything it depends on.
 
-        Derivatives of a block that is ``repeated`` in a program are compiled.
+        Derivatives are compiled if the block is ``repeated`` in a program.
         """
         key, derived = hash_of(facts), cache(derive)
         jacobian = cached_function(f"{name}_jac", key, lambda: derived().jacobian)
@@ -120,7 +122,7 @@ class ConstraintBlock:
         *,
         repetitive: bool = True,
     ) -> ConstraintBlock:
-        """Take the expressions of rows, Jacobian and Hessian; find common subexpressions if they
+        """Set the expressions for rows, Jacobian and Hessian; find common subexpressions if they
         are ``repetitive``.
         """
         g, H = ca.densify(g), ca.triu(H)
@@ -136,21 +138,21 @@ class ConstraintBlock:
 
 @dataclass(frozen=True)
 class Stages:
-    """The functions of one robot's problem, whatever the number of intervals.
+    """Functions of one robot's problem, for any number of intervals.
 
     Attributes
     ----------
     joints
         n.
     beginning, interval, end
-        Rows of the first knot, of two neighbouring knots, and of the last one.
+        Rows for the first knot, for two neighbouring knots, and for the last knot.
     path_row_count
-        Rows of the interval that are inequalities, ``>= 0``: its last ones.
+        Number of inequality rows (``>= 0``) in the interval, its last ones.
     rotation_of_step
-        The rotation vector (3,) of a step (:func:`turn_function`).
+        Rotation vector (3,) of a step (:func:`turn_function`).
     distances
-        Distances of pairs of links, and of links and obstacles, from planes in an interval, plus a
-        lack that is a variable of the program: as its rows and ``>= 0``; None: none.
+        Distances of link pairs, and of links and obstacles, from planes in an interval, plus a lack
+        variable: program rows, ``>= 0``; None: none.
     """
 
     joints: int
@@ -163,7 +165,7 @@ class Stages:
 
     @property
     def drifting(self) -> bool:
-        """Whether the angular momentum is a parameter of the interval; else it is zero."""
+        """Whether the angular momentum is an interval parameter; otherwise it is zero."""
         return self.interval.values.numel_in(1) > _DIRECTION_SIZE
 
     @classmethod
@@ -178,7 +180,7 @@ class Stages:
         end_effectors: ca.Function | None = None,
         drifting: bool = False,
     ) -> Stages:
-        """Derive the functions of a robot's problem, or read them from the cache.
+        """Derive the functions for a robot's problem, or read them from the cache.
 
         Parameters
         ----------
@@ -217,14 +219,14 @@ class Stages:
         return cls(n, beginning_block(n), interval, ends, path, turn)
 
     def with_distances(self, rows: Sequence[PlaneDistance], instants: int) -> Stages:
-        """Return the problem in which pairs of links keep distances, too, at a number of instants
-        in each interval.
+        """Return the problem in which link pairs also keep distances, at a number of instants per
+        interval.
         """
         return replace(self, distances=_distance_block(self.joints, rows, instants))
 
 
 def beginning_block(joints: int) -> ConstraintBlock:
-    """Return the rows of the first knot, of ``[h; s; v]``: its shape is the start (n,)."""
+    """Return the rows for the first knot, in ``[h; s; v]``: its shape is the start (n,)."""
     h, s, v = ca.SX.sym("h"), ca.SX.sym("s", joints), ca.SX.sym("v", joints)
     start = ca.SX.sym("start", joints)
     return ConstraintBlock.of("beginning", ca.vertcat(h, s, v), start, s - h * v / 2 - start)
@@ -258,7 +260,7 @@ def _cached_interval(
 
 
 def hash_of(facts: Sequence[str]) -> str:
-    """Return the cache key of an object that is derived from some facts."""
+    """Return the cache key for an object derived from given facts."""
     return hashlib.sha256("\n".join(facts).encode()).hexdigest()
 
 
@@ -305,7 +307,7 @@ def _interval_block(
 @dataclass(frozen=True)
 class AttitudeRows:
     """Rows (4,) of an interval that vanish if its attitudes follow from the rotations at the Gauss
-    points, with their derivatives by its variables.
+    points, with their derivatives with respect to its variables.
 
     Attributes
     ----------
@@ -314,7 +316,7 @@ class AttitudeRows:
     rows, jacobian
         The rows and their Jacobian.
     multiplier, hessian
-        Multipliers (4,) of the rows, and the Hessian of their product.
+        Multipliers (4,) of the rows, and the Hessian of their product with the rows.
     """
 
     rotations: list[ca.SX]
@@ -333,7 +335,7 @@ class AttitudeRows:
         rotation: ca.Function,
         defect: ca.SX | None = None,
     ) -> AttitudeRows:
-        """Derive the rows by the chain rule, as only terms with the robot's inertia are large.
+        """Derive the rows by the chain rule, because only terms with the robot's inertia are large.
 
         Parameters
         ----------
@@ -343,8 +345,8 @@ class AttitudeRows:
             The arguments of ``rotation`` at the Gauss points.
         rotation
             Rotation, its Jacobian and the Hessian of its product with multipliers. Common
-            subexpressions are searched for in it; a search in the expressions of an interval takes
-            several times as long, and finds one per cent more.
+            subexpressions are searched for in it; a search in the interval expressions takes
+            several times as long, and finds only 1 % more.
         defect
             A parameter (3,) that is added to the rotation vector of the step; None: none.
         """
@@ -476,13 +478,13 @@ def _path_constraint_rows(
 
 
 def state_within_interval(tau: float, s: ca.SX, u: ca.SX, u_next: ca.SX) -> ca.SX:
-    """Return shape and step (2 n,) in an interval with vertex s, tau of the way."""
+    """Return shape and step (2 n,) at the fraction tau of an interval with vertex s."""
     change = u_next - u
     return ca.vertcat(s + (tau - 1 / 2) * u + tau**2 / 2 * change, u + tau * change)
 
 
 def momentum_in_base(tau: float, X: ca.SX, X_next: ca.SX, L_0: ca.SX) -> ca.SX:
-    """Return the angular momentum (3,) in the base, tau of the way between two attitudes."""
+    """Return the angular momentum (3,) in the base at the fraction tau between two attitudes."""
     mean = (1 - tau) * X + tau * X_next
     v, w = mean[:3], mean[3]
     # R(mean)' L_0 for a quaternion of any norm.
@@ -507,7 +509,8 @@ def _rotation_symbols(robot: SpaceRobot, drifting: bool) -> list[tuple[str, int]
 
 
 def rotation_with_derivatives(robot: SpaceRobot, *, drifting: bool) -> ca.Function:
-    """Return the rotation w, its Jacobian, and the Hessian of ``mu' w``, of the point and mu.
+    """Return the rotation w, its Jacobian, and the Hessian of ``mu' w``, as functions of the point
+    and mu.
 
     By differentiating ``D w + D_q u = 0``, or l on the right, once and twice.
     """
@@ -537,8 +540,8 @@ def magnus(first: ca.SX, second: ca.SX) -> ca.SX:
 def turn_function(robot: SpaceRobot, *, drifting: bool = False) -> ca.Function:
     """Return ``(q, u, u+) -> Omega`` (3,): the rotation vector of a step, base components.
 
-    If the robot drifts, a fourth argument is the angular impulse (3,) of the step: the angular
-    momentum in the base about half-way, times the duration of the step.
+    If the robot drifts, the fourth argument is the angular impulse (3,) of the step: the angular
+    momentum in the base about half-way, times the step duration.
     """
     q, u, u_next = (ca.SX.sym(name, robot.n) for name in ("q", "u", "u_next"))
     impulse = ca.SX.sym("impulse", 3 if drifting else 0)
@@ -553,11 +556,11 @@ def turn_function(robot: SpaceRobot, *, drifting: bool = False) -> ca.Function:
 
 @dataclass(frozen=True)
 class Layout:
-    """Indices of the variables of N intervals: the step, then knot after knot its states and its
-    controls, which the last knot has not.
+    """Indices of the variables for N intervals: the step, then the states and controls knot by
+    knot; the last knot has no controls.
 
-    Where pairs are kept apart, the last variable is by how much they are nearer than they ought to
-    be, m (``has_lack``). ``states`` and ``controls`` are the sizes of the parts of a knot.
+    If pairs are kept apart, the last variable is the distance by which they are closer than
+    required, m (``has_lack``). ``states`` and ``controls`` are the sizes of the knot components.
     """
 
     states: tuple[int, ...]
@@ -567,7 +570,7 @@ class Layout:
 
     @classmethod
     def of(cls, stages: Stages, intervals: int) -> Layout:
-        """Return the indices of the problem of some stages, whose knots are ``X, s, v, a``."""
+        """Return the indices for a problem with these stages, whose knots are ``X, s, v, a``."""
         n = stages.joints
         return cls((4, n, n), (n,), intervals, stages.distances is not None)
 
@@ -578,7 +581,7 @@ class Layout:
         return 1 + of_states + sum(self.controls) * self.intervals + self.has_lack
 
     def knots(self) -> tuple[Indices, ...]:
-        """Return the places of the states (N + 1, ...), then of the controls (N, ...)."""
+        """Return the indices of the states (N + 1, ...), then of the controls (N, ...)."""
         ends = np.cumsum([0, *self.states, *self.controls])
         first = 1 + ends[-1] * np.arange(self.intervals + 1)[:, np.newaxis]
         places = [first + np.arange(i, j) for i, j in pairwise(ends)]
@@ -588,7 +591,7 @@ class Layout:
 
 @dataclass(frozen=True)
 class Program:
-    """Functions of variables x and parameters p, as IPOPT requires; the bounds are those of g."""
+    """Functions of variables x and parameters p, as required by IPOPT; the bounds apply to g."""
 
     problem: dict[str, ca.MX]
     jac_g: ca.Function
@@ -599,11 +602,10 @@ class Program:
 
 @dataclass(frozen=True)
 class PlacedBlock:
-    """A block placed at every interval or end of the program.
+    """A block placed at every interval, or at an end, of the program.
 
-    ``variables`` and ``rows`` (count, ...) are the places of its variables in x and of its rows in
-    g, ``parameters`` the part of p that it takes: a column for all places, or one
-    for each.
+    ``variables`` and ``rows`` (count, ...) are the indices of its variables in x and of its rows in
+    g, ``parameters`` its part of p: one column for all places, or one per place.
     """
 
     block: ConstraintBlock
@@ -619,14 +621,14 @@ class PlacedBlock:
         variables: Indices,
         parameters: ca.MX,
     ) -> PlacedBlock:
-        """Place a block whose rows come after those of others."""
+        """Place a block after the rows of the others."""
         count = len(variables)
         rows = sum(each.rows.size for each in placed)
         of_block = rows + np.arange(count * block.rows).reshape(count, block.rows)
         return cls(block, variables, of_block, parameters)
 
     def called(self, function: ca.Function, x: ca.MX, *more: ca.MX) -> list[ca.MX]:
-        """Return the results at all places: the nonzeros of one place after the other."""
+        """Return the results at all places: the nonzeros place by place."""
         count = len(self.variables)
         z = ca.reshape(x[self.variables.ravel().tolist()], -1, count)
         p = self.parameters
@@ -637,7 +639,7 @@ class PlacedBlock:
         return [ca.vec(result.nz[:]) for result in results]
 
     def multipliers(self, lam_g: ca.MX) -> ca.MX:
-        """Return the multipliers of its rows, a column for each place."""
+        """Return the multipliers of its rows, one column per place."""
         return ca.reshape(lam_g[self.rows.ravel().tolist()], -1, len(self.rows))
 
 
@@ -687,10 +689,10 @@ def place_stages(
     parameters: tuple[ca.MX, ca.MX, ca.MX],
     path_row_count: int = 0,
 ) -> tuple[list[PlacedBlock], int]:
-    """Place the blocks of the first knot, of all intervals and of the last knot.
+    """Place the blocks for the first knot, for all intervals and for the last knot.
 
     The last ``path_row_count`` rows of an interval are inequalities, which come after all
-    equalities; their number is returned, too.
+    equalities; their number is also returned.
     """
     beginning, interval, end = blocks
     N, first, dynamics = len(variables[1]), beginning.rows, interval.rows - path_row_count
@@ -713,9 +715,7 @@ def assembled(
     placed: Sequence[PlacedBlock],
     equalities: int,
 ) -> Program:
-    """Return the program of an objective f and of blocks, whose rows after the equalities are
-    ``>= 0``.
-    """
+    """Return the program for an objective f and blocks; rows after the equalities are ``>= 0``."""
     rows = sum(each.rows.size for each in placed)
     g = _gather_rows(rows, [(each.rows, each.called(each.block.values, x)[0]) for each in placed])
     values, jacobian = _jacobian(placed, x, rows)

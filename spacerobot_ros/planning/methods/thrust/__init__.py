@@ -1,1 +1,1 @@
-"""Motions of base and joints under thrust, around obstacles and for the least propellant."""
+"""Motions of the base and the joints under thrust, around obstacles and with least propellant."""

@@ -1,8 +1,9 @@
-"""What may come too near in a motion under thrust: links, obstacles, and a tumbling target.
+"""Bodies that may come too close in a motion under thrust: links, obstacles, and a tumbling target.
 
-Relative to a target, its body is an obstacle at rest. So the exact check is the one for obstacles,
-with the pose of the base relative to the target; a plane between a link and the target is
-transformed to W by the pose of the target at that time.
+Relative to a target frame, the target body is an obstacle at rest. So the exact check for obstacles
+is used,
+with the base pose relative to the target; a plane between a link and the target is transformed to W
+by the target pose at that time.
 """
 
 from __future__ import annotations
@@ -43,7 +44,7 @@ _ROOM = 4e-3
 """Distance beyond the required one at these instants: paths bend between them, m."""
 
 _NO_DISTANCE = 1e3
-"""m; rows of a plane this far away are always satisfied."""
+"""m; rows for a plane this far away are always satisfied."""
 
 
 class _Samples(NamedTuple):
@@ -69,7 +70,7 @@ class _Surroundings:
         """Distances (P,), m."""
 
     def base(self, path: _Samples) -> BasePoses:
-        """Return the poses of the base in the frame in which the obstacles rest."""
+        """Return the base poses in the frame in which the obstacles are at rest."""
         if self.target is None:
             return path.base
         X_WT, r_WT = self.target.body_poses(path.times)
@@ -93,8 +94,8 @@ class _Surroundings:
 
 
 class Bodies:
-    """The pairs of solids of one motion: those of a robot and its obstacles, then those of a robot
-    and a target.
+    """Pairs of solids for one motion: those of a robot and its obstacles, then those of a robot and
+    a target.
 
     Parameters
     ----------
@@ -246,7 +247,7 @@ class Bodies:
     # -- the exact check ----------------------------------------------------------------------
 
     def approaches(self, motion: ThrustMotion) -> list[Approach]:
-        """Return the pairs that come too near in a motion, nearest first."""
+        """Return the pairs that come too close in a motion, nearest first."""
         shapes, base = motion.path()
         path = _Samples(shapes, base, np.linspace(0.0, motion.duration, len(shapes)))
         found: list[Approach] = []
@@ -262,7 +263,7 @@ class Bodies:
         return any(around.geometry.with_obstacles[pair] for around, pair in pairs)
 
     def reason(self, approach: Approach) -> str:
-        """Return a clause about a motion that is not clear."""
+        """Return a clause that describes a motion that is not clear."""
         around, _ = self._pair(approach.pair)
         return f"no clear motion was found: {around.clearance.clause(approach, None)}"
 

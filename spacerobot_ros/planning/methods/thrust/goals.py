@@ -21,17 +21,18 @@ class Grapple:
     Attributes
     ----------
     motion
-        The motion of the target, beginning at the start of the robot's.
+        Target motion, beginning at the start of the robot's motion.
     description
-        Its body, one link, from which the robot keeps clear; None: it is not known.
+        Target body, one link, from which the robot keeps clear; None: unknown.
     clearance
-        Distance from its body, m; 0: it is not checked.
+        Distance from the target body, m; 0: not checked.
     horizon
-        Time within which it is met, s.
+        Time within which the target must be met, s.
     detumbles
-        Whether the total angular momentum of robot and target at the grasp must be zero or minimal.
+        Whether the total angular momentum of the robot and the target at the grasp must be zero or
+        minimal.
     standoff
-        (3,) a position in the grapple frame from which the end-effector would come straight, m.
+        (3,) a position in the grapple frame from which the end-effector would approach straight, m.
     """
 
     motion: TorqueFreeMotion
@@ -58,7 +59,7 @@ class ThrustGoal:
 
 
 def base_for_hand(robot: SpaceRobot, link: str, shape: Array, hand: Array) -> Array:
-    """Return the pose (7,) of the base with which a link, in a shape (n,), has a pose (7,)."""
+    """Return the base pose (7,) for which a link has a given pose (7,) in a shape (n,)."""
     still = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
     there = np.concatenate(end_effector_pose(robot, link, still[:3], still[3:], shape))
     return compose_poses(hand, relative_pose(there, still))

@@ -1,4 +1,4 @@
-"""A motion under thrust over time: exact states, accelerations and efforts."""
+"""Motion under thrust over time: exact states, accelerations and efforts."""
 
 from __future__ import annotations
 
@@ -33,11 +33,11 @@ from spacerobot_ros.planning.methods.thrust.transcription import (
 )
 
 EXACT_STEPS = 8
-"""Steps of Runge-Kutta in an interval that is integrated exactly."""
+"""Runge-Kutta steps per exactly integrated interval."""
 
 
 class FrameSample(NamedTuple):
-    """The motion of a frame in W: position (3,), m, quaternion (4,), and their velocities and
+    """Motion of a frame in W: position (3,), m, quaternion (4,), and their velocities and
     accelerations (3,), in world components.
     """
 
@@ -50,9 +50,9 @@ class FrameSample(NamedTuple):
 
 
 class MotionSample(NamedTuple):
-    """A motion at one instant: frames of the base and of the end-effector (None: there is none),
-    positions, velocities and accelerations (n,) of the joints, the wrench (6,) at the origin of the
-    base in its components, and the joint efforts (n,).
+    """A motion at one instant: frames of the base and the end-effector (None if there is none),
+    joint positions, velocities and accelerations (n,), the wrench (6,) at the base origin in base
+    components, and the joint efforts (n,).
     """
 
     base: FrameSample
@@ -90,7 +90,7 @@ def base_poses(robot: SpaceRobot, states: Array) -> BasePoses:
 
 
 class ThrustMotion:
-    """A planned motion as flown by its controls: integrated from the start.
+    """A planned motion as flown by its controls, integrated from the start.
 
     Parameters
     ----------
@@ -108,7 +108,7 @@ class ThrustMotion:
         self.propulsion = propulsion
         self._functions, self._knots = functions, knots
         self.levels = knots.levels
-        """Levels (N, m) of the propulsion, each held for :attr:`step` seconds."""
+        """Propulsion levels (N, m), each held for :attr:`step` seconds."""
         self.step = knots.step
         qddot = np.diff(state_parts(knots.states)[5], axis=0) / knots.step
         self._controls = np.hstack([qddot, knots.levels @ propulsion.wrenches.T])

@@ -1,4 +1,4 @@
-"""Propulsion of a base: a table of thrusters, or a wrench in any direction within two norms."""
+"""Base propulsion: a thruster table, or a wrench in any direction within two norms."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ class Propulsion:
     Attributes
     ----------
     wrenches
-        (6, m) force (N) over torque (N m) at the origin of the base link, in base components, at
-        level one.
+        (6, m) force (N) over torque (N m) at the base link origin, in base components, at level
+        one.
     cost
-        (m,) cost of a second at level one: kg of propellant if there is a table, else N s of
+        (m,) cost per second at level one: kg of propellant if there is a table, else N s of
         impulse.
     norms
-        Groups of levels whose Euclidean norm is at most one, and which go from -1 to 1. All other
-        levels go from 0 to 1.
+        Groups of levels with a Euclidean norm of at most one, which range from -1 to 1. All other
+        levels range from 0 to 1.
     """
 
     wrenches: Array
@@ -41,14 +41,15 @@ class Propulsion:
 
     @property
     def lowest(self) -> Array:
-        """Lowest levels (m,): -1 within norms, else 0."""
+        """Lowest levels (m,): -1 in norm groups, else 0."""
         lowest = np.zeros(self.size)
         lowest[[i for group in self.norms for i in group]] = -1.0
         return lowest
 
     @classmethod
     def of_table(cls, table: ThrusterTable, reserve: float = 0.0) -> Propulsion:
-        """Return thrusters of a table, with a share of the levels reserved for feedback.
+        """Return the propulsion for a thruster table, with a fraction of the levels reserved for
+        feedback.
 
         Raises
         ------
@@ -66,7 +67,7 @@ class Propulsion:
 
     @classmethod
     def within(cls, force: float, torque: float, reserve: float = 0.0) -> Propulsion:
-        """Return a wrench of a largest force (N) and torque (N m), each in Euclidean norm.
+        """Return the propulsion for a largest force (N) and torque (N m), each in Euclidean norm.
 
         Raises
         ------
@@ -76,14 +77,14 @@ class Propulsion:
         for name, value in (("force", force), ("torque", torque)):
             if not (value > 0 and math.isfinite(value)):
                 raise ParameterError(
-                    f"The {name} limit of the thrusters is {value:g}; a motion under thrust is "
+                    f"The thruster {name} limit is {value:g}; a motion under thrust is "
                     f"planned within a finite limit: set max_{name}."
                 )
         limits = (1.0 - reserve) * np.repeat([force, torque], 3)
         return cls(np.diag(limits), limits, ((0, 1, 2), (3, 4, 5)))
 
     def largest_force(self) -> float:
-        """Return a bound of the force in any direction, N."""
+        """Return a bound on the force in any direction, N."""
         force = self.wrenches[:3]
         if self.norms:
             return float(np.abs(force).max())

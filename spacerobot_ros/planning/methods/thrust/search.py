@@ -1,10 +1,11 @@
-"""Motions under thrust for goals: a guess, the shortest time, the least propellant, and clearance.
+"""Motions under thrust to goals: a guess, the shortest time, the least propellant, and clearance.
 
-The search is short, as base and arm are pushed in every direction: a straight guess leads to the
-solution in most cases. It is solved for the shortest time, then in a longer time for the least
-propellant, then again with the defects of its intervals until it is exact. Pairs that come too
-near, by the exact check, get planes along a path clear of them, which is found by bowing it away
-from obstacles.
+The search is short, because the base and the arm can be pushed in every direction: in most cases, a
+straight guess leads to the solution. The problem is solved for the shortest time, then in a longer
+time for the
+least propellant, then again with the interval defects until it is exact. For pairs that come too
+close in the exact check, planes are added along a path clear of them, which is found by bending it
+away from obstacles.
 """
 
 from __future__ import annotations
@@ -67,78 +68,83 @@ from spacerobot_ros.planning.methods.thrust.transcription import (
 _LOG = logging.getLogger(__name__)
 
 _REGULARISATION = 1e-3
-"""Weight of the squares of levels, which makes solutions unique. 1e-2 costs 1 % of propellant, 1e-4
+"""Weight of the squared levels, which makes solutions unique. 1e-2 costs 1 % of propellant, 1e-4
 saves 0.1 % and takes twice the steps."""
 
 _SMOOTHNESS = 1.0
-"""Weight of the squares of joint accelerations: arms that swing as counterweights save 5 % of
-propellant, and swing into their own robot."""
+"""Weight of the squares of joint accelerations: arms swinging as counterweights save 5 % of
+propellant, but swing into their own robot."""
 
 _TIME_REGULARISATION = 1e-5
 
 _ROUNDINGS = (0.1, 0.01, 0.003)
-"""Levels at which costs of norms are rounded off, in turn: the last one alone takes three times the
+"""Levels at which norm costs are smoothed, in turn: the last one alone takes three times the
 steps."""
 
 _EXACT_END, _MAX_CORRECTIONS = 1e-5, 10
-"""Largest error at the end, m and rad, and the largest number of corrections that lead there."""
+"""Largest error at the end, m and rad, and largest number of corrections to reach it."""
 
 _NEAR_END = 1e-2
-"""Error at the end below which the nearest exact motion is searched for, m and rad."""
+"""Final error below which the nearest exact motion is searched for, m and rad."""
 
 _LARGEST_END_ERROR = 1e-3
-"""Error at the end above which a motion is not a solution, m and rad."""
+"""Final error above which a motion is not a solution, m and rad."""
 
 _END_REACH = 0.3
-"""Distance of the joints at the end from the shape that inverse kinematics finds, m or rad."""
+"""Distance of the joints at the end from the shape found by inverse kinematics, m or rad."""
 
 _COST_OF_LACK = 1e3
-"""Weight of a metre of missing distance of pairs."""
+"""Weight of missing distance between pairs, per metre."""
 
 _LARGEST_LACK = 1e-4
-"""Missing distance of pairs up to which a solution counts as clear before the exact check, m."""
+"""Missing distance between pairs up to which a solution counts as clear before the exact check,
+m."""
 
 _MAX_ROUNDS = 6
-"""Number of times that new planes are made to clear a path of pairs."""
+"""Number of times that new planes are computed to clear a path."""
 
 _GRASP_REACH = 0.6
-"""Distance of the joints from their shape at the start on the way to a grasp, m or rad: the base
-moves, and the arm stays clear of it."""
+"""Distance of the joints from their initial shape on the way to a grasp, m or rad: the base moves,
+and the arm stays clear of it."""
 
 _SHALLOW = 0.1
-"""Depth of a contact on a path from which on it is not tried with planes, m."""
+"""Contact depth on a path above which it is not tried with planes, m."""
 
 _SHARES_LEFT = (0.0, 0.25, 0.5)
-"""Shares of the angular momentum after a grasp that may be left."""
+"""Fractions of the angular momentum that may be left after a grasp."""
 
 _MEETING_PERIOD = 1.0
-"""Interval between times at which a guess meets a target, s."""
+"""Interval between the times at which guesses meet a target, s."""
 
 _LARGEST_STRETCH = 4.0
-"""Largest factor of the time of a motion whose efforts are too large."""
+"""Largest factor applied to the duration of a motion with excessive efforts."""
 
 _BOW_SHARES = (0.0, 0.25, 0.5, 0.75, 1.0, 1.5, 2.0)
 _BOW_DIRECTIONS = 12
-"""Heights of bows away from a straight line, relative to the smallest one worth trying, and number
-of directions."""
+"""Heights of bends away from a straight line, relative to the smallest height worth trying, and
+number of directions."""
 
 
 @dataclass(frozen=True)
 class ThrustOptions(MotionOptions):
-    """The options of motions planned under thrust."""
+    """Options of motions planned under thrust."""
 
     time_factor: float = parameter(
         1.5,
-        "duration of a motion of least propellant, relative to the shortest; 1: the shortest",
+        "duration of a least-propellant motion, relative to the shortest; 1: the shortest",
         minimum=1.0,
         maximum=1e3,
     )
     duration: float = parameter(
-        0.0, "duration of a motion; 0: by time_factor", unit="s", minimum=0.0, maximum=1e5
+        0.0,
+        "duration of a motion; 0: determined by time_factor",
+        unit="s",
+        minimum=0.0,
+        maximum=1e5,
     )
     reserve: float = parameter(
         0.2,
-        "share of thrust and of joint efforts reserved for the feedback of the controller",
+        "fraction of thrust and joint efforts reserved for the controller's feedback",
         minimum=0.0,
         maximum=0.9,
     )
@@ -148,7 +154,7 @@ class ThrustOptions(MotionOptions):
     )
     clearance: float = parameter(
         DEFAULT_CLEARANCE,
-        "smallest distance of links and obstacles; 0: contacts are ignored",
+        "smallest distance between links and from obstacles; 0: contacts are ignored",
         unit="m",
         minimum=0.0,
         maximum=1e3,
@@ -156,18 +162,18 @@ class ThrustOptions(MotionOptions):
 
 
 class ThrustPlanner:
-    """Plans motions of base and joints of one robot.
+    """Plans base and joint motions of one robot.
 
     Parameters
     ----------
     robot
         The model, with its world if it has one.
     propulsion
-        Propulsion of its base, minus the reserve.
+        Base propulsion, minus the reserve.
     options
         The options.
     link
-        Link of the end-effector; empty: none.
+        End-effector link; empty: none.
 
     Raises
     ------
@@ -205,12 +211,12 @@ class ThrustPlanner:
     def plan(
         self, start: RobotMotion, goal: ThrustGoal | Grapple, cancellation: Cancellation = NEVER
     ) -> ThrustMotion:
-        """Return the motion of least propellant to a goal.
+        """Return the least-propellant motion to a goal.
 
         Raises
         ------
         PlanningError
-            There is no motion within the limits, none was found, or the search was cancelled.
+            No motion exists within the limits, none was found, or the search was cancelled.
         """
         self._solvers = {key: each for key, each in self._solvers.items() if not key[1]}
         grapple = goal if isinstance(goal, Grapple) else None
@@ -342,7 +348,7 @@ class ThrustPlanner:
             if not is_reached(distance, angle):
                 raise NotFoundError(
                     f"No joint positions were found that put '{self.link}' at its goal while the "
-                    f"base is at its own: {distance:.3g} m and {angle:.3g} rad remain.",
+                    f"base is at its goal: {distance:.3g} m and {angle:.3g} rad remain.",
                 )
         return found
 
@@ -491,7 +497,7 @@ class _Search:
         Raises
         ------
         PlanningError
-            There is no motion, or none is found.
+            No motion exists, or none was found.
         """
         options = self.planner.options
         self._begin(SearchPhase.SEARCHING)

@@ -11,10 +11,10 @@ in the base at the Gauss points tau_i of an interval,
 ``L+ = L + h sum R_i (n - c_i x f) / 2``, ``X+ = X exp(Omega)``,
 
 and Omega is the Magnus expansion of the rates at the Gauss points, ``D w + D_q u = h R_i' L_i``.
-Momenta as states keep their conservation exact: without thrust both are constant, whatever the
-joints do. Every interval has a defect as a parameter, added to its end: the difference to an exact
-integration of the same controls, found beforehand, so that solutions obey the equations themselves
-and not their discretisation (deferred correction).
+With the momenta as states, conservation is exact: without thrust, both are constant for any joint
+motion. Every interval has a defect parameter that is added to its end: the precomputed
+difference from an exact integration of the same controls, so that solutions obey the equations
+themselves, not their discretisation (deferred correction).
 """
 
 from __future__ import annotations
@@ -68,10 +68,10 @@ DEFECT_SIZE = 12
 """Length of an interval's defect: rotation vector, then L, r and V at its end."""
 
 INSTANTS = 2
-"""Instants of an interval at which pairs are kept apart."""
+"""Instants in an interval at which pairs are kept apart."""
 
 KeptPlaces = tuple[tuple[int, tuple[int, ...]], ...]
-"""Pairs that are kept apart, and the places at which they are among all K instants of the N
+"""Pairs that are kept apart, and the places where they are, among all K instants of the N
 intervals, from 0 to N K - 1.
 """
 
@@ -209,7 +209,7 @@ class EndKind(NamedTuple):
 
     @property
     def size(self) -> int:
-        """Number of parameters: poses (7 each), or the intervals, the numbers of the target
+        """Number of parameters: poses (7 each), or the intervals, the target parameters
         (:meth:`.TorqueFreeMotion.numbers`), and the angular momentum (3).
         """
         return 4 + TARGET_SIZE if self.target else 7 * (1 + bool(self.link))
