@@ -1,7 +1,7 @@
 """Collision geometry: the solids of a robot, and pairs that may come into contact.
 
 A link uses the shapes of its ``<collision>`` elements or, if it has none, of its ``<visual>``
-elements. A mesh, closed or open, is replaced by its convex hull.
+elements. Meshes, closed or open, are replaced by their convex hulls.
 
 A pair is omitted if its solids belong to one body or to neighbouring bodies, if an SRDF disables
 it, or if it is in contact in all of 1000 random configurations, which is a modelling artefact.
@@ -296,7 +296,7 @@ class CollisionGeometry:
     def nearest_along(
         self, shapes: Array, base: BasePoses | None = None, required: Array | float = 0.0
     ) -> tuple[Array, npt.NDArray[np.int64]]:
-        """Return the smallest distances (N,) in configurations (N, n), m, and their pairs (N,).
+        """Return the smallest distances (N,) for configurations (N, n), m, and their pairs (N,).
 
         Distances are those beyond ``required``, (P,) distances of the pairs, of which minus
         infinity ignores one. They are infinite if there are no pairs; obstacles are ignored without
@@ -376,8 +376,8 @@ class CollisionGeometry:
         """Return lever arms: the solids in a pair move relative to each other by at most
         ``reaches @ |dtheta|`` (P,), m.
 
-        ``reaches`` (P, m) is the largest distance of a point of the pair from each moving joint
-        between the two solids, in any of the configurations (N, n). It is zero for other joints,
+        ``reaches`` (P, m) is the largest distance of any point of the pair from each moving joint
+        between the two solids, over all configurations (N, n). It is zero for other joints,
         and for joints that rotate a body of revolution, such as a reaction wheel, about its axis.
         Also return the largest distances (P,) from the base for pairs with obstacles, zero for
         other pairs.

@@ -2,9 +2,9 @@
 
 A rounded box is the set of all points within a radius of a box, its core. The core of a sphere is a
 point, that of a capsule a line: so one formula bounds all distances. The gap between the
-projections of two convex bodies on any direction is at most their distance; along the line between
-their nearest points it is equal. The nearest points come from alternating projections; if cores
-overlap, the directions of the separating axis theorem give the depth.
+projections of two convex bodies onto any direction is at most their distance, and equal to it along
+the line between their nearest points. The nearest points come from alternating projections; if
+cores overlap, the directions of the separating axis theorem give the depth.
 
 S. Gottschalk, M. Lin, D. Manocha, "OBBTree: a hierarchical structure for rapid interference
 detection", SIGGRAPH, 1996. W. Cheney, A. Goldstein, "Proximity maps for convex sets", Proceedings
@@ -120,7 +120,8 @@ def separation(
 def separating_planes(
     first: RoundedBox, R_1: Array, r_1: Array, second: RoundedBox, R_2: Array, r_2: Array
 ) -> tuple[Array, Array]:
-    """Return the bounds of :func:`separation`, and planes and points (N, 7) that attain them.
+    """Return the bounds from :func:`separation`, with the planes and points (N, 7) that attain
+    them.
 
     A plane touches the first box. It is given by a unit normal toward the second box and the
     distance from the origin, m, in the first link frame. The point is the one on the second box

@@ -6,7 +6,7 @@ to a standoff; there the end-effector moves with the grapple frame for a while, 
 a straight line in that frame. At contact, both have the same pose and velocity.
 
 The approach starts at the earliest time for which the whole reference is within its limits and the
-arm can follow it, with the base fixed, within joint limits and joint rates.
+arm can follow it, with the base fixed, within joint position and rate limits.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ class ApproachOptions:
         minimum=1e-4,
     )
     horizon: float = parameter(
-        120.0, "time within which the approach must start", unit="s", minimum=0.0, maximum=3600.0
+        120.0, "time limit for the start of the approach", unit="s", minimum=0.0, maximum=3600.0
     )
     patience: float = parameter(
         3.0, "time at contact within which the target must be captured", unit="s", minimum=0.0

@@ -72,8 +72,8 @@ class ControllerConfig(CommanderConfig):
     )
     reference_timeout: float = nonnegative(
         1.0,
-        "time for which states wait for a silent publisher of joint_reference or base_reference: "
-        "simulated time, or wall time in lockstep; 0: forever",
+        "longest time for which states wait for a silent publisher of joint_reference or "
+        "base_reference: simulated time, or wall time in lockstep; 0: forever",
         "s",
     )
     settle_time: float = nonnegative(

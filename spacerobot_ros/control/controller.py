@@ -101,9 +101,9 @@ class CoordinatedController:
     control_period
         Time between commands, s.
     estimation_time
-        Longest time for which the base is estimated by integration when its measurements stop
-        (paper 4, section IV), s. After that, the thrusters are off and the joints are brought to
-        rest.
+        Longest time for which the base state is estimated by integration after its measurements
+        stop (paper 4, section IV), s. After that, the thrusters are off and the joints are brought
+        to rest.
     wheels
         The reaction wheels, if the robot has any; the law then controls the robot's gyrostat.
     planner
@@ -142,7 +142,7 @@ class CoordinatedController:
         """Whether the gains were checked against the control period."""
         self._brake: tuple[ComputedTorqueLaw, Reference] | None = None
         self.coming_to_rest = False
-        """Whether the robot is being brought to rest, at any pose."""
+        """Whether the robot is being brought to rest, in any pose."""
         self._to_rest: Callable[[ControlState], Actuation] = rates.braking_command
 
     def reset(self) -> None:
@@ -308,7 +308,7 @@ class CoordinatedController:
         self.set_goals(time, state)
 
     def come_to_rest(self, law: Callable[[ControlState], Actuation] | None = None) -> None:
-        """Bring the whole robot to rest, at any pose, until there is a new goal or reference.
+        """Bring the whole robot to rest, in any pose, until there is a new goal or reference.
 
         ``law`` returns the unlimited command for a state; None:
         :meth:`.JointRateLimits.braking_command`.
@@ -474,7 +474,7 @@ class CoordinatedController:
         return self.law.outputs.selection.distance(self.law.error)
 
     def distance_between(self, state: ControlState, goal: Reference) -> OutputDistance:
-        """Return the distance of the outputs in a state from a goal for all outputs."""
+        """Return the distance between the outputs in a state and a goal for all outputs."""
         outputs = self.law.outputs
         return outputs.selection.distance(outputs.errors(state, goal))
 

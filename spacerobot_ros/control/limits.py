@@ -264,7 +264,7 @@ class JointRateLimits:
     def braking_command(self, state: ControlState) -> Actuation:
         """Return the unlimited command under which joint rates and momenta decay.
 
-        The thrusters remove both total momenta, which joint efforts do not change; the motors
+        The thrusters remove both total momenta, which joint efforts cannot change; the motors
         remove the joint rates. Each decays independently, at any base pose.
         """
         robot, r = self._robot, self._rest_rate

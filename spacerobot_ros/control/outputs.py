@@ -44,7 +44,7 @@ _PARALLEL_TOLERANCE = 1e-6
 
 @dataclass(frozen=True)
 class OutputSelection:
-    """The components of ``z1`` (paper 4, eqs 22 and 31), in this order.
+    """Components of ``z1`` (paper 4, eqs 22 and 31), in this order.
 
     ``base`` and ``end_effector``: pose components in W of the base link and of
     ``end_effector_link``, from :data:`AXES`; ``joints``: names of joints.
@@ -119,7 +119,7 @@ class OutputSelection:
 
 @dataclass(frozen=True)
 class OutputDistance:
-    """Distances of the outputs from a reference; NaN for uncontrolled kinds.
+    """Distances between the outputs and a reference; NaN for uncontrolled kinds.
 
     ``position`` (m) and ``attitude`` (rad): distance and angle along the controlled axes, the
     larger of base and end-effector; ``joints``: the largest joint error, m or rad.

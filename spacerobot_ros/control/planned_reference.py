@@ -181,7 +181,7 @@ class GoalMotion(NamedTuple):
 
 
 class ReferencePlanner:
-    """Plans the references of one controller.
+    """Plans references for one controller.
 
     Parameters
     ----------

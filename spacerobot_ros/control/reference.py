@@ -1,6 +1,6 @@
 """Reference profiles from current poses and joint positions to the goals.
 
-The paper sets the goal at once (:class:`StepReference`): simple, but with the largest actuator
+The paper sets the goal as a step (:class:`StepReference`): simple, but with the largest actuator
 command at the start. :class:`QuinticReference` moves the reference there smoothly.
 """
 
@@ -25,15 +25,15 @@ from spacerobot_ros.model.rotations import (
 )
 
 _QUINTIC_PEAK_RATE = 15 / 8
-"""Largest ds/dt of the quintic over one second."""
+"""Largest ds/dt of a one-second quintic."""
 
 _QUINTIC_PEAK_ACCELERATION = 10 / math.sqrt(3)
-"""Largest d2s/dt2 of the quintic over one second."""
+"""Largest d2s/dt2 of a one-second quintic."""
 
 
 @dataclass(frozen=True)
 class OutputErrors:
-    """Largest errors of the outputs: positions (m), attitudes (rad), single joints (m or rad)."""
+    """Largest output errors: positions (m), attitudes (rad), single joints (m or rad)."""
 
     position: float
     attitude: float
@@ -52,7 +52,8 @@ class ReferenceProfile(ABC):
     limits
         Largest speeds and accelerations.
     carries
-        Whether the end-effector has no goal and moves with the base: the arm keeps its shape.
+        Whether the end-effector has no goal and moves with the base, so that the arm keeps its
+        shape.
 
     Raises
     ------
@@ -75,7 +76,7 @@ class ReferenceProfile(ABC):
         self.limits = limits
         self.carries = carries
         self.duration = 0.0
-        """Time after which the reference is the goal, s."""
+        """Time after which the reference equals the goal, s."""
 
     @abstractmethod
     def at(self, time: float) -> Reference:
@@ -119,8 +120,8 @@ class QuinticReference(ReferenceProfile):
 
     An end-effector carried by the base rotates about the base origin, which moves along its line.
     All share one profile, ``s = 10 u^3 - 15 u^4 + 6 u^5`` of ``u = t / T``: rest to rest, without
-    acceleration jumps. T is the shortest time for which all motions are within their limits:
-    the slowest sets the pace, and all reach their goals together.
+    acceleration jumps. T is the shortest time for which all motions are within their limits: the
+    slowest motion determines it, and all reach their goals together.
     """
 
     name: ClassVar[str] = "quintic"
@@ -146,7 +147,8 @@ class QuinticReference(ReferenceProfile):
         self.duration = max(needs, default=0.0)
 
     def at(self, time: float) -> Reference:
-        """Return the reference ``time`` s after its start; before it, that at the start."""
+        """Return the reference ``time`` s after its start; before that, the reference at the
+        start."""
         time = max(time, 0.0)
         if time >= self.duration:
             return self.goal
@@ -174,7 +176,7 @@ def profile_numbers(profile: ReferenceProfile, base: bool, end_effector: bool, n
     Parameters
     ----------
     profile
-        A profile whose goal has the controlled groups.
+        A profile whose goal includes the controlled groups.
     base, end_effector
         Whether these poses are controlled.
     n
@@ -233,8 +235,8 @@ def _profile_sizes(base: bool, end_effector: bool, n: int) -> list[int]:
 class HeldVelocityReference:
     """Joint references from commands whose velocities are held over a control period.
 
-    At a command the velocity jumps: the reference has the mean of the velocities before and after,
-    and the acceleration between them over one period.
+    At a command, the velocity jumps: the reference has the mean of the velocities before and after,
+    and the acceleration that changes one into the other within one period.
 
     Parameters
     ----------
@@ -315,7 +317,7 @@ class _PoseInterpolation:
 
 
 def quintic_duration(distance: float, speed: float, acceleration: float) -> float:
-    """Return the shortest duration (s) of a quintic over a distance within its limits."""
+    """Return the shortest duration (s) of a quintic over a distance, given its limits."""
     return max(
         _QUINTIC_PEAK_RATE * distance / speed,
         math.sqrt(_QUINTIC_PEAK_ACCELERATION * distance / acceleration),

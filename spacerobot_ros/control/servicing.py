@@ -1,4 +1,4 @@
-"""Tasks before a goal: the approach to a target until its capture, and detumbling after it.
+"""Tasks before a goal: approaching a target until its capture, and detumbling after it.
 
 A task sets the controller's references, state by state, until it succeeds or fails. An approach
 sets the end-effector reference; detumbling replaces the law until the robot is at rest.
@@ -156,7 +156,7 @@ class ApproachTask:
         options = self.config.target
         target, link = self.target, controller.law.outputs.selection.end_effector_link
         if not controller.law.outputs.selection.end_effector:
-            return self._ended(f"the law '{controller.law.name}' controls no end-effector")
+            return self._ended(f"the law '{controller.law.name}' does not control an end-effector")
         self._began = time if self._began is None else self._began
         if target.motion is None or target.body is None:
             if not target.why_unknown and time - self._began < options.timeout:
@@ -351,7 +351,7 @@ class DetumblingTask:
         *,
         in_background: bool,
     ) -> TaskProgress:
-        """Have the controller bring the robot to rest."""
+        """Make the controller bring the robot to rest."""
         del in_background
         options = self.config.detumble
         if self._law is None:

@@ -33,7 +33,7 @@ _LAG_SHARE = 0.5
 """Largest lag of an unimpeded robot behind its reference, as a fraction of the distance."""
 
 _LEAST_SMALLEST_TOLERANCE = 1e-9
-"""Tolerance (m, rad) used instead of zero."""
+"""Tolerance (m, rad) used in place of zero."""
 
 _STOP_SHARE = 0.005
 """Distance, as a fraction of its range, at which a joint is considered to be at its stop."""
@@ -52,8 +52,8 @@ class StallMonitor:
     than before:
 
     * after the reference has come to rest, and while an error is beyond its tolerance;
-    * while the reference moves, if the robot lags behind by more than half of the distance and more
-      than its tolerance, and the error has not begun to shrink.
+    * while the reference moves, if the robot lags behind by more than half the distance and more
+    than its tolerance, and the error has not begun to shrink.
 
     The stall ends when the errors shrink again.
     """

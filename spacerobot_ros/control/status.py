@@ -182,7 +182,7 @@ class ControllerStatus:
         Raises
         ------
         SpaceRobotError
-            The pairs are not a controller's status.
+            The pairs are not a controller status.
         """
         command = None
         if "law" in values:

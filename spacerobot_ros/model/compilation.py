@@ -1,7 +1,8 @@
 """CasADi functions as generated C code, compiled once by the system's ``cc`` and cached.
 
 Without a compiler, or with ``SPACEROBOT_COMPILE=0``, the same functions run in CasADi's virtual
-machine: slower, with the same formulas. Compiled objects are stored in ``SPACEROBOT_CACHE_DIR``, by
+machine, which is slower but uses the same formulas. Compiled objects are stored in
+``SPACEROBOT_CACHE_DIR``, by
 default ``$XDG_CACHE_HOME/spacerobot_ros`` (``~/.cache/spacerobot_ros``), under a hash of the
 source, flags, compiler and C library. Only complete objects owned by this user are loaded
 (:class:`.Cache`).
@@ -61,7 +62,7 @@ class BufferedFunction:
     :meth:`evaluate`, read ``outputs``.
 
     ``inputs`` and ``outputs`` are numpy arrays with the shapes of the function's arguments (vectors
-    are 1-D), allocated once. A call costs well under a microsecond in addition to the computation.
+    are 1-D), allocated once. The overhead of a call is well under a microsecond.
 
     ``held`` is the constant value of the last argument, if that is not among ``inputs``.
     """
@@ -142,7 +143,7 @@ def compiled(function: ca.Function) -> ca.Function:
         return load_library(name, str(generator.dump()), lambda path: ca.external(name, path))
     except NoLibraryError as reason:
         warn_once(
-            "Functions run in CasADi's virtual machine, slower, with the same formulas "
+            "Functions run in CasADi's virtual machine, slower but with the same formulas "
             f"(SPACEROBOT_COMPILE=0 selects it): {reason}."
         )
         return function
@@ -196,8 +197,9 @@ def load_library(
             return load(str(kept[0]))
         except (OSError, RuntimeError):
             warn_once(
-                f"The compiled functions in '{kept[0].parent}' are intact but cannot be loaded, as "
-                "on a file system that forbids execution; they are compiled at each start."
+                f"The compiled functions in '{kept[0].parent}' are intact but cannot be loaded, "
+                "for example because the file system forbids execution; they are compiled at each "
+                "start."
             )
     _announce_compilation()
     with tempfile.TemporaryDirectory(prefix="spacerobot_ros_") as folder:
@@ -261,7 +263,7 @@ def cached_function(name: str, key: str, build: Callable[[], ca.Function]) -> ca
     name
         The function's own.
     key
-        A hash of everything on which the function depends.
+        Hash of everything the function depends on.
     build
         Derives it.
     """

@@ -24,8 +24,8 @@ algorithm, whose cost grows only linearly.
 as part of the state. The state is ``x = [q; quaternion_WB; qdot; p_W; L_W; r_WC_W]``, (2 n + 13,):
 shape, attitude (x, y, z, w), joint rates, total linear momentum (kg m/s), total angular momentum
 about the system's centre of mass (kg m^2/s), and position of the centre of mass (m), the last three
-in W. The base twist is not a state: it follows from the momenta and joint rates. Without thrusters
-the momenta are therefore constant to the last bit, for any step:
+in W. The base twist is not a state: it follows from the momenta and joint rates. Without thrusters,
+the momenta are therefore constant to the last bit, for any step size:
 
 * ``p_W_dot = R_WB f``, ``L_W_dot = R_WB (n + (r_origin - c) x f)``, ``r_WC_W_dot = p_W / M``;
 * ``K qddot = Q`` at the ``omega_WB_B`` that the momenta imply.
@@ -36,8 +36,8 @@ after each Runge-Kutta step.
 
 Under external loads (:mod:`spacerobot_ros.model.external_loads`), the last entry of the state is
 the time (s), and that of the command the load vector. For the load ``F_k`` on composite k and the
-friction d, ``Q_j`` gains ``S_j' F_j - B_j' F_0 - d (K qdot)_j``; both momenta change by ``F_0``,
-the uniform gravity and the friction.
+friction d, ``S_j' F_j - B_j' F_0 - d (K qdot)_j`` is added to ``Q_j``; both momenta change due to
+``F_0``, uniform gravity and friction.
 """
 
 from __future__ import annotations
@@ -373,7 +373,7 @@ def composite_dynamics(
 
 
 def state_slices(n: int) -> tuple[slice, ...]:
-    """Return the slices of ``q, quaternion_WB, qdot, p_W, L_W, r_WC_W`` in the state."""
+    """Return the state slices of ``q, quaternion_WB, qdot, p_W, L_W, r_WC_W``."""
     ends = [n, n + 4, 2 * n + 4, 2 * n + 7, 2 * n + 10, 2 * n + 13]
     return tuple(slice(a, b) for a, b in zip([0, *ends], ends, strict=False))
 

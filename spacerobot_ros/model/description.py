@@ -55,7 +55,8 @@ class Pose:
 
 @dataclass(frozen=True)
 class Inertia:
-    """Mass (kg), centre of mass (3,) in m and inertia about it (3, 3) in kg m^2, in one frame."""
+    """Mass (kg), centre of mass (3,) in m and inertia about it (3, 3) in kg m^2, in a given
+    frame."""
 
     mass: float = 0.0
     com: Array = field(default_factory=lambda: np.zeros(3))
@@ -357,7 +358,7 @@ def weld_links(
 ) -> tuple[list[Body], dict[str, tuple[int, Pose]]]:
     """Order the tree from the root, and merge links connected by fixed joints.
 
-    Returns ``bodies`` and ``frames`` of a :class:`RobotDescription`.
+    Returns ``bodies`` and ``frames`` for a :class:`RobotDescription`.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Equations of the papers in closed form: dynamics (paper 4), connection (papers 1 and 2).
+"""The papers' equations in closed form: dynamics (paper 4), connection (papers 1 and 2).
 
 Equations of motion ``H+ zddot + C+ = Q`` (paper 4, eqs 8-10 and 18-21). The independent velocities
 are ``z0dot = [v_cm; omega; qdot]``, the first two in base components (eq. 8), so that nothing
@@ -36,7 +36,7 @@ def point_jacobian(kin: TreeKinematics, link: str) -> ca.SX:
 def bias(kin: TreeKinematics, v_cm: ca.SX, omega: ca.SX, qdot: ca.SX) -> ca.SX:
     """Return ``C+`` (6 + n,) by d'Alembert: the generalised force that keeps ``z0ddot`` at zero.
 
-    Outward recursion of the velocity-product accelerations, inward sum of their inertia forces.
+    Outward recursion for the velocity-product accelerations, inward sum of their inertia forces.
     Accelerations are relative to the system's centre of mass, which itself accelerates by
     ``omega x v_cm``.
     """
@@ -104,8 +104,8 @@ def solve_positive_definite(matrix: ca.SX, right: ca.SX) -> ca.SX:
 def momentum_of_bodies(
     kin: TreeKinematics, v_WB_B: ca.SX, omega_WB_B: ca.SX, qdot: ca.SX
 ) -> tuple[ca.SX, ca.SX, ca.SX]:
-    """Return linear momentum (3,), angular momentum about the system's centre of mass (3,) and
-    kinetic energy, in base components, summed body by body.
+    """Return the linear momentum (3,), the angular momentum about the system's centre of mass (3,)
+    and the kinetic energy, in base components, summed body by body.
 
     This does not use ``H+``: it is an independent check of the motion.
     """

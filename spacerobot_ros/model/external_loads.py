@@ -13,7 +13,7 @@ body k and the moment about its centre of mass r_k are ::
 Their sum over the bodies is the moment ``3 n^2 o x D o`` about the system's centre of mass, where D
 is the locked inertia, and the force ``M n^2 (3 o o' - 1) r_C`` on that centre.
 
-On an air table all bodies have the same acceleration, and friction is proportional to momentum:
+On an air table, all bodies have the same acceleration, and friction is proportional to momentum:
 ``f_k = -d m_k v_k``, ``n_k = -d I_k omega_k``.
 """
 
@@ -47,7 +47,7 @@ class LoadLayout:
 
     @property
     def in_link(self) -> slice:
-        """Force (N) over torque (N m) at the origin of every link, in its frame: (6 L,)."""
+        """Force (N) over torque (N m) at every link origin, in the link frame: (6 L,)."""
         return slice(0, 6 * self.links)
 
     @property

@@ -223,7 +223,7 @@ _Motion = TypeVar("_Motion", bound="RelativeMotion")
 
 @dataclass(frozen=True)
 class RelativeMotion:
-    """The motion of one frame relative to another.
+    """Motion of one frame relative to another.
 
     Attributes
     ----------

@@ -108,7 +108,7 @@ class TreeKinematics:
         return self.robot.bodies[k].parent
 
     def is_revolute(self, k: int) -> bool:
-        """Whether body k rotates (revolute, continuous) rather than slides."""
+        """Whether the joint of body k is revolute or continuous, not prismatic."""
         joint = self.robot.bodies[k].joint
         return joint is not None and joint.kind is not JointKind.PRISMATIC
 
@@ -290,7 +290,7 @@ class ForwardKinematics:
     links
         Link names, the base link first, each after its parent.
     moving, fixed
-        Parent and child of each moving joint, and of each fixed one.
+        Parent and child of each moving joint, and of each fixed joint.
     transforms, fixed_transforms
         Poses of these children in their parents: (k, 7), updated in place by :meth:`update`, and
         (m, 7).

@@ -132,7 +132,7 @@ def mesh_file(resource: str) -> Path | None:
     """Return the file of a mesh given its URI (``file://``, ``package://``) or path; None: not
     there.
 
-    Packages are looked up in the ROS environment; meshes of this package need none.
+    Packages are looked up in the ROS environment, which meshes of this package do not need.
     """
     url = urlparse(resource)
     if url.scheme == "package":

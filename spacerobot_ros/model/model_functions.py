@@ -88,7 +88,7 @@ class ModelFunctions:
     def function(self, name: str, *, compile: bool = True) -> ca.Function:
         """Return a model function by name (the keys of ``_builders``).
 
-        ``compile=False`` gives the symbolic function, to build larger ones from.
+        ``compile=False`` returns the symbolic function, for building larger functions.
         """
         kind, _, argument = name.partition(":")
         if name not in self._symbolic:
@@ -118,7 +118,7 @@ class ModelFunctions:
 
     @cached_property
     def equations_key(self) -> str:
-        """A hash of the equations at zero momentum: equal for robots with the same motion."""
+        """Hash of the equations at zero momentum, equal for robots with the same motion."""
         digest = hashlib.sha256()
         for name in ("locked_inertia", "center_of_mass"):
             digest.update(self.function(name, compile=False).serialize().encode())
@@ -390,7 +390,7 @@ class Composition:
 
 
 class SymbolicModels:
-    """Models with mass properties as an argument, for all robots of the same structure."""
+    """Models with mass properties as an argument, for all robots with the same structure."""
 
     def __init__(self, robot: RobotDescription) -> None:
         self._robot = robot
@@ -409,7 +409,7 @@ class SymbolicModels:
         """Return the model for inertial parameters (..., B), and its argument ``p`` (..., k).
 
         Entries that are zero in the nominal robot are usually zero in all robots, and are omitted
-        from ``p``. If one of them is not zero, all entries are in ``p``.
+        from ``p``. If one of them is nonzero, all entries are in ``p``.
         """
         vector = parameters.vector
         usual = not vector[..., ~self._free].any()

@@ -1,7 +1,7 @@
 """First and second derivatives of the angular momentum with respect to the configuration, in closed
 form.
 
-At zero linear momentum the angular momentum about the centre of mass is ``L = D(q) omega + D_q(q)
+At zero linear momentum, the angular momentum about the centre of mass is ``L = D(q) omega + D_q(q)
 qdot`` (paper 1, eq. 3). For a vector ``eta``, ``eta' L`` is a sum over the bodies of
 ``V1' I_k V2_k``, where V1 is the motion of a rigid system that rotates at ``eta``, and V2_k the
 motion of body k at ``omega`` and ``qdot``. Spatial vectors and inertias are as in
@@ -24,7 +24,7 @@ and if joint i carries joint j or is joint j, the second derivatives are
 
 They are zero for joints on different branches. All of this holds for a given motion of the centre
 of mass. To keep it at rest, subtract ``(f1_x' f2_y + f2_x' f1_y) / M``, where f1_x and f2_x are the
-derivatives of the linear momenta of both motions by the variables x and y.
+derivatives of both motions' linear momenta with respect to the variables x and y.
 
 These formulas need a tenth of the operations of CasADi's derivatives. They are derived here; the
 derivative of a subtree's momentum with respect to its joint is from R. Featherstone, Rigid Body

@@ -30,7 +30,7 @@ from spacerobot_ros.model.inertial_parameters import INERTIA_ENTRIES
 from spacerobot_ros.model.rotations import hat
 
 PAYLOAD_PARAMETERS = ("m", "m cx", "m cy", "m cz", "Ixx", "Iyy", "Izz", "Ixy", "Ixz", "Iyz")
-"""Names of the parameters: kg, kg m, and kg m^2 about the origin of L."""
+"""Parameter names: kg, kg m, and kg m^2 about the origin of L."""
 
 _SMALLEST_SINGULAR_VALUE = 1e-7
 """Smallest singular value of a direction determined by the motion, relative to the largest."""
@@ -51,7 +51,7 @@ _MIN_UNDETERMINED_SHARE = 0.2
 """Fraction of undetermined directions above which a parameter is undetermined."""
 
 _ROUNDING = 1e-11
-"""Smallest relative error of momenta; impulses are sums over ticks."""
+"""Smallest relative momentum error; impulses are sums over ticks."""
 
 _PRIOR_WEIGHT = 1e-6
 """Prior weight of undetermined directions, relative to the largest singular value."""

@@ -30,7 +30,7 @@ _TOLERANCE_SHARE = 1e-3
 """Automatic position tolerance as a fraction of the robot size."""
 
 _SMALLEST_TOLERANCE, _LARGEST_TOLERANCE = 1e-4, 1e-2
-"""Bounds of automatic position tolerances, m."""
+"""Bounds on automatic position tolerances, m."""
 
 Config = TypeVar("Config", bound="CommanderConfig")
 
@@ -132,7 +132,7 @@ def _with_model_error(true: RobotDescription, config: RobotConfig) -> SpaceRobot
 
 @dataclass(frozen=True)
 class WatchdogConfig:
-    """Supervision of the heartbeats of other nodes."""
+    """Supervision of other nodes' heartbeats."""
 
     watchdog_timeout: float = nonnegative(
         0.8,
@@ -157,8 +157,8 @@ class CommanderConfig(WatchdogConfig, AssumedRobotConfig):
     )
     diagnostics_period: float = nonnegative(
         1.0,
-        "simulated time between diagnostics; 0: ignored states only. Also published "
-        "once a second of wall time, except in a run in one process",
+        "simulated time between diagnostics; 0: ignored states only. Also published once per "
+        "second of wall time, except in single-process runs",
         "s",
     )
     position_tolerance: float = nonnegative(

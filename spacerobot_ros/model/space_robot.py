@@ -260,8 +260,8 @@ class SpaceRobot:
         """Return an orthonormal basis (n, k) of joint rates that do not rotate the base.
 
         They are the null space of the coupling inertia ``D_q`` (Nenchev, Umetani and Yoshida, 1992,
-        from memory): at zero angular momentum the base keeps its attitude while the joints move at
-        such rates. The projection ``N N'`` maps any rates to the nearest of them.
+        from memory): at zero angular momentum, the base keeps its attitude while the joints move at
+        these rates. The projection ``N N'`` maps any rates to the nearest such rates.
         """
         _, s, Vt = np.linalg.svd(self.connection(q)[3:])
         rank = int(np.count_nonzero(s > _MIN_RELATIVE_COUPLING * max(1.0, s.max(initial=0.0))))
@@ -291,8 +291,9 @@ class SpaceRobot:
         omega_WB_B: npt.ArrayLike,
         qdot: npt.ArrayLike,
     ) -> tuple[Array, Array, float]:
-        """Return linear momentum (3,) in kg m/s and angular momentum about the system's centre of
-        mass (3,) in kg m^2/s, both in W, and kinetic energy in J; summed body by body.
+        """Return the linear momentum (3,) in kg m/s and the angular momentum about the system's
+        centre of mass (3,) in kg m^2/s, both in W, and the kinetic energy in J, summed body by
+        body.
         """
         p, L, energy = self._call_function("momentum", quaternion_WB, q, v_WB_B, omega_WB_B, qdot)
         return p, L, float(energy[0])
@@ -316,7 +317,7 @@ class SpaceRobot:
         """Return a model function by name (see :class:`.ModelFunctions`), with this robot's
         mass properties as constants.
 
-        ``compile=False`` gives the symbolic function, to compose larger ones from.
+        ``compile=False`` returns the symbolic function, for composing larger functions.
         """
         return self._numeric_model.function(name, compile=compile)
 
@@ -345,7 +346,7 @@ class SpaceRobot:
         """Return a buffered function that ``build`` composes from MX model functions.
 
         It is compiled once per name for all robots that differ only in mass properties, for
-        evaluation in every tick.
+        evaluation at every tick.
         """
         model = self._model
         function = model.composed(name, lambda: build(Composition(model, ca.MX)))
@@ -359,7 +360,7 @@ class SpaceRobot:
     def view(self, function: ca.Function, key: Hashable) -> BufferedFunction:
         """Compile a function of :meth:`expressions`, and return it with its own buffers.
 
-        The argument ``p``, if it has one, is set to this robot's mass properties. Functions with
+        The argument ``p``, if any, is set to this robot's mass properties. Functions with
         equal ``key`` are the same function, compiled once (:meth:`cached_object`).
         """
         return BufferedFunction(self._model.composed(key, lambda: function), self._p)
@@ -376,7 +377,7 @@ class SpaceRobot:
 
     @property
     def mass_arguments(self) -> dict[str, Array]:
-        """The last argument of functions of :meth:`expressions`, by name; empty: none."""
+        """The last argument of functions from :meth:`expressions`, by name; empty: none."""
         return {} if self._p is None else {"p": self._p}
 
     @property

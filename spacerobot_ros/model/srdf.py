@@ -27,7 +27,7 @@ def with_srdf(robot: RobotDescription, path: str | Path) -> RobotDescription:
     Raises
     ------
     RobotDescriptionError
-        The file cannot be read, is not an SRDF, or names a link that the robot does not have.
+        The file cannot be read, is not an SRDF, or names an unknown link.
     """
     try:
         root = fromstring(read_regular(path))

@@ -59,7 +59,7 @@ def relative_vector(a: ca.SX, b: ca.SX) -> ca.SX:
 
 
 _HALF_TURN_ROUNDING = 1e-9
-"""Keeps the derivatives of the half angle finite at a rotation by pi."""
+"""Keeps the half-angle derivatives finite at a rotation by pi."""
 
 
 def half_angle_vector(R: ca.SX) -> ca.SX:
@@ -86,7 +86,7 @@ def quaternion_from_rotvec(rotvec: ca.SX) -> ca.SX:
 def quaternion_from_small_rotvec(rotvec: ca.SX) -> ca.SX:
     """Return the quaternion (4,) of a rotation vector (3,) much shorter than a radian.
 
-    A power series with an error of order six: smooth at zero, and without a square root.
+    A power series with sixth-order error, smooth at zero and without a square root.
     """
     square = ca.sumsqr(rotvec)
     return ca.vertcat(

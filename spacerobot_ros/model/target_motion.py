@@ -247,7 +247,7 @@ def _evaluate_polynomials(coefficients: Array, t: Array) -> list[Array]:
 
 
 class TorqueFreeMotion:
-    """The motion of a free target, starting from a measured state.
+    """Motion of a free target, starting from a measured state.
 
     Parameters
     ----------
@@ -306,7 +306,7 @@ class TorqueFreeMotion:
         return X, self._r + t[:, np.newaxis] * self._v - arm
 
     def later(self, elapsed: float) -> TorqueFreeMotion:
-        """Return the same motion from a later time on."""
+        """Return the same motion starting at a later time."""
         X, r = self.body_poses([elapsed])
         R = matrices_from_quaternions(X)
         omega = R[0] @ self._rates(R)[0]
@@ -435,7 +435,7 @@ class PathInWorld:
     Parameters
     ----------
     relative
-        The path relative to G with the same endpoints.
+        Path relative to G with the same endpoints.
     target
         The target with grapple frame G.
     start

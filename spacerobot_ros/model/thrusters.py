@@ -1,6 +1,6 @@
 """Thrusters in flight software: table, wrench allocation, pulse modulation.
 
-A node of a real robot can use it without a plant::
+A node on a real robot can use it without a plant::
 
     table = find_thrusters("urdf", robot.description)
     modulator = ThrusterModulator(table, control_period=0.01)
@@ -434,14 +434,14 @@ class ThrusterModulator:
         self._remaining = np.zeros(count)
         """Remaining time of minimum pulses (m,), s."""
         self._open = np.zeros(count, dtype=np.bool_)
-        """Whether each thruster (m,) is open between the last period and the next one."""
+        """Whether each thruster (m,) is open between the last and the next period."""
         self._excluded: list[str] = []
         for name in excluded:
             self.exclude(name)
         self.unmet = np.zeros(6)
         """Part of the last desired wrench that the thrusters could not produce, N, N m."""
         self.unmet_periods = 0
-        """Number of periods in which the thrusters could not produce the whole wrench."""
+        """Number of periods in which the thrusters could not produce the full wrench."""
         self.begun = np.zeros(count, dtype=np.bool_)
         """Whether a pulse of each thruster (m,) began in the last period."""
         self.pulses = np.zeros(count, dtype=np.int64)

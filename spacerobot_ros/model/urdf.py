@@ -229,7 +229,7 @@ def with_held_joints(robot: RobotDescription, positions: Array | None = None) ->
     Raises
     ------
     RobotDescriptionError
-        The number of positions is wrong, or one is not finite or outside the limits.
+        The number of positions is wrong, or a position is not finite or outside the limits.
     """
     names, limits = robot.joint_names, (robot.limits("lower"), robot.limits("upper"))
     q = np.clip(0.0, *limits) if positions is None else np.asarray(positions, dtype=float)
@@ -392,7 +392,7 @@ def _read_inertia(moments: Element | None, where: str) -> Array:
 def describe_inertia_flaw(about: Array) -> str:
     """Return a clause that describes impossible moments of inertia (3, 3), kg m^2; empty: none.
 
-    It completes a message that begins with the owner of the inertia.
+    The clause completes a message that begins with the owner of the inertia.
     """
     low, middle, high = np.linalg.eigvalsh(about)
     if low < -1e-12 * max(1.0, float(np.abs(about).max())):
@@ -671,7 +671,7 @@ _ELEMENTS_READ = {
     "joint": ("origin", "parent", "child", "axis", "limit", "mimic", "wheel"),
     "material": ("color",),
 }
-"""Tags of the elements to read, by the tag of their parent; other elements are ignored."""
+"""Element tags to read, by parent tag; other elements are ignored."""
 
 _EXACT_ELEMENTS = ("origin", "mimic")
 """Elements with optional attributes: an unknown attribute is an error and would change the

@@ -1,6 +1,7 @@
 """Robot visuals as triangles and sharp edges, for pictures, pages and the viewer.
 
-Pictures, pages and the viewer choose colours, cameras and backgrounds. Meshes come from files
+Colours, cameras and backgrounds are chosen by pictures, pages and the viewer. Meshes come from
+files
 (:func:`meshes_from_files`) or from a bag (:func:`meshes_from_attachments`), to which a recorder
 adds the result of :func:`meshes_for_bag`; :class:`MeshFolder` writes them back to files.
 """
@@ -226,7 +227,7 @@ def meshes_from_files(
     most
         Largest number of faces per mesh; finer meshes are simplified.
     on_error
-        Called with a message about each mesh that cannot be read.
+        Called with a message for each mesh that cannot be read.
     """
     found = {}
     for resource in _mesh_uris(robot):

@@ -1,9 +1,9 @@
 """Reaction wheels: bodies of revolution on the base that spin about their axes.
 
 A wheel is the child of a continuous joint with the element ``<wheel/>``, whose ``<limit>`` gives
-the largest rate and torque. Since it is a body of revolution, its angle changes nothing; only its
-spin
-matters. With ``A`` (3, k) the axes in base components, ``J`` (k,) the moments of inertia about them
+the largest rate and torque. Since a wheel is a body of revolution, its angle has no effect; only
+its spin matters. With ``A`` (3, k) the axes in base components, ``J`` (k,) the moments of inertia
+about them
 and the spins ``h = J (A' omega + qdot_w)`` (k,), the momenta of the wheels about their axes in
 inertial space, the base and the arm obey the equations of a robot without wheels (a gyrostat)
 

@@ -45,7 +45,7 @@ def obstacles_from_topic(text: str) -> RobotDescription | None:
     world = parse_world(text)
     if world.world is not None:
         raise RobotDescriptionError(
-            "Obstacles cannot have obstacles of their own: remove <world> from their URDF."
+            "Obstacles cannot contain obstacles: remove <world> from their URDF."
         )
     require_found_meshes(world)
     return world

@@ -4,7 +4,7 @@ The time and memory limits guard against mistakes, such as a macro that calls it
 sandbox the file: xacro expressions are Python, so only files that the user names ``.xacro`` are
 expanded.
 
-Nothing of the package is imported here, so that it starts quickly.
+No module of the package is imported here, so the program starts quickly.
 """
 
 from __future__ import annotations

@@ -92,7 +92,7 @@ class Analysis:
 
     @property
     def chosen(self) -> str:
-        """The method that ``auto`` usually chooses: ``optimal`` if it suits; "" if none does."""
+        """Method usually chosen by ``auto``: ``optimal`` if it suits; "" if none does."""
         suits = [
             name
             for name, objection in self.objections.items()
@@ -171,8 +171,8 @@ def _check_shape(robot: SpaceRobot, shape: Sequence[float]) -> Array:
     values = np.asarray(shape, dtype=float)
     if values.shape != (robot.n,) or not np.all(np.isfinite(values)):
         raise ParameterError(
-            f"The shape has {values.size} number(s); robot '{robot.description.name}' "
-            f"needs a finite one for each joint: {', '.join(robot.joint_names)}."
+            f"The shape has {values.size} number(s); robot '{robot.description.name}' needs a "
+            f"finite value for each joint: {', '.join(robot.joint_names)}."
         )
     return values
 

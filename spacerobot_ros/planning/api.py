@@ -69,13 +69,13 @@ def plan(
         empty: the default end-effector); or of several links, by name.
     end_effector_path
         Positions (K, 3) in m, or positions and quaternions (K, 7), through which one end-effector
-        moves on straight lines; the last one is its goal.
+        moves along straight lines; the last position or pose is its goal.
     start
         The start: a state, or the shape (n,) with the base at the origin of W; None: zero, or as
         close to zero as the joint limits allow.
     linear_momentum, angular_momentum
         (3,) each in W, kg m/s and kg m^2/s; angular momentum is about the centre of mass; None: the
-        momenta of the start. Only ``optimal`` plans for robots that drift.
+        momenta of the start. Only ``optimal`` plans for drifting robots.
     method
         Name of a gait method; ``options`` are its own. None: ``resolved_rate`` for a goal with a
         path, otherwise ``optimal``.

@@ -147,7 +147,7 @@ def test_a_target_that_is_too_fast_is_refused_with_the_limit(
     motion: TorqueFreeMotion, limits: dict[str, float], said: str
 ) -> None:
     refused = refusal(motion, limits=MotionLimits(**{**vars(LIMITS), **limits}))
-    assert_one_sentence(refused, "The target moves too fast to be met", said)
+    assert_one_sentence(refused, "The target moves too fast to be reached", said)
 
 
 def test_rotation_counts_only_where_it_is_controlled() -> None:

@@ -236,7 +236,7 @@ def test_a_law_without_an_end_effector_approaches_nothing() -> None:
     loop.aim(base=goal_at(AIM, "5"))
     loop.answer()
     (refused,) = [each for each in loop.statuses if each.state is ControllerState.REFUSED]
-    assert_one_sentence(refused.message, "'transposed_jacobian' controls no end-effector")
+    assert_one_sentence(refused.message, "'transposed_jacobian' does not control an end-effector")
 
 
 def test_a_target_that_is_not_seen_any_more_is_lost() -> None:

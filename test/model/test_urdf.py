@@ -416,7 +416,7 @@ def test_a_text_is_obstacles_and_an_empty_one_is_none() -> None:
         ("<robot", "is not XML"),
         (
             BALL_AND_POST.replace("</robot>", f"<world>{BALL_AND_POST}</world></robot>"),
-            "^Obstacles cannot have obstacles of their own: remove <world>",
+            "^Obstacles cannot contain obstacles: remove <world>",
         ),
         (BALL_AND_POST.replace("0.3", "${radius}"), "radius"),
     ],

@@ -316,7 +316,7 @@ def test_twists_on_a_topic_move_the_hand_until_they_stop(harness: Harness) -> No
     flight.ticks(2)
     statuses = [(values_of(each)["state"], each.message) for each in heard["planner/status"]]
     assert ("teleoperating", "'end_effector' follows twists.") in statuses
-    assert statuses[-1] == ("idle", "No more twists arrive: the joints rest.")
+    assert statuses[-1] == ("idle", "No more twists arrive: the joints are at rest.")
     oracle = PinocchioOracle(URDF.read_text("utf-8"), NAMES)
     commands = [
         np.array([dict(zip(m.name, m.velocity, strict=True))[name] for name in NAMES])

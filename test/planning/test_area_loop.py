@@ -339,7 +339,7 @@ def test_a_singular_nominal_shape_is_named(arm_of_area_loop_refusals: SpaceRobot
 def test_joints_that_do_not_move_are_no_choice() -> None:
     servo = 'lower="-2.8" upper="2.8" velocity="0.5"'
     stuck = changed((servo, 'lower="-2.8" upper="2.8" velocity="0"'))
-    with pytest.raises(PlanningError, match=r"three joints that move; .* has 2 with a velocity"):
+    with pytest.raises(PlanningError, match=r"three moving joints; .* has 2 with a velocity"):
         refusing_planner(stuck).plan(at(NOMINAL), GOAL)
 
 

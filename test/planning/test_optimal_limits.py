@@ -286,7 +286,7 @@ def test_joints_without_a_velocity_limit_are_refused_with_the_remedies() -> None
     with pytest.raises(ParameterError) as refusal:
         plan(free, rotvec=[0, 0, 0.2], **QUICK)
     assert str(refusal.value) == (
-        "Joint 'pin_1' has no velocity limit, within which optimal plans: give it "
+        "Joint 'pin_1' has no velocity limit, which optimal requires: give it "
         '<limit velocity="..." effort="..."/> in the URDF, or optimal.max_velocity.'
     )
     assert plan(free, rotvec=[0, 0, 0.2], max_velocity=[0.5, 0.5], **QUICK).ticks > 0

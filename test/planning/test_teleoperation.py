@@ -135,7 +135,7 @@ def test_rates_change_within_the_limits_and_the_joints_brake_when_twists_stop() 
     assert np.all(np.diff(speeds) <= 1e-12)
     assert speeds[-1] == 0.0
     assert loop.executive.phase is Phase.IDLE
-    assert loop.statuses[-1].message == "No more twists arrive: the joints rest."
+    assert loop.statuses[-1].message == "No more twists arrive: the joints are at rest."
     assert loop.states[-1] == "idle"
     commands = np.array(loop.commands)
     assert np.abs(np.diff(commands, axis=0) / TICK / most).max() <= 1 + 1e-9

@@ -21,8 +21,8 @@ class ComputedTorqueLaw(ControlLaw):
     base reacts with ``omegadot = -D^-1 (D_q u + C_omega)``, the base rows of eq. (19) of paper 4
     without a wrench; inserted into the joint rows this gives ``Js = D_qq - D_q' D^-1 D_q`` and
     ``Fs = C_q - D_q' D^-1 C_omega``. This form holds for any spatial tree and any momentum; the
-    paper's case is a planar chain without angular momentum. No wrench is commanded, so that both
-    momenta are conserved.
+    paper's case is a planar chain without angular momentum. No wrench is commanded, so both momenta
+    are conserved.
     """
 
     name: ClassVar[str] = "computed_torque"

@@ -65,8 +65,8 @@ class GainPair:
     The integral gain removes the steady-state error under constant disturbances. With laws that use
     the inertia, each error is stable if ``ki < kp kd``; choose a much smaller value.
 
-    Commands are held for one control period. A derivative gain that removes more than the whole
-    velocity within one period makes the loop unstable: Kd times the period must stay well below 2
+    Commands are held for one control period. If a derivative gain removes more than the whole
+    velocity within one period, the loop is unstable: Kd times the period must stay well below 2
     (with ``transposed_jacobian``, below twice the smallest inertia moved by the output, which for
     end-effector attitude is that of the last wrist link about its joint).
     """
@@ -234,7 +234,7 @@ class ControlLaw(ABC):
     defines ``name``, ``gain_units`` and :meth:`results`, and if it has options, ``Options``: a
     frozen dataclass derived from :class:`LawOptions`, whose fields become the parameters
     ``<name>.<option>`` of the controller node. A line in
-    :mod:`spacerobot_ros.control.laws.registry` makes it available.
+    :mod:`spacerobot_ros.control.laws.registry` makes the law available.
 
     Parameters
     ----------
@@ -247,7 +247,7 @@ class ControlLaw(ABC):
     options
         An instance of the law's ``Options``; None: their defaults.
     thrust
-        Whether thrusters act on the base; otherwise the law commands no force.
+        Whether thrusters act on the base; if not, the law commands no force.
     control_period
         Duration for which a command is held, s; longer durations lower the automatic gains.
 
@@ -364,7 +364,7 @@ class ControlLaw(ABC):
     def automatic_effort(self, symbols: Mapping[str, ca.SX]) -> ca.SX:
         """Return the efforts (m,) due to automatic gains if the law commands forces; else zeros.
 
-        They make the errors of outputs whose ``kp`` and ``kd`` are 0 critically damped:
+        They critically damp the errors of outputs with zero ``kp`` and ``kd``:
         ``Htilde (z1ddot_des + Kd edot + Kp e)``, with the output mass matrix ``Htilde`` (eq. 25),
         slightly damped so that it stays bounded at singularities.
         """
@@ -410,7 +410,7 @@ class ControlLaw(ABC):
         Raises
         ------
         ParameterError
-            An integral gain is not zero, and the law has no integral term.
+            An integral gain is nonzero, but the law has no integral term.
         """
         selection = self.outputs.selection
         self._ki = gains.integral_diagonal(selection)
@@ -465,7 +465,7 @@ class ControlLaw(ABC):
     def start(self, time: float, start: Reference, goal: Reference) -> None:
         """Restart the law: at ``time`` (s), the reference starts towards new goals.
 
-        A law that keeps a state between commands initialises it here, after calling this method.
+        A stateful law initialises its state here, after calling this method.
         """
         self.reset_integral()
 
@@ -540,7 +540,7 @@ class ControlLaw(ABC):
             return ""
         i = int(np.abs(modes[:m, fastest]).argmax())
         kp, kd = (gains[i] for gains in self.gain_diagonals)
-        inertia = f", on an inertia (or mass) of {1 / mobility[i, i]:.1g}"
+        inertia = f", for an inertia (or mass) of {1 / mobility[i, i]:.1g}"
         return (
             f"The gains kp = {kp:g} and kd = {kd:g} of output '{self.outputs.labels[i]}'"
             f"{inertia if self.gain_units == FORCE_GAINS else ''} are too high for a control "

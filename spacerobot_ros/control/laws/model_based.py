@@ -50,8 +50,8 @@ class ModelBasedLaw(ControlLaw):
     Near a singularity of J_z (smallest singular value ``s`` below the threshold ``t``) no bounded
     force accelerates the outputs along the singular direction ``u``. There, the law is damped:
 
-    * The mobility along u, ``s^2 v' H+^-1 v`` with ``J_z' u = s v``, is raised to its value with
-      ``t`` for ``s``: damping ``d = sqrt(t^2 - s^2)``, which starts from zero at the threshold.
+    * The mobility along u, ``s^2 v' H+^-1 v`` with ``J_z' u = s v``, is raised to its value for
+    ``s = t``: damping ``d = sqrt(t^2 - s^2)``, which starts from zero at the threshold.
       Accelerations along v stay bounded; other directions are unaffected.
     * Velocity along v, which the outputs no longer show, so that their Kd does not act on it, is
     damped directly with the largest Kd. If the reference describes a single motion, motion along

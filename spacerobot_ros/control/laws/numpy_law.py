@@ -18,11 +18,11 @@ from spacerobot_ros.model.description import Array
 class NumpyLaw(ControlLaw):
     """A law that computes its command from the state and the reference in Python.
 
-    A subclass defines ``name`` and :meth:`compute`. Before each call the base class evaluates
+    A subclass defines ``name`` and :meth:`compute`. Before each call, the base class evaluates
     :attr:`error`, :attr:`error_rate` and :attr:`J_z` of the outputs; :attr:`gain_diagonals` are the
     parameters ``gains``; :attr:`gain_matrices` include their couplings. A stateful law keeps its
-    state in attributes and resets it in :meth:`start`. All engines except the lanes of campaigns
-    support such a law.
+    state in attributes and resets it in :meth:`start`. All engines except campaign lanes support
+    such a law.
 
     See :class:`ControlLaw` for the parameters and errors of the constructor.
     """

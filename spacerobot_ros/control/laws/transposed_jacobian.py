@@ -30,7 +30,7 @@ class TransposedJacobianLaw(ControlLaw):
     """Paper 4, eqs (29) and (30): ``[f; n; tau] = J_q^-T J_z' (Kp e + Kd edot)``.
 
     The product ``J_z J_q^-1`` maps the base twist and the joint rates to the output rates: the
-    masses cancel, and the law needs only the robot's geometry. No potentially singular matrix is
+    masses cancel, and the law requires only the robot's geometry. No potentially singular matrix is
     inverted: if the errors are bounded, so is the command, even near a singularity of ``J_z``.
     It has no
     acceleration feedforward. Automatic gains are matrices that depend on the masses, with

@@ -46,7 +46,7 @@ class Controllability:
     shape
         (n,) shape at which the brackets are taken, m or rad.
     message
-        The result, a sentence for the user; if ``controllable`` is false, the reason.
+        Result as a sentence for the user; if ``controllable`` is false, the reason.
     """
 
     rank: int
@@ -58,7 +58,7 @@ class Controllability:
 
     @property
     def controllable(self) -> bool:
-        """Whether the brackets span all needed axes."""
+        """Whether the brackets span all required axes."""
         return self.rank >= self.required_rank
 
     def require(self) -> None:
@@ -74,7 +74,8 @@ class Controllability:
 
     @property
     def condition(self) -> float:
-        """Condition number of the best three brackets; infinite for linearly dependent brackets."""
+        """Condition number of the best three brackets; infinite if the brackets are linearly
+        dependent."""
         largest, _, smallest = self.singular_values
         return float(largest / smallest) if smallest > ZERO_TURN_PER_AREA else np.inf
 
@@ -169,7 +170,7 @@ def tilted_goal_error(robot: SpaceRobot, axis: Array, tilt: float) -> Unreachabl
     return UnreachableError(
         f"The goal attitude is {tilt:.4g} rad off any rotation about the axis "
         f"{(np.round(axis, 6) + 0.0).tolist()} of {robot.base_link}: planar robot "
-        f"'{robot.description.name}' rotates about no other axis.",
+        f"'{robot.description.name}' cannot rotate about any other axis.",
         Proof.RANK,
     )
 

@@ -43,7 +43,7 @@ MAX_PATH_POSES = 10_000
 """Largest number of poses in a given path, which limits planning time."""
 
 _MAX_ANGLE = 2e6 * np.pi
-"""A million revolutions, rad: a larger angle does not resolve its attitude."""
+"""A million revolutions, rad: larger angles do not resolve the attitude."""
 
 
 @dataclass(frozen=True)
@@ -191,7 +191,7 @@ class Goal:
     end_effectors
         End-effector goals, at most one per link.
     base
-        Requested components of the base pose. With end-effectors, any or none of them may be
+        Requested components of the base pose. With end-effector goals, any or none of them may be
         requested; the motion determines the others.
     asked
         Base pose components given explicitly by the sender. Other components are
@@ -305,7 +305,7 @@ class Goal:
         parts: dict[Controlled, Sequence[float]] = {"position": position, "attitude": quaternion}
         asked = frozenset(part for part, numbers in parts.items() if not np.isnan(numbers).all())
         if not asked:
-            raise GoalError("The goal is a pose of NaN, which requests nothing.")
+            raise GoalError("The goal pose is all NaN, which requests nothing.")
         made = cls.checked(
             position if "position" in asked else [0.0, 0.0, 0.0],
             quaternion if "attitude" in asked else [0.0, 0.0, 0.0, 1.0],
@@ -320,8 +320,8 @@ class Goal:
         Raises
         ------
         GoalError
-            The goal is invalid, or the rotation vector is not three numbers of at most a million
-            revolutions.
+            The goal is invalid, or the rotation vector does not consist of three numbers of at most
+            a million revolutions.
         """
         vector = as_numbers(rotvec, "The goal rotation vector", GoalError)
         if vector.shape != (3,) or not np.all(np.abs(vector) <= _MAX_ANGLE):
@@ -361,7 +361,7 @@ class Goal:
             link = robot.end_effector(each.link)
             if not link:
                 raise GoalError(
-                    f"The goal is for the end-effector, and robot '{robot.name}' has no link "
+                    f"The goal is for the end-effector, but robot '{robot.name}' has no link "
                     f"'{DEFAULT_END_EFFECTOR}'{remedy}."
                 )
             if link == robot.base_link:
@@ -592,7 +592,7 @@ def missed_turn(angle: float, tolerance: Tolerance) -> dict[str, str]:
 
 
 def reached_message(remaining: str, missed: Mapping[str, str]) -> str:
-    """Return the message about a reached goal; ``missed`` are its :func:`missed_parts`."""
+    """Return the message for a reached goal; ``missed`` are its :func:`missed_parts`."""
     parts = " and ".join(f"its {part}, which is {error} off" for part, error in missed.items())
     but = f" but for {parts} and not controlled" if parts else ""
     return f"The goal is reached{but}: {remaining}."

@@ -75,7 +75,7 @@ class PlanRequest:
         small, and options that fix the size of the first manoeuvre do not apply.
     previous
         The last executed schedule for the same goal; None for the first. ``auto`` keeps its
-        method, and methods that plan piece by piece continue from its ``progress``.
+        method, and methods that plan step by step continue from its ``progress``.
     motion
         Joint motion at the start of the gait; None: they rest. Only methods that
         declare ``starts_in_motion`` receive it.
@@ -107,8 +107,8 @@ NO_JOINTS = (
 class GaitMethod(ABC):
     """An algorithm that turns a goal pose into a gait.
 
-    A method is built once for a robot and plans many times. Between calls of :meth:`plan` it keeps
-    nothing but compiled functions.
+    A method is built once per robot and used for many plans. Between calls to :meth:`plan`, it
+    keeps only compiled functions.
 
     Parameters
     ----------
@@ -302,7 +302,7 @@ class GaitMethod(ABC):
         GoalError
             The shape belongs to another robot.
         UnreachableError
-            The shape is beyond the joint limits.
+            The shape is outside the joint limits.
         """
         wanted, robot = goal.joint_positions, self.robot
         if wanted is None:

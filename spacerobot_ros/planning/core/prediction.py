@@ -29,7 +29,7 @@ largest number of step halvings."""
 def coasting_positions(
     robot: SpaceRobot, state: RobotState, time: Array, shapes: Array, quaternions: Array
 ) -> Array:
-    """Return the base position (K, 3) in W, m: at -c(q) from the coasting centre of mass.
+    """Return the base position (K, 3) in W, m: at -c(q) relative to the drifting centre of mass.
 
     Parameters
     ----------

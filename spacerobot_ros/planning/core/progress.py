@@ -63,7 +63,7 @@ class SearchProgress:
 
 
 def log_progress(logger: logging.Logger, progress: SearchProgress, line: str) -> None:
-    """Log a line about a search, with its progress."""
+    """Log a message about a search, with its progress."""
     logger.info(line, extra={_RECORD_ATTRIBUTE: progress})
 
 
@@ -78,7 +78,7 @@ def report_progress(
     show
         Called with the progress of every search.
     announce
-        Called with a message when other long work begins.
+        Called with a message when other long-running work begins.
     """
     handler, logger = _ProgressHandler(show, announce), logging.getLogger(_PACKAGE)
     before = logger.level

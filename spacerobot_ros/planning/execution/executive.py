@@ -71,8 +71,8 @@ class Executive:
     If the worker plans synchronously, the measured state waits for its plan, and a plan requested
     while the joints move begins with braking. If it plans in the background, the joints brake to
     rest before a plan is requested, and hold their shape until it is available. If the methods of
-    both schedules allow it, no braking is needed: a plan takes over in motion at a later tick. That
-    tick depends on parameters and on the stamp of the request, not on the planning time.
+    both schedules allow it, no braking is needed: a plan takes over in motion at a later tick. This
+    tick depends on parameters and on the request's stamp, not on the planning time.
 
     Parameters
     ----------
@@ -233,7 +233,7 @@ class Executive:
         return commanded_until_ns >= since or rests_since_ns <= since
 
     def schedule_ended(self, why: str = "", *, final: bool = False) -> None:
-        """End the schedule at the next state: the robot's own controller has ended it.
+        """End the schedule at the next state, because the robot's own controller has ended it.
 
         The measured state is compared with the goal as after every schedule, and the remaining
         motion is planned again; ``final``: there are no further plans. ``why`` is the clause that
@@ -280,7 +280,7 @@ class Executive:
             self._teleoperation = Teleoperation(robot, self.config, worker.clearance)
 
     def plan_at_once(self) -> None:
-        """From now on, plan while states wait: the plant is in lockstep."""
+        """From now on, plan while states wait, because the plant is in lockstep."""
         self.config = replace(self.config, plan_in_background=False)
         self._worker.plans_in_background = False
 
@@ -345,7 +345,7 @@ class Executive:
     # -- measured states ----------------------------------------------------------------------
 
     def add_base_measurement(self, measured: MeasuredState) -> None:
-        """Use a base measurement that arrives after its state was processed."""
+        """Use a base measurement that arrived after its state was processed."""
         if self.phase is Phase.TELEOPERATING:
             self._teleoperation.keep_base_pose(measured)
         elif self.measuring:

@@ -89,7 +89,7 @@ class GoalFile:
     Parameters
     ----------
     path
-        The file; empty: nothing is saved and nothing is loaded.
+        The file; if empty, nothing is saved or loaded.
     keys
         Allowed goal keys; a file with other keys is rejected.
     """

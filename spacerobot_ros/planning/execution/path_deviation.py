@@ -1,4 +1,4 @@
-"""Deviation of the measured base from its predicted path, and the mass errors that explain it.
+"""Deviation of the measured base from its predicted path, and mass errors that explain it.
 
 At zero momentum, the base rotation depends only on the shape path and on ratios of masses and
 inertias. A rotation that differs from the prediction indicates errors in these model
@@ -237,8 +237,8 @@ class PathDeviation:
         """Add a measured position (3,) and attitude (4,) at instant k of the path.
 
         ``lag`` (6,) is the part of its deviation, displacement (m) and rotation vector (rad) in W,
-        due to joints lagging behind the schedule. It vanishes when they catch up, so it
-        is excluded from the mean deviation.
+        due to joints lagging behind the schedule. It vanishes when the joints catch up, so it is
+        excluded from the mean deviation.
         """
         predicted = self._path.quaternion[k]
         turn = matrix_from_quaternion(predicted) @ attitude_error(predicted, quaternion)

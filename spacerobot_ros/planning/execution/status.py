@@ -477,7 +477,7 @@ def describe_remaining_error(
 
 
 def manoeuvre_time(statuses: Iterable[tuple[float, PlannerStatus]], end_s: float) -> float | None:
-    """Return the duration of the flown schedules for the last goal, s.
+    """Return the duration of the executed schedules for the last goal, s.
 
     This is the planner's value, minus the rest of the last schedule if the flight was cut off. If
     the planner has no value, as after an abort, it is the result of :func:`time_to_end`.

@@ -40,7 +40,7 @@ from spacerobot_ros.planning.methods.resolved_rate import (
 from spacerobot_ros.times import SECOND
 
 _SLOW_PROGRESS_RATE = 2 * MIN_PROGRESS_RATE
-"""Progress below which the end-effector slows down before a singularity."""
+"""Progress per joint motion below which the end-effector slows down before a singularity."""
 
 _LOOK_AHEAD = 1e-3
 """Motion of the fastest joint after which progress is checked again, rad."""
@@ -125,9 +125,8 @@ class TwistCommand:
 class TwistStep(NamedTuple):
     """Result for one state while an end-effector follows twists.
 
-    ``rates`` (n,) are the joint rates; None if the joints hold their shape. ``message`` is for
-    the
-    status, empty if there is nothing new. ``ended``: whether the joints are at rest and twists have
+    ``rates`` (n,) are the joint rates; None if the joints hold their shape. ``message`` is for the
+    status; empty if there is nothing new. ``ended``: whether the joints are at rest and twists have
     ended.
     """
 
@@ -262,7 +261,7 @@ class Teleoperation:
         pose = np.eye(7)[6] if following.pose is None else following.pose
         rates, limited = following.follower.rates(twist, pose, q, before)
         if following.twist is None and not np.any(rates):
-            return TwistStep(rates, "No more twists arrive: the joints rest.", ended=True)
+            return TwistStep(rates, "No more twists arrive: the joints are at rest.", ended=True)
         return TwistStep(rates, self._news(following, reason or limited, stamp))
 
     def _news(self, following: _Following, reason: str, stamp: int) -> str:

@@ -328,7 +328,7 @@ class TrajectoryTracker:
         return take_over
 
     def covers(self, stamp_ns: int) -> bool:
-        """Whether the schedule or braking covers a time."""
+        """Whether the schedule or braking covers a given time."""
         return self._follower is not None and self._follower.covers(stamp_ns)
 
     def has_ended(self, stamp_ns: int, q: Array) -> bool:
@@ -360,8 +360,8 @@ class TrajectoryTracker:
     def track(self, stamp_ns: int, q: Array, *, obeyed: bool = True) -> list[int]:
         """Write the setpoint for the current shape ``q`` (n,), and return the stuck joints.
 
-        If the shape is not finite, the setpoint is rest. While no command is in effect at the plant
-        (``obeyed`` is false), joints that do not move are not considered stuck.
+        If the shape is not finite, the setpoint commands rest. While no command is in effect at the
+        plant (``obeyed`` is false), joints that do not move are not considered stuck.
         """
         assert self._follower is not None
         position, velocity = self.setpoint.position, self.setpoint.velocity
@@ -401,8 +401,8 @@ class TrajectoryTracker:
     def hold(self, q: Array, qdot: Array | None = None, *, obeyed: bool = True) -> None:
         """Write the setpoint that keeps the shape without a schedule.
 
-        Reaction wheels keep their last commanded rates, or initially the measured ones in ``qdot``
-        (n,): braking them would rotate the base.
+        Reaction wheels keep their last commanded rates, or initially the measured rates in ``qdot``
+        (n,): braking the wheels would rotate the base.
         """
         # The reference of a controller must not follow the measured shape; for a plant, rest is any
         # shape. Motions while no command is in force are not undone afterwards.
@@ -438,7 +438,7 @@ _MIN_JOINT_ERROR = 1e-6  # m or rad
 
 
 class StuckJointWatch:
-    """Watches the joints while a schedule is tracked, tick by tick.
+    """Monitors the joints tick by tick while a schedule is tracked.
 
     For every joint, the range of positions since it last followed is compared with the commanded
     range. A joint is stuck if it was commanded to move in at least N ticks and the first range is a
@@ -466,7 +466,7 @@ class StuckJointWatch:
         self.restart()
 
     def restart(self) -> None:
-        """Begin to watch the joints for a new schedule."""
+        """Start monitoring the joints for a new schedule."""
         n = self._joints
         self._suspicious, self._ticks_without_check = False, 0
         self._moving_ticks = np.zeros(n, dtype=np.int64)

@@ -162,7 +162,8 @@ class _Coasting:
 class PlanningWorker:
     """Plans with a planner's method, one plan at a time.
 
-    With ``plan_in_background`` a thread plans: CasADi and numpy release Python's global interpreter
+    With ``plan_in_background``, a thread plans: CasADi and numpy release Python's global
+    interpreter
     lock for most of the time. A robot that drifts moves during planning: its plans begin with a
     rest period, which is
     extended for the next plan if planning took longer. The thread uses the robot's functions, whose
@@ -324,7 +325,7 @@ class PlanningWorker:
         Raises
         ------
         PlanningError
-            No plan is found; the message says why.
+            No plan was found; the message says why.
         """
         method = self._choose_method(task)
         if task.take_over is not None:

@@ -10,7 +10,7 @@ the path, and held commands follow it.
 
 Loops run along joint axes and enclose given areas (figure 5) in the planes of joints (1, 2),
 (2, 3) and (3, 1); an area is positive if the path is counter-clockwise. Six edges of a box enclose
-all three at once, rectangles one by one.
+all three areas at once, rectangles enclose them one by one.
 """
 
 from __future__ import annotations
@@ -85,7 +85,7 @@ class AreaLoopOptions:
         "", "names of the three joints, separated by spaces; '': the best three", of_joints=True
     )
     cycles_per_plan: int = parameter(
-        1, "cycles before the attitude is measured again", minimum=1, maximum=10000
+        1, "number of cycles before the attitude is measured again", minimum=1, maximum=10000
     )
     most_cycles: int = parameter(
         1000, "largest number of cycles for a goal", minimum=1, maximum=1000000
@@ -430,8 +430,8 @@ class EdgePath:
     Attributes
     ----------
     loops
-        Each (V, 3): the vertices in the order of travel, the first again at the end; the centre of
-        their bounding box is the origin.
+        Each polygon (V, 3): vertices in order of travel, with the first repeated at the end; their
+        bounding box is centred at the origin.
     edge_ratio
         Largest ratio of an edge to the longest allowed edge.
     """
@@ -452,8 +452,8 @@ def edge_path(areas: Array, longest: Array) -> EdgePath:
 
     The cube-like path is used if its edges are short enough, or shorter than those of the
     rectangles.
-    If the areas are too large, ``excess`` is above 1; edges scale with the square root of the
-    areas.
+    If the areas are too large, ``excess`` is greater than 1; edges scale with the square root of
+    the areas.
     """
     areas = np.where(np.abs(areas) > _NEGLIGIBLE_AREA_SHARE * np.abs(areas).max(), areas, 0.0)
     rectangles = _rectangle_path(areas, longest)

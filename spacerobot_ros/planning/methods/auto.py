@@ -188,7 +188,7 @@ class _MethodResult:
         return cls(schedule, schedule.controls & asked, reaches)
 
     def rank(self, others: Collection[_MethodResult]) -> tuple[bool, bool, float]:
-        """Return the key to sort by: the better one of two results has the smaller key."""
+        """Return the sort key: the better of two results has the smaller key."""
         less = any(self.parts < other.parts and other.reaches_goal for other in others)
         return not self.reaches_goal, less, self.schedule.expected_duration
 

@@ -1,14 +1,14 @@
 """Planar robots, and their base rotation along a path in shape space: paper 3's geometric phase.
 
-A planar robot's joints all rotate about parallel axes, and nothing tilts its base. The attitude is
+All joints of a planar robot rotate about parallel axes, and nothing tilts its base. The attitude is
 a single angle theta about the robot axis. At zero angular momentum
 ``theta_dot = -s(psi)' psi_dot`` (eq. 3), where ``s_i = N_i / D`` is the mechanical connection's
 component about the axis, ``D`` the locked robot's inertia about the axis, and ``N_i`` its coupling
 to joint i. The rotation along a shape path is the line integral of ``-s`` (eq. 11): it
 depends on the path, not on the speed.
 
-Small loops rotate the base most where the curvature is largest (remark 2). Boxes (2, 2) are lower
-over upper bounds of two joints, rad.
+Small loops rotate the base most where the curvature is largest (remark 2). Boxes (2, 2) contain
+lower over upper bounds of two joints, rad.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ _EQUAL_PEAK_TOLERANCE = 1e-4
 _EQUAL_DISTANCE_TOLERANCE = 1e-2  # rad
 
 _NEIGHBOUR_OFFSETS = np.array([[x, y] for x in (0.0, -1.0, 1.0) for y in (0.0, -1.0, 1.0)])
-"""Offsets of a grid point and its eight neighbours; the first, of the point itself, wins ties."""
+"""Offsets of a grid point and its eight neighbours; the first, for the point itself, wins ties."""
 
 
 def planar_axis(robot: SpaceRobot) -> Array:
@@ -268,7 +268,7 @@ def centre_box(at: Array, lower: Array, upper: Array) -> Array:
 
 
 def curvature_peaks(plane: PhasePlane, at: Array, boxes: Array) -> Array:
-    """Return the points (R, 2) of the largest |curvature| in boxes (R, 2, 2).
+    """Return the points (R, 2) of largest |curvature| in boxes (R, 2, 2).
 
     Among equally good points, the one nearest to ``at`` (2,) is returned.
     """

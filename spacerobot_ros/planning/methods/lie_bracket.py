@@ -1,8 +1,8 @@
 """Sliding masses and first-order Lie brackets: the manoeuvre of paper 1, section 5.
 
 Step 1 finds the final shape ``zf`` that puts the base at the goal position (eq. 9). Step 2 slides
-the masses there (eq. 10). Step 3 rotates the base by n equal cycles of three frequencies whose
-brackets add up to the remaining rotation.
+the masses there (eq. 10). Step 3 rotates the base by n equal cycles with three frequencies, whose
+brackets sum to the remaining rotation.
 
 The plant holds each command for one tick, so the sliders trace polygons inside the smooth curves.
 Their area is smaller by ``sin(x)/x``, where ``x`` is the phase per tick; the amplitudes compensate
@@ -59,13 +59,13 @@ class LieBracketOptions:
     """The options of ``lie_bracket``."""
 
     t1: float = parameter(
-        100.0, "duration of step 2, the slide to the final shape", "s", minimum=1e-3, maximum=1e9
+        100.0, "duration of step 2, the motion to the final shape", "s", minimum=1e-3, maximum=1e9
     )
     n1: int = parameter(
         10, "number of periods of the sin^2 velocity profile in step 2", minimum=1, maximum=10000
     )
     cycle_period: float = parameter(
-        3.0, "duration of one cycle of step 3, (tf - t1) / n", "s", minimum=1e-3, maximum=1e9
+        3.0, "duration of one cycle in step 3, (tf - t1) / n", "s", minimum=1e-3, maximum=1e9
     )
     cycles: int = nonnegative(
         0, "n, the number of cycles of step 3; 0: determined by loop_area", maximum=1e8
@@ -294,7 +294,7 @@ class LieBracketGait(GaitMethod):
         condition = float(np.linalg.cond(brackets))
         if not condition < MAX_CONDITION:
             raise PlanningError(
-                "The first-order Lie brackets of the sliders do not span the three axes of "
+                "The sliders' first-order Lie brackets do not span the three axes of "
                 f"rotation at the final shape {np.round(z_f, 4).tolist()} (condition number "
                 f"{condition:.2g}): the attitude cannot be controlled there by lie_bracket."
             )

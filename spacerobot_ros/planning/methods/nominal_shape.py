@@ -30,7 +30,7 @@ JOINT_PLANES = ((0, 1), (1, 2), (2, 0))
 """The planes of three joints in which loops enclose areas."""
 
 _GRID_POINTS = {1: 11, 2: 7}
-"""Points per joint of the first grid, by the number of triples; 5 for more triples."""
+"""Points per joint in the first grid, by number of triples; 5 for more triples."""
 
 _MAX_TRIPLES, _SAMPLED_SHAPE_COUNT = 8, 48
 """Largest number of joint triples to examine closely, and of shapes at which to choose them."""
@@ -144,14 +144,16 @@ class NominalShapeChooser:
         Raises
         ------
         PlanningError
-            Limits leave no room for loops, or loops there do not rotate the base about all axes.
+            Joint limits leave no room for loops, or loops at this shape do not rotate the base
+            about all axes.
         """
         return kept if kept is not None and self._can_be_kept(kept, q) else self._choose_nominal(q)
 
     def shapes_with_more_room(self, q: Array, is_clear: ClearanceTest) -> Iterator[NominalShape]:
         """Yield other nominal shapes from shape ``q`` (n,), around which loops have room.
 
-        All shapes in a box around one keep the clearance (``is_clear``). The edges of the first box
+        All shapes in a box around each keep the clearance (``is_clear``). The edges of the first
+        box
         are as long as loop edges may be, those of the next box half as long, and so on. Nothing is
         yielded if the user has specified the nominal shape.
         """
@@ -178,7 +180,7 @@ class NominalShapeChooser:
         robot = self._robot
         if not self._triples:
             raise PlanningError(
-                f"area_loop needs three joints that move; robot '{robot.description.name}' has "
+                f"area_loop needs three moving joints; robot '{robot.description.name}' has "
                 f"{int(np.sum(robot.velocity_limit > 0))} with a velocity limit above zero."
             )
         if self._given_shape is not None:

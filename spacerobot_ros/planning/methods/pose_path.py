@@ -2,8 +2,8 @@
 
 Within a distance ``d`` of a corner, both lines are blended: the position is ``c - a l_1 + b l_2``,
 with the lines ``l_1`` and ``l_2`` to and from the corner ``c``, ``a = (1 - t)^2 d / |l_1|``, and
-``b = t^2 d / |l_2|``, for t from 0 to 1. The tangent is continuous, and the position is at most
-``d / 4`` off the lines. The attitude is blended in the same way, by rotations.
+``b = t^2 d / |l_2|``, for t from 0 to 1. The tangent is continuous, and the position deviates from
+the lines by at most ``d / 4``. The attitude is blended in the same way, using rotations.
 """
 
 from __future__ import annotations

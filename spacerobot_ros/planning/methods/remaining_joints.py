@@ -1,4 +1,4 @@
-"""Plans for robots with stuck joints, which use the other joints."""
+"""Plans for robots with stuck joints, using the other joints."""
 
 from __future__ import annotations
 

@@ -498,7 +498,7 @@ class PathProgress:
 
 
 class ResolvedRateGait(GaitMethod):
-    """End-effectors on straight lines, or along paths, to their goals, with the base free.
+    """Moves end-effectors along straight lines or paths to their goals, with the base free.
 
     From rest to rest, as fast as the joint limits allow. Handles positions, or poses with a
     rotation about one axis, of one end-effector or several at once; along a given path, only one.
@@ -671,7 +671,7 @@ class ResolvedRateGait(GaitMethod):
         Raises
         ------
         PlanningError
-            The goal is of another kind, or requests too much; see :meth:`plan`.
+            The goal is of an unsupported kind, or requests too much; see :meth:`plan`.
         """
         goal = request.goal.for_robot(self.robot.description)
         self._require_goal_of_end_effectors(goal)

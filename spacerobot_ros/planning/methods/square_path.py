@@ -53,7 +53,7 @@ _MAX_SIDE = math.pi
 revolution, a larger square adds curvature of opposite sign."""
 
 _SIDE_SAMPLES = 8
-"""Number of tried sides between zero and the largest side that fits."""
+"""Number of side lengths tried between zero and the largest that fits."""
 
 _USED_RANGE_SHARE = 1.0 - 1e-9
 """Fraction of the free range used by the largest square: rounding must not put a corner beyond

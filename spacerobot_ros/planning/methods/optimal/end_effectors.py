@@ -7,8 +7,8 @@ attitude B_0 of the base,
 ``r_CE = X (r_BE(q) - r_BC(q))``,  ``R = X R_BE(q)``.
 
 An end-effector goal is a value of the first, or of both; the base position is treated as that of
-the base link. These are :class:`EndEffectorRows` of the optimal control problem, only
-along directions in which the joints can move the link. Its guesses end in shapes found by inverse
+the base link. In the optimal control problem, these are :class:`EndEffectorRows`, only along
+directions in which the joints can move the link. Its guesses end in shapes found by inverse
 kinematics (:meth:`EndEffectorSpecification.boundary_conditions`), each with the base rotation along
 the direct path there (Umetani and Yoshida's generalised Jacobian), because the solver
 finds only the nearest minimum, and every family of shapes has a minimum of its own.
@@ -98,8 +98,8 @@ _GIVEN_SHAPE_ERROR = 1e-9
 
 @dataclass(frozen=True)
 class LinkDirections:
-    """Directions, in B_0, along which the joints move a link: (k, 3) of its origin, (l, 3) of its
-    rotation; no rotation rows if any attitude is allowed.
+    """Directions, in B_0, along which the joints can move a link: (k, 3) of its origin, (l, 3) of
+    its rotation; no rotation rows if any attitude is allowed.
     """
 
     link: str
@@ -378,7 +378,7 @@ class EndEffectorSpecification:
         shape: Array | None,
         limits: MotionLimits,
     ) -> BoundaryConditions:
-        """Return the boundary conditions of a request, with possible ends for guesses.
+        """Return the boundary conditions for a request, with possible ends for guesses.
 
         The arguments are as in :meth:`GoalSpecification.boundary_conditions`.
 
@@ -389,7 +389,7 @@ class EndEffectorSpecification:
         NotFoundError
             No shape that puts the end-effectors at their goals was found.
         PlanningError
-            The method does not plan for such a goal.
+            The method does not support such a goal.
         """
         state, goal, tolerance = request.state, request.goal, request.tolerance
         if robot.n == 0:

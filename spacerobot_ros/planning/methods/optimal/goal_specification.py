@@ -1,6 +1,6 @@
 """Goal specification: the goal components to be reached, and whether the joints can reach them.
 
-At zero momentum ``omega_WB_B = F(q) qdot``. If all columns of F are along one axis, the base
+At zero momentum, ``omega_WB_B = F(q) qdot``. If all columns of F are along one axis, the base
 rotates only about that axis. Otherwise the brackets of the columns span all rotations, provided
 that the curvature of the connection is not zero everywhere (paper 1, section 4).
 """
@@ -134,7 +134,7 @@ class GoalSpecification:
         shape: Array | None,
         limits: MotionLimits,
     ) -> BoundaryConditions:
-        """Return the boundary conditions of a request.
+        """Return the boundary conditions for a request.
 
         Parameters
         ----------
@@ -186,7 +186,7 @@ class GoalSpecification:
                 raise UnreachableError(
                     f"The goal attitude and shape put the base {miss:.3g} m from the goal "
                     "position: "
-                    "without thrust the centre of mass stays where it is. Leave the shape out, or "
+                    "without thrust the centre of mass stays where it is. Omit the shape, or "
                     "ignore the position with optimal.base_position 2.",
                     Proof.MOMENTUM,
                 )
@@ -217,7 +217,7 @@ class GoalSpecification:
         if not self.base_rotations.loops_turn_base:
             raise PlanningError(
                 f"{drifts}, and loops of its joints do not rotate its base: optimal plans for "
-                "drifting robots only if they do. With optimal.base_attitude 0 the attitude is "
+                "drifting robots only if they do. With optimal.base_attitude 0, the attitude is "
                 "ignored."
             )
         if len(self.base_rotations.axes) == 1:

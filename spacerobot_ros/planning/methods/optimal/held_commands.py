@@ -71,7 +71,7 @@ _FIT_TOLERANCE = 1e-5
 """Error before the last program, rad, m or m/s; the remaining error is far smaller."""
 
 _MIN_SMOOTH_TICKS = 20
-"""Smallest number of ticks of a smooth manoeuvre; shorter manoeuvres are polygons."""
+"""Smallest number of ticks in a smooth manoeuvre; shorter manoeuvres are polygons."""
 
 _TICK_ROUNDING = 0.02
 """Fraction of a tick by which a solver's duration may miss a whole number of ticks."""
@@ -459,7 +459,7 @@ def least_change(
     Parameters
     ----------
     positions
-        (N + 1, n) shapes at the ticks, m or rad; the first one is fixed.
+        (N + 1, n) shapes at the ticks, m or rad; the first shape is fixed.
     rows, error
         (m, N + 1, n) derivatives of m end values with respect to the shapes, and their required
         change (m,).

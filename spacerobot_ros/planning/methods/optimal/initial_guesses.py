@@ -40,7 +40,7 @@ _CANDIDATES_PER_GUESS = 24
 """Number of random loops of one kind, of which the one closest to the goal becomes the guess."""
 
 _MIN_LOOP_SIZE = 0.1
-"""Smallest size of loops on the path to a possible end, in half ranges, after the first guess."""
+"""Smallest loop size on the path to a possible end, in half ranges, after the first guess."""
 
 _MAX_RANGE_SHARE = 0.85
 

@@ -100,7 +100,7 @@ _COASTING_ANGLE = math.radians(5.0)
 _COASTING_TURNS = 4.0
 
 _MAX_COASTING_ENDS = 3
-"""Largest number of tried instants at which the coasting base passes the goal."""
+"""Largest number of instants tried at which the coasting base passes the goal."""
 
 _MAX_DURATION_RATIO = 2.5
 """Longest duration of a manoeuvre that ends at a pass, as a multiple of that at zero momentum."""

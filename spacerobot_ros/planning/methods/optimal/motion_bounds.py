@@ -63,7 +63,7 @@ class CenterReach:
     origin
         (3,) m, base components.
     slider_directions
-        (3, s) motion of the centre of mass with each slider of fixed direction, m/m.
+        (3, s) centre-of-mass motion per motion of each slider with fixed direction, m/m.
     lower, upper
         (s,) ends of the slider ranges, m.
     radius
@@ -164,7 +164,7 @@ class ConnectionBounds:
     turn
         (n,) largest base rotation by each joint, rad per rad or m; infinite: unknown.
     center
-        (n,) largest displacement of the centre of mass in the base, m per rad or m.
+        (n,) largest centre-of-mass displacement in the base, m per rad or m.
     inertia
         Smallest moment of inertia of the robot with its joints locked, kg m^2; for planar robots,
         about their axis.

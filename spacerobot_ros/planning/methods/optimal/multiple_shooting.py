@@ -1,4 +1,4 @@
-"""The program of direct multiple shooting (:mod:`.transcription`), solved by IPOPT."""
+"""The nonlinear program of direct multiple shooting (:mod:`.transcription`), solved by IPOPT."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _INFEASIBLE = "Infeasible_Problem_Detected"
 """Solver status if it ends at a minimum of the constraint violation."""
 
 TOLERANCE = 1e-5
-"""Durations within a thousandth of a control period, for manoeuvres of some seconds."""
+"""Durations are accurate to a thousandth of a control period for manoeuvres of several seconds."""
 
 _IPOPT_OPTIONS = {
     "print_time": False,
@@ -111,7 +111,7 @@ class DurationBounds:
 
 @dataclass(frozen=True)
 class Neighbourhood:
-    """Neighbourhood of a guess in which a solver searches for a path that keeps links apart.
+    """Neighbourhood of a guess in which a solver searches for a path without collisions.
 
     Attributes
     ----------
@@ -136,7 +136,7 @@ class Neighbourhood:
 
 
 class MultipleShooting:
-    """Solves the problem of one robot for many boundary conditions.
+    """Solves one robot's problem for many boundary conditions.
 
     Parameters
     ----------
@@ -319,7 +319,7 @@ def pack_knots(layout: Layout, step: float, *knots: Array) -> Array:
 
 
 class SolverMonitor(ca.Callback):
-    """Receives every iterate: keeps the best feasible one, and stops the solver."""
+    """Receives every iterate, keeps the best feasible iterate, and stops the solver."""
 
     def __init__(self, problem: dict[str, ca.MX], lower: Array, upper: Array) -> None:
         ca.Callback.__init__(self)

@@ -112,7 +112,7 @@ class OptimalOptions(MotionOptions):
         maximum=1e9,
     )
     keep_direction: tuple[float, ...] = parameter(
-        (), "direction in the world that keep_axis stays away from", minimum=-1e9, maximum=1e9
+        (), "world direction from which keep_axis stays away", minimum=-1e9, maximum=1e9
     )
     keep_angle: float = parameter(
         0.0,
@@ -168,7 +168,7 @@ _UNLIMITED_HALF_RANGE = np.pi
 _SMOOTH_BODY_EXPONENT = 8
 
 _UNBOUNDED_FROM = 1e6
-"""Bounds of a box beyond this, m or rad, are ignored for joints without limits."""
+"""Box bounds beyond this value, m or rad, are ignored for joints without limits."""
 
 _CONSTRAINT_RESERVE = 0.02
 """Relative margin of a solution from its path constraints, which are imposed only at steps."""
@@ -233,7 +233,7 @@ class BoundaryConditions:
 
     @property
     def drifts(self) -> bool:
-        """Whether the angular momentum is not zero."""
+        """Whether the angular momentum is nonzero."""
         return bool(self.angular_momentum.any())
 
     @property
@@ -291,13 +291,13 @@ class MotionLimits:
         for name, v, a in zip(robot.joint_names, velocity, acceleration, strict=True):
             if np.isinf(v) and not np.isfinite(a):
                 raise ParameterError(
-                    f"Joint '{name}' has no velocity limit, within which {method} plans: give it "
+                    f"Joint '{name}' has no velocity limit, which {method} requires: give it "
                     f'<limit velocity="..." effort="..."/> in the URDF, or {method}.max_velocity.'
                 )
             if not (v > 0 and np.isfinite(a) and a > 0):
                 raise ParameterError(
                     f"Joint '{name}' is limited to {v:.4g} per second and {a:.4g} per second "
-                    f"squared; {method} needs a speed above zero and a finite acceleration: see "
+                    f"squared; {method} needs a positive speed and a finite acceleration: see "
                     f"{method}.max_acceleration."
                 )
         return cls(robot.lower.copy(), robot.upper.copy(), velocity, acceleration)
@@ -368,7 +368,7 @@ class Trajectory:
     """N steps of ``step`` seconds with constant accelerations.
 
     ``shapes`` and ``velocities`` (N + 1, n) at the knots between them, and the attitude
-    ``quaternions`` (N + 1, 4) relative to the one at the start.
+    ``quaternions`` (N + 1, 4) relative to the initial attitude.
     """
 
     step: float
@@ -457,7 +457,7 @@ class PathConstraints:
 
     @classmethod
     def of(cls, robot: SpaceRobot, options: OptimalOptions) -> PathConstraints:
-        """Return the constraints that the options specify.
+        """Return the constraints specified by the options.
 
         Raises
         ------

@@ -14,7 +14,7 @@ Each step consists of a few methods of :class:`ManoeuvreSearch`.
 
 J. Schulman et al., "Motion planning with sequential convex optimization and convex collision
 checking", International Journal of Robotics Research 33, 2014, clear paths in steps that are
-quadratic programs; here the steps are the manoeuvre's own problem.
+quadratic programs; here, each step is the manoeuvre's own problem.
 """
 
 from __future__ import annotations
@@ -77,8 +77,8 @@ _GENTLE_TICKS, _GENTLE_TIME = 20, 1.0
 faster one would leave a larger error."""
 
 _GENTLE_DURATION_FACTOR = 4.0
-"""A gentle manoeuvre is the path of least effort in this many times the time of its guess, then as
-fast as the limits allow."""
+"""A gentle manoeuvre is the path of least effort with this multiple of its guess's duration, then
+as fast as the limits allow."""
 
 _BUDGET_FACTOR_WITHOUT_SOLUTION = 5.0
 """As ``optimal.time_budget`` is documented."""
@@ -134,7 +134,8 @@ a multiple of their penetration depth."""
 _MAX_WORK_PER_ITERATION, _WORK_FACTOR_WITHOUT_PATH = 8e4, 3.0
 """Largest work on clear paths, in Jacobian nonzeros over all solver steps, per step that
 ``optimal.iterations`` allows from one guess, and its factor if there is no clear path yet:
-12 and 36 s of an idle core (0.5 us a nonzero). With 1.25e5 two arms took 40 s for the same plan."""
+12 and 36 s of an idle core (0.5 us a nonzero). With 1.25e5, two arms took 40 s for the same
+plan."""
 
 _MIN_SHORTENING_ROUNDS = 3
 """Number of paths on the way to a fast one that are always tried."""
@@ -158,8 +159,8 @@ _REACH_FROM_GUESS = 4.0
 _MAX_CLEAR_STARTS, _MAX_CLEAR_STARTS_IN_MOTION, _CLEAR_ANSWERS = 16, 1, 2
 """Largest number of guesses whose solutions are searched nearby for clear manoeuvres (in motion,
 unless the base drifts, only the rest of the motion: from rest, after braking, others are found
-sooner), and the number of clear paths on a coarse grid that ends the search. With 8 guesses a plan
-of a quadruped took 40 % longer."""
+sooner), and the number of clear paths on a coarse grid that ends the search. With 8 guesses, a plan
+for a quadruped took 40 % longer."""
 
 _REPORT_PERIOD = 1.0
 """Wall time after which a solver reports that it is still busy, s."""
@@ -294,7 +295,7 @@ class SearchProblem:
         return float(np.mean(np.sum(change**2, axis=1)))
 
     def solutions_agree(self, solutions: Sequence[Trajectory]) -> bool:
-        """Whether enough of the solutions agree with the best one."""
+        """Whether enough solutions agree with the best one."""
         costs = np.array([self.cost(each) for each in solutions])
         same = int(np.sum(costs <= costs.min(initial=math.inf) * (1 + _AGREEING_COST_TOLERANCE)))
         return 0 < self.options.agreeing <= same

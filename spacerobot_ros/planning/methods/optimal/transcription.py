@@ -340,7 +340,7 @@ class AttitudeRows:
         Parameters
         ----------
         z, X, X_next
-            Variables of the interval, and the attitudes (4,) at its ends among them.
+            Variables of the interval, including the attitudes (4,) at its ends.
         points
             The arguments of ``rotation`` at the Gauss points.
         rotation
@@ -512,7 +512,7 @@ def rotation_with_derivatives(robot: SpaceRobot, *, drifting: bool) -> ca.Functi
     """Return the rotation w, its Jacobian, and the Hessian of ``mu' w``, as functions of the point
     and mu.
 
-    By differentiating ``D w + D_q u = 0``, or l on the right, once and twice.
+    Obtained by differentiating ``D w + D_q u = 0``, or l on the right, once and twice.
     """
     q, u, impulse = (ca.SX.sym(name, k) for name, k in _rotation_symbols(robot, drifting))
     w, mu, eta = (ca.SX.sym(name, 3) for name in ("w", "mu", "eta"))

@@ -167,7 +167,7 @@ class ThrustPlanner:
     Parameters
     ----------
     robot
-        The model, with its world if it has one.
+        The model, including its world, if any.
     propulsion
         Base propulsion, minus the reserve.
     options
@@ -268,7 +268,7 @@ class ThrustPlanner:
         return self._solvers[kind, kept]
 
     def motion(self, knots: ThrustKnots) -> ThrustMotion:
-        """Return the motion flown by the controls of a solution."""
+        """Return the motion produced by a solution's controls."""
         return ThrustMotion(self._functions, self.propulsion, knots)
 
     # -- both ends ----------------------------------------------------------------------------

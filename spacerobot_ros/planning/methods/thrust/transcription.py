@@ -329,7 +329,7 @@ def _interval_block(robot: SpaceRobot, levels: int) -> ConstraintBlock:
 
 
 def pair_block(joints: int, distance: ca.Function) -> ConstraintBlock:
-    """Return the distance of a pair from a plane at an instant of an interval, plus the lack.
+    """Return the distance of a pair from a plane at an instant in an interval, plus the lack.
 
     ``distance`` is :func:`.support_distance`. The variables are ``[h; x; x+; lack]``, the
     parameters the plane and a point, in W if one of the pair is an obstacle, and the instant from 0
