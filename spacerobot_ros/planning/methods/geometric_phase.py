@@ -260,7 +260,7 @@ def centre_box(at: Array, lower: Array, upper: Array) -> Array:
     """Return the box that contains every distinct point within the limits (2,) once.
 
     Shapes repeat after a revolution: for a joint with a larger range, all points are within half a
-    revolution of ``at`` (2,), or of a point half a revolution from the range end nearest to ``at``.
+    revolution of ``at`` (2,), or within one revolution of the range end nearest to it.
     """
     width = np.minimum(upper - lower, 2 * math.pi)
     start = np.clip(at - width / 2, lower, upper - width)

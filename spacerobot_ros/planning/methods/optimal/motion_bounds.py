@@ -142,7 +142,8 @@ class _FrameBounds:
     radius: float
 
     def of_child(self, index: int, body: Body, lower: float, upper: float) -> _FrameBounds:
-        """Return the set for a body outboard of this one, carried by a joint with these limits."""
+        """Return the bounds for a body outboard of this one, carried by a joint with these
+        limits."""
         assert body.joint is not None
         slides = body.joint.kind is JointKind.PRISMATIC
         if self.R is None:

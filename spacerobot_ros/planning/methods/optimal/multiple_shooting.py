@@ -342,7 +342,7 @@ class SolverMonitor(ca.Callback):
         return 1
 
     def get_sparsity_in(self, i: int) -> ca.Sparsity:
-        """Return the size of an output."""
+        """Return the size of a reported value."""
         return ca.Sparsity.dense(self._sizes[ca.nlpsol_out(i)])
 
     def has_eval_buffer(self) -> bool:
