@@ -162,7 +162,7 @@ def test_a_goal_out_of_the_plane_is_refused_in_lanes_as_elsewhere() -> None:
     for row in lanes.values():
         refused = row.outcome == "refused"
         assert row.engine == ("flights" if refused else "lanes")
-        assert ("in z of the world" in row.reason) is refused
+        assert ("along z of the world" in row.reason) is refused
 
 
 def test_a_part_that_is_asked_for_and_not_controlled_is_missed_in_lanes_as_elsewhere() -> None:

@@ -87,7 +87,7 @@ def test_each_part_of_a_goal_has_a_tolerance_of_its_own(part: str) -> None:
         ([0, 0, np.inf], [0, 0, 0, 1], "position"),
         ([0, 0, 0], [0, 0, np.nan, 1], "orientation"),
         ([0, 0, 0], [0, 0, 0, 0], "zero quaternion"),
-        ([0, 0], [0, 0, 0, 1], "three numbers"),
+        ([0, 0], [0, 0, 0, 1], "three position"),
         ([0, 0, 0], [0, 0, 1], "four"),
     ],
 )
@@ -153,7 +153,7 @@ def test_a_call_without_ros_checks_its_options_too() -> None:
 
 
 def test_a_start_has_a_position_for_every_joint_and_a_method_is_one_of_the_registry() -> None:
-    with pytest.raises(ParameterError, match=r"start has 2 joint position\(s\); .* has 3 joints"):
+    with pytest.raises(ParameterError, match=r"start has 2 joint position\(s\), .* has 3 joints"):
         plan(robot_of(ARM), start=(0.1, 0.2))
     with pytest.raises(ParameterError, match="no gait method 'magic'; there are: lie_bracket, "):
         plan(robot_of(ARM), method="magic")

@@ -86,7 +86,7 @@ def test_two_sliders_share_a_way_up_to_the_ends_of_both_strokes_and_no_further()
         text = refusal_in(partial(method.final_shape, ends, goal))
         assert "beyond stroke" in text
         # 0.4 mm of 2 kg are missing, of 18 kg.
-        assert f"no nearer than {4e-4 * 2 / 18:.3g} m" in text
+        assert f"no closer to it than {4e-4 * 2 / 18:.3g} m" in text
 
 
 def test_the_path_of_many_cycles_is_predicted_at_the_end_of_some() -> None:

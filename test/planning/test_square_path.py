@@ -292,7 +292,7 @@ def test_fewer_than_three_links_are_refused(links: int) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "mention"),
     [
-        ('"pin_2" type="continuous"', '"pin_2" type="prismatic"', "joint 'pin_2' slides"),
+        ('"pin_2" type="continuous"', '"pin_2" type="prismatic"', "joint 'pin_2' is prismatic"),
         ('<axis xyz="0 0 1"/>', '<axis xyz="0 0.02 1"/>', "axis of joint 'pin_2' is not parallel"),
         (
             '<origin xyz="0.5 0 0"/>\n      <mass',
