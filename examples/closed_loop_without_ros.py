@@ -18,7 +18,7 @@ RATE = 100.0  # Hz
 
 
 def main() -> None:
-    """Fly for 12 s to goals of base and end-effector; print how the errors go."""
+    """Fly to base and end-effector goals for 12 s; print the errors over time."""
     robot = SpaceRobot.from_file(robot_file("planar_manipulator"))
     start = PlantConfig(
         actuation="effort",

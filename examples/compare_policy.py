@@ -1,7 +1,7 @@
-"""Compare a policy of ``spacerobot/ReorientArm-v0`` with planned manoeuvres to the same goals.
+"""Compare a policy for ``spacerobot/ReorientArm-v0`` with planned manoeuvres to the same goals.
 
-Run it with ``python examples/compare_policy.py [FILE] [GOALS]``; the policy is one of
-``train_policy.py``. Plans are made and flown for the first GOALS of 1024 goals.
+Run it with ``python examples/compare_policy.py [FILE] [GOALS]``; the policy comes
+from ``train_policy.py``. Manoeuvres are planned and flown for the first GOALS of 1024 goals.
 """
 
 import sys
@@ -35,7 +35,7 @@ def fly(policy: Policy) -> tuple[Array, Array, Array]:
 
 
 def main(file: Path, count: int) -> None:
-    """Print what each way reaches, and in which time."""
+    """Print which goals each method reaches, and how fast."""
     goals, reached, durations = fly(Policy.load(file))
     print(f"{'way':12}{'goals':>8}{'reached':>10}{'median':>10}{'longest':>10}")
     tell("policy", reached, durations)
@@ -48,7 +48,7 @@ def main(file: Path, count: int) -> None:
 
 
 def tell(way: str, reached: Array, durations: Array) -> None:
-    """Print a row of the table; durations are of the goals that are reached."""
+    """Print a table row; durations are those of reached goals."""
     told = f"{way:12}{len(reached):8}{reached.mean():10.1%}"
     if reached.any():
         told += "".join(f"{of(durations[reached]):8.2f} s" for of in (np.median, np.max))

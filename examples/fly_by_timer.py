@@ -1,7 +1,7 @@
-"""A commander on a timer of the wall clock, whose `use_sim_time` is off: a swinging joint.
+"""A commander on a wall timer, without `use_sim_time`, that swings a joint.
 
-Run it with ``python examples/fly_by_timer.py``. A command answers a state of the plant, so its
-stamp is that of a state, or zero, which means the present one. The plant refuses the wall clock's.
+Run it with ``python examples/fly_by_timer.py``. A command responds to a plant state, so its
+stamp is that of a state, or zero for the current state. The plant refuses wall clock stamps.
 """
 
 import math
@@ -17,7 +17,7 @@ PERIOD, FREQUENCY, AMPLITUDE = 0.1, 0.5, 0.2  # s, Hz, m/s
 
 
 class TimedCommander(rclpy.node.Node):
-    """Commands velocities ten times a second, whatever the plant's rate is."""
+    """Commands velocities ten times per second, independent of the plant's rate."""
 
     def __init__(self, **options: Any) -> None:
         super().__init__("commander", **options)
@@ -30,11 +30,11 @@ class TimedCommander(rclpy.node.Node):
         self.create_timer(PERIOD, self.on_time)
 
     def on_state(self, state: JointState) -> None:
-        """Learn the names of the joints: a command names all of them."""
+        """Store the joint names: a command must name all joints."""
         self.names = list(state.name)
 
     def on_time(self) -> None:
-        """Command; a commander that falls silent leaves the joints at rest after a while."""
+        """Send a command; if no commands arrive, the joints come to rest after a while."""
         if not self.names:
             return
         now = self.get_clock().now()
@@ -46,7 +46,7 @@ class TimedCommander(rclpy.node.Node):
         self.commands.publish(command)
 
     def on_diagnostics(self, message: DiagnosticArray) -> None:
-        """Count the commands that the plant has refused."""
+        """Count the commands refused by the plant."""
         for status in message.status:
             if status.name.endswith("plant: commands"):
                 values = {each.key: each.value for each in status.values}

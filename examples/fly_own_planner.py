@@ -1,4 +1,4 @@
-"""A planner of one's own on the topics of ours: state feedback from odom and joint_states.
+"""A custom planner on the stack's topics: state feedback from odom and joint_states.
 
 Run it with ``python examples/fly_own_planner.py``.
 """
@@ -20,13 +20,13 @@ from spacerobot_ros.resources import robot_file
 
 
 def arrays(pose: Pose) -> tuple[Array, Rotation]:
-    """Return position and attitude of a message."""
+    """Return the position and attitude in a message."""
     p, o = pose.position, pose.orientation
     return np.array([p.x, p.y, p.z]), Rotation.from_quat([o.x, o.y, o.z, o.w])
 
 
 class FeedbackPlanner(rclpy.node.Node):
-    """Commands joint rates by which the error of the base decays as ``exp(-t)``."""
+    """Commands joint rates such that the base error decays as ``exp(-t)``."""
 
     def __init__(self, robot: SpaceRobot, **options: Any) -> None:
         super().__init__("planner", **options)
@@ -44,11 +44,11 @@ class FeedbackPlanner(rclpy.node.Node):
         self.tell("executing")
 
     def on_odom(self, message: Odometry) -> None:
-        """Keep the base, which comes before the joints of the same stamp."""
+        """Store the base state, which arrives before the joints with the same stamp."""
         self.odom = message
 
     def on_joints(self, joints: JointState) -> None:
-        """Answer every state, with its stamp: the plant refuses any other."""
+        """Respond to every state with its stamp: the plant refuses any other."""
         names, rates, odom = self.robot.joint_names, np.zeros(self.robot.n), self.odom
         if self.state == "executing" and odom and odom.header.stamp == joints.header.stamp:
             q = np.array([joints.position[joints.name.index(name)] for name in names])
@@ -61,7 +61,7 @@ class FeedbackPlanner(rclpy.node.Node):
         self.commands.publish(JointState(header=joints.header, name=names, velocity=rates.tolist()))
 
     def tell(self, state: str) -> None:
-        """Publish the state of the goal, for the clients of a planner."""
+        """Publish the goal state, for planner clients."""
         self.state, values = state, [KeyValue(key="state", value=state)]
         self.statuses.publish(DiagnosticStatus(name="planner", message=state, values=values))
 

@@ -1,4 +1,4 @@
-"""A driver in place of the plant: motion capture and encoders in, drives out; twists estimated.
+"""A driver instead of the plant: motion capture and encoder inputs, drive outputs, twist estimates.
 
 Run it with ``python examples/fly_own_robot.py``: its hardware is a plant in the namespace lab.
 """
@@ -19,7 +19,7 @@ LONGEST_GAP, SMOOTHING, LOSSY = 0.25, 0.5, qos_profile_sensor_data  # s, share o
 
 
 class Driver(rclpy.node.Node):
-    """Publishes odom and joint_states of one stamp, as the plant does; drives take commands."""
+    """Publishes odom and joint_states with a common stamp, like the plant; drives get commands."""
 
     def __init__(self, **options: Any) -> None:
         super().__init__("driver", **options)
@@ -33,7 +33,7 @@ class Driver(rclpy.node.Node):
         self.create_subscription(JointState, "joint_commands", self.drives.publish, 10)
 
     def on_capture(self, message: PoseStamped) -> None:
-        """Take a pose, which has the stamp of its pictures, and estimate the twist."""
+        """Receive a pose, stamped with the image time, and estimate the twist."""
         p, o, stamp = message.pose.position, message.pose.orientation, message.header.stamp
         r_WB, R_WB = np.array([p.x, p.y, p.z]), Rotation.from_quat([o.x, o.y, o.z, o.w])
         step = stamp.sec + stamp.nanosec * 1e-9 - self.captured
@@ -44,7 +44,7 @@ class Driver(rclpy.node.Node):
         self.r_WB, self.R_WB, self.captured = r_WB, R_WB, stamp.sec + stamp.nanosec * 1e-9
 
     def on_encoders(self, joints: JointState) -> None:
-        """Publish a state: the pose ahead by its age, and none where it is too old."""
+        """Publish a state: the pose predicted by its age, or none if it is too old."""
         age = joints.header.stamp.sec + joints.header.stamp.nanosec * 1e-9 - self.captured
         if age <= LONGEST_GAP:
             r_WB = self.r_WB + age * self.twist[0]
@@ -59,7 +59,7 @@ class Driver(rclpy.node.Node):
 
 
 def xyz(kind: Any, values: Any) -> Any:
-    """Return a message with the fields x, y, z and, of a quaternion, w."""
+    """Return a message with the fields x, y, z and, for a quaternion, w."""
     return kind(**dict(zip("xyzw", values, strict=False)))
 
 

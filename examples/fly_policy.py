@@ -1,6 +1,6 @@
-"""Fly a policy of ``spacerobot/ReorientArm-v0`` through ROS, beside the environment it is from.
+"""Fly a policy for ``spacerobot/ReorientArm-v0`` over ROS, and compare it with the environment.
 
-Run it with ``python examples/fly_policy.py [FILE]``; the policy is one of ``train_policy.py``.
+Run it with ``python examples/fly_policy.py [FILE]``; the policy comes from ``train_policy.py``.
 """
 
 import sys
@@ -24,7 +24,7 @@ HOLD, STEPS = 5, 60
 
 
 class PolicyNode(rclpy.node.Node):
-    """Answers each state of the plant with the action that the policy holds."""
+    """Responds to each plant state with the action that the policy holds."""
 
     def __init__(self, task: Task, goal: Array, policy: Policy) -> None:
         super().__init__("policy")
@@ -36,7 +36,7 @@ class PolicyNode(rclpy.node.Node):
         self.create_subscription(JointState, "joint_states", self.on_joints, 100)
 
     def on_joints(self, joints: JointState) -> None:
-        """Observe at every fifth state, and command the policy's action for it."""
+        """Observe every fifth state, and command the policy's action for it."""
         rates = np.zeros(len(joints.name))
         if self.odoms and self.odoms[-1].header.stamp == joints.header.stamp:  # Odom comes first.
             if self.ticks % HOLD == 0:
@@ -54,7 +54,7 @@ class PolicyNode(rclpy.node.Node):
 
 
 def main(file: Path) -> None:
-    """Fly in the environment and through ROS, and print the largest difference."""
+    """Fly in the environment and over ROS, and print the largest difference."""
     trained, scenario = Policy.load(file), load_scenario("arm_attitude")
     env = gymnasium.make("spacerobot/ReorientArm-v0", hold=HOLD, tolerance=1e-9).unwrapped
     seen = [env.reset(options={"goal": scenario.goal.quaternion})[0]]

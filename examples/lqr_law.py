@@ -1,7 +1,7 @@
-"""A control law of one's own in plain numpy: a linear-quadratic regulator of base and joints.
+"""A custom control law in plain numpy: a linear-quadratic regulator for base and joints.
 
-Run it with ``python examples/lqr_law.py``; any robot flies with it by ``spacerobot --plugin
-examples/lqr_law.py run ROBOT --method lqr --goal X Y Z``.
+Run it with ``python examples/lqr_law.py``; to fly any robot with it, use
+``spacerobot --plugin examples/lqr_law.py run ROBOT --method lqr --goal X Y Z``.
 """
 
 from dataclasses import dataclass
@@ -28,9 +28,9 @@ class LqrOptions(LawOptions):
 
 
 class LqrLaw(NumpyLaw):
-    """``[f; n; tau] = M a_ref - K dx``, with K of the robot at rest in the shape of the goal.
+    """``[f; n; tau] = M a_ref - K dx``, with K for the robot at rest in the goal configuration.
 
-    Errors are weighed by their share of energy: the cost is ``dx' Q dx + du' R du`` with the mass
+    Errors are weighted by their share of energy: the cost is ``dx' Q dx + du' R du`` with the mass
     matrix M in ``Q = diag(M, M T^2)`` and ``R = M^-1 T^4``, where T is the response time.
     """
 
@@ -39,11 +39,11 @@ class LqrLaw(NumpyLaw):
 
     @classmethod
     def default_outputs(cls, robot: SpaceRobot, end_effector_link: str) -> OutputSelection:
-        """Return the pose of the base and all joints."""
+        """Return the outputs: the base pose and all joints."""
         return OutputSelection(("x", "y", "z", "rx", "ry", "rz"), (), robot.joint_names)
 
     def start(self, time: float, start: Reference, goal: Reference) -> None:
-        """Compute the gains in the shape of the goal."""
+        """Compute the gains in the goal configuration."""
         super().start(time, start, goal)
         assert goal.joints is not None
         A, B = self.robot.linearised(goal.joints.q)

@@ -1,4 +1,4 @@
-"""A control law of one's own: transposed-Jacobian control whose pull saturates.
+"""A custom control law: transposed-Jacobian control with saturation.
 
 Run it with ``python examples/own_control_law.py``, or fly it with
 ``spacerobot --plugin examples/own_control_law.py run coordinated_control --method soft``.
@@ -39,7 +39,7 @@ class SoftLaw(ControlLaw):
 
 
 def main() -> None:
-    """Compare what the law and paper 4's ask for, near the goal and far from it."""
+    """Compare the commands of this law and of paper 4's law, near the goal and far from it."""
     robot = SpaceRobot.from_file(robot_file("planar_manipulator"))
     upright = np.array([0.0, 0.0, 0.0, 1.0])
     state = ControlState.at_rest(np.zeros(3), upright, np.array([-1.0, 1.0]))

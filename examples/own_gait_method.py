@@ -1,7 +1,7 @@
-"""A gait method of one's own: straight to a wanted shape, whatever the base does on the way.
+"""A custom gait method: straight to a desired configuration, regardless of the base motion.
 
-Run it with ``python examples/own_gait_method.py``; in a flight it is the method ``stow`` with
-``spacerobot --plugin examples/own_gait_method.py``.
+Run it with ``python examples/own_gait_method.py``; for flights, it is the method
+``stow`` with ``spacerobot --plugin examples/own_gait_method.py``.
 """
 
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""A robot of one's own: a URDF, what it can do, and a turn of its base by its arm alone.
+"""A custom robot: its URDF, its capabilities, and a base rotation by its arm alone.
 
 Run it with ``python examples/own_urdf.py``.
 """
@@ -31,12 +31,12 @@ URDF = f"""<robot name="inspector">
 
 
 def main() -> None:
-    """Load the robot, print what its equations say, plan a turn of 10 deg about z."""
+    """Load the robot, print model quantities, and plan a 10 deg rotation about z."""
     robot = SpaceRobot.from_urdf(URDF)
     q = np.array([0.0, -0.8, 1.6])
     print(f"{robot.description.name}: {robot.n} joints, {robot.total_mass:g} kg")
     print(f"centre of mass in the base frame: {np.round(robot.center_of_mass(q), 4).tolist()} m")
-    # With no momentum, base twist = -A(q) qdot: what a turning joint does to the base.
+    # With no momentum, base twist = -A(q) qdot: the effect of a joint rate on the base.
     print(f"the base turns at {np.round(-robot.connection(q)[3:, 0], 3).tolist()} rad/s a rad/s")
 
     schedule = plan(robot, start=q, rotvec=(0.0, 0.0, np.radians(10.0)), answers=1)

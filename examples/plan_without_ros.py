@@ -1,4 +1,4 @@
-"""Plan a gait without ROS: by two methods, and what each predicts.
+"""Plan a gait without ROS with two methods, and print their predictions.
 
 Run it with ``python examples/plan_without_ros.py``.
 """
@@ -12,8 +12,8 @@ POSITION, ROTVEC = (0.1, 0.0, 0.05), (0.0, 0.0, 0.2)  # m, rad
 
 
 def main() -> None:
-    """Plan the same goal by two methods, and one that no shape can reach."""
-    # Paper 1's small loops, and the fastest manoeuvre within the limits of the URDF.
+    """Plan the same goal with two methods, and a goal that no configuration can reach."""
+    # Paper 1's small loops, and the fastest manoeuvre within the URDF limits.
     for method in ("lie_bracket", "optimal"):
         schedule = plan("sliding_masses", position=POSITION, rotvec=ROTVEC, method=method)
         fastest = np.abs(schedule.velocities).max(axis=0)

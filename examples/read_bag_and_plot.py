@@ -1,7 +1,7 @@
-"""Read a recorded flight as numpy arrays, and draw it.
+"""Read a recorded flight as numpy arrays and plot it.
 
 Run it with ``python examples/read_bag_and_plot.py [BAG] [PICTURE]``; the default is a short flight
-of paper 4's example that comes with the package.
+of paper 4's example, included in the package.
 """
 
 import sys
@@ -16,7 +16,7 @@ BAG = Path(__file__).parents[1] / "bags" / "coordinated_control.mcap"
 
 
 def main(source: Path = BAG, picture: Path = Path("flight.png")) -> None:
-    """Print what a bag holds; draw base, joints and momentum over time."""
+    """Print the contents of a bag; plot base, joints and momentum over time."""
     bag = read_bag(source)
     odom, joints, momentum = bag["/odom"], bag["/joint_states"], bag["/momentum"]
     base = np.column_stack([odom.field(f"pose.pose.position.{axis}") for axis in "xyz"])

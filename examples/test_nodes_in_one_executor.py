@@ -1,4 +1,4 @@
-"""A pytest of one's own with the nodes in one executor, and a node of one's own beside them.
+"""A custom pytest that runs the stack's nodes and a custom node in one executor.
 
 Run it with ``pytest examples/test_nodes_in_one_executor.py``.
 """
@@ -13,7 +13,7 @@ LATCHED = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
 class Listener(rclpy.node.Node):
-    """Keeps the states of the planner, in their order."""
+    """Stores the planner's states in order."""
 
     def __init__(self, context: rclpy.Context) -> None:
         super().__init__("listener", context=context)
@@ -21,12 +21,12 @@ class Listener(rclpy.node.Node):
         self.create_subscription(DiagnosticStatus, "planner/status", self.on_status, LATCHED)
 
     def on_status(self, message: DiagnosticStatus) -> None:
-        """Keep the state in a status."""
+        """Store the state in a status."""
         self.states.append({pair.key: pair.value for pair in message.values}["state"])
 
 
 def test_a_goal_is_reached() -> None:
-    """In lockstep, as fast as the machine goes; the second goal begins where the first one ends."""
+    """Fly in lockstep, as fast as possible; the second goal starts where the first one ended."""
     method = {"planner": {"method": "lie_bracket"}}
     with Stack("sliding_masses", ["plant", "planner", Listener], method) as stack:
         assert stack.fly_to(x=0.05).reached

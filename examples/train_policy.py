@@ -1,4 +1,4 @@
-"""Train a policy that turns a spacecraft by its arm: PPO of stable-baselines3 on SIMD lanes.
+"""Train a policy that rotates a spacecraft with its arm: stable-baselines3 PPO on SIMD lanes.
 
 Run it with ``python examples/train_policy.py [STEPS] [FILE]``: FILE.png is the return curve.
 """
