@@ -1,4 +1,4 @@
-"""A controller for batches of flights: one flight at a time, or as one function for SIMD lanes."""
+"""A controller for flight batches: one flight at a time, or as one function for SIMD lanes."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from spacerobot_ros.times import SECOND
 
 
 class BatchController:
-    """One controller for all flights of a batch, with their goals and gains.
+    """One controller for all flights in a batch, with their goals and gains.
 
     Parameters
     ----------
@@ -58,7 +58,7 @@ class BatchController:
 
     @classmethod
     def of(cls, flights: Flights) -> BatchController:
-        """Return the controller of the flights of a batch.
+        """Return the controller for the flights in a batch.
 
         Raises
         ------
@@ -72,14 +72,14 @@ class BatchController:
     # -- one flight ---------------------------------------------------------------------------
 
     def begin_flight(self, row: int, state: ControlState) -> tuple[ReferenceProfile, Array]:
-        """Begin a flight at its first measured state.
+        """Start a flight from its first measured state.
 
         Returns
         -------
         profile
-            The profile of its references.
+            Reference profile.
         bounds
-            (m,) errors of the outputs beyond which control is lost.
+            (m,) output errors beyond which control is lost.
 
         Raises
         ------
@@ -99,19 +99,19 @@ class BatchController:
         return profile, controller.error_bounds(self._config.error_margin.as_errors())
 
     def time_of_tick(self, tick: int) -> float:
-        """Return the time of a tick as controllers compute it, s."""
+        """Return a tick's time as computed by controllers, s."""
         return tick * self._period_ns / SECOND
 
     def command(self, tick: int, state: ControlState) -> list[Array]:
-        """Return efforts and wrench for a state of the last flight that was begun."""
+        """Return the efforts and wrench for a state of the last started flight."""
         time = self.time_of_tick(tick)
         realised = self.controller.command(time, state, state.q, state.qdot).realised
         return [realised.tau, realised.wrench_B]
 
     def decide(self, monitor: GoalMonitor, tick: int, qdot: Array, bounds: Array) -> Decision:
-        """Return the decision about the goal after the last command.
+        """Return the goal decision after the last command.
 
-        ``qdot`` (n,) are measured joint rates, ``bounds`` (m,) those of :meth:`begin_flight`.
+        ``qdot`` (n,) are measured joint rates, ``bounds`` (m,) as in :meth:`begin_flight`.
         """
         controller, time = self.controller, self.time_of_tick(tick)
         assert controller.reference_ends is not None
@@ -129,11 +129,11 @@ class BatchController:
     # -- lanes --------------------------------------------------------------------------------
 
     def profile_argument(self, profile: ReferenceProfile) -> Array:
-        """Return the argument ``profile`` of :meth:`function`."""
+        """Return argument ``profile`` of :meth:`function`."""
         return profile_numbers(profile, *self._groups)
 
     def gains_argument(self, rows: Sequence[int]) -> Array:
-        """Return the argument ``gains``, Kp over Kd, of flights: (flights, 2 m)."""
+        """Return argument ``gains``, Kp over Kd, for flights: (flights, 2 m)."""
         each = (self.law.gain_arguments(self._gains(row)) for row in rows)
         return np.array([np.concatenate(pair) for pair in each])
 
@@ -154,19 +154,19 @@ class BatchController:
         """Return the function of a controller's tick. Its arguments and results:
 
         ``state``, ``pose``, ``twist``
-            Of the plant.
+            Plant state, base pose and base twist.
         ``normals`` (12 + 2 n,), ``bias`` (6 + n,), ``sigma`` (6,)
             Random numbers in the order of :class:`.Sensors`, and measurement errors.
         ``time``, ``profile``, ``gains``, ``bounds``
-            Time, s; :meth:`profile_argument`; :meth:`gains_argument`; of :meth:`begin_flight`.
+            Time, s; :meth:`profile_argument`; :meth:`gains_argument`; as in :meth:`begin_flight`.
         ``monitor``, ``next_monitor`` (3,)
-            Memory of :class:`.GoalMonitor` without ``started``, which is zero.
+            State of :class:`.GoalMonitor` without ``started``, which is zero.
         ``command`` (n + 6,)
             Efforts and wrench; if ``exact``, :meth:`exact_command` computes them instead.
         ``measured`` (13 + 2 n,)
             The measured state.
         ``verdict``
-            The :class:`.Decision` about the goal.
+            The goal :class:`.Decision`.
 
         Raises
         ------

@@ -1,7 +1,7 @@
-"""A batch of flights: shared numbers, numbers of each flight, and results.
+"""A flight batch: shared values, values per flight, and results.
 
-Rows are flights. A row holds the numbers of :class:`.PlantConfig`, :class:`.InitialState` and
-:class:`.SensorConfig` for one flight; with the same numbers, the plant flies the same flight.
+Rows are flights. A row contains the values of :class:`.PlantConfig`, :class:`.InitialState` and
+:class:`.SensorConfig` for one flight; with the same values, the plant flies the same flight.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ NOISES = (
     "joint_noise",
     "joint_rate_noise",
 )
-"""Parameters of :class:`.SensorConfig` in the order of columns of :attr:`SensorErrors.noise`."""
+""":class:`.SensorConfig` parameters in the column order of :attr:`SensorErrors.noise`."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ class InitialStates:
         Raises
         ------
         ParameterError
-            The plant would refuse an initial state.
+            The plant would reject an initial state.
         """
         is_center_of_mass = [each.center_of_mass is not None for each in initial]
         positions = [
@@ -84,12 +84,12 @@ class InitialStates:
 
     @classmethod
     def repeated(cls, robot: SpaceRobot, initial: InitialState, count: int) -> InitialStates:
-        """Return ``count`` equal rows; the caller may change their columns.
+        """Return ``count`` equal rows; the caller may change columns.
 
         Raises
         ------
         ParameterError
-            The plant would refuse the initial state.
+            The plant would reject the initial state.
         """
         one = cls.of(robot, [initial])
         return cls(*(np.repeat(getattr(one, each.name), count, axis=0) for each in fields(cls)))
@@ -102,7 +102,7 @@ class InitialStates:
         return InitialStates(*(getattr(self, each.name)[rows] for each in fields(self)))
 
     def initial_state(self, index: int) -> InitialState:
-        """Return one row as an initial state of the plant."""
+        """Return one row as an initial plant state."""
         is_center_of_mass = bool(self.position_is_of_center_of_mass[index])
         state = InitialState(
             quaternion=self.quaternion[index],
@@ -152,7 +152,7 @@ class SensorErrors:
         return SensorErrors(*(getattr(self, each.name)[rows] for each in fields(self)))
 
     def config(self, index: int) -> SensorConfig:
-        """Return one row as a configuration of the plant's sensors."""
+        """Return one row as a plant sensor configuration."""
         return SensorConfig(
             **dict(zip(NOISES, self.noise[index].tolist(), strict=True)),
             position_bias=tuple(self.pose_bias[index, :3].tolist()),
@@ -164,7 +164,7 @@ class SensorErrors:
     def measure(
         self, normals: Array, pose: Array, twist: Array, q: Array, qdot: Array
     ) -> tuple[Array, Array, Array, Array]:
-        """Return measurements of poses (N, 7), twists (N, 6), and joints and their rates (N, n).
+        """Return measurements of poses (N, 7), twists (N, 6), and joint positions and rates (N, n).
 
         ``normals`` (N, 12 + 2 n) are random numbers in the order of :class:`.Sensors`.
         """
@@ -251,12 +251,12 @@ FlightProgram = FollowedSchedule | HeldCommands | ControlledGoals
 
 @dataclass(frozen=True)
 class Flights:
-    """N flights of one robot that differ only in numbers.
+    """N flights of one robot that differ only in numerical values.
 
     Raises
     ------
     ParameterError
-        Some values do not match; the message names them.
+        Some values are inconsistent; the message names them.
     RobotDescriptionError
         A mass or an inertia is not physical.
     """
@@ -308,7 +308,7 @@ class Flights:
                 )
             self.inertial.require_physical([body.name for body in bodies])
         if self.sensors is not None and len(self.sensors) != count:
-            raise ParameterError(f"There are sensors of {len(self.sensors)} flights, not {count}.")
+            raise ParameterError(f"There are sensors for {len(self.sensors)} flights, not {count}.")
         if self.actuation == "velocity" and self.initial_states.qdot.any():
             raise ParameterError("Joints under velocity commands must start at rest.")
 
@@ -328,11 +328,11 @@ class Flights:
                         "lanes do not support: use engine 'flights'."
                     )
                 if self.actuation != "effort":
-                    raise ParameterError("A controller needs effort actuation.")
+                    raise ParameterError("A controller requires effort actuation.")
                 if round(config.control_period * SECOND) != round(self.control_period * SECOND):
                     raise ParameterError("The controller and the plant have different rates.")
                 if gains and len(gains) != count:
-                    raise ParameterError(f"There are gains of {len(gains)} flights, not {count}.")
+                    raise ParameterError(f"There are gains for {len(gains)} flights, not {count}.")
 
     def __len__(self) -> int:
         return len(self.initial_states)
@@ -373,9 +373,9 @@ def _require_rows(name: str, array: Array, count: int, width: int) -> None:
     if array.ndim not in (2, 3) or array.shape[-1] != width or array.shape[-2] < 1:
         raise ParameterError(f"The {name} are {array.shape}, not (ticks, {width}).")
     if array.ndim == 3 and len(array) != count:
-        raise ParameterError(f"There are {name} of {len(array)} flights, not {count}.")
+        raise ParameterError(f"There are {name} for {len(array)} flights, not {count}.")
     if not np.all(np.isfinite(array)):
-        raise ParameterError(f"The {name} have a number that is not finite.")
+        raise ParameterError(f"The {name} contain a value that is not finite.")
 
 
 def state_size(n: int) -> int:

@@ -1,8 +1,8 @@
-"""Blocks of flights: in the lanes of vector registers, or each in a thread of a device.
+"""Blocks of flights: in the lanes of vector registers, or one flight per device thread.
 
-A block's memory is one array (groups, rows, lanes); a row is one number of each flight of a group.
-Threads are all in one group. ``driver.hpp`` loops over the ticks and hands back commands that lanes
-cannot compute.
+A block's memory is one array (groups, rows, lanes); a row contains one value for each flight in a
+group. All threads are in one group. ``driver.hpp`` loops over the ticks and returns commands that
+lanes cannot compute.
 """
 
 from __future__ import annotations
@@ -39,10 +39,10 @@ from spacerobot_ros.simulation.effort_plant import FAILURES
 from spacerobot_ros.times import SECOND
 
 _MAX_BLOCK_GROUPS = 64
-"""Largest number of lane groups in a block; more bring no gain."""
+"""Largest number of lane groups in a block; more would not be faster."""
 
 _CHUNK_TICKS = 2000
-"""Number of ticks, with their noise, between two checks for signals."""
+"""Number of ticks, with their noise, between checks for signals."""
 
 _PROGRAMS = {
     HeldCommands: Program.HELD,
@@ -52,10 +52,10 @@ _PROGRAMS = {
 
 
 def fly_lanes(flights: Flights, target: Target | None = None) -> BatchResult:
-    """Fly many flights at once, one in each SIMD lane, or each in a thread of a device.
+    """Fly many flights at once, one per SIMD lane or device thread.
 
-    Every flight equals the plant's flight with the same numbers up to rounding (1e-12 over the
-    flights of the benchmark). Without a C++ compiler, the plant flies the flights one by one;
+    Every flight equals the plant's flight with the same values up to rounding (1e-12 in the
+    benchmark flights). Without a C++ compiler, the plant flies the flights one by one;
     :attr:`BatchResult.engine` names the engine used.
     """
     try:
@@ -80,7 +80,7 @@ def _fly_all_in_lanes(flights: Flights, target: Target) -> BatchResult:
 
 
 def symbolic_model_of(flights: Flights) -> tuple[ModelFunctions, Array]:
-    """Return the model of the robot and its arguments ``p`` (N, ...): the masses of the flights."""
+    """Return the robot model and its arguments ``p`` (N, ...), the masses in the flights."""
     inertial = flights.inertial
     if inertial is None:
         inertial = flights.robot.inertial.scaled(np.ones((len(flights), 1)))
@@ -88,7 +88,7 @@ def symbolic_model_of(flights: Flights) -> tuple[ModelFunctions, Array]:
 
 
 def starts_accepted_by_plant(flights: Flights) -> Flags:
-    """Return which flights (N,) start in a state that the plant accepts."""
+    """Return which flights (N,) start in a state accepted by the plant."""
     starts, robot = flights.initial_states, flights.robot
     fit = np.isfinite(starts.position).all(axis=1) & np.isfinite(starts.momenta).all(axis=1)
     fit &= np.isfinite(starts.qdot).all(axis=1)
@@ -362,7 +362,7 @@ class LaneBlock:
 
 
 class SensorNoise:
-    """The sensors' random numbers for the flights of a block, drawn as by :class:`.Sensors`."""
+    """Sensor random numbers for the flights in a block, drawn as in :class:`.Sensors`."""
 
     def __init__(self, flights: Flights, rows: Counts) -> None:
         self._errors: SensorErrors | None = flights.sensors
@@ -381,7 +381,7 @@ class SensorNoise:
 
     @property
     def is_fed_back(self) -> bool:
-        """Whether commands depend on sensor errors; along schedules, on joint errors only."""
+        """Whether commands depend on sensor errors; along schedules, only on joint errors."""
         errors = self._errors
         if errors is None:
             return False
@@ -389,7 +389,7 @@ class SensorNoise:
         return bool(self._affects_all or joints)
 
     def draw_noise(self, begin: int, end: int, alive: Array) -> Array | None:
-        """Draw the noise of the ticks from ``begin`` up to but excluding ``end``.
+        """Draw the noise for the ticks from ``begin`` up to, but excluding, ``end``.
 
         ``alive`` (groups, lanes): whether flights are in progress. Returns the noise (groups,
         ticks, 12 + 2 n, lanes); None if commands do not depend on it.
@@ -414,7 +414,7 @@ class SensorNoise:
         return np.ascontiguousarray(np.moveaxis(grouped, 1, 3))
 
     def measure(self, result: BatchResult, rows: Counts) -> None:
-        """Write the measurements of the reported states of some flights."""
+        """Write the measurements for the reported states of some flights."""
         measured = result.pose[rows], result.q[rows]
         if self._errors is not None:
             at = np.repeat(self._rows[: len(rows)], len(self._instants))

@@ -1,9 +1,8 @@
-"""The ticks of a plant and its commander, compiled for SIMD lanes, one flight per lane.
+"""The tick of a plant and its commander, compiled for SIMD lanes, one flight per lane.
 
-CasADi's functions become C++ in which every number is a vector register; ``driver.hpp`` loops over
-ticks and groups of lanes. Everything shared by Python and C++ is declared here once and generated
-as C++: the rows of a group's memory (:class:`RowLayout`), the enumerations, and
-:class:`Job`.
+CasADi functions become C++ in which every number is a vector register; ``driver.hpp`` loops over
+ticks and groups of lanes. Everything shared by Python and C++ is declared once, here, and generated
+as C++: the rows of a group's memory (:class:`RowLayout`), the enumerations, and :class:`Job`.
 """
 
 from __future__ import annotations
@@ -30,7 +29,7 @@ from spacerobot_ros.simulation.effort_plant import JointStops
 
 
 class Program(IntEnum):
-    """Kind of commands: held, along a schedule, from a controller, or set before each step."""
+    """Command kind: constant, along a schedule, from a controller, or set before each step."""
 
     HELD = 0
     FOLLOWED = 1
@@ -47,21 +46,21 @@ _JOB_MEMBERS = (
     ("long long", "period_ns", ""),
     ("long long", "program", "Program"),
     ("const double *", "table", "(ticks, COMMANDS); each_table: (groups, ticks, COMMANDS, LANES)"),
-    ("long long", "table_ticks", "FOLLOWED: the table has shapes, one more than ticks"),
+    ("long long", "table_ticks", "FOLLOWED: the table has joint positions, one more than ticks"),
     ("long long", "each_table", ""),
     ("long long", "noisy", "whether commands depend on measurement errors"),
     ("const double *", "normals", "(groups, ticks from normals_from on, normals_width, LANES)"),
     ("long long", "normals_from", ""),
     ("long long", "normals_ticks", ""),
     ("long long", "normals_width", ""),
-    ("double", "gain", "FOLLOWED: feedback of shape errors, 1/s"),
+    ("double", "gain", "FOLLOWED: feedback gain for joint position errors, 1/s"),
     ("double", "deadband", "FOLLOWED: m or rad"),
-    ("const long long *", "instants", "ticks whose states are reported, ascending"),
+    ("const long long *", "instants", "ticks at which states are reported, ascending"),
     ("long long", "instant_count", ""),
     ("V *", "reports", "(groups, instants, REPORT_ROWS)"),
-    ("long long", "ends", "CONTROLLED: whether flights end with the decision about their goals"),
+    ("long long", "ends", "CONTROLLED: whether flights end with their goal decision"),
 )
-"""Members of :class:`Job`: type in C++, name, meaning."""
+"""Members of :class:`Job`: C++ type, name, meaning."""
 
 _MEMBER_TYPES: dict[str, Any] = {"long long": ctypes.c_longlong, "double": ctypes.c_double}
 
@@ -76,7 +75,8 @@ _JOB = ctypes.POINTER(Job)
 
 
 class RowLayout:
-    """The rows of a group's memory by name; a row holds one number of each flight in the group."""
+    """The rows of a group's memory by name; a row contains one value for each flight in the
+    group."""
 
     def __init__(self, sizes: Mapping[str, int]) -> None:
         self.slices: dict[str, slice] = {}
@@ -90,16 +90,16 @@ class RowLayout:
         return self.slices[name]
 
     def first_row(self, name: str, offset: int = 0) -> int:
-        """Return the first row of a name, or the row ``offset`` rows later."""
+        """Return the first row with a name, or the row ``offset`` rows later."""
         return int(self.slices[name].start) + offset
 
     def row_count(self, name: str) -> int:
-        """Return the number of rows of a name."""
+        """Return the number of rows with a name."""
         rows = self.slices[name]
         return int(rows.stop - rows.start)
 
     def copy_range(self, source: str, target: str) -> tuple[int, int, int]:
-        """Return the first rows of two names of the same size, and that size."""
+        """Return the first rows of two names with the same size, and that size."""
         return self.first_row(source), self.first_row(target), self.row_count(source)
 
 

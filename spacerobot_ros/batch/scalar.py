@@ -1,4 +1,4 @@
-"""Flights one by one in the package's own plant: the reference for SIMD lanes."""
+"""Flights flown one by one in the package's plant: the reference for SIMD lanes."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ from spacerobot_ros.simulation.sensors import Sensors
 from spacerobot_ros.times import SECOND
 
 _Commands = Callable[[int, Plant | Sensors], Sequence[Array]]
-"""Function from a tick and a measured state to the commands of a flight."""
+"""Function from a tick and a measured state to a flight's commands."""
 
 
 def fly_one_by_one(flights: Flights, rows: Iterable[int] | None = None) -> BatchResult:
-    """Fly the flights of some rows (all, unless given) in the plant, tick by tick.
+    """Fly the flights in some rows (by default all) in the plant, tick by tick.
 
     The other rows are NaN or zero.
     """
@@ -52,7 +52,7 @@ def fly_one_by_one(flights: Flights, rows: Iterable[int] | None = None) -> Batch
 
 
 def plant_of(flights: Flights, row: int) -> Plant:
-    """Return the plant of one flight at its start."""
+    """Return the plant of one flight in its start state."""
     kind = PLANTS[flights.actuation]
     return kind.plant(
         flights.robot_of(row),

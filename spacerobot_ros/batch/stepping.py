@@ -1,8 +1,8 @@
-"""Flights that a caller advances tick by tick, each with its own start, time and end.
+"""Flights advanced tick by tick by the caller, each with its own start, time and end.
 
-:class:`SteppedFlights` is the plant of many simultaneous flights: a policy, or any other source of
-commands, reads the states and provides the next commands. A step is the plant's, in SIMD lanes or,
-without them, in one plant per flight.
+:class:`SteppedFlights` is the plant for many simultaneous flights: a policy, or any other command
+source, reads the states and provides the next commands. Steps are the same as in the plant,
+computed in SIMD lanes or, if these are unavailable, in one plant per flight.
 """
 
 from __future__ import annotations
@@ -41,22 +41,22 @@ from spacerobot_ros.simulation.plant import Plant
 
 
 class SteppedFlights:
-    """N flights of one robot, advanced together by ticks under given commands.
+    """N flights of one robot, advanced together tick by tick under given commands.
 
     A flight that has ended keeps the state of its last tick.
 
     Parameters
     ----------
     robot, actuation, control_period, starts, inertial, integration_step
-        See :class:`.Flights`; all flights begin at the starts.
+        See :class:`.Flights`; all flights begin in their start states.
     link
         Link whose position is computed; empty: none.
     in_lanes
         Whether the flights are in SIMD lanes; if not, or if lanes cannot be compiled, each flight
-        has a plant. Both compute the same states up to rounding.
+        has its own plant. Both compute the same states up to rounding.
     plants
-        Configurations of plants for each flight, with thrusters, faults or external loads, which
-        lanes do not support; a reset builds a plant from the present configuration in the list.
+        Plant configuration for each flight, with thrusters, faults or external loads, which lanes
+        do not support; a reset builds a plant from the current configuration in the list.
         Empty: none.
     target
         What lanes run on; None: the widest registers of this processor.
@@ -64,7 +64,7 @@ class SteppedFlights:
     Raises
     ------
     ParameterError
-        Some values do not match, there is no such link, or a start is invalid.
+        Some values are inconsistent, there is no such link, or a start state is invalid.
     RobotDescriptionError
         A mass or an inertia is not physical.
     """
@@ -147,16 +147,16 @@ class SteppedFlights:
         Parameters
         ----------
         rows
-            (K,) numbers of the flights.
+            (K,) flight indices.
         starts
             Initial states, K rows.
         inertial
-            Masses, centres and inertias, (K, ...); None: unchanged.
+            Masses, centres of mass and inertias, (K, ...); None: unchanged.
 
         Raises
         ------
         ParameterError
-            The numbers of rows differ, or a start is invalid.
+            The numbers of rows differ, or a start state is invalid.
         RobotDescriptionError
             A mass or an inertia is not physical.
         """
@@ -182,7 +182,7 @@ class SteppedFlights:
         Raises
         ------
         ParameterError
-            The plant refuses a start.
+            The plant rejects a start state.
         RobotDescriptionError
             A mass or an inertia is not physical.
         """
@@ -201,8 +201,8 @@ class SteppedFlights:
         Parameters
         ----------
         commands
-            (N, command_size) joint velocities, or efforts and a wrench on the base: force (N) over
-            torque (N m) at the origin of the base link, base components. Commands are clipped to
+            (N, command_size) joint velocities, or efforts and a base wrench: force (N) over torque
+            (N m) at the base link origin, in base components. Commands are clipped to
             the limits.
         ticks
             Number of ticks.
@@ -210,9 +210,9 @@ class SteppedFlights:
         Raises
         ------
         ParameterError
-            The shape of the commands is wrong, or there are no ticks.
+            The command array has the wrong shape, or there are no ticks.
         CommandError
-            A command of a flight in progress is not finite; no flight is stepped.
+            A command for a flight in progress is not finite; no flight is stepped.
         """
         if np.shape(commands) != (len(self), self.command_size):
             raise ParameterError(

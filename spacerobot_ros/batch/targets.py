@@ -1,8 +1,8 @@
-"""What flights run on: vector registers of this processor, or the threads of a CUDA device.
+"""Targets on which flights run: vector registers of this processor, or threads of a CUDA device.
 
-The sources are the same: CasADi's functions, ``driver.hpp``, and the declarations of
-:mod:`.native`. Registers hold one flight in each lane. On a device each flight is a thread; the
-compiler of this machine compiles that program too, with a loop in place of the threads.
+Both use the same sources: CasADi functions, ``driver.hpp``, and the declarations in :mod:`.native`.
+Registers contain one flight per lane. On a device, each flight is a thread; the
+local compiler can also compile that program, with a loop instead of threads.
 """
 
 from __future__ import annotations
@@ -27,20 +27,20 @@ from spacerobot_ros.model.compilation import NoLibraryError, load_library
 _SOURCE_FOLDER = Path(__file__).resolve().parent
 
 _SCHEDULING = ("-fschedule-insns", "-fsched-pressure")
-"""Options of GCC, ignored by Clang: it orders long sums of products such that they do not wait for
-each other, which takes a fifth of the time of flights and changes no number."""
+"""GCC options, ignored by Clang: long sums of products are ordered such that they do not wait for
+each other, which saves a fifth of the flight time and does not change results."""
 
 _CASADI_SELECTION = re.compile(r"\((\w+|\(\*\w+\+\+\))\?(\w+(?:\[i\])?):0\)")
-"""CasADi's texts for a number, alone or in a loop, that is zero unless a condition holds."""
+"""CasADi's code for a number, alone or in a loop, that is zero unless a condition holds."""
 
 _CUDA_OPTIONS = ("-std=c++17", "-default-device", "--fmad=false", "-diag-suppress=177,550")
-"""Products and sums are rounded as on the processor; unused variables are no news."""
+"""Products and sums are rounded as on the processor; warnings of unused variables are off."""
 
 _THREADS = 64
-"""Threads in a block of a device: with the registers that flights need, more gain nothing."""
+"""Threads in a device block: with the registers that flights need, more would not be faster."""
 
 Entries = Mapping[str, Sequence[Any]]
-"""Functions of the driver by name, with the types of their arguments."""
+"""Driver functions by name, with their argument types."""
 
 
 @dataclass(frozen=True)
@@ -65,50 +65,49 @@ class Target:
 
     @property
     def engine(self) -> str:
-        """Name of the engine for results."""
+        """Engine name for results."""
         return self.name if self.threads else f"{self.lanes} lanes ({self.name})"
 
     @property
     def dtype(self) -> type[np.floating[Any]]:
-        """Type of the numbers of states."""
+        """Number type of states."""
         return np.float32 if self.single else np.float64
 
     @property
     def arrays(self) -> Any:
-        """The module whose arrays the driver works on, with NumPy's functions."""
+        """Array module used by the driver, with NumPy's functions."""
         return np
 
     def zeros(self, shape: tuple[int, ...]) -> Any:
-        """Return an array of numbers for the driver, aligned to its registers."""
+        """Return a numeric array for the driver, aligned to its registers."""
         count, size = int(np.prod(shape)), np.dtype(self.dtype).itemsize
         memory = np.zeros(count + 64 // size, self.dtype)
         offset = (-memory.ctypes.data % 64) // size
         return memory[offset : offset + count].reshape(shape)
 
     def address(self, array: Any) -> int:
-        """Return where the driver finds an array."""
+        """Return the address of an array for the driver."""
         return int(array.ctypes.data)
 
     def to_numpy(self, array: Any) -> npt.NDArray[Any]:
-        """Return an array of the driver as one of NumPy."""
+        """Return a driver array as a NumPy array."""
         return np.asarray(array)
 
     def compile(
         self, functions: Mapping[str, ca.Function], declarations: str, entries: Entries
     ) -> Any:
-        """Return the driver's functions as attributes; their first argument is a job.
+        """Return the driver functions as attributes; their first argument is a job.
 
         Parameters
         ----------
-        functions
-            CasADi's by their names in the driver: ``FLIGHT`` and ``REPORT``, the tick without and
-            with the results of reports; ``MOMENTUMLESS``, the former of robots without angular
+        functions CasADi functions by driver name: ``FLIGHT`` and ``REPORT``, the tick without and
+            with report results; ``MOMENTUMLESS``, ``FLIGHT`` for robots without angular
             momentum; ``CONTROL``, the command for a state; ``HOLDING_STEP`` and
             ``SHAPE_EQUATIONS``, for joints on their stops.
         declarations
-            Declarations of :mod:`.native`.
+            Declarations from :mod:`.native`.
         entries
-            Functions of the driver.
+            Driver functions.
 
         Raises
         ------
@@ -171,13 +170,13 @@ VECTOR_UNITS: dict[str, Target] = {
     "avx2": Target("AVX2", 4, ("-mavx2",), "d"),
     "sse2": Target("SSE2", 2, ("-msse2",), "b"),
 }
-"""Vector registers by the name of the processor's flag, the widest first."""
+"""Vector registers by processor flag name, widest first."""
 
 _PORTABLE_UNIT = Target("two at a time", 2)
-"""Registers of other processors, which the compiler chooses."""
+"""Registers on other processors, chosen by the compiler."""
 
-THREADS_OF_HOST = Target("threads of a device in a loop", 1, ("-O1",), threads=True)
-"""The program of a device, for tests where there is none."""
+THREADS_OF_HOST = Target("device threads in a loop", 1, ("-O1",), threads=True)
+"""The device program, for tests on machines without a device."""
 
 
 @lru_cache(maxsize=1)
@@ -194,7 +193,7 @@ def vector_unit() -> Target:
 
 @dataclass(frozen=True)
 class CudaDevice(Target):
-    """A CUDA device; arrays are CuPy's, which torch and JAX take over without a copy (DLPack).
+    """A CUDA device; arrays are CuPy arrays, which torch and JAX accept without copying (DLPack).
 
     Raises
     ------
@@ -206,14 +205,14 @@ class CudaDevice(Target):
 
     @classmethod
     def of(cls, number: int = 0, *, single: bool = False) -> CudaDevice:
-        """Return a device by its number, with numbers of 64 bits or of 32."""
-        cupy = optional_module("cupy", "cuda", "Flights on a GPU need")
+        """Return the device with a number, using 64-bit or 32-bit numbers."""
+        cupy = optional_module("cupy", "cuda", "Flights on a GPU require")
         runtime = cupy.cuda.runtime
         try:
             count = runtime.getDeviceCount()
         except runtime.CUDARuntimeError as error:
             raise SpaceRobotError(
-                f"No CUDA device can be used here: {error}. Install a driver, or fly in lanes."
+                f"No CUDA device is usable: {error}. Install a driver, or fly in lanes."
             ) from error
         if not 0 <= number < count:
             raise ParameterError(f"There is no CUDA device {number}; there are {count}, from 0.")
@@ -232,7 +231,7 @@ class CudaDevice(Target):
     @cached_property
     def arrays(self) -> Any:
         """CuPy."""
-        return optional_module("cupy", "cuda", "Flights on a GPU need")
+        return optional_module("cupy", "cuda", "Flights on a GPU require")
 
     def zeros(self, shape: tuple[int, ...]) -> Any:
         """Return an array on the device."""
@@ -240,17 +239,17 @@ class CudaDevice(Target):
             return self.arrays.zeros(shape, self.dtype)
 
     def address(self, array: Any) -> int:
-        """Return the place of an array on the device."""
+        """Return the address of an array on the device."""
         return int(array.data.ptr)
 
     def to_numpy(self, array: Any) -> npt.NDArray[Any]:
-        """Return a copy of an array in the memory of this machine."""
+        """Return a copy of an array in host memory."""
         return np.asarray(self.arrays.asnumpy(array))
 
     def compile(
         self, functions: Mapping[str, ca.Function], declarations: str, entries: Entries
     ) -> Any:
-        """Return the driver's functions; CuPy caches them by their source."""
+        """Return the driver's functions; CuPy caches them by source."""
         source = self._source(functions, declarations).replace("#include <math.h>", "")
         module = self.arrays.RawModule(code=source, options=_CUDA_OPTIONS, backend="nvrtc")
         try:

@@ -2,7 +2,7 @@
 
 If Gymnasium is installed, importing this package registers ``spacerobot/ReorientArm-v0``,
 ``spacerobot/Reach-v0`` and, for custom tasks, ``spacerobot/Task-v0``. Tasks and actions
-(:mod:`.tasks`) do not need Gymnasium: a trained policy flies without it.
+(:mod:`.tasks`) do not require Gymnasium: a trained policy flies without it.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ __all__ = ["register"]
 NAMESPACE = "spacerobot"
 
 ENVIRONMENTS = {"ReorientArm-v0": "reorient", "Reach-v0": "reach", "Task-v0": ""}
-"""Environment names within :data:`NAMESPACE`, and their tasks; empty: task is an argument."""
+"""Environment names in :data:`NAMESPACE`, and their tasks; empty: the task is an argument."""
 
 
 def import_gymnasium() -> Any:
-    """Return the module of Gymnasium; see :func:`.optional_module`."""
+    """Return the Gymnasium module; see :func:`.optional_module`."""
     return optional_module("gymnasium", "rl", "Environments need")
 
 

@@ -1,4 +1,4 @@
-"""Episodes of N robots: random starts and goals, steps of the plant, rewards and ends."""
+"""Episodes of N robots: random starts and goals, plant steps, rewards and ends."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ _MAX_REFUSED_DRAWS = 100
 _GOALS = ("random", "scenario")
 
 _CHANGEABLE = ("reward", "spread", "time_limit", "tolerance")
-"""Arguments that may change from episode to episode."""
+"""Arguments that may change between episodes."""
 
 _BEYOND_LANES = "faults", "plant.thrusters", "plant.disturbances", "plant.orbit.", "plant.table."
 """Prefixes of dispersions for which each robot needs its own plant."""
@@ -50,7 +50,7 @@ _BEYOND_LANES = "faults", "plant.thrusters", "plant.disturbances", "plant.orbit.
 
 @dataclass(frozen=True)
 class EpisodeConfig:
-    """The configuration of episodes: the keyword arguments of the environments.
+    """Episode configuration: the keyword arguments of the environments.
 
     ``reward`` has changed weights of :class:`.RewardWeights`.
     """
@@ -93,7 +93,8 @@ class EpisodeConfig:
     def __post_init__(self) -> None:
         if self.scenario and self.campaign:
             raise ParameterError(
-                "Arguments 'scenario' and 'campaign' are both given: a campaign names its scenario."
+                "Arguments 'scenario' and 'campaign' are both given: a campaign names its own "
+                "scenario."
             )
 
     @property
@@ -157,7 +158,7 @@ class _Starts:
             name.startswith("plant.sensors.") for name in dispersed
         )
         self._made: dict[int, _Start | str] = {}
-        """Starts of the draws by number; texts are the reasons for refusals."""
+        """Draw starts by number; strings are reasons for rejection."""
 
     def draw(
         self, generators: Sequence[np.random.Generator], flights: SteppedFlights
@@ -195,8 +196,7 @@ class _Starts:
         except (ParameterError, RobotDescriptionError) as refusal:
             if not any(isinstance(each, str) for each in self._made.values()):
                 warn_once(
-                    f"Draw {number} of the campaign is omitted, as are other refused draws: "
-                    f"{refusal}"
+                    f"Campaign draw {number} is omitted, as are other refused draws: {refusal}"
                 )
             return str(refusal)
         _require_steppable(flight.scenario)
@@ -229,11 +229,11 @@ class Episodes:
     Parameters
     ----------
     config
-        The goals and errors of the episodes.
+        Goals and errors of the episodes.
     count
         Their number N.
     in_lanes
-        Whether the robots are in SIMD lanes; otherwise each robot has a plant.
+        Whether the robots are in SIMD lanes; otherwise, each robot has its own plant.
     """
 
     def __init__(self, config: EpisodeConfig, count: int, *, in_lanes: bool) -> None:
@@ -286,11 +286,11 @@ class Episodes:
         return name in _CHANGEABLE or (hasattr(self.task, name) and not name.startswith("_"))
 
     def attribute(self, name: str) -> Any:
-        """Return the value that :meth:`change` changes."""
+        """Return the value that :meth:`change` sets."""
         return getattr(self if name in _CHANGEABLE else self.task, name)
 
     def change(self, name: str, value: Any) -> None:
-        """Change ``reward``, ``spread``, ``time_limit``, ``tolerance`` or an attribute of the task.
+        """Change ``reward``, ``spread``, ``time_limit``, ``tolerance`` or a task attribute.
 
         Raises
         ------
@@ -310,7 +310,7 @@ class Episodes:
         link = self.robot.description.end_effector(link or scenario.plant.end_effector_frame)
         if not link:
             raise ParameterError(
-                f"Robot '{self.robot.description.name}' has no end-effector: give argument 'link'."
+                f"Robot '{self.robot.description.name}' has no end-effector: set argument 'link'."
             )
         return link
 
@@ -342,10 +342,10 @@ class Episodes:
         goal: Any = None,
         start: Any = None,
     ) -> None:
-        """Restart the episodes of some rows, with the random generators of all rows.
+        """Restart the episodes in some rows, given the random generators of all rows.
 
-        ``goal``, one for all (goal_size,) or one per row (N, goal_size), replaces the drawn goals.
-        ``start``, a dictionary or one per row, replaces some values of :class:`.InitialState`.
+        ``goal``, one for all (goal_size,) or one per row (N, goal_size), overrides the drawn goals.
+        ``start``, one dictionary or one per row, overrides some values of :class:`.InitialState`.
 
         Raises
         ------
@@ -389,7 +389,7 @@ class Episodes:
         each = list(start) if isinstance(start, list | tuple) else [start] * count
         if len(each) != count or not all(isinstance(one, Mapping) for one in each):
             raise ParameterError(
-                f"The start is {start!r}: give a dictionary, or a list of {count} of them."
+                f"The start is {start!r}: pass a dictionary, or a list of {count} dictionaries."
             )
         sizes = {part.name: 3 for part in fields(InitialState)}
         sizes |= {"quaternion": 4, "joint_positions": n, "joint_velocities": n}
@@ -423,7 +423,7 @@ class Episodes:
         return np.asarray(self._camera.picture(self._states[at], self.goals[at]))
 
     def step(self, actions: Any) -> None:
-        """Step all episodes that have not ended, for ``hold`` ticks.
+        """Step all unfinished episodes by ``hold`` ticks.
 
         ``actions`` (N, entries of an action) are shares of the largest command, clipped to -1 and
         1.
@@ -431,7 +431,7 @@ class Episodes:
         Raises
         ------
         CommandError
-            The shape is wrong, or an action is not a finite number.
+            The shape is wrong, or an action is not finite.
         """
         flights, task, wanted = self.flights, self.task, (len(self.goals), len(self.taken))
         shares = as_numbers(actions, "The array of actions", CommandError)

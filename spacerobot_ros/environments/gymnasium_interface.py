@@ -1,4 +1,4 @@
-"""The Gymnasium environments: one robot in a plant, or many in SIMD lanes."""
+"""Gymnasium environments: one robot in a plant, or many in SIMD lanes."""
 
 from __future__ import annotations
 
@@ -66,8 +66,9 @@ def _seeds_of(seed: Any, count: int) -> list[int | None]:
 class SpaceRobotEnv(gymnasium.Env, EzPickle):
     """One robot, stepped by a plant. The arguments are those of `EpisodeConfig`.
 
-    A copy, also by pickle, has the same arguments and starts anew. `get_wrapper_attr` and
-    `set_wrapper_attr` read and change arguments and attributes of the task: see `Episodes.change`.
+    A copy, including a pickled one, has the same arguments and starts from scratch.
+    `get_wrapper_attr` and `set_wrapper_attr` read and change arguments and task attributes; see
+    `Episodes.change`.
 
     Raises
     ------
@@ -89,13 +90,13 @@ class SpaceRobotEnv(gymnasium.Env, EzPickle):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """Begin an episode; options ``goal`` and ``start`` replace the drawn values."""
+        """Start an episode; options ``goal`` and ``start`` override the drawn values."""
         super().reset(seed=seed)
         self.episodes.begin([0], [self.np_random], **_begin_options(options))
         return self.episodes.observations[0].copy(), self._info()
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """Step for the ticks of one action."""
+        """Step by the ticks of one action."""
         episodes = self.episodes
         episodes.step(np.asarray(action)[np.newaxis])
         ended = bool(episodes.terminations[0]), bool(episodes.truncations[0])
@@ -109,7 +110,7 @@ class SpaceRobotEnv(gymnasium.Env, EzPickle):
         return self.episodes.picture(0) if self.render_mode else None
 
     def has_wrapper_attr(self, name: str) -> bool:
-        """Return whether this environment or its episodes have an attribute of this name."""
+        """Return whether this environment or its episodes have an attribute with this name."""
         return hasattr(self, name) or self.episodes.has_attribute(name)
 
     def get_wrapper_attr(self, name: str) -> Any:
@@ -130,8 +131,8 @@ class SpaceRobotEnv(gymnasium.Env, EzPickle):
 class SpaceRobotVectorEnv(VectorEnv, EzPickle):
     """Many robots in SIMD lanes, with the same episodes as :class:`SpaceRobotEnv`.
 
-    With a seed s, lane i has the same episodes as one environment with the seed s + i. A copy, also
-    by pickle, has the same arguments and starts anew.
+    With seed s, lane i has the same episodes as a single environment with seed s + i. A copy,
+    including a pickled one, has the same arguments and starts from scratch.
 
     Parameters
     ----------
@@ -167,7 +168,7 @@ class SpaceRobotVectorEnv(VectorEnv, EzPickle):
         self._seeds = [seed for _, seed in seeded]
         self._begun = np.zeros(num_envs, dtype=np.bool_)
         self._ended = np.zeros(num_envs, dtype=np.bool_)
-        """Episodes that have ended and were not restarted."""
+        """Episodes that have ended and have not been restarted."""
 
     @property
     def np_random_seed(self) -> tuple[int, ...]:
@@ -185,9 +186,9 @@ class SpaceRobotVectorEnv(VectorEnv, EzPickle):
         seed: int | Sequence[int | None] | None = None,
         options: dict[str, Any] | None = None,
     ) -> tuple[Any, dict[str, Any]]:
-        """Begin all episodes, or only those in ``options["reset_mask"]`` (num_envs,).
+        """Start all episodes, or only those in ``options["reset_mask"]`` (num_envs,).
 
-        Options ``goal`` and ``start``, one for all or one per robot, replace the drawn values.
+        Options ``goal`` and ``start``, one for all or one per robot, override the drawn values.
         """
         mask, begin = np.ones(self.num_envs, dtype=np.bool_), _begin_options(options)
         if options is not None and "reset_mask" in options:

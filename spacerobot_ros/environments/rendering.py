@@ -23,13 +23,14 @@ from spacerobot_ros.report.solids import (
 WIDTH, HEIGHT = 640, 480
 
 _SHAPES = 50
-"""Number of shapes from which the size of the picture is chosen."""
+"""Number of configurations used to choose the picture scale."""
 
 Picture = npt.NDArray[np.uint8]
 
 
 class Camera:
-    """Draws robots of one task; the base is in the centre, and one scale fits all shapes."""
+    """Draws the robots of a task; the base is in the centre, and one scale fits all
+    configurations."""
 
     def __init__(self, task: Task) -> None:
         self._task, self._robot = task, task.robot.description
@@ -43,7 +44,7 @@ class Camera:
         return robot_bodies(self._robot, self._meshes, poses, q, MAX_MESH_FACES)
 
     def picture(self, states: RobotStates, goals: Array) -> Picture:
-        """Return the picture (HEIGHT, WIDTH, 3) of one robot from its state and goal (one row
+        """Return a picture (HEIGHT, WIDTH, 3) of one robot from its state and goal (one row
         each)."""
         view, half = View(), self._reach * np.array([WIDTH / HEIGHT, 1.0])
         middle = view(states.pose[0, :3])

@@ -16,7 +16,7 @@ from stable_baselines3.common.vec_env import VecEnv  # noqa: E402
 
 
 class SpaceRobotVecEnv(VecEnv):
-    """A vector environment of `gymnasium.make_vec` as a stable-baselines3 `VecEnv`.
+    """A vector environment from `gymnasium.make_vec` as a stable-baselines3 `VecEnv`.
 
     Parameters
     ----------
@@ -25,7 +25,7 @@ class SpaceRobotVecEnv(VecEnv):
     num_envs
         Number of robots.
     arguments
-        Arguments of the environment; see `EpisodeConfig`.
+        Environment arguments; see `EpisodeConfig`.
     """
 
     def __init__(self, name: str, num_envs: int, **arguments: Any) -> None:
@@ -35,7 +35,7 @@ class SpaceRobotVecEnv(VecEnv):
         super().__init__(num_envs, made.single_observation_space, made.single_action_space)
 
     def reset(self) -> Any:
-        """Begin all episodes with the seeds and options that were set."""
+        """Start all episodes with the seeds and options that were set."""
         options = {name: [each[name] for each in self._options] for name in self._options[0]}
         seen, infos = self.env.reset(seed=self._seeds, options=options)
         self.reset_infos = [{"error": error} for error in infos["error"]]
@@ -44,11 +44,11 @@ class SpaceRobotVecEnv(VecEnv):
         return seen
 
     def step_async(self, actions: Any) -> None:
-        """Step all episodes; episodes that end are restarted."""
+        """Step all episodes; ended episodes are restarted."""
         self._stepped = self.env.step(actions)
 
     def step_wait(self) -> tuple[Any, Any, Any, list[dict[str, Any]]]:
-        """Return observations, rewards, ends, and information about the ends."""
+        """Return observations, rewards, end flags, and information about ended episodes."""
         seen, rewards, terminated, truncated, infos = self._stepped
         told: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         for row in np.flatnonzero(ended := terminated | truncated):
@@ -66,7 +66,7 @@ class SpaceRobotVecEnv(VecEnv):
         return [self.env.get_attr(attr_name)[0]] * len(list(self._get_indices(indices)))
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
-        """Change an attribute, which all robots share."""
+        """Change an attribute that is shared by all robots."""
         self.env.set_attr(attr_name, value)
 
     def env_method(self, method_name: str, *args: Any, indices: Any = None, **named: Any) -> Any:

@@ -1,7 +1,7 @@
-"""Tasks of environments: goals, observations, rewards, ends, and the command of an action.
+"""Environment tasks: goals, observations, rewards, ends, and the commands for actions.
 
-All functions take the states of N robots at once, so that the same code observes one robot in a
-plant, many robots in lanes, and a robot behind ROS topics. A custom task is a class derived from
+All functions take the states of N robots at once, so the same code can observe one robot in a
+plant, many robots in lanes, or a robot over ROS topics. A custom task is a class derived from
 :class:`Task`.
 """
 
@@ -36,13 +36,13 @@ from spacerobot_ros.simulation.plant import InitialState
 _SAMPLED_SHAPE_COUNT = 12
 
 _MIN_SHARE_OF_MOTION = 1e-7
-"""Singular values below this share of the largest are considered no motion."""
+"""Singular values below this fraction of the largest are treated as no motion."""
 
 Flags = npt.NDArray[np.bool_]
 Generators = Sequence[np.random.Generator]
 
 LARGEST_OBSERVATION = 1e6
-"""Bound of observed quantities without another bound; observations are clipped to it."""
+"""Bound for observed quantities without another bound; observations are clipped to it."""
 
 
 def require_names(none: str, given: Iterable[str], known: Collection[str]) -> None:
@@ -119,13 +119,13 @@ class RewardWeights:
         for name, value in (changes or {}).items():
             if not (isinstance(value, numbers.Real) and np.isfinite(value)):
                 raise ParameterError(
-                    f"The weight '{name}' of the reward is {value!r}: give a finite number."
+                    f"The reward weight '{name}' is {value!r}: use a finite number."
                 )
         return cls(**(changes or {}))
 
 
 class Task(ABC):
-    """A kind of goal: its draws, errors, observations and rewards.
+    """A task type: its random goals, errors, observations and rewards.
 
     Subclasses define a name, :attr:`goal_size`, :meth:`random_goal` and :meth:`remaining`, and
     override other members as needed.
@@ -135,28 +135,28 @@ class Task(ABC):
     robot
         The robot.
     link
-        Link from the argument ``link`` or the scenario, or the end-effector; empty: none.
+        Link from argument ``link``, the scenario, or the end-effector; empty: none.
     pushed
-        Whether actions have a force on the base, and a torque.
+        Whether actions include a base force and a base torque.
     """
 
     name: ClassVar[str]
     goal_size: ClassVar[int]
-    """Number of entries of a goal."""
+    """Number of entries in a goal."""
     scenario: ClassVar[str] = "arm_attitude"
     """Default scenario."""
     weights: ClassVar[type[RewardWeights]] = RewardWeights
-    """Class of the reward weights, which may add further weights."""
+    """Class of the reward weights, which may define further weights."""
     has_link: ClassVar[bool] = False
-    """Whether the task has a link, whose position is then in :attr:`RobotStates.link_r`."""
+    """Whether the task has a link; if so, its position is in :attr:`RobotStates.link_r`."""
     tolerance: float = 0.01
     """Default error within which the goal is reached."""
     spread: float = 1.0
     """Default size of random goals."""
     error_size: int = 3
-    """Number of entries of :meth:`remaining`."""
+    """Number of entries in :meth:`remaining`."""
     largest_error: float = LARGEST_OBSERVATION
-    """Bound of the entries of :meth:`remaining`."""
+    """Bound on the entries of :meth:`remaining`."""
 
     def __init__(
         self, robot: SpaceRobot, link: str = "", pushed: tuple[bool, bool] = (False, False)
@@ -178,11 +178,11 @@ class Task(ABC):
         """Return the remaining errors (N, error_size): rotation vectors (rad) or vectors (m)."""
 
     def start(self, initial: InitialState, rng: np.random.Generator) -> InitialState:
-        """Return the initial state of an episode, given the scenario's or the draw's."""
+        """Return the initial state of an episode, given the state in the scenario or the draw."""
         return initial
 
     def goal_of(self, scenario: Scenario) -> Array:
-        """Return the goal (goal_size,) of a scenario.
+        """Return a scenario's goal (goal_size,).
 
         Raises
         ------
@@ -194,7 +194,7 @@ class Task(ABC):
         )
 
     def checked_goals(self, goals: Array) -> Array:
-        """Return given goals (N, goal_size) as the task uses them.
+        """Return the given goals (N, goal_size) in the form used by the task.
 
         Raises
         ------
@@ -204,11 +204,11 @@ class Task(ABC):
         return goals
 
     def goal_poses(self, states: RobotStates, goals: Array) -> Array | None:
-        """Return poses (N, 7) in W of the goals in pictures; None: goals are not shown."""
+        """Return the poses (N, 7) in W of goals in pictures; None: goals are not shown."""
         return None
 
     def errors(self, remaining: Array) -> Array:
-        """Return the sizes of the errors (N,)."""
+        """Return the error magnitudes (N,)."""
         return np.asarray(np.linalg.norm(remaining, axis=1))
 
     def reached(self, states: RobotStates, errors: Array, tolerance: float) -> Flags:
@@ -216,18 +216,18 @@ class Task(ABC):
         return np.asarray(errors <= tolerance)
 
     def failed(self, states: RobotStates, goals: Array) -> Flags:
-        """Return which episodes fail (N,), apart from flights that cannot continue."""
+        """Return which episodes fail (N,), in addition to flights that cannot continue."""
         return np.zeros(len(states.q), dtype=np.bool_)
 
     def reward(self, step: Step, weights: Any) -> Array:
-        """Return the rewards (N,) of a step."""
+        """Return the rewards (N,) for a step."""
         reward = weights.progress * (step.errors_before - step.errors)
         square = np.mean(step.actions**2, axis=1)
         reward -= step.duration * (weights.time + weights.action * square)
         return np.asarray(reward + weights.reached * step.reached - weights.failed * step.failed)
 
     def observe(self, states: RobotStates, remaining: Array) -> Array:
-        """Return observations: remaining error, q, qdot, twist of the base."""
+        """Return observations: remaining error, q, qdot and base twist."""
         parts = [remaining, states.q, states.qdot, states.twist]
         return np.clip(np.concatenate(parts, axis=1), *self.observation_bounds())
 
@@ -267,8 +267,8 @@ class Reorient(_DrawnTogether):
         if not self.by_torque:
             raise ParameterError(
                 f"The joints of robot '{self.robot.description.name}' cannot rotate its base near "
-                "the start, so there are no random goals: give 'max_torque' under "
-                "efforts, or use the goal of a scenario (goals: scenario)."
+                "the start, so there are no random goals: set 'max_torque' under efforts, or use "
+                "the scenario goal (goals: scenario)."
             )
         return np.eye(3)
 
@@ -282,24 +282,24 @@ class Reorient(_DrawnTogether):
         return quaternion_multiply(starts.pose[:, 3:], quaternions_from_rotvecs(turns))
 
     def remaining(self, states: RobotStates, goals: Array) -> Array:
-        """Return the rotation vectors (N, 3) from the bases to the goals in B, rad."""
+        """Return the rotation vectors (N, 3) from base to goal attitudes in B, rad."""
         return rotvecs_from_quaternions(
             quaternion_multiply(quaternion_inverse(states.pose[:, 3:]), goals)
         )
 
     def goal_of(self, scenario: Scenario) -> Array:
-        """Return the goal attitude of the base."""
+        """Return the base's goal attitude."""
         return scenario.goal.quaternion
 
     def checked_goals(self, goals: Array) -> Array:
         """Return unit quaternions; see :meth:`Task.checked_goals`."""
         sizes = np.linalg.norm(goals, axis=1, keepdims=True)
         if sizes.min() < 1e-3:
-            raise ParameterError("The goal is a quaternion of zeros, which is not an attitude.")
+            raise ParameterError("The goal quaternion is zero, which is not an attitude.")
         return np.asarray(goals / sizes)
 
     def goal_poses(self, states: RobotStates, goals: Array) -> Array:
-        """Return the goal attitudes at the positions of the bases."""
+        """Return the goal attitudes at the base positions."""
         return np.hstack([states.pose[:, :3], goals])
 
 
@@ -322,7 +322,7 @@ class Reach(_DrawnTogether):
         if not len(found):
             raise ParameterError(
                 f"The joints of robot '{robot.description.name}' do not move link '{self.link}', "
-                "so there are no random goals: give another 'link'."
+                "so there are no random goals: set another 'link'."
             )
         return np.eye(3) if len(found) == 3 else found
 
@@ -337,14 +337,14 @@ class Reach(_DrawnTogether):
         return np.asarray(self.link_positions(starts) + ways)
 
     def remaining(self, states: RobotStates, goals: Array) -> Array:
-        """Return the displacements (N, 3) from the links to the goals in B, m."""
+        """Return the displacements (N, 3) from link to goal in B, m."""
         R = matrices_from_quaternions(states.pose[:, 3:])
         of_base = np.einsum("nji,nj->ni", R, goals - states.pose[:, :3])
         assert states.link_r is not None
         return np.asarray(of_base - states.link_r)
 
     def goal_of(self, scenario: Scenario) -> Array:
-        """Return the goal position of the link; see :meth:`Task.goal_of`."""
+        """Return the link's goal position; see :meth:`Task.goal_of`."""
         for each in scenario.goal.end_effectors:
             if each.link == self.link:
                 return each.position
@@ -355,11 +355,11 @@ class Reach(_DrawnTogether):
         return scenario.end_effector_goal.position
 
     def goal_poses(self, states: RobotStates, goals: Array) -> Array:
-        """Return the goals with the attitude of the world."""
+        """Return the goals with the world's attitude."""
         return np.hstack([goals, np.tile([0.0, 0.0, 0.0, 1.0], (len(goals), 1))])
 
     def link_positions(self, states: RobotStates) -> Array:
-        """Return the positions of the links in W (N, 3), m."""
+        """Return the link positions in W (N, 3), m."""
         R = matrices_from_quaternions(states.pose[:, 3:])
         assert states.link_r is not None
         return np.asarray(states.pose[:, :3] + np.einsum("nij,nj->ni", R, states.link_r))
@@ -384,8 +384,8 @@ def action_scale(robot: SpaceRobot, actuation: str, max_force: float, max_torque
     for name, limit in zip(robot.joint_names, limits.tolist(), strict=True):
         if not np.isfinite(limit):
             raise ParameterError(
-                f"Joint '{name}' has no {actuation} limit, and actions are shares of this limit: "
-                "set it in the URDF, or give action_scale."
+                f"Joint '{name}' has no {actuation} limit, and actions are fractions of this "
+                "limit: set it in the URDF, or set action_scale."
             )
     if actuation == "velocity":
         return limits.copy()
@@ -393,9 +393,9 @@ def action_scale(robot: SpaceRobot, actuation: str, max_force: float, max_torque
 
 
 def command_of(actions: Any, scale: Array, taken: Sequence[int] | npt.NDArray[np.int64]) -> Array:
-    """Return the commands (N, len(scale)) for actions (N, len(taken)), shares from -1 to 1.
+    """Return the commands (N, len(scale)) for actions (N, len(taken)), fractions from -1 to 1.
 
-    ``taken`` are the entries of commands that actions set; the others are zero.
+    ``taken`` are the command entries set by actions; the others are zero.
     """
     shares = np.asarray(actions, dtype=float)
     commands = np.zeros((len(shares), len(scale)))

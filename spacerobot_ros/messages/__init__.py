@@ -1,1 +1,1 @@
-"""Messages as bytes and plain values, without ROS: layouts, definitions, statuses, plans."""
+"""ROS messages as bytes and plain values, without ROS: layouts, definitions, statuses, plans."""

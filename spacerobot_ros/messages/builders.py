@@ -1,4 +1,4 @@
-"""Messages of the stack from plain values: states, goals, plans, predicted paths, frames."""
+"""Builds the stack's messages from plain values: states, goals, plans, predicted paths, frames."""
 
 from __future__ import annotations
 
@@ -30,19 +30,19 @@ if TYPE_CHECKING:
 
 TRANSFORM_TYPE = "tf2_msgs/msg/TFMessage"
 TRANSFORMS, STATIC_TRANSFORMS = "/tf", "/tf_static"
-"""Names of the transform topics before remaps."""
+"""Transform topic names before remapping."""
 
 _NUMBERS_PER_POSE = 7
 _POSE_PATH = "pose.pose.position.x"
 
 
 class TransformTemplate:
-    """A serialised tf2_msgs/TFMessage whose stamps and numbers are written in place.
+    """A serialised tf2_msgs/TFMessage whose stamps and values are written in place.
 
     Parameters
     ----------
     frames
-        Names of the parent and the child of each transform.
+        Parent and child frame of each transform.
     """
 
     def __init__(self, frames: Frames) -> None:
@@ -65,7 +65,7 @@ class TransformTemplate:
 
 
 class RobotTransforms:
-    """The transforms of a robot as messages.
+    """A robot's transforms as messages.
 
     Parameters
     ----------
@@ -74,9 +74,9 @@ class RobotTransforms:
     world_frame
         Name of the inertial frame.
     prefix
-        Prefix of the names of the links, like robot_state_publisher's ``frame_prefix``.
+        Prefix of link names, like robot_state_publisher's ``frame_prefix``.
     links
-        Whether to include the transforms of all links, or only of the base link.
+        Whether to include the transforms of all links or only of the base link.
     """
 
     def __init__(
@@ -90,7 +90,7 @@ class RobotTransforms:
         self._fixed = _prefix_frames(fixed, prefix)
 
     def message(self, time_ns: int, pose: Array, q: Array) -> bytes:
-        """Return the message for a pose (7,) of the base link and positions (n,) of the joints."""
+        """Return the message for a base link pose (7,) and joint positions (n,)."""
         self._poses[0] = pose
         if self._links is not None:
             self._links.update(q)
@@ -108,7 +108,7 @@ class RobotTransforms:
         ]
 
     def static_message(self, time_ns: int) -> bytes | None:
-        """Return the message of links fixed to their parents; None without such links."""
+        """Return the message for links fixed to their parents; None without such links."""
         if self._links is None or not self._fixed:
             return None
         return TransformTemplate(self._fixed).serialised(time_ns, self._links.fixed_transforms)
@@ -119,7 +119,7 @@ def _prefix_frames(frames: Iterable[tuple[str, str]], prefix: str) -> Frames:
 
 
 class StateFrames:
-    """Reads the frames of a robot from its odom and joint_states."""
+    """Computes a robot's frames from odom and joint_states."""
 
     def __init__(self, description: RobotDescription) -> None:
         self._description = description
@@ -132,7 +132,7 @@ class StateFrames:
         Raises
         ------
         CommandError
-            The messages are of another robot.
+            The messages belong to another robot.
         """
         self._joints.accept(joint_states)
         self._odom.accept(odom)
@@ -144,17 +144,17 @@ class StateFrames:
 
     @property
     def pose(self) -> Array:
-        """Pose of the base link (7,)."""
+        """Base link pose (7,)."""
         return self._odom.floats(_POSE_PATH)
 
     @property
     def q(self) -> Array:
-        """Positions of the joints (n,), m or rad."""
+        """Joint positions (n,), m or rad."""
         return self._joints.values["position"]
 
 
 def robot_frames(description: RobotDescription, state: StateFrames) -> dict[str, tuple[str, Array]]:
-    """Return each link's parent and pose (7,) in the parent, by link name, in a measured state."""
+    """Return each link's parent and pose (7,) in the parent, by link name, for a measured state."""
     links, prefix = ForwardKinematics(description), state.prefix
     links.update(state.q)
     frames = {prefix + description.base_link: (state.world, state.pose)}
@@ -170,18 +170,18 @@ POSE_STAMPED = "geometry_msgs/msg/PoseStamped"
 def state_message(
     topic: Topic, names: Sequence[str], world: str, base: str, target: str = ""
 ) -> bytes:
-    """Return the message of a state topic with all numbers zero.
+    """Return a state topic message with all values zero.
 
     Parameters
     ----------
     topic
-        An entry of the table of topics.
+        A topic table entry.
     names
-        Joints or thrusters that its arrays have entries for.
+        Joints or thrusters that correspond to the array entries.
     world, base
-        Names of the inertial frame and of the base link's frame.
+        Names of the inertial frame and of the base link frame.
     target
-        Name of the frame of the target's root link.
+        Frame name of the target's root link.
     """
     values: dict[str, Any] = {}
     if topic.type == "std_msgs/msg/Float64MultiArray":
@@ -201,7 +201,7 @@ def state_message(
 
 
 def goal_message(goal: Goal, frame: str, stamp_ns: int = 0) -> bytes:
-    """Return the pose of a goal as geometry_msgs/PoseStamped; parts not required are NaN."""
+    """Return a goal pose as geometry_msgs/PoseStamped; components not required are NaN."""
     r, quaternion = (
         values if part in goal.asked else np.full(len(values), np.nan)
         for part, values in (("position", goal.position), ("attitude", goal.quaternion))
@@ -220,7 +220,7 @@ def goal_message(goal: Goal, frame: str, stamp_ns: int = 0) -> bytes:
 def given_path_message(poses: Array, frame: str, stamp_ns: int) -> bytes:
     """Return a path of poses (K, 7), or of positions (K, 3), as nav_msgs/Path.
 
-    Positions have quaternions of zeros, which mean any attitude.
+    For positions, all quaternions are zero, which means any attitude.
     """
     numbers = np.zeros((len(poses), 7))
     numbers[:, : poses.shape[1]] = poses
@@ -232,8 +232,8 @@ def given_path_message(poses: Array, frame: str, stamp_ns: int) -> bytes:
 def trajectory_message(schedule: GaitSchedule, stamp_ns: int, frame: str) -> bytes:
     """Return a schedule as trajectory_msgs/JointTrajectory.
 
-    Point k has the joint positions at tick k and the velocities until tick k+1 (zero at the end).
-    Long gaits have a hundred thousand points.
+    Point k contains the joint positions at tick k and the velocities until tick k+1 (zero at the
+    end). Long gaits have about a hundred thousand points.
     """
     n, count = len(schedule.joint_names), len(schedule.positions)
     period_ns = round(schedule.control_period * SECOND)

@@ -1,7 +1,7 @@
-"""Definitions of message types: of installed packages, and of schemas in bags.
+"""Message type definitions, from installed packages and from schemas in bags.
 
-``rosbags`` generates Python code for every type that it decodes, with one line per element of a
-message array, and never ends if a type contains itself. The definitions of a bag are untrusted, so
+``rosbags`` generates Python code for every decoded type, with one line per element of a message
+array, and never terminates if a type contains itself. Definitions in bags are untrusted, so
 names, lengths, nesting and the number of fields are limited.
 """
 
@@ -59,10 +59,11 @@ _PARTS: dict[str, tuple[str, int | str]] = {
     "_Response": ("srv", 1),
     "_Event": ("srv", _EVENT),
 }
-"""Messages that rosidl generates from a service or an action, by the suffix of their names.
+"""Messages that rosidl generates from a service or an action, by name suffix.
 
-Each has the suffix of the declaring file, and either the section there or a text in which the name
-of the service or action replaces the braces. Names in interface files have no underscore.
+Each value is the suffix of the declaring file, and either the section in that file or
+a template in which the service or action name replaces the braces. Names in interface files contain
+no underscores.
 """
 
 _SECTION_END = re.compile(r"^---[ \t]*\r?\n?", re.MULTILINE)
@@ -73,17 +74,16 @@ _PRIMITIVES = {"bool", "byte", "char", "float32", "float64", "string", "wstring"
 
 @cache
 def message_definition(type_name: str) -> str:
-    """Return the full definition of a message type as rosbag2 writes it into a schema.
+    """Return the full definition of a message type as rosbag2 writes it to a schema.
 
-    It is the text of the ``.msg`` file, followed by a separator line, ``MSG: package/Type`` and the
-    text of every type it uses, depth first, in alphabetical order and each once (``ros2msg``).
+    It consists of the ``.msg`` file, followed by a separator line, ``MSG: package/Type`` and the
+    definition of each type it uses, depth first, in alphabetical order and each once (``ros2msg``).
     Types of ROS 2 Jazzy that are not installed are defined without comments.
 
     Raises
     ------
     RecordingError
-        The name is not a message type, or a required package is neither installed nor part of
-        Jazzy.
+        The name is not a message type, or a required package is neither installed nor in Jazzy.
     """
     return _of_installed_or_jazzy(
         type_name,
@@ -127,10 +127,10 @@ def _with_dependencies(name: _InterfaceName, seen: set[str]) -> str:
 
 @cache
 def type_hash(type_name: str) -> str:
-    """Return the hash by which ROS 2 distinguishes versions of a message type.
+    """Return the type hash by which ROS 2 distinguishes message type versions.
 
-    It is ``RIHS01_`` and 64 hexadecimal digits; empty if the package was installed without the
-    description of its types (``share/<package>/msg/<Type>.json``). Raises as
+    It is ``RIHS01_`` followed by 64 hexadecimal digits; empty if the package was installed without
+    type descriptions (``share/<package>/msg/<Type>.json``). Raises as
     :func:`message_definition` does.
     """
 
@@ -147,10 +147,10 @@ def type_hash(type_name: str) -> str:
 
 
 def message_module(type_name: str) -> tuple[str, str, str]:
-    """Return the Python module of an installed message type, and two class names. The first is the
-    interface that the module exports. The second is the message itself, in the interface's own
-    module; it differs for parts of services and actions. RecordingError: the name is not a message
-    type, or the package is not installed.
+    """Return the Python module of an installed message type, and two class names. The first class
+    is the interface exported by the module. The second is the message itself, in the interface's
+    module; the two differ for service and action components. RecordingError: the name is not a
+    message type, or the package is not installed.
     """
     name = _InterfaceName.of(type_name)
     name.file()
@@ -180,12 +180,12 @@ class _InterfaceName:
 
     @property
     def whole(self) -> str:
-        """Name of the message without its package."""
+        """Message name without its package."""
         return self.interface + (self.part if self.kind != "msg" else "")
 
     @property
     def full(self) -> str:
-        """Name of the message with its package and folder."""
+        """Message name with its package and folder."""
         return f"{self.package}/{self.kind}/{self.whole}"
 
     def file(self) -> Path:
@@ -194,12 +194,12 @@ class _InterfaceName:
         if not path.is_file():
             raise RecordingError(
                 f"The package {self.package} in {share} has no message {self.whole}: "
-                "check the name, or install the version that has it."
+                "check the name, or install a version that has it."
             )
         return path
 
     def text(self) -> str:
-        """Return the definition of the message without the definitions of its field types."""
+        """Return the message definition without the definitions of its field types."""
         text = self.file().read_bytes().decode()
         if self.kind == "msg":
             return text
@@ -227,7 +227,7 @@ def _share_folder(package: str) -> Path:
 
 @cache
 def fields_of(type_name: str) -> Fields:
-    """Return the fields of an installed type and of all types in it.
+    """Return the fields of an installed type and of all nested types.
 
     Raises as :func:`message_definition` does.
     """
@@ -240,18 +240,18 @@ _TYPE_NAME = re.compile(r"[A-Za-z]\w*/(msg|srv|action)/[A-Za-z]\w*", re.ASCII)
 _MAX_TEXT_BYTES = 262_144
 _MAX_LINES = 5_000
 _MAX_FIELDS = 1_000
-"""Largest number of fields; in arrays of messages and strings every element is counted."""
+"""Largest number of fields; in arrays of messages and strings, every element is counted."""
 
 _MAX_NESTING = 32
 
 
 class MessageType:
-    """A message type defined by the text of its schema in a bag.
+    """A message type defined by its schema in a bag.
 
     Attributes
     ----------
     fields
-        Definitions of the type and of all types in it.
+        Definitions of the type and of all nested types.
 
     Raises
     ------
@@ -287,7 +287,7 @@ class MessageType:
 
 
 message_type = lru_cache(maxsize=64)(MessageType)
-"""Return a :class:`MessageType`, whose code is generated once for all bags."""
+"""Return a :class:`MessageType`, with code generated once for all bags."""
 
 
 def _parsed(text: str, type_name: str) -> Any:
@@ -302,11 +302,11 @@ def _parsed(text: str, type_name: str) -> Any:
 
 def _parsed_within_limits(type_name: str, text: bytes) -> Any:
     if not _TYPE_NAME.fullmatch(type_name):
-        raise ValueError("a type is called 'package/msg/Type'")
+        raise ValueError("a type is named 'package/msg/Type'")
     if len(text) > _MAX_TEXT_BYTES or text.count(b"\n") > _MAX_LINES:
         raise ValueError(
-            f"its text is longer than {_MAX_TEXT_BYTES} bytes or {_MAX_LINES} lines, which no "
-            "message needs"
+            f"its text is longer than {_MAX_TEXT_BYTES} bytes or {_MAX_LINES} lines, more than "
+            "any message needs"
         )
     types = _parsed(text.decode(), type_name)
     _count_fields(types, type_name, {})
@@ -336,7 +336,7 @@ def _count_fields(types: Fields, name: str, counts: dict[str, int], depth: int =
             count += length if detail[0] == "string" else 1
         if count > _MAX_FIELDS:
             raise ValueError(
-                f"{name} has more than {_MAX_FIELDS} fields, counting those of the messages in it"
+                f"{name} has more than {_MAX_FIELDS} fields, including those of nested messages"
             )
     counts[name] = max(count, 1)
     return counts[name]

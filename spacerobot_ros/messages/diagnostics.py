@@ -1,4 +1,4 @@
-"""Diagnostics of a plant and of its commanders: the records of diagnostic_msgs/DiagnosticArray."""
+"""Diagnostics of a plant and its commanders as diagnostic_msgs/DiagnosticArray records."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from spacerobot_ros.simulation.time_modes import RealTime
 from spacerobot_ros.times import LATEST_NS
 
 PROPELLANT_KEY = "propellant_kg"
-"""Key of the propellant used."""
+"""Key of the propellant consumption."""
 
 _MOMENTUM_ROUNDING = 1e-9
-"""Largest momentum change by rounding, divided by the mass, m/s and m^2/s."""
+"""Largest momentum change due to rounding, divided by the mass, m/s and m^2/s."""
 
 _MILLISECONDS = 1e3
 
@@ -26,15 +26,15 @@ _OK, _WARN, _ERROR = 0, 1, 2
 
 
 def diagnostic_name(node: str, part: str) -> str:
-    """Return the name of a part of a node in /diagnostics, as diagnostic_updater forms it.
+    """Return the name of a node component in /diagnostics, as formed by diagnostic_updater.
 
-    Aggregators match prefixes of names and build a tree of them: there is no leading slash.
+    Aggregators match name prefixes and build a tree from them, so there is no leading slash.
     """
     return f"{node.removeprefix('/')}: {part}"
 
 
 def encode_diagnostics(records: Sequence[StatusRecord], time_ns: int) -> bytes:
-    """Return records of one time as a serialised DiagnosticArray."""
+    """Return the records at one time as a serialised DiagnosticArray."""
     status = [record.fields for record in records]
     return encode(
         "diagnostic_msgs/msg/DiagnosticArray",
@@ -51,20 +51,20 @@ def state_diagnostics(
     warning: str = "",
     missing: str = "",
 ) -> list[StatusRecord]:
-    """Return the diagnostics of a commander: its responses to states, and the state of its goal.
+    """Return a commander's diagnostics: its responses to states, and its goal state.
 
     Parameters
     ----------
     node, robot
-        Full name of the node, and name of its robot.
+        Full node name, and robot name.
     ignored
-        Numbers of ignored states, or parts of states, by key.
+        Numbers of ignored states, or ignored parts of states, by key.
     last
         The last published status; None: none yet.
     warning
-        A warning, which is published instead of the status; empty: none.
+        A warning to publish instead of the status; empty: none.
     missing
-        What the commander waits for, as a clause; empty: nothing.
+        Clause describing what the commander waits for; empty: nothing.
     """
     level = _WARN if warning or missing else _OK
     message = warning or (f"waiting for {missing}" if missing else "responding to states")
@@ -90,11 +90,11 @@ class PlantDiagnostics:
     Parameters
     ----------
     node
-        Full name of the plant's node.
+        Full name of the plant node.
     plant, commands
         Sources of the diagnostics.
     real_time
-        Clock of a plant in real time; None in lockstep.
+        Clock of a real-time plant; None in lockstep.
     """
 
     def __init__(
@@ -117,7 +117,8 @@ class PlantDiagnostics:
         self._commands, self._plant, self._thrusters = commands, plant, thrusters_in(plant)
 
     def note_refusal(self, source: CommandSource, refusal: Refusal) -> str:
-        """Note a refused command, which its validator has counted; return a sentence."""
+        """Record a refused command, already counted by its validator; return a sentence about
+        it."""
         self._last_refusal = f"A command on '{source.topic}' was refused: {refusal.clause}."
         return self._last_refusal
 
@@ -240,7 +241,8 @@ class PlantDiagnostics:
         )
 
     def of_thrusters(self, thrusters: ThrusterPlant) -> StatusRecord:
-        """Return propellant, pulses and unmet wrenches; a warning for new unmet wrenches."""
+        """Return propellant, pulses and unmet wrenches; a warning if there are new unmet
+        wrenches."""
         unmet = thrusters.unmet_ticks > self._unmet_reported
         self._unmet_reported = thrusters.unmet_ticks
         sentences = [f"they cannot produce {thrusters.missing}"] if thrusters.missing else []
@@ -266,7 +268,7 @@ class PlantDiagnostics:
 
 
 def timing_record(node: str, robot: str, real_time: RealTime) -> StatusRecord:
-    """Return the delays of a plant's ticks and of its commander's commands."""
+    """Return the delays of plant ticks and of the commander's commands."""
     timing = real_time.report()
     return _record(
         diagnostic_name(node, "timing"),

@@ -1,8 +1,9 @@
-"""Positions of fields in serialised messages: little-endian CDR, as ROS 2 exchanges it.
+"""Field positions in serialised messages: little-endian CDR, as exchanged by ROS 2.
 
-Most topics repeat one layout: the same frame names, the same number of joints. A field then has the
-same position in every message, where it can be read or overwritten. Its column over many messages
-is a slice of one matrix of bytes, about a hundred times faster than decoding each message.
+Most topics repeat one layout, with the same frame names and the same number of joints. A field then
+has the same position in every message, where it can be read or overwritten. Its values over many
+messages are a slice of one byte matrix, which is about a hundred times faster than decoding each
+message.
 """
 
 from __future__ import annotations
@@ -35,33 +36,33 @@ DTYPES = {
     "float32": np.dtype("<f4"),
     "float64": np.dtype("<f8"),
 }
-"""Number types in serialised messages, by their names in definitions."""
+"""Number types in serialised messages, by name in definitions."""
 
 ENCAPSULATION = 4
 """Length of the CDR header, bytes; alignment is relative to its end."""
 
 BIG_ENDIAN, LITTLE_ENDIAN = b"\x00\x00", b"\x00\x01"
-"""First two bytes of a message in CDR of either byte order."""
+"""First two bytes of a CDR message in either byte order."""
 
 _TIME_TYPES = ("builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration")
 
 
 class TooLongError(Exception):
-    """A list of texts or messages has more elements than the reader of its layout allows."""
+    """A list of strings or messages has more elements than the layout reader allows."""
 
 
 @dataclass(frozen=True)
 class Leaf:
-    """Position of a number, an array of numbers or a text in a message.
+    """Position of a number, a numeric array or a string in a message.
 
     Attributes
     ----------
     offset, size
-        First byte and number of bytes; for a text, without the terminating zero.
+        First byte and number of bytes; for a string, without the terminating zero.
     dtype
         Type of the numbers; None for a text.
     shape
-        ``()`` for one number or text, ``(k,)`` for an array.
+        ``()`` for one number or string, ``(k,)`` for an array.
     """
 
     offset: int
@@ -71,10 +72,10 @@ class Leaf:
 
 
 class Layout:
-    """Positions of the fields of one serialised message.
+    """Field positions in one serialised message.
 
-    Another message of the type has the same layout if its size and its bytes in ``lengths`` are
-    equal, and the same texts if its bytes in ``fixed`` are equal.
+    Another message of the type has the same layout if its size and its ``lengths`` bytes are equal,
+    and the same strings if its ``fixed`` bytes are equal.
 
     Parameters
     ----------
@@ -83,28 +84,28 @@ class Layout:
     type_name
         Such as ``nav_msgs/msg/Odometry``.
     fields
-        The definitions of the type and of all types in it; by default those installed.
+        Definitions of the type and of all nested types; by default the installed ones.
     elements
-        Whether fields inside of lists get paths, such as ``markers[2].pose.position.x``.
+        Whether fields inside lists get paths, such as ``markers[2].pose.position.x``.
     max_elements
-        Largest number of texts or messages in a list.
+        Largest number of strings or messages in a list.
 
     Attributes
     ----------
     leaves
-        Fields by their paths, such as ``pose.pose.position.x``.
+        Fields by path, such as ``pose.pose.position.x``.
     counts
-        Number of texts or messages in each list.
+        Number of strings or messages in each list.
     starts
-        First byte after the length of each such list.
+        First byte after the length field of each such list.
     texts
-        Span of each list of texts.
+        Byte span of each list of strings.
     ends
-        First byte after each element of such a list, if ``elements``.
+        First byte after each element of such a list, if ``elements`` is set.
     lengths
-        First bytes of the lengths (uint32) of texts and lists.
+        First bytes of the length fields (uint32) of strings and lists.
     fixed
-        Spans of these lengths and of all texts, in the order of the message.
+        Byte spans of these length fields and of all strings, in message order.
     end
         First byte after the last field.
 
@@ -113,7 +114,7 @@ class Layout:
     IndexError
         The message ends before its fields.
     TooLongError
-        A list has more texts or messages than ``max_elements``.
+        A list has more strings or messages than ``max_elements``.
     """
 
     def __init__(
@@ -206,7 +207,7 @@ class Layout:
         self._align(4)
         word = self._message[self.end : self.end + 4]
         if len(word) < 4:
-            raise IndexError("the message ends inside of a length")
+            raise IndexError("the message ends inside a length field")
         self.lengths.append(self.end)
         self.fixed.append((self.end, self.end + 4))
         self.end += 4
@@ -227,8 +228,8 @@ def encode(type_name: str, values: Mapping[str, Any] | None = None) -> bytes:
     type_name
         Such as ``sensor_msgs/msg/JointState``.
     values
-        Fields by name: numbers, texts, arrays, mappings for messages, and lists of them; for a
-        time or duration also whole nanoseconds. The other fields are zero or empty.
+        Fields by name: numbers, strings, arrays, mappings for messages, and lists of these; a time
+        or duration may also be given in integer nanoseconds. All other fields are zero or empty.
 
     Raises
     ------
@@ -297,18 +298,18 @@ def encode_list(
     element: Mapping[str, Any],
     columns: Mapping[str, NDArray[Any]],
 ) -> bytes:
-    """Return a message with a list of many messages of one layout.
+    """Return a message that contains a list of many messages with one layout.
 
     Parameters
     ----------
     type_name, values
-        The message without its list, as for :func:`encode`.
+        The message without its list, as in :func:`encode`.
     name
         Field of the list.
     element
-        Values that all elements have in common; arrays have their final lengths.
+        Values common to all elements; arrays have their final lengths.
     columns
-        Numbers (N, size), a row for each element, by the path at which they begin in an element.
+        Numbers (N, size), one row per element, by the path in an element at which they begin.
     """
     count = len(next(iter(columns.values())))
     if not count:
@@ -336,14 +337,14 @@ def stamped_copies(
     stamps_ns: NDArray[np.int64],
     columns: Mapping[str, NDArray[np.float64]],
 ) -> list[bytes]:
-    """Return copies of a message with new stamps and numbers.
+    """Return copies of a message with new stamps and values.
 
     Parameters
     ----------
     prototype, type_name
         The message; its lists must have their final lengths.
     stamps_ns
-        (N,) stamps of the headers or of a clock, ns; ignored if the message has neither.
+        (N,) header or clock stamps, ns; ignored if the message has neither.
     columns
         Numbers (N, size) by the path at which they begin.
     """
@@ -361,7 +362,7 @@ def stamped_copies(
 
 
 def seconds_and_nanoseconds(times_ns: NDArray[np.int64]) -> NDArray[np.uint32]:
-    """Return times (N,) in ns as seconds and nanoseconds (N, 2) of stamps."""
+    """Convert times (N,) in ns to stamps of seconds and nanoseconds (N, 2)."""
     return np.stack([times_ns // SECOND, times_ns % SECOND], axis=1).astype("<u4")
 
 
@@ -369,7 +370,7 @@ def seconds_and_nanoseconds(times_ns: NDArray[np.int64]) -> NDArray[np.uint32]:
 
 
 class Columns:
-    """Fields at the same position in all messages of a list, as arrays over the messages."""
+    """Fields with the same position in all messages of a list, as arrays over the messages."""
 
     def __init__(
         self, matrix: NDArray[np.uint8], leaves: dict[str, Leaf], texts: dict[str, slice]
@@ -384,7 +385,7 @@ class Columns:
         return self._leaves.keys()
 
     def constant(self, path: str) -> bool:
-        """Whether a list of texts is the same in all messages."""
+        """Whether a list of strings is the same in all messages."""
         part = self._texts.get(path)
         return part is not None and bool((self._matrix[:, part] == self._matrix[0, part]).all())
 
@@ -409,7 +410,7 @@ def column_dtype(dtype: np.dtype[Any]) -> np.dtype[Any]:
 def read_columns(messages: Sequence[bytes], type_name: str, fields: Fields) -> Columns | None:
     """Return the fields that have the same position in every message of one type.
 
-    Fields in lists of messages and of texts are omitted. None if the layouts differ.
+    Fields in lists of messages or strings are omitted. None if the layouts differ.
     """
     if not messages or len(set(map(len, messages))) != 1:
         return None

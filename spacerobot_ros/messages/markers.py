@@ -1,4 +1,4 @@
-"""Markers of a robot, its target, its obstacles, its goal and its planned path, for viewers.
+"""Markers for a robot, its target, obstacles, goal and planned path, for viewers.
 
 All are in the world frame, so that a viewer needs no transforms.
 """
@@ -21,15 +21,15 @@ if TYPE_CHECKING:
 MARKER_ARRAY = "visualization_msgs/msg/MarkerArray"
 
 _TYPES = {"box": 1, "sphere": 2, "cylinder": 3, "mesh": 10, "capsule": 11}
-"""Values of ``type`` of a Marker by the kinds of shapes: CUBE ... TRIANGLE_LIST."""
+"""Marker ``type`` values by geometry kind: CUBE ... TRIANGLE_LIST."""
 
 _LINE_STRIP = 4
 _DELETE = 2
-"""Value of ``action`` of a Marker that is erased."""
+"""Value of ``action`` that deletes a Marker."""
 
 _GHOST_ALPHA = 0.25
 _LINE_WIDTH, _LINE_COLOR = 0.005, (0.95, 0.6, 0.1, 1.0)
-"""Width (m) and color of the lines of paths."""
+"""Width (m) and color of path lines."""
 
 
 def _pose(r: Array, R: Array) -> dict[str, Any]:
@@ -87,10 +87,10 @@ def _line(namespace: str, number: int, places: Array, frame: str) -> dict[str, A
 
 
 def goal_markers(goal: Goal, path: BasePath, robot: RobotDescription, frame: str) -> bytes:
-    """Return markers of the base at its goal, of the planned path of the base as a line, and of an
+    """Return markers for the base at its goal, the planned base path as a line, and an
     end-effector's goal path.
 
-    The base at its goal has the visuals of the base link and of the links fixed to it.
+    The base at its goal is drawn with the visuals of the base link and of the links fixed to it.
     """
     markers: list[dict[str, Any]] = []
     base = Pose(matrix_from_quaternion(goal.quaternion), goal.position)
@@ -111,7 +111,7 @@ def goal_markers(goal: Goal, path: BasePath, robot: RobotDescription, frame: str
 
 
 class RobotMarkers:
-    """All visuals of a robot, of its target and of its obstacles as one marker array.
+    """All visuals of a robot, its target and its obstacles as one marker array.
 
     Parameters
     ----------
@@ -124,7 +124,7 @@ class RobotMarkers:
     def __init__(self, robot: RobotDescription, target: RobotDescription | None, frame: str):
         self._robot, self._target, self._frame = robot, target, frame
         self._drawn: set[tuple[str, int]] = set()
-        """Namespaces and numbers of all markers so far."""
+        """Namespaces and IDs of all markers so far."""
         self.use_obstacles(robot.world)
 
     def use_obstacles(self, world: RobotDescription | None) -> None:
@@ -137,7 +137,7 @@ class RobotMarkers:
                 markers.append(shape_marker(shape, frame, link.name, len(markers)))
                 poses.append((index, shape.pose))
         self._of_target: list[Pose] = []
-        """Poses of the visuals of the target in the frame of its root link."""
+        """Poses of the target visuals in its root link frame."""
         for link in () if target is None else target.links:
             for shape in link.shapes:
                 markers.append(shape_marker(shape, frame, link.name, len(markers)))
@@ -153,7 +153,7 @@ class RobotMarkers:
         markers += [_erased(*each) for each in sorted(self._drawn - present)]
         self._drawn |= present
         self.draws_anything = bool(markers)
-        """Whether there is a marker: robot, target and obstacles may have no shapes."""
+        """Whether there is any marker: the robot, target and obstacles may have no visuals."""
         self._template = MessageTemplate(MARKER_ARRAY, encode(MARKER_ARRAY, {"markers": markers}))
         moved = len(poses) + len(self._of_target)
         self._places = [
@@ -171,7 +171,7 @@ class RobotMarkers:
         time_ns
             The stamp, ns.
         base, target
-            Poses (7,) of the base and of the target in the world.
+            Poses (7,) of the base and the target in the world.
         link_R, link_r
             Attitudes (3, 3 L) and positions (3, L) of the links in the base frame, m.
         """

@@ -1,8 +1,8 @@
-"""Readers and writers of serialised messages that repeat one layout: numbers in place.
+"""Readers and writers of serialised messages that repeat one layout; values are accessed in place.
 
-rclpy spends most of a tick turning Python objects into bytes and back. A state message has the
-same layout every tick, so it is serialised once and its numbers are written into the bytes; a
-command is read the same way. If a message has another layout, the reader learns it.
+rclpy spends most of a tick converting Python objects to bytes and back. A state message has the
+same layout every tick, so it is serialised once and its values are written into the bytes; a
+command is read the same way. If a message has a different layout, the reader adapts to it.
 """
 
 from __future__ import annotations
@@ -42,27 +42,27 @@ ODOMETRY = "nav_msgs/msg/Odometry"
 WRENCH = "geometry_msgs/msg/WrenchStamped"
 
 _OTHER_JOINTS_BYTES = 65536
-"""Size allowed for unknown joints of a measured state, bytes."""
+"""Size allowed for unknown joints in a measured state, bytes."""
 
 _NOT_FINITE_RATES = "velocities are not finite"
 
 _MAX_LIST_TEXTS = 10_000
-"""Largest number of texts in a list; a faulty publisher may send a million."""
+"""Largest number of strings in a list; a faulty publisher may send a million."""
 
 _HEADER_BYTES = 4096
 _POSE_PATH, _TWIST_PATH = "pose.pose.position.x", "twist.twist.linear.x"
 _WRENCH_PATH = "wrench.force.x"
 
 Quantity = Literal["position", "velocity", "effort"]
-"""Name of a number array of a JointState."""
+"""Name of a numeric array in a JointState."""
 
 
 class UnreadableError(CommandError):
-    """Bytes are not a message of their type; the message names the type."""
+    """The bytes are not a message of their type; the error message names the type."""
 
 
 def read_text(raw: bytes, type_name: str, path: str) -> str:
-    """Return a text of one serialised message.
+    """Return a string in one serialised message.
 
     Raises
     ------
@@ -77,14 +77,15 @@ def read_text(raw: bytes, type_name: str, path: str) -> str:
 
 
 class MessageTemplate:
-    """A serialised message whose numbers are overwritten in place.
+    """A serialised message whose values are overwritten in place.
 
     Parameters
     ----------
     type_name
         Such as ``nav_msgs/msg/Odometry``.
     prototype
-        The serialised message; every list has its final length and every text its final content.
+        The serialised message; every list must have its final length and every string its final
+        content.
     """
 
     def __init__(self, type_name: str, prototype: bytes) -> None:
@@ -108,7 +109,7 @@ class MessageTemplate:
         self._feeds[path] = slice(begin, begin + len(data)), data
 
     def serialised(self, stamp: bytes) -> bytes:
-        """Return the current message, with ``stamp`` (:func:`stamp_bytes`) in every header."""
+        """Return the current message with ``stamp`` (:func:`stamp_bytes`) in every header."""
         for place, source in self._feeds.values():
             self._buffer[place] = source
         for place in self._stamps:
@@ -117,24 +118,24 @@ class MessageTemplate:
 
 
 def joint_template(joint_names: Sequence[str]) -> MessageTemplate:
-    """Return the template of a JointState with zeros for all quantities of some joints."""
+    """Return a JointState template with zeros for all quantities of the given joints."""
     zeros = np.zeros(len(joint_names))
     values = {"name": joint_names, "position": zeros, "velocity": zeros, "effort": zeros}
     return MessageTemplate(JOINT_STATE, encode(JOINT_STATE, values))
 
 
 class TemplateReader:
-    """Reads float arrays and the stamp of serialised messages that repeat one layout.
+    """Reads float arrays and the stamp from serialised messages that repeat one layout.
 
     Parameters
     ----------
     type_name
-        Type of the messages, which begin with a header.
+        Message type, which must begin with a header.
     spans
-        Paths to read, and how many float64 follow each: ``{"pose.pose.position.x": 7}``; None for
-        an array of any length.
+        Paths to read, and the number of float64 values at each: ``{"pose.pose.position.x": 7}``;
+        None for an array of any length.
     max_size
-        Largest size of messages with another layout, bytes; longer ones are refused unread.
+        Largest size of messages with a different layout, bytes; longer ones are rejected unread.
     """
 
     def __init__(
@@ -157,7 +158,7 @@ class TemplateReader:
         Raises
         ------
         UnreadableError
-            The bytes are not a message of the type; the earlier message stays.
+            The bytes are not a message of the type; the previous message is kept.
         """
         if raw is self.raw:
             return
@@ -172,17 +173,17 @@ class TemplateReader:
         return np.frombuffer(self.raw, np.float64, count, offset)
 
     def value_count(self, path: str) -> int:
-        """Return the number of values at ``path`` in messages of this layout; 0: there are none."""
+        """Return the number of values at ``path`` in messages with this layout; 0: none."""
         return self._value_spans[path][1] if path in self._value_spans else 0
 
     def text(self, path: str) -> str:
-        """Return a text of messages of this layout."""
+        """Return a string in messages with this layout."""
         assert self._layout is not None
         leaf = self._layout.leaves[path]
         return self.raw[leaf.offset : leaf.offset + leaf.size].decode(errors="replace")
 
     def texts(self, path: str) -> list[str]:
-        """Return a list of texts of messages of this layout."""
+        """Return a list of strings in messages with this layout."""
         assert self._layout is not None
         return [self.text(f"{path}[{i}]") for i in range(self._layout.counts[path])]
 
@@ -232,11 +233,11 @@ def _as_little_endian(raw: bytes, type_name: str) -> bytes:
 
 
 class JointReader:
-    """Reads quantities of JointState messages in the order of the model's joints.
+    """Reads quantities from JointState messages in model joint order.
 
-    A command names all joints, in any order. A measured state may also name other joints, as a
-    broadcaster for a whole machine does: they are ignored. Measured joints may arrive in several
-    messages (:meth:`joined`).
+    A command names all joints, in any order. A measured state may also name other joints, for
+    example from a broadcaster for a whole machine; these are ignored. Measured joint states may
+    arrive in several messages (:meth:`joined`).
 
     Parameters
     ----------
@@ -245,9 +246,9 @@ class JointReader:
     quantities
         Quantities to read; the first is required in every message.
     measured
-        Whether messages are measured states, whose stamp and size are bounded.
+        Whether messages are measured states, which have bounded stamps and sizes.
     followers
-        Names of joints that mimic joints of the model, and are not coordinates of the model.
+        Names of mimic joints, which are not model coordinates.
     """
 
     def __init__(
@@ -261,7 +262,7 @@ class JointReader:
         self._measured, self._joints, self._quantities = measured, list(joint_names), quantities
         self._followers = followers
         self.ignored: Counter[str] = Counter()
-        """Number of ignored parts of accepted messages, by their description."""
+        """Number of ignored parts of accepted messages, by description."""
         max_size = math.inf
         if measured:
             # Every joint adds a name with its length and three numbers; a machine has other joints.
@@ -276,9 +277,9 @@ class JointReader:
         """Last accepted message: publishers often repeat the same bytes."""
         self._order = JointOrder(np.zeros(0, np.intp), np.zeros(0, np.intp))
         self._missing = ""
-        """A joint that measured states of this layout lack; empty: none."""
+        """A joint missing in measured states with this layout; empty: none."""
         self._seen = np.zeros(len(joint_names), dtype=np.bool_)
-        """Joints received since the last complete state, with their values in ``values``."""
+        """Joints received since the last complete state; their values are in ``values``."""
 
     def accept(self, raw: bytes) -> int:
         """Read a message into ``values`` and return its stamp in ns.
@@ -287,7 +288,7 @@ class JointReader:
         ------
         CommandError
             A joint is unknown or named twice, or a length is wrong; or the stamp of a measured
-            state is too late for a command to carry it.
+            state is too large for a command to carry.
         """
         self.require(raw)
         stamp = self._reader.stamp_ns
@@ -310,14 +311,14 @@ class JointReader:
                 self.ignored[_NOT_FINITE_RATES] += 1
 
     def joined(self, raw: bytes) -> bytes | None:
-        """Return a measured state of all joints: this message, or one merged from several.
+        """Return a measured state of all joints: this message, or one merged from several messages.
 
         None: some joints are missing since the last complete state.
 
         Raises
         ------
         CommandError
-            The message is refused.
+            The message is rejected.
         """
         try:
             self.require(raw)
@@ -337,12 +338,12 @@ class JointReader:
 
     @property
     def incomplete(self) -> str:
-        """Clause about the joints that are missing since the last complete state."""
+        """Clause describing the joints missing since the last complete state."""
         absent = [n for n, seen in zip(self._joints, self._seen, strict=True) if not seen]
         return f"no message names {', '.join(absent)}"
 
     def require(self, raw: bytes) -> None:
-        """Refuse a message that :meth:`accept` would refuse; ``values`` stay.
+        """Reject a message that :meth:`accept` would reject; ``values`` stay.
 
         Raises
         ------
@@ -366,7 +367,7 @@ class JointReader:
 
     @property
     def stamp_ns(self) -> int:
-        """Stamp of the last message given to :meth:`accept`, refused or not, ns."""
+        """Stamp of the last message passed to :meth:`accept`, rejected or not, ns."""
         return self._reader.stamp_ns
 
     def _check_names_and_lengths(self) -> None:
@@ -396,14 +397,14 @@ class MissingJointError(CommandError):
 
 @dataclass(frozen=True)
 class JointOrder:
-    """Assignment of the joints of a message to the joints of a model.
+    """Mapping from message joints to model joints.
 
     Attributes
     ----------
     of_message, of_model
-        Indices of the joints that both have, in the message and in the model.
+        Indices of the common joints, in the message and in the model.
     ignored
-        Descriptions of the joints of the message that the model does not have.
+        Descriptions of message joints that are not in the model.
     """
 
     of_message: npt.NDArray[np.intp]
@@ -425,7 +426,7 @@ class JointOrder:
         ------
         CommandError
             A joint is named twice, or is unknown or missing. Partial messages may have unknown and
-            missing joints if they name a joint of the model.
+            missing joints if they name at least one model joint.
         """
         known = [name for name in named if name in joints] if partial else list(named)
         if not partial or (joints and not known):
@@ -439,30 +440,30 @@ class JointOrder:
             np.array(places, dtype=np.intp),
             np.array([list(joints).index(name) for name in known], dtype=np.intp),
             tuple(
-                f"joint '{name}' {'follows another' if name in followers else 'is unknown'}"
+                f"joint '{name}' {'is a mimic joint' if name in followers else 'is unknown'}"
                 for name in others
             ),
         )
 
 
 class MessageDecoder:
-    """Reads measured states and references of one robot from serialised messages.
+    """Reads measured states and references for one robot from serialised messages.
 
     It is the :class:`~spacerobot_ros.commanding.host.StateDecoder` of the nodes.
 
     Parameters
     ----------
     joint_names
-        Joints of the robot, in its order.
+        Joints of the robot, in the robot's order.
     followers
-        Names of joints that mimic others.
+        Names of mimic joints.
     """
 
     def __init__(self, joint_names: Sequence[str], followers: Collection[str] = ()) -> None:
         quantities: list[Quantity] = ["position", "velocity"]
         self._joints = JointReader(joint_names, quantities, measured=True, followers=followers)
         self.ignored, self.joined = self._joints.ignored, self._joints.joined
-        """Ignored parts of joint states, and the function that merges joint states."""
+        """Ignored parts of joint states, and a function that merges joint states."""
         self._references = JointReader(joint_names, ["position", "velocity"])
         spans = {_POSE_PATH: 7, _TWIST_PATH: 6}
         self._odom = TemplateReader(ODOMETRY, spans)
@@ -472,36 +473,36 @@ class MessageDecoder:
 
     @property
     def incomplete(self) -> str:
-        """Clause about joints that are still missing in joint states."""
+        """Clause describing the joints still missing in joint states."""
         return self._joints.incomplete
 
     def decode_base(self, odom: bytes) -> tuple[Array, Array]:
-        """Return pose (7,) and twist (6,) of an Odometry."""
+        """Return the pose (7,) and twist (6,) in an Odometry message."""
         self._odom.accept(odom)
         return self._odom.floats(_POSE_PATH), self._odom.floats(_TWIST_PATH)
 
     def target(self, odom: bytes) -> tuple[Array, Array]:
-        """Return pose (7,) and twist (6,) of an Odometry of the target."""
+        """Return the pose (7,) and twist (6,) in a target Odometry message."""
         self._target.accept(odom)
         return self._target.floats(_POSE_PATH), self._target.floats(_TWIST_PATH)
 
     def joint_reference(self, message: bytes) -> tuple[Array, Array]:
-        """Return positions and rates (n,) of a JointState; a quantity that it lacks is 0."""
+        """Return the positions and rates (n,) in a JointState; missing quantities are 0."""
         self._references.accept(message)
         return self._references.values["position"], self._references.values["velocity"]
 
 
 class CommandReader:
-    """Reads the messages of one source and offers them to the validator.
+    """Reads messages from one source and passes them to the validator.
 
     Parameters
     ----------
     source
-        Topic and kind of the commands.
+        Command topic and type.
     robot
         The model.
     frame_prefix
-        Prefix that the name of the base link may have in commands.
+        Prefix that the base link name may have in commands.
     """
 
     def __init__(self, source: CommandSource, robot: SpaceRobot, frame_prefix: str = "") -> None:
@@ -515,7 +516,7 @@ class CommandReader:
             self._values = self._reader.values[source.quantity]
 
     def offer(self, commands: CommandValidator, raw: bytes, now_ns: int) -> Refusal | None:
-        """Offer a command message to the validator; return the refusal, None if accepted."""
+        """Pass a command message to the validator; return the refusal, None if accepted."""
         try:
             stamp_ns, command = self.read(raw)
         except UnreadableError as error:
@@ -523,7 +524,7 @@ class CommandReader:
         return commands.accept_or_refuse(self.source, stamp_ns, command, now_ns)
 
     def read(self, raw: bytes) -> tuple[int, Array | CommandError]:
-        """Return the stamp of a message, ns, and its values, or the reason why they are malformed.
+        """Return a message's stamp, ns, and its values, or the reason why it is malformed.
 
         The values are overwritten by the next message. Raises UnreadableError for bytes that are
         not a message of the type.
@@ -537,9 +538,9 @@ class CommandReader:
 
 
 def actuation_of(message: Any) -> str:
-    """Return what a JointState commands, ``velocity`` or ``effort``; empty: joints at rest.
+    """Return the command type of a JointState, ``velocity`` or ``effort``; empty: joints at rest.
 
-    Nodes of this package fill both arrays, one of them with zeros.
+    The nodes in this package fill both arrays, one of them with zeros.
     """
     moves, pushes = any(message.velocity), any(message.effort)
     if moves == pushes:

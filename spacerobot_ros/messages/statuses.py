@@ -1,4 +1,4 @@
-"""Statuses and events as messages: diagnostic_msgs/DiagnosticStatus from and to plain values."""
+"""Conversion of statuses and events between diagnostic_msgs/DiagnosticStatus and plain values."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ STATUS = "diagnostic_msgs/msg/DiagnosticStatus"
 
 @dataclass(frozen=True)
 class StatusRecord:
-    """The content of a DiagnosticStatus.
+    """Content of a DiagnosticStatus.
 
     Attributes
     ----------
     name
-        Name of the node, or of a part of the node.
+        Name of the node or of a component of it.
     level
         0 OK, 1 WARN, 2 ERROR, 3 STALE.
     message
         One sentence for the user.
     values
-        Values as texts by key.
+        Values as strings by key.
     hardware_id
         Name of the robot or bag, or role of the node.
     """
@@ -38,7 +38,7 @@ class StatusRecord:
 
     @property
     def fields(self) -> dict[str, Any]:
-        """The fields of the message by their names."""
+        """Message fields by name."""
         return {
             "level": self.level,
             "name": self.name,
@@ -53,14 +53,14 @@ class StatusRecord:
 
 
 def key_values(pairs: Iterable[Any]) -> dict[str, str]:
-    """Return diagnostic_msgs/KeyValue messages as a dictionary of printable texts."""
+    """Return diagnostic_msgs/KeyValue messages as a dictionary of printable strings."""
     return {printable(pair.key): printable(pair.value) for pair in pairs}
 
 
 def read_status(message: Any) -> StatusRecord:
-    """Return the content of a received or recorded DiagnosticStatus, printable.
+    """Return the printable content of a received or recorded DiagnosticStatus.
 
-    If several pairs have one key, the last one takes precedence.
+    If several pairs have the same key, the last one takes precedence.
     """
     level = message.level if isinstance(message.level, int) else message.level[0]
     return StatusRecord(

@@ -69,7 +69,7 @@ NOT_A_NUMBER[1, 2, 0] = np.nan
          "The instants (0, 5, 5) are not ascending ticks of a flight of 10."),
         (STILL, {"report_ticks": (-1, 5)},
          "The instants (-1, 5) are not ascending ticks of a flight of 10."),
-        (STILL, {"sensors": range(3)}, "There are sensors of 3 flights, not 2."),
+        (STILL, {"sensors": range(3)}, "There are sensors for 3 flights, not 2."),
         (FollowedSchedule(np.zeros((5, 3))), {"actuation": "effort"},
          "A schedule needs velocity actuation."),
         (FollowedSchedule(np.zeros((5, 2))), {}, "The positions are (5, 2), not (ticks, 3)."),
@@ -516,7 +516,7 @@ def test_bad_values_are_refused_and_change_nothing(three: SteppedFlights) -> Non
     refusals: list[tuple[Any, type[Exception], str]] = [
         (lambda: three.step(zero[:2]), ParameterError, r"The commands are \(2, 9\), not \(3, 9\)"),
         (lambda: three.step(zero, 0), ParameterError, "A step of 0 ticks is too short"),
-        (lambda: three.step(bad), CommandError, "The command of flight 2 is not finite"),
+        (lambda: three.step(bad), CommandError, "The command for flight 2 is not finite"),
         (lambda: three.reset([0, 1], one), ParameterError, "2 flights are reset to 1 starts"),
         (
             lambda: three.reset([0], one, drawn_masses(robot, 2, np.random.default_rng(1))),

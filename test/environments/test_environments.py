@@ -274,9 +274,7 @@ def test_draws_that_are_refused_are_left_out_with_one_warning(
         observations, _ = vector.reset(seed=seed)
         np.testing.assert_array_equal(observations[0], single.reset(seed=seed)[0])
     (record,) = [each for each in caplog.records if "is omitted" in each.message]
-    assert re.search(
-        f"Draw .* of the campaign is omitted, as are other .*{refusal}", record.message
-    )
+    assert re.search(f"Campaign draw .* is omitted, as are other .*{refusal}", record.message)
     made = vector.episodes._source._made.values()
     assert sum(isinstance(each, str) for each in made) > 3
     assert sum(not isinstance(each, str) for each in made) > 3
@@ -286,7 +284,7 @@ def test_a_campaign_whose_draws_are_all_refused_says_so(tmp_path: Path) -> None:
     file = tmp_path / "draws.yaml"
     file.write_text(SLIDING.format("initial.joints.slider_1: {uniform: [3.0, 4.0]}"))
     environment = gymnasium.make(ARM, campaign=str(file))
-    with pytest.raises(ParameterError, match="100 successive draws of the campaign are refused"):
+    with pytest.raises(ParameterError, match="100 successive campaign draws are refused"):
         environment.reset(seed=1)
 
 
@@ -383,18 +381,18 @@ def test_bad_actions_goals_and_masks_are_refused() -> None:
         with pytest.raises(ParameterError, match=r"The goal .* is not a list of numbers\."):
             vector.reset(options={"goal": given})
     for options, message in (
-        ({"gaol": [0, 0, 0, 1]}, "A reset has no option 'gaol'; it has goal, start, "),
-        ({"start": [{}]}, r"The start is \[{}\]: give a dictionary, or a list of 2 of them"),
+        ({"gaol": [0, 0, 0, 1]}, "A reset has no option 'gaol'; its options are goal, start "),
+        ({"start": [{}]}, r"The start is \[{}\]: pass a dictionary, or a list of 2 dictionaries"),
         ({"start": {"q": [0, 0]}}, "A start has no 'q'; it has position, quaternion, "),
         ({"start": {"position": [0, 0]}}, r"The start's position is \[0, 0\]; it must be 3 finite"),
-        ("goal", "The options of a reset are 'goal': give a dictionary"),
+        ("goal", "The reset options are 'goal': pass a dictionary"),
     ):
         with pytest.raises(ParameterError, match=message):
             vector.reset(options=options)
     for count in (0, 1.5, "2"):
         with pytest.raises(ParameterError, match=f"number of environments is {count!r}"):
             gymnasium.make_vec(ARM, num_envs=count, scenario="planar_chain")
-    with pytest.raises(ParameterError, match="a quaternion of zeros"):
+    with pytest.raises(ParameterError, match="The goal quaternion is zero"):
         vector.reset(options={"goal": [0, 0, 0, 0]})
     for mask in (np.zeros(2, dtype=bool), np.ones(3, dtype=bool), np.ones(2)):
         with pytest.raises(ValueError, match="must be 2 booleans, at least one true"):
@@ -632,7 +630,7 @@ def test_a_base_that_no_joint_turns_is_turned_by_torques_alone() -> None:
     hull = """<robot name="hull"><link name="hull"><inertial><mass value="20"/>
       <inertia ixx="1.5" iyy="2" izz="2.5" ixy="0" ixz="0" iyz="0"/></inertial></link></robot>"""
     robot, given = SpaceRobot(parse_robot(hull)), states(0)
-    with pytest.raises(ParameterError, match=r"cannot rotate its base .* give 'max_torque'"):
+    with pytest.raises(ParameterError, match=r"cannot rotate its base .* set 'max_torque'"):
         Reorient(robot, pushed=(True, False)).random_goal(given, 0.3, np.random.default_rng(6))
     task, rng = Reorient(robot, pushed=(False, True)), np.random.default_rng(6)
     start = Rotation.from_quat(given.pose[0, 3:])

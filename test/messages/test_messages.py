@@ -370,14 +370,14 @@ def refused(text: str, name: str = NAME) -> str:
 
 @pytest.mark.parametrize("name", ["a/B", "a/msg/1B", "a/msg/B/C", "1a/msg/B", "a/foo/B"])
 def test_types_have_names_of_three_parts(name: str) -> None:
-    assert refused("int32 x\n", name) == "a type is called 'package/msg/Type'"
+    assert refused("int32 x\n", name) == "a type is named 'package/msg/Type'"
 
 
 def test_texts_of_types_are_limited() -> None:
     line = "int32 x\n"
     full = line + "#" * (262_144 - len(line))
     assert MessageType(NAME, full.encode())
-    long = "its text is longer than 262144 bytes or 5000 lines, which no message needs"
+    long = "its text is longer than 262144 bytes or 5000 lines, more than any message needs"
     assert refused(full + "#") == long
     lines = line + "\n" * 4_999
     assert MessageType(NAME, lines.encode())
@@ -474,7 +474,7 @@ def test_what_a_measured_state_says_beyond_the_robot_is_counted_with_its_reason(
     assert (decoder.q.tolist(), decoder.qdot.tolist()) == ([4, 3], [0.5, 0.0])
     assert decoder.ignored == {
         "joint 'camera_pan' is unknown": 1,
-        "joint 'finger2' follows another": 1,
+        "joint 'finger2' is a mimic joint": 1,
         "velocities are not finite": 1,
     }
     # Drivers of two machines send a message each.
