@@ -1,1 +1,2 @@
-"""Campaigns: one scenario flown many times with different masses, sensors, starts and goals."""
+"""Campaigns: one scenario flown many times with different masses, sensors, start states and
+goals."""

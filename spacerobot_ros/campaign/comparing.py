@@ -1,4 +1,4 @@
-"""Comparison of two campaigns with the same draws: paired differences with intervals."""
+"""Comparison of two campaigns with the same draws: paired differences with confidence intervals."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def require_same_draws(first: Campaign, second: Campaign) -> None:
     Raises
     ------
     ParameterError
-        Seed, sampler, number of flights or a dispersion differs.
+        The seeds, samplers, numbers of flights or dispersions differ.
     """
     sentence = f"The campaigns '{first.name}' and '{second.name}' do not have the same draws: "
     for key in ("seed", "sampler", "flights"):
@@ -50,12 +50,13 @@ def require_same_draws(first: Campaign, second: Campaign) -> None:
 
 
 def write_comparison(folders: tuple[Path, Path], path: Path) -> list[str]:
-    """Write the report of two datasets with the same draws; return lines for the terminal.
+    """Write a comparison report of two datasets with the same draws; return the terminal output
+    lines.
 
     Raises
     ------
     ParameterError
-        A folder holds no flights, or their draws differ.
+        A folder contains no flights, or the draws differ.
     SpaceRobotError
         The file cannot be written.
     """
@@ -66,8 +67,8 @@ def write_comparison(folders: tuple[Path, Path], path: Path) -> list[str]:
     rows_b = np.searchsorted(second.flight_numbers, common)
     if not common.size:
         raise ParameterError(
-            f"'{first.campaign.name}' and '{second.campaign.name}' have flown no draw in common: "
-            "fly more flights of one of them."
+            f"'{first.campaign.name}' and '{second.campaign.name}' share no flown draws: fly more "
+            "flights of one of them."
         )
     # Metrics required by one campaign only are compared too, if both have them.
     names = list(dict.fromkeys([*first.shown_metrics, *second.shown_metrics]))
@@ -128,7 +129,7 @@ def _notes_on_failures(first: Results, second: Results) -> list[str]:
             share = f"{count} of {len(each)} flights"
             notes.append(f"Of {each.campaign.name}, {share} have the outcome {outcome}: {message}")
     if first.refused.any() or second.refused.any():
-        notes.append("Differences exclude draws whose goal one of the campaigns refused.")
+        notes.append("Differences exclude draws whose goal was refused in one of the campaigns.")
     return notes
 
 

@@ -1,4 +1,4 @@
-"""The file of a campaign: scenario, number of flights, dispersions and criteria."""
+"""Campaign file: scenario, number of flights, dispersions and criteria."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from spacerobot_ros.resources import suggestion
 from spacerobot_ros.scenario import CONFIGS, Scenario, scenario_or_robot
 
 SAMPLERS = ("random", "latin_hypercube", "sobol", "halton", "saltelli")
-"""Names of samplers; saltelli, for sensitivity indices, is from SALib, the others from scipy."""
+"""Sampler names; saltelli (for sensitivity indices) is from SALib, the others are from scipy."""
 
 FIXED_SIZE_SAMPLERS = ("latin_hypercube", "saltelli")
 """Samplers whose draws depend on the number of flights."""
@@ -41,12 +41,12 @@ _CAMPAIGN_KEYS = (
 )
 _MAX_FLIGHTS = 10_000_000
 ENGINES = ("auto", "lanes", "flights")
-"""Names of the engines that may fly a campaign."""
+"""Names of engines that can fly a campaign."""
 
 
 @dataclass(frozen=True)
 class Criterion:
-    """Permitted range of a metric, from ``minimum`` to ``maximum``."""
+    """Permitted metric range, from ``minimum`` to ``maximum``."""
 
     metric: str
     minimum: float = -math.inf
@@ -68,9 +68,9 @@ class Campaign:
     name
         Name of its file.
     scenario
-        Scenario with the parameters common to all flights.
+        Scenario, including the parameters common to all flights.
     flights, seed, sampler
-        Number of draws, their seed, and their sampler.
+        Number of draws, seed and sampler.
     max_flight_time
         Simulated time after which a flight is interrupted, s.
     dispersions
@@ -78,11 +78,11 @@ class Campaign:
     criteria
         Requirements on metrics, in addition to reaching the goal.
     metrics
-        Names of metrics that are measured and reported in addition to those of the criteria.
+        Names of metrics that are reported in addition to those in the criteria.
     engine
         Name of the engine: ``auto``, ``lanes`` or ``flights``.
     description
-        Text for the reader of the report.
+        Description for readers of the report.
     section
         Content of the file.
     """
@@ -102,7 +102,7 @@ class Campaign:
 
     @cached_property
     def names(self) -> tuple[str, ...]:
-        """Names of the drawn quantities, in the order of the columns."""
+        """Names of the drawn quantities, in column order."""
         return tuple(dispersion.name for dispersion in self.dispersions)
 
     @property
@@ -115,7 +115,7 @@ class Campaign:
 
     @property
     def description_lines(self) -> list[str]:
-        """Lines for the terminal: ranges of the drawn numbers, grouped by range."""
+        """Terminal output lines: ranges of drawn values, grouped by range."""
         together: dict[str, list[str]] = {}
         for each in self.dispersions:
             if not each.distribution.choices:
@@ -130,12 +130,12 @@ class Campaign:
 
     @property
     def named_metrics(self) -> list[str]:
-        """Metrics that a criterion or ``metrics`` names."""
+        """Metrics named by a criterion or in ``metrics``."""
         return list(dict.fromkeys([*(each.metric for each in self.criteria), *self.metrics]))
 
     @property
     def own_metrics(self) -> list[str]:
-        """Named metrics that users have defined."""
+        """User-defined metrics that are named."""
         return [name for name in self.named_metrics if name in OWN_METRICS]
 
     @property
@@ -154,19 +154,19 @@ class _UniqueKeyLoader(yaml.SafeLoader):
                 continue  # An unhashable key is refused elsewhere with its own message.
             if key.value in known:
                 raise yaml.constructor.ConstructorError(
-                    None, None, f"the key '{key.value}' occurs twice", key.start_mark
+                    None, None, f"the key '{key.value}' appears twice", key.start_mark
                 )
             known.add(key.value)
         return super().construct_mapping(node, deep)
 
 
 def load_campaign(path: Path, flights: int | None = None) -> Campaign:
-    """Read the file of a campaign; ``flights`` replaces its number of flights.
+    """Read a campaign file; ``flights`` overrides its number of flights.
 
     Raises
     ------
     ParameterError
-        The file cannot be read, or a value in it is invalid; the message names the place.
+        The file cannot be read, or contains an invalid value; the message states where.
     """
     try:
         content = load_yaml(read_regular(path).decode("utf-8"), _UniqueKeyLoader)
@@ -188,7 +188,7 @@ def load_campaign(path: Path, flights: int | None = None) -> Campaign:
 def parse_campaign(
     name: str, section: Mapping[str, Any], folder: Path = Path(), scenario: Scenario | None = None
 ) -> Campaign:
-    """Return the campaign described by the content of a file.
+    """Return the campaign described by a file's content.
 
     Parameters
     ----------
@@ -197,9 +197,9 @@ def parse_campaign(
     section
         Content of ``campaign:``.
     folder
-        Folder in which the scenario's file is searched.
+        Folder in which the scenario file is searched for.
     scenario
-        Scenario with the parameters under ``set``; None: the scenario that the section names.
+        Scenario, including the parameters under ``set``; None: the scenario named in the section.
 
     Raises
     ------
@@ -217,18 +217,18 @@ def parse_campaign(
         rows, drawn = len(columns[0].distribution.choices), [*columns, *drawn]
     flights = _read_whole_number(section, "flights", rows or 100, 1, _MAX_FLIGHTS)
     if rows is not None and flights > rows:
-        raise ParameterError(f"'flights' is {flights}, but the table has rows for only {rows}.")
+        raise ParameterError(f"'flights' is {flights}, but the table has only {rows} rows.")
     sampler = str(section.get("sampler", "random"))
     engine = str(section.get("engine", "auto"))
     _require_known("sampler", sampler, SAMPLERS)
     _require_known("engine", engine, ENGINES)
     dispersions = checked_dispersions(drawn)
     if sampler == "saltelli" and not dispersions:
-        raise ParameterError("the sampler 'saltelli' needs at least one dispersion.")
+        raise ParameterError("the sampler 'saltelli' requires at least one dispersion.")
     if sampler == "saltelli" and not all(each.is_independent for each in dispersions):
         raise ParameterError(
-            "the sampler 'saltelli' requires independent values: use another one with a table or "
-            "multivariate_normal."
+            "the sampler 'saltelli' requires independent values: use another sampler with a table "
+            "or multivariate_normal."
         )
     return Campaign(
         name=name,
@@ -257,7 +257,7 @@ def _require_known(kind: str, name: Any, known: Sequence[str]) -> None:
 def _read_scenario(section: Mapping[str, Any], folder: Path) -> Scenario:
     given = section.get("scenario")
     if not isinstance(given, str):
-        raise ParameterError("'scenario' must be the name or the file of a scenario.")
+        raise ParameterError("'scenario' must be a scenario name or file.")
     beside = folder / given
     scenario = scenario_or_robot(str(beside) if beside.is_file() else given)
     return scenario_of_section(scenario, section)
@@ -269,15 +269,15 @@ def scenario_of_section(scenario: Scenario, section: Mapping[str, Any]) -> Scena
     Raises
     ------
     ParameterError
-        The scenario has no goal, a parameter is invalid, or campaigns do not support the scenario.
+        The scenario has no goal or is not supported by campaigns, or a parameter is invalid.
     """
     scenario.require_goal()
     for key, value in _read_mapping(section, "set").items():
         node, _, parameter = str(key).partition(".")
         if node not in CONFIGS or not parameter:
             raise ParameterError(
-                f"'{key}' under 'set' is not a parameter: write NODE.PARAMETER with one of the "
-                f"nodes {', '.join(CONFIGS)}."
+                f"'{key}' under 'set' is not a parameter: write NODE.PARAMETER, where NODE is one "
+                f"of {', '.join(CONFIGS)}."
             )
         scenario = scenario.with_overrides(node, {parameter: value})
     if "method" in section:
@@ -285,7 +285,7 @@ def scenario_of_section(scenario: Scenario, section: Mapping[str, Any]) -> Scena
     for node in ("plant", *scenario.commanders):
         scenario.config(node)  # Invalid parameters are refused before the first flight.
     if not scenario.lockstep:
-        raise ParameterError("campaigns run in lockstep: leave plant.time_mode out.")
+        raise ParameterError("campaigns run in lockstep: omit plant.time_mode.")
     return scenario
 
 
@@ -293,7 +293,7 @@ def _read_mapping(section: Mapping[str, Any], key: str) -> Mapping[str, Any]:
     value = section.get(key)
     value = {} if value is None else value
     if not isinstance(value, dict):
-        raise ParameterError(f"'{key}' must contain names with values.")
+        raise ParameterError(f"'{key}' must map names to values.")
     return value
 
 
@@ -316,7 +316,7 @@ def _read_criteria(section: Mapping[str, Any], scenario: Scenario) -> tuple[Crit
     for name, given in section.items():
         _require_metric(str(name), scenario)
         if not isinstance(given, dict) or not given or set(given) - {"min", "max"}:
-            raise ParameterError(f"the criterion of '{name}' must have 'min' or 'max', or both.")
+            raise ParameterError(f"the criterion of '{name}' must have 'min', 'max' or both.")
         least = read_real_number(f"{name}: min", given["min"]) if "min" in given else -math.inf
         most = read_real_number(f"{name}: max", given["max"]) if "max" in given else math.inf
         if least > most:
@@ -346,7 +346,7 @@ def _require_metric(name: str, scenario: Scenario) -> None:
 def passes_criteria(
     criteria: Sequence[Criterion], outcome: str, metrics: Mapping[str, float]
 ) -> bool:
-    """Return whether a flight has reached its goal and met every criterion."""
+    """Return whether a flight reached its goal and met every criterion."""
     return outcome == "reached" and all(
         meets_criterion(criterion, metrics) for criterion in criteria
     )

@@ -1,4 +1,4 @@
-"""Dataset of a campaign: its files, and a Parquet row for each finished flight."""
+"""Campaign dataset: its files, and a Parquet row for each finished flight."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from spacerobot_ros.simulation.capture import load_target, target_parameters
 from spacerobot_ros.version import __version__, source_hash
 
 DRAW_PREFIX = "draw."
-"""Prefix of the columns of drawn quantities."""
+"""Prefix of columns of drawn quantities."""
 
 _ABOUT_FILE, _CAMPAIGN_FILE, _SCENARIO_FILE = "about.json", "campaign.yaml", "scenario.yaml"
 _FLIGHTS_FOLDER = "flights"
@@ -43,7 +43,7 @@ _FLUSH_PERIOD, _FLUSH_ROWS = 5.0, 2000
 
 @lru_cache(maxsize=1)
 def versions_json() -> str:
-    """Return the software versions, with the hash of this package's code."""
+    """Return the software versions, including the hash of this package's code."""
     return json.dumps(
         {
             "spacerobot_ros": __version__,
@@ -55,7 +55,7 @@ def versions_json() -> str:
 
 
 class Dataset:
-    """The folder of a campaign.
+    """A campaign folder.
 
     ``campaign.yaml`` and ``scenario.yaml`` describe the flights; ``flights/*.parquet`` contain one
     row per flight.
@@ -73,17 +73,18 @@ class Dataset:
         self._schema: Any = None
         self._part = 0
         self._descriptor = -1
-        """Descriptor of the folder, locked while this process writes into it."""
+        """Folder descriptor, locked while this process writes to the folder."""
 
     # -- description --------------------------------------------------------------------------
 
     def begin(self, campaign: Campaign) -> set[int]:
-        """Create or resume the folder; return the numbers of its flights.
+        """Create or resume the folder; return the numbers of the flights in it.
 
         Raises
         ------
         ParameterError
-            The folder holds another campaign, another process writes into it, or a file is damaged.
+            The folder contains another campaign, another process is writing to it, or a file is
+            damaged.
         RecordingError
             The folder cannot be written.
         SpaceRobotError
@@ -125,15 +126,15 @@ class Dataset:
         difference = " and ".join(f"another '{key}'" for key in differing)
         difference = difference or "another scenario or other parameters"
         raise ParameterError(
-            f"The folder {self.folder} holds another campaign: '{facts['name']}', with "
-            f"{difference}. Name another folder, or remove it."
+            f"The folder {self.folder} contains another campaign: '{facts['name']}', with "
+            f"{difference}. Use another folder, or remove this one."
         )
 
     def _name_other_software(self) -> None:
         flown_by = json.loads((self.folder / _ABOUT_FILE).read_text("utf-8")).get("versions", "")
         if flown_by != versions_json():
             warn_once(
-                f"The flights in {self.folder} were flown with other software ({flown_by}): "
+                f"The flights in {self.folder} were flown with different software ({flown_by}): "
                 "further flights may differ."
             )
 
@@ -141,12 +142,12 @@ class Dataset:
         if not self.folder.exists():
             return
         if not self.folder.is_dir():
-            raise ParameterError(f"{self.folder} is a file: name a folder for the campaign.")
+            raise ParameterError(f"{self.folder} is a file: specify a folder for the campaign.")
         own = {_FLIGHTS_FOLDER, _CAMPAIGN_FILE, _SCENARIO_FILE}
         others = [path for path in self.folder.iterdir() if path.name.lstrip(".") not in own]
         if others or self._row_files():
             raise ParameterError(
-                f"The folder {self.folder} is not empty and holds no campaign: use another one."
+                f"The folder {self.folder} is not empty and contains no campaign: use another one."
             )
 
     def _write_description(self, campaign: Campaign, flights: int) -> None:
@@ -181,12 +182,12 @@ class Dataset:
         except OSError:
             os.close(descriptor)
             raise ParameterError(
-                f"Another process flies the campaign in {self.folder} now."
+                f"Another process is flying the campaign in {self.folder}."
             ) from None
         self._descriptor = descriptor
 
     def close(self) -> None:
-        """Write the remaining rows, and unlock the folder for other processes."""
+        """Write the remaining rows, and unlock the folder."""
         try:
             self.flush()
         finally:
@@ -195,12 +196,12 @@ class Dataset:
                 self._descriptor = -1
 
     def campaign(self) -> Campaign:
-        """Return the campaign of the folder.
+        """Return the campaign in the folder.
 
         Raises
         ------
         ParameterError
-            The folder holds no campaign.
+            The folder contains no campaign.
         """
         facts = self._read_identity()
         try:
@@ -224,7 +225,7 @@ class Dataset:
         except OSError as error:
             reason = error.strerror or error
             raise ParameterError(
-                f"The folder {self.folder} holds no campaign: {path.name}: {reason}."
+                f"The folder {self.folder} contains no campaign: {path.name}: {reason}."
             ) from error
         except (ValueError, TypeError, KeyError) as error:
             raise _damaged_file_error(path, error) from error
@@ -239,14 +240,14 @@ class Dataset:
         return found
 
     def add(self, rows: Iterable[Row]) -> None:
-        """Add rows; they are written after a few seconds, or with :meth:`flush`."""
+        """Add rows; they are written after a few seconds, or by :meth:`flush`."""
         self._rows += rows
         late = time.monotonic() - self._written > _FLUSH_PERIOD
         if self._rows and (late or len(self._rows) >= _FLUSH_ROWS):
             self.flush()
 
     def flush(self) -> None:
-        """Write the added rows atomically into a new file.
+        """Write the added rows atomically to a new file.
 
         Raises
         ------
@@ -269,15 +270,15 @@ class Dataset:
         except OSError as error:
             raise RecordingError(
                 f"The last {len(self._rows)} flights cannot be written to {path}: {reason(error)}. "
-                "The same command continues from the earlier flights."
+                "Repeat the command to continue from the earlier flights."
             ) from error
         self._rows.clear()
 
     def table(self, columns: Sequence[str] | None = None) -> Any:
-        """Return the rows as a pyarrow table, ordered by flight number, one row per flight.
+        """Return the rows as a pyarrow table, one row per flight, ordered by flight number.
 
-        If rows repeat a flight because a file was copied into the folder, the first row is used,
-        with a warning. Only ``columns`` are read; columns that no file has are omitted.
+        If a flight has several rows because a file was copied into the folder, the first row is
+        used, with a warning. Only ``columns`` are read; columns that are in no file are omitted.
 
         Raises
         ------
@@ -294,8 +295,8 @@ class Dataset:
         _, first = np.unique(table["flight"].to_numpy(), return_index=True)
         if repeated := len(table) - len(first):
             warn_once(
-                f"{repeated} of the rows in {self.folder} repeat a flight: the first row of each "
-                "flight is used. Remove files that were copied there."
+                f"{repeated} rows in {self.folder} are duplicates: the first row of each flight "
+                "is used. Remove any files that were copied there."
             )
         table = table.take(first)
         return (
@@ -318,7 +319,7 @@ def _read_row_file(part: Path, columns: Collection[str] | None = None) -> Any:
     except (OSError, arrow.ArrowException) as error:
         reason = str(error).splitlines()[0].rstrip(".")
         raise ParameterError(
-            f"The file {part} is damaged ({reason}): remove it, and its flights are flown again."
+            f"The file {part} is damaged ({reason}): remove it to fly its flights again."
         ) from error
 
 
@@ -388,10 +389,11 @@ def _settings_of_draws(campaign: Campaign) -> dict[str, Any]:
 
 
 def self_contained(campaign: Campaign) -> Campaign:
-    """Return the campaign with the texts of its robots instead of files, for use on other machines.
+    """Return the campaign with robot descriptions embedded instead of files, for use on other
+    machines.
 
-    Texts are canonical XML: files that differ only in layout, comments or attribute order are the
-    same robot.
+    Descriptions are canonical XML: files that differ only in layout, comments or attribute order
+    describe the same robot.
     """
     scenario = campaign.scenario
     for node in ("plant", *scenario.commanders):

@@ -1,4 +1,4 @@
-"""Distributions of drawn values: from scipy, choices, covariances, and rows of a table."""
+"""Distributions of drawn values: from scipy, choices, covariances, and table rows."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _TABLE, _CORRELATED = "table", "multivariate_normal"
 
 @dataclass(frozen=True)
 class Distribution:
-    """Probability distribution of a value: from scipy.stats, a choice, or the rows of a table.
+    """Probability distribution of a value: from scipy.stats, a choice, or table rows.
 
     Attributes
     ----------
@@ -32,7 +32,7 @@ class Distribution:
     arguments
         Arguments by name, as in ``scipy.stats``.
     choices
-        Equally likely values of a ``choice``, or the values of a ``table`` flight by flight.
+        Equally likely values of a ``choice``, or the values in a ``table``, one per flight.
     """
 
     name: str
@@ -40,14 +40,15 @@ class Distribution:
     choices: tuple[Any, ...] = ()
 
     def values(self, flights: Sequence[int], shares: Array) -> list[Any]:
-        """Return the values (N,) of flights by their numbers and cumulative probabilities (N,)."""
+        """Return the values (N,) for flights with given numbers and cumulative probabilities
+        (N,)."""
         if self.name == _TABLE:
             # Draws are made in blocks, whose last one reaches beyond the table.
             return [self.choices[flight % len(self.choices)] for flight in flights]
         return self.quantiles(shares)
 
     def quantiles(self, shares: Array) -> list[Any]:
-        """Return the quantiles (N,) of cumulative probabilities (N,), 0 to 1."""
+        """Return the quantiles (N,) for cumulative probabilities (N,), 0 to 1."""
         if self.choices:
             last = len(self.choices) - 1
             return [self.choices[min(int(u * (last + 1)), last)] for u in shares.tolist()]
@@ -69,10 +70,10 @@ class Distribution:
 
 @dataclass(frozen=True)
 class Dispersion:
-    """A quantity that varies from flight to flight, and its distribution.
+    """A quantity that varies between flights, and its distribution.
 
-    For a correlated quantity, ``weights`` are the weights of independent standard normals, by name
-    of their dispersion; the weighted sum is its standard normal. Empty: the quantity is
+    For a correlated quantity, ``weights`` are the weights of independent standard normals, by
+    dispersion name; the weighted sum is the quantity's standard normal. Empty: the quantity is
     independent.
     """
 
@@ -140,7 +141,7 @@ def _read_correlated(
     if not isinstance(given, dict) or set(given) - {"mean", "cov"} or "cov" not in given:
         raise ParameterError(f"'{names}': {_CORRELATED} must have 'cov' and may have 'mean'.")
     if any(target.is_text for target in targets):
-        raise ParameterError(f"'{names}' has a text: {_CORRELATED} takes numbers only.")
+        raise ParameterError(f"'{names}' includes a string: {_CORRELATED} accepts only numbers.")
     count = len(targets)
     try:
         mean = np.array(given.get("mean", np.zeros(count)), dtype=float)
@@ -155,7 +156,7 @@ def _read_correlated(
             raise ValueError("cov must be symmetric")
     except (TypeError, ValueError) as error:
         raise ParameterError(
-            f"'{names}': {_CORRELATED} of {count} values is refused: {str(error).rstrip('.')}."
+            f"'{names}': {_CORRELATED} of {count} values is invalid: {str(error).rstrip('.')}."
         ) from error
     values, vectors = np.linalg.eigh(covariance / np.outer(spread, spread))
     factor = vectors * np.sqrt(np.clip(values, 0.0, None))
@@ -166,7 +167,7 @@ def _read_correlated(
 
 
 def read_table_text(given: Any, folder: Path) -> str:
-    """Return the CSV text of a table, from a file or from the campaign's file itself.
+    """Return the CSV content of a table, from a file or from the campaign file itself.
 
     Raises
     ------
@@ -174,7 +175,7 @@ def read_table_text(given: Any, folder: Path) -> str:
         The file cannot be read.
     """
     if not isinstance(given, str):
-        raise ParameterError("'table' must be the name of a CSV file, or its lines.")
+        raise ParameterError("'table' must be the name or the content of a CSV file.")
     if "\n" in given:
         return given
     try:
@@ -193,11 +194,11 @@ def read_table(text: str, scenario: Scenario) -> list[Dispersion]:
     """
     names, *rows = [row for row in csv.reader(text.splitlines(), skipinitialspace=True) if row]
     if not rows:
-        raise ParameterError("the table needs one line of names and one line per flight.")
+        raise ParameterError("the table must have one line of names and one line per flight.")
     for number, row in enumerate(rows, 1):
         if len(row) != len(names):
             raise ParameterError(
-                f"row {number} of the table has {len(row)} values for {len(names)} names."
+                f"table row {number} has {len(row)} values for {len(names)} names."
             )
     found = []
     for name, column in zip(names, zip(*rows, strict=True), strict=True):
@@ -217,7 +218,7 @@ def checked_dispersions(drawn: Sequence[Dispersion]) -> tuple[Dispersion, ...]:
     Raises
     ------
     ParameterError
-        Two dispersions set the same number.
+        Two dispersions set the same value.
     """
     found: dict[str, Dispersion] = {}
     for each in drawn:
@@ -226,7 +227,7 @@ def checked_dispersions(drawn: Sequence[Dispersion]) -> tuple[Dispersion, ...]:
         for other in found.values():
             if other.target.assigned_parameters & each.target.assigned_parameters:
                 raise ParameterError(
-                    f"'{other.name}' and '{each.name}' set the same numbers: leave one out."
+                    f"'{other.name}' and '{each.name}' set the same values: omit one of them."
                 )
         found[each.name] = each
     return tuple(sorted(found.values(), key=lambda each: each.target.order))
@@ -235,8 +236,8 @@ def checked_dispersions(drawn: Sequence[Dispersion]) -> tuple[Dispersion, ...]:
 _SCIPY_NAMES = {"normal": "norm", "gauss": "norm", "gaussian": "norm", "exponential": "expon"}
 
 _ARGUMENT_HELP = {
-    "norm": "loc is its mean and scale its standard deviation",
-    "uniform": "loc is its smallest value and scale its width; [a, b] is from a to b",
+    "norm": "loc is the mean and scale the standard deviation",
+    "uniform": "loc is the smallest value and scale the width; [a, b] is from a to b",
 }
 
 
@@ -252,18 +253,18 @@ def _read_distribution(target: DispersionTarget, given: Any) -> Distribution:
             raise ParameterError(f"'{name}' must have a list of values to choose from.")
         return Distribution("choice", {}, tuple(_read_choice(target, each) for each in arguments))
     if target.is_text:
-        raise ParameterError(f"'{name}' is a text: it must have a 'choice' of texts.")
+        raise ParameterError(f"'{name}' is a string: it must have a 'choice' of strings.")
     distribution = _load_scipy_distribution(str(kind))
     shapes = (distribution.shapes or "").replace(" ", "").split(",")
     words = [*filter(None, shapes), "loc", *(["scale"] if hasattr(distribution, "pdf") else [])]
     if isinstance(arguments, list):
         if kind == "uniform":
             if len(arguments) != 2:
-                raise ParameterError(f"'{name}': uniform takes [least, largest], two numbers.")
+                raise ParameterError(f"'{name}': uniform takes two numbers, [smallest, largest].")
             least, most = (read_real_number(f"{name}: uniform", each) for each in arguments)
             if not least < most:
                 raise ParameterError(
-                    f"'{name}': uniform is from {least:g} to {most:g}; the first must be the lower."
+                    f"'{name}': uniform is from {least:g} to {most:g}; the first must be smaller."
                 )
             arguments = [least, most - least]
         if len(arguments) > len(words):
@@ -282,7 +283,7 @@ def _read_distribution(target: DispersionTarget, given: Any) -> Distribution:
             )
     missing = [word for word in filter(None, shapes) if word not in arguments]
     if missing:
-        raise ParameterError(f"'{name}': {kind} needs its argument '{missing[0]}'.")
+        raise ParameterError(f"'{name}': {kind} requires the argument '{missing[0]}'.")
     values = {word: read_real_number(f"{name}: {word}", value) for word, value in arguments.items()}
     with np.errstate(all="ignore"):
         middle = float(distribution.ppf(0.5, **values))
@@ -297,7 +298,7 @@ def _read_distribution(target: DispersionTarget, given: Any) -> Distribution:
 def _read_choice(target: DispersionTarget, value: Any, where: str = "choice") -> Any:
     if target.is_text:
         if not isinstance(value, str):
-            raise ParameterError(f"'{target.name}' is a text; the {where} has {value!r}.")
+            raise ParameterError(f"'{target.name}' is a string; the {where} has {value!r}.")
         return value
     return read_real_number(
         f"{target.name}: {where}", number_in(value) if isinstance(value, str) else value

@@ -1,8 +1,8 @@
-"""Draws of a campaign: the random values of each flight.
+"""Campaign draws: the random values of each flight.
 
 A draw is determined by its number: it depends neither on the number of workers nor on the order in
-which flights end. With the samplers ``random``, ``sobol`` and ``halton`` it does not depend on the
-number of flights either.
+which flights finish. With the samplers ``random``, ``sobol`` and ``halton``, it does not depend on
+the number of flights either.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ _MIN_PROBABILITY = 1e-12
 infinite."""
 
 _BLOCK_SIZE = 256
-"""Number of draws that are computed together."""
+"""Number of draws computed together."""
 
 _SEED = "plant.sensors.seed"
-"""Name of the seed of a flight, which campaigns may disperse like other parameters."""
+"""Name of the flight seed, which campaigns may disperse like other parameters."""
 
 
 @dataclass(frozen=True)
@@ -39,11 +39,11 @@ class Draw:
     Attributes
     ----------
     number
-        The number of the flight.
+        Flight number.
     seed
-        The seed of sensor and actuator noise.
+        Seed of sensor and actuator noise.
     values
-        The values by name of the dispersion.
+        Values by dispersion name.
     """
 
     number: int
@@ -52,12 +52,12 @@ class Draw:
 
 
 class Draws:
-    """All draws of a campaign.
+    """All draws in a campaign.
 
     Raises
     ------
     ParameterError
-        The sampler needs more flights.
+        The sampler requires more flights.
     """
 
     def __init__(self, campaign: Campaign) -> None:
@@ -133,7 +133,7 @@ class Draws:
         base = self._campaign.flights // (size + 2)
         if base < 2:
             raise ParameterError(
-                f"the sampler 'saltelli' needs at least {2 * (size + 2)} flights for {size} "
+                f"the sampler 'saltelli' requires at least {2 * (size + 2)} flights for {size} "
                 "dispersion(s)."
             )
         base = 2 ** int(np.log2(base))
@@ -144,12 +144,13 @@ class Draws:
 
 
 def drawn_flight(campaign: Campaign, draw: Draw, common: DrawnFlight | None = None) -> DrawnFlight:
-    """Return the flight of a draw; ``common`` is :meth:`.DrawnFlight.of` of the scenario, if known.
+    """Return the flight for a draw; ``common`` is :meth:`.DrawnFlight.of` for the scenario, if
+    known.
 
     Raises
     ------
     ParameterError
-        The value of a parameter is invalid.
+        A parameter value is invalid.
     RobotDescriptionError
         A drawn mass or inertia is not physical.
     """
@@ -162,7 +163,7 @@ def drawn_flight(campaign: Campaign, draw: Draw, common: DrawnFlight | None = No
 def drawn_flights(
     campaign: Campaign, draws: Iterable[Draw], common: DrawnFlight
 ) -> Iterator[tuple[Draw, DrawnFlight | Exception]]:
-    """Yield draws with their flights, or with the error that :func:`drawn_flight` raises.
+    """Yield draws with their flights, or with the error raised by :func:`drawn_flight`.
 
     Mass properties are computed for many draws at once.
     """
@@ -200,17 +201,17 @@ def _with_values(campaign: Campaign, draw: Draw, flight: DrawnFlight) -> DrawnFl
 
 
 def require_module(module: str) -> Any:
-    """Return a module of the extra ``campaign``; see :func:`.optional_module`."""
+    """Return a module from the extra ``campaign``; see :func:`.optional_module`."""
     return optional_module(module, "campaign", "Campaigns need")
 
 
 def import_salib(module: str) -> Any:
-    """Return a module of SALib; see :func:`require_module`."""
+    """Return a SALib module; see :func:`require_module`."""
     return require_module(f"SALib.{module}")
 
 
 def sobol_problem(names: Sequence[str]) -> dict[str, Any]:
-    """Return SALib's problem definition for quantities from 0 to 1 with these names."""
+    """Return the SALib problem definition for quantities from 0 to 1 with the given names."""
     # The names are an array, because pandas 3 accepts no list from SALib 1.5.
     listed = np.array(list(names), dtype=object)
     return {"num_vars": len(listed), "names": listed, "bounds": [[0, 1]] * len(listed)}

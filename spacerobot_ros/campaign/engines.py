@@ -1,4 +1,4 @@
-"""The engines by name; each flies the same flight for the same draw."""
+"""Engines by name; each flies the same flight for the same draw."""
 
 from __future__ import annotations
 
@@ -17,11 +17,12 @@ ENGINE_FACTORIES: Mapping[str, Callable[[], Engine]] = {
     "lanes": LanesEngine,
     "flights": FlightsEngine,
 }
-"""The engines by name, in order of preference."""
+"""Engines by name, in order of preference."""
 
 
 def select_engine(campaign: Campaign, engine_name: str) -> Engine:
-    """Return the engine ``engine_name``; for ``auto``, the first engine that can fly the campaign.
+    """Return the engine ``engine_name``; ``auto`` selects the first engine that can fly the
+    campaign.
 
     Raises
     ------

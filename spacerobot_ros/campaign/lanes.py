@@ -1,8 +1,8 @@
-"""Draws of a campaign in SIMD lanes, along schedules of the planner or under control.
+"""Campaign draws in SIMD lanes, along planned schedules or under control.
 
-A lane can follow one schedule to its end and evaluate the goal, or fly coordinated control until
-the goal is decided. A draw that needs more (a correction, a joint at a limit, a loss of control)
-becomes a :class:`.Fallback` for the engine ``flights``; the rows are the same.
+A lane can follow one schedule to its end and evaluate the goal, or fly under coordinated control
+until the outcome is known. A draw that requires more (a correction, a joint at a limit, a loss of
+control) becomes a :class:`.Fallback` for the engine ``flights``; the rows are the same.
 """
 
 from __future__ import annotations
@@ -53,22 +53,22 @@ from spacerobot_ros.simulation.plant import InitialState
 from spacerobot_ros.times import SECOND
 
 _STATES_PER_FLIGHT = 40
-"""Largest number of evaluated states of a flight along a schedule, before its last state."""
+"""Largest number of states evaluated along a flight's schedule, before its last state."""
 
 _MAX_BATCH_TICKS = 4_000_000
-"""Largest number of ticks of one batch, whose schedules are in memory."""
+"""Largest number of ticks in one batch, whose schedules are in memory."""
 
 _MAX_BATCH_PREPARATION_TIME = 4.0
-"""Wall time, s, after which a batch is flown with the draws that are ready; it bounds the loss if
+"""Wall time, s, after which a batch is flown with the draws that are ready; it limits the loss if
 the campaign is interrupted."""
 
 _END_POSITION_TOLERANCE = 1e-6
-"""Largest distance of a joint from its last position at the end of a schedule, m or rad."""
+"""Largest distance between a joint and its final scheduled position, m or rad."""
 
 _EXTERNAL_LOAD_PREFIXES = "plant.disturbances", "plant.orbit.", "plant.table."
 
 _GAIN_PREFIX = "coordinated_control.gains."
-"""Prefix of the controller parameters that may differ between lanes."""
+"""Prefix of controller parameters that may differ between lanes."""
 
 _PARAMETERS_COMMON_TO_LANES = (
     "plant.tick_rate",
@@ -147,7 +147,7 @@ class LanesEngine:
         if plant.target.given:
             return "it has a target"
         if plant.engine != "exact":
-            return f"its plant has the engine '{plant.engine}'; use engine 'flights'"
+            return f"its plant uses engine '{plant.engine}'; use engine 'flights'"
         loads = plant.disturbances, plant.orbit, plant.table
         dispersed = any(
             each.name.startswith(_EXTERNAL_LOAD_PREFIXES) for each in campaign.dispersions
@@ -155,7 +155,7 @@ class LanesEngine:
         if dispersed or loads != ((), OrbitConfig(), TableConfig()):
             return "it has disturbances, an orbit or a table; use engine 'flights'"
         if campaign.measures_clearance:
-            return "it names the metric clearance_m, and lanes measure no distances between links"
+            return "it uses the metric clearance_m, and lanes measure no distances between links"
         if campaign.own_metrics:
             return (
                 f"the metric '{campaign.own_metrics[0]}' needs whole flights; use engine 'flights'"
@@ -165,7 +165,7 @@ class LanesEngine:
                 return self._scheduled.refusal(campaign)
             case ("coordinated_control",), "effort":
                 return self._controlled.refusal(campaign)
-        return "lanes support only velocities of a planner, or efforts of coordinated control"
+        return "lanes support only planner velocities or coordinated control efforts"
 
     def fly(
         self, campaign: Campaign, draws: Iterable[Draw], stopped: Callable[[], bool]
@@ -231,11 +231,11 @@ class _ScheduledLanes:
 
     def __init__(self) -> None:
         self._extremes: tuple[GaitSchedule, Array, Array] | None = None
-        """The last schedule, and the lowest and highest positions (n,) of its joints, m or rad."""
+        """The last schedule, and its lowest and highest joint positions (n,), m or rad."""
         self._planned_values: _PlannedValues | None = None
-        """The values that determine the plans of the last scenario, common to many draws."""
+        """The values that determine plans for the last scenario, common to many draws."""
         self._last_plan: tuple[Any, _Plan | None] | None = None
-        """The last plan from a state measured without noise, and the values that determine it."""
+        """The last plan from a noise-free state, and the values that determine it."""
 
     def refusal(self, campaign: Campaign) -> str:
         """Return the reason why lanes cannot fly a campaign, as a clause; empty if they can."""
@@ -249,7 +249,7 @@ class _ScheduledLanes:
         dispersed = [each.name for each in campaign.dispersions]
         for name in dispersed:
             if name.startswith(_PARAMETERS_COMMON_TO_SCHEDULES):
-                return f"'{name}' is dispersed, and all lanes share it"
+                return f"'{name}' is dispersed, but shared by all lanes"
         noisy = sensors.joint_noise or any(sensors.joint_bias)
         if noisy or any(name.startswith("plant.sensors.joint") for name in dispersed):
             return "the joints are measured with errors"
@@ -263,7 +263,7 @@ class _ScheduledLanes:
         if plan is None:
             return Fallback(draw, "had no schedule at the first state")
         if plan.schedule.controls & (POSE - goal.asked):
-            return Fallback(draw, "keeps a part of the pose that its goal does not request")
+            return Fallback(draw, "keeps part of the pose that its goal does not specify")
         return _PreparedDraw(draw, flight, plan, time.perf_counter() - began)
 
     def _plan_first_state(self, flight: DrawnFlight) -> _Plan | None:
@@ -312,8 +312,8 @@ class _ScheduledLanes:
         flights: Flights,
         taken: float,
     ) -> Iterator[Measures | str]:
-        """Yield the measures of each flight with a decision at the end of its schedule, or the
-        reason for a fallback; ``taken`` is the wall time per flight of the batch, s.
+        """Yield the measures of each flight whose outcome is known at the end of its schedule, or
+        the reason for a fallback; ``taken`` is the wall time per flight in the batch, s.
         """
         rows = np.arange(len(batch))
         instants = {tick: place for place, tick in enumerate(flights.report_ticks)}
@@ -381,25 +381,25 @@ class _ControlledLanes:
         if scenario.goal.end_effectors:
             return "the goal is for end-effectors"
         if scenario.goal.asked != POSE:
-            return "the goal requests only a part of the base pose"
+            return "the goal specifies only part of the base pose"
         if plant.thrusters:
             return "it has on/off thrusters; use engine 'flights'"
         if plant.beyond_limits != "clip":
             return "the plant refuses commands beyond limits"
         robots = nominal_robots(scenario)
         if robots.plant.description.world is not None:
-            return "it has obstacles, and lanes detect no contacts"
+            return "it has obstacles, and lanes do not detect contacts"
         if robots.controller.description.wheel_names:
             return "the robot has reaction wheels; use engine 'flights'"
         if scenario.controller.profile == PlannedReference.name:
             return "its references are planned; use engine 'flights'"
         if scenario.controller.tasks:
-            return "its controller has tasks before goals; use engine 'flights'"
+            return "its controller performs tasks before goals; use engine 'flights'"
         for dispersion in campaign.dispersions:
             name = dispersion.name
             own = name.startswith("coordinated_control.") and not name.startswith(_GAIN_PREFIX)
             if own or name.startswith(_PARAMETERS_COMMON_TO_LANES):
-                return f"'{name}' is dispersed, and all lanes share it"
+                return f"'{name}' is dispersed, but shared by all lanes"
         try:
             law = build_controller(nominal_robots(scenario).controller, scenario.controller).law
         except SpaceRobotError as error:
@@ -417,13 +417,13 @@ class _ControlledLanes:
             if goal is not None and not getattr(law.outputs.selection, key):
                 return f"the law '{law.name}' does not control the {key.replace('_', '-')}"
         if controlled_parts(law.outputs.selection.base) != POSE:
-            return f"the law '{law.name}' controls only a part of the base pose"
+            return f"the law '{law.name}' controls only part of the base pose"
         return ""
 
     def prepare_draw(
         self, campaign: Campaign, draw: Draw, flight: DrawnFlight
     ) -> _PreparedDraw | Fallback:
-        """Check that a draw can be in a batch, because its error would end the other flights."""
+        """Check that a draw can be in a batch, because an error would end the other flights."""
         ready = _PreparedDraw(draw, flight)
         try:
             self.flights(campaign, [ready])
@@ -432,7 +432,7 @@ class _ControlledLanes:
         return ready
 
     def flights(self, campaign: Campaign, batch: Sequence[_PreparedDraw]) -> Flights:
-        """Return the batch of draws; raise SpaceRobotError if a parameter, start or goal is
+        """Return a batch of draws; raise SpaceRobotError if a parameter, start or goal is
         invalid."""
         scenario = campaign.scenario
         drawn = [each.flight for each in batch]
@@ -462,7 +462,7 @@ class _ControlledLanes:
         taken: float,
     ) -> Iterator[Measures | str]:
         """Yield the measures of each flight, or the reason for a fallback; ``taken`` is the wall
-        time per flight of the batch, s.
+        time per flight in the batch, s.
         """
         for row, ready in enumerate(batch):
             if row in result.failures:
@@ -478,7 +478,7 @@ class _ControlledLanes:
         if decision is Decision.LOST:
             return "lost control"
         if decided == 0:
-            return "ended at its first state"
+            return "ended in its first state"
         n, end = flights.robot.n, result.end_state[row]
         q, pose = end[:n], end[2 * n : 2 * n + 7]
         hand = _end_effector_error(flights.robot, ready.flight, q, pose)

@@ -1,4 +1,4 @@
-"""Metrics of campaigns by name: built-in and user-defined metrics."""
+"""Campaign metrics by name, built-in and user-defined."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ if TYPE_CHECKING:
 
 
 class FlightMetric(ABC):
-    """A user-defined metric, computed for each flight of a campaign that names it.
+    """A user-defined metric, computed for each flight in campaigns that name it.
 
     Derived classes are registered like control laws: with ``--plugin``, an entry point
     ``spacerobot_ros.metrics``, or :meth:`.Registry.register` of ``OWN_METRICS``.
     """
 
     name: ClassVar[str]
-    """Name of the column, used under ``metrics`` or ``criteria``."""
+    """Column name, used under ``metrics`` or ``criteria``."""
 
     unit: ClassVar[str] = ""
     """SI unit, for people."""
 
     yes_or_no: ClassVar[bool] = False
-    """Whether the value is 1 for yes and 0 for no; reports then show no distribution."""
+    """Whether the value is 1 for yes and 0 for no; if so, reports show no distribution."""
 
     @abstractmethod
     def evaluate(self, flight: Flight) -> float:
@@ -47,12 +47,12 @@ def metric_of(name: str) -> Metric | type[FlightMetric]:
 
 
 def own_metrics_of(flight: Flight, names: Iterable[str]) -> dict[str, float]:
-    """Return the user-defined metrics of a flight.
+    """Return a flight's user-defined metrics.
 
     Raises
     ------
     SpaceRobotError
-        A metric raises an exception or is not a number.
+        A metric raises an exception or does not return a number.
     """
     found: dict[str, float] = {}
     for name in names:

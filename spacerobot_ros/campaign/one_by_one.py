@@ -66,7 +66,7 @@ class FlightsEngine:
 
 
 def robots_of(flight: DrawnFlight) -> Robots:
-    """Return the models of a flight; draws that differ only in masses share them."""
+    """Return the models for a flight; draws that differ only in masses share them."""
     scenario = flight.scenario
     robots = nominal_robots(scenario)
     if "planner" in scenario.commanders:
@@ -83,7 +83,7 @@ def robots_of(flight: DrawnFlight) -> Robots:
 
 
 def nominal_robots(scenario: Scenario) -> Robots:
-    """Return the models of a scenario without mass dispersions, always the same objects."""
+    """Return the models for a scenario without mass dispersions, always as the same objects."""
     plant = description_of(scenario).urdf
 
     def build(node: str, config: RobotConfig) -> SpaceRobot | None:
@@ -120,7 +120,7 @@ def _method_of_planner(robot: SpaceRobot, config: PlannerConfig) -> GaitMethod:
 
 
 def plant_robot(flight: DrawnFlight) -> SpaceRobot:
-    """Return the robot of the plant without mass dispersions."""
+    """Return the plant's robot without mass dispersions."""
     robot = _build_robot("plant", flight.nominal.urdf, "", "", 0.0, 0)
     assert robot is not None
     return robot

@@ -1,4 +1,4 @@
-"""The report of a campaign: one self-contained HTML file."""
+"""Campaign report: one self-contained HTML file."""
 
 from __future__ import annotations
 
@@ -39,26 +39,26 @@ from spacerobot_ros.report.page_parts import facts, figure, html_page, table, ti
 from spacerobot_ros.version import __version__
 
 FOOTER_TEXT = f"Made by spacerobot_ros {__version__}."
-"""Footer of the pages of campaigns."""
+"""Footer of campaign pages."""
 
 _MAX_HISTOGRAMS, _MAX_SCATTER_PLOTS = 9, 6
-"""Largest number of histograms of metrics and of scatter plots of drivers."""
+"""Largest number of metric histograms and of scatter plots."""
 
 NO_INFLUENCES_TEXT = "no correlation is significant (p < 0.05, corrected for multiple tests)."
 
 _QUANTILES_SHOWN = (0.01, 0.5, 0.99)
 _MAX_CURVE_STEPS = 2000
 _PART_OF_METRIC = {"position_error_m": "position", "attitude_error_rad": "attitude"}
-"""Part of the base goal whose error is the metric."""
+"""Base goal component whose error is the metric."""
 
 
 def write_campaign_report(folder: Path, path: Path) -> list[str]:
-    """Write the report of a dataset; return lines for the terminal.
+    """Write a dataset's report; return the terminal output lines.
 
     Raises
     ------
     ParameterError
-        The folder holds no campaign, or no flights yet.
+        The folder contains no campaign, or no flights yet.
     SpaceRobotError
         The file cannot be written.
     """
@@ -105,8 +105,8 @@ def figure_with_axes(count: int, across: int, height: float = 2.2) -> tuple[Figu
 
 
 def metric_label(metric: str, not_controlled: Sequence[str] = ()) -> str:
-    """Return the name of a metric with its unit, unless the name includes it; errors of
-    uncontrolled parts of the goal are marked.
+    """Return the name of a metric, with its unit unless the name includes it; errors of
+    uncontrolled goal components are marked.
     """
     unit = metric_of(metric).unit
     named = metric.endswith(("_m", "_rad", "_s", "_kg", "_N", "_Nm", "_Ns", "_Nms"))
@@ -214,7 +214,7 @@ def _outcomes_section(results: Results) -> str:
 
 def _percentiles_section(results: Results) -> str:
     if not results.distributed_metrics:
-        return '<p class="missing">No flight has any metric.</p>'
+        return '<p class="missing">No metric is available for any flight.</p>'
     rows, free = [], results.not_controlled
     for name in results.distributed_metrics:
         values = results.columns[name]
@@ -254,15 +254,15 @@ def _histograms_section(results: Results) -> str:
         shares.set_ylim(0.0, 1.02)
         shares.set_ylabel("cumulative share")
     caption = (
-        "Distributions of the metrics; dotted: percentiles 5, 50 and 95, orange: requirements, "
-        "black: share of flights up to a value."
+        "Distributions of the metrics; dotted: percentiles 5, 50 and 95; orange: requirements; "
+        "black: cumulative share of flights."
     )
     return picture_part(figure, "distributions", caption)
 
 
 def _sensitivity_section(found: Sequence[Influence]) -> str:
     if not found:
-        return '<p class="missing">No drawn number varies with a metric.</p>'
+        return '<p class="missing">No drawn value varies together with a metric.</p>'
     sobol = any(each.total_order_index is not None for each in found)
     rows = []
     for each in _sort_passing_first(found)[:15]:
@@ -274,11 +274,11 @@ def _sensitivity_section(found: Sequence[Influence]) -> str:
         rows.append(cells)
     head = ["drawn", "metric", "rank correlation", "p", "of its distance from the median", "p"]
     head += ["Sobol, first order", "Sobol, total"] if sobol else []
-    note = "Spearman's rank correlations, first of passing, then in order of strength; p: p-value "
-    note += "corrected for multiple tests (Benjamini-Hochberg). A metric that grows to both sides "
-    note += "of the median correlates with the distance of the draw from the median."
+    note = "Spearman's rank correlations, first for passing, then in order of strength; p: p-value "
+    note += "corrected for multiple tests (Benjamini-Hochberg). A metric that grows on both sides "
+    note += "of the median correlates with the distance between the draw and the median."
     if not sobol:
-        note += " The sampler 'saltelli' adds Sobol indices."
+        note += " Sampler 'saltelli' adds Sobol indices."
     if not any(each.is_significant for each in found):
         note += f" Here {NO_INFLUENCES_TEXT}"
     return f'<p class="facts">{escape(note)}</p>' + table("drivers", head, rows)
@@ -325,7 +325,7 @@ def _success_by_bins_section(results: Results, found: Sequence[Influence]) -> st
         panel.set_xlabel(name)
         panel.set_ylabel("success")
         panel.tick_params(axis="x", labelsize=7)
-    caption = "Success over drawn values, in bins of about equally many flights; 95 % intervals."
+    caption = "Success over drawn values, in bins with about equal flight counts; 95 % intervals."
     return picture_part(figure, "success", caption)
 
 
@@ -364,7 +364,7 @@ def _convergence_section(results: Results) -> list[str]:
         final = percentiles(values)[PERCENTILES.index(95.0)] or 1.0
         line = [percentiles(values[:k])[PERCENTILES.index(95.0)] / final for k in at]
         axes[1].plot(at, line, color=PALETTE[i], label=name)
-    axes[1].set_ylabel("95 percentile over its last value")
+    axes[1].set_ylabel("95th percentile relative to its final value")
     if results.distributed_metrics:
         axes[1].legend(fontsize=7, frameon=False)
     for panel in axes:

@@ -1,4 +1,4 @@
-"""The rows of a campaign as columns, and the data of its report."""
+"""Campaign rows as columns, and the report data."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ PASSING = "passing"
 _WORST_FLIGHTS_SHOWN = 10
 _MESSAGES_SHOWN = 4
 _MAX_BOUND_DISTANCE = 100.0
-"""Distance from a bound, in standard deviations, at which the order of flights saturates."""
+"""Distance from a bound, in standard deviations, at which the flight order saturates."""
 
 _REASON = "reason"
 _TEXT_COLUMNS = ("outcome", _REASON, "engine", "fallback")
@@ -49,13 +49,13 @@ _MAIN_METRICS = (
 )
 
 _NOT_CONTROLLED = re.compile(r"[(; ]([a-z]+(?: and [a-z]+)*) not controlled\)")
-"""Uncontrolled parts of the goal in the message of a flight."""
+"""Uncontrolled goal components in a flight's message."""
 
 
 class Columns(Mapping[str, Any]):
-    """The columns of a dataset by name, in the order of the flights, read on demand.
+    """Dataset columns by name, in flight order, read on demand.
 
-    Numbers are arrays (N,) with NaN for missing values; texts are lists with None for missing
+    Numbers are arrays (N,) with NaN for missing values; strings are lists with None for missing
     values.
 
     Parameters
@@ -75,7 +75,7 @@ class Columns(Mapping[str, Any]):
         self._known["flight"] = dataset.table(["flight"])["flight"].to_numpy().astype(float)
 
     def read(self, names: Iterable[str]) -> None:
-        """Read columns together, opening each file once."""
+        """Read several columns, opening each file once."""
         left = [name for name in names if name not in self._known]
         table = self._dataset.table(left)
         text = require_module("pyarrow").string()
@@ -115,7 +115,7 @@ class Columns(Mapping[str, Any]):
 
 @dataclass(frozen=True)
 class Results:
-    """The rows of a campaign as columns.
+    """Campaign rows as columns.
 
     Attributes
     ----------
@@ -124,11 +124,11 @@ class Results:
     folder
         Folder of the dataset.
     flight_numbers
-        (N,) numbers of the flights.
+        (N,) flight numbers.
     columns
-        Columns by name: arrays of numbers, lists of texts.
+        Columns by name: arrays of numbers, lists of strings.
     planned_flights
-        Number of flights of the whole campaign.
+        Number of flights in the whole campaign.
     """
 
     campaign: Campaign
@@ -144,7 +144,7 @@ class Results:
         Raises
         ------
         ParameterError
-            The folder holds no campaign, or no flights yet.
+            The folder contains no campaign, or no flights yet.
         """
         dataset = Dataset(folder)
         campaign = dataset.campaign()
@@ -160,17 +160,17 @@ class Results:
 
     @property
     def incompleteness_warning(self) -> str:
-        """Warning that missing flights bias the numbers; empty if none are missing.
+        """Warning that missing flights bias the results; empty if none are missing.
 
-        Flights that take long finish late and are underrepresented in an incomplete campaign.
+        Long flights finish late and are underrepresented in an incomplete campaign.
         """
         missing = int(self.flight_numbers.max()) + 1 - len(self) if len(self) else 0
         if not missing:
             return ""
         draws = "1 draw is" if missing == 1 else f"{missing} draws are"
         return (
-            f"{draws} not flown yet although later ones are, usually because they take longer: "
-            "shares and distributions may change."
+            f"{draws} not flown yet although later ones have been, usually because they take "
+            "longer: shares and distributions may change."
         )
 
     @property
@@ -185,25 +185,25 @@ class Results:
 
     @property
     def drawn_numbers(self) -> dict[str, Array]:
-        """(N,) drawn values, by name of the dispersion; numbers only."""
+        """(N,) drawn values by dispersion name; numbers only."""
         columns = {name: self.columns[f"{DRAW_PREFIX}{name}"] for name in self.campaign.names}
         return {name: x for name, x in columns.items() if isinstance(x, np.ndarray)}
 
     @property
     def shown_metrics(self) -> list[str]:
-        """Metrics of the report that have values: named metrics and the main metrics."""
+        """Report metrics that have values: named metrics and the main metrics."""
         names = self.campaign.named_metrics
         names += [name for name in _MAIN_METRICS if name not in names]
         return [name for name in names if np.isfinite(self.columns.get(name, np.nan)).any()]
 
     @property
     def refused(self) -> Flags:
-        """(N,) whether the goal of each flight was refused."""
+        """(N,) whether each flight's goal was refused."""
         return np.array([outcome == "refused" for outcome in self.columns["outcome"]], dtype=bool)
 
     @cached_property
     def messages(self) -> tuple[list[str], dict[str, str]]:
-        """The message of each flight without numbers, and for each such message the form with
+        """Each flight's message without numbers, and for each such message the version with
         numbers, if it is the same for all flights.
         """
         found: list[str] = []
@@ -219,19 +219,19 @@ class Results:
 
     @property
     def not_controlled(self) -> list[str]:
-        """Parts of the goal that successful flights did not control, from their messages."""
+        """Goal components that successful flights did not control, according to their messages."""
         notes = [_NOT_CONTROLLED.search(text) for text in self.messages[1]]
         named = {part for note in notes if note for part in note[1].split(" and ")}
         return sorted(named)
 
     @property
     def distributed_metrics(self) -> list[str]:
-        """Metrics of the report other than yes-or-no metrics."""
+        """Report metrics other than yes-or-no metrics."""
         return [name for name in self.shown_metrics if not metric_of(name).yes_or_no]
 
     @property
     def sampler_shares(self) -> dict[str, Share]:
-        """Shares of flights with a yes, by name of the metric."""
+        """Shares of flights with a yes, by metric name."""
         found = {}
         for name, metric in METRICS.items():
             values = self.columns.get(name)
@@ -240,7 +240,7 @@ class Results:
         return found
 
     def metrics(self) -> dict[str, Array]:
-        """Return the columns of the report's metrics."""
+        """Return the columns of the report metrics."""
         return {name: self.columns[name] for name in self.shown_metrics}
 
     def share_meeting(self, criterion: Criterion) -> Share:
@@ -250,7 +250,7 @@ class Results:
         return share(met, len(self))
 
     def influences(self) -> list[Influence]:
-        """Return the sensitivities, the strongest first, with Sobol indices if available."""
+        """Return the sensitivities, strongest first, with Sobol indices if available."""
         passing = {PASSING: self.passed.astype(float)}
         found = corrected_for_multiple_tests(
             influences(self.drawn_numbers, passing | self.metrics())
@@ -267,19 +267,19 @@ class Results:
         return sorted(found, key=lambda each: -each.strength)
 
     def drawn_by_influence(self, found: Sequence[Influence]) -> list[str]:
-        """Return the names of drawn values: texts first, then numbers by influence on passing."""
+        """Return the names of drawn values: strings first, then numbers by influence on passing."""
         causes = [each.cause for each in found if each.metric == PASSING]
         return [*(name for name in self.campaign.names if name not in self.drawn_numbers), *causes]
 
     def success_by_bins(self, name: str) -> list[Bin]:
-        """Return the shares of flights that passed, over the drawn values of a name."""
+        """Return the shares of flights that passed, over the drawn values with a given name."""
         return success_by_bins(np.asarray(self.columns[f"{DRAW_PREFIX}{name}"]), self.passed)
 
     def worst_rows(self) -> list[int]:
-        """Return the rows of the worst flights: first flights that failed, then flights that missed
-        a criterion.
+        """Return the rows of the worst flights: first failed flights, then flights that missed a
+        criterion.
 
-        Flights that passed are ordered by distance from a bound, in standard deviations.
+        Passed flights are ordered by distance from a bound, in standard deviations.
         """
         badness = np.full(len(self), -_MAX_BOUND_DISTANCE)
         for criterion in self.campaign.criteria:
@@ -304,7 +304,7 @@ class Results:
 
 
 def messages_of(results: Results) -> list[tuple[str, int, str]]:
-    """Return outcomes with their most frequent messages and numbers of flights.
+    """Return outcomes with their most frequent messages and flight counts.
 
     Messages that differ only in numbers are merged, without the numbers.
     """

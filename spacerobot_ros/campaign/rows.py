@@ -1,4 +1,4 @@
-"""The rows of a campaign, one for each draw, and the engines that fly draws."""
+"""Campaign rows, one per draw, and the engines that fly draws."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ FLIGHTS = "flights"
 """Name of the engine that flies draws one by one, the fallback of other engines."""
 
 ERROR = "error"
-"""The outcome of a draw that could not be flown."""
+"""Outcome of a draw that could not be flown."""
 
 
 @dataclass(frozen=True)
@@ -36,17 +36,17 @@ class Row:
     draw
         The drawn values.
     outcome, reason
-        Outcome of the goal, or ``error``, and its message.
+        Goal outcome, or ``error``, and the message.
     metrics
         Metrics by name; empty if nothing was flown.
     passed
-        Whether the goal was reached and every criterion met.
+        Whether the goal was reached and all criteria were met.
     engine
-        Name of the engine that flew the draw.
+        Name of the engine used.
     fallback
-        Reason why the engine ``flights`` replaced the campaign's engine; empty: it did not.
+        Reason why engine ``flights`` was used instead of the campaign's engine; empty: it was not.
     wall_time, plan_time
-        Wall time of the flight, and of planning in it, s.
+        Wall time of the flight and of its planning, s.
     """
 
     draw: Draw
@@ -61,7 +61,7 @@ class Row:
 
     @classmethod
     def of(cls, campaign: Campaign, draw: Draw, flight: Flight, engine: str) -> Row:
-        """Return the row of a flight, with the user-defined metrics of the campaign."""
+        """Return a flight's row, including the campaign's user-defined metrics."""
         measures = flight.measured(clearance=campaign.measures_clearance)
         (row,) = cls.of_each(campaign, [(draw, measures)], engine)
         if not campaign.own_metrics:
@@ -93,7 +93,7 @@ class Row:
 
     @classmethod
     def of_error(cls, draw: Draw, error: BaseException, engine: str) -> Row:
-        """Return the row of a draw that could not be flown."""
+        """Return the row for a draw that could not be flown."""
         reason = str(error)
         if not isinstance(error, SpaceRobotError):
             reason = f"{type(error).__name__}: {' '.join(reason.split())}"
@@ -102,7 +102,7 @@ class Row:
 
 @dataclass(frozen=True)
 class Fallback:
-    """A draw that an engine passes on to the engine ``flights``.
+    """A draw that an engine passes on to engine ``flights``.
 
     ``reason`` completes "the flight ..." ("needed corrections"), or is an error message.
     """
@@ -112,7 +112,7 @@ class Fallback:
 
 
 class Engine(Protocol):
-    """Flies the draws of a campaign; fewer than ``efficient_flights`` flights take as long."""
+    """Flies campaign draws; fewer than ``efficient_flights`` flights take just as long."""
 
     name: str
     efficient_flights: int

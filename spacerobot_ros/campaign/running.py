@@ -1,4 +1,4 @@
-"""Runs a campaign into its dataset, and repeats single flights, with a bag.
+"""Flies campaigns into datasets, and repeats single flights with a bag.
 
 :func:`sweep` runs a small campaign from Python, with the arguments of ``fly``.
 """
@@ -52,8 +52,8 @@ class Progress:
     seconds
         Wall time so far.
     unflown
-        Flights of the dataset whose draw or goal was refused or that ended with an error, counted
-        at the end.
+        Number of flights in the dataset whose draw or goal was refused or that ended with an error,
+        counted at the end.
     """
 
     flown: int
@@ -64,7 +64,7 @@ class Progress:
 
     @property
     def seconds_left(self) -> float:
-        """Estimated wall time left, s; infinite before the first flight."""
+        """Estimated remaining wall time, s; infinite before the first flight."""
         return (
             (self.total - self.flown) / self.flights_per_second
             if self.flights_per_second
@@ -81,20 +81,20 @@ def run_campaign(
     show: Callable[[Progress], None] = lambda progress: None,
     stopped: Callable[[], bool] = lambda: False,
 ) -> Progress:
-    """Fly all draws of a campaign whose rows are not in its folder yet.
+    """Fly all campaign draws that do not have a row in the folder yet.
 
     Parameters
     ----------
     campaign
         The campaign.
     folder
-        The folder of its dataset.
+        Dataset folder.
     engine
-        The name of an engine, or ``auto``.
+        Engine name, or ``auto``.
     cluster
         The workers that fly.
     show
-        Receives the progress after each task and a few times per second.
+        Called with the progress after each task and a few times per second.
     stopped
         Returns whether to stop; called a few times per second. Finished flights are kept.
 
@@ -106,7 +106,7 @@ def run_campaign(
     Raises
     ------
     SpaceRobotError
-        The engine cannot fly the campaign, the folder holds another campaign, or a package is
+        The engine cannot fly the campaign, the folder contains another campaign, or a package is
         missing.
     """
     draws, dataset = Draws(campaign), Dataset(folder)
@@ -160,7 +160,7 @@ def _fly_rows(
 
 
 RERUN_TOLERANCE = 1e-9
-"""Largest deviation of equal flights, absolute below 1 (SI units) and relative above."""
+"""Largest deviation between equal flights, absolute below 1 (SI units) and relative above."""
 
 
 @dataclass(frozen=True)
@@ -170,17 +170,17 @@ class Rerun:
     Attributes
     ----------
     row
-        The row of the repeated flight.
+        Row of the repeated flight.
     deviation
-        Largest deviation of a metric; None: the dataset does not have the flight.
+        Largest deviation of a metric; None: the flight is not in the dataset.
     worst_metric
-        The name of that metric.
+        Name of that metric.
     outcome
-        Outcome in the dataset; empty: the dataset does not have the flight.
+        Outcome in the dataset; empty: the flight is not in the dataset.
     bag
         Path of the bag.
     note
-        Reason why the metrics may differ from the dataset; empty: they must agree.
+        Reason why the metrics may differ from those in the dataset; empty: they must agree.
     """
 
     row: Row
@@ -192,14 +192,14 @@ class Rerun:
 
     @property
     def agrees(self) -> bool:
-        """Whether the metrics agree with the dataset, or cannot be compared with it."""
+        """Whether the metrics agree with the dataset or cannot be compared with it."""
         if self.deviation is None or self.note:
             return True
         return self.outcome == self.row.outcome and self.deviation <= RERUN_TOLERANCE
 
     @property
     def report_lines(self) -> list[str]:
-        """Lines of text for the user."""
+        """Output lines for the user."""
         row = self.row
         drawn = ", ".join(
             f"{name} {value:.6g}" if isinstance(value, float) else f"{name} {value}"
@@ -219,12 +219,12 @@ class Rerun:
 
 
 def rerun_flight(folder: Path, number: int, bag: Path) -> Rerun:
-    """Repeat one flight of a campaign and record a bag.
+    """Repeat one campaign flight and record a bag.
 
     Raises
     ------
     ParameterError
-        The folder holds no campaign, or it has no such flight.
+        The folder contains no campaign, or the campaign has no such flight.
     SpaceRobotError
         The drawn values are invalid, or the bag cannot be written.
     """
@@ -250,14 +250,14 @@ def rerun_flight(folder: Path, number: int, bag: Path) -> Rerun:
     note = ""
     if campaign.scenario.plant.thrusters and flight.inertial is not None:
         note = (
-            "The masses are random, so the plants of the campaign and of this flight round "
-            "differently, and on/off thrusters amplify the difference."
+            "The masses are random, so rounding differs between the campaign's plant and the "
+            "plant of this flight, and on/off thrusters amplify the difference."
         )
     return Rerun(row, deviation, at, outcome, bag, note)
 
 
 def stored_flight(dataset: Dataset, number: int) -> tuple[str, str, dict[str, float]] | None:
-    """Return outcome, engine and metrics of a flight in a dataset; None: not in the dataset."""
+    """Return the outcome, engine and metrics of a flight in a dataset; None: not in the dataset."""
     if number not in dataset.flown_numbers():
         return None
     record = next(row for row in dataset.table().to_pylist() if row["flight"] == number)
@@ -316,14 +316,14 @@ def sweep(
     end_effector_position, end_effector_pose, end_effector
         The same.
     disperse
-        Distributions by name of the quantity, as in a campaign file.
+        Distributions by quantity name, as in a campaign file.
     seed, flights
-        Seed of the draws, and their number.
+        Seed and number of draws.
     folder
-        Folder of the dataset, which a later call resumes; None: no folder.
+        Dataset folder, which a later call resumes; None: no folder.
     section
-        Other keys of a campaign file: ``sampler``, ``criteria``, ``engine``, ``longest``;
-        ``set`` means the same as ``parameters``.
+        Other campaign file keys: ``sampler``, ``criteria``, ``engine``, ``longest``;
+        ``set`` is equivalent to ``parameters``.
 
     Returns
     -------

@@ -17,7 +17,7 @@ from spacerobot_ros.model.description import Array
 Flags = npt.NDArray[np.bool_]
 
 CONFIDENCE = 0.95
-"""Confidence level of every interval."""
+"""Confidence level of all intervals."""
 
 PERCENTILES = (5.0, 50.0, 95.0, 99.0)
 
@@ -27,9 +27,9 @@ _MAX_PERMUTED_VALUES = 8
 
 @dataclass(frozen=True)
 class Share:
-    """A share of flights with its confidence intervals.
+    """A share of flights and its confidence intervals.
 
-    ``interval_low`` to ``interval_high`` is the Wilson interval, ``exact_interval`` the
+    ``interval_low`` to ``interval_high`` is the Wilson interval; ``exact_interval`` is the
     Clopper-Pearson interval.
     """
 
@@ -52,7 +52,7 @@ class Share:
 
 
 def share(count: int, total: int) -> Share:
-    """Return a share with its intervals; without flights they are 0 to 1."""
+    """Return a share with its intervals; without flights, these are 0 to 1."""
     if not total:
         return Share(0, 0, 0.0, 1.0, (0.0, 1.0))
     from scipy.stats import binomtest
@@ -71,7 +71,7 @@ _MAX_BINS, _FLIGHTS_OF_BIN = 8, 10
 
 @dataclass(frozen=True)
 class Bin:
-    """The flights with drawn values from ``low`` to ``high``, and the share that passed."""
+    """Flights with drawn values from ``low`` to ``high``, and the share that passed."""
 
     low: Any
     high: Any
@@ -81,8 +81,8 @@ class Bin:
 def success_by_bins(drawn: npt.NDArray[Any], passed: Flags) -> list[Bin]:
     """Return the shares of flights that passed, (N,), in bins of the drawn values (N,).
 
-    Each text, or each of a few numbers, has its own bin; many numbers are binned with about equally
-    many flights per bin.
+    Each string, or each number if there are few, has its own bin; many numbers are binned with
+    about the same number of flights per bin.
     """
     if drawn.dtype.kind == "f":
         finite = np.isfinite(drawn)
@@ -103,7 +103,7 @@ def success_by_bins(drawn: npt.NDArray[Any], passed: Flags) -> list[Bin]:
 
 
 _SIGNIFICANCE = 0.05
-"""Largest p-value of a significant influence, after correction for multiple tests."""
+"""Largest p-value of a significant influence after correction for multiple tests."""
 
 
 @dataclass(frozen=True)
@@ -113,16 +113,16 @@ class Influence:
     Attributes
     ----------
     cause, metric
-        Names of the dispersion and of the metric.
+        Dispersion and metric names.
     correlation
         Spearman's rank correlation.
     p_value
-        Probability that a correlation at least as large arises by chance.
+        Probability that a correlation at least this large occurs by chance.
     distance_correlation, distance_p_value
-        The same for the distance of the drawn value from its median; it reveals metrics that grow
-        to both sides.
+        The same for the distance between the drawn value and its median, which reveals metrics that
+        grow on both sides.
     first_order_index, total_order_index
-        Sobol indices with the half widths of their intervals, if the sampler provides them.
+        Sobol indices and the half widths of their intervals, if provided by the sampler.
     """
 
     cause: str
@@ -148,7 +148,7 @@ class Influence:
 
     @property
     def strength(self) -> float:
-        """Key for sorting: the total index, or the larger correlation."""
+        """Sorting key: the total index, or else the larger correlation."""
         if self.total_order_index is not None:
             return self.total_order_index[0]
         return max(abs(self.correlation), abs(self.distance_correlation))
@@ -165,7 +165,7 @@ class Influence:
 def influences(causes: Mapping[str, Array], metrics: Mapping[str, Array]) -> list[Influence]:
     """Return the sensitivity of each metric (N,) to each dispersion (N,).
 
-    Flights without the metric are omitted, and so are pairs without variation.
+    Flights without the metric and pairs without variation are omitted.
     """
     found = []
     for metric, values in metrics.items():
@@ -189,8 +189,8 @@ def influences(causes: Mapping[str, Array], metrics: Mapping[str, Array]) -> lis
 def rank_correlation(x: Array, y: Array) -> tuple[float, float]:
     """Return Spearman's correlation of varying samples (N,), and its p-value.
 
-    For few samples the p-value is computed by counting permutations: the approximation by Student's
-    t, used for many samples, is zero instead of one third for a perfect order of three samples.
+    For few samples, the p-value is computed by counting permutations: the Student's t approximation
+    used for many samples gives zero instead of one third for three perfectly ordered samples.
     """
     from scipy.stats import rankdata, spearmanr
 
@@ -211,10 +211,10 @@ def _permutations(count: int) -> npt.NDArray[np.int64]:
 
 
 def corrected_for_multiple_tests(found: Sequence[Influence]) -> list[Influence]:
-    """Return sensitivities with p-values corrected for their number.
+    """Return sensitivities with p-values corrected for multiple tests.
 
-    Both kinds are corrected together by the procedure of Benjamini and Hochberg: among the p-values
-    of at most p, a share of at most p is expected by chance.
+    Both kinds are corrected together by the Benjamini-Hochberg procedure: among p-values of at most
+    p, a share of at most p is expected by chance.
     """
     if not found:
         return []
@@ -231,10 +231,10 @@ def corrected_for_multiple_tests(found: Sequence[Influence]) -> list[Influence]:
 def sobol_indices(
     names: Sequence[str], values: Array
 ) -> dict[str, tuple[float, float, float, float]]:
-    """Return first-order and total Sobol indices with their intervals, by name of the dispersion.
+    """Return first-order and total Sobol indices with their intervals, by dispersion name.
 
-    ``values`` (N,) are in the order of a Saltelli sample. The result is empty if a flight lacks the
-    metric.
+    ``values`` (N,) are in Saltelli sample order. The result is empty if the metric is
+    missing for a flight.
     """
     if not np.all(np.isfinite(values)) or np.ptp(values) == 0.0:
         return {}
@@ -255,7 +255,7 @@ def percentiles(values: Array) -> list[float]:
 
 @dataclass(frozen=True)
 class PairedDifference:
-    """Mean paired difference of a metric between two campaigns, with its interval."""
+    """Mean paired difference in a metric between two campaigns, with its interval."""
 
     metric: str
     count: int
@@ -272,9 +272,10 @@ class PairedDifference:
 
 
 def paired_difference(metric: str, first: Array, second: Array) -> PairedDifference | None:
-    """Return the paired difference of a metric (N,), second campaign minus first.
+    """Return the paired difference in a metric (N,), second campaign minus first.
 
-    The interval is Student's, for the mean of the differences. None for fewer than two pairs.
+    The interval is Student's t interval for the mean difference. None if there are fewer than two
+    pairs.
     """
     there = np.isfinite(first) & np.isfinite(second)
     count = int(there.sum())
@@ -297,7 +298,8 @@ def paired_difference(metric: str, first: Array, second: Array) -> PairedDiffere
 
 
 def paired_success(first: Flags, second: Flags) -> tuple[int, int, float]:
-    """Return the counts of draws that only the first or second passes, and McNemar's exact p."""
+    """Return the numbers of draws passed only by the first and only by the second campaign, and
+    McNemar's exact p."""
     from scipy.stats import binomtest
 
     only_first, only_second = int((first & ~second).sum()), int((second & ~first).sum())

@@ -1,4 +1,4 @@
-"""The quantities that a campaign can disperse, by name, and their effect on a flight."""
+"""Quantities that a campaign can disperse, by name, and their effect on a flight."""
 
 from __future__ import annotations
 
@@ -41,48 +41,48 @@ _PARAMETERS_EQUAL_IN_ALL_FLIGHTS = (
     *("planner.resume_file", "coordinated_control.resume_file"),
 )
 _MIN_FACTOR = 1e-6
-"""For factors of masses and inertias between this and its inverse, bodies need no check."""
+"""If mass and inertia factors are between this value and its inverse, bodies need no check."""
 
 _FACTORS = ("mass", "inertia", "com")
-"""Attributes of :class:`DrawnFlight` with numbers for each flight."""
+"""Attributes of :class:`DrawnFlight` with one value per flight."""
 
 _POSE_TARGET_NAMES = ("goal", "end_effector_goal", "initial")
 
 TARGET_KINDS = (
-    ("NODE.PARAMETER", "a parameter of a node; NODE.PARAMETER[i] or [JOINT]: one of a list"),
+    ("NODE.PARAMETER", "a parameter of a node; NODE.PARAMETER[i] or [JOINT]: one list element"),
     ("mass, mass.BODY, mass.*", "factor on mass and inertia of all bodies, one body, each body"),
     ("inertia, inertia.BODY, inertia.*", "factor on the inertia, in the same way"),
-    ("com.BODY.AXIS, com.*", "offset of a centre of mass in the frame of its body, m"),
-    ("target.mass, target.inertia", "factor on mass and inertia of the target, on its inertia"),
-    ("target.com.AXIS", "offset of its centre of mass in the frame of its root link, m"),
-    ("goal.position.AXIS, goal.rotvec.AXIS", "offset of the goal, m; rotation in its frame, rad"),
+    ("com.BODY.AXIS, com.*", "offset of a centre of mass in its body frame, m"),
+    ("target.mass, target.inertia", "factor on the target's mass and inertia, on its inertia"),
+    ("target.com.AXIS", "offset of its centre of mass in its root link frame, m"),
+    ("goal.position.AXIS, goal.rotvec.AXIS", "goal offset, m; rotation in the goal frame, rad"),
     ("end_effector_goal. ...", "the same for the end-effector"),
-    ("initial.position.AXIS, initial.rotvec.AXIS", "the same for the base at the start"),
-    ("initial.joints.JOINT", "offset of a joint at the start, m or rad"),
-    ("faults[i].at, .until, .value, .kind, .target", "of the i-th fault of plant.faults"),
-    ("faults[i].present", "1 or 0: whether that fault takes place"),
+    ("initial.position.AXIS, initial.rotvec.AXIS", "the same for the initial base pose"),
+    ("initial.joints.JOINT", "offset of an initial joint position, m or rad"),
+    ("faults[i].at, .until, .value, .kind, .target", "of the i-th fault in plant.faults"),
+    ("faults[i].present", "1 or 0: whether the fault occurs"),
 )  # fmt: skip
-"""The kinds of names, with descriptions for users."""
+"""Kinds of names, with descriptions for users."""
 
 
 @dataclass(frozen=True)
 class DispersionTarget:
-    """One number (or text) that differs from flight to flight.
+    """One number (or string) that differs between flights.
 
     Attributes
     ----------
     name
         Name of its column.
     apply
-        Function that returns a flight with a drawn value.
+        Function that applies a drawn value to a flight.
     unit
         Unit, for people.
     is_text
-        Whether the values are texts.
+        Whether the values are strings.
     assigned_parameters
-        Names of the numbers that the target sets; targets that set the same number share a name.
+        Names of the values that the target sets; targets that set the same value share a name.
     changes_masses_only
-        Whether the target changes only mass properties of the robot, not the scenario; ``apply``
+        Whether the target changes only the robot's mass properties, not the scenario; ``apply``
         then also accepts N flights with drawn values (N,).
     order
         Targets are applied in ascending order.
@@ -99,26 +99,28 @@ class DispersionTarget:
 
 @dataclass(frozen=True)
 class DrawnFlight:
-    """One flight of a campaign, or several that share a scenario and differ in masses.
+    """One campaign flight, or several that share a scenario and differ in masses.
 
-    Leading dimensions (...) are the flights: none for one flight, (N,) for N flights.
+    Leading dimensions (...) index flights: none for one flight, (N,) for N flights.
 
     Attributes
     ----------
     scenario
-        The scenario, without the plant's masses and the seed until :meth:`with_draws_in_scenario`.
-        Flights whose draws do not change the scenario share one object.
+        The scenario; it includes the plant's masses and the seed only after
+        :meth:`with_draws_in_scenario`. Flights whose draws do not change the scenario share one
+        object.
     nominal
         The robot without dispersions.
     mass, inertia
-        (..., B) factors of the bodies; the inertia scales with the mass and with its own factor.
+        (..., B) body factors; the inertia scales with the mass and additionally with its own
+        factor.
     com
-        (..., B, 3) offsets of the centres of mass, m.
+        (..., B, 3) centre of mass offsets, m.
     parameters, is_physical
-        Masses, centres and inertias of the nominal robot, and whether they are physical without
-        slack for rounding.
+        Masses, centres of mass and inertias of the nominal robot, and whether they are physical
+        without rounding tolerance.
     has_target_masses
-        Whether the mass properties of the target are drawn.
+        Whether the target's mass properties are drawn.
     seed
         Seed of sensor and actuator noise; None: the scenario's.
     """
@@ -152,19 +154,19 @@ class DrawnFlight:
         )
 
     def with_overrides(self, node: str, parameters: Mapping[str, Any]) -> DrawnFlight:
-        """Return the flight with other parameters of a node."""
+        """Return the flight with different parameters for a node."""
         return replace(self, scenario=self.scenario.with_overrides(node, parameters))
 
     @cached_property
     def seeded_scenario(self) -> Scenario:
-        """The scenario with the seed of the flight."""
+        """The scenario, including the flight's seed."""
         if self.seed is None:
             return self.scenario
         return self.scenario.with_overrides("plant", {"sensors.seed": self.seed})
 
     @cached_property
     def inertial(self) -> InertialParameters | None:
-        """Masses, centres and inertias of the bodies; None: as in the robot's description."""
+        """Body masses, centres of mass and inertias; None: as in the robot description."""
         return self._scaled_parameters if self._has_other_masses.any() else None
 
     @property
@@ -190,7 +192,7 @@ class DrawnFlight:
         return replace(self, **numbers)
 
     def separate(self, seeds: Sequence[int | None]) -> list[DrawnFlight]:
-        """Return the flights one by one, with their seeds."""
+        """Return the individual flights, with their seeds."""
         flights = []
         inertial, has_other_masses = self._scaled_parameters, self._has_other_masses.tolist()
         for row, (seed, has_other) in enumerate(zip(seeds, has_other_masses, strict=True)):
@@ -202,7 +204,7 @@ class DrawnFlight:
         return flights
 
     def surely_physical(self) -> npt.NDArray[np.bool_]:
-        """Return whether :meth:`require_physical` can skip the check of bodies for flights (...).
+        """Return whether :meth:`require_physical` can skip the body check for flights (...).
 
         Positive factors preserve the ratios of principal moments.
         """
@@ -225,7 +227,7 @@ class DrawnFlight:
     def with_draws_in_scenario(self) -> DrawnFlight:
         """Return the flight with its seed in the scenario and its masses in the plant's URDF.
 
-        Commanders keep the nominal robot, unless they have their own.
+        Commanders keep the nominal robot unless they have their own.
 
         Building such a robot takes milliseconds, so engines without ROS use :attr:`inertial`
         directly.
@@ -243,7 +245,7 @@ class DrawnFlight:
 
 
 def description_of(scenario: Scenario) -> RobotDescription:
-    """Return the robot of the plant.
+    """Return the plant's robot.
 
     Raises
     ------
@@ -253,7 +255,7 @@ def description_of(scenario: Scenario) -> RobotDescription:
     plant = scenario.plant
     if not (plant.robot or plant.robot_description):
         raise ParameterError(
-            f"the scenario '{scenario.name}' names no robot for its plant: set plant.robot."
+            f"the scenario '{scenario.name}' specifies no robot for its plant: set plant.robot."
         )
     return _load_description(plant.robot, plant.robot_description, plant.world)
 
@@ -275,7 +277,7 @@ def _load_description(robot: str, text: str, world: str) -> RobotDescription:
 
 
 def targets_of(name: str, scenario: Scenario) -> list[DispersionTarget]:
-    """Return the targets of a name: one, or one for each body.
+    """Return the targets with a name: one, or one per body.
 
     Raises
     ------
@@ -301,7 +303,7 @@ def targets_of(name: str, scenario: Scenario) -> list[DispersionTarget]:
     known += [*_POSE_TARGET_NAMES, "faults[0].at", "faults[0].until"]
     kinds = "; ".join(names for names, _ in TARGET_KINDS)
     raise ParameterError(
-        f"'{name}' cannot be dispersed; there are {kinds}.{suggestion(name, known)}"
+        f"'{name}' cannot be dispersed; available: {kinds}.{suggestion(name, known)}"
     )
 
 
@@ -319,13 +321,13 @@ def _parameter_target(name: str, node: str, rest: str, scenario: Scenario) -> Di
     declaration = known[bare]
     value = values_of(scenario.config(node))[bare]
     if isinstance(value, bool) or declaration.texts:
-        raise ParameterError(f"'{name}' is neither a number nor a text: it cannot be dispersed.")
+        raise ParameterError(f"'{name}' is neither a number nor a string: it cannot be dispersed.")
     if name in _PARAMETERS_EQUAL_IN_ALL_FLIGHTS:
         raise ParameterError(f"'{name}' is the same in all flights of a campaign.")
     if isinstance(value, tuple) and bare.startswith("initial_orientation"):
         raise ParameterError(f"'{name}' is a quaternion: disperse initial.rotvec.x, y and z.")
     if isinstance(value, tuple) is not bool(index):
-        how = f"say which number of the list: {name}[0]" if not index else "it is not a list"
+        how = f"name an element of the list, such as {name}[0]" if not index else "it is not a list"
         raise ParameterError(f"'{name}': {how}.")
     if not index:
         return _scalar_target(name, node, declaration, value)
@@ -376,7 +378,7 @@ def _list_values(name: str, node: str, declaration: Parameter, scenario: Scenari
     assert isinstance(values, tuple)
     if any(isinstance(each, str) for each in values):
         raise ParameterError(
-            f"'{name}': the list has texts NAME:VALUE; set a number for each joint under 'set'."
+            f"'{name}': the list has strings NAME:VALUE; set a number for each joint under 'set'."
         )
     if values:
         return [float(x) for x in values]
@@ -384,7 +386,7 @@ def _list_values(name: str, node: str, declaration: Parameter, scenario: Scenari
         start = _start_positions(scenario)
         return start if "positions" in name else [0.0] * len(start)
     raise ParameterError(
-        f"'{name}': the list is empty, which has a special meaning: set all of it under 'set'."
+        f"'{name}': the list is empty, which has a special meaning: set the whole list under 'set'."
     )
 
 
@@ -557,7 +559,7 @@ def _fault_target(name: str, index: int, part: str, scenario: Scenario) -> Dispe
         )
     kind = _require_fault(faults[index], scenario).kind
     if part == "value" and not FAULT_KINDS[kind].value:
-        raise ParameterError(f"'{name}': a fault of the kind {kind} has no value.")
+        raise ParameterError(f"'{name}': a fault of kind {kind} has no value.")
     is_text = part in ("kind", "target")
 
     def apply(flight: DrawnFlight, drawn: Any) -> DrawnFlight:
@@ -587,9 +589,9 @@ def _require_fault(line: str, scenario: Scenario) -> Fault:
 
 
 def urdf_with(robot: RobotDescription, parameters: InertialParameters) -> str:
-    """Return the URDF of a robot with different masses, centres of mass and inertias.
+    """Return a robot's URDF with different masses, centres of mass and inertias.
 
-    The first link of each body has the inertia of the body; links attached by fixed joints have
+    The first link of each body carries the body's inertia; links attached by fixed joints have
     none.
     """
     root = ET.fromstring(robot.urdf)

@@ -1,7 +1,7 @@
-"""Workers of a campaign: local processes behind pipes, or a dask.distributed cluster.
+"""Campaign workers: local processes connected by pipes, or a dask.distributed cluster.
 
 :meth:`TaskDistributor.rows` distributes the draws in tasks of about :data:`TARGET_TASK_TIME`, and
-yields the rows as tasks end.
+yields the rows as tasks finish.
 """
 
 from __future__ import annotations
@@ -37,26 +37,26 @@ from spacerobot_ros.termination import end_with_parent
 from spacerobot_ros.version import __version__, source_hash
 
 TARGET_TASK_TIME = 2.0
-"""Desired wall time of a task, s; the overhead of its distribution is then small."""
+"""Desired wall time of a task, s, which keeps the distribution overhead small."""
 
 _MIN_FIRST_TASK_FLIGHTS, _MAX_TASK_FLIGHTS = 4, 2000
 """Smallest number of flights in the first tasks, and largest number in any task."""
 
 _MAX_WORKER_DEATHS = 2
-"""Worker deaths after which a flight is reported as killed and not repeated."""
+"""Number of worker deaths after which a flight is reported as killed and not repeated."""
 
 _PACKAGE_NAME = "spacerobot_ros"
 
 _POLL_PERIOD = 0.2
-"""Longest wall time between two checks of tasks, signals and the dataset, s."""
+"""Longest wall time between checks of tasks, signals and the dataset, s."""
 
 _NO_WORKER_WARNING_DELAY = 5.0
-"""Wall time without a worker after which a warning is printed, s."""
+"""Wall time without workers after which a warning is printed, s."""
 
 _THREAD_COUNT_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 
 KILLED = "killed"
-"""The outcome of a flight during which a worker died twice."""
+"""Outcome of a flight during which a worker died twice."""
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,7 @@ THIS_PROCESS = Cluster()
 
 
 def serialise_campaign(campaign: Campaign) -> bytes:
-    """Return a campaign serialised for workers: the content of its file, and its scenario."""
+    """Return a campaign serialised for workers: its file content and its scenario."""
     campaign = self_contained(campaign)
     return pickle.dumps((campaign.name, dict(campaign.section), Path(), campaign.scenario))
 
@@ -93,21 +93,21 @@ def _deserialise_campaign(packed: bytes) -> Campaign:
 
 
 def this_code() -> str:
-    """Return the version of the package, and the hash of its code."""
+    """Return the package version and code hash."""
     return f"{__version__} ({source_hash()})"
 
 
 def fly_task(
     packed: bytes, code: str, draws: list[Draw], engine: str, include_fallbacks: bool
 ) -> list[Row | Fallback]:
-    """Fly some draws: a task of a worker.
+    """Fly some draws: a worker task.
 
     Parameters
     ----------
     packed, code
-        Result of :func:`serialise_campaign`, and :func:`this_code` of the process that made it.
+        Result of :func:`serialise_campaign`, and of :func:`this_code` in the same process.
     draws, engine
-        Draws, and name of the engine.
+        Draws, and engine name.
     include_fallbacks
         Whether this task also flies the engine's fallbacks.
 
@@ -118,8 +118,8 @@ def fly_task(
     """
     if code != this_code():
         raise SpaceRobotError(
-            f"A worker has {_PACKAGE_NAME} {this_code()}, and this process has {code}: all need "
-            "the same code."
+            f"A worker has {_PACKAGE_NAME} {this_code()}, and this process has {code}: all must "
+            "have the same code."
         )
     flying, campaign = engine_by_name(engine), _deserialise_campaign(packed)
     fly = partial(fly_all, flying) if include_fallbacks else flying.fly
@@ -165,9 +165,11 @@ class _LocalWorker:
 
 
 class LocalWorkers:
-    """Processes on this machine, each behind an anonymous pipe that no other process can reach.
+    """Processes on this machine, each connected by an anonymous pipe that no other process can
+    access.
 
-    Each has one task at a time, so a death has one cause; a busy worker represents its task.
+    Each worker has one task at a time, so a worker's death has one cause; a busy worker represents
+    its task.
 
     Parameters
     ----------
@@ -185,7 +187,7 @@ class LocalWorkers:
         return len(self._workers)
 
     def submit(self, *arguments: Any) -> _LocalWorker:
-        """Begin a task in an idle worker; the arguments are those of :func:`fly_task`."""
+        """Start a task in an idle worker; the arguments are those of :func:`fly_task`."""
         place = next(place for place, worker in enumerate(self._workers) if not worker.busy)
         if not self._workers[place].process.is_alive():
             self._workers[place].close()
@@ -197,12 +199,12 @@ class LocalWorkers:
         return worker
 
     def ended(self, tasks: list[_LocalWorker]) -> list[_LocalWorker]:
-        """Return the tasks that have ended; an empty list if none ends for a while."""
+        """Return the finished tasks, or an empty list if none finishes for a while."""
         ready = wait([worker.connection for worker in tasks], timeout=_POLL_PERIOD)
         return [worker for worker in tasks if worker.connection in ready]
 
     def result(self, task: _LocalWorker) -> list[Row | Fallback]:
-        """Return the result of a task that has ended, or raise its exception."""
+        """Return the result of a finished task, or raise its exception."""
         task.busy = False
         try:
             answer: list[Row | Fallback] | Exception = task.connection.recv()
@@ -214,7 +216,7 @@ class LocalWorkers:
         return answer
 
     def cancel(self, tasks: list[_LocalWorker]) -> None:
-        """Stop tasks: :meth:`close` ends the processes."""
+        """Stop tasks; :meth:`close` terminates the processes."""
 
     def close(self) -> None:
         """End the processes."""
@@ -253,10 +255,10 @@ class DaskWorkers:
         self._client = client
         self._checked: set[str] = set()
         self._empty_since = math.inf
-        """Monotonic time since which the scheduler has no worker; infinite if it has one."""
+        """Monotonic time since which the scheduler has had no worker; infinite if it has one."""
 
     def count(self) -> int:
-        """Return the number of workers, at least 1, because others may join later.
+        """Return the number of workers, at least 1 because workers may join later.
 
         Raises
         ------
@@ -274,7 +276,7 @@ class DaskWorkers:
         now = time.monotonic()
         self._empty_since = math.inf if workers else min(self._empty_since, now)
         if now - self._empty_since > _NO_WORKER_WARNING_DELAY:
-            warn_once("The scheduler has no worker: the flights wait for one.")
+            warn_once("The scheduler has no workers: flights are waiting for one.")
         return max(1, workers)
 
     def submit(self, *arguments: Any) -> Any:
@@ -282,7 +284,7 @@ class DaskWorkers:
         return self._client.submit(fly_task, *arguments, pure=False, retries=0)
 
     def ended(self, tasks: list[Any]) -> list[Any]:
-        """Return the tasks that have ended; an empty list if none ends for a while."""
+        """Return the finished tasks, or an empty list if none finishes for a while."""
         import distributed
 
         try:
@@ -294,7 +296,7 @@ class DaskWorkers:
         return [task for task in tasks if task.done()]
 
     def result(self, task: Any) -> list[Row | Fallback]:
-        """Return the result of a task that has ended.
+        """Return the result of a finished task.
 
         Raises
         ------
@@ -317,13 +319,13 @@ class DaskWorkers:
                 raise
             raise SpaceRobotError(
                 "The scheduler or a worker cannot load the task "
-                f"({str(error).splitlines()[0]}): all of them need {_PACKAGE_NAME}[campaign] "
+                f"({str(error).splitlines()[0]}): all of them require {_PACKAGE_NAME}[campaign] "
                 f"{__version__}."
             ) from error
         return made
 
     def cancel(self, tasks: list[Any]) -> None:
-        """Stop tasks that have not ended."""
+        """Stop unfinished tasks."""
         self._client.cancel(tasks, force=True)
 
     def _require_package(self, workers: Iterable[str]) -> None:
@@ -336,7 +338,7 @@ class DaskWorkers:
         for address, spec in found.items():
             if spec is None:
                 raise SpaceRobotError(
-                    f"The worker at {address} has no {_PACKAGE_NAME}: install it there."
+                    f"The worker at {address} does not have {_PACKAGE_NAME}: install it there."
                 )
             if not isinstance(spec, Exception):  # The worker may have left again.
                 self._checked.add(address)
@@ -344,7 +346,7 @@ class DaskWorkers:
 
 def _lost_scheduler_error() -> SpaceRobotError:
     return SpaceRobotError(
-        "The scheduler is gone. Finished flights are kept; the same command continues."
+        "The scheduler is gone. Finished flights are kept; repeat the command to continue."
     )
 
 
@@ -353,7 +355,7 @@ Workers = LocalWorkers | DaskWorkers
 
 @contextmanager
 def open_workers(cluster: Cluster, flights: int) -> Iterator[Workers]:
-    """Yield the workers of a cluster, with at most as many processes as flights.
+    """Yield the workers of a cluster, with no more processes than flights.
 
     Raises
     ------
@@ -407,9 +409,9 @@ class _SubmittedTask:
 class TaskDistributor:
     """Distributes draws to workers.
 
-    Fallbacks of an engine are redistributed to the engine ``flights``, in tasks of fewer flights.
+    An engine's fallbacks are redistributed to engine ``flights``, in tasks with fewer flights.
 
-    If a worker dies, each flight of its task is repeated in a separate task, one such task at a
+    If a worker dies, each flight in its task is repeated in a separate task, one such task at a
     time. If a worker dies again, the flight has killed two workers and is reported. (A dask
     scheduler reports all tasks of a dead worker, not only the running one.)
 
@@ -418,7 +420,7 @@ class TaskDistributor:
     workers
         The workers.
     campaign, draws, engine
-        The campaign, its draws, and the name of the engine.
+        The campaign, its draws, and the engine name.
     stopped
         Returns whether to stop; called a few times per second.
     """
@@ -439,15 +441,15 @@ class TaskDistributor:
         }
         """Number of flights per task, by engine."""
         self._fallbacks: deque[int] = deque()
-        """Draws that the engine passes on to the engine ``flights``."""
+        """Draws that the engine passes on to engine ``flights``."""
         self._reasons: dict[int, str] = {}
         self._running: dict[Any, _SubmittedTask] = {}
         self._retry_alone: deque[int] = deque()
-        """Draws of tasks whose worker has died."""
+        """Draws in tasks whose worker has died."""
         self._deaths: Counter[int] = Counter()
 
     def rows(self, numbers: list[int]) -> Iterator[list[Row]]:
-        """Yield the rows of the draws as their tasks end, and empty lists in between."""
+        """Yield the rows of draws as their tasks finish, and empty lists in between."""
         waiting = deque(numbers)
         while (
             waiting or self._fallbacks or self._retry_alone or self._running

@@ -50,33 +50,33 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     ({"disperse": {"mass": {"norm": {"scal": 1}}}}, "no argument 'scal'.*Did you mean 'scale'"),
     ({"disperse": {"mass": {"norm": {"scale": -1}}}}, "norm is not defined for these"),
     ({"disperse": {"mass": {"norm": {"loc": "one"}}}}, "'mass: loc' is 'one'"),
-    ({"disperse": {"mass": {"beta": {"a": 1}}}}, "beta needs its argument 'b'"),
+    ({"disperse": {"mass": {"beta": {"a": 1}}}}, "beta requires the argument 'b'"),
     ({"disperse": {"mass": {"norm": [1, 2, 3]}}}, "norm takes loc, scale, not 3 numbers"),
-    ({"disperse": {"mass": {"uniform": [1]}}}, r"uniform takes \[least, largest\], two numbers"),
+    ({"disperse": {"mass": {"uniform": [1]}}}, r"uniform takes two numbers, \[smallest, largest\]"),
     (
         {"disperse": {"mass": {"uniform": [2, 1]}}},
-        "uniform is from 2 to 1; the first must be the lower",
+        "uniform is from 2 to 1; the first must be smaller",
     ),
     ({"disperse": {"mass": 1.0}}, "must have one distribution"),
-    ({"disperse": {"mass": NORM, "mass.mass_1": NORM}}, "set the same numbers"),
+    ({"disperse": {"mass": NORM, "mass.mass_1": NORM}}, "set the same values"),
     ({"disperse": {"mass.mass_1": NORM, "mass": NORM}}, "'mass.mass_1' and 'mass' set the same"),
     ({"disperse": {"mass.": NORM}}, "the robot has no body ''"),
-    ({"disperse": 0}, "'disperse' must contain names"),
-    ({"criteria": []}, "'criteria' must contain names"),
+    ({"disperse": 0}, "'disperse' must map names to values"),
+    ({"criteria": []}, "'criteria' must map names to values"),
     ({"disperse": {"mass": {"gaussian": {}}}}, "Did you mean 'norm'"),
-    ({"disperse": {"mass": {"norm": {"mean": 1}}}}, "loc is its mean and scale its standard"),
+    ({"disperse": {"mass": {"norm": {"mean": 1}}}}, "loc is the mean and scale the standard"),
     (
         {"disperse": {"mass": {"uniform": {"max": 1}}}},
-        "loc is its smallest value and scale its width",
+        "loc is the smallest value and scale the width",
     ),
     ({"table": "none.csv"}, "the table 'none.csv' cannot be read: No such file"),
     ({"table": "/dev/zero"}, "the table '/dev/zero' cannot be read: it is a device"),
-    ({"table": 3}, "'table' must be the name of a CSV file, or its lines"),
-    ({"table": "mass\n"}, "needs one line of names and one line per flight"),
-    ({"table": "mass\n1,2\n"}, "row 1 of the table has 2 values for 1 names"),
+    ({"table": 3}, "'table' must be the name or the content of a CSV file"),
+    ({"table": "mass\n"}, "must have one line of names and one line per flight"),
+    ({"table": "mass\n1,2\n"}, "table row 1 has 2 values for 1 names"),
     ({"table": "mass.*\n1\n"}, r"'mass.\*' in the table names 4 values: name one"),
     ({"table": "mass\nx\n"}, "'mass: table' is 'x'; it must be a finite number"),
-    ({"table": "mass\n1\n", "disperse": {"mass.mass_1": NORM}}, "set the same numbers"),
+    ({"table": "mass\n1\n", "disperse": {"mass.mass_1": NORM}}, "set the same values"),
     ({"table": "planner.method\noptima\n"}, "must be one of lie_bracket"),
     ({"table": "mass\n1\n", "sampler": "saltelli"}, "'saltelli' requires independent values"),
     (joint(cov=[[1, 2], [2.5, 8]]), "cov must be symmetric"),
@@ -85,13 +85,13 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     (joint(mean=[1], cov=[[1, 0], [0, 1]]), "mean must have 2 numbers, cov 2 x 2"),
     (joint(cov=[[1, 0], [0, 0]]), "means must be finite and variances positive"),
     (joint(mean=[1, 2]), "multivariate_normal must have 'cov' and may have 'mean'"),
-    (joint("mass, planner.method", cov=[[1, 0], [0, 1]]), "has a text"),
+    (joint("mass, planner.method", cov=[[1, 0], [0, 1]]), "includes a string"),
     ({"disperse": {"mass": {"norm": {"loc": 1, "scale": 0}}}}, "norm is not defined for these"),
     ({"disperse": {"mass": {"choice": [1, None]}}}, "'mass: choice' is None"),
     ({"disperse": {"mass": {"choice": [True, 1]}}}, "'mass: choice' is True"),
     ({"disperse": {"mass": {"choice": [[1], 2]}}}, r"'mass: choice' is \[1\]"),
     ({"disperse": {"mass": {"choice": [float("inf")]}}}, "it must be a finite number"),
-    ({"disperse": {"planner.method": {"choice": ["optimal", 3]}}}, "is a text; the choice has 3"),
+    ({"disperse": {"planner.method": {"choice": ["optimal", 3]}}}, "is a string; the choice has 3"),
     ({"disperse": {"planner.method": {"choice": ["optimall"]}}}, "must be one of lie_bracket"),
     ({"disperse": {"plant.sensors.position_noise": {"choice": [-1]}}}, "must be a number from 0"),
     ({"disperse": {"plant.sensors.position_bias[3]": NORM}}, "not an index from 0 to 2"),
@@ -102,7 +102,7 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     ({"disperse": {"plant.time_mode": {"choice": ["realtime"]}}}, "the same in all flights"),
     ({"disperse": {"initial.joint.slider_1": NORM}}, "Did you mean 'initial.joints.slider_1'"),
     ({"disperse": {"com.x": NORM}}, "'com.x' must be com.BODY.x.*the bodies are base_link"),
-    ({"disperse": {"initial.position.x": NORM, "plant.initial_position[0]": NORM}}, "same numbers"),
+    ({"disperse": {"initial.position.x": NORM, "plant.initial_position[0]": NORM}}, "same values"),
     (
         {
             "disperse": {
@@ -110,11 +110,11 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
                 "plant.initial_joint_positions[slider_1]": NORM,
             }
         },
-        "set the same numbers",
+        "set the same values",
     ),
     ({"disperse": {"plant.sensors.noise": NORM}}, "no parameter 'sensors.noise'.*Did you mean"),
     ({"disperse": {"coordinated_control.time_limit": NORM}}, "a node that does not fly"),
-    ({"disperse": {"plant.linear_momentum": NORM}}, "say which number of the list"),
+    ({"disperse": {"plant.linear_momentum": NORM}}, "name an element of the list"),
     ({"disperse": {"plant.tick_rate[0]": NORM}}, "it is not a list"),
     ({"disperse": {"plant.initial_orientation[0]": NORM}}, "disperse initial.rotvec"),
     ({"disperse": {"initial.joints.slider": NORM}}, "no joint 'slider'.*Did you mean 'slider_"),
@@ -126,7 +126,7 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
             "disperse": {"faults[0].target": {"choice": ["slider_1", "slider_9"]}},
             "set": {"plant.faults": ["joint_stuck slider_1"]},
         },
-        "'joint_stuck slider_9' is refused: the target of joint_stuck is one of slider_1",
+        "'joint_stuck slider_9' is refused: the target of joint_stuck must be one of slider_1",
     ),
     (
         {
@@ -135,14 +135,14 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
         },
         "joint_slow needs a value: factor on the command",
     ),
-    ({"disperse": {"planner.method": NORM}}, "is a text: it must have a 'choice' of texts"),
+    ({"disperse": {"planner.method": NORM}}, "is a string: it must have a 'choice' of strings"),
     ({"disperse": {"faults[0].present": NORM}}, r"plant.faults has 0 fault\(s\)"),
     ({"disperse": {"mass": {"choice": ["a"]}}}, "'mass: choice' is 'a'"),
     ({"criteria": {"position_eror_m": {"max": 1}}}, "no metric.*Did you mean 'position_error_m'"),
     ({"criteria": {"peak_rate.slider_9": {"max": 1}}}, "Did you mean 'peak_rate.slider_[123]'"),
-    ({"criteria": {"duration_s": {"most": 1}}}, "must have 'min' or 'max'"),
+    ({"criteria": {"duration_s": {"most": 1}}}, "must have 'min', 'max' or both"),
     ({"criteria": {"duration_s": {"min": 2, "max": 1}}}, "has min 2.0 above max 1.0"),
-    ({"sampler": "saltelli"}, "needs at least one dispersion"),
+    ({"sampler": "saltelli"}, "requires at least one dispersion"),
 ]
 
 
@@ -177,7 +177,7 @@ def test_a_key_that_is_there_twice_is_refused(tmp_path: Path) -> None:
     file.write_text(text)
     assert load_campaign(file).names == ("mass",)
     file.write_text(text.replace("disperse:\n", "disperse:\n    mass: {norm: {}}\n"))
-    with pytest.raises(ParameterError, match=r"the key 'mass' occurs twice.*line 4"):
+    with pytest.raises(ParameterError, match=r"the key 'mass' appears twice.*line 4"):
         load_campaign(file)
     file.write_text("campaign:\n  ? [1, 2]\n  : 3\n")
     with pytest.raises(ParameterError, match=r"found unhashable key.*line 2"):
@@ -339,7 +339,7 @@ def test_the_rows_of_a_table_are_its_flights(tmp_path: Path) -> None:
         {"mass.mass_1": 0.75, "planner.method": "auto", "goal.position.x": -0.002},
     ]
     assert second[0] != second[1]
-    with pytest.raises(ParameterError, match="'flights' is 3, but the table has rows for only 2"):
+    with pytest.raises(ParameterError, match="'flights' is 3, but the table has only 2 rows"):
         load_campaign(file, 3)
 
 

@@ -283,7 +283,7 @@ def test_the_engine_is_chosen_and_says_why_it_cannot() -> None:
         select_engine(beside, "lanes")
     has_contact_forces = campaign(set={"plant.engine": "mujoco"})
     assert select_engine(has_contact_forces, "auto").name == "flights"
-    with pytest.raises(SpaceRobotError, match="its plant has the engine 'mujoco'"):
+    with pytest.raises(SpaceRobotError, match="its plant uses engine 'mujoco'"):
         select_engine(has_contact_forces, "lanes")
     near = campaign(criteria={"clearance_m": {"min": 0.0}})
     assert select_engine(near, "auto").name == "flights"
@@ -292,7 +292,7 @@ def test_the_engine_is_chosen_and_says_why_it_cannot() -> None:
     among = controlled(
         set={"plant.world": str(share_directory() / "config" / "worlds" / "panel.urdf")}
     )
-    with pytest.raises(SpaceRobotError, match="it has obstacles, and lanes detect no contacts"):
+    with pytest.raises(SpaceRobotError, match="it has obstacles, and lanes do not detect contacts"):
         select_engine(among, "lanes")
     # What would be another kind of flight is not flown as the nominal one.
     for name, values in (
@@ -306,7 +306,7 @@ def test_the_engine_is_chosen_and_says_why_it_cannot() -> None:
         assert select_engine(campaign(set=given), "auto").name == "flights"
 
 
-SHARED = "is dispersed, and all lanes share it"
+SHARED = "is dispersed, but shared by all lanes"
 
 
 @pytest.mark.parametrize(
@@ -344,7 +344,7 @@ def test_what_all_lanes_share_is_not_dispersed(name: str) -> None:
         ({"plant.beyond_limits": "refuse"}, "the plant refuses commands beyond limits"),
         (
             {"coordinated_control.tasks": "detumble"},
-            "its controller has tasks before goals; use engine 'flights'",
+            "its controller performs tasks before goals; use engine 'flights'",
         ),
         (
             {"coordinated_control.law": "transposed_jacobian"},

@@ -207,7 +207,7 @@ def test_criteria_include_their_bounds() -> None:
 @pytest.mark.parametrize(
     ("given", "sentence"),
     [
-        ({"scenario": None}, "'scenario' must be the name or the file of a scenario."),
+        ({"scenario": None}, "'scenario' must be a scenario name or file."),
         (
             {"disperse": {"mass.mass_1": {"norm": {}}, "mass.*": {"norm": {}}}},
             "'mass.mass_1' is dispersed twice.",
@@ -251,8 +251,7 @@ def test_a_file_that_is_refused_is_named(tmp_path: Path) -> None:
     with pytest.raises(ParameterError) as refused:
         load_campaign(file)
     assert str(refused.value) == (
-        f"The campaign file {file} is refused: 'scenario' must be the name or the file of a "
-        "scenario."
+        f"The campaign file {file} is refused: 'scenario' must be a scenario name or file."
     )
 
 
@@ -404,7 +403,8 @@ def test_a_folder_without_a_campaign_or_flights_is_named(tmp_path: Path) -> None
     with pytest.raises(ParameterError) as refused:
         Dataset(tmp_path / "none").campaign()
     assert str(refused.value) == (
-        f"The folder {tmp_path / 'none'} holds no campaign: about.json: No such file or directory."
+        f"The folder {tmp_path / 'none'} contains no campaign: about.json: No such file or "
+        "directory."
     )
     dataset = Dataset(tmp_path / "new")
     dataset.begin(MADE)

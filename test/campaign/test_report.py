@@ -78,7 +78,7 @@ def test_a_report_of_flights_that_ended_early_says_that_late_ones_are_missing(
     assert not Results.of(first).incompleteness_warning
     page = tmp_path / "page.html"
     lines = write_campaign_report(quick, page)
-    sentence = "10 draws are not flown yet although later ones are"
+    sentence = "10 draws are not flown yet although later ones have been"
     assert sentence in "\n".join(lines)
     assert sentence in unescape(page.read_text("utf-8"))
 
@@ -290,7 +290,7 @@ def test_two_designs_are_compared_draw_by_draw(tmp_path: Path) -> None:
     lines = write_comparison((one, barred), tmp_path / "barred.html")
     assert lines[-2:] == [
         "Of short, 120 of 120 flights have the outcome refused: Too far.",
-        "Differences exclude draws whose goal one of the campaigns refused.",
+        "Differences exclude draws whose goal was refused in one of the campaigns.",
     ]
     assert not any(line.startswith("position_error_m") for line in lines)
     half = filled(tmp_path / "half", made, better, refuses=lambda number: number < 60)
@@ -349,7 +349,7 @@ def test_flights_that_all_failed_have_a_report(tmp_path: Path, count: int) -> No
     assert lines[0].startswith(f"success     0 % (0 of {count};")
     assert lines.count(f"error       {count} of {count}: The mass is negative.") == 1
     text = (tmp_path / "report.html").read_text()
-    assert "No flight has any metric." in text
+    assert "No metric is available for any flight." in text
     assert "The mass is negative." in text
 
 

@@ -108,25 +108,25 @@ def test_a_robot_file_that_is_written_anew_is_the_same_robot(tmp_path: Path) -> 
     own.write_bytes(ElementTree.tostring(root, "utf-8"))
     assert fly(2) == 2
     own.write_text(own.read_text("utf-8").replace('mass value="', 'mass value="1', 1))
-    with pytest.raises(ParameterError, match="holds another campaign"):
+    with pytest.raises(ParameterError, match="contains another campaign"):
         fly(3)
 
 
 def test_the_folder_of_another_campaign_is_refused(tmp_path: Path) -> None:
     run_campaign(small(flights=1), tmp_path / "one")
     for other in (small(flights=1, seed=3), small(flights=1, set={"planner.averaging": 3})):
-        with pytest.raises(ParameterError, match="holds another campaign"):
+        with pytest.raises(ParameterError, match="contains another campaign"):
             run_campaign(other, tmp_path / "one")
-    with pytest.raises(ParameterError, match=r"'short', with another 'seed'. Name another"):
+    with pytest.raises(ParameterError, match=r"'short', with another 'seed'. Use another"):
         run_campaign(small(flights=1, seed=3), tmp_path / "one")
     with pytest.raises(ParameterError, match="with another scenario or other parameters"):
         run_campaign(small(flights=1, method="optimal"), tmp_path / "one")
     (tmp_path / "file").touch()
-    with pytest.raises(ParameterError, match="is a file: name a folder"):
+    with pytest.raises(ParameterError, match="is a file: specify a folder"):
         run_campaign(small(), tmp_path / "file")
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "thesis.txt").write_text("1")
-    with pytest.raises(ParameterError, match="is not empty and holds no campaign"):
+    with pytest.raises(ParameterError, match="is not empty and contains no campaign"):
         run_campaign(small(), tmp_path / "full")
 
 
@@ -147,7 +147,7 @@ def test_a_flight_that_cannot_be_flown_ends_no_other(tmp_path: Path) -> None:
 def test_two_processes_do_not_fly_into_one_folder(tmp_path: Path) -> None:
     first = Dataset(tmp_path)
     first.begin(small())
-    with pytest.raises(ParameterError, match="Another process flies the campaign"):
+    with pytest.raises(ParameterError, match="Another process is flying the campaign"):
         run_campaign(small(), tmp_path)
     first.close()
     assert run_campaign(small(flights=1), tmp_path).flown == 1
@@ -222,7 +222,9 @@ def test_a_disk_that_is_full_costs_nothing_that_is_there(
     assert len(Results.of(tmp_path)) == 2
     with monkeypatch.context() as patch:
         patch.setattr(require_module("pyarrow.parquet"), "write_table", full)
-        with pytest.raises(RecordingError, match=r"The last 1 flights cannot be .*continues from"):
+        with pytest.raises(
+            RecordingError, match=r"The last 1 flights cannot be .*to continue from"
+        ):
             run_campaign(small(flights=3), tmp_path)
     assert str(rows(tmp_path)) == str(before)
     assert run_campaign(small(flights=3), tmp_path).flown == 3
@@ -292,7 +294,7 @@ def test_a_flight_that_is_twice_in_a_folder_counts_once(
     for part in sorted(flights.glob("part-0000*.parquet")):
         shutil.copy2(part, flights / part.name.replace("part-0000", "part-0001"))
     np.testing.assert_equal(rows(tmp_path), before)
-    assert any(line.startswith(f"3 of the rows in {tmp_path} repeat") for line in caplog.messages)
+    assert any(line.startswith(f"3 rows in {tmp_path} are duplicates") for line in caplog.messages)
     results = Results.of(tmp_path)
     assert (len(results), results.incompleteness_warning) == (3, "")
     assert rerun_flight(tmp_path, 1, tmp_path / "again.mcap").agrees
@@ -304,7 +306,7 @@ def test_rows_of_other_software_are_named(tmp_path: Path, caplog: pytest.LogCapt
     about = tmp_path / "about.json"
     about.write_text(about.read_text("utf-8").replace(source_hash(), "0123456789ab"))
     run_campaign(small(flights=2), tmp_path)
-    assert any("were flown with other software" in line for line in caplog.messages)
+    assert any("were flown with different software" in line for line in caplog.messages)
 
 
 def test_a_task_of_lanes_leaves_what_others_fly_unless_all_of_it_is_asked_for() -> None:

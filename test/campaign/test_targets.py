@@ -288,9 +288,12 @@ def test_masses_go_into_the_description_of_the_plant_alone(scenario: Scenario) -
         ("tick_rate", "cannot be dispersed"),
         ("coordinated_control.tick_rate", "flies with planner"),
         ("plant.tick_rat", "has no parameter 'tick_rat'. Did you mean 'tick_rate'?"),
-        ("plant.tf_links", "is neither a number nor a text"),
+        ("plant.tf_links", "is neither a number nor a string"),
         ("plant.initial_orientation[0]", "disperse initial.rotvec.x, y and z"),
-        ("plant.initial_position", "say which number of the list: plant.initial_position[0]"),
+        (
+            "plant.initial_position",
+            "name an element of the list, such as plant.initial_position[0]",
+        ),
         ("plant.tick_rate[0]", "it is not a list"),
         ("plant.initial_position[3]", "'3' is not an index from 0 to 2 of the list."),
         ("plant.initial_joint_positions[3]", "nor one of the joints slider_1, slider_2, slider_3"),
@@ -301,7 +304,7 @@ def test_masses_go_into_the_description_of_the_plant_alone(scenario: Scenario) -
         ("initial.joints.slider_9", "has no joint 'slider_9'; it has slider_1, slider_2, slider_3"),
         ("end_effector_goal.position.x", "has no goal for the end-effector"),
         ("faults[3].at", "plant.faults has 3 fault(s); the first is faults[0]."),
-        ("faults[0].value", "a fault of the kind joint_stuck has no value"),
+        ("faults[0].value", "a fault of kind joint_stuck has no value"),
     ],
 )
 def test_names_that_are_none_are_refused(name: str, words: str, scenario: Scenario) -> None:
