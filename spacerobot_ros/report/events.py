@@ -1,4 +1,4 @@
-"""Events of a flight below the time axes of its figures: goals, plans, faults, latches."""
+"""Flight events below the time axes of figures: goals, plans, faults, latches."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ from spacerobot_ros.simulation.faults import with_seconds
 from spacerobot_ros.times import SECOND
 
 EVENT_STRIP_HEIGHT = 0.62
-"""Height of a strip of events with its key below a time axis, inches."""
+"""Height of an event strip with its legend below a time axis, inches."""
 
 _MAX_MARKS = 2000
-"""Largest number of marks in a strip: more would merge."""
+"""Largest number of marks in a strip: more would overlap."""
 
 _STRIP_DISTANCE = 0.44
-"""Distance of the strip's upper edge from the axis, inches, with space for labels."""
+"""Distance from the axis to the strip's upper edge, inches, including space for labels."""
 
 _STRIP_HEIGHT = 0.24
 _GOOD, _BAD, _WARN, _PLAIN = PALETTE[2], "#c62f2f", PALETTE[1], PALETTE[0]
@@ -37,7 +37,7 @@ _GOOD, _BAD, _WARN, _PLAIN = PALETTE[2], "#c62f2f", PALETTE[1], PALETTE[0]
 
 @dataclass(frozen=True)
 class FlightEvent:
-    """An event of a recorded flight, ``time`` in s since its first state."""
+    """An event in a recorded flight; ``time`` is in s since the first state."""
 
     time: float
     node: str
@@ -120,7 +120,7 @@ _MARKS = {
     EventKind.NODE_BACK: _Mark("node back", "h", _GOOD, 1, hollow=True),
     EventKind.NODE_RESTARTED: _Mark("node restarted", "h", _WARN, 1),
 }
-"""Marks of events by kind; other kinds, such as starts and stops of nodes, are not drawn."""
+"""Event marks by kind; other kinds, such as node starts and stops, are not drawn."""
 
 
 _GLYPHS = {
@@ -138,7 +138,7 @@ _GLYPHS = {
     "|": "❙❙",
     "P": "✚✚",
 }
-"""Markers of matplotlib as characters, full and hollow."""
+"""matplotlib markers as characters, filled and hollow."""
 
 _FAULT_KINDS = frozenset(
     (
@@ -157,11 +157,11 @@ _PROMINENT_KINDS = _FAULT_KINDS | {
     EventKind.WHEEL_FAILED,
     EventKind.CAPTURED,
 }
-"""Kinds marked over the full height of a chart."""
+"""Event kinds marked over the full height of a chart."""
 
 
 def event_style(kind: EventKind) -> dict[str, Any]:
-    """Return the appearance of events of a kind on a page."""
+    """Return the appearance of an event kind on a page."""
     mark = _MARKS[kind]
     return {
         "kind": kind.value,
@@ -181,11 +181,11 @@ def timed_events(
     Parameters
     ----------
     events
-        Events with their log times (ns) and nodes.
+        Events with log times (ns) and nodes.
     began
         Time of the first state, s.
     stamped
-        Whether ``began`` is simulated time, like the events' own time; otherwise log times are
+        Whether ``began`` is simulated time, like the time in the events; otherwise log times are
         used.
     """
     found = []
@@ -198,7 +198,7 @@ def timed_events(
 
 
 def draw_events(axes: Axes, events: Sequence[FlightEvent]) -> None:
-    """Draw a strip below a time axis with the events in its span, and a key of their marks."""
+    """Draw a strip below a time axis with the events in its span, and a legend of their marks."""
     start, end = axes.get_xlim()
     shown = [each for each in events if start <= each.time <= end][:_MAX_MARKS]
     figure = axes.figure

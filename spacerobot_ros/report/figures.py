@@ -1,4 +1,4 @@
-"""The figures of reports: style, panels, traces, and files (SVG, PDF, PNG)."""
+"""Report figures: style, panels, traces, and files (SVG, PDF, PNG)."""
 
 from __future__ import annotations
 
@@ -35,35 +35,35 @@ TEXT_COLOUR, SECONDARY_COLOUR, LINE_COLOUR = "#1f2328", "#667085", "#c3c8d0"
 _OKABE_ITO = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 _TOL = ("#332288", "#882255", "#999933", "#44AA99")
 PALETTE = (*_OKABE_ITO, *_TOL)
-"""Colours that can be distinguished with any kind of colour vision."""
+"""Colours that can be distinguished with any type of colour vision."""
 
 BASE_COLOUR, HAND_COLOUR, PLANNED_COLOUR, GHOST_COLOUR = (PALETTE[i] for i in (0, 3, 4, 2))
-"""Colours of the paths of base and end-effector, of plans, and of goals in space: blue, pink,
-orange and green, as on the live page."""
+"""Colours of base and end-effector paths, plans and goals in space: blue, pink, orange and
+green, as on the live page."""
 
 WIDTH = 9.6
-"""Width of a figure of a page, inches."""
+"""Figure width on a page, inches."""
 
 _NARROW_WIDTH = 6.0
-"""Figures narrower than this are drawn for one column of a paper, inches."""
+"""Figures narrower than this are styled for one column of a paper, inches."""
 
 TRACE_TIME_SLICES = 960
 """Number of time slices across a figure that summarise a dense trace."""
 
 LARGEST_VALUE_SLICES = 240
-"""Number of time slices of a trace that is drawn as the largest value of each slice."""
+"""Number of time slices for a trace drawn as the largest value in each slice."""
 
 _INVISIBLE_ERROR = 5e-4
-"""Largest error of a simplified line, as a share of the height of its panel."""
+"""Largest error of a simplified line, as a share of the panel height."""
 
 _PATH_DATA = re.compile(rb' d="[^"]*"')
 _DECIMALS = re.compile(rb"(\.\d\d)\d+")
 
 _FONT_SIZE = 8.5
-"""Font size for which the distances in these modules are designed, points."""
+"""Font size that the distances in these modules are designed for, points."""
 
 _FONT_SIZE_RANGE = (3.0, 30.0)
-"""Least and largest font size of a style file, points."""
+"""Smallest and largest font size in a style file, points."""
 
 _FIXED_SETTINGS: Any = {
     # Names of joints may contain dollar signs.
@@ -97,21 +97,20 @@ def drawing(
     degrees: bool = False,
     lettered: bool = False,
 ) -> Iterator[None]:
-    """Use the style of these figures within the block.
+    """Apply the figure style within the block.
 
     Parameters
     ----------
     width
-        Width of a figure, inches.
+        Figure width, inches.
     style
-        Style file of this package: ``report`` for pages, ``paper`` for papers.
+        Style file in this package: ``report`` for pages, ``paper`` for papers.
     own
-        Style file of the user, or name of a style of this package or of matplotlib; it overrides
-        ``style``.
+        User style file, or name of a style in this package or in matplotlib; overrides ``style``.
     degrees
         Whether angles over time are in degrees instead of rad.
     lettered
-        Whether multiple panels of a figure are labelled (a), (b) and so on.
+        Whether multiple panels in a figure are labelled (a), (b) and so on.
 
     Raises
     ------
@@ -155,7 +154,7 @@ def _read_style(path: Path) -> mpl.RcParams:
 
         if str(path) in styles.library:
             return styles.library[str(path)]
-        raise ValueError("there is no such file, and matplotlib has no style of that name")
+        raise ValueError("there is no such file, and matplotlib has no style with that name")
     if not path.is_file():
         raise ValueError("it is no file")
     return mpl.rc_params_from_file(path, use_default_template=False)
@@ -170,7 +169,7 @@ def _require_fonts(path: Path) -> None:
         )
     if mpl.rcParams["text.usetex"]:
         raise SpaceRobotError(
-            f"The style file {path} is refused: text.usetex would read the names of joints as TeX, "
+            f"The style file {path} is refused: text.usetex would interpret joint names as TeX "
             "and leave no editable text."
         )
     families = mpl.rcParams["font.family"]
@@ -214,7 +213,7 @@ class _Warnings(logging.Filter):
         self.messages: list[str] = []
 
     def filter(self, record: logging.LogRecord) -> bool:
-        """Store the first line of a warning and keep it from being shown."""
+        """Store the first line of a warning and suppress its display."""
         if record.levelno < logging.WARNING:
             return True
         self.messages.append(record.getMessage().strip().splitlines()[0].rstrip("."))
@@ -222,12 +221,12 @@ class _Warnings(logging.Filter):
 
 
 def width() -> float:
-    """Return the width of a figure, inches."""
+    """Return the figure width, inches."""
     return _look.get().width
 
 
 def narrow() -> bool:
-    """Whether a figure is for one column of a paper."""
+    """Whether a figure fits one column of a paper."""
     return _look.get().width / _look.get().scale < _NARROW_WIDTH
 
 
@@ -237,7 +236,7 @@ def inches(length: float) -> float:
 
 
 def angle_unit() -> tuple[float, str]:
-    """Return the unit for angles, and the number of these units in one rad."""
+    """Return the angle unit, and its number per rad."""
     return (180.0 / np.pi, "deg") if _look.get().degrees else (1.0, "rad")
 
 
@@ -252,11 +251,11 @@ def sheet(
     lane: float = 0.0,
     top: float = 0.3,
 ) -> tuple[Figure, list[list[Axes]]]:
-    """Return a figure of panels, row by row.
+    """Return a figure with rows of panels.
 
-    Each row has the relative widths of its panels; ``heights`` are the heights of the rows in
-    inches. ``left``, ``right`` and ``bottom`` are the space for labels of the panels, ``top`` the
-    space for titles, ``gap`` the space between rows, and ``lane`` the space below every row.
+    Each row contains the relative widths of its panels; ``heights`` are the row heights in inches.
+    ``left``, ``right`` and ``bottom`` are the space for panel labels, ``top`` the space for
+    titles, ``gap`` the space between rows, and ``lane`` the space below every row.
     """
     scale = _look.get().scale
     if narrow() and left > 0.5:
@@ -277,8 +276,8 @@ def sheet(
         room = width() - left - right - between * (len(widths) - 1)
         if room <= 0.0:
             raise SpaceRobotError(
-                f"Letters of {mpl.rcParams['font.size']:g} points leave no room for panels in a "
-                f"figure {25.4 * width():.3g} mm wide."
+                f"A font size of {mpl.rcParams['font.size']:g} points leaves no room for panels "
+                f"in a figure {25.4 * width():.3g} mm wide."
             )
         x, row = left, []
         for share in widths:
@@ -295,7 +294,7 @@ _LETTER_WIDTH = 0.32
 """Space for the letter to the left of a panel, inches."""
 
 _LETTER = "letter"
-"""Group of the panel letters."""
+"""Group ID of the panel letters."""
 
 
 def _letter_panels(panels: Sequence[Axes], left: float) -> None:
@@ -315,11 +314,11 @@ def _letter_panels(panels: Sequence[Axes], left: float) -> None:
 
 
 _LEFT_EDGE = 0.03
-"""Distance of the labels from the left edge of a figure with widened panels, inches."""
+"""Distance from the left edge to the labels in a figure with extended panels, inches."""
 
 
 def widen_panels(figure: Figure) -> None:
-    """Widen panels in one column to the left, as far as their labels permit."""
+    """Extend panels in a single column to the left as far as their labels allow."""
     places = [axes.get_position() for axes in figure.axes]
     if len({round(place.x0, 6) for place in places}) != 1:
         return
@@ -340,7 +339,7 @@ def widen_panels(figure: Figure) -> None:
 
 
 def new_figure(height: float) -> Figure:
-    """Return an empty figure of a height in inches."""
+    """Return an empty figure with a height in inches."""
     figure = Figure(figsize=(width(), height), facecolor="white")
     FigureCanvasAgg(figure)
     return figure
@@ -353,12 +352,12 @@ def panel(figure: Figure, x: float, y: float, width: float, height: float) -> Ax
 
 
 def room_for(names: Sequence[str]) -> float:
-    """Return the width of the longest name, for the margin to the right of a panel, inches."""
+    """Return the width of the longest name, inches, for the margin to the right of a panel."""
     return 0.15 + 0.075 * max(map(len, names), default=0)
 
 
 class PictureFormat(str, Enum):
-    """Format of a picture file, by its suffix."""
+    """Picture file format, by suffix."""
 
     PNG = "png"
     SVG = "svg"
@@ -371,20 +370,20 @@ class PictureFormat(str, Enum):
         Raises
         ------
         SpaceRobotError
-            The suffix is not one of these formats.
+            The suffix does not match any of these formats.
         """
         try:
             return cls(path.suffix[1:].lower())
         except ValueError:
             raise SpaceRobotError(
-                f"Pictures are written as .png, .svg or .pdf, not as '{path.name}'."
+                f"Pictures can be .png, .svg or .pdf, not '{path.name}'."
             ) from None
 
 
 def picture_of(figure: Figure, format: PictureFormat, pixels: int = 1600) -> bytes:
-    """Return a figure as a file, the same bytes for the same figure.
+    """Return a figure as file content; equal figures give equal bytes.
 
-    ``pixels`` is the width of a PNG; images in SVG and PDF have 200 pixels per inch.
+    ``pixels`` is the PNG width; images in SVG and PDF have 200 pixels per inch.
     """
     across = float(figure.get_size_inches()[0])
     about = {
@@ -414,7 +413,7 @@ _FLIGHT_DASHES = ((), (4.5, 1.2, 1.2, 1.2), (2.0, 1.0), (6.0, 1.2, 1.2, 1.2, 1.2
 
 
 def flight_dashes(number: int) -> tuple[float, ...]:
-    """Return the dashes for one of several flights in a panel; the first has a solid line."""
+    """Return the line dashes for one of several flights in a panel; the first line is solid."""
     return _FLIGHT_DASHES[number % len(_FLIGHT_DASHES)]
 
 
@@ -429,8 +428,8 @@ def draw_traces(
     """Draw every column of a signal; return whether any is drawn as a band.
 
     A line omits samples that make no visible difference. If more samples remain than the panel,
-    with ``share`` of a figure's width, can show, a band spans the smallest and the largest value in
-    each slice of time.
+    which has ``share`` of the figure width, can show, a band spans the smallest and largest value
+    in each time slice.
     """
     if not len(signal):
         # A close-up without samples.
@@ -466,7 +465,8 @@ def draw_traces(
 
 
 def largest_over_time(signal: Signal, column: int) -> tuple[Array, Array]:
-    """Return times and values of a column; only the largest of each time slice if it is dense."""
+    """Return the times and values of a column; if it is dense, only the largest value in each time
+    slice."""
     if len(signal) <= 2 * LARGEST_VALUE_SLICES:
         return signal.time, signal.values[:, column]
     time, _, high = envelope(signal, column, LARGEST_VALUE_SLICES)
@@ -480,7 +480,7 @@ def set_range(
     least: float = 0.0,
     axis: Literal["x", "y"] = "y",
 ) -> None:
-    """Set an axis to the range of values with a margin, and nearby values of ``extra``.
+    """Set an axis to the value range with a margin, including nearby values of ``extra``.
 
     The axis spans at least ``least``, or 0.1 if the values are constant, so that rounding errors
     are not magnified.
@@ -499,14 +499,14 @@ def set_range(
 
 
 def log_range(values: Array, decades: int) -> tuple[float, float]:
-    """Return both ends of a logarithmic axis: ``decades`` powers of ten up to the largest value."""
+    """Return the ends of a logarithmic axis: ``decades`` powers of ten up to the largest value."""
     largest = float(np.nanmax(values, initial=0.0))
     top = float(np.ceil(np.log10(largest))) if largest > 0 else -15.0
     return 10.0 ** (top - decades), 10.0**top
 
 
 def set_time(axes: Axes, start: float, end: float, label: bool = True) -> None:
-    """Set the x axis to a span of time in s."""
+    """Set the x axis to a time span in s."""
     if end - start < 1e-9:
         start, end = start - 0.5, end + 0.5
     axes.set_xlim(start, end)
@@ -516,7 +516,7 @@ def set_time(axes: Axes, start: float, end: float, label: bool = True) -> None:
 
 
 def end_labels(axes: Axes, labels: Sequence[tuple[float, str, str]]) -> None:
-    """Write the texts of (value, text, colour) to the right of the axes at their values, without
+    """Write the labels (value, text, colour) to the right of the axes at their values, without
     overlaps."""
     low, high = axes.get_ylim()
     ordered = sorted(labels)
@@ -551,7 +551,7 @@ def _separate_labels(wanted: Array, gap: float) -> Array:
 
 
 def legend_entry(tint: str, label: str, dashes: tuple[float, ...] = ()) -> Line2D:
-    """Return an entry of a legend."""
+    """Return a legend entry."""
     line = Line2D([], [], color=tint, linewidth=1.2, label=label)
     if dashes:
         line.set_linestyle((0, dashes))
@@ -559,7 +559,7 @@ def legend_entry(tint: str, label: str, dashes: tuple[float, ...] = ()) -> Line2
 
 
 def legend_above(axes: Axes, keys: Sequence[Line2D]) -> None:
-    """Add a legend above the axes, at the right."""
+    """Add a legend above the axes, right-aligned."""
     if keys:
         legend = axes.legend(
             handles=keys,
@@ -577,14 +577,14 @@ def legend_above(axes: Axes, keys: Sequence[Line2D]) -> None:
 
 
 def fit_legend(legend: Legend, room: float) -> None:
-    """Reduce the font size of a legend if it is wider than ``room``, pixels."""
+    """Reduce the font size of a legend if it is wider than ``room`` pixels."""
     share = room / legend.get_window_extent().width
     for text in legend.get_texts() if share < 1.0 else ():
         text.set_fontsize(share * float(text.get_fontsize()))
 
 
 def scaled(unit: str, largest: float) -> tuple[float, str]:
-    """Return factor and unit that suit values of at most ``largest``."""
+    """Return the factor and unit suited to values of at most ``largest``."""
     if unit not in ("m", "rad") or largest == 0.0 or largest >= 0.05:
         return 1.0, unit
     return (1e3, f"m{unit}") if largest >= 5e-5 else (1e6, f"µ{unit}")
@@ -596,28 +596,28 @@ LIMIT = "limit (URDF)"
 
 @dataclass(frozen=True)
 class TraceGroup:
-    """Traces of one unit that share a panel.
+    """Traces with a common unit that share a panel.
 
     Attributes
     ----------
     signal, names, colours
-        The traces, and the name and colour of each.
+        The traces, with their names and colours.
     label, unit
-        Label of the axis, and unit of the values.
+        Axis label and unit.
     goals
-        (start, end, trace, value) of each goal.
+        (start, end, trace, value) for each goal.
     limits
-        (trace, value) of each limit.
+        (trace, value) for each limit.
     limit_name
-        Name of the limits in the legend of the picture.
+        Name of the limits in the picture's legend.
     window
-        Lower and upper end of the axis, if high peaks are cut off; None: all values are shown.
+        Lower and upper end of the axis if high peaks are clipped; None: all values are shown.
     decades
-        Powers of ten shown below the largest value, on a logarithmic axis; 0: a linear axis.
+        Number of powers of ten shown below the largest value on a logarithmic axis; 0: linear axis.
     rows
         Whether each trace has its own row of height one, for duty cycles from 0 to 1.
     beside
-        The same traces of other flights; empty signals if a flight lacks them.
+        The same traces from other flights; empty signals if a flight lacks them.
     """
 
     signal: Signal
@@ -635,18 +635,16 @@ class TraceGroup:
 
     @property
     def signals(self) -> list[Signal]:
-        """The traces of all flights that have them."""
+        """Traces from all flights that have them."""
         return [each for each in (self.signal, *self.beside) if len(each)]
 
     @property
     def values(self) -> Array:
-        """All values of all flights."""
+        """All values from all flights."""
         return np.concatenate([np.empty(0), *(each.values.ravel() for each in self.signals)])
 
     def in_unit_of_angles(self) -> TraceGroup:
-        """Return the traces in the unit selected for angles: in degrees instead of rad, if
-        requested.
-        """
+        """Return the traces in the selected angle unit: degrees instead of rad, if requested."""
         if not _look.get().degrees or not self.unit.startswith("rad"):
             return self
         factor, unit = angle_unit()
@@ -664,7 +662,7 @@ class TraceGroup:
 
 @dataclass(frozen=True)
 class ReportFigure:
-    """A figure of a report, as a picture and, if it is over time, as chart data.
+    """A report figure, as a picture and, if it is over time, as chart data.
 
     Attributes
     ----------
@@ -675,7 +673,7 @@ class ReportFigure:
     groups
         The traces of its panels over the whole flight; none if the figure is not over time.
     picture_section
-        The part of the caption that applies to the picture and not to its charts.
+        The part of the caption that applies to the picture but not to its charts.
     """
 
     name: str

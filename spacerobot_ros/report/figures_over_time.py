@@ -1,8 +1,8 @@
-"""Figures over the time of a flight: motion, efforts, thrusters, momentum, errors.
+"""Figures over flight time: motion, efforts, thrusters, momentum, errors.
 
-Traces of one unit share a panel; events are below the time axes; gaits of equal cycles get
-close-ups. A function named after a figure returns it, or one sentence on why the bag has no such
-figure, or None if it does not apply to the flight.
+Traces with the same unit share a panel; events are shown below the time axes; gaits with equal
+cycles get close-ups. A function named after a figure returns the figure, a sentence explaining why
+the bag has no such figure, or None if it does not apply to the flight.
 """
 
 from __future__ import annotations
@@ -57,28 +57,29 @@ SHOWN_CYCLES = 3
 DASHES, DOTS = (5.0, 2.5), (1.0, 1.5)
 
 _MAX_MARKED_SCHEDULES = 10
-"""Largest number of schedules marked by lines; more would look like hatching."""
+"""Largest number of schedules marked with lines; more would look like hatching."""
 
 _LABEL_HEIGHT = 0.17
-"""Height of the label of one of several flights, inches."""
+"""Label height for one of several flights, inches."""
 
 _DUTY_ROW_HEIGHT = 0.8
-"""Height of a duty cycle of 1, in its row."""
+"""Height of a duty cycle of 1 relative to its row."""
 
 BAND_CAPTION = (
-    "If a trace has more samples than the picture has columns, the band spans the smallest and the "
-    "largest value in each slice of time."
+    "If a trace has more samples than the picture has columns, the band spans the smallest and "
+    "largest value in each time slice."
 )
 
 EVENTS_CAPTION = (
-    "Below the time axis, events: goals and plans in the upper row, robot and faults in the lower."
+    "Events below the time axis: goals and plans in the upper row, robot and faults below."
 )
 
 
 def draw_group(
     axes: Axes, group: TraceGroup, end: float, share: float = 1.0, later: Sequence[float] = ()
 ) -> bool:
-    """Draw traces from zero to an end, s, and marks of ``later`` schedules at their starts, s.
+    """Draw traces from zero to an end time, s, and marks at the start times of ``later`` schedules,
+    s.
 
     Return whether any trace is drawn as a band.
     """
@@ -91,7 +92,7 @@ def draw_group(
     colours = group.colours
     values = np.concatenate([group.values, [g[3] for g in group.goals]])
     if group.window is not None:
-        text = f"peaks of {np.abs(values).max():.3g} {group.unit} are beyond the axis"
+        text = f"peaks of {np.abs(values).max():.3g} {group.unit} exceed the axis"
         axes.text(
             0.02, 0.97, text, transform=axes.transAxes, va="top", color=SECONDARY_COLOUR,
             bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 1.0}, zorder=4,
@@ -159,7 +160,7 @@ def _draw_decades(axes: Axes, group: TraceGroup) -> None:
     axes.set_ylabel(group.unit if several else f"{group.label} ({group.unit})")
 
 
-ONE_STATE_TEXT = "The bag holds one state: there are no figures over time."
+ONE_STATE_TEXT = "The bag contains only one state: there are no figures over time."
 
 
 def time_figure(
@@ -171,11 +172,11 @@ def time_figure(
     *,
     flights: Sequence[str] = (),
 ) -> ReportFigure | str:
-    """Return a figure with a panel for each group, and close-ups of a gait of equal cycles; a
+    """Return a figure with one panel per group, and close-ups if a gait has equal cycles; a
     sentence if nothing was recorded over time.
 
-    ``caption`` is its beginning. ``flights``: labels of several flights, whose traces the groups
-    have.
+    ``caption`` is its beginning. ``flights``: labels of the flights whose traces the groups
+    contain.
     """
     if all(len(signal) < 2 for group in groups for signal in group.signals):
         return ONE_STATE_TEXT
@@ -207,14 +208,14 @@ def time_figure(
         for axes in (each for row in panels for each in row):
             draw_events(axes, flight.timed_events)
     if any(group.goals for group in groups):
-        caption += "; dashed, the goal"
+        caption += "; dashed: goal"
     if any(group.limits and group.limit_name == LIMIT for group in groups):
-        caption += "; dotted, the limits of the URDF, if they are in range"
+        caption += "; dotted: URDF limits, if in range"
     caption += "."
     aside = ""
     if cycles is not None:
         aside += (
-            f" The flight ends with {cycles.count} equal cycles of {cycles.period:.4g} s; below, "
+            f" The flight ends with {cycles.count} equal cycles of {cycles.period:.4g} s; below: "
             f"the part before them, and the change during the last {SHOWN_CYCLES} cycles."
         )
     aside += f" {BAND_CAPTION}" if any(dense) else ""
@@ -226,11 +227,11 @@ def time_figure(
 def figure_of_flights(
     flights: Sequence[FlightReport], draw: Callable[[FlightReport], ReportFigure | str | None]
 ) -> ReportFigure | str | None:
-    """Return a figure over time with the traces of several flights; a sentence if no flight has
-    one, or it is not over time.
+    """Return a figure over time with traces from several flights; a sentence if no flight has such
+    a figure, or it is not over time.
 
-    Traces with the same label, unit and name share a panel. Events, cycles and duty cycles, which
-    apply to single flights, are omitted.
+    Traces with the same label, unit and name share a panel. Events, cycles and duty cycles are
+    omitted, since they apply to single flights.
     """
     drawn = [draw(each) for each in flights]
     figures = [each for each in drawn if isinstance(each, ReportFigure)]
@@ -262,7 +263,7 @@ def figure_of_flights(
             )
         )
     if not merged:
-        return "It shows a single flight: name one bag."
+        return "This figure shows a single flight: specify one bag."
     first, labels = figures[0], [each.label for each in flights]
     only = replace(flights[0], timed_events=[])
     return time_figure(only, first.name, first.heading, first.heading, merged, flights=labels)
@@ -341,9 +342,9 @@ def _draw_last_cycles(axes: Axes, group: TraceGroup, cycles: Cycles) -> None:
 
 JOINTS_PER_PANEL = 6
 
-NO_POSES_TEXT = "The bag holds no base poses (odom); figures of the base are missing."
+NO_POSES_TEXT = "The bag contains no base poses (odom); base figures are missing."
 
-NO_JOINTS_TEXT = "The bag holds no joint positions (joint_states)."
+NO_JOINTS_TEXT = "The bag contains no joint positions (joint_states)."
 
 
 def position_group(flight: FlightReport) -> TraceGroup:
@@ -358,7 +359,7 @@ def position_group(flight: FlightReport) -> TraceGroup:
 
 
 def attitude_group(flight: FlightReport) -> TraceGroup:
-    """Return the base attitude as rotation vector, and its goals."""
+    """Return the base attitude as a rotation vector, and its goals."""
     goals = [
         (t.start, t.end, i, x)
         for t in flight.targets
@@ -370,8 +371,8 @@ def attitude_group(flight: FlightReport) -> TraceGroup:
 
 
 def shape_groups(flight: FlightReport) -> list[TraceGroup]:
-    """Return the joint positions, in groups of one unit and at most six joints, and the rates of
-    reaction wheels, whose angles are irrelevant.
+    """Return the joint positions, in groups of at most six joints with the same unit, and reaction
+    wheel rates (wheel angles are irrelevant).
     """
 
     def bounds(joint: Joint) -> list[float]:
@@ -398,10 +399,10 @@ def joint_groups(
     most: int,
     columns: Sequence[int] | None = None,
 ) -> list[TraceGroup]:
-    """Group the columns (N, n) of a signal by unit; ``units`` maps a position's unit to the
-    signal's.
+    """Group the columns (N, n) of a signal by unit; ``units`` maps the position unit to the signal
+    unit.
 
-    ``columns``: only the columns of these joints.
+    ``columns`` selects the columns of these joints.
     """
     unknown = " or ".join(units.values())
     each = [units.get(joint_unit(flight, name), unknown) for name in flight.joint_names]
@@ -436,29 +437,29 @@ def axis_groups(signal: Signal, parts: Sequence[tuple[str, str]]) -> list[TraceG
 
 
 def position_figure(flight: FlightReport) -> ReportFigure | str:
-    """Base position against the goal."""
+    """Base position and goal."""
     if not len(flight.position):
         return NO_POSES_TEXT
-    caption = "Position of the base link in the world frame"
+    caption = "Base link position in the world frame"
     return time_figure(flight, "position", "Base position", caption, [position_group(flight)])
 
 
 def pose_figure(flight: FlightReport) -> ReportFigure | str:
-    """Base position over base attitude, against the goal."""
+    """Base position above base attitude, and goals."""
     if not len(flight.position):
         return NO_POSES_TEXT
-    caption = "Position of the base link in the world frame, and its attitude as a rotation vector"
+    caption = "Base link position in the world frame, and base attitude as a rotation vector"
     groups = [position_group(flight), attitude_group(flight)]
     return time_figure(flight, "pose", "Base pose", caption, groups)
 
 
 def attitude_figure(flight: FlightReport) -> ReportFigure | str:
-    """Base attitude against the goal."""
+    """Base attitude and goal."""
     if not len(flight.attitude):
         return NO_POSES_TEXT
     caption = (
-        "Attitude of the base link as exponential coordinates: the rotation vector, along the axis "
-        "of rotation, with the angle as its length"
+        "Base link attitude as exponential coordinates: a rotation vector along the rotation "
+        "axis, with the angle as its length"
     )
     if np.linalg.norm(flight.attitude.values, axis=1).max() > np.pi:
         caption += ", continuous beyond half a revolution"
@@ -466,10 +467,10 @@ def attitude_figure(flight: FlightReport) -> ReportFigure | str:
 
 
 def shape_figure(flight: FlightReport) -> ReportFigure | str:
-    """Joint positions, with the limits of the URDF that are in range."""
+    """Joint positions, with URDF limits that are in range."""
     if not len(flight.shape) or not flight.joint_names:
         return _why_no_joints(flight)
-    caption = "Joint positions" + (", and rates of the wheels" if flight.wheel_columns else "")
+    caption = "Joint positions" + (", and wheel rates" if flight.wheel_columns else "")
     return time_figure(flight, "shape", "Shape", caption, shape_groups(flight))
 
 
@@ -479,11 +480,11 @@ def _why_no_joints(flight: FlightReport) -> str:
 
 
 def rates_figure(flight: FlightReport) -> ReportFigure | str | None:
-    """Joint velocities; None if all joints are wheels: shape figures have their rates."""
+    """Joint velocities; None if all joints are wheels; their rates are in shape figures."""
     if not flight.joint_names:
         return _why_no_joints(flight)
     if not len(flight.rates):
-        return "The bag holds no joint velocities."
+        return "The bag contains no joint velocities."
     units, columns = {"m": "m/s", "rad": "rad/s"}, flight.shape_columns
     groups = joint_groups(
         flight, flight.rates, "velocity", units, _rate_bounds, JOINTS_PER_PANEL, columns
@@ -498,32 +499,30 @@ def _rate_bounds(joint: Joint) -> list[float]:
 
 
 def twist_figure(flight: FlightReport) -> ReportFigure | str | None:
-    """Velocity and angular velocity of the base link.
+    """Linear and angular velocity of the base link.
 
-    None if it is at rest, or if it oscillates in a gait of many equal cycles.
+    None if the base is at rest, or oscillates in a gait with many equal cycles.
     """
     if flight.cycles is not None or not flight.signal("twist").values.any():
         return None
     groups = axis_groups(flight.signal("twist"), (("velocity", "m/s"), ("rate", "rad/s")))
-    caption = (
-        "Velocity of the base link's origin and its angular velocity, in the base link's frame"
-    )
+    caption = "Linear and angular velocity of the base link, in the base link frame"
     return time_figure(flight, "twist", "Base velocity", caption, groups)
 
 
 _MOMENTUM_DECADES = 4
 
 _MAX_PEAK_SHARE = 0.02
-"""Largest share of the samples that may be cut off as peaks."""
+"""Largest share of samples that may be clipped as peaks."""
 
 _PEAK_RATIOS = (3.0, 1e4)
-"""Least and largest ratio of the range of all samples to the range without peaks for which peaks
-are cut off. Below the first, both are readable together; above the second, the robot is at rest
-except for the peaks.
+"""Smallest and largest ratio of the full range to that without peaks at which peaks are clipped.
+
+Below the first, both are readable together; above the second, the robot rests except at peaks.
 """
 
 _EFFORT_ROUNDING = 1e-9
-"""Forces and torques up to this value are rounding errors, N or N m."""
+"""Forces and torques up to this value are considered rounding errors, N or N m."""
 
 
 def efforts_figure(flight: FlightReport) -> ReportFigure | str | None:
@@ -546,18 +545,18 @@ def efforts_figure(flight: FlightReport) -> ReportFigure | str | None:
     if not groups:
         return None
     caption = (
-        "Commanded thruster force and torque at the base link's origin, in its frame, and joint "
-        "efforts"
+        "Commanded thruster force and torque at the base link origin, in the base link frame, and "
+        "joint efforts"
     )
     if not wrench:
         caption = "Commanded joint efforts; no thrust was commanded"
     if any(group.window is not None for group in groups):
-        caption += ". Axes cut off short peaks, so that the rest is readable"
+        caption += ". Short peaks are clipped to keep the rest readable"
     return time_figure(flight, "efforts", "Wrench and efforts", caption, groups)
 
 
 def range_without_peaks(signal: Signal) -> tuple[float, float] | None:
-    """Return the range of a signal without its highest peaks; None if it has no such peaks."""
+    """Return the signal range without its highest peaks; None if it has no such peaks."""
     if not len(signal):
         return None
     low, high = (float(np.min(signal.values)), float(np.max(signal.values)))
@@ -570,7 +569,7 @@ def range_without_peaks(signal: Signal) -> tuple[float, float] | None:
 
 
 def thrusters_figure(flight: FlightReport) -> ReportFigure | str | None:
-    """Duty cycles of the thrusters, their impulse, and the propellant."""
+    """Thruster duty cycles, impulse and propellant."""
     names = flight.bag.names("thrusters")
     if not len(flight.signal("thruster_duty")) or not flight.signal("thruster_duty").values.any():
         return None
@@ -578,31 +577,31 @@ def thrusters_figure(flight: FlightReport) -> ReportFigure | str | None:
     used = [k for k in range(len(names)) if whole.values[:, k].any()]
     duty = Signal(whole.time, whole.values[:, used])
     tints = [colour(k) for k in range(len(used))]
-    label, unit = "thrusters", "share of each tick that they are on"
+    label, unit = "thrusters", "share of each tick during which they are on"
     groups = [TraceGroup(duty, [shortened(names[k]) for k in used], label, unit, tints, rows=True)]
     impulse, propellant = flight.impulse, flight.series.get("propellant")
     groups.append(TraceGroup(impulse, ["impulse"], "impulse given", "N s", [PALETTE[0]]))
-    caption = "Share of each tick that each thruster was on; below, their total impulse"
+    caption = "Share of each tick during which each thruster was on; below: total impulse"
     if propellant is not None:
         grams = Signal(propellant.time, 1e3 * propellant.values)
         groups.append(TraceGroup(grams, ["propellant"], "propellant", "g", [PALETTE[1]]))
-        caption += " and the propellant consumed, according to their specific impulse"
+        caption += " and the propellant consumed, according to the specific impulse"
     if len(used) < len(names):
         caption += f". {len(names) - len(used)} of {len(names)} thrusters were never on"
     return time_figure(flight, "thrusters", "Thruster firings", caption, groups)
 
 
 def momentum_figure(flight: FlightReport) -> ReportFigure | str:
-    """Change of the total momenta, and the kinetic energy."""
+    """Change in total momenta, and kinetic energy."""
     balance = flight.unexplained_momentum
     if not len(balance):
-        return "The bag holds no momentum."
+        return "The bag contains no momentum."
     changes = momentum_change(balance.values[:, :6], balance.values[0, :6])
     groups = [
         TraceGroup(
             Signal(balance.time, changes),
             ["|p − p₀| (kg m/s)", "|L − L₀| (kg m²/s)"],
-            "change of the total momenta",
+            "change in total momenta",
             "kg m/s, kg m²/s",
             PALETTE[:2],
             decades=_MOMENTUM_DECADES,
@@ -617,15 +616,16 @@ def momentum_figure(flight: FlightReport) -> ReportFigure | str:
     ]
     caption = (
         "The momentum balance of the whole system. Top: change of the linear momentum p and of the "
-        "angular momentum L about the centre of mass since the start, less the impulse of the "
-        "thrusters, on a logarithmic axis; smaller changes and zero are at its lower edge. Bottom: "
+        "angular momentum L about the centre of mass since the start, minus the thruster impulse, "
+        "on a logarithmic axis; smaller changes and zero are shown at its lower edge. Bottom: "
         "kinetic energy"
     )
     return time_figure(flight, "momentum", "Momentum balance", caption, groups)
 
 
 def momentum_budget_figure(flight: FlightReport) -> ReportFigure | str | None:
-    """Angular momentum of base, arm, wheels and all; None without wheels and without a capture."""
+    """Angular momentum of the base, arm, wheels and total; None if there are neither wheels nor a
+    capture."""
     try:
         budget = flight.momentum_budget
     except RobotDescriptionError as error:
@@ -642,11 +642,11 @@ def momentum_budget_figure(flight: FlightReport) -> ReportFigure | str | None:
     tints = [colour(column) for column in columns]
     group = TraceGroup(signal, parts, "angular momentum", "N m s", tints)
     caption = (
-        "Angular momentum about the centre of mass: of the base, if it rotated with its joints at "
-        "rest; of the arm, from joint motion relative to the base, with a held body; "
+        "Angular momentum about the centre of mass: of the base, as if it rotated with its joints "
+        "at rest; of the arm, from joint motion relative to the base, including a held body; "
     )
     caption += "of the wheels about their axes; " if "wheels" in parts else ""
-    caption += "and in total, which only external loads change (norms; vectors add up)"
+    caption += "and the total, which only external loads change (norms; the vectors add up)"
     return time_figure(flight, "momentum_budget", "Momentum budget", caption, [group])
 
 
@@ -654,7 +654,7 @@ _MAX_CLEARANCE_SAMPLES = 2000
 
 
 def clearance_figure(flight: FlightReport) -> ReportFigure | str | None:
-    """Smallest distance between two links; None if no links of the robot could touch."""
+    """Smallest distance between two links; None if no robot links can touch."""
     clearance = flight.clearance
     if clearance is None:
         return None
@@ -672,22 +672,22 @@ def clearance_figure(flight: FlightReport) -> ReportFigure | str | None:
     )
     nearest = clearance.nearest
     sentence = f"{sentence_case(str(nearest))} at {clearance.nearest_time:.6g} s"
-    caption = f"Smallest distance between two links that no joint connects. {sentence}"
+    caption = f"Smallest distance between two links not connected by a joint. {sentence}"
     if touching:
-        caption += "; below the dotted line links touch, according to the shapes in the URDF"
+        caption += "; below the dotted line, links touch according to the URDF geometry"
     if not clearance.geometry.exact:
         caption += "; distances are lower bounds, since the package coal is not installed"
     return time_figure(flight, "clearance", "Clearance", caption, [group])
 
 
 def power_of_ten(value: float) -> str:
-    """Return a power of ten as text with an exponent, for a logarithmic axis."""
+    """Return a power of ten as a string with an exponent, for a logarithmic axis."""
     exponent = str(round(np.log10(value))).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
     return f"10{exponent}"
 
 
 _SENSOR_ROUNDING = 1e-12
-"""Sensor errors up to this value are rounding errors, m or rad."""
+"""Sensor errors up to this value are considered rounding errors, m or rad."""
 
 
 _MAX_DECADES = 8
@@ -696,12 +696,12 @@ _ERROR_PARTS: tuple[tuple[Literal["position", "attitude"], str, str], ...] = (
     ("position", "distance", "m"),
     ("attitude", "angle", "rad"),
 )
-"""Parts of a goal, names of the norms of their errors, and units of these norms."""
+"""Goal components, and the names and units of their error norms."""
 
 
 def errors_figure(flight: FlightReport) -> ReportFigure | str | None:
-    """Distance and angle of the base, and of a controller's end-effector, from their goals, in the
-    components under control.
+    """Distance and angle between the base and its goal, and between a controller's end-effector and
+    its goal, in the controlled components.
     """
     base = Signal(flight.position.time, np.hstack([flight.position.values, flight.quaternion]))
     groups = []
@@ -718,11 +718,11 @@ def errors_figure(flight: FlightReport) -> ReportFigure | str | None:
     if not groups:
         return None
     caption = (
-        "Distance and angle from the goal, in the components under control, on logarithmic axes; "
-        "smaller values are at the lower edge; dotted, the tolerance"
+        "Distance and angle from the goal, in the controlled components, on logarithmic axes; "
+        "smaller values are at the lower edge; dotted: tolerance"
     )
     if left_out := [part for part, *_ in _ERROR_PARTS if part in flight.not_controlled]:
-        caption += f"; the {' and '.join(left_out)} of the base is not controlled"
+        caption += f"; the base {' and '.join(left_out)} is not controlled"
     return time_figure(flight, "errors", "Errors", caption, groups)
 
 
@@ -749,7 +749,7 @@ def _error_group(
 
 
 def link_errors_figure(flight: FlightReport) -> ReportFigure | str | None:
-    """Distance and angle of each link to its goals; None if no link had a goal."""
+    """Distance and angle between each link and its goals; None if no link had a goal."""
     if not flight.link_errors:
         return flight.hidden_links_text or None if flight.link_goals else None
     groups: list[TraceGroup] = []
@@ -758,8 +758,8 @@ def link_errors_figure(flight: FlightReport) -> ReportFigure | str | None:
             if len(signal):
                 groups.append(_error_group(flight, signal, part, shortened(link), colour(number)))
     caption = (
-        "Distance of each link from the position of its goal, and angle from its goal attitude if "
-        "required, on logarithmic axes; smaller values are at the lower edge; dotted, the tolerance"
+        "Distance between each link and its goal position, and angle from its goal attitude if "
+        "required, on logarithmic axes; smaller values are at the lower edge; dotted: tolerance"
     )
     if flight.base_goal is None:
         caption += "; the base is not controlled"
@@ -791,7 +791,7 @@ def sensors_figure(flight: FlightReport) -> ReportFigure | str | None:
     groups = [g for g in groups if np.abs(g.signal.values).max(initial=0.0) > _SENSOR_ROUNDING]
     if not groups:
         return None
-    caption = "Measured minus true values, at the times of the measurements"
+    caption = "Measured minus true values at the measurement times"
     return time_figure(flight, "sensors", "Errors of the sensors", caption, groups)
 
 

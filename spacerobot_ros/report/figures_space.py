@@ -1,4 +1,4 @@
-"""Figures in space: the robot at instants of its flight, paths, and loops in shape space."""
+"""Figures in space: the robot at several instants, paths, and loops in shape space."""
 
 from __future__ import annotations
 
@@ -55,14 +55,13 @@ from spacerobot_ros.report.solids import (
 )
 
 PIXELS = 420
-"""Width of the picture of a robot, pixels."""
+"""Width of a robot picture, pixels."""
 _MAX_SHOWN_POSES = 6
 _FOOT_SHARE = 0.1
-"""Share of the height of a picture of a robot that is reserved for the scale bar."""
+"""Share of a robot picture's height that is reserved for the scale bar."""
 
 _NEAR = 2.0
-"""Largest extent, in robot extents, of the robot and its goal or obstacles, up to which these are
-fully shown.
+"""Largest total extent, in robot extents, at which the goal or obstacles are still fully shown.
 """
 
 
@@ -95,28 +94,29 @@ def configurations_figure(flight: FlightReport) -> ReportFigure | str:
     if not narrow():
         legend_above(places[-1], keys)
     caption = (
-        "The robot at instants from the first recorded state to the last, at the same scale, with "
-        "the shapes of its URDF. Each moving link has the color of its joint in the other figures."
+        "The robot at several instants from the first to the last recorded state, at the same "
+        "scale, with its URDF geometry. Each moving link has the color of its joint in the other "
+        "figures."
     )
     if flight.target is not None:
-        caption += " The target is drawn where it is, free or held."
+        caption += " The target is drawn at its actual pose, free or held."
     if flight.obstacles:
-        caption += " Obstacles have the shapes used to measure distances."
+        caption += " Obstacles are drawn with the geometry used to measure distances."
     if flight.base_goal is not None:
-        caption += " In the last picture, the base link at the goal is dashed."
+        caption += " In the last picture, the base link at its goal is dashed."
     caption += flight.missing_meshes
     return ReportFigure("configurations", "Configurations", caption, figure)
 
 
 def with_near(points: Array, more: Array, view: View) -> Array:
-    """Return points (k, 3) of a robot, and of other objects unless they are far away, m."""
+    """Return points (k, 3) on a robot, and on other objects that are not far away, m."""
     both = np.concatenate([points, more])
     shown = np.ptp(view(both), axis=0).max() < _NEAR * np.ptp(view(points), axis=0).max()
     return both if shown else points
 
 
 def view_of(flight: FlightReport) -> View:
-    """Return the direction of view: from above if the flight is planar."""
+    """Return the viewing direction: from above if the flight is planar."""
     return View(-90.0, 90.0) if is_flat(flight) else View()
 
 
@@ -184,7 +184,7 @@ def draw_robot(axes: Axes, solids: Sequence[PlacedSolid], points: Array, view: V
 
 
 def draw_goal_and_path(axes: Axes, flight: FlightReport, view: View) -> list[Line2D]:
-    """Draw the base at the goal as a ghost, and the path of the base; return legend entries."""
+    """Draw the base at the goal as a ghost, and the base path; return legend entries."""
     keys = []
     path = flight.position.values
     limits = axes.axis()
@@ -211,11 +211,12 @@ def _round_length(longest: float) -> float:
 _LINK_COLOURS = (HAND_COLOUR, PALETTE[1], *PALETTE[5:])
 
 _FLIGHT_COLOURS = (BASE_COLOUR, PALETTE[1], *PALETTE[5:])
-"""Colours of compared flights; the first colour is for the flight of the report."""
+"""Colours of compared flights; the first colour is for the reported flight."""
 
 
 def path_figure(flight: FlightReport, beside: Sequence[FlightReport] = ()) -> ReportFigure | str:
-    """The path of the base in three views, with that of the end-effector and of other flights."""
+    """The base path in three views, together with the paths of the end-effector and of other
+    flights."""
     if not len(flight.position):
         return NO_POSES_TEXT
     if len(flight.position) < 2 and not beside:
@@ -278,11 +279,11 @@ def path_figure(flight: FlightReport, beside: Sequence[FlightReport] = ()) -> Re
         "Path of the base origin"
         + (" and of the end-effector" if shows_tool else "")
         + (" and of links with goals" if flight.link_poses else "")
-        + f" in the world frame{', three views at the same scale' if len(views) > 1 else ''}: open "
-        "circle, start; full circle, end"
-        + ("; cross, goal" if goals else "")
-        + ("; dashed, the planned path of the base" if flight.planned else "")
-        + ". Every recorded state is drawn."
+        + f" in the world frame{', three views at the same scale' if len(views) > 1 else ''}; "
+        "open circle: start; filled circle: end"
+        + ("; cross: goal" if goals else "")
+        + ("; dashed: planned base path" if flight.planned else "")
+        + ". All recorded states are drawn."
     )
     return ReportFigure("path", "Paths", caption, figure)
 
@@ -314,11 +315,11 @@ _LOOP_JOINTS = 3
 
 
 def loops_figure(flight: FlightReport) -> ReportFigure | str:
-    """Joint positions against each other, for the first three joints in pairs."""
+    """Joint positions plotted against each other, for pairs of the first three joints."""
     columns = flight.shape_columns[:_LOOP_JOINTS]
     names = [flight.joint_names[i] for i in columns]
     if len(names) < 2:
-        return "A loop in shape space needs two joints or more."
+        return "A loop in shape space requires at least two joints."
     if not len(flight.shape):
         return NO_JOINTS_TEXT
     if len(flight.shape) < 2:
@@ -353,9 +354,7 @@ def loops_figure(flight: FlightReport) -> ReportFigure | str:
             axes.set_title(f"area {area:+.4g} {unit}")
             _draw_direction(axes, x, y)
     if cycles is None:
-        caption = (
-            "Joint positions against each other; a circle marks the first shape, a dot the last."
-        )
+        caption = "Joint positions in pairs; a circle marks the first shape, a dot the last."
     else:
         caption = (
             f"The last {SHOWN_CYCLES} of {cycles.count} cycles in shape space. Each begins and "
@@ -386,16 +385,16 @@ def _draw_direction(axes: Axes, x: Array, y: Array) -> None:
 
 
 _CLOSED_LOOP_DISTANCE = 0.02
-"""Distance from its first shape up to which a loop is considered closed, as a share of its size."""
+"""Distance from the first shape at which a loop is considered closed, as a share of its size."""
 
 _MIN_LOOPS = 4
 _LOG_AXIS_RATIO = 10.0
 
 
 def cycles_figure(flight: FlightReport) -> ReportFigure | None:
-    """Attitude, and the remaining angle to the goal, at the end of each loop in shape space.
+    """Attitude and remaining angle to the goal at the end of each loop in shape space.
 
-    None if no method repeats cycles, or the joints do not return to one shape several times.
+    None if no method repeats cycles, or the joints do not return to the same shape several times.
     """
     if (
         not flight.repeats_cycles
@@ -424,8 +423,8 @@ def cycles_figure(flight: FlightReport) -> ReportFigure | None:
     above.set_ylabel(f"rotation vector ({unit})")
     end_labels(above, list(zip(attitude[-1].tolist(), "xyz", PALETTE[:3], strict=True)))
     caption = (
-        f"Attitude of the base link at the {len(ends)} instants at which the shape returns to the "
-        "start of its loops; number 0 is before the first loop"
+        f"Base link attitude at the {len(ends)} instants at which the joints return to the start "
+        "of a loop; number 0 is before the first loop"
     )
     if goal is not None:
         below = panels[1][0]
@@ -433,7 +432,7 @@ def cycles_figure(flight: FlightReport) -> ReportFigure | None:
         left = factor * np.array([PoseError.between(r, q, goal).angle for r, q in poses])
         below.plot(number, left, color=PALETTE[0], marker=dots)
         below.set_ylabel(f"remaining angle ({unit})")
-        caption += "; dashed, the goal. Below, the remaining angle to the goal"
+        caption += "; dashed: goal. Below: remaining angle to the goal"
         if left.min() > 0 and left.max() > _LOG_AXIS_RATIO * left.min():
             below.set_yscale("log")
             below.minorticks_off()
@@ -448,9 +447,10 @@ def cycles_figure(flight: FlightReport) -> ReportFigure | None:
 
 
 def loop_ends(shape: Signal) -> Indices:
-    """Return the samples at which the shape returns to the last shape, which closes its loops.
+    """Return the samples at which the joints return to their last shape, which closes a loop.
 
-    A rest there is represented by its last sample, a rest at the end of the flight by its first.
+    If the joints rest there, the last sample of the rest is returned, or the first at the end of
+    the flight.
     """
     values = shape.values
     moving = np.flatnonzero((np.abs(np.diff(values, axis=0)) > 0).any(axis=1))

@@ -1,4 +1,4 @@
-"""A flight and its bag as a report shows them, times in s since the first state."""
+"""A flight and its bag as shown in a report; times are in s since the first state."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ _MAX_LINK_ERROR_STATES = 2000
 
 @dataclass(frozen=True)
 class GoalSpan:
-    """A goal and the time during which it was flown to, ``start`` to ``end`` in s."""
+    """A goal and the time span, ``start`` to ``end`` in s, in which the robot flew to it."""
 
     start: float
     end: float
@@ -70,16 +70,16 @@ class GoalSpan:
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
 class FlightReport(Flight):
-    """A flight and its bag, times in s since the first state; missing signals are empty.
+    """A flight and its bag; times are in s since the first state, and missing signals are empty.
 
     Attributes
     ----------
     bag
         The bag that the flight was read from.
     timed_events
-        The events that figures show; none in bags of earlier versions.
+        The events that figures show; none in bags from earlier versions.
     meshes
-        Triangles of the meshes in the bag, by their URIs.
+        Triangles of the meshes in the bag, by URI.
     """
 
     bag: FlightBag
@@ -88,7 +88,7 @@ class FlightReport(Flight):
 
     @classmethod
     def of(cls, bag: FlightBag, flight: Flight | None = None) -> FlightReport:
-        """Return the report of a bag; its flight is read unless given.
+        """Return the report data of a bag; its flight is read unless given.
 
         Raises
         ------
@@ -108,28 +108,28 @@ class FlightReport(Flight):
 
     @cached_property
     def position(self) -> Signal:
-        """True position of the base link in the world (N, 3), m."""
+        """True base link position in the world (N, 3), m."""
         return Signal(self.time, self.pose[:, :3])
 
     @property
     def quaternion(self) -> Array:
-        """True attitude of the base link in the world (N, 4)."""
+        """True base link attitude in the world (N, 4)."""
         return self.pose[:, 3:]
 
     @cached_property
     def attitude(self) -> Signal:
-        """Attitude of the base as exponential coordinates (N, 3), rad, continuous beyond half
+        """Base attitude as exponential coordinates (N, 3), rad, continuous beyond half
         revolutions."""
         return Signal(self.position.time, rotvecs(self.quaternion))
 
     @cached_property
     def shape(self) -> Signal:
-        """True positions of the joints (N, n), m or rad."""
+        """True joint positions (N, n), m or rad."""
         return self.signal("q")
 
     @cached_property
     def rates(self) -> Signal:
-        """True velocities of the joints (N, n), m/s or rad/s."""
+        """True joint velocities (N, n), m/s or rad/s."""
         return self.signal("qdot")
 
     @cached_property
@@ -144,8 +144,8 @@ class FlightReport(Flight):
 
     @cached_property
     def momentum_budget(self) -> Signal:
-        """Angular momentum (N, 4), N m s, of base, arm, wheels and all of them, at up to two
-        thousand states; empty unless the robot has wheels or captured a target.
+        """Angular momentum (N, 4), N m s, of the base, arm, wheels and total, at up to two thousand
+        states; empty unless the robot has wheels or captured a target.
 
         Raises
         ------
@@ -159,18 +159,18 @@ class FlightReport(Flight):
 
     @cached_property
     def tool(self) -> Signal:
-        """Pose of the end-effector in the world (N, 7)."""
+        """End-effector pose in the world (N, 7)."""
         return self.signal("end_effector_pose")
 
     @property
     def wrench(self) -> Signal:
-        """Commanded force (N) and torque (N m) of the thrusters, in the base link (N, 6)."""
+        """Commanded thruster force (N) and torque (N m), in the base link frame (N, 6)."""
         wrench = self.bag.signal("base_wrench", WRENCH_COLUMNS, 6)
         return _shift_time(wrench, self.bag.began)
 
     @property
     def efforts(self) -> Signal:
-        """Commanded efforts of the joints (N, n), by the names of the states."""
+        """Commanded joint efforts (N, n), in the joint order of the states."""
         names = self.joint_names
         # Commands of velocities hold no efforts, and reading them takes a while.
         velocity = self.parameter("plant", "actuation") == "velocity"
@@ -184,7 +184,7 @@ class FlightReport(Flight):
 
     @cached_property
     def planned(self) -> list[Array]:
-        """Planned positions of the base (K, 3), m, one array a schedule."""
+        """Planned base positions (K, 3), m, one array per schedule."""
         return [
             np.array([[getattr(p.pose.position, x) for x in "xyz"] for p in message.poses]).reshape(
                 -1, 3
@@ -201,19 +201,19 @@ class FlightReport(Flight):
         return [name or "/" for name in others if name != self.bag.namespace]
 
     def mesh_of(self, shape: Shape) -> TriangleMesh:
-        """Return a mesh from the bag; files named in a bag are not read."""
+        """Return a mesh from the bag; external files named in the bag are not read."""
         if shape.resource not in self.meshes:
             raise MeshError(f"The bag does not contain the mesh '{shape.resource}'.")
         return self.meshes[shape.resource].moved(shape.pose, shape.size)
 
     @cached_property
     def obstacles(self) -> tuple[tuple[Visual, Pose], ...]:
-        """The solids of the obstacles, each with the pose of its link in the world."""
+        """Obstacle solids, each with the pose of its link in the world."""
         return () if self.robot is None else obstacle_visuals(self.robot.world, self.mesh_of)
 
     @property
     def target_pose(self) -> Signal:
-        """True pose of the target (M, 7): position, m, and quaternion; empty without one."""
+        """True target pose (M, 7): position, m, and quaternion; empty without a target."""
         if self.target is None:
             return Signal.empty(7)
         return self.signal("true_target_pose") or self.signal("target_pose")
@@ -222,18 +222,19 @@ class FlightReport(Flight):
 
     @property
     def label(self) -> str:
-        """Short name to distinguish several flights: names of the file and the method."""
+        """Short name to distinguish several flights: file name and method."""
         path, method = self.bag.path, self.flown_method
         return f"{path.stem} ({method})" if method else path.name
 
     @property
     def flown_method(self) -> str:
-        """Gait method of the first schedule, or the planner's parameter, or the control law."""
+        """Gait method from the first schedule or from the planner's parameter, or the control
+        law."""
         named = (method for _, status in self.reports if (method := _method_of(status)))
         return next(named, str(self.parameter("planner", "method") or ""))
 
     def parameter(self, node: str, name: str) -> Any:
-        """Return a parameter of a node; None if the bag does not hold it."""
+        """Return a node parameter; None if it is not in the bag."""
         return self.scenario.in_file.get(node, {}).get(name)
 
     # -- reports and goals ------------------------------------------------------------------------
@@ -247,8 +248,8 @@ class FlightReport(Flight):
 
     @cached_property
     def timed_statuses(self) -> list[tuple[float, Status | str]]:
-        """Statuses of the planner, or else of the controller, with their times, s. For a status of
-        another package, only the message is returned.
+        """Planner statuses, or else controller statuses, with their times, s. For a status
+        from another package, only the message is returned.
         """
         for commander in COMMANDERS:
             found = [
@@ -261,7 +262,7 @@ class FlightReport(Flight):
 
     @cached_property
     def reports(self) -> list[tuple[float, Status]]:
-        """The statuses of this package among :attr:`timed_statuses`."""
+        """The statuses in :attr:`timed_statuses` that come from this package."""
         return [(time, each) for time, each in self.timed_statuses if not isinstance(each, str)]
 
     @property
@@ -275,13 +276,13 @@ class FlightReport(Flight):
 
     @cached_property
     def outputs(self) -> frozenset[str]:
-        """Names of the controller's outputs; none if a planner has the goals."""
+        """Names of the controller outputs; none if the goals belong to a planner."""
         reports = (each for _, each in self.reports if isinstance(each, ControllerStatus))
         return frozenset(name for each in reports if each.command for name in each.command.errors)
 
     @cached_property
     def targets(self) -> list[GoalSpan]:
-        """Goals of the base in the schedules; without schedules, the goals that were sent."""
+        """Base goals in the schedules; without schedules, the goals that were sent."""
         return [target for target in self._all_targets if target.goal.base]
 
     @cached_property
@@ -295,12 +296,12 @@ class FlightReport(Flight):
 
     @property
     def base_goal(self) -> Goal | None:
-        """The goal of the base in force at the end; None: there is none, or the base is free."""
+        """The base goal in force at the end; None: no goal, or the base is free."""
         return self.goal if self.goal is not None and self.goal.base else None
 
     @property
     def other_goal(self) -> bool:
-        """Whether the base was sent to a goal other than its scenario's."""
+        """Whether the base was sent to a goal other than the scenario goal."""
         own = self.scenario.goal
         return self.scenario.has_goal and any(
             not np.allclose(sent.goal.position, own.position)
@@ -311,20 +312,20 @@ class FlightReport(Flight):
 
     @cached_property
     def link_goals(self) -> dict[str, EndEffectorGoal]:
-        """The planner's goals of links in force at the end."""
+        """The planner's link goals in force at the end."""
         return {} if self.goal is None else {each.link: each for each in self.goal.end_effectors}
 
     @cached_property
     def link_errors(self) -> dict[str, tuple[Signal, Signal]]:
-        """Distances (N, 1), m, and angles (M, 1), rad, of the true poses of links from their goals,
-        at up to two thousand states; no angles where any attitude will do, and no links where the
-        bag lacks the robot's description or its states.
+        """Distances (N, 1), m, and angles (M, 1), rad, between true link poses and their goals, at
+        up to two thousand states; no angles if any attitude is acceptable, and no links if the bag
+        lacks the robot description or states.
         """
         return {link: self._errors_of_link(link) for link in self.link_poses}
 
     @cached_property
     def link_poses(self) -> dict[str, Signal]:
-        """Poses in the world (k, 7) of links that had goals, at up to two thousand states."""
+        """World poses (k, 7) of links with goals, at up to two thousand states."""
         aims = (each for target in self._all_targets for each in target.goal.end_effectors)
         links = list(dict.fromkeys(each.link for each in aims))
         if self.robot is None or self.hidden_links_text or not links:
@@ -348,13 +349,13 @@ class FlightReport(Flight):
 
     @property
     def tool_goals(self) -> tuple[SentGoal, ...]:
-        """Goals of the end-effector of a controller."""
+        """Goals of a controller's end-effector."""
         # A planner takes goals of the link `end_effector` on the same topic, and reports them.
         return () if DEFAULT_END_EFFECTOR in self.link_goals else self.end_effector_goals
 
     @property
     def tool_targets(self) -> list[GoalSpan]:
-        """Goals of the end-effector, each until the next."""
+        """End-effector goals, each until the next."""
         return self._targets_until_next(_timed_goals(self.tool_goals))
 
     def _targets_until_next(self, goals: list[tuple[float, Goal]]) -> list[GoalSpan]:
@@ -363,13 +364,13 @@ class FlightReport(Flight):
 
     @property
     def position_counts(self) -> bool:
-        """Whether the method controls the position of the base."""
+        """Whether the method controls the base position."""
         return "position" not in self.not_controlled
 
     def controls(self, part: str) -> list[int]:
-        """Components x, y, z, rx, ry, rz (0..5) of ``base`` or ``end_effector`` under control.
+        """Controlled components x, y, z, rx, ry, rz (0..5) of ``base`` or ``end_effector``.
 
-        All six if no controller has named its outputs.
+        All six if no controller has reported its outputs.
         """
         if not self.outputs:
             return list(range(6))
@@ -377,19 +378,18 @@ class FlightReport(Flight):
         return [i for i, axis in enumerate(axes) if f"{part}.{axis}" in self.outputs]
 
     def goal_rotvec(self, goal: Goal) -> Array:
-        """Attitude of a goal as the rotation vector (3,), rad, that is nearest to the last
-        attitude."""
+        """Goal attitude as the rotation vector (3,), rad, nearest to the last attitude."""
         rotvec = rotvec_from_quaternion(goal.quaternion)
         return nearest_rotvec(rotvec, self.attitude.values[-1]) if len(self.attitude) else rotvec
 
     @property
     def time_flown(self) -> float | None:
-        """Time flown for the last goal, s, see :func:`~spacerobot_ros.measures.flown_time`."""
+        """Time flown to the last goal, s; see :func:`~spacerobot_ros.measures.flown_time`."""
         return flown_time(self.reports, self.end)
 
     @property
     def time_to_end(self) -> float | None:
-        """Time from the first schedule for the last goal to its end, s, including waits; None if no
+        """Time from the first schedule of the last goal to its end, s, including waits; None if no
         schedule was flown.
         """
         planned = [(time, each) for time, each in self.reports if isinstance(each, PlannerStatus)]
@@ -397,7 +397,7 @@ class FlightReport(Flight):
 
     @property
     def hidden_links_text(self) -> str:
-        """A message about data missing for a picture of the robot; empty: none is missing."""
+        """A message about data missing for robot pictures; empty: nothing is missing."""
         lacking = []
         if self.robot is None:
             lacking.append("no robot description (robot_description)")
@@ -410,11 +410,11 @@ class FlightReport(Flight):
             lacking.append(f"no positions of joint '{absent[0]}'{more} (joint_states)")
         if not lacking:
             return ""
-        return f"The bag holds {' and '.join(lacking)}: the robot is not drawn."
+        return f"The bag contains {' and '.join(lacking)}: the robot is not drawn."
 
     @property
     def missing_meshes(self) -> str:
-        """A sentence for captions about meshes missing in the bag; empty: none are."""
+        """A sentence for captions about meshes missing in the bag; empty: none."""
         shapes: list[Shape] = []
         if self.robot is not None:
             shapes += [each for link in self.robot.links for each in link.shapes]
@@ -434,9 +434,9 @@ class FlightReport(Flight):
 
     @cached_property
     def joints(self) -> Array:
-        """Joint positions (N, n), in the order of the robot description, at the base poses.
+        """Joint positions (N, n), in robot description order, at the base poses.
 
-        Angles of reaction wheels are 0: a body of revolution looks the same at any angle.
+        Reaction wheel angles are set to 0: a body of revolution looks the same at any angle.
         """
         assert self.robot is not None
         time, found = self.position.time, []
@@ -450,7 +450,7 @@ class FlightReport(Flight):
 
     @property
     def repeats_cycles(self) -> bool:
-        """Whether the flown method repeats cycles, or is unknown; false for control laws."""
+        """Whether the method used repeats cycles or is unknown; false for control laws."""
         if any(isinstance(status, ControllerStatus) for _, status in self.reports):
             return False
         flown = {status.method for _, status in self.executing if status.method}
@@ -470,7 +470,7 @@ class FlightReport(Flight):
 
     @property
     def tick(self) -> float:
-        """Time from one recorded pose to the next, s; 0 with one or none."""
+        """Time between recorded poses, s; 0 if there are fewer than two."""
         return float(np.median(np.diff(self.position.time))) if len(self.position) > 1 else 0.0
 
     @cached_property
@@ -481,17 +481,17 @@ class FlightReport(Flight):
 
     @cached_property
     def wheel_columns(self) -> tuple[int, ...]:
-        """Columns of the joints that carry reaction wheels."""
+        """Columns of reaction wheel joints."""
         wheels = self.robot.wheel_names if self.robot is not None else ()
         return tuple(i for i, name in enumerate(self.joint_names) if name in wheels)
 
     @cached_property
     def shape_columns(self) -> tuple[int, ...]:
-        """Columns of the other joints, whose positions are the shape of the robot."""
+        """Columns of the other joints, whose positions form the robot's shape."""
         return tuple(i for i in range(len(self.joint_names)) if i not in self.wheel_columns)
 
     def joint(self, name: str) -> Joint | None:
-        """The joint of that name in the robot description."""
+        """The joint with that name in the robot description."""
         joints = self.robot.movable_joints if self.robot is not None else ()
         return next((joint for joint in joints if joint.name == name), None)
 
@@ -513,7 +513,7 @@ def _shift_time(signal: Signal, start: float) -> Signal:
 
 
 def pose_errors(pose: Signal, targets: Sequence[GoalSpan]) -> Signal:
-    """Return goal minus pose (N, 7) while there is a goal: position, rotation vector (M, 6)."""
+    """Return goal minus pose (N, 7) while there is a goal: position and rotation vector (M, 6)."""
     times, values = [np.empty(0)], [np.empty((0, 6))]
     for target in targets:
         part = pose.between(target.start, target.end)
@@ -532,7 +532,7 @@ def read_report(path: Path, namespace: str | None = None) -> FlightReport:
     Raises
     ------
     RecordingError
-        There is no such bag or robot, or it is damaged.
+        There is no such bag or robot, or the bag is damaged.
     """
     return FlightReport.of(open_flight_bag(path, namespace))
 

@@ -1,4 +1,4 @@
-"""The page of a flight's report: numbers, tables, figures, and charts that uPlot draws."""
+"""The page of a flight report: key figures, tables, figures, and uPlot charts."""
 
 from __future__ import annotations
 
@@ -37,19 +37,19 @@ from spacerobot_ros.report.tables import (
 from spacerobot_ros.scenario import different_parameters
 
 _CHART_HELP = (
-    '<p class="facts" id="use">Drag across a chart to zoom all charts, double-click for the '
-    "whole flight. Click once to see the robot at that instant above; the vertical line marks the "
+    '<p class="facts" id="use">Drag across a chart to zoom all charts; double-click for the whole '
+    "flight. Click once to see the robot at that instant above; the vertical line marks the "
     "instant shown there. Click a name to hide its trace.</p>"
 )
 _MAX_EVENT_ROWS, _MAX_UNFOLDED_ROWS = 200, 20
-"""Largest numbers of events in the table of the page, and in a table that is not collapsed."""
+"""Largest number of events in the table, and in a table that is not collapsed."""
 
 _MAX_SAMPLES = 2000
 _MAX_SLICED_SAMPLES = 5000
-"""Largest number of samples of a chart, if omitted ones lie on lines, and if they do not."""
+"""Largest number of samples in a chart if the omitted samples lie on lines, and if they do not."""
 
 _LINE_TOLERANCE = 5e-4
-"""Largest distance of an omitted sample from its line, as a share of the trace's extent."""
+"""Largest distance between an omitted sample and its line, as a fraction of the trace's extent."""
 
 _MAX_CHART_EVENTS = 500
 
@@ -57,7 +57,7 @@ _FOLDED = ("velocities", "efforts", "twist")
 """Names of the collapsed figures."""
 
 Figures = Sequence[ReportFigure | str | None]
-"""Figures of a page; a text says why a figure is missing."""
+"""Figures on a page; a string explains why a figure is missing."""
 
 
 def page(
@@ -66,7 +66,7 @@ def page(
     figures: Figures,
     beside: Sequence[FlightReport] = (),
 ) -> str:
-    """Return the whole page; the flights ``beside`` get a row in a table."""
+    """Return the whole page; the flights in ``beside`` each get a row in a table."""
     charts = charts_of(flight, figures)
     scenario = flight.scenario.described_for_other_goal() if flight.other_goal else flight.scenario
     name, description = scenario.name, scenario.description
@@ -111,7 +111,7 @@ def _facts_html(flight: FlightReport) -> str:
 def _outcome_html(flight: FlightReport) -> str:
     if not flight.timed_statuses:
         return (
-            '<p class="outcome">The bag holds no status of a planner or a controller '
+            '<p class="outcome">The bag contains no planner or controller status '
             "(planner/status, controller/status).</p>"
         )
     (_, last), verdict = flight.timed_statuses[-1], flight.verdict
@@ -145,7 +145,7 @@ def _numbers_html(flight: FlightReport) -> list[str]:
     result, joints = result_table(flight), joint_table(flight)
     parts = ["<h2>Numbers of the run</h2>"]
     if flight.goal is None and not flight.tool_goals:
-        parts.append('<p class="missing">The bag holds no goal pose.</p>')
+        parts.append('<p class="missing">The bag contains no goal pose.</p>')
     if result.rows:
         parts.append(table("numbers", (), result.rows))
     if joints is not None:
@@ -228,7 +228,8 @@ def _footer_text(flight: FlightReport) -> str:
     version = flight.bag.metadata.get("spacerobot", {}).get("version", "")
     by = f", recorded by spacerobot_ros {version}" if version else ""
     return (
-        f"Made from the bag {flight.bag.path.name} alone: {flight.bag.message_count} messages{by}."
+        f"Created from the bag {flight.bag.path.name} alone: "
+        f"{flight.bag.message_count} messages{by}."
     )
 
 
@@ -238,8 +239,7 @@ def _footer_text(flight: FlightReport) -> str:
 def charts_of(flight: FlightReport, figures: Figures) -> PagePart:
     """Return the charts of all figures over time.
 
-    The element of a figure lists the numbers of its charts in ``data-charts``
-    (:func:`chart_numbers`).
+    Each figure element lists its chart numbers in ``data-charts`` (:func:`chart_numbers`).
     """
     groups = [group for each in figures if isinstance(each, ReportFigure) for group in each.groups]
     if not groups:
@@ -271,7 +271,7 @@ def _chart_events(flight: FlightReport) -> list[dict[str, Any]]:
 
 
 def chart_numbers(figures: Figures) -> dict[str, str]:
-    """Return the numbers of the charts of each figure, by name."""
+    """Return the chart numbers of each figure, by figure name."""
     found, first = {}, 0
     for each in figures:
         if isinstance(each, ReportFigure) and each.groups:
@@ -318,10 +318,10 @@ def _limit_range(group: TraceGroup) -> tuple[float, float]:
 
 
 def thin_out(signal: Signal) -> Signal:
-    """Return a signal with fewer samples for a chart that looks the same.
+    """Return a signal with fewer samples that looks the same in a chart.
 
-    It keeps samples that are not on lines between others. If there are too many, it keeps the
-    smallest and the largest value of every trace in each slice of time.
+    Samples that are not on lines between others are kept. If these are too many, the smallest and
+    largest value of every trace in each time slice are kept.
     """
     if len(signal) <= _MAX_SAMPLES:
         return signal

@@ -1,8 +1,8 @@
-"""Parts of HTML pages: shell and security policy, tables, figures, and the scripts of a page.
+"""HTML page components: page shell and security policy, tables, figures and scripts.
 
-Reports of flights and of campaigns consist of these. A page is self-contained: its
-Content-Security-Policy forbids loading anything, and allows only its own scripts, by their hashes.
-Untrusted text from a bag therefore never runs.
+Flight and campaign reports are built from them. A page is self-contained: its
+Content-Security-Policy forbids loading anything and allows only its own scripts, identified by
+hash. Untrusted text in a bag is therefore never executed.
 """
 
 from __future__ import annotations
@@ -24,16 +24,16 @@ _SECURITY_POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'
 
 @dataclass(frozen=True)
 class PagePart:
-    """A part of a page with scripts.
+    """A page component with scripts.
 
     Attributes
     ----------
     markup
         HTML of the part.
     data
-        JSON data by element id, under which the scripts find them.
+        JSON data for the scripts, by element id.
     programs
-        JavaScript, in the order of execution.
+        JavaScript, in execution order.
     style
         CSS.
     notices
@@ -48,19 +48,19 @@ class PagePart:
 
 
 def package_file(name: str) -> str:
-    """Return the text of a file of this package, such as ``page.css``."""
+    """Return the content of a package file, such as ``page.css``."""
     return files("spacerobot_ros.report").joinpath(name).read_text(encoding="utf-8")
 
 
 def html_page(title: str, body: Sequence[str], footer: str, parts: Sequence[PagePart] = ()) -> str:
-    """Return a whole page, with a button for the light or dark theme.
+    """Return a whole page, with a button to switch between the light and dark themes.
 
     Parameters
     ----------
     title, footer
         Plain text.
     body
-        HTML of the elements; empty texts are omitted.
+        HTML of the elements; empty strings are omitted.
     parts
         Their scripts, styles and licences are added to the page; their markup is in ``body``.
     """
@@ -108,18 +108,18 @@ def _licences_html(parts: Sequence[PagePart]) -> str:
 
 
 def unbroken(text: str) -> str:
-    """Return a text as HTML in which no line ends within a number such as ``1.5e-06``."""
+    """Return a string as HTML without line breaks inside numbers such as ``1.5e-06``."""
     return _WITH_EXPONENT.sub(r'<span class="unbroken">\g<0></span>', escape(text))
 
 
 def facts(texts: Sequence[str]) -> str:
-    """Return short facts on one line; empty if there are none."""
+    """Return short facts on one line, or an empty string if there are none."""
     spans = "".join(f"<span>{escape(fact)}</span>" for fact in texts)
     return f'<p class="facts">{spans}</p>' if texts else ""
 
 
 def tiles(rows: Sequence[tuple[str, str, str]]) -> str:
-    """Return the main numbers as tiles, each with label, value and note."""
+    """Return the key figures as tiles, each with a label, value and note."""
     made = []
     for label, value, note in rows:
         small = f"<small>{unbroken(note)}</small>" if note else ""
@@ -135,9 +135,10 @@ def table(
     rows: Sequence[Sequence[str]],
     numeric: Sequence[int] = (),
 ) -> str:
-    """Return a table; the first cell of a row is its header, ``numeric`` columns align right.
+    """Return a table; the first cell of each row is a header, and ``numeric`` columns are
+    right-aligned.
 
-    Without a ``head`` it has only rows.
+    Without ``head``, the table has no header row.
     """
 
     def row(cells: Sequence[str], tag: str) -> str:
@@ -166,11 +167,11 @@ def figure(name: str, svg: bytes, text: str, caption: str, attributes: str = "")
     svg
         The picture.
     text
-        Plain text in place of the picture.
+        Alternative text for the picture.
     caption
         HTML below it.
     attributes
-        HTML attributes of the element, each after a space.
+        HTML attributes of the element, each preceded by a space.
     """
     data = base64.b64encode(svg).decode()
     return (

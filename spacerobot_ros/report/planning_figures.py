@@ -1,7 +1,8 @@
-"""Pictures of the commands ``analyze`` and ``plan``: curvature maps and workspaces of a robot, and
-one plan.
+"""Pictures for the commands ``analyze`` and ``plan``: curvature maps and workspaces of a robot, and
+plans.
 
-Curvature maps over the shape space are as in paper 3, figures 2 and 3, and paper 2, figures 6 to 8.
+Curvature maps over the shape space follow figures 2 and 3 in paper 3, and figures 6 to 8 in paper
+2.
 """
 
 from __future__ import annotations
@@ -45,7 +46,7 @@ from spacerobot_ros.report.figures import (
 from spacerobot_ros.report.figures_over_time import draw_group
 
 _FINE_GRID, _COARSE_GRID = 61, 37
-"""Points per side of a map, for robots with up to three joints and with more."""
+"""Points per side of a map, for robots with up to three joints and for those with more."""
 
 _COLOUR_LEVELS = 16
 _CONDITION_LEVELS = (1.0, 1.5, 2.0, 3.0, 5.0, 7.0, 10.0, 20.0, 50.0, 100.0)
@@ -53,7 +54,7 @@ _MAX_CONDITION = 300.0
 """Larger condition numbers are drawn as this one: singular shapes are lines between grid points."""
 
 _MIN_LIMIT_DISTANCE = 0.25
-"""Least distance of the centre of squares from the joint limits, rad."""
+"""Smallest distance between the centre of a square and the joint limits, rad."""
 
 _SQUARE_COUNT = 60
 _COLOUR_BAR_X = WIDTH - 0.86
@@ -73,7 +74,7 @@ _AXIS_NAMES = ("x", "y", "z")
 
 
 def draw_analysis(found: Analysis, format: PictureFormat = PictureFormat.PNG) -> bytes | None:
-    """Return the curvature maps of a robot as a picture; None if no loop rotates its base."""
+    """Return a picture of a robot's curvature maps; None if no loop rotates its base."""
     with drawing():
         if found.planar.controllable:
             figure = _planar_figure(found)
@@ -88,7 +89,7 @@ def draw_analysis(found: Analysis, format: PictureFormat = PictureFormat.PNG) ->
 
 
 def draw_workspaces(found: Analysis, format: PictureFormat = PictureFormat.PNG) -> bytes:
-    """Return the workspaces of the end-effector, around the centre of mass, as a picture."""
+    """Return a picture of the end-effector workspaces around the centre of mass."""
     with drawing():
         high, gap = 3.3, 0.75
         figure = new_figure(high + 1.35)
@@ -168,7 +169,7 @@ def _draw_square_turns(axes: Axes, plane: PhasePlane, centre: Array, room: float
         sides, small, color=SECONDARY_COLOUR, dashes=(4, 3), lw=0.9, label="|H| z², small squares"
     )
     axes.set_xlabel("side z of the square (rad)")
-    axes.set_title("rotation of the base by one square loop")
+    axes.set_title("base rotation by one square loop")
     axes.set_ylabel("turn (rad)")
     axes.set_xlim(0.0, None)
     axes.set_ylim(0.0, 1.35 * turns.max())
@@ -307,7 +308,7 @@ def _joint_symbol(pair: Sequence[int], index: int) -> str:
 def draw_plan(
     problem: PlanningProblem, trial: PlanEvaluation, format: PictureFormat = PictureFormat.PNG
 ) -> bytes:
-    """Return the picture of a plan: joints, their velocities, base path, and goal."""
+    """Return a picture of a plan: joint positions and velocities, base path and goal."""
     with drawing():
         return picture_of(_plan_figure(problem, trial), format)
 

@@ -1,4 +1,4 @@
-"""The 3D view of a flight on its page: its scene as commands for MeshCat's viewer."""
+"""The 3D view on a flight's page: its scene as commands for the MeshCat viewer."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ Command = dict[str, Any]
 
 @dataclass(frozen=True)
 class View3D:
-    """Commands for the viewer, selectable spans of time (name, start, end), and a caption."""
+    """Viewer commands, selectable time spans (name, start, end), and a caption."""
 
     commands: list[Command]
     parts: list[tuple[str, float, float]]
@@ -44,7 +44,7 @@ class View3D:
 
 
 def viewer_script() -> str | None:
-    """Return MeshCat's viewer; None if the package ``meshcat`` is not installed."""
+    """Return MeshCat's viewer; None if package ``meshcat`` is not installed."""
     spec = find_spec("meshcat")
     for folder in (spec.submodule_search_locations or ()) if spec is not None else ():
         path = Path(folder) / "viewer" / "dist" / "main.min.js"
@@ -73,7 +73,7 @@ move it; click it first to zoom with the wheel.</p>
 
 
 def player_of(scene: View3D | str) -> PagePart:
-    """Return the player of a scene, or the reason why there is none."""
+    """Return a scene player, or the reason why there is none."""
     viewer = viewer_script()
     if isinstance(scene, str) or viewer is None:
         sentence = scene if isinstance(scene, str) else NO_VIEWER
@@ -109,26 +109,26 @@ def _licence_notices() -> tuple[tuple[str, str], ...]:
 # -- key frames ---------------------------------------------------------------------------------
 
 FULL_CYCLES = 3
-"""Number of cycles shown in full at the beginning and at the end of a gait."""
+"""Number of cycles shown in full at the start and at the end of a gait."""
 
 _MAX_KEY_FRAMES = 1000
 _MAX_CYCLE_INSTANTS = 300
-"""Largest number of instants of equal phase between the cycles shown in full."""
+"""Largest number of equal-phase instants between the cycles shown in full."""
 
 
 @dataclass(frozen=True)
 class KeyFrames:
-    """Recorded states to show, between which motion is interpolated.
+    """Recorded states to show; motion between them is interpolated.
 
     Attributes
     ----------
     indices
-        Their indices, ascending, with the first and the last state of the recording.
+        State indices, ascending, including the first and last recorded state.
     error
-        Largest distance of an omitted state from the interpolation, in tolerances.
+        Largest deviation of an omitted state from the interpolation, in tolerances.
     every
-        Number of cycles per shown state, always at the same phase, between the cycles shown in
-        full; 0: all cycles are shown in full.
+        Between the cycles shown in full, one state is shown per this number of cycles, always at
+        the same phase; 0: all cycles are shown in full.
     """
 
     indices: Indices
@@ -137,14 +137,14 @@ class KeyFrames:
 
 
 def key_frames(motion: Signal, cycles: Cycles | None) -> KeyFrames:
-    """Choose at most a thousand key frames between which linear interpolation is good enough.
+    """Choose at most a thousand key frames such that linear interpolation is accurate enough.
 
     Parameters
     ----------
     motion
         The visible motion, (N, k), each column divided by its tolerance.
     cycles
-        Its equal cycles. All except the first and the last few are sampled at equal phase:
+        Its equal cycles. All but the first and last few cycles are sampled at equal phase:
         otherwise fast loops would look like slow ones (aliasing).
     """
     shown, every = np.arange(len(motion)), 0
@@ -269,29 +269,29 @@ def _color_number(color: str) -> int:
 # -- the view of a flight -----------------------------------------------------------------------
 
 _POSITION_TOLERANCE = 0.001
-"""Tolerance of positions between key frames, as a share of the size of the scene."""
+"""Position tolerance between key frames, as a share of the scene size."""
 
 _ANGLE_TOLERANCE = 0.005  # rad
 _MAX_LINE_POINTS = 4000
 _MAX_MESH_FACES = 20_000
-"""Largest number of faces of all meshes together: about 0.6 MB."""
+"""Largest total number of mesh faces: about 0.6 MB."""
 
 _BACKGROUND = [246 / 255, 247 / 255, 249 / 255]
 _FIELD_OF_VIEW = 30.0
-"""Field of view of the camera from top to bottom, deg."""
+"""Vertical field of view of the camera, deg."""
 
 _MIN_ASPECT = 1.3
-"""Width of the picture over its height, on narrow screens."""
+"""Aspect ratio (width to height) of the picture on narrow screens."""
 
 _MARGIN = 1.06
-"""Distance of the camera, relative to the least distance at which the whole scene is visible."""
+"""Camera distance relative to the smallest distance at which the whole scene is visible."""
 
 _AXIS_COLOURS = ("#d55e00", "#009e73", "#0072b2")
 WORLD = "/flight"
 
 
 def view_of_flight(flight: FlightReport) -> View3D | str:
-    """Return the 3D view of a flight, or the reason why there is none."""
+    """Return a flight's 3D view, or the reason why there is none."""
     if flight.hidden_links_text:
         return flight.hidden_links_text
     most = _MAX_MESH_FACES // max(len(flight.meshes), 1)
@@ -458,23 +458,23 @@ def _time_spans(flight: FlightReport) -> list[tuple[str, float, float]]:
 
 def _caption_text(flight: FlightReport, frames: KeyFrames, radius: float, ghosts: bool) -> str:
     text = (
-        "The robot has the shapes of its URDF; each moving link has the color of its joint in the "
-        "figures below; lines are the paths of the base (blue)"
+        "The robot is drawn with its URDF geometry; each moving link has the color of its joint "
+        "in the figures below; lines are the paths of the base (blue)"
     )
     several = len(flight.link_poses) > 1
     if several:
         text += " and of the end-effectors (pink)"
     elif len(flight.tool) or flight.link_poses:
         text += " and of the end-effector (pink)"
-    text += " and what was planned (orange)" * bool(flight.planned)
+    text += " and the plans (orange)" * bool(flight.planned)
     text += "; the green ghost is the goal" if ghosts else ""
-    text += "; obstacles have the shapes used to measure distances" * bool(flight.obstacles)
+    text += "; obstacles have the geometry used to measure distances" * bool(flight.obstacles)
     text += "; the target moves according to target/odom" * (flight.target is not None)
     if len(flight.position) < 2:
         return f"{text}.{flight.missing_meshes}"
     text += (
-        f". {len(frames.indices)} key frames of {len(flight.position)} recorded states; in between "
-        "the motion is interpolated"
+        f". {len(frames.indices)} key frames from {len(flight.position)} recorded states; motion "
+        "in between is interpolated"
     )
     within = max(frames.error, 1.0)
     text += (

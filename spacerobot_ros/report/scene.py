@@ -1,4 +1,4 @@
-"""The scene of a flight: bodies with their solids, colors and poses over time.
+"""Flight scene: bodies with their solids, colors and poses over time.
 
 Pictures (:mod:`.solids`) and the 3D view (:mod:`.player`) draw the same bodies; the live page draws
 the same solids (:mod:`spacerobot_ros.model.visuals`).
@@ -23,24 +23,24 @@ from spacerobot_ros.report.signals import continuous, link_poses
 _BASE_COLOUR = "#c4c9d2"
 
 _FLATNESS_STATES = 25
-"""Number of states at which links are checked for leaving a horizontal plane."""
+"""Number of states at which links are checked to be in a horizontal plane."""
 
 
 @dataclass(frozen=True, eq=False)
 class Body:
-    """A rigid body of the scene.
+    """A rigid body in the scene.
 
     Attributes
     ----------
     name
         Its unique name.
     visuals
-        Its solids, in its frame.
+        Its solids, in the body frame.
     poses
-        Its poses in the world (K, 7) at the instants of the scene, m and quaternion; (1, 7): it is
+        Its world poses (K, 7) at the scene instants, m and quaternion; (1, 7): it is
         at rest.
     color
-        ``#rrggbb``; empty: each solid has the color of its shape.
+        ``#rrggbb``; empty: each solid has its own color.
     """
 
     name: str
@@ -60,18 +60,18 @@ def robot_bodies(
     q: Array,
     most: int,
 ) -> list[Body]:
-    """Return the links of a robot with solids, in the colors of the joints that move them.
+    """Return the robot links that have solids, colored like the joints that move them.
 
     Parameters
     ----------
     robot
         The robot.
     meshes
-        Triangles of its meshes by their URIs.
+        Triangles of its meshes, by URI.
     base, q
-        (K, 7) poses of the base in the world, and (K, n) joint positions, m or rad.
+        (K, 7) base poses in the world, and (K, n) joint positions, m or rad.
     most
-        Largest number of faces of a mesh.
+        Largest number of mesh faces.
     """
     poses = link_poses(robot, base, q)
     visuals = visuals_of(robot, meshes, most)
@@ -86,9 +86,9 @@ def robot_bodies(
 
 
 def bodies_of(flight: FlightReport, rows: Sequence[int], most: int) -> list[Body]:
-    """Return the robot and the target of a flight, at some of its recorded states.
+    """Return the robot and the target in a flight, at some of its recorded states.
 
-    ``most``: largest number of faces of a mesh.
+    ``most``: largest number of mesh faces.
     """
     assert flight.robot is not None
     at = np.asarray(rows)
@@ -106,7 +106,7 @@ def bodies_of(flight: FlightReport, rows: Sequence[int], most: int) -> list[Body
 
 
 def obstacles_of(flight: FlightReport) -> list[Body]:
-    """Return the obstacles around a robot, with the shapes used to measure distances."""
+    """Return the obstacles around a robot, with the geometry used to measure distances."""
     return [
         Body(f"obstacle {number} {visual.link}", (visual,), _as_values(pose))
         for number, (visual, pose) in enumerate(flight.obstacles)
@@ -114,9 +114,9 @@ def obstacles_of(flight: FlightReport) -> list[Body]:
 
 
 def goal_of_base(flight: FlightReport, most: int) -> Body | None:
-    """Return the base of a robot at its goal; None: it has none.
+    """Return a robot's base at its goal; None: it has none.
 
-    If only the attitude has a goal, it is at the last position.
+    If only the attitude has a goal, the base is at its last position.
     """
     goal, robot = flight.base_goal, flight.robot
     if goal is None or robot is None or not flight.controls("base"):
@@ -132,7 +132,7 @@ def goal_of_base(flight: FlightReport, most: int) -> Body | None:
 
 
 def is_flat(flight: FlightReport) -> bool:
-    """Whether every link of a robot stays in a plane z = const of the world."""
+    """Whether every link of a robot stays in a plane z = const in the world."""
     bodies = bodies_of(flight, flight.samples(_FLATNESS_STATES), 1)
     poses = np.array([each.poses for each in bodies])
     # Tilt of the z axis: 1 - cos.

@@ -18,15 +18,15 @@ Indices = npt.NDArray[np.int64]
 
 _MIN_CYCLES = 12
 _INITIAL_STRETCHES = 64
-"""Number of parts into which a recording is cut before simplification, to bound the work."""
+"""Number of parts into which a recording is split before simplification, to bound the work."""
 
 _MAX_PERIOD_SAMPLES = 1 << 14
-"""Number of samples at the end of a gait in which a period is searched."""
+"""Number of samples at the end of a gait that are searched for a period."""
 
 
 @dataclass(frozen=True)
 class Cycles:
-    """A part of a flight, ``start`` to ``end`` in s, that repeats every ``period`` s."""
+    """A segment of a flight, ``start`` to ``end`` in s, that repeats every ``period`` s."""
 
     start: float
     end: float
@@ -38,14 +38,14 @@ class Cycles:
         return int((self.end - self.start) / self.period + 0.05)
 
     def last(self, count: int) -> tuple[float, float]:
-        """Return start and end of the last few cycles."""
+        """Return the start and end of the last few cycles."""
         return self.end - count * self.period, self.end
 
 
 def envelope(signal: Signal, column: int, columns: int) -> tuple[Array, Array, Array]:
-    """Return times and the smallest and largest value of one column in each slice of time.
+    """Return the times, and the smallest and largest value of one column in each time slice.
 
-    A slice reaches to the first sample of the next one, so that the band is connected.
+    A slice extends to the first sample of the next slice, so that the band is connected.
     """
     edges = np.unique(np.linspace(0, len(signal) - 1, columns + 1).astype(int))
     values = signal.values[:, column]
@@ -59,14 +59,14 @@ def envelope(signal: Signal, column: int, columns: int) -> tuple[Array, Array, A
 
 
 def simplified(motion: Signal, most: int) -> tuple[Indices, float]:
-    """Drop samples on the line between others (Douglas and Peucker), keeping the farthest first.
+    """Drop samples on lines between others (Douglas-Peucker), keeping the farthest samples first.
 
     Parameters
     ----------
     motion
         Each column divided by its tolerance.
     most
-        Largest number of samples to keep, plus some dozens that are always kept.
+        Largest number of samples to keep, in addition to a few dozen that are always kept.
 
     Returns
     -------
@@ -132,23 +132,23 @@ def nearest_rotvec(rotvec: Array, near: Array) -> Array:
 
 
 def continuous(poses: Array) -> Array:
-    """Return poses (N, 7) with quaternions of continuous sign."""
+    """Return poses (N, 7) with sign-continuous quaternions."""
     flips = np.cumsum((poses[1:, 3:] * poses[:-1, 3:]).sum(axis=1) < 0) % 2
     signs = np.append(1, 1 - 2 * flips)[: len(poses), np.newaxis]
     return np.hstack([poses[:, :3], poses[:, 3:] * signs])
 
 
 def link_poses(robot: RobotDescription, base: Array, q: Array) -> dict[str, Array]:
-    """Return the poses (K, 7) in the world of all links, the base link first.
+    """Return the world poses (K, 7) of all links, the base link first.
 
-    Their quaternions are continuous, as those of the base are.
+    Link quaternions are continuous if the base quaternions are.
 
     Parameters
     ----------
     robot
         The robot.
     base, q
-        (K, 7) poses of the base in the world, and (K, n) joint positions, m or rad.
+        (K, 7) base poses in the world, and (K, n) joint positions, m or rad.
     """
     from scipy.spatial.transform import Rotation
 
@@ -160,7 +160,7 @@ def link_poses(robot: RobotDescription, base: Array, q: Array) -> dict[str, Arra
 
 
 def find_cycles(rates: Signal) -> Cycles | None:
-    """Return the equal cycles at the end of a gait, from its joint velocities.
+    """Return the equal cycles at the end of a gait, detected from its joint velocities.
 
     None unless there are at least twelve cycles, equal within a tenth of the peak velocity.
     """

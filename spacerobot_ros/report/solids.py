@@ -1,4 +1,4 @@
-"""Pictures of bodies: their solids in a parallel projection, hidden surfaces removed."""
+"""Pictures of bodies: their solids in parallel projection, with hidden surfaces removed."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ Floats = npt.NDArray[np.floating[Any]]
 
 EDGE_COLOUR = "#3d4450"
 MAX_MESH_FACES = 1500
-"""Largest number of faces of a mesh, which are filled one by one."""
+"""Largest number of mesh faces, since faces are filled one by one."""
 
 _OVERSAMPLING = 2
 _EDGE_WIDTH = 3
-"""Width of an edge, in pixels before averaging."""
+"""Edge width, in pixels before averaging."""
 
 _MIN_FACING_COSINE = 1e-6
 
@@ -36,12 +36,12 @@ class PlacedSolid:
     Attributes
     ----------
     corners, normals
-        (F, 3, 3) corners of its triangles, and their outward normals (F, 3).
+        (F, 3, 3) triangle corners, and outward normals (F, 3).
     edges, edge_normals
-        (E, 2, 3) ends of its sharp edges, and the normals (E, 2, 3) of the two adjacent faces; an
-        edge is visible if one of these faces is.
+        (E, 2, 3) ends of sharp edges, and normals (E, 2, 3) of the two adjacent faces; an edge is
+        visible if one of these faces is visible.
     fill
-        (3,) color, shares of red, green and blue.
+        (3,) color: red, green and blue, 0 to 1.
     """
 
     corners: Array
@@ -52,7 +52,7 @@ class PlacedSolid:
 
 
 def placed_solids(bodies: Iterable[Body], instant: int) -> list[PlacedSolid]:
-    """Return the solids of bodies in the world at the instant with this number."""
+    """Return the solids of bodies in the world at the instant with this index."""
     found = []
     for body in bodies:
         pose = body.poses[min(instant, len(body.poses) - 1)]
@@ -81,7 +81,8 @@ def corner_points(solids: Iterable[PlacedSolid]) -> Array:
 
 
 class View:
-    """A parallel projection of world points to the paper, from azimuth and elevation (deg)."""
+    """A parallel projection of world points to the image plane, from azimuth and elevation
+    (deg)."""
 
     def __init__(self, azimuth: float = -58.0, elevation: float = 24.0) -> None:
         a, e = math.radians(azimuth), math.radians(elevation)
@@ -103,7 +104,7 @@ class View:
 
 
 class Canvas:
-    """Pixels over a rectangle of the paper, ``low`` to ``high`` (2,) in m.
+    """Pixels over a rectangle in the image plane, ``low`` to ``high`` (2,) in m.
 
     Parameters
     ----------
@@ -125,7 +126,7 @@ class Canvas:
         self._pixels = np.zeros((*size, 4), np.float32)
 
     def draw(self, solids: Sequence[PlacedSolid]) -> None:
-        """Draw the faces of solids, then the edges that no face hides."""
+        """Draw the faces of solids, then the edges that are not hidden."""
         for solid in solids:
             for corners, normal in zip(solid.corners, solid.normals, strict=True):
                 if normal @ self._view.viewing_direction > _MIN_FACING_COSINE:
@@ -136,7 +137,7 @@ class Canvas:
                 self._draw_edge(ends)
 
     def draw_lines(self, lines: Iterable[Array], color: str) -> None:
-        """Draw lines (2, 3) in the world over everything."""
+        """Draw lines (2, 3) in the world on top of everything."""
         for ends in lines:
             self._draw_edge(ends, color, pixels_nearer=1e9)
 
@@ -208,9 +209,9 @@ class Canvas:
 
 
 def outlines(body: Body) -> list[Array]:
-    """Return the outlines of a body at its first instant as lines (2, 3) in the world.
+    """Return the outline of a body at its first instant as lines (2, 3) in the world.
 
-    A body without solids has a small cross.
+    A body without solids is drawn as a small cross.
     """
     R, r = matrix_from_quaternion(body.poses[0, 3:]), body.poses[0, :3]
     lines = [line for visual in body.visuals for line in visual.outline]

@@ -1,4 +1,4 @@
-"""The numbers of a flight as rows of text."""
+"""Key figures of a flight as table rows."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ from spacerobot_ros.scenario import Published
 _NO_VALUE = "–"
 _LEAST_ANGLE_IN_DEGREES = 1e-4  # rad
 _EQUAL_TIME_TICKS = 1.5
-"""Largest difference between times considered equal, control periods."""
+"""Largest difference between times that are considered equal, control periods."""
 
 
 @dataclass(frozen=True)
 class Table:
-    """Rows of text under a head; ``numeric`` are the columns to align as numbers."""
+    """Rows of text below a header; ``numeric`` are the columns aligned as numbers."""
 
     head: tuple[str, ...]
     rows: Sequence[tuple[str, ...]]
@@ -37,7 +37,7 @@ class Table:
 
 
 def headline(flight: FlightReport) -> list[tuple[str, str, str]]:
-    """Return label, value and note of each headline number."""
+    """Return the label, value and note of each key figure."""
     rows: list[tuple[str, str, str]] = []
     error, sensed = flight.error, pose_error(flight.signal("measured_pose"), flight.base_goal)
     tool = flight.end_effector_error if flight.tool_goals else None
@@ -110,7 +110,7 @@ def _error_with_tolerance(
 
 
 def runs_table(flights: Sequence[FlightReport]) -> Table:
-    """Return outcome and headline numbers of several flights, a column each."""
+    """Return the outcome and key figures of several flights, one column each."""
     found = [
         {"Outcome": flight.verdict.word} | {label: value for label, value, _ in headline(flight)}
         for flight in flights
@@ -121,7 +121,7 @@ def runs_table(flights: Sequence[FlightReport]) -> Table:
 
 
 def result_table(flight: FlightReport) -> Table:
-    """Return goals and final poses, an estimated body, and the clearance, if the bag has them."""
+    """Return goals and final poses, an estimated body and the clearance, if they are in the bag."""
     rows: list[tuple[str, ...]] = []
     last = flight.reports[-1][1].state.value if flight.reports else ""
     refused = " (refused)" if last == "refused" and not flight.executing else ""
@@ -170,7 +170,7 @@ def _link_goal_text(goal: EndEffectorGoal) -> str:
 
 
 def different_goals(flights: Sequence[FlightReport]) -> list[tuple[str, ...]]:
-    """Return a row for each part of the goals that differs between flights: name and texts."""
+    """Return a row for each goal component that differs between flights: name and values."""
     goals = [
         _base_goal_texts(flight)
         | {f"of {link}": _link_goal_text(goal) for link, goal in flight.link_goals.items()}
@@ -190,7 +190,7 @@ def _payload_rows(flight: FlightReport) -> list[tuple[str, ...]]:
 
 
 def payload_text(estimate: PayloadEstimate) -> str:
-    """Return the parameters of a held body that its motion determines."""
+    """Return the parameters of a held body that are determined by its motion."""
     parts = []
     mass, spread = estimate.parameters[0], estimate.deviations[0]
     if not math.isnan(mass):
@@ -210,7 +210,7 @@ def payload_text(estimate: PayloadEstimate) -> str:
 
 
 def joint_table(flight: FlightReport) -> Table | None:
-    """Return first and last positions and peak velocities of the joints, with their limits."""
+    """Return the first and last joint positions and peak joint velocities, with limits."""
     if not flight.joint_names or not len(flight.shape):
         return None
     rows = []
@@ -238,7 +238,8 @@ def joint_table(flight: FlightReport) -> Table | None:
 
 
 def published_table(flight: FlightReport) -> Table | None:
-    """Return published figures next to those of this flight; None if the scenario has none."""
+    """Return published values next to those of this flight; None if there are none for the
+    scenario."""
     if not flight.scenario.published:
         return None
     rows = []

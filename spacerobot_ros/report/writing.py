@@ -1,4 +1,4 @@
-"""The picture report of a flight, from its bag alone."""
+"""The graphical report of a flight, created from its bag alone."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ from spacerobot_ros.report.solids import MAX_MESH_FACES, corner_points, placed_s
 from spacerobot_ros.resources import suggestion
 
 _PAPER_WIDTHS = (40.0, 400.0)
-"""Least and largest width of a figure for a paper, mm."""
+"""Smallest and largest figure width for a paper, mm."""
 
 _PICTURE_PIXELS = 1000
 
 _ROBOT_PANEL_WIDTH = 3.9
-"""Width of the robot in a picture, inches."""
+"""Robot width in a picture, inches."""
 
 FIGURES: dict[str, Callable[[FlightReport], ReportFigure | str | None]] = {
     "robot": space.configurations_figure,
@@ -62,7 +62,7 @@ FIGURES: dict[str, Callable[[FlightReport], ReportFigure | str | None]] = {
 """The figures of :func:`write_figures`, by name."""
 
 _REPORT_FIGURES = tuple(draw for name, draw in FIGURES.items() if name not in ("pose", "path"))
-"""Figures of a report, with separate position and attitude, and a figure of all paths."""
+"""Report figures, with separate position and attitude figures and a figure of all paths."""
 
 
 def write_report(
@@ -70,14 +70,14 @@ def write_report(
 ) -> None:
     """Write the report of a bag as one self-contained HTML file.
 
-    Any bag makes a page: parts that it lacks are left out, and the page says so. Bags
-    ``beside`` it, of other methods to the same goal for one, get a column in a table and their
-    paths in the figure of paths. Of several robots in the bag ``namespace`` chooses one.
+    A page is created for any bag: parts without data are omitted, and the page says so. Bags in
+    ``beside``, for example from other methods for the same goal, are added as columns in a table
+    and as paths in the path figure. If the bag has several robots, ``namespace`` selects one.
 
     Raises
     ------
     SpaceRobotError
-        There is no such bag or robot, one is damaged, or the file cannot be written.
+        There is no such bag or robot, a bag is damaged, or the file cannot be written.
     """
     flight = read_report(bag, namespace)
     others = [read_report(other) for other in beside]
@@ -100,33 +100,33 @@ def write_figures(
     degrees: bool = False,
     namespace: str | None = None,
 ) -> dict[str, Path | str]:
-    """Write figures of a flight for a paper, one file each.
+    """Write a flight's figures for a paper, one file each.
 
     Parameters
     ----------
     bag
         The flight.
     folder
-        Folder of the files, ``pose.pdf`` and so on; existing files are replaced.
+        Output folder for the files, ``pose.pdf`` and so on; existing files are replaced.
     only
-        Names of :data:`FIGURES`; empty for all that the bag has data for, with position and
+        Names of :data:`FIGURES`; empty for all figures that the bag has data for, with position and
         attitude in one figure.
     beside
-        Other flights, whose traces and paths are added to the same panels; figures of single
-        flights are omitted.
+        Other flights, whose traces and paths are added to the same panels; figures that show a
+        single flight are omitted.
     format
-        Format of the files. Text in PDF and SVG remains text.
+        Format of the files. Text in PDF and SVG files remains text.
     width
-        Width of a figure, mm.
+        Figure width, mm.
     style
-        A matplotlib style file for fonts, sizes and colours of lines and axes, or the name of a
+        A matplotlib style file for fonts and for sizes and colours of lines and axes, the name of a
         matplotlib style, or ``serif``.
     events
-        Whether events are shown below time axes.
+        Whether to show events below time axes.
     degrees
         Whether angles over time are in degrees instead of rad.
     namespace
-        Namespace of the robot, if the bag has several.
+        Robot namespace, if the bag has several robots.
 
     Returns
     -------
@@ -146,8 +146,7 @@ def write_figures(
         raise SpaceRobotError(f"A figure is {least:g} to {most:g} mm wide, not {width:g} mm.")
     if folder.suffix.lower() in {f".{each.value}" for each in PictureFormat}:
         raise SpaceRobotError(
-            f"Figures are written to a folder with a file for each; '{folder.name}' is the name of "
-            "a file."
+            f"Figures are written to a folder, one file each; '{folder.name}' is a file name."
         )
     flight, *others = (read_report(each, namespace) for each in (bag, *beside))
     if not events:
@@ -172,7 +171,7 @@ def write_figures(
                     raise
                 # Of the settings in a style file matplotlib refuses some only when it draws.
                 raise SpaceRobotError(
-                    f"Nothing can be drawn with the style file {style}: {error}."
+                    f"Figures cannot be drawn with the style file {style}: {error}."
                 ) from error
             if isinstance(figure, ReportFigure):
                 made[name] = path = folder / f"{name}.{format.value}"
@@ -185,12 +184,13 @@ def write_figures(
 def write_picture(bag: Path, picture: Path, *, namespace: str | None = None) -> None:
     """Write one picture of a flight: pose and shape over time, and the robot.
 
-    It is a PNG 1000 pixels wide, or an SVG or PDF, depending on the suffix of the file.
+    Depending on the file suffix, it is a PNG (1000 pixels wide), an SVG or a PDF.
 
     Raises
     ------
     SpaceRobotError
-        There is no such bag, it is damaged or holds no base poses, or the file cannot be written.
+        There is no such bag, it is damaged or contains no base poses, or the file cannot be
+        written.
     """
     format = PictureFormat.of(picture)
     flight = read_report(bag, namespace)

@@ -1,6 +1,6 @@
 """The live page that shows and steers a robot, without ROS.
 
-The page shows a :class:`~spacerobot_ros.viewer.state.StackState` and returns the actions of its
-users as :data:`~spacerobot_ros.viewer.state.Action`; the viewer node provides the state and
+The page shows a :class:`~spacerobot_ros.viewer.state.StackState` and returns user actions as
+:data:`~spacerobot_ros.viewer.state.Action`; the viewer node provides the state and
 performs the actions.
 """

@@ -1,4 +1,4 @@
-"""Texts, tables and curves of the page, made from the state of the stack."""
+"""Messages, tables and curves on the page, created from the state of the stack."""
 
 from __future__ import annotations
 
@@ -32,16 +32,16 @@ from spacerobot_ros.viewer.state import Measured, Momenta, Notice, Part, StackSt
 Color = tuple[int, int, int]
 
 SILENT_AFTER = 1.0
-"""Wall time without a state after which the page reports it, s."""
+"""Wall time after which the page reports that no state was received, s."""
 
 _NEAR_LIMIT_SHARE = 0.05
-"""Distance from a limit below which a joint is marked, as a share of its range."""
+"""Distance to a limit below which a joint is highlighted, as a fraction of its range."""
 
 _WARNING_WHEEL_SHARE, _SATURATED_WHEEL_SHARE = 0.8, 0.98
-"""Shares of a wheel's largest rate above which it is marked amber, and red."""
+"""Fractions of a wheel's maximum rate above which it is shown in amber and in red."""
 
 _NEAR_CONTACT = 0.02
-"""Distance between links below which it is shown at the top of the page, m."""
+"""Link distance below which it is shown at the top of the page, m."""
 
 COLORS: Mapping[Verdict, Color] = {
     Verdict.UNCHECKED: (150, 150, 160),
@@ -50,14 +50,14 @@ COLORS: Mapping[Verdict, Color] = {
     Verdict.PARTLY: (240, 160, 30),
     Verdict.REFUSED: (220, 60, 60),
 }
-"""Colours of the ghost, by the verdict on its goal."""
+"""Ghost colours by goal verdict."""
 
 _LEVEL_COLORS = (
     "var(--ok-color,#2a9d5c)",
     "var(--warn-color,#c98a00)",
     "var(--bad-color,#d23c3c)",
 )
-"""Colours of the levels OK, WARN and ERROR: those of ``page.js`` are readable in both themes."""
+"""Colours of the levels OK, WARN and ERROR; those in ``page.js`` are readable in both themes."""
 
 _FAINT_COLOR, _BAR_COLOR = "var(--faint-color,#8a8f98)", "#8a8f9855"
 
@@ -68,7 +68,7 @@ _ENDED = "The stack has ended: none of its nodes responds."
 
 
 def silence_message(state: StackState) -> str:
-    """Return a message if states have stopped or never came, else an empty text."""
+    """Return a message if states have stopped or never arrived, otherwise an empty string."""
     if state.replay is not None and (state.replay.paused or state.replay.ended):
         return ""
     if state.age_s == math.inf:
@@ -83,7 +83,7 @@ def silence_message(state: StackState) -> str:
 def time_to_go(state: StackState) -> float | None:
     """Return the expected time until the goal is reached, s; None if there is no such goal.
 
-    A planner reports it, or else a controller.
+    It is reported by a planner, or else by a controller.
     """
     planner, controller, measured = state.planner, state.controller, state.measured
     if measured is None:
@@ -109,7 +109,7 @@ def _to_go_text(left: float | None) -> str:
 
 
 def progress(state: StackState) -> float | None:
-    """Return the completed share of the planned manoeuvre, 0 to 1; None if there is none."""
+    """Return the completed fraction of the planned manoeuvre, 0 to 1; None if there is none."""
     left, planner = time_to_go(state), state.planner
     if left is None or planner is None or planner.manoeuvre_time_s <= 0.0:
         return None
@@ -125,8 +125,8 @@ def status_html(
 ) -> str:
     """Return the state of the stack; ``described``: whether a robot is known.
 
-    ``errors``: see :func:`goal_errors`. ``tolerance``: of the planner or else of the controller, if
-    known.
+    ``errors``: see :func:`goal_errors`. ``tolerance``: the planner's or else the controller's
+    tolerance, if known.
     """
     lines = []
     silence = silence_message(state)
@@ -202,7 +202,7 @@ def _distance_lines(
 
 
 def not_controlled(state: StackState, part: Part) -> tuple[Controlled, ...]:
-    """Return the known parts of a goal that planner or controller do not control."""
+    """Return the goal components known not to be controlled by the planner or controller."""
     goal = state.goals.get(part)
     if goal is None or goal.end_effectors:
         return ()
@@ -215,7 +215,7 @@ def not_controlled(state: StackState, part: Part) -> tuple[Controlled, ...]:
 
 
 def look_back_html(shown: StackState, live: StackState) -> str:
-    """Return the lines above an earlier state: its age, and whether the stack has ended."""
+    """Return the lines shown above an earlier state: its age, and whether the stack has ended."""
     assert shown.measured is not None
     assert live.measured is not None
     ago = live.measured.time_s - shown.measured.time_s
@@ -227,19 +227,20 @@ def look_back_html(shown: StackState, live: StackState) -> str:
 
 
 def line_html(text: str, level: int) -> str:
-    """Return a line in the head of the page."""
+    """Return a line in the page header."""
     return padded(_line_html(text, level))
 
 
 def has_stack_ended(state: StackState) -> bool:
-    """Whether every node that has reported a status is offline, and one of them fell silent."""
+    """Whether every node that has reported a status is offline, and at least one of them fell
+    silent."""
     statuses = {"plant": state.plant, "planner": state.planner, "controller": state.controller}
     known = {key for key, status in statuses.items() if status is not None}
     return bool(known and state.silent) and known <= state.absent
 
 
 def padded(html: str) -> str:
-    """Return HTML with the margins and the font size of the other elements of the page."""
+    """Return HTML with the margins and font size of the other page elements."""
     return f'<div style="padding:2px 12px;font-size:.85em;line-height:1.35">{html}</div>'
 
 
@@ -266,7 +267,7 @@ def _line_html(text: str, level: int | None) -> str:
 
 
 def check_html(check: GoalCheck) -> str:
-    """Return the result of checking the goal."""
+    """Return the goal check result."""
     red, green, blue = COLORS[check.verdict]
     dot = (
         f'<span style="display:inline-block;width:.8em;height:.8em;border-radius:50%;'
@@ -280,7 +281,7 @@ def check_html(check: GoalCheck) -> str:
 
 
 def joints_html(robot: RobotDescription, q: Array, qdot: Array, effort: Array) -> str:
-    """Return a table of the joints (n,) and their limits, with a bar for each range."""
+    """Return a table of joints (n,) and their limits, with a bar for each range."""
     rows = []
     lower, upper = robot.limits("lower"), robot.limits("upper")
     fastest, strongest = robot.limits("velocity"), robot.limits("effort")
@@ -335,7 +336,7 @@ def _value_and_limit(value: float, limit: float, unit: str) -> str:
 
 
 def log_html(notices: Iterable[Notice]) -> str:
-    """Return the lines of the log, in the order given."""
+    """Return the log lines, in the given order."""
     rows = []
     for notice in notices:
         time = "" if notice.time_s is None else f"{notice.time_s:.2f} s"
@@ -353,7 +354,7 @@ def log_html(notices: Iterable[Notice]) -> str:
 
 @dataclass(frozen=True)
 class GoalDistance:
-    """Error of a part relative to its goal: ``distance``, m, and ``angle``, rad; None: any
+    """Error of a robot part relative to its goal: ``distance``, m, and ``angle``, rad; None: any
     attitude."""
 
     distance: float
@@ -362,7 +363,8 @@ class GoalDistance:
     def describe(
         self, tolerance: Tolerance | None = None, left_out: Sequence[Controlled] = ()
     ) -> str:
-        """Return a clause with the numbers, their tolerances, and parts that are not controlled."""
+        """Return a clause with the errors, their tolerances, and the components that are not
+        controlled."""
         limits = (0.0, 0.0) if tolerance is None else (tolerance.position, tolerance.attitude)
         errors, tolerances = [], []
         for part, value, unit, limit in (
@@ -379,7 +381,7 @@ class GoalDistance:
 
     @property
     def numbers(self) -> tuple[float, ...]:
-        """The distance, and the angle if the attitude is required."""
+        """The distance, and the angle if an attitude is required."""
         return (self.distance,) if self.angle is None else (self.distance, self.angle)
 
 
@@ -390,8 +392,8 @@ def _task_before_goals(state: StackState) -> str:
 
 
 def goal_errors(state: StackState, kinematics: ForwardKinematics) -> dict[Part, GoalDistance]:
-    """Return the error of each part with a goal and a known pose. Goals that a controller pursues
-    after a task, such as an approach, are omitted.
+    """Return the error of each robot part that has a goal and a known pose. Goals that a controller
+    pursues after a task, such as an approach, are omitted.
     """
     measured, errors = state.measured, {}
     if _task_before_goals(state):
@@ -423,9 +425,9 @@ def _measured_pose(
 
 
 def end_effector_positions(state: StackState, kinematics: ForwardKinematics) -> dict[Part, Array]:
-    """Return the positions (3,) in the world of the end-effectors whose paths are drawn, m.
+    """Return the world positions (3,), m, of the end-effectors whose paths are drawn.
 
-    They are the end-effector of the plant, if it publishes one, and the links with goals.
+    These are the plant's end-effector, if it publishes one, and the links with goals.
     """
     found = {} if state.tool is None else {DEFAULT_END_EFFECTOR: state.tool[:3]}
     for goal in state.goals.values():
@@ -439,9 +441,9 @@ def end_effector_positions(state: StackState, kinematics: ForwardKinematics) -> 
 def planned_positions(
     state: StackState, robot: RobotDescription, kinematics: ForwardKinematics
 ) -> dict[Part, Array]:
-    """Return the planned positions (k, 3) in the world of end-effectors, m.
+    """Return the planned world positions (k, 3) of end-effectors, m.
 
-    The end-effectors are as in :func:`end_effector_positions`, if they are links of the robot.
+    The end-effectors are those in :func:`end_effector_positions` that are links of the robot.
     """
     motion = state.planned_motion
     n = len(robot.joint_names)
@@ -456,9 +458,9 @@ def planned_positions(
 
 
 def flown_check(state: StackState) -> GoalCheck | None:
-    """Return the end of the plan being flown, as the check of its goal; None: there is none.
+    """Return the end of the plan being flown, as a goal check result; None: there is none.
 
-    Controlled parts of the goal are assumed to be reached: later plans correct what one leaves.
+    Controlled goal components are assumed to be reached: later plans correct remaining errors.
     """
     planner, motion = state.planner, state.planned_motion
     if planner is None or motion is None or "planner" in state.absent:
@@ -479,9 +481,9 @@ def flown_check(state: StackState) -> GoalCheck | None:
 
 
 def momentum_drift(momenta: Momenta, first: Array) -> tuple[float, float]:
-    """Return the drift of linear and angular momentum, kg m/s and kg m^2/s.
+    """Return the linear and angular momentum drift, kg m/s and kg m^2/s.
 
-    It is measured from the expected momenta; if the plant publishes none, from ``first`` (6,).
+    It is relative to the expected momenta or, if the plant publishes none, to ``first`` (6,).
     """
     expected = first if momenta.expected is None else momenta.expected
     linear, angular = momentum_change(momenta.actual, expected).tolist()
@@ -489,12 +491,12 @@ def momentum_drift(momenta: Momenta, first: Array) -> tuple[float, float]:
 
 
 MOMENTUM_PARTS = ("base", "arm", "wheels", "sum")
-"""Parts of the momentum budget, in the order of the page."""
+"""Components of the momentum budget, in page order."""
 
 
 def momentum_budget(state: StackState) -> dict[str, float]:
-    """Return the angular momentum of each part from controller/status, N m s; empty: it has none,
-    or the controller is offline.
+    """Return the angular momentum components in controller/status, N m s; empty: there are none, or
+    the controller is offline.
     """
     control = state.controller
     if control is None or control.command is None or "controller" in state.absent:
@@ -505,7 +507,7 @@ def momentum_budget(state: StackState) -> dict[str, float]:
 
 
 def momentum_html(state: StackState) -> str:
-    """Return the momentum budget, and the rate of each wheel as a share of its largest rate."""
+    """Return the momentum budget, and the rate of each wheel as a fraction of its maximum."""
     budget = momentum_budget(state)
     control = state.controller
     if not budget or control is None or control.command is None:
@@ -523,7 +525,8 @@ def momentum_html(state: StackState) -> str:
 
 
 def has_tool(state: StackState) -> bool:
-    """Whether the end-effector accepts goals: a controller runs, and its pose is known."""
+    """Whether the end-effector accepts goals: a controller is running, and the end-effector pose is
+    known."""
     return state.controller is not None and state.tool is not None
 
 
@@ -531,7 +534,7 @@ def has_tool(state: StackState) -> bool:
 
 
 def fault_kinds(targets: FaultTargets) -> dict[str, list[str]]:
-    """Return the possible targets of each kind of fault, if it has any."""
+    """Return the possible targets of each fault kind that has targets."""
     found = {name: targets.of(kind) for name, kind in FAULT_KINDS.items()}
     return {name: names for name, names in found.items() if names}
 
@@ -539,17 +542,15 @@ def fault_kinds(targets: FaultTargets) -> dict[str, list[str]]:
 def fault_line(
     kind: str, target: str, value: float, lasts_s: float, now_s: float, targets: FaultTargets
 ) -> str:
-    """Return the description of a fault that begins now and lasts ``lasts_s``; 0: forever.
+    """Return the description of a fault that starts now and lasts for ``lasts_s``; 0: forever.
 
     Raises
     ------
     ParameterError
-        There is no such fault, or a number is not finite.
+        There is no such fault, or a value is not finite.
     """
     if not (math.isfinite(lasts_s) and lasts_s >= 0.0):
-        raise ParameterError(
-            f"The duration of the fault is {lasts_s:g} s; it must not be negative."
-        )
+        raise ParameterError(f"The fault duration is {lasts_s:g} s; it must not be negative.")
     words = [kind, target]
     if kind in FAULT_KINDS and FAULT_KINDS[kind].value:
         words.append(f"{value:.9g}")
@@ -579,14 +580,14 @@ T = TypeVar("T")
 
 
 class RecentItems(Generic[T]):
-    """Items of the last minutes of simulated time, the oldest first, separated by at least a step.
+    """Items from the last minutes of simulated time, oldest first, at least one step apart.
 
     Parameters
     ----------
     span_s
-        Time from the oldest item to the latest, s of simulated time.
+        Simulated time from the oldest to the latest item, s.
     most
-        Largest number of items; beyond it, every second one is dropped and the step doubled.
+        Largest number of items; beyond it, every second item is dropped and the step is doubled.
     """
 
     def __init__(self, span_s: float = 300.0, most: int = 1500) -> None:
@@ -595,7 +596,8 @@ class RecentItems(Generic[T]):
         self._items: list[T] = []
 
     def add(self, time_s: float, item: T) -> None:
-        """Add an item; items of this time or later are dropped first (time may jump back)."""
+        """Add an item; existing items at this time or later are dropped first (time may jump
+        back)."""
         times = self._times
         begin, end = (bisect_left(times, each) for each in (time_s - self._span, time_s))
         if end - begin > 1 and times[end - 1] - times[end - 2] < self._step:
@@ -613,23 +615,23 @@ class RecentItems(Generic[T]):
 
     @property
     def span(self) -> tuple[float, float] | None:
-        """Times of the first and the last item, s; None: there is none."""
+        """Times of the first and last items, s; None: there is none."""
         return (self._times[0], self._times[-1]) if self._times else None
 
     def at(self, time_s: float) -> T:
-        """Return the last item until a time, or the first of all items."""
+        """Return the last item at or before a time, or else the first item."""
         return self._items[max(bisect_right(self._times, time_s) - 1, 0)]
 
 
 class Trail:
-    """The flown path of the base, as points separated by at least a step.
+    """The flown base path, as points at least one step apart.
 
     Parameters
     ----------
     step
-        Least distance between neighbours, m.
+        Smallest distance between neighbours, m.
     most
-        Largest number of points; beyond it, every second one is dropped and the step doubled.
+        Largest number of points; beyond it, every second point is dropped and the step is doubled.
     """
 
     def __init__(self, step: float, most: int = 1500) -> None:
@@ -638,7 +640,8 @@ class Trail:
         self._times: list[float] = []
 
     def add(self, time_s: float, point: Array) -> None:
-        """Add a point; points of this time or later are dropped first (time may jump back)."""
+        """Add a point; existing points at this time or later are dropped first (time may jump
+        back)."""
         while self._times and self._times[-1] >= time_s:
             self._times.pop()
             self._points.pop()
@@ -651,5 +654,5 @@ class Trail:
             self._step *= 2
 
     def points(self, until: float = math.inf) -> Array:
-        """Return the points (k, 3), m, until a time, s."""
+        """Return the points (k, 3), m, up to a time, s."""
         return np.array(self._points[: bisect_right(self._times, until)]).reshape(-1, 3)

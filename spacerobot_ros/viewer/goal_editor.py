@@ -44,10 +44,10 @@ Defer = Callable[[Callable[[], None]], None]
 
 
 def react(register: Callable[[Any], Any], defer: Defer, act: Callable[[Any], None]) -> None:
-    """Have a function called with the value of an element in the thread that draws the page.
+    """Call a function with an element's value in the thread that draws the page.
 
-    ``register`` is the element's ``on_click`` or ``on_update``. Only users count, not the values
-    that the page itself writes.
+    ``register`` is the element's ``on_click`` or ``on_update``. The function is called only for
+    user changes, not for values set by the page.
     """
 
     @register
@@ -58,7 +58,7 @@ def react(register: Callable[[Any], Any], defer: Defer, act: Callable[[Any], Non
 
 
 GOAL_SETTLING_TIME_S = 0.3
-"""Wall time without a change after which a goal is checked, s."""
+"""Wall time without changes after which a goal is checked, s."""
 
 _HIDDEN_GHOST_DISTANCE = 0.01
 """Distance from the robot below which the ghost is hidden, in robot lengths and rad."""
@@ -66,14 +66,14 @@ _HIDDEN_GHOST_DISTANCE = 0.01
 _BASE_GIZMO, _TOOL_GIZMO = "/goal", "/end_effector_goal"
 
 _DECIMALS = 4, 2
-"""Decimals of the position (m) and of the angles (deg) of a goal that a user edits."""
+"""Decimal places for the position (m) and angles (deg) of a goal being edited."""
 
 _MARK_SIZE = 0.15
-"""Radius of the mark at the goal of an end-effector, as a share of the size of its gizmo."""
+"""Radius of the mark at an end-effector goal, as a fraction of its gizmo size."""
 
 
 class RequestedPart(Enum):
-    """Parts of a link's pose that a goal may require."""
+    """Link pose components that a goal may require."""
 
     NOTHING = "free"
     POSITION = "position"
@@ -81,28 +81,28 @@ class RequestedPart(Enum):
 
 
 class Origin(Enum):
-    """Origin of the goal that is shown."""
+    """Origin of the displayed goal."""
 
     ROBOT = "the robot's own pose"
-    USER = "a user of the page, who has not sent it yet"
-    SENT = "the last goal that was sent, by this page or by others"
+    USER = "a user of the page, not sent yet"
+    SENT = "the last goal sent, from this page or elsewhere"
 
 
 class GoalEditor:
-    """Lets users choose a goal; it does not send the goal.
+    """Lets users choose a goal, without sending it.
 
-    A goal for a planner is for the base, for end-effectors, or for both, as users choose. A goal
-    for a controller is for the base and for the controller's end-effector: the end-effector's gizmo
-    follows the base's gizmo, and can be moved separately.
+    Users choose whether a planner goal is for the base, for end-effectors, or for both. A
+    controller goal is for the base and for the controller's end-effector: the end-effector gizmo
+    follows the base gizmo, and can be moved separately.
 
     Parameters
     ----------
     server
-        Server of the page; the number fields are added to the current GUI container.
+        Page server; the number fields are added to the current GUI container.
     defer
-        Queues the changes of users.
+        Queues user changes.
     on_note
-        Called with the reason when an input is refused.
+        Called with the reason if an input is rejected.
     """
 
     def __init__(
@@ -118,15 +118,15 @@ class GoalEditor:
         self._changed_at: float | None = None
         self._origin = Origin.ROBOT
         self._in_flight = False
-        """Whether the robot flies to the shown goal, which hides the gizmos."""
+        """Whether the robot is flying to the displayed goal, which hides the gizmos."""
         self._followed: Mapping[Part, Goal] = {}
-        """The goals that were last followed."""
+        """The last followed goals."""
         self._check = GoalCheck(Verdict.UNCHECKED)
         gui = server.gui
         self._none_taken = gui.add_html(
             hint_html("A recording does not accept goals."), visible=False
         )
-        self._hint = gui.add_html(hint_html("Drag the arrows or type numbers, then press Fly."))
+        self._hint = gui.add_html(hint_html("Drag the arrows or enter numbers, then press Fly."))
         self._verdict = gui.add_html(check_html(self._check))
         edit = self._defer_edit
         self._parts = _PartMenu(gui, defer, edit, on_note, self._on_parts_chosen)
@@ -153,18 +153,18 @@ class GoalEditor:
 
     @property
     def has_tool(self) -> bool:
-        """Whether the editor has a goal of the end-effector."""
+        """Whether the editor has an end-effector goal."""
         return _TOOL_GIZMO in self._poses
 
     def add_tool(self, pose: Array | None) -> None:
-        """Add a goal of the end-effector at a pose (7,)."""
+        """Add an end-effector goal at a pose (7,)."""
         if pose is not None and self.placed:
             self._add_gizmo(_TOOL_GIZMO, 0.12 * self._reach)
             self._move_gizmo(_TOOL_GIZMO, pose)
             self.touch(time.monotonic())
 
     def on_reset_goal(self, act: Callable[[], None]) -> None:
-        """Call a function if the button that moves the goal to the robot is pressed."""
+        """Call a function when the button that moves the goal to the robot is pressed."""
         react(self._to_robot.on_click, self._defer, lambda _: act())
 
     def show_robot(self, robot: RobotDescription | None, reach: float) -> None:
@@ -206,12 +206,12 @@ class GoalEditor:
         self._origin = Origin.ROBOT
 
     def follow(self, goals: Mapping[Part, Goal], now: float) -> None:
-        """Show the goals that anyone has sent last, once. A goal that a user is changing is kept.
+        """Show the last goals sent by anyone, once. A goal that a user is editing is kept.
 
         Parameters
         ----------
         goals
-            The goals by part.
+            Goals by robot part.
         now
             Wall time, s.
         """
@@ -244,17 +244,17 @@ class GoalEditor:
             self.show_check(GoalCheck(Verdict.PLANNING, "Another goal has been sent."))
 
     def note_sent(self) -> None:
-        """Note that the goal shown has been sent."""
+        """Record that the displayed goal has been sent."""
         self._origin, self._hint.visible = Origin.SENT, False
 
     @property
     def shows_sent_goal(self) -> bool:
-        """Whether the goal shown is the one that was sent last."""
+        """Whether the displayed goal is the last one sent."""
         return self._origin is Origin.SENT
 
     @property
     def check(self) -> GoalCheck:
-        """The check that is shown."""
+        """The displayed check result."""
         return self._check
 
     def _defer_edit(self, act: Callable[[], None]) -> None:
@@ -266,9 +266,9 @@ class GoalEditor:
         self._defer(edit)
 
     def update_robot(self, pose: Array, q: Array) -> None:
-        """Update the pose (7,) of the robot's base and the positions (n,) of its joints.
+        """Update the robot's base pose (7,) and joint positions (n,).
 
-        The ghost takes these joint positions unless a plan or a user sets others, and is hidden if
+        The ghost uses these joint positions unless a plan or a user sets others, and is hidden if
         it would coincide with the robot.
         """
         self._present = pose, q
@@ -310,15 +310,15 @@ class GoalEditor:
         )
 
     def show_flight(self, *, flies: bool) -> None:
-        """Hide the gizmos while the robot flies to the shown goal."""
+        """Hide the gizmos while the robot flies to the displayed goal."""
         in_flight = flies and self.shows_sent_goal
         if in_flight != self._in_flight:
             self._in_flight = in_flight
             self._show_parts()
 
     def show_parts(self, *, tool: bool, planned: bool) -> None:
-        """Show or hide the controls of a controller's end-effector, and those that planners take:
-        the choice of end-effectors, and the final joint positions.
+        """Show or hide the controls for a controller's end-effector, and those for planners: the
+        choice of end-effectors, and the final joint positions.
         """
         self._tool_too.visible = tool
         if _TOOL_GIZMO in self._gizmos:
@@ -328,7 +328,7 @@ class GoalEditor:
         self._final.show(visible=planned)
 
     def offer_end_effectors(self, links: Iterable[str]) -> None:
-        """Offer goals for the links for which the planner accepts goals."""
+        """Offer goals for the links whose goals the planner accepts."""
         offered = tuple(links)
         if offered == self._parts.links:
             return  # The choice of users stays.
@@ -349,8 +349,7 @@ class GoalEditor:
             self._show_parts()
 
     def goals(self) -> dict[Part, Goal]:
-        """Return the goals to send, by part; a goal of a link contains the link in its
-        end-effectors.
+        """Return the goals to send, by robot part; a link goal names the link in its end-effectors.
 
         Raises
         ------
@@ -376,8 +375,8 @@ class GoalEditor:
         return Goal.checked(pose[:3].tolist(), pose[3:].tolist(), shape)
 
     def settled_goals(self, now: float) -> dict[Part, Goal] | None:
-        """Return the goals once after every change, as soon as they are unchanged for a while; else
-        None."""
+        """Return the goals once after every change, when they have not changed for a while;
+        otherwise None."""
         if (
             self._changed_at is None
             or now - self._changed_at < GOAL_SETTLING_TIME_S
@@ -397,12 +396,12 @@ class GoalEditor:
         return self._changed_at is not None
 
     def touch(self, now: float) -> None:
-        """Request another check of the goal, because its preconditions have changed."""
+        """Request another goal check because its preconditions have changed."""
         if self.placed:
             self._changed_at = now
 
     def show_check(self, check: GoalCheck) -> None:
-        """Show the result of a check of the goal."""
+        """Show the goal check result."""
         self._check = check
         text = check_html(check)
         if text != self._verdict.content:
@@ -554,7 +553,8 @@ class _PartMenu:
         return str(self._numbers.value)
 
     def asked(self, part: Part) -> RequestedPart:
-        """Return whether the goal is for position or pose of a part, or leaves the part free."""
+        """Return whether the goal requires the position or the pose of a robot part, or leaves it
+        free."""
         if self._there and part in self._menus:
             return RequestedPart(self._menus[part].value)
         return RequestedPart.POSE if part == BASE_GOAL_KEY else RequestedPart.NOTHING
@@ -564,7 +564,7 @@ class _PartMenu:
         return {link: each for link, each in asked.items() if each is not RequestedPart.NOTHING}
 
     def offer(self, links: Iterable[str]) -> None:
-        """Offer goals of other links; reset the goal to the base."""
+        """Offer goals for other links; reset the goal to the base."""
         for menu in self._menus.values():
             menu.remove()
         self._menus = {}
@@ -575,7 +575,7 @@ class _PartMenu:
         self._update()
 
     def choose(self, asked: Mapping[Part, RequestedPart]) -> None:
-        """Choose the parts of a goal that someone else has sent."""
+        """Select the robot parts of a goal that someone else sent."""
         for part, menu in self._menus.items():
             menu.value = asked.get(part, RequestedPart.NOTHING).value
         self._update()
@@ -633,7 +633,7 @@ class _FinalShape:
         self._enabled: Any = gui.add_checkbox(
             "Final joint positions",
             initial_value=False,
-            hint="The planned motion ends in these joint positions, not in arbitrary ones.",
+            hint="The planned motion ends at these joint positions; otherwise they are free.",
         )
         self._enabled.visible = False
         self._folder = gui.add_folder("At the end", visible=False)
@@ -643,7 +643,7 @@ class _FinalShape:
 
     @property
     def positions(self) -> Array | None:
-        """Final positions (n,) of the joints, m or rad; None: any."""
+        """Final joint positions (n,), m or rad; None: any."""
         if not (self._enabled.visible and self._enabled.value):
             return None
         return np.array([field.value for field in self._fields], float)
@@ -674,7 +674,7 @@ class _FinalShape:
         return self._gui.add_slider(label, low, high, step, min(max(0.0, low), high), hint=name)
 
     def update_robot(self, q: Array) -> None:
-        """Update the joint positions (n,) of the robot."""
+        """Update the robot's joint positions (n,)."""
         self._q = q
 
     def fill(self) -> None:

@@ -1,7 +1,7 @@
 """The page: the scene and its panels, redrawn from the state of the stack.
 
-One thread, which calls :meth:`Page.update`, draws everything. Input from browsers arrives in
-threads of the server and is queued for the next update.
+One thread, which calls :meth:`Page.update`, draws everything. Browser input arrives in server
+threads and is queued for the next update.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ if TYPE_CHECKING:
 
 
 RequestAction = Callable[[Action], None]
-"""Function that receives an action of a user of the page."""
+"""Function that receives a user action."""
 
 _MAX_NOTICES = 200
 _MAX_SHOWN_NOTICES = 60
@@ -67,7 +67,7 @@ _LOOK_BACK_STEP_S = 0.1  # simulated s
 _MIN_LOOK_BACK_S = 1.0  # simulated s
 
 _SLIDER_HOLD_S = 1.5
-"""Wall time for which the page does not move the time slider after a user moved it, s."""
+"""Wall time after a user moves the time slider during which the page does not move it, s."""
 
 
 class ButtonPanel:
@@ -109,7 +109,7 @@ class ButtonPanel:
 
 
 class TimeLine:
-    """Controls of a replay: play, hold, and a time slider."""
+    """Replay controls: play, hold, and a time slider."""
 
     def __init__(self, gui: viser.GuiApi, defer: Defer, act: RequestAction) -> None:
         self._gui, self._defer, self._act = gui, defer, act
@@ -122,7 +122,7 @@ class TimeLine:
         react(self._buttons.on_click, defer, lambda label: act(Request(label.lower())))
 
     def show(self, state: StackState, now: float) -> None:
-        """Show the position of the replay, if there is one."""
+        """Show the replay position, if there is a replay."""
         replay = state.replay
         self._folder.visible = replay is not None
         if replay is None:
@@ -149,7 +149,7 @@ class TimeLine:
 
 
 class LookBack:
-    """Slider over the past of a flight, and a button to return to the present.
+    """Slider for looking back in a flight, and a button to return to the current state.
 
     Attributes
     ----------
@@ -167,7 +167,7 @@ class LookBack:
             _LOOK_BACK_STEP_S,
             0.0,
             visible=False,
-            hint="Show an earlier state, from the last five minutes; the robot continues.",
+            hint="Show an earlier state from the last five minutes; the robot keeps flying.",
         )
         self._live = gui.add_button("Back to the present", color="orange", visible=False)
         react(self._live.on_click, defer, lambda _: self._look(None, 0.0))
@@ -184,7 +184,7 @@ class LookBack:
         self.time_s, self._left_alone_until = time_s, left_alone_until
 
     def show(self, span: tuple[float, float] | None) -> None:
-        """Show the slider for a span of simulated time, s; None: there is no past."""
+        """Show the slider for a span of simulated time, s; None: no past states."""
         if span is None or span[1] - span[0] < _MIN_LOOK_BACK_S:
             self.time_s = None
             self._slider.visible = self._live.visible = False
@@ -212,7 +212,7 @@ class LookBack:
 
 
 class FaultPanel:
-    """Menu of the faults that can be injected, and list of the active ones."""
+    """Menu of faults that can be injected, and list of active faults."""
 
     def __init__(
         self, gui: viser.GuiApi, defer: Defer, act: RequestAction, on_note: Callable[[str], None]
@@ -234,7 +234,7 @@ class FaultPanel:
         react(self._clear.on_click, defer, lambda _: act(InjectAction("clear")))
 
     def offer(self, targets: FaultTargets) -> None:
-        """Offer the faults that are possible with a plant's targets."""
+        """Offer the faults that are possible for a plant's targets."""
         if targets == self._targets:
             return
         self._targets, self._names = targets, content.fault_kinds(targets)
@@ -245,7 +245,7 @@ class FaultPanel:
         self._show_kind()
 
     def show_menu(self, *, visible: bool) -> None:
-        """Show or hide the menu; a replay shows active faults only."""
+        """Show or hide the menu; a replay shows only active faults."""
         for handle in (self._kind, self._target, self._lasts, self._inject, self._clear):
             handle.visible = visible
         self._meaning.visible = visible
@@ -329,7 +329,7 @@ class Plots:
                 self._shape = _Plot(self._gui, "Joints", names, 0.01, units, signed=True)
 
     def add(self, state: StackState, errors: Mapping[Part, content.GoalDistance]) -> None:
-        """Append the last state, and its distances from goals, to the curves."""
+        """Append the last state and its goal errors to the curves."""
         measured = state.measured
         if measured is None:
             return
@@ -375,7 +375,7 @@ class Plots:
         self._no_errors.visible = not errors
 
     def draw(self, tolerance: Tolerance | None = None, time_s: float | None = None) -> None:
-        """Redraw the curves, with tolerances of errors, and a line at the shown time, s."""
+        """Redraw the curves, with error tolerances and a line at the displayed time, s."""
         limits = () if tolerance is None else (tolerance.position, tolerance.attitude)
         for plot in [each for each in self._errors.values() if each.handle.visible]:
             plot.set_logarithmic(enabled=bool(self._logarithmic.value))
@@ -479,7 +479,7 @@ class _Plot:
 
 
 class LogPanel:
-    """Events and warnings, the newest first."""
+    """Events and warnings, newest first."""
 
     def __init__(self, gui: viser.GuiApi) -> None:
         self._html = gui.add_html(content.log_html(()))
@@ -504,15 +504,15 @@ _ROBOT_PATH = "/robot"
 _OBSTACLES_PATH, _TARGET_PATH = "/obstacles", "/target"
 
 _TEXTS_S, _TABLES_S, _PLOTS_S, _PATHS_S = 0.2, 0.25, 0.5, 0.5
-"""Drawing periods of the slower parts, wall s."""
+"""Drawing periods of the slower components, wall s."""
 
 _ANSWER_TIME_S = 10.0
-"""Wall time for which the response to a user's action is shown at the top, s."""
+"""Wall time for which the response to a user action is shown at the top, s."""
 
 CAMERA = np.array([1.1, 1.4, 0.8])
-"""Initial position of the camera relative to the robot, in robot lengths.
+"""Initial camera position relative to the robot, in robot lengths.
 
-An arm in front of the base is then on the left, because the panel is on the right.
+It places an arm in front of the base on the left, because the panel is on the right.
 """
 
 
@@ -521,38 +521,38 @@ _PRESETS = {
     "Side": np.array([0.0, 1.9, 0.3]),
     "Top": np.array([0.0, 0.01, 1.9]),
 }
-"""Positions of the camera relative to the robot by button name, in robot lengths."""
+"""Camera positions relative to the robot by button name, in robot lengths."""
 
 _THEME: Any = {"control_width": "large", "show_logo": False, "show_share_button": False}
 
 _LAYERS = (
-    ("Paths", True, "Planned path of the base, flown paths of base and end-effectors."),
+    ("Paths", True, "Planned base path, and flown paths of the base and end-effectors."),
     ("Frames", False, "Axes of the world and of all links."),
     ("Ghost", True, "The robot at the goal."),
     ("Plumes", True, "Thrusters that are on."),
-    ("Collision shapes", False, "The shapes used to measure distances between links."),
+    ("Collision shapes", False, "The geometry used to measure distances between links."),
     ("Names", False, "Names of the links."),
 )
-"""Layers of the scene: name, whether initially shown, and explanation."""
+"""Scene layers: name, initial visibility, and explanation."""
 
 
 _PORTRAIT, _PORTRAIT_DISTANCE, _PORTRAIT_SHIFT, _PANEL_SHIFT = 0.8, 1.75, 0.36, 0.32
-"""Aspect ratio (width to height) below which a window is a phone's; ratio of its camera distance to
-the desktop's; and offset of the view below the robot, or else to its right, as shares of the
-distance.
+"""Aspect ratio (width to height) below which a window is a phone's; ratio of phone to desktop
+camera distance; and view offset below the robot, or else to its right, as shares of the distance.
 """
 
 
 def view_beside_panel(at: Array, away: Array, aspect: float) -> tuple[Array, Array]:
-    """Return position and target (3,) of a camera, m, such that the panel does not cover the robot.
+    """Return the position and target (3,) of a camera, m, such that the panel does not cover the
+    robot.
 
     Parameters
     ----------
     at, away
-        Position (3,) of the robot, and desktop position of the camera relative to it, m.
+        Robot position (3,), and camera position relative to it on a desktop, m.
     aspect
-        Aspect ratio (width to height) of the window. The panel is below on a phone, on the right on
-        a desktop.
+        Window aspect ratio (width to height). The panel is at the bottom on a phone, and on
+        the right on a desktop.
     """
     right = np.cross([0.0, 0.0, 1.0], away)
     right /= np.linalg.norm(right)
@@ -567,7 +567,7 @@ def view_beside_panel(at: Array, away: Array, aspect: float) -> tuple[Array, Arr
 
 
 class Page:
-    """The page; all browsers that open it see the same.
+    """The page; all browsers that open it show the same content.
 
     Parameters
     ----------
@@ -579,7 +579,7 @@ class Page:
     Attributes
     ----------
     editor, faults
-        The goal editor, and the menu of faults.
+        The goal editor and the fault menu.
     """
 
     def __init__(self, server: viser.ViserServer, config: ViewerConfig) -> None:
@@ -599,7 +599,7 @@ class Page:
         self._due: dict[str, float] = {}
         self._now = 0.0
         self._last: Measured | None = None
-        """The last received state, from which users look back."""
+        """The last received state; users look back from there."""
         self._drawn: Measured | None = None
         self._looked_back = False
         self._announced: tuple[Notice, float] | None = None
@@ -629,7 +629,7 @@ class Page:
             self._log = LogPanel(gui)
         self.editor.on_reset_goal(self._goal_to_robot)
         look = gui.add_button(
-            "Look at the robot", color="gray", hint="Point the camera of this browser at the robot."
+            "Look at the robot", color="gray", hint="Point this browser's camera at the robot."
         )
 
         @look.on_click
@@ -638,7 +638,7 @@ class Page:
                 defer(lambda: self._aim_camera(event.client.camera))
 
         presets = gui.add_button_group(
-            "View from", tuple(_PRESETS), hint="Rotate the camera of this browser."
+            "View from", tuple(_PRESETS), hint="Rotate this browser's camera."
         )
 
         @presets.on_click
@@ -690,7 +690,7 @@ class Page:
         self._reach = reach
         self._trails: dict[Part, Trail] = {}
         self._planned: tuple[Array | None, Array | None] = None, None
-        """The planned path and motion that are drawn."""
+        """The planned path and motion being drawn."""
         self.editor.show_robot(robot, reach)
         self._plots.show_robot(robot)
         if robot is None:
@@ -722,7 +722,7 @@ class Page:
         return drawn
 
     def show_target(self, target: RobotDescription) -> None:
-        """Draw the second floating body from its first state on."""
+        """Draw the second floating body, starting with its first state."""
         if self._target_drawing is not None:
             self._target_drawing.base.remove()
         self._target = target
@@ -742,7 +742,7 @@ class Page:
             self._around.show_backdrop(str(self._setting.value))
 
     def end(self) -> None:
-        """Report that the viewer has ended, in browsers that still show the page."""
+        """Report that the viewer has stopped, in browsers that still show the page."""
         text = "The viewer has ended. This page shows its last state and cannot steer the robot."
         self._status.content = content.line_html(text, 2)
         self._bar.visible = False
@@ -757,7 +757,7 @@ class Page:
         self._table = table
 
     def show_tolerance(self, tolerance: Tolerance | None) -> None:
-        """Set the goal tolerance of the planner or controller; None: unknown."""
+        """Set the planner's or controller's goal tolerance; None: unknown."""
         self._tolerance = tolerance
 
     def note(self, notice: Notice) -> None:
@@ -772,7 +772,7 @@ class Page:
     # -- drawing --------------------------------------------------------------------------------
 
     def update(self, state: StackState, now: float) -> list[Action]:
-        """Draw a state; return the actions of users since the last call. ``now``: wall time, s."""
+        """Draw a state; return the user actions since the last call. ``now``: wall time, s."""
         before, self._state, self._now = self._state, state, now
         self._handle_inbox()
         with self._server.atomic():
@@ -946,7 +946,7 @@ class Page:
             self._refuse(str(error))
             return
         if not goals:
-            self._refuse("There is no goal to send: no state of the robot has been received yet.")
+            self._refuse("There is no goal to send: no robot state has been received yet.")
             return
         self._request(FlyAction(goals))
 

@@ -1,11 +1,12 @@
-"""Whether a goal is reachable: plans, and joint positions of an arm, in a child process.
+"""Checks in a child process whether a goal is reachable, by planning or by inverse kinematics of an
+arm.
 
-The process has a lower priority, so that neither the page nor the plant waits for it. It works on
-one goal at a time: a newer one cancels the plan in progress. Numbered questions and answers are
-pickled on its standard input and output, to which no other program can write.
+The process has low priority, so that neither the page nor the plant waits for it. It works on
+one goal at a time: a newer goal cancels the plan in progress. Numbered questions and answers are
+pickled on its standard input and output, which no other program can write to.
 
-A controller flies to any pose and reports only in flight that the arm is too short. Its goals are
-checked by searching joint positions with both base and end-effector at their goals.
+A controller flies to any pose, and reports only in flight that the arm is too short. Its goals are
+checked by searching for joint positions with both the base and the end-effector at their goals.
 """
 
 from __future__ import annotations
@@ -54,7 +55,7 @@ from spacerobot_ros.termination import Terminated, end_child, guarded, start_chi
 from spacerobot_ros.viewer.state import Part, StackState
 
 _NICENESS = 10
-"""Added to the niceness of the process, so that everything else runs first."""
+"""Niceness increment of the process, so that everything else runs first."""
 
 _MAX_CANCELLATION_S = 2.0
 """Wall time from the cancellation of a plan until the process is killed, s."""
@@ -64,29 +65,29 @@ class Verdict(Enum):
     """Verdict on a goal."""
 
     UNCHECKED = "not checked"
-    """No check: it is disabled, or only a controller flies."""
+    """No check: it is disabled, or only a controller is running."""
     PLANNING = "planning"
     REACHABLE = "reachable"
     PARTLY = "partly reachable"
-    """The goal has parts that the method does not control, and that end outside the tolerance."""
+    """The goal has components that the method does not control, ending outside the tolerance."""
     REFUSED = "refused"
 
 
 @dataclass(frozen=True, eq=False)
 class GoalCheck:
-    """Result of a check of a goal.
+    """Result of a goal check.
 
     Attributes
     ----------
     verdict
         The verdict.
     message
-        Text for the user, with the reason of a refusal.
+        Message for the user, including the reason if the goal is refused.
     shape, base
-        (n,) joint positions at its end, m or rad, and (7,) pose of the base, as predicted; None if
+        Predicted (n,) joint positions, m or rad, and (7,) base pose at the end; None if
         there is none.
     source
-        The planned motion it comes from, if the motion is already being flown.
+        The planned motion it is based on, if this motion is already being flown.
     """
 
     verdict: Verdict
@@ -98,21 +99,21 @@ class GoalCheck:
 
 @dataclass(frozen=True)
 class GoalQuestion:
-    """A goal to check, and the situation for the check.
+    """A goal to check, and the current situation.
 
     Attributes
     ----------
     urdf
         Description of the robot.
     parameters
-        Parameters of the planner, as JSON texts by name.
+        Planner parameters, as JSON strings by name.
     state, goal
-        Start of the robot, and the goal of its base, of links, or of both.
+        Robot start state, and the goal of its base, links, or both.
     tool, link
-        Goal of a link for a controller, which does not plan: the check is whether the arm can reach
-        it. None: a planner flies.
+        Link goal for a controller, which does not plan: the check is whether the arm can reach it.
+        None: a planner flies.
     axes
-        Axes of the link that the controller controls; other errors are ignored.
+        Link axes that the controller controls; errors in other axes are ignored.
     """
 
     urdf: str
@@ -130,16 +131,16 @@ def make_question(
     robot: RobotDescription | None,
     parameters: Mapping[str, Mapping[str, str]],
 ) -> GoalQuestion | str:
-    """Return the question whether goals are reachable, or the reason why there is none.
+    """Return a reachability question for goals, or the reason why there is none.
 
     Parameters
     ----------
     state, goals
-        The state of the stack, and the goals by part.
+        The state of the stack, and the goals by robot part.
     robot
         The robot; None: unknown.
     parameters
-        Parameters of ``planner`` and ``controller``, as JSON texts by name, if known.
+        Parameters of ``planner`` and ``controller``, as JSON strings by name, if known.
     """
     measured = state.measured
     if measured is None or robot is None:
@@ -154,7 +155,7 @@ def make_question(
         known = parameters.get("controller", {})
         link = robot.end_effector(json.loads(known.get("end_effector_frame", '""')))
         if link not in robot.frames:
-            return "The end-effector is not a link of the robot."
+            return "The end-effector is not a robot link."
         axes = json.loads(known.get("end_effector_outputs", '""')).split()
         axes = axes or default_selection(robot, link).end_effector or AXES
         return GoalQuestion(robot.urdf, {}, RobotState(*pose, q), goal, tool, link, tuple(axes))
@@ -170,7 +171,7 @@ def make_question(
 
 
 def planned_goal(goals: Mapping[Part, Goal]) -> Goal:
-    """Return goals by part as one goal for a planner, without goals of a controller.
+    """Return goals by robot part as one planner goal, without controller goals.
 
     Raises
     ------
@@ -186,7 +187,7 @@ def planned_goal(goals: Mapping[Part, Goal]) -> Goal:
 
 
 def planner_config(parameters: Mapping[str, str]) -> PlannerConfig:
-    """Return the parameters of a planner, given as JSON texts by name; others are omitted.
+    """Return the planner parameters among JSON strings by name; others are omitted.
 
     Raises
     ------
@@ -204,7 +205,7 @@ def planner_config(parameters: Mapping[str, str]) -> PlannerConfig:
 def goal_tolerance(
     parameters: Mapping[str, str] | None, robot: RobotDescription | None
 ) -> Tolerance | None:
-    """Return the tolerance of goals in the parameters of a planner or controller, if known."""
+    """Return the goal tolerance in the parameters of a planner or controller, if known."""
     names = ("position_tolerance", "attitude_tolerance", "joint_tolerance")
     if parameters is None or not all(name in parameters for name in names):
         return None
@@ -217,7 +218,7 @@ def goal_tolerance(
 def planned_links(
     parameters: Mapping[str, str] | None, robot: RobotDescription | None
 ) -> tuple[str, ...]:
-    """Return the links of a robot for which a planner with these parameters accepts goals."""
+    """Return the robot links for which a planner with these parameters accepts goals."""
     if parameters is None or robot is None:
         return ()
     try:
@@ -243,7 +244,7 @@ class GoalChecker:
         self._lock = threading.Lock()
 
     def ask(self, question: GoalQuestion) -> None:
-        """Cancel the check in progress, and start the check of a question."""
+        """Cancel the check in progress, and start checking a question."""
         process = self._running_process()
         self._number += 1
         if not self._answered and self._cancelled_at is None:
@@ -263,7 +264,8 @@ class GoalChecker:
         return True
 
     def latest_answer(self) -> GoalCheck | None:
-        """Return the answer to the last question once; before that, the time spent on it."""
+        """Return the answer to the last question, once; until it is available, return the time
+        spent on it."""
         if self._answered:
             return None
         with self._lock:
@@ -274,7 +276,7 @@ class GoalChecker:
             return answer
         if self._process is not None and self._process.poll() is not None:
             self._answered = True
-            return GoalCheck(Verdict.UNCHECKED, "The process that checks goals has ended.")
+            return GoalCheck(Verdict.UNCHECKED, "The process that checks goals has terminated.")
         if self._cancellation_ignored():
             # A solver, or a compiler, that does not look for its cancellation.
             self.close()
@@ -283,7 +285,7 @@ class GoalChecker:
         return GoalCheck(Verdict.PLANNING, f"Planning for {seconds:.0f} s{found}.")
 
     def close(self) -> None:
-        """End the child process that checks goals."""
+        """Terminate the child process that checks goals."""
         process, self._process = self._process, None
         self._cancelled_at = None
         if process is not None:
@@ -337,13 +339,13 @@ class GoalChecker:
 
 
 class Planner:
-    """Plans from rest like the planner of the stack; keeps the model of the last robot."""
+    """Plans from rest like the stack's planner; keeps the model of the last robot."""
 
     def __init__(self) -> None:
         self._built: tuple[str, Mapping[str, str]] | None = None
 
     def answer(self, question: GoalQuestion, cancellation: Cancellation) -> GoalCheck:
-        """Return the result of a check.
+        """Return the check result.
 
         Raises
         ------
@@ -366,7 +368,7 @@ class Planner:
         base = _predicted_end(self._robot, request, schedule)
         left_out = _uncontrolled_text(schedule, base, question.goal, request.tolerance)
         message = (
-            f"Reachable in {schedule.expected_duration:.4g} s by '{schedule.method}'.{left_out}"
+            f"Reachable in {schedule.expected_duration:.4g} s with '{schedule.method}'.{left_out}"
         )
         verdict = Verdict.PARTLY if left_out else Verdict.REACHABLE
         return GoalCheck(verdict, message, schedule.positions[-1], base)
@@ -427,8 +429,8 @@ def _check_arm(question: GoalQuestion, tool: Goal) -> GoalCheck:
         message = "The end-effector can reach its goal there."
         return GoalCheck(Verdict.REACHABLE, message, shape=shape)
     message = (
-        f"The end-effector cannot reach its goal: the nearest joint positions found leave "
-        f"{quantity(distance, 'm')} and {quantity(angle, 'rad')}."
+        "The end-effector cannot reach its goal: at the nearest joint positions found, it misses "
+        f"by {quantity(distance, 'm')} and {quantity(angle, 'rad')}."
     )
     return GoalCheck(Verdict.REFUSED, message, shape=shape)
 

@@ -1,8 +1,8 @@
-"""The robot and its surroundings, as nodes of a viser scene.
+"""The robot and its surroundings as nodes in a viser scene.
 
-A tree of frames as in the URDF is attached to the pose of the base: only transforms that a joint
-changes are sent again. Node paths are separated by slashes, so they do not contain link names,
-which may have slashes.
+The URDF's frame tree is attached to the base pose: only transforms changed by a joint are sent
+again. Node paths use slashes as separators, so they do not contain link names,
+which may include slashes.
 """
 
 from __future__ import annotations
@@ -35,26 +35,26 @@ _COLLISION: Color = (200, 60, 200)
 _LINE_WIDTH = 3.0  # pixels
 
 _FRAME_SIZE = 0.12
-"""Length of the axes of a link, in robot lengths."""
+"""Length of link axes, in robot lengths."""
 
 _STARS, _SKY = 1800, 40.0
 """Number of stars, and their distance in robot lengths."""
 
 _SPACE = np.full((1, 1, 3), 14, np.uint8)
-"""Image of the space behind the stars: one pixel, red, green and blue."""
+"""Image of the space behind the stars: one pixel (red, green, blue)."""
 
 _SUN = np.array([0.55, 0.65, 0.52]) / np.linalg.norm([0.55, 0.65, 0.52])
 _SUN_COLOR: Color = (255, 244, 214)
 _SUN_INTENSITY, _SKY_INTENSITY = 3.0, 0.35
 
 _MIN_LINE_SEGMENTS = 32
-"""Least capacity of a line, in segments."""
+"""Smallest line capacity, in segments."""
 
 _GRID: tuple[Color, Color] = (150, 150, 155), (120, 120, 128)
-"""Colours of cells and sections, visible on white and on black."""
+"""Cell and section colours, visible on white and black."""
 
 _MAX_MESH_TRIANGLES = 20_000
-"""Largest number of triangles of a mesh; finer ones are simplified."""
+"""Largest number of triangles in a mesh; finer meshes are simplified."""
 
 
 def wxyz(quaternion: Array) -> Array:
@@ -68,18 +68,18 @@ def xyzw(quaternion: Array) -> Array:
 
 
 class RobotDrawing:
-    """A drawing of a robot: the robot itself, or the ghost at its goal.
+    """A drawn robot: the robot itself, or the ghost at its goal.
 
     Parameters
     ----------
     scene
         Scene to draw in.
     path
-        Path of the node of its base.
+        Node path of its base.
     robot
         The robot.
     color
-        Color of all parts; None: the colors of the URDF.
+        Color of all parts; None: the URDF colors.
     on_note
         Called with a message about each mesh that cannot be drawn.
     """
@@ -115,7 +115,7 @@ class RobotDrawing:
         ]
         self._robot, self._paths = robot, paths
         self._extras: dict[str, list[Any]] = {}
-        """Parts by kind, which are drawn when they are first shown."""
+        """Parts by kind; each kind is drawn when first shown."""
 
     def _node_paths(self, robot: RobotDescription) -> dict[str, str]:
         paths = {robot.base_link: self._path}
@@ -124,7 +124,7 @@ class RobotDrawing:
         return paths
 
     def show_collision_shapes(self, *, visible: bool) -> None:
-        """Show or hide the shapes used to measure distances between links."""
+        """Show or hide the geometry used to measure distances between links."""
         scene, paths = self._scene, self._paths
         self._show("collision", visible, lambda: [
             _draw_solid(scene, f"{paths[visual.link]}/collision{number}", visual, _COLLISION)
@@ -133,7 +133,7 @@ class RobotDrawing:
         ])  # fmt: skip
 
     def show_frames(self, *, visible: bool) -> None:
-        """Show or hide the axes of the frames of all links."""
+        """Show or hide the axes of all link frames."""
         length = _FRAME_SIZE * reach_of(self._robot)
         for frame in self._frames.values():
             if visible:
@@ -141,7 +141,7 @@ class RobotDrawing:
             frame.show_axes = visible
 
     def show_names(self, *, visible: bool) -> None:
-        """Show or hide the names of all links, at the origins of their frames."""
+        """Show or hide all link names, at the link frame origins."""
         add, paths = self._scene.add_label, self._paths
         self._show("name", visible, lambda: [add(f"{paths[x]}/name", x) for x in self._frames])
 
@@ -164,7 +164,7 @@ class RobotDrawing:
         self.base.wxyz = wxyz(pose[3:])
 
     def set_joint_positions(self, q: Array) -> None:
-        """Move the links to positions (n,) of the joints, m or rad."""
+        """Move the links to joint positions (n,), m or rad."""
         self._kinematics.update(q)
         for frame, pose in zip(self._moving, self._kinematics.transforms, strict=True):
             frame.position = pose[:3]
@@ -174,7 +174,7 @@ class RobotDrawing:
 def draw_obstacles(
     scene: viser.SceneApi, path: str, world: RobotDescription | None
 ) -> list[viser.MeshHandle]:
-    """Draw and return the shapes of obstacles by which distances are measured; None: none."""
+    """Draw and return the obstacle geometry used to measure distances; None: none."""
     return [
         _draw_solid(scene, f"{path}/{number}", replace(visual, mesh=visual.mesh.moved(pose)))
         for number, (visual, pose) in enumerate(obstacle_visuals(world))
@@ -201,7 +201,7 @@ def _draw_solid(
 
 
 def reach_of(robot: RobotDescription) -> float:
-    """Return an upper bound of the distance of any part from the origin of the base, m."""
+    """Return an upper bound on the distance of any part from the base origin, m."""
     farthest: dict[str, float] = {robot.base_link: 0.0}
     for joint in joints_outward(robot):
         farthest[joint.child] = farthest[joint.parent] + float(np.linalg.norm(joint.origin.r))
@@ -218,13 +218,13 @@ def reach_of(robot: RobotDescription) -> float:
 class Lines:
     """Connected points in the scene, such as a path.
 
-    A node has a fixed capacity of segments and is replaced by a larger one if necessary: browsers
-    do not redraw a node whose number of segments changes.
+    A node has a fixed segment capacity and is replaced by a larger one if necessary: browsers do
+    not redraw a node if its number of segments changes.
 
     Parameters
     ----------
     scene, path
-        Scene to draw in, and path of the node.
+        Scene to draw in, and node path.
     color
         Color of the line.
     """
@@ -268,16 +268,16 @@ class Lines:
 
 
 def plume_lines(table: ThrusterTable, names: tuple[str, ...], duty: Array, length: float) -> Array:
-    """Return the plumes of active thrusters as segments (k, 2, 3) in the base frame, m.
+    """Return active thruster plumes as segments (k, 2, 3) in the base frame, m.
 
     Parameters
     ----------
     table
-        The thrusters of the robot.
+        The robot's thrusters.
     names, duty
-        Names of thrusters, and the share of the time for which each is on, 0 to 1.
+        Thruster names, and the fraction of time each thruster is on, 0 to 1.
     length
-        Length of a plume at a duty of 1, m.
+        Plume length at a duty cycle of 1, m.
     """
     segments = []
     for name, part in zip(names, duty, strict=True):
@@ -289,7 +289,7 @@ def plume_lines(table: ThrusterTable, names: tuple[str, ...], duty: Array, lengt
 
 
 BACKDROPS = ("Space", "Grid")
-"""The surroundings that a robot is shown in."""
+"""The displayed surroundings of a robot."""
 
 
 class Surroundings:
@@ -300,9 +300,9 @@ class Surroundings:
     scene
         Scene to draw in.
     reach
-        Size of the robot, see :func:`reach_of`, m.
+        Robot size, m; see :func:`reach_of`.
     robot_path
-        Path of the node of the robot's base, which carries the plumes.
+        Node path of the robot's base, to which the plumes are attached.
     center
         (3,) point above the grid, m.
     """
@@ -375,17 +375,17 @@ class Surroundings:
             each.visible = not indoors
 
     def show_world(self, *, visible: bool) -> None:
-        """Show or hide the axes of the world."""
+        """Show or hide the world axes."""
         self._world.visible = visible
 
     def show_paths(self, *, visible: bool) -> None:
-        """Show or hide the planned path and the flown ones."""
+        """Show or hide the planned and flown paths."""
         self._paths_shown = visible
         for each in self._paths.values():
             each.show(visible=visible)
 
     def draw_paths(self, kind: Literal["flown", "planned"], paths: Mapping[str, Array]) -> None:
-        """Draw the paths (k, 3) of base and end-effectors, m; those of others are cleared."""
+        """Draw the paths (k, 3) of the base and end-effectors, m; other paths are cleared."""
         for name in [name for each, name in self._paths if each == kind and name not in paths]:
             self._paths[kind, name].draw(np.zeros((0, 3)))
         for name, points in paths.items():

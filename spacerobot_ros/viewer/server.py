@@ -1,8 +1,9 @@
-"""The web server of the page, and the parameters of the viewer.
+"""The page's web server, and the viewer parameters.
 
-viser accepts websockets from any page that is open in a browser, and connects to a server of its
-makers if a client requests to share the page. Both are prevented here, to keep foreign pages in a
-user's browser from steering the robot. For the same reason no other page may frame this page.
+viser accepts websockets from any page open in a browser, and connects to its vendor's server if a
+client requests to share the page. Both are prevented here, to keep foreign pages in a
+user's browser from steering the robot. For the same reason, other pages cannot embed this page in a
+frame.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class ViewerConfig(WatchdogConfig):
-    """Parameters of the viewer: address, drawing rate, and goal checks."""
+    """Viewer parameters: address, drawing rate, and goal checks."""
 
     watchdog_timeout: float = parameter(
         1.5,
@@ -42,25 +43,25 @@ class ViewerConfig(WatchdogConfig):
     )
     host: str = parameter(
         "127.0.0.1",
-        "address of the page; any address but the default lets other machines steer the robot",
+        "address of the page; any other than the default lets other machines steer the robot",
     )
     port: int = parameter(
         8080,
-        "port of the page, or the next free one; 0: any",
+        "port of the page; if in use, the next free one; 0: any",
         minimum=0,
         maximum=65535,
     )
     update_rate: float = parameter(
-        20.0, "updates of the page per second of wall time", unit="Hz", minimum=1.0, maximum=60.0
+        20.0, "page updates per second of wall time", unit="Hz", minimum=1.0, maximum=60.0
     )
-    dark: bool = parameter(True, "whether pages are dark when they are opened")
-    world_frame: str = parameter("world", "frame of the goals that the page sends")
+    dark: bool = parameter(True, "whether pages open in the dark theme")
+    world_frame: str = parameter("world", "frame of goals sent by the page")
     title: str = parameter("spacerobot", "title of the page")
     scenario_goals: str = parameter(
-        "", "goals of a scenario by parts, as JSON, which a button of the page sends; empty: none"
+        "", "scenario goals by robot part, as JSON, sent by a button on the page; empty: none"
     )
     check_goals: bool = parameter(
-        True, "plan the shown goal to check whether it is reachable before it is sent"
+        True, "whether to check by planning that the displayed goal is reachable before it is sent"
     )
 
 
@@ -77,7 +78,7 @@ changes with each start.
 """
 
 _server_start_lock = threading.Lock()
-"""Held while a server starts, which replaces a function of websockets."""
+"""Held while a server starts, because starting it replaces a websockets function."""
 
 
 def require_viser() -> None:
@@ -90,13 +91,13 @@ def require_viser() -> None:
     """
     if importlib.util.find_spec("viser") is None:
         raise SpaceRobotError(
-            "The viewer needs viser, which is not installed: pip install '.[viewer]' in the clone "
-            "(or: pip install viser)."
+            "The viewer requires viser, which is not installed: pip install '.[viewer]' in the "
+            "clone (or: pip install viser)."
         )
 
 
 def is_loopback(host: str) -> bool:
-    """Whether an address can be reached from this machine only."""
+    """Whether an address can only be reached from this machine."""
     try:
         return ipaddress.ip_address(host.strip("[]")).is_loopback
     except ValueError:
@@ -104,12 +105,12 @@ def is_loopback(host: str) -> bool:
 
 
 def free_port(host: str, port: int) -> int:
-    """Return ``port`` or the next free one; for 0 any free port.
+    """Return ``port`` or the next free one; if it is 0, any free port.
 
     Raises
     ------
     ParameterError
-        The address is not one of this machine, or a hundred ports are taken.
+        The address does not belong to this machine, or a hundred ports are in use.
     """
     try:
         family, _, _, _, _ = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
@@ -135,14 +136,15 @@ def free_port(host: str, port: int) -> int:
 
 
 def is_own_page(origin: str | None, host: str | None, served: str) -> bool:
-    """Whether a websocket is opened by a page of this server, or by a program other than a browser.
+    """Whether a websocket is opened by a page from this server, or by a program that is not a
+    browser.
 
     Parameters
     ----------
     origin, host
-        Headers of the request: the page that opens the websocket, and the server it addresses.
+        Request headers: the page that opens the websocket, and the server that it addresses.
     served
-        The address of the page.
+        The page address.
     """
     if origin is None:
         return True  # Browsers always send an origin: this is a program.
@@ -215,10 +217,10 @@ def start_server(host: str, port: int, title: str = "") -> viser.ViserServer:
     import viser
 
     class LocalServer(viser.ViserServer):
-        """A server that never shares its page through the internet."""
+        """A server that never shares its page over the internet."""
 
         def request_share_url(self, verbose: bool = True) -> str | None:
-            """Return None: no share is requested."""
+            """Return None: sharing is not requested."""
             return None
 
     # viser looks for a free port as well, but waits forever if an address is wrong.
@@ -238,6 +240,6 @@ def url_of(server: viser.ViserServer) -> str:
 
 
 def stop_server(server: viser.ViserServer) -> None:
-    """Stop the server of the page."""
+    """Stop the page's server."""
     with redirect_stdout(io.StringIO()):
         server.stop()

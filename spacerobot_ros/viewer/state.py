@@ -1,4 +1,4 @@
-"""The interface of the page: the state of the stack that it shows, and the actions of its users."""
+"""Page interface: the displayed state of the stack, and user actions."""
 
 from __future__ import annotations
 
@@ -33,11 +33,11 @@ class Measured:
     time_s
         Simulated time, s.
     pose
-        (7,) of the base link in the world: m, quaternion (x, y, z, w).
+        (7,) base link pose in the world: m, quaternion (x, y, z, w).
     q, qdot, effort
-        (n,) of the joints in the order of the description: m or rad, m/s or rad/s, N or N m.
+        (n,) joint values in robot description order: m or rad, m/s or rad/s, N or N m.
     twist
-        (6,) velocity and angular velocity of the base link, in its own axes, m/s and rad/s.
+        (6,) linear and angular velocity of the base link, in its own frame, m/s and rad/s.
     """
 
     time_s: float
@@ -50,7 +50,7 @@ class Measured:
 
 @dataclass(frozen=True)
 class Momenta:
-    """Total momenta in the world: linear (kg m/s), then angular (kg m^2/s).
+    """Total momenta in the world: linear (kg m/s) over angular (kg m^2/s).
 
     Attributes
     ----------
@@ -66,15 +66,16 @@ class Momenta:
 
 @dataclass(frozen=True)
 class Firing:
-    """Thruster activity: ``names``, and the on-time of each as a share of the last tick, 0 to 1."""
+    """Thruster activity: ``names``, and the on-time of each as a fraction of the last tick, 0 to
+    1."""
 
     names: tuple[str, ...]
     duty: Array
 
 
 Part = str
-"""The part of the robot that a goal is for: ``base``, the name of a link, or ``end_effector``, also
-for the end-effector of a controller.
+"""The part of the robot that a goal is for: ``base``, a link name, or ``end_effector``,
+also for a controller's end-effector.
 """
 
 
@@ -92,20 +93,20 @@ def goals_to_text(goal: Goal, of_controller: Goal | None = None) -> str:
 
 
 def goals_from_text(text: str) -> dict[Part, Goal]:
-    """Return the goals by part from a text of :func:`goals_to_text`; empty for an empty text."""
+    """Return the goals by robot part from a :func:`goals_to_text` string; empty if it is empty."""
     return {part: decode_goal(entry) for part, entry in json.loads(text or "{}").items()}
 
 
 @dataclass(frozen=True)
 class StackState:
-    """The state of the stack at one time; None: not known, or no such node.
+    """The state of the stack at one time; None: unknown, or no such node.
 
     Attributes
     ----------
     measured, age_s
-        The last state, and the wall time since its arrival, s; infinite before the first.
+        The last state, and the wall time since it arrived, s; infinite before the first state.
     tool
-        (7,) pose of the end-effector in the world.
+        (7,) end-effector pose in the world.
     target
         (7,) pose of the target's root link in the world.
     momenta, firing, clearance
@@ -113,20 +114,20 @@ class StackState:
     plant, planner, controller, replay
         The last status of each node; None if there is no such node.
     planned_path
-        (k, 3) positions of the base predicted by the planner, m.
+        (k, 3) base positions predicted by the planner, m.
     planned_motion
-        (k, 7 + n) poses of the base along the planned path, and positions of the joints there;
-        None also if the planner has published no schedule that starts with the path.
+        (k, 7 + n) base poses and joint positions along the planned path;
+        None also if the planner has not published a schedule that starts together with the path.
     goals
-        The last goal sent by anyone, by part. A planner's goal for a link has the link in its
-        ``end_effectors``; a goal for the end-effector of a controller is only a pose.
+        The last goal sent by anyone, by robot part. A planner's link goal names the link in
+        ``end_effectors``; a goal for a controller's end-effector is only a pose.
     silent
-        Wall time since the last heartbeat of each node that has fallen silent, s, by name.
+        Wall time since the last heartbeat of each silent node, s, by name.
     inactive
-        Names of the nodes that were deactivated or shut down.
+        Names of nodes that were deactivated or shut down.
     absent
-        The statuses among ``plant``, ``planner``, ``controller``, ``replay`` whose nodes are silent
-        or inactive: they may no longer be true.
+        The statuses (``plant``, ``planner``, ``controller``, ``replay``) whose nodes are silent or
+        inactive: they may be outdated.
     busy
         Whether a planner or controller is planning or compiling, which delays its response.
     """
@@ -153,7 +154,8 @@ class StackState:
 
 @dataclass(frozen=True)
 class Notice:
-    """A line of the log: ``level`` 0 OK, 1 WARN, 2 ERROR; ``time_s`` simulated, if known, s."""
+    """A log line: ``level`` 0 OK, 1 WARN, 2 ERROR; ``time_s`` simulated time, s, if
+    known."""
 
     message: str
     level: int = 0
@@ -162,10 +164,10 @@ class Notice:
 
 
 class Request(Enum):
-    """A request that a service of the stack performs."""
+    """A request to be performed by a service of the stack."""
 
     ABORT = "abort"
-    """Planner and controller drop their goals; the joints brake."""
+    """The planner and the controller drop their goals; the joints brake."""
     STOP = "stop"
     """The plant brings everything to rest and refuses commands until ``REARM``."""
     REARM = "rearm"
@@ -180,7 +182,7 @@ class Request(Enum):
 
 @dataclass(frozen=True)
 class FlyAction:
-    """Send goals, by part, all with one stamp."""
+    """Send goals, by robot part, all with the same stamp."""
 
     goals: Mapping[Part, Goal]
 
@@ -200,4 +202,4 @@ class SeekAction:
 
 
 Action = Request | FlyAction | InjectAction | SeekAction
-"""An action of a user of the page."""
+"""A user action."""

@@ -180,7 +180,7 @@ def test_a_bag_without_states_says_why_there_are_no_errors(hands: FlightReport) 
     blind = replace(hands, series={**hands.series, "pose": hands.signal("pose").between(9.0, 10.0)})
     sentence = link_errors_figure(blind)
     assert isinstance(sentence, str)
-    assert sentence.startswith("The bag holds no base poses (odom)")
+    assert sentence.startswith("The bag contains no base poses (odom)")
 
 
 def test_a_logarithmic_axis_ends_at_the_power_of_ten_above_the_largest_value() -> None:
@@ -252,7 +252,7 @@ def test_obstacles_stand_in_the_3d_view_where_the_world_has_them(strut: FlightRe
     corners = np.reshape(cylinder["data"]["attributes"]["position"]["array"], (-1, 3))
     np.testing.assert_allclose(np.ptp(corners, axis=0), [0.12, 0.12, 0.8], atol=1e-5)
     assert drawn["object"]["materials"][0]["color"] == 0x9999A6, "the color of its shape"
-    assert "obstacles have the shapes used to measure distances" in scene.caption
+    assert "obstacles have the geometry used to measure distances" in scene.caption
 
 
 def test_a_flight_without_obstacles_says_nothing_of_them(hands: FlightReport) -> None:
@@ -282,7 +282,7 @@ def test_pictures_of_configurations_have_the_obstacles(strut: FlightReport) -> N
     np.testing.assert_allclose(fills - [0.6, 0.6, 0.65], 0.0, atol=0.003)
     figure = configurations_figure(strut)
     assert isinstance(figure, ReportFigure)
-    assert "Obstacles have the shapes used to measure distances." in figure.caption
+    assert "Obstacles are drawn with the geometry used to measure distances." in figure.caption
 
 
 def test_meshes_of_obstacles_are_those_that_a_bag_carries(strut: FlightReport) -> None:

@@ -120,7 +120,9 @@ def test_figures_of_several_bags_by_the_command(bag: Path, tmp_path: Path) -> No
     words = ["figures", str(bag), str(other), "--format", "svg", "--only", names]
     result = CliRunner().invoke(main, [*words, "--out", str(tmp_path / "out")])
     assert result.exit_code == 1
-    assert_one_sentence(result.stderr, "robot", "none: It shows a single flight: name one bag")
+    assert_one_sentence(
+        result.stderr, "robot", "none: This figure shows a single flight: specify one bag"
+    )
     for name in ("pose", "path", "momentum"):
         text = (tmp_path / "out" / f"{name}.svg").read_text("utf-8")
         for label in ("flight.mcap", "other.mcap"):
@@ -165,7 +167,7 @@ def test_what_is_refused_is_named(
         ("font.size: nan\n", "font.size is nan"),
         ("text.usetex: True\n", "text.usetex"),
         ("font.family: Nowhere Sans\n", "none of its fonts (Nowhere Sans) is installed"),
-        ("figure.subplot.left: 2\nlines.dashed_pattern: 0, 0\n", "Nothing can be drawn"),
+        ("figure.subplot.left: 2\nlines.dashed_pattern: 0, 0\n", "Figures cannot be drawn"),
     ],
 )
 def test_a_style_file_with_a_mistake_is_one_sentence(
@@ -223,7 +225,7 @@ def test_a_bag_without_a_flight_has_no_figures_and_says_so(tmp_path: Path) -> No
     lines = result.stderr.splitlines()
     assert len(lines) > 10
     assert all("none: " in line and line.endswith(".") for line in lines)
-    assert "pose        none: The bag holds no base poses (odom)" in result.stderr
+    assert "pose        none: The bag contains no base poses (odom)" in result.stderr
     assert list(tmp_path.iterdir()) == [bag]
 
 

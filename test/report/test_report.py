@@ -205,7 +205,7 @@ def test_dense_traces_become_bands_and_say_so(tmp_path: Path) -> None:
     with drawing():
         figure = shape_figure(read_report(bag))
     assert isinstance(figure, ReportFigure)
-    assert "the smallest and the largest value in each slice of time" in figure.caption
+    assert "the smallest and largest value in each time slice" in figure.caption
     assert len(figure.svg) < 250_000
 
 
@@ -224,21 +224,21 @@ def test_a_robot_without_joints(tmp_path: Path) -> None:
         (
             Story(still(), topics=("odom",)),
             (
-                "The bag holds no positions of joint 'joint_0' and 2 more (joint_states): the "
+                "The bag contains no positions of joint 'joint_0' and 2 more (joint_states): the "
                 "robot is not drawn.",
-                "The bag holds no joint positions (joint_states).",
+                "The bag contains no joint positions (joint_states).",
             ),
         ),
         (
             Story(still(), topics=(), urdf=None),
             (
-                "The bag holds no robot description (robot_description) and no base poses (odom): "
-                "the robot is not drawn.",
+                "The bag contains no robot description (robot_description) and no base poses "
+                "(odom): the robot is not drawn.",
             ),
         ),
         (
             Story(still(), name="other_"),
-            ("The bag holds no positions of joint 'joint_0' and 2 more",),
+            ("The bag contains no positions of joint 'joint_0' and 2 more",),
         ),
     ],
 )
@@ -266,8 +266,8 @@ def test_any_number_of_joints(tmp_path: Path, n: int) -> None:
 def test_without_goal_and_planner_and_in_a_namespace(tmp_path: Path) -> None:
     page = report_of(tmp_path, Story(still(), prefix="/free_flyer"))
     assert list(page.figures) == [name for name in FIGURES if name != "errors"]
-    assert "The bag holds no goal pose." in page.text
-    assert "no status of a planner" in page.text
+    assert "The bag contains no goal pose." in page.text
+    assert "no planner or controller status" in page.text
     assert "Position error" not in page.tiles
 
 
@@ -287,7 +287,7 @@ def test_a_refused_goal(tmp_path: Path) -> None:
 def test_what_was_sent_and_is_no_pose(tmp_path: Path) -> None:
     goals = [(0.0, [math.nan, 0.0, 0.0], [0.0, 0.0, 0.0])]
     page = report_of(tmp_path, Story(still(2), goals=goals, urdf="<robot/>"))
-    assert "The bag holds no goal pose." in page.text
+    assert "The bag contains no goal pose." in page.text
     assert "nan" not in page.text
     assert "configurations" not in page.figures
 
@@ -365,7 +365,7 @@ def test_cut_short_right_after_the_start(tmp_path: Path) -> None:
     statuses = [(0.0, "Flying a gait.", EXECUTING | goal_value())]
     page = report_of(tmp_path, Story(still(count=1), statuses, goals=[(0.0, *GOAL)]))
     assert list(page.figures) == ["configurations"]
-    assert "The bag holds one state: there are no figures over time." in page.text
+    assert "The bag contains only one state: there are no figures over time." in page.text
     assert "Momentum drift" not in page.text
     assert "Drag across a chart" not in page.text
     assert "key frames" not in page.text
@@ -383,7 +383,7 @@ def test_what_is_missing_is_left_out(tmp_path: Path, topics: tuple[str, ...]) ->
         ("momentum",): ["momentum"],
     }
     assert list(page.figures) == expected[topics]
-    assert "The bag holds no robot description" in page.text
+    assert "The bag contains no robot description" in page.text
 
 
 @pytest.mark.slow

@@ -147,7 +147,7 @@ def test_goals_of_links_are_planned_for_and_the_base_ends_where_the_plan_has_it(
     asked = GoalQuestion(robot.urdf, texts, start, Goal.of_end_effectors([aim]))
     answer = Planner().answer(asked, Cancellation())
     assert answer.verdict == Verdict.REACHABLE, answer
-    assert re.fullmatch(r"Reachable in [\d.]+ s by 'resolved_rate'\.", answer.message)
+    assert re.fullmatch(r"Reachable in [\d.]+ s with 'resolved_rate'\.", answer.message)
     assert answer.shape is not None
     assert answer.base is not None
     # By Pinocchio the link is at its goal then, with the base off its place.
@@ -380,7 +380,7 @@ def test_the_question_of_a_controller_is_for_its_end_effector() -> None:
     assert (other.link, other.parameters) == (known, {})
     absent = {"controller": {"end_effector_frame": '"nobody"'}}
     answer = make_question(state, goals, SERVICER, absent)
-    assert answer == "The end-effector is not a link of the robot."
+    assert answer == "The end-effector is not a robot link."
 
 
 def test_the_robot_of_a_planner_is_that_of_the_page() -> None:
