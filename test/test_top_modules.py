@@ -293,8 +293,8 @@ def test_kills_of_nodes(line: str, kills: tuple[Kill, ...]) -> None:
                 "plant at inf": "'inf' is not a finite number",
                 "plant at nan": "'nan' is not a finite number",
                 "plant at -1": "it is at -1 s, before the start of the flight",
-                "plant at 2 until 2": "it ends at 2 s and begins at 2 s",
-                "plant at 2 until 1": "it ends at 1 s and begins at 2 s",
+                "plant at 2 until 2": "it ends at 2 s but begins at 2 s",
+                "plant at 2 until 1": "it ends at 1 s but begins at 2 s",
             }.items()
         ),
     ],

@@ -1,4 +1,4 @@
-"""MCAP bags that any ROS 2 tool opens: writing, reading, replaying and verifying them."""
+"""Writing, reading, replaying and verifying MCAP bags that any ROS 2 tool can open."""
 
 from spacerobot_ros.bag.mcap_file import LATCHED, QosProfile
 from spacerobot_ros.bag.playback import Playback, ReplayMessage, ReplayTopic

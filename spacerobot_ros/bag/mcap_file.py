@@ -1,7 +1,7 @@
-"""The file of a bag: MCAP with the metadata of rosbag2.
+"""Bag file: MCAP with rosbag2 metadata.
 
-``mcap.writer.Writer`` makes the records. This module adds a file that is locked, never overwritten,
-and complete up to its last record after any kill or on a full disk.
+``mcap.writer.Writer`` makes the records. Files are locked, never overwritten, and complete up to
+the last record even if the process is killed or the disk is full.
 """
 
 from __future__ import annotations
@@ -31,15 +31,15 @@ from spacerobot_ros.times import SECOND
 # -- quality of service -----------------------------------------------------------------------
 
 INFINITE_NS = 2**63 - 1
-"""A duration without end, in nanoseconds (``RMW_DURATION_INFINITE``)."""
+"""Infinite duration, in nanoseconds (``RMW_DURATION_INFINITE``)."""
 
 
 @dataclass(frozen=True)
 class QosProfile:
-    """The quality of service that a topic's publisher offers.
+    """Quality of service offered by a topic's publisher.
 
-    The policies are the lower-case words of rmw (``rmw_qos_*_policy_to_str``), the only ones that
-    ``ros2 bag play`` knows.
+    Policies are rmw's lower-case strings (``rmw_qos_*_policy_to_str``), the only ones that ``ros2
+    bag play`` accepts.
 
     Parameters
     ----------
@@ -54,7 +54,7 @@ class QosProfile:
     deadline_ns
         Longest time between two messages, in nanoseconds.
     lifespan_ns
-        Lifespan of a message, in nanoseconds.
+        Message lifespan, in nanoseconds.
     liveliness
         ``automatic``, ``manual_by_topic``, or as above.
     liveliness_lease_duration_ns
@@ -75,15 +75,15 @@ class QosProfile:
 
     @classmethod
     def from_yaml(cls, text: str) -> list[QosProfile]:
-        """Read a channel's ``offered_qos_profiles``, whose policies are words or numbers.
+        """Parse a channel's ``offered_qos_profiles``, whose policies are strings or numbers.
 
-        ``text`` is the YAML of a list with one profile for each publisher; empty for none. Entries
-        that a profile lacks are as in ``QosProfile()``.
+        ``text`` is a YAML list with one profile per publisher, or empty. Missing
+        entries default to those of ``QosProfile()``.
 
         Raises
         ------
         RecordingError
-            The text is not such a list.
+            ``text`` is not such a list.
         """
         # It imports all of rosbags, and few bags are replayed.
         from rosbags.rosbag2.metadata import parse_qos
@@ -97,11 +97,11 @@ class QosProfile:
             raise RecordingError(f"A QoS profile of the bag cannot be read: {error}.") from error
 
     def to_yaml(self) -> str:
-        """Return a channel's ``offered_qos_profiles`` with this profile, as rosbag2 dumps it."""
+        """Return a channel's ``offered_qos_profiles`` with this profile, in rosbag2's format."""
         return yaml.dump([self.to_dict()], Dumper=_Dumper, sort_keys=False).rstrip()
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the profile as rosbag2's YAML has it."""
+        """Return the profile as it appears in rosbag2's YAML."""
         entry: dict[str, Any] = {}
         for name, value in vars(self).items():
             if name.endswith("_ns"):
@@ -126,7 +126,7 @@ def _profile_arguments(profile: Qos) -> dict[str, Any]:
 
 
 LATCHED = QosProfile(depth=1, durability="transient_local")
-"""Reliable, transient local, depth 1: a late subscriber gets the last message."""
+"""Reliable, transient local, depth 1: late subscribers receive the last message."""
 
 
 _MAX_YAML_CHARACTERS = 65_536
@@ -145,7 +145,7 @@ _METADATA_VERSION = 9
 
 @dataclass(frozen=True)
 class RecordedTopic:
-    """One topic of a bag: name, type, hash of the type, QoS offered and messages recorded."""
+    """One topic of a bag: name, type, type hash, offered QoS and number of recorded messages."""
 
     name: str
     type_name: str
@@ -197,7 +197,7 @@ def _rosbag2_metadata(
 # -- the file ---------------------------------------------------------------------------------
 
 _MESSAGE_HEAD_SIZE = 31
-"""Length of the header before the data of a message in a chunk, bytes."""
+"""Length of a message header in a chunk, bytes."""
 
 
 class BagExistsError(RecordingError):
@@ -207,13 +207,13 @@ class BagExistsError(RecordingError):
 def _create_locked_file(path: Path, overwrite: bool) -> io.FileIO:
     """Create an empty, locked, regular file; BagExistsError if the file must not be overwritten."""
     with suppress(FileNotFoundError):
-        require_regular(os.stat(path).st_mode, path, "make")
+        require_regular(os.stat(path).st_mode, path, "create")
     flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC
     try:
         descriptor = os.open(path, flags if overwrite else flags | os.O_EXCL, 0o666)
     except FileExistsError as error:
         raise BagExistsError(
-            f"Cannot make the bag {path}: File exists; name another one, or remove it."
+            f"Cannot create the bag {path}: File exists; name another one, or remove it."
         ) from error
     # Unbuffered: appended records survive a kill.
     raw = open(descriptor, "wb", buffering=0)  # noqa: SIM115
@@ -248,21 +248,22 @@ class _Tail:
         return self.start + len(self.data)
 
     def flush(self) -> None:
-        """Do nothing; the library calls this method."""
+        """Do nothing; the library requires this method."""
 
 
 class McapFile:
     """An MCAP file that grows by whole chunks.
 
-    Every chunk, attachment and metadata record goes to the operating system at once, and a failed
-    one is undone. If the process dies, the file is complete except for the record being appended.
-    An open file is locked: no second one can be opened on the same path. If the disk is full or
+    Every chunk, attachment and metadata record is passed to the operating system at once; a failed
+    write is undone. If the process dies, the file is complete except for the record being appended.
+    An open file is locked: the same path cannot be opened a second time. If the disk is full or
     fails, calls that add records raise RecordingError; the file is then unchanged and must be
     closed.
 
-    The folders of ``path`` are created. For ``compression``, ``chunk_size`` and ``overwrite`` see
-    :class:`~spacerobot_ros.bag.BagWriter`; ``profile`` is the profile in the MCAP header. Raises
-    RecordingError if the file cannot be created, BagExistsError if it exists or is being written.
+    The parent folders of ``path`` are created. For ``compression``, ``chunk_size`` and
+    ``overwrite`` see :class:`~spacerobot_ros.bag.BagWriter`; ``profile`` is the profile in the MCAP
+    header. Raises RecordingError if the file cannot be created, BagExistsError if it exists or is
+    being written.
     """
 
     def __init__(
@@ -276,12 +277,12 @@ class McapFile:
     ) -> None:
         self.path = path
         self.message_counts: Counter[int] = Counter()
-        """Number of messages by channel, including the chunk in progress."""
+        """Number of messages by channel, including the current chunk."""
         self.start_ns: int | None = None
         self.end_ns: int | None = None
-        """Log times of the earliest and the latest message, ns."""
+        """Earliest and latest log times, ns."""
         self.bytes_waiting = 0
-        """Size of the messages in the chunk in progress, bytes."""
+        """Size of the messages in the current chunk, bytes."""
         self._counts_in_file: Counter[int] = Counter()
         self._tail = _Tail()
         self._library = Writer(
@@ -294,7 +295,7 @@ class McapFile:
             self._raw = _create_locked_file(path, overwrite)
         except (OSError, ValueError) as error:
             reason = getattr(error, "strerror", None) or error
-            raise RecordingError(f"Cannot make the bag {path}: {reason}.") from error
+            raise RecordingError(f"Cannot create the bag {path}: {reason}.") from error
         try:
             self._library.start(profile, library="spacerobot_ros")
             self._commit()
@@ -304,7 +305,7 @@ class McapFile:
 
     @property
     def size(self) -> int:
-        """Number of bytes handed to the operating system."""
+        """Number of bytes passed to the operating system."""
         return self._tail.start
 
     def check(self) -> None:
@@ -315,16 +316,16 @@ class McapFile:
             if (ours.st_dev, ours.st_ino) != (theirs.st_dev, theirs.st_ino):
                 problem = "another file replaced it"
             elif ours.st_size != self.size:
-                problem = f"it has {ours.st_size} bytes, and {self.size} were written"
+                problem = f"it has {ours.st_size} bytes, but {self.size} were written"
         except FileNotFoundError:
             problem = "it was removed or moved"
         except OSError as error:
             problem = str(error.strerror or error)
         if problem:
-            raise RecordingError(f"The bag {self.path} is lost while it is written: {problem}.")
+            raise RecordingError(f"The bag {self.path} was lost during recording: {problem}.")
 
     def add_schema(self, name: str, encoding: str, data: bytes) -> int:
-        """Add the definition of a type; return its number."""
+        """Add a type definition; return its ID."""
         number = self._library.register_schema(name, encoding, data)
         self._commit_full_chunk()
         return number
@@ -332,13 +333,13 @@ class McapFile:
     def add_channel(
         self, topic: str, encoding: str, schema_id: int, metadata: dict[str, str]
     ) -> int:
-        """Add a channel, and return its number."""
+        """Add a channel; return its ID."""
         number = self._library.register_channel(topic, encoding, schema_id, metadata)
         self._commit_full_chunk()
         return number
 
     def write(self, channel_id: int, data: bytes, log_time_ns: int, publish_time_ns: int) -> bool:
-        """Add a message, and return whether it completed a chunk."""
+        """Add a message; return whether it completed a chunk."""
         self._library.add_message(channel_id, log_time_ns, data, publish_time_ns)
         self.message_counts[channel_id] += 1
         self.bytes_waiting += _MESSAGE_HEAD_SIZE + len(data)
@@ -354,22 +355,22 @@ class McapFile:
         self._commit()
 
     def add_metadata(self, name: str, data: dict[str, str]) -> None:
-        """Append a record of keys and values."""
+        """Append a key-value metadata record."""
         self._library.add_metadata(name, data)
         self._commit()
 
     def add_rosbag2_metadata(self, topics: Sequence[RecordedTopic]) -> None:
-        """Append rosbag2's metadata record of the messages so far."""
+        """Append rosbag2's metadata record for the messages so far."""
         values = _rosbag2_metadata(self.path.name, topics, self.start_ns, self.end_ns)
         self.add_metadata(METADATA_NAME, values)
 
     def flush(self) -> bool:
-        """Complete the chunk in progress; return whether there was one."""
+        """Complete the current chunk; return whether there was one."""
         self._library.flush()
         return self._commit_full_chunk()
 
     def finish(self, topics: Sequence[RecordedTopic] | None = None) -> None:
-        """Complete the file and close it, with rosbag2's record of its topics if they are given."""
+        """Complete the file and close it, including rosbag2's topic record if topics are given."""
         try:
             self.flush()
             if topics is not None:
@@ -407,6 +408,6 @@ class McapFile:
             self.message_counts = self._counts_in_file
             raise RecordingError(
                 f"Cannot write the bag {self.path}: {error.strerror or error}; "
-                f"the {self.message_counts.total()} messages before that are safe in it."
+                f"the {self.message_counts.total()} messages written before are safe."
             ) from error
         self._tail.start += len(data)

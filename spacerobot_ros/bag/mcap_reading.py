@@ -1,9 +1,9 @@
-"""Reads records, summary and messages of MCAP files from untrusted sources.
+"""Reads records, summaries and messages from untrusted MCAP files.
 
 The records are parsed by ``mcap``. Values are checked before use: records end within the file,
-chunks have the size they claim, and all chunks of a bag together inflate to no more than a limit. A
-violation is a ``ValueError`` that names the byte; :class:`BagFile` turns it into a message for
-users.
+chunks have the declared size, and the total inflated size of all chunks in a bag is limited. A
+violation raises a ``ValueError`` that names the byte; :class:`BagFile` converts it to a user
+message.
 """
 
 from __future__ import annotations
@@ -51,19 +51,19 @@ INFLATED_SIZE_VARIABLE = "SPACEROBOT_BAG_LIMIT"
 """Environment variable: number of MB to which even a small bag may inflate."""
 
 _DEFAULT_LIMIT_MB = 32.0
-"""Default limit of the inflated size of a bag, MB."""
+"""Default limit on the inflated size of a bag, MB."""
 
 _MAX_INFLATION_RATIO = 200
-"""Largest ratio of inflated size to file size of a bag above the limit in MB. Telemetry has ratios
+"""Largest ratio of inflated size to file size for a bag above the MB limit. Telemetry has ratios
 of 3 to 40, malicious bags 1000 and more."""
 
 _UNPACKED_AT_ONCE = 1 << 20  # bytes
 
 _SQLITE_MAGIC = b"SQLite f"
-"""First eight bytes of files of rosbag2's SQLite storage."""
+"""First eight bytes of rosbag2 SQLite files."""
 
 _RECORD_HEAD = struct.Struct("<BQ")
-"""Head of a record: opcode and length of the body in bytes."""
+"""Record header: opcode and body length in bytes."""
 
 _OPCODES = set(Opcode)
 
@@ -76,27 +76,27 @@ DAMAGE_ERRORS = (
     struct.error,
     zstandard.ZstdError,
 )
-"""Exceptions of reading a damaged record: the libraries have no common base class."""
+"""Exceptions raised by damaged records: the libraries have no common base class."""
 
 
 # -- files ------------------------------------------------------------------------------------
 
 
 def require_regular(mode: int, path: Path, action: str = "read") -> None:
-    """Raise RecordingError unless a file is regular: pipes block, devices may be damaged."""
+    """Raise RecordingError unless a file is regular: pipes block, and devices may be damaged."""
     if kind := irregular_kind(mode):
         raise RecordingError(f"Cannot {action} the bag {path}: it is {kind}.")
 
 
 @contextmanager
 def open_file(path: Path, content: Path | None = None) -> Iterator[BinaryIO]:
-    """Open a bag for reading, or the file with its unpacked content.
+    """Open a bag for reading, or the temporary file with its unpacked content.
 
     Raises
     ------
     RecordingError
-        There is no such file, it is not a regular file, it cannot be read, or a damaged record is
-        found within the context.
+        There is no such file, or it is not regular or cannot be read, or a damaged record is found
+        within the context.
     """
     content = content or path
     try:
@@ -113,7 +113,7 @@ def open_file(path: Path, content: Path | None = None) -> Iterator[BinaryIO]:
 
 
 class RecordedChannel(NamedTuple):
-    """A channel of a file: a topic of one publisher."""
+    """A channel in a file: a topic from one publisher."""
 
     number: int
     topic: str
@@ -129,7 +129,7 @@ class RecordedChannel(NamedTuple):
 class BagFile:
     """One MCAP file of a bag, and its summary.
 
-    A file that was compressed as a whole, such as ``NAME.mcap.zstd`` of rosbag2, is unpacked to a
+    A file compressed as a whole, such as rosbag2's ``NAME.mcap.zstd``, is unpacked to a
     temporary file, which is deleted with this object.
 
     Parameters
@@ -140,7 +140,7 @@ class BagFile:
     Raises
     ------
     RecordingError
-        There is no such file, it cannot be read, is not MCAP, or was cut short.
+        There is no such file, or it cannot be read, is not MCAP, or is truncated.
     """
 
     def __init__(self, path: Path) -> None:
@@ -174,12 +174,11 @@ class BagFile:
 
     @contextmanager
     def open(self) -> Iterator[BinaryIO]:
-        """Open the file; convert every defect into an error of one sentence.
+        """Open the file; convert every defect into a one-sentence error.
 
         Raises
         ------
-        RecordingError
-            See the class; also raised if a damaged record is found within the context.
+        RecordingError See the class; also raised if a damaged record is found within the context.
         """
         with open_file(self.path, self._content) as file:
             _require_magic_bytes(self.path, file)
@@ -195,20 +194,20 @@ def _unpack(file: BinaryIO, unpacked: BinaryIO) -> None:
         unpacked.write(block)
         if unpacked.tell() > limit:
             raise ValueError(
-                f"it inflates to more than the {limit} bytes that its size allows (set "
+                f"it inflates to more than the {limit} bytes allowed for its size (set "
                 f"{INFLATED_SIZE_VARIABLE} to more MB if you trust it)"
             )
 
 
 def require_mcap(path: Path, start: bytes) -> None:
-    """Raise RecordingError unless a file begins as MCAP; ``start`` may be cut."""
+    """Raise RecordingError unless a file starts with the MCAP magic bytes; ``start`` may be cut."""
     if start.startswith(zstandard.FRAME_HEADER):
-        raise RecordingError(f"The bag {path} is compressed: unpack it by 'zstd -d'.")
+        raise RecordingError(f"The bag {path} is compressed: unpack it with 'zstd -d'.")
     if start == _SQLITE_MAGIC:
         raise RecordingError(
-            f"The bag {path} is in SQLite: convert it by 'rosbags-convert --src "
-            f"{shlex.quote(str(path.parent))} --dst NEW_FOLDER --dst-storage mcap', or by "
-            "'ros2 bag convert'."
+            f"The bag {path} is in SQLite: convert it with 'rosbags-convert --src "
+            f"{shlex.quote(str(path.parent))} --dst NEW_FOLDER --dst-storage mcap', or with 'ros2 "
+            "bag convert'."
         )
     if start != MCAP0_MAGIC[: len(start)]:
         raise RecordingError(f"{path} is not an MCAP file.")
@@ -225,7 +224,7 @@ def _require_magic_bytes(path: Path, file: BinaryIO) -> None:
     if length < 2 * size or file.read(size) != MCAP0_MAGIC:
         raise RecordingError(
             f"The bag {path} was cut short, because its writer was killed or its disk was full: "
-            f"'spacerobot salvage {shlex.quote(str(path))}' makes a complete bag of its content."
+            f"'spacerobot salvage {shlex.quote(str(path))}' recovers its content."
         )
     file.seek(0)
 
@@ -242,34 +241,35 @@ def file_size(file: BinaryIO) -> int:
 
 
 def records(file: BinaryIO, start: int) -> Iterator[tuple[int, int, bytes]]:
-    """Iterate over the records from a byte offset: start, opcode and bytes of each."""
+    """Iterate over the records from a byte offset: each record's start, opcode and bytes."""
     end = file_size(file)
     while start < end:
         file.seek(start)
         head = file.read(_RECORD_HEAD.size)
         if len(head) < _RECORD_HEAD.size:
-            raise ValueError(f"it ends inside of the record at byte {start}")
+            raise ValueError(f"it ends inside the record at byte {start}")
         opcode, length = _RECORD_HEAD.unpack(head)
         left = end - start - len(head)
         if length > left:
             raise ValueError(
-                f"the record at byte {start} claims {length} bytes, but only {left} are left"
+                f"the record at byte {start} declares {length} bytes, but only {left} remain"
             )
         yield start, opcode, head + file.read(length)
         start += len(head) + length
 
 
 def records_in_chunk(data: bytes, place: int) -> Iterator[tuple[int, int]]:
-    """Iterate over the records of the unpacked chunk at ``place``: first byte and end of each."""
+    """Iterate over the records in the unpacked chunk at ``place``: each record's first byte and
+    end."""
     position, size = 0, len(data)
     unpack, head = _RECORD_HEAD.unpack_from, _RECORD_HEAD.size
     while position < size:
         if size - position < head:
-            raise ValueError(f"the chunk at byte {place} ends inside of a record")
+            raise ValueError(f"the chunk at byte {place} ends inside a record")
         opcode, length = unpack(data, position)
         end = position + head + length
         if end > size:
-            raise ValueError(f"a record reaches out of the chunk at byte {place}")
+            raise ValueError(f"a record extends beyond the chunk at byte {place}")
         if not opcode:
             # Otherwise a chunk of zeros would count as millions of records.
             raise ValueError(f"the chunk at byte {place} has records of unknown kinds")
@@ -278,14 +278,14 @@ def records_in_chunk(data: bytes, place: int) -> Iterator[tuple[int, int]]:
 
 
 def parse_record(record: bytes) -> McapRecord | None:
-    """Return a record, a chunk still packed; None for a kind that MCAP lacks."""
+    """Return a record; a chunk remains packed; None: the kind is not defined by MCAP."""
     if record[0] not in _OPCODES:
         return None
     return next(StreamReader(BytesIO(record), skip_magic=True, emit_chunks=True).records)
 
 
 def read_record(file: BinaryIO, place: int, kind: type[RecordT]) -> RecordT:
-    """Return the record at byte ``place`` of a file, which must be of a kind."""
+    """Return the record at byte ``place`` of a file, which must be of the given kind."""
     for _, _, record in records(file, place):
         found = parse_record(record)
         if isinstance(found, kind):
@@ -298,7 +298,7 @@ def read_record(file: BinaryIO, place: int, kind: type[RecordT]) -> RecordT:
 
 
 class ChunkUnpacker:
-    """Unpacks the chunks of a file, up to a limit on the sum of their inflated sizes."""
+    """Unpacks the chunks of a file, up to a limit on the total inflated size."""
 
     def __init__(self, compressed: int) -> None:
         limit_mb = _DEFAULT_LIMIT_MB
@@ -310,17 +310,18 @@ class ChunkUnpacker:
         self._inflated_size = 0
 
     def count(self, size: int, place: int) -> None:
-        """Count the inflated size of the chunk at ``place``; ValueError if the sum is too large."""
+        """Add the inflated size of the chunk at ``place`` to the total; ValueError if the total is
+        too large."""
         if self._inflated_size + size > self.max_bytes:
             raise ValueError(
                 f"with the chunk at byte {place} it inflates to {self._inflated_size + size} "
-                f"bytes, more than the {self.max_bytes} that its size allows (set "
+                f"bytes, more than the {self.max_bytes} allowed for its size (set "
                 f"{INFLATED_SIZE_VARIABLE} to more MB if you trust it)"
             )
         self._inflated_size += size
 
     def unpack(self, chunk: Chunk, place: int) -> bytes:
-        """Return the records of the chunk at ``place``; they have the claimed size and checksum."""
+        """Return the records of the chunk at ``place``; their size and checksum are verified."""
         size = chunk.uncompressed_size
         self.count(size, place)
         if chunk.compression not in _DECOMPRESSORS:
@@ -333,7 +334,7 @@ class ChunkUnpacker:
         except DAMAGE_ERRORS as error:
             raise ValueError(f"the chunk at byte {place} cannot be unpacked: {error}") from error
         if len(data) != size:
-            raise ValueError(f"the chunk at byte {place} does not hold the {size} bytes it claims")
+            raise ValueError(f"the chunk at byte {place} does not hold the declared {size} bytes")
         if chunk.uncompressed_crc and zlib.crc32(data) != chunk.uncompressed_crc:
             raise ValueError(f"the checksum of the chunk at byte {place} is wrong")
         return data
@@ -344,7 +345,7 @@ _DECOMPRESSORS: dict[str, Callable[[bytes, int], bytes]] = {
     "lz4": lambda data, most: lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=most),
     "": lambda data, _: data,
 }
-"""Decompressor by name, a function of the data and the largest number of bytes to return."""
+"""Decompressor by name, a function of the data and the maximum number of bytes to return."""
 
 
 # -- summary ----------------------------------------------------------------------------------
@@ -357,7 +358,7 @@ def _read_summary(path: Path, file: BinaryIO) -> tuple[Summary, Statistics]:
     size = file_size(file)
     start = read_record(file, max(size - FOOTER_SIZE - MAGIC_SIZE, 0), Footer).summary_start
     if start > size:
-        raise ValueError(f"its summary begins at byte {start}, behind its end")
+        raise ValueError(f"its summary begins at byte {start}, after its end")
     summary, chunks = Summary(), ChunkUnpacker(size)
     for _, _, record in records(file, start) if start else ():
         match parse_record(record):
@@ -378,8 +379,8 @@ def _read_summary(path: Path, file: BinaryIO) -> tuple[Summary, Statistics]:
                 break
     if summary.statistics is None:
         raise RecordingError(
-            f"The bag {path} has no summary: 'spacerobot salvage {shlex.quote(str(path))}' makes "
-            "one."
+            f"The bag {path} has no summary: 'spacerobot salvage {shlex.quote(str(path))}'  "
+            "creates one."
         )
     return summary, summary.statistics
 
@@ -387,7 +388,7 @@ def _read_summary(path: Path, file: BinaryIO) -> tuple[Summary, Statistics]:
 # -- messages ---------------------------------------------------------------------------------
 
 MessageBlock = tuple[NDArray[np.intp], NDArray[np.uint64], NDArray[np.uint64], list[bytes]]
-"""N recorded messages: numbers of their topics (N,), log times (N,) and publish times (N,) in ns,
+"""N recorded messages: topic indices (N,), log times (N,) and publish times (N,) in ns,
 and serialised bytes."""
 
 _MESSAGE_HEADS = np.dtype(
@@ -401,7 +402,7 @@ _MESSAGE_HEADS = np.dtype(
     ]
 )
 _LATEST_TIME_NS = 2**63 - 1
-"""Latest time that an int64 of nanoseconds holds: the year 2262."""
+"""Latest time that int64 nanoseconds can represent: the year 2262."""
 
 _MOST_CHANNELS = 65_536
 _NOT_WANTED = -1
@@ -435,7 +436,7 @@ class _Wanted:
 
 
 def blocks_in_file_order(file: BagFile, topics: Sequence[str]) -> Iterator[MessageBlock]:
-    """Iterate over messages of a file in the order they were written, chunk by chunk.
+    """Iterate over the messages in a file in write order, chunk by chunk.
 
     ``topics``: the topics to read. Errors: see :meth:`BagFile.open`.
     """
@@ -462,7 +463,7 @@ def _messages_in(data: bytes, place: int, wanted: _Wanted) -> MessageBlock:
     within = begins[:, np.newaxis] + np.arange(size)
     heads = np.frombuffer(data, np.uint8).take(within, mode="clip").view(_MESSAGE_HEADS)[:, 0]
     if (heads["length"] < size - _RECORD_HEAD.size).any():
-        raise ValueError(f"a message of the chunk at byte {place} is shorter than its head")
+        raise ValueError(f"a message of the chunk at byte {place} is shorter than its header")
     numbers = wanted.numbers[heads["channel"]]
     rows = np.flatnonzero(
         (numbers >= 0)
@@ -481,7 +482,7 @@ class _Section(NamedTuple):
 
     start_ns: int
     written: tuple[int, int]
-    """Number of the file, and byte offset in it."""
+    """File index, and byte offset in the file."""
     end_ns: int
     chunk: ChunkIndex | None
 
@@ -492,11 +493,11 @@ def blocks_in_time_order(
     start_ns: int = 0,
     end_ns: int = _LATEST_TIME_NS,
 ) -> Iterator[MessageBlock]:
-    """Iterate over messages of a bag by log time, then by the order in which they were written.
+    """Iterate over the messages in a bag by log time, then in write order.
 
-    Only messages on these topics with log times in the span (ns) are returned. A block has the
-    messages of chunks with overlapping times; only these are in memory together. Errors: see
-    :meth:`BagFile.open`.
+    Only messages on these topics with log times in the span (ns) are returned. A block contains the
+    messages of chunks with overlapping times; only these are in memory at the same time. Errors:
+    see :meth:`BagFile.open`.
     """
     wanted = [_Wanted(file, topics, start_ns, end_ns) for file in files]
     sections = [
@@ -556,5 +557,5 @@ def _messages_of_chunk(file: BinaryIO, index: ChunkIndex, wanted: _Wanted) -> Me
     place = index.chunk_start_offset
     chunk = read_record(file, place, Chunk)
     if chunk.uncompressed_size != index.uncompressed_size:
-        raise ValueError(f"the chunk at byte {place} and its index claim different sizes")
+        raise ValueError(f"the chunk at byte {place} and its index state different sizes")
     return _messages_in(ChunkUnpacker(file_size(file)).unpack(chunk, place), place, wanted)

@@ -1,4 +1,4 @@
-"""Determines when messages of a replay are due, without a clock or a publisher."""
+"""Determines when replayed messages are due, without a clock or a publisher."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ _LATEST_TIME_NS = 2**63 - 1
 _MAX_AGE_REPUBLISHED_AFTER_SEEK_NS = SECOND
 
 _MAX_REPLAYED_TOPICS = 1000
-"""Largest number of replayed topics: each one needs a publisher, memory and discovery."""
+"""Largest number of replayed topics: each requires a publisher, memory and discovery."""
 
 
 @dataclass(frozen=True)
 class ReplayTopic:
-    """A topic to publish: its name, type and quality of service in the bag."""
+    """A topic to publish: its name, type and QoS in the bag."""
 
     name: str
     type_name: str
@@ -30,22 +30,22 @@ class ReplayTopic:
 
     @property
     def latched(self) -> bool:
-        """Whether a late subscriber gets the last message."""
+        """Whether late subscribers receive the last message."""
         return self.qos.durability == "transient_local"
 
 
 @dataclass(frozen=True)
 class ReplayStatus:
-    """State of a replay, as published on replay/status.
+    """Replay state, as published on replay/status.
 
     Attributes
     ----------
     position_s, duration_s
-        Time of the replay since its first message, and time from its first to its last message, s.
+        Replay time since the first message, and time from the first to the last message, s.
     paused, ended
         Whether the replay is paused, and whether all messages have been published.
     rate
-        Seconds of bag time per second of the wall clock.
+        Bag seconds per second of wall time.
     """
 
     position_s: float
@@ -66,7 +66,7 @@ class ReplayStatus:
         Raises
         ------
         SpaceRobotError
-            They are not a status of a replay.
+            The pairs are not a replay status.
         """
         with _STATUS_FORMAT.reading():
             state = values["state"]
@@ -92,16 +92,17 @@ class ReplayMessage:
 
 
 class SubscriberWait:
-    """Decides when a replay may begin: once all known readers are matched and no more appear.
+    """Decides when a replay may start: when all known subscribers are matched and no new ones
+    appear.
 
     Parameters
     ----------
     period
-        Time between two checks, s.
+        Time between checks, s.
     longest
         Longest wait, s.
     settled
-        Time without a new reader after which no more are expected, s.
+        Time without a new subscriber after which no more are expected, s.
     """
 
     def __init__(self, period: float, longest: float, settled: float = 0.3) -> None:
@@ -110,7 +111,7 @@ class SubscriberWait:
         self._waited = self._quiet = 0.0
 
     def may_begin(self, matched: Sequence[int], known: Sequence[int]) -> bool:
-        """Return whether to begin, given the counts of matched and known readers by topic."""
+        """Return whether to start, given the numbers of matched and known subscribers by topic."""
         readers = sum(matched)
         self._waited += self._period
         self._quiet = self._quiet + self._period if readers == self._readers else 0.0
@@ -125,7 +126,7 @@ def renamed_topics(remap: str, topics: Collection[str]) -> dict[str, str]:
     Raises
     ------
     ParameterError
-        A rule has another form, or names a topic that is not among ``topics``.
+        A rule is malformed, or names a topic that is not in ``topics``.
     """
     names = {}
     for rule in remap.split():
@@ -146,30 +147,30 @@ def renamed_topics(remap: str, topics: Collection[str]) -> dict[str, str]:
 
 
 class Playback:
-    """The messages of a bag, due by their log times.
+    """Messages in a bag, scheduled by log time.
 
     The last messages of latched topics before the start are due at once:
-    a subscriber of a latched topic always expects its last message.
+    subscribers to a latched topic always expect its last message.
 
     Parameters
     ----------
     bag
         What to play.
     topics
-        Names to play; empty for all.
+        Topics to play; empty for all.
     rate
-        Seconds of bag time per second of the clock.
+        Bag seconds per second of clock time.
     start
-        Start, in seconds from the first message.
+        Start time relative to the first message, in seconds.
     duration
-        Duration to play, in seconds of the bag; 0 for all.
+        Duration to play, in seconds of bag time; 0 for all.
     loop
-        Whether to begin again at the end.
+        Whether to restart at the end.
 
     Raises
     ------
     RecordingError
-        The bag has no such topic, or no message to replay.
+        A topic is not in the bag, or there is no message to replay.
     """
 
     def __init__(
@@ -186,8 +187,8 @@ class Playback:
             raise RecordingError(f"The bag {bag.path} has no messages to replay.")
         if len(topics or bag.topics) > _MAX_REPLAYED_TOPICS:
             raise RecordingError(
-                f"The bag {bag.path} has {len(bag.topics)} topics, and only "
-                f"{_MAX_REPLAYED_TOPICS} can be replayed at once: name the ones to replay."
+                f"The bag {bag.path} has {len(bag.topics)} topics, but only "
+                f"{_MAX_REPLAYED_TOPICS} can be replayed at once: name the topics to replay."
             )
         self._bag = bag
         self._loop = loop
@@ -200,7 +201,7 @@ class Playback:
         self._rate = rate
         self._bag_ns = self._start_ns
         self._clock_ns: int | None = None
-        """Clock time at bag time `_bag_ns`; None: bag time is stopped there."""
+        """Clock time at bag time `_bag_ns`; None: bag time is paused there."""
         self._begin()
         if self._next_message is None:
             raise RecordingError(
@@ -215,7 +216,7 @@ class Playback:
         return self._next_message is None
 
     def bag_time(self, clock_ns: int) -> int:
-        """Return the time in the bag, in nanoseconds, when the clock is at ``clock_ns``."""
+        """Return the bag time, in nanoseconds, at clock time ``clock_ns``."""
         now = self._time(clock_ns)
         if self._next_message is None:
             return now
@@ -223,7 +224,7 @@ class Playback:
         return min(now, max(self._next_message.log_time_ns, self._start_ns))
 
     def run(self, clock_ns: int) -> None:
-        """Let time advance; ``clock_ns`` is the current time of the clock."""
+        """Let time advance; ``clock_ns`` is the current clock time."""
         if self._clock_ns is None:
             self._clock_ns = clock_ns
 
@@ -248,24 +249,27 @@ class Playback:
         return taken
 
     def next_due_time(self) -> int | None:
-        """Return the clock time of the next message, ns; None at the end or during a pause."""
+        """Return the clock time at which the next message is due, ns; None at the end or while
+        paused."""
         if self._next_message is None or self._clock_ns is None:
             return None
         return self._clock_ns + self._clock_span(self._next_message.log_time_ns)
 
     def step(self, clock_ns: int) -> ReplayMessage | None:
-        """Return the next message at once, due or not; None at the end of the replay."""
+        """Return the next message immediately, even if it is not due; None at the end of the
+        replay."""
         if self._next_message is None:
             return None
         self._set_time(max(self._next_message.log_time_ns, self._start_ns), clock_ns)
         return self._take_next_message()
 
     def seek(self, bag_ns: int, clock_ns: int) -> list[ReplayMessage]:
-        """Jump to ``bag_ns``, limited to the replayed part of the bag; a pause continues.
+        """Jump to ``bag_ns``, limited to the replayed part of the bag; the replay remains paused if
+        it was.
 
-        Returns the messages that a subscriber would have by then: the last one of each topic if it
-        is latched or at most a second old. During a pause at the beginning, these are the first
-        messages, which are published again when time continues.
+        Returns the messages that a subscriber would have received by then: the last message of each
+        topic that is latched, or whose last message is at most a second old. If paused at the
+        beginning, these are the first messages, which are published again when time resumes.
 
         Raises
         ------
@@ -282,7 +286,7 @@ class Playback:
 
     @property
     def start_ns(self) -> int:
-        """Log time at which the replay begins, ns."""
+        """Log time at which the replay starts, ns."""
         return self._start_ns
 
     @property

@@ -1,4 +1,4 @@
-"""Reads a bag as time series: all topics, or the topics of one robot."""
+"""Reads a bag as time series: all topics, or those of one robot."""
 
 from __future__ import annotations
 
@@ -47,28 +47,28 @@ Array = NDArray[np.float64]
 _STRING_TYPE = "std_msgs/msg/String"
 
 _MAX_DECODED_BYTES, _MAX_DECODED_TO_FILE_RATIO = 16_000_000, 50
-"""Largest size of a topic to decode, in bytes or relative to the file's size. Its objects take ten
-times as much."""
+"""Largest topic to decode, in bytes or relative to the file size.
+Decoded objects need ten times as much."""
 
 
 def read_bag(path: str | os.PathLike[str]) -> Bag:
-    """Open a bag for reading; at first, only its summary is read.
+    """Open a bag for reading; initially, only its summary is read.
 
-    ``path`` is an MCAP file, a folder with one bag, as ``ros2 bag record`` makes it, or the name
+    ``path`` is an MCAP file, a folder with one bag, as created by ``ros2 bag record``, or the name
     ``NAME.mcap`` of a recording that was split into ``NAME_0.mcap``, ``NAME_1.mcap``, ... All files
-    of a folder or a recording are one bag.
+    in a folder or split recording form one bag.
 
     Raises
     ------
     RecordingError
-        There is no such bag, it is not MCAP, was cut short or is damaged.
+        There is no such bag, or it is not MCAP, is truncated or is damaged.
     """
     given, files = Path(path), bag_files(Path(path))
     return Bag(given if given.is_dir() and len(files) > 1 else files[0], files)
 
 
 def iterate_raw(path: str | os.PathLike[str]) -> Iterator[tuple[str, str, int, int, bytes]]:
-    """Iterate over all messages of a bag, still serialised, in the order they were written.
+    """Iterate over all messages of a bag, still serialised, in write order.
 
     Yields
     ------
@@ -77,7 +77,7 @@ def iterate_raw(path: str | os.PathLike[str]) -> Iterator[tuple[str, str, int, i
     Raises
     ------
     RecordingError
-        See :func:`read_bag`; raised when the first message or a damaged one is requested.
+        See :func:`read_bag`; raised when the first or a damaged message is requested.
     """
     for file in map(BagFile, bag_files(Path(path))):
         types = {channel.topic: channel.type_name for channel in file.channels}
@@ -96,14 +96,14 @@ def salvaged_copy(path: Path) -> Path:
 
 
 def bag_files(path: Path) -> list[Path]:
-    """Return the files of a bag in order: all of a folder or a split recording, or one file.
+    """Return the files of a bag in order: all files in a folder or a split recording, or one file.
 
     If there are several files, salvaged copies replace truncated ones.
 
     Raises
     ------
     RecordingError
-        A folder has no MCAP file, or several that its ``metadata.yaml`` does not list.
+        A folder has no MCAP file, or has several that are not listed in its ``metadata.yaml``.
     """
     if path.is_dir():
         return _files_of_folder(path)
@@ -134,10 +134,10 @@ def _files_of_folder(folder: Path) -> list[Path]:
     found = (sorted(folder.glob(f"*{suffix}")) for suffix in (".mcap", ".mcap.zst*", ".db3"))
     files = next(filter(None, found), [])
     if not files:
-        raise RecordingError(f"The folder {folder} holds no bag: name an MCAP file.")
+        raise RecordingError(f"The folder {folder} contains no bag: name an MCAP file.")
     if len(files) != 1:
         raise RecordingError(
-            f"The folder {folder} holds {len(files)} MCAP files: name one of them."
+            f"The folder {folder} contains {len(files)} MCAP files: name one of them."
         )
     return files
 
@@ -159,14 +159,14 @@ def _listed_files(folder: Path) -> list[str]:
 class Bag(Mapping[str, TopicSeries]):
     """A bag as time series: ``bag["odom"].field("pose.pose.position.x")``.
 
-    It maps the names of its topics, with or without the leading slash, to their messages. A topic
-    is read on first access and cached. The file is not kept open.
+    It maps topic names, with or without the leading slash, to their messages. A topic
+    is read on first access and cached. The file does not stay open.
 
     Raises
     ------
     RecordingError
-        In the constructor, see :func:`read_bag`; in methods, if there is no such topic, the bag is
-        damaged, or pandas or xarray is not installed.
+        In the constructor, as in :func:`read_bag`; in methods, if there is no such topic, the bag
+        is damaged, or pandas or xarray is not installed.
     """
 
     def __init__(self, path: Path, files: Sequence[Path] | None = None) -> None:
@@ -186,7 +186,7 @@ class Bag(Mapping[str, TopicSeries]):
 
     @cached_property
     def topics(self) -> dict[str, str]:
-        """Type of every recorded topic by its name, including topics without messages."""
+        """Type of every recorded topic by topic name, including topics without messages."""
         return {name: each[-1].type_name for name, each in self._channels_by_topic.items()}
 
     def __iter__(self) -> Iterator[str]:
@@ -205,7 +205,7 @@ class Bag(Mapping[str, TopicSeries]):
         return isinstance(topic, str) and self._recorded_name(topic) in self.topics
 
     def get(self, topic: str, default: Any = None) -> Any:
-        """Return the messages of a topic, or ``default`` if there is no such topic."""
+        """Return the messages on a topic, or ``default`` if there is no such topic."""
         if topic in self:
             return self[topic]
         return default
@@ -242,19 +242,20 @@ class Bag(Mapping[str, TopicSeries]):
     def _recorded_name(self, topic: str) -> str:
         """Return the recorded name of a topic, which may be given without its leading slash."""
         if not isinstance(topic, str):
-            raise TypeError(f"The name of a topic is a text, such as 'odom', not {topic!r}.")
+            raise TypeError(f"A topic name must be a string, such as 'odom', not {topic!r}.")
         other = topic[1:] if topic.startswith("/") else f"/{topic}"
         return other if topic not in self.topics and other in self.topics else topic
 
     @cached_property
     def metadata(self) -> dict[str, dict[str, str]]:
-        """Keys and values of every metadata record by name; the last of equal names takes
+        """Keys and values of every metadata record by name; if names are equal, the last one takes
         precedence."""
         return {each.name: each.metadata for each in self._records(Metadata)}
 
     @cached_property
     def attachments(self) -> dict[str, bytes]:
-        """Content of every attachment by name; the last of equal names takes precedence."""
+        """Content of every attachment by name; if names are equal, the last one takes
+        precedence."""
         return {each.name: each.data for each in self._records(Attachment)}
 
     def _records(self, kind: type[RecordT]) -> Iterator[RecordT]:
@@ -293,7 +294,7 @@ class Bag(Mapping[str, TopicSeries]):
         return [file.statistics for file in self._files if file.statistics.message_count]
 
     def message_count(self, topic: str | None = None) -> int:
-        """Return the number of messages of a topic, or of the whole bag."""
+        """Return the number of messages on a topic, or in the whole bag."""
         if topic is None:
             return sum(int(each.message_count) for each in self._statistics)
         return sum(channel.message_count for channel in self._channels(topic))
@@ -301,7 +302,7 @@ class Bag(Mapping[str, TopicSeries]):
     def raw_messages(
         self, topics: Sequence[str], start_ns: int = 0, end_ns: int = 2**63 - 1
     ) -> Iterator[tuple[str, int, bytes]]:
-        """Iterate over the messages of some topics, still serialised, by log time.
+        """Iterate over the messages on some topics by log time, still serialised.
 
         Yields
         ------
@@ -315,16 +316,16 @@ class Bag(Mapping[str, TopicSeries]):
                 yield topics[number], time_ns, data
 
     def qos(self, topic: str) -> list[QosProfile]:
-        """Return the recorded quality of service of the publishers of a topic."""
+        """Return the recorded QoS of a topic's publishers."""
         texts = [c.offered_qos for c in self._channels(topic)]
         return [profile for text in texts for profile in QosProfile.from_yaml(text)]
 
     def times(self, topic: str) -> NDArray[np.float64]:
-        """Return the log times of a topic in seconds, shape (N,)."""
+        """Return the log times on a topic in seconds, shape (N,)."""
         return self[topic].time
 
     def messages(self, topic: str) -> Iterator[tuple[int, Any]]:
-        """Iterate over the decoded messages of a topic by log time.
+        """Iterate over the decoded messages on a topic by log time.
 
         Yields
         ------
@@ -343,9 +344,9 @@ class Bag(Mapping[str, TopicSeries]):
     ) -> pandas.DataFrame | dict[str, pandas.DataFrame]:
         """Return a topic as a pandas DataFrame, or all readable topics by name.
 
-        The index is the log time in seconds, ``attrs["units"]`` has the units of the columns; see
+        The index is the log time in seconds, and ``attrs["units"]`` contains the column units; see
         :func:`~spacerobot_ros.bag.tables.table_of` for the columns. If ``euler`` is set, the
-        columns ``roll``, ``pitch`` and ``yaw`` have the rotations of each attitude about the fixed
+        columns ``roll``, ``pitch`` and ``yaw`` contain each attitude as rotations about the fixed
         axes x, y, z (rad).
         """
         if topic is not None:
@@ -363,7 +364,7 @@ class Bag(Mapping[str, TopicSeries]):
     ) -> xarray.Dataset | dict[str, xarray.Dataset]:
         """Return a topic as an xarray Dataset, or all readable topics by name.
 
-        Arrays remain arrays, over ``time`` and ``joint`` for joint states; every variable has its
+        Arrays remain arrays, over ``time`` and ``joint`` for joint states; every variable has
         ``units``. ``euler``: see :meth:`to_pandas`.
         """
         if topic is not None:
@@ -371,9 +372,9 @@ class Bag(Mapping[str, TopicSeries]):
         return {name: to_xarray(table) for name, table in self.tables(euler=euler).items()}
 
     def table(self, topic: str, *, euler: bool = False) -> TopicTable:
-        """Return a topic as a table; the units of joints follow the URDF in the bag.
+        """Return a topic as a table; joint units follow the URDF in the bag.
 
-        ``euler``: whether to add ``roll``, ``pitch`` and ``yaw`` of attitudes.
+        ``euler``: whether to add ``roll``, ``pitch`` and ``yaw`` for attitudes.
         """
         series = self[topic]
         found = table_of(series, self._prismatic_joints(series.topic.rpartition("/")[0]))
@@ -410,10 +411,10 @@ class Bag(Mapping[str, TopicSeries]):
         return found
 
     def robot_descriptions(self, namespace: str = "", *, others: bool = True) -> list[bytes]:
-        """Return candidates for the URDF of the robot in a namespace, the likeliest first.
+        """Return candidate URDFs for the robot in a namespace, most likely first.
 
         The file attached for the robot comes first, then its last robot_description, then, if
-        ``others`` is set, the other attached ones.
+        ``others`` is set, other attached files.
         """
         topic = f"{namespace}/robot_description"
         attached = {n: text for n, text in self.attachments.items() if n.endswith(".urdf")}
@@ -444,7 +445,7 @@ class Bag(Mapping[str, TopicSeries]):
         return self._series_by_topic[topic]
 
     def load(self, topics: Iterable[str]) -> None:
-        """Read topics together, in one pass over the file; unreadable ones are omitted.
+        """Read several topics in one pass over the file; unreadable topics are omitted.
 
         They stay in memory.
         """
@@ -513,19 +514,19 @@ def _format_list(names: list[str], most: int = 40) -> str:
 
 
 def columns(topic: str, path: str) -> list[str]:
-    """Return the paths of a state topic's numbers below a path of its message."""
+    """Return the paths of a state topic's numeric fields below a message path."""
     return next(field.columns for field in TOPICS[topic].state if field.path == path)
 
 
 class RecordedRobot:
-    """The topics of one robot in a bag, by their names without its namespace.
+    """The topics of one robot in a bag, by name relative to its namespace.
 
     Parameters
     ----------
     bag
         The recording.
     namespace
-        Of the robot's topics, such as ``/robot_1``; empty for none.
+        Namespace of the robot's topics, such as ``/robot_1``; empty for none.
     """
 
     def __init__(self, bag: Bag, namespace: str = "") -> None:
@@ -533,12 +534,12 @@ class RecordedRobot:
         self.namespace = namespace
 
     def topic_names(self) -> list[str]:
-        """Return the names of all topics of the robot, without its namespace."""
+        """Return the names of all topics of the robot, relative to its namespace."""
         prefix = f"{self.namespace}/"
         return [name.removeprefix(prefix) for name in self.bag.topics if name.startswith(prefix)]
 
     def get(self, name: str) -> TopicSeries | None:
-        """Return a topic of the stack; None if it has no message or another type."""
+        """Return a topic published by the stack; None if it has no messages or a different type."""
         topic = f"{self.namespace}/{name}"
         if self.bag.topics.get(topic) != topic_named(name).type or not self.bag.message_count(
             topic
@@ -551,7 +552,7 @@ class RecordedRobot:
         return self.get(name) is not None
 
     def load(self, names: Iterable[str]) -> None:
-        """Read the topics of the stack that the bag has, together: see :meth:`Bag.load`."""
+        """Read all topics of the stack in the bag in one pass; see :meth:`Bag.load`."""
         types = {f"{self.namespace}/{name}": topic_named(name).type for name in names}
         self.bag.load(topic for topic, kind in types.items() if self.bag.topics.get(topic) == kind)
 
@@ -566,14 +567,16 @@ class RecordedRobot:
         series = self.get(name)
         if series is None:
             topic = f"{self.namespace}/{name}"
-            raise RecordingError(f"The bag {self.bag.path} holds no state: nothing is on {topic}.")
+            raise RecordingError(
+                f"The bag {self.bag.path} contains no state: no messages on {topic}."
+            )
         return series
 
     @property
     def metadata(self) -> dict[str, dict[str, str]]:
-        """Metadata records of the bag by name; this robot's nodes have ``parameters/NODE``.
+        """Metadata records by name; this robot's nodes use ``parameters/NODE``.
 
-        A recorder in the namespace of the robot uses these names.
+        A recorder in the robot's namespace uses these names.
         """
         before = f"parameters{self.namespace}/"
         return {
@@ -587,7 +590,7 @@ class RecordedRobot:
 
     @property
     def joint_names(self) -> list[str]:
-        """Names of the joints in the order of ``joint_states``; empty without that topic."""
+        """Joint names in ``joint_states`` order; empty without that topic."""
         return self.names("joint_states")
 
     def names(self, topic: str) -> list[str]:
@@ -597,5 +600,5 @@ class RecordedRobot:
 
     @property
     def urdf(self) -> bytes | None:
-        """The description of the robot: the attached file, or else the last robot_description."""
+        """Robot description: the attached file, otherwise the last robot_description."""
         return next(iter(self.bag.robot_descriptions(self.namespace, others=False)), None)

@@ -1,4 +1,4 @@
-"""Recording of serialised messages: the time base of a bag, latched topics, failures."""
+"""Recording of serialised messages: bag time base, latched topics and failures."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from spacerobot_ros.times import SECOND
 
 
 class RecordingState(Enum):
-    """Treatment of messages that arrive at a recorder."""
+    """Handling of messages that arrive at a recorder."""
 
     PAUSED = "paused"
     """Messages are dropped; the last one of each latched topic is kept until recording starts."""
@@ -24,10 +24,10 @@ class RecordingState(Enum):
     """Messages are kept in memory until it is known whether a clock is published."""
 
     ON_CLOCK = "on clock"
-    """Messages are written with the time of the published clock."""
+    """Messages are written with the published clock time."""
 
     ON_WALL_TIME = "on wall time"
-    """Messages are written with the wall time of their arrival."""
+    """Messages are written with their wall arrival time."""
 
     FAILED = "failed"
     """Messages are dropped because the disk is full or lost; earlier messages are kept."""
@@ -49,18 +49,18 @@ class _EarlyMessage(NamedTuple):
 
 
 class Recording:
-    """Writes messages with one time base for the whole bag; begins paused.
+    """Writes messages with one time base for the whole bag; starts paused.
 
-    Messages get the time of the clock; messages before its first message get the time of that
-    message. If no clock is published for ``clock_wait``, all get the wall time of their arrival.
+    Messages are logged at clock time; messages before the first clock message are logged at its
+    time. If no clock is published for ``clock_wait``, all are logged at their wall arrival time.
     The choice is final, because a bag has one time base.
 
     Parameters
     ----------
     writer
-        The bag, which is closed with the recording.
+        The bag, which is closed together with the recording.
     clock_wait
-        Longest wait of the first message for a clock, wall time in s.
+        Longest time that the first message waits for a clock, wall time in s.
     on_failure
         Called once, with the reason, if writing fails.
     wall_time
@@ -77,23 +77,23 @@ class Recording:
         self.writer = writer
         self.state = RecordingState.PAUSED
         self.now_ns = 0
-        """The latest time of the clock, or the arrival of the latest message, ns."""
+        """Latest clock time, or arrival time of the latest message, ns."""
         self.messages = 0
         """Number of messages written to the bag."""
         self.clock_steps_back = 0
-        """Number of times the clock went back: once at a restart, repeatedly with two clocks."""
+        """Number of times the clock jumped back: once at a restart, repeatedly with two clocks."""
         self.lost: Counter[str] = Counter()
         """Number of messages of each topic that were published but never received."""
         self.attached: set[str] = set()
-        """Names of the files in the bag."""
+        """File names in the bag."""
         self.latched: dict[int, _EarlyMessage | None] = {}
-        """Last message received during a pause, by the channel of its latched topic."""
+        """Last message of each latched topic received during a pause, by channel."""
         self.failure: RecordingError | None = None
         self._clock_wait_ns = clock_wait * SECOND
         self._on_failure = on_failure
         self._wall_time = wall_time
         self.early_messages: list[_EarlyMessage] = []
-        """Messages that wait until the time base of the bag is chosen."""
+        """Messages that wait until the bag's time base is chosen."""
         self._time_base: RecordingState | None = None
         self._write = writer.write
 
@@ -103,7 +103,7 @@ class Recording:
         return self.state not in _DROPPING_STATES
 
     def start(self) -> None:
-        """Start recording, with the last earlier message of every latched topic."""
+        """Start recording, including the last earlier message of every latched topic."""
         if self.state is not RecordingState.PAUSED:
             return
         self.state = self._time_base or RecordingState.WAITING
@@ -118,7 +118,7 @@ class Recording:
             self.state = RecordingState.PAUSED
 
     def set_clock(self, time_ns: int) -> None:
-        """Set the time of the clock; without effect once the bag uses wall time."""
+        """Set the clock time; has no effect once the bag uses wall time."""
         if self._time_base is RecordingState.ON_WALL_TIME:
             return
         self.clock_steps_back += time_ns < self.now_ns
@@ -127,9 +127,9 @@ class Recording:
             self._choose_time_base(RecordingState.ON_CLOCK)
 
     def record(self, channel: int, message: bytes, published_ns: int = 0) -> None:
-        """Write a message, or keep it until the time base of the bag is chosen.
+        """Write a message, or keep it until the bag's time base is chosen.
 
-        ``published_ns`` is its stamp; 0: the time at which it is recorded.
+        ``published_ns`` is its stamp; 0: the recording time.
         """
         if self.state is not RecordingState.ON_CLOCK:
             arrival_ns = self._wall_time()
@@ -153,7 +153,7 @@ class Recording:
         self.messages += 1
 
     def flush(self, clock_is_published: bool) -> None:
-        """Write data in memory to the file once per flush period of wall time."""
+        """Write buffered data to the file once per flush period (wall time)."""
         if self.early_messages and not clock_is_published:
             waited_ns = self._wall_time() - self.early_messages[0].arrival_ns
             if waited_ns > self._clock_wait_ns:
@@ -169,7 +169,7 @@ class Recording:
         self._fail_on_error(lambda: self.writer.add_metadata(name, values))
 
     def attach_robot(self, name: str, urdf: bytes) -> None:
-        """Attach a robot description and its meshes, if they exist on this machine."""
+        """Attach a robot description, and its meshes if they exist on this machine."""
         # Importing the robot model doubles the import time of this module.
         from spacerobot_ros.model.urdf import parse_robot
         from spacerobot_ros.model.visuals import meshes_for_bag
@@ -186,13 +186,13 @@ class Recording:
         self._fail_on_error(lambda: self.writer.add_attachment(name, data, media_type, self.now_ns))
 
     def close(self) -> None:
-        """Write the remaining data and the message counts, and complete the bag, unless done
-        already.
+        """Write the remaining data and the message counts, and complete the bag if this has not
+        been done yet.
 
         Raises
         ------
         RecordingError
-            Writing failed, and no earlier call has reported it.
+            Writing failed, and no earlier call reported it.
         """
         if self.state is RecordingState.CLOSED:
             return

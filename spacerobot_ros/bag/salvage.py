@@ -1,4 +1,4 @@
-"""Recovers bags that were cut off or damaged: a complete bag, or the last state in one."""
+"""Recovers truncated or damaged bags: a complete bag, or the last state in a bag."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ from spacerobot_ros.times import SECOND
 
 _STATE_TOPICS = ("odom", "joint_states", "momentum")
 _WITHOUT_STATES = ("inactive", "failed")
-"""Plant states without published robot states."""
+"""Plant states in which no robot state is published."""
 
 
 @dataclass(frozen=True)
@@ -62,11 +62,11 @@ class Salvaged:
     path
         The new bag.
     messages, duration
-        Messages in it, and the time in s that they span.
+        Number of messages in the new bag, and the time span in s.
     lost_chunks
         Chunks that could not be read.
     loss_reason
-        Why the first lost chunk could not be read; empty if no chunk is lost.
+        Why the first lost chunk could not be read; empty if no chunk was lost.
     lost_bytes
         Bytes after the last complete record, which are not in the new bag.
     """
@@ -85,13 +85,13 @@ def salvage_bag(
     """Write the readable records of a bag into a new, complete one; the old one is unchanged.
 
     ``out`` is the new file, which must not exist; by default ``NAME-salvaged.mcap`` next to the old
-    one. If a bag has several files, the first incomplete one is salvaged.
+    file. If a bag has several files, the first incomplete one is salvaged.
 
     Raises
     ------
     RecordingError
-        There is no such bag, it is not MCAP, it is already complete, nothing in it can be read, or
-        the new one cannot be written.
+        There is no such bag, or it is not MCAP, is already complete or is unreadable, or the new
+        one cannot be written.
     """
     source = next((file for file in bag_files(Path(path)) if not is_complete(file)), None)
     if source is None:
@@ -101,7 +101,7 @@ def salvage_bag(
         start = old.read(MAGIC_SIZE)
         require_mcap(source, start)
         if start != MCAP0_MAGIC:
-            raise RecordingError(f"{source} holds nothing yet: there is nothing to salvage.")
+            raise RecordingError(f"{source} is still empty: there is nothing to salvage.")
         profile = "ros2"
         with suppress(*DAMAGE_ERRORS):
             profile = read_record(old, MAGIC_SIZE, Header).profile
@@ -147,9 +147,9 @@ class _Copy:
         self.loss_reason = ""
         self._file = file
         self._schemas: dict[int, tuple[int, str]] = {}
-        """New number and name, by number in the old file."""
+        """New ID and name, by ID in the old file."""
         self._channels: dict[int, tuple[int, Channel]] = {}
-        """New number and old record, by number in the old file."""
+        """New ID and old record, by ID in the old file."""
 
     def add_readable_records(self, old: BinaryIO) -> None:
         """Add the readable content of a file, up to the first truncated record."""
@@ -204,7 +204,7 @@ class _Copy:
                 self._file.add_metadata(metadata.name, metadata.metadata)
 
     def topics(self) -> list[RecordedTopic]:
-        """Return all topics for rosbag2's record, including topics without messages."""
+        """Return all topics for rosbag2's topic record, including topics without messages."""
         topics = []
         for number, channel in self._channels.values():
             count, words = self._file.message_counts[number], channel.metadata
@@ -222,23 +222,23 @@ class _Copy:
 
 @dataclass(frozen=True)
 class LastState:
-    """The last recorded state of a robot.
+    """A robot's last recorded state.
 
     Attributes
     ----------
     time_ns
         Stamp of the state.
     position, quaternion
-        Pose of the base link in the world: (3,) m and (x, y, z, w).
+        Base link pose in the world: (3,) m and (x, y, z, w).
     joint_names, joints, rates
-        Names, positions and velocities (n,) of the joints.
+        Joint names, positions and velocities (n,).
     momenta
-        Linear, then angular momentum in the world (6,), of robot and held body together.
+        Linear over angular momentum in the world (6,), of the robot and held body together.
     target
-        Pose (7,) of the target's root link in the world, then its twist (6,) in T; None: there is
+        Pose (7,) of the target's root link in the world, and its twist (6,) in T; None: there is
         no target.
     payload
-        The body that the robot holds, as the text of ``plant/status``; empty: none.
+        The body that the robot holds, as a string from ``plant/status``; empty: none.
     """
 
     time_ns: int
@@ -255,7 +255,7 @@ class LastState:
 def last_state(path: str | os.PathLike[str], namespace: str = "") -> LastState:
     """Read the last state whose pose, joints and momenta were recorded.
 
-    A bag that was cut off is read as far as possible. ``namespace`` is the plant's.
+    A truncated bag is read as far as possible. ``namespace`` is the plant's.
 
     Raises
     ------
@@ -277,7 +277,7 @@ def _last_state(robot: RecordedRobot) -> LastState:
     # momenta k.
     common = np.intersect1d(odom.stamp_ns, joints.stamp_ns)
     if not len(common):
-        raise RecordingError(f"The bag {robot.bag.path} holds no complete state.")
+        raise RecordingError(f"The bag {robot.bag.path} contains no complete state.")
     k, j = (int(np.flatnonzero(series.stamp_ns == common[-1])[-1]) for series in (odom, joints))
     pose = odom.table(columns("odom", "pose.pose"))[k]
     names = robot.joint_names
@@ -288,7 +288,7 @@ def _last_state(robot: RecordedRobot) -> LastState:
     whole = len(positions) == len(rates) == len(names) and len(momenta) == 6
     if not (whole and np.isfinite(numbers).all()):
         raise RecordingError(
-            f"The last state in the bag {robot.bag.path} lacks numbers, or they are not finite."
+            f"The last state in the bag {robot.bag.path} has missing or non-finite values."
         )
     return LastState(
         time_ns=int(common[-1]),

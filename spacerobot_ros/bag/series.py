@@ -1,4 +1,4 @@
-"""One topic of a bag as time series."""
+"""One topic in a bag as time series."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from spacerobot_ros.times import SECOND
 JOINT_STATE = "sensor_msgs/msg/JointState"
 _BY_JOINT = ("name", "position", "velocity", "effort")
 _MAX_JOINTS = 50
-"""Largest number of joint names on a topic, as a multiple of those in its longest message."""
+"""Largest number of joint names on a topic, relative to its longest message."""
 
 _HEADER = (Nodetype.NAME, "std_msgs/msg/Header")
 
@@ -31,14 +31,14 @@ _DECODING_ERRORS = (SerdeError, ValueError, IndexError, OverflowError, TypeError
 
 
 class TopicSeries:
-    """The messages of one topic in order of log time; ``bag[topic]`` makes it.
+    """The messages on one topic in log time order; ``bag[topic]`` makes it.
 
     Attributes
     ----------
     topic, type_name
-        Name of the topic and of the type of its messages.
+        Topic name and message type.
     time_ns
-        Log times in nanoseconds, not decreasing, shape (N,), read-only.
+        Non-decreasing log times in nanoseconds, shape (N,), read-only.
     data
         Serialised messages.
     """
@@ -72,7 +72,7 @@ class TopicSeries:
 
     @property
     def paths(self) -> list[str]:
-        """Paths of the fields, for :meth:`field`; a list of messages has one path."""
+        """Field paths, for :meth:`field`; a list of messages has one path."""
         return list(self._leaf_paths(self.type_name, ""))
 
     def _leaf_paths(self, type_name: str, prefix: str) -> Iterator[str]:
@@ -83,7 +83,7 @@ class TopicSeries:
                 yield prefix + name
 
     def element_type(self, path: str) -> str:
-        """Return the type of a message field or of a list's messages; else empty.
+        """Return the type of a message field or of the messages in a list; otherwise empty.
 
         Raises
         ------
@@ -99,12 +99,12 @@ class TopicSeries:
 
     @property
     def stamp(self) -> NDArray[np.float64]:
-        """Stamps of the headers in seconds (N,), a copy; the log times if messages have none."""
+        """Header stamps in seconds (N,), a copy; log times if messages have no header."""
         return np.asarray(self.stamp_ns / SECOND)
 
     @cached_property
     def stamp_ns(self) -> NDArray[np.int64]:
-        """Stamps of the headers in nanoseconds (N,), read-only; log times without headers."""
+        """Header stamps in nanoseconds (N,), read-only; log times if messages have no header."""
         if not self.stamped:
             return self.time_ns
         seconds, nanoseconds = self.field("header.stamp.sec"), self.field("header.stamp.nanosec")
@@ -123,15 +123,15 @@ class TopicSeries:
         Parameters
         ----------
         path
-            Path of the field, such as ``pose.pose.position.x``. It may lead through a list of
+            Field path, such as ``pose.pose.position.x``. It may lead through a list of
             messages, as ``points.positions`` does.
 
         Returns
         -------
-        An array of shape (N,) for a number, of shape (N, k) for k numbers in each message, with
-        whole numbers as 64-bit integers and others as float64. A list of N values
-        for everything else: strings, lists, messages, arrays that differ in length. Arrays of joint
-        states and their names are in the order of :attr:`joint_names`; joints missing in a message
+        An array of shape (N,) for a number, or (N, k) for k numbers per message; integers are
+        64-bit, other numbers float64. A list of N values for everything
+        else: strings, lists, messages, arrays of varying length. Joint state
+        arrays and names are in :attr:`joint_names` order; joints missing in a message
         are nan.
 
         Raises
@@ -161,10 +161,10 @@ class TopicSeries:
 
     @cached_property
     def joint_names(self) -> list[str]:
-        """Names of the joints or thrusters of joint states, in the order of their first messages.
+        """Joint or thruster names in joint states, in order of first appearance.
 
-        Positions, velocities and efforts have one column for each. Empty for messages of other
-        types, and if names are missing or repeated.
+        Positions, velocities and efforts have one column per name. Empty for other message types,
+        or if names are missing or repeated.
         """
         if self.type_name != JOINT_STATE or not len(self):
             return []
@@ -181,10 +181,10 @@ class TopicSeries:
         return self._columns is not None and self._columns.constant("name")
 
     def of_joints(self, path: str, names: Sequence[str]) -> NDArray[np.float64]:
-        """Return an array of joint states by joints: shape (N, n); nan if a joint is missing.
+        """Return a joint state array of shape (N, n), a column per joint; nan if a joint is
+        missing.
 
-        ``path`` is ``position``, ``velocity`` or ``effort``, and ``names`` are the names of n
-        joints.
+        ``path`` is ``position``, ``velocity`` or ``effort``, and ``names`` are n joint names.
         """
         found = _field_matrix(self.field(path), len(self.joint_names))
         places = {name: k for k, name in enumerate(self.joint_names)}
@@ -209,18 +209,18 @@ class TopicSeries:
         return made
 
     def table(self, fields: Sequence[str], width: int | None = None) -> NDArray[np.float64]:
-        """Return number fields of all messages as a matrix with one row for each message.
+        """Return numeric fields of all messages as a matrix with one row per message.
 
         Parameters
         ----------
         fields
-            Paths as for :meth:`field`, all of one number, or all of one array.
+            Paths as in :meth:`field`, all of scalars or all of arrays.
         width
-            Columns of the table, the same number for every field; by default one for each field.
+            Number of columns, equal for all fields; by default one per field.
 
         Returns
         -------
-        Shape (N, width). If a message has another number of values in a field, the values are nan.
+        Shape (N, width). If a field of a message has a different number of values, they are nan.
 
         Raises
         ------
@@ -262,7 +262,7 @@ class TopicSeries:
         size = sum(map(len, self.data))
         if size > self._max_decoded_bytes:
             raise RecordingError(
-                f"The messages on {self.topic} have {size} bytes; the limit "
+                f"The messages on {self.topic} total {size} bytes; the limit "
                 f"for a bag of this size is {self._max_decoded_bytes:.0f} bytes."
             )
 

@@ -1,7 +1,7 @@
-"""Messages of a topic as a table, and tables for pandas, xarray, CSV, Parquet and MATLAB.
+"""Topic messages as a table, for pandas, xarray, CSV, Parquet and MATLAB.
 
-A row is a message, a column a number or a text. A table has the units of its numbers and the joint
-names of array entries.
+Each row is a message, each column contains numbers or strings. A table includes units, and joint
+names for array entries.
 """
 
 from __future__ import annotations
@@ -35,17 +35,17 @@ if TYPE_CHECKING:
 _KEY_VALUES = "diagnostic_msgs/msg/KeyValue"
 _HEADER_STAMP = ("header.stamp.sec", "header.stamp.nanosec")
 _TIME_COLUMNS = ("time", "time_ns", "stamp", "stamp_ns")
-"""Time columns of every table; a message field of the same name gets the prefix ``message``."""
+"""Time columns in every table; a message field with the same name gets the prefix ``message``."""
 
 _MAX_ARRAY_COLUMNS = 1000
-"""Largest array that becomes columns; images, for example, do not."""
+"""Largest array that is split into columns; images, for example, are not."""
 
 _JOINT_UNITS = {
     "position": ("m", "rad"),
     "velocity": ("m/s", "rad/s"),
     "effort": ("N", "N m"),
 }
-"""Units of joint states: of a prismatic joint, and of a revolute one."""
+"""Joint state units: for prismatic and for revolute joints."""
 
 _THRUSTER_UNITS = {"position": "s", "velocity": "1", "effort": "N"}
 _MOMENTUM_UNITS = {"linear": "kg m/s", "angular": "kg m^2/s", "kinetic": "J"}
@@ -61,23 +61,23 @@ _UNITS_BY_PATH_ENDING = tuple(
         (r"torque\.[xyz]", "N m"),
     )
 )
-"""SI unit (REP 103) of a field by the suffix of its path, because messages have no units."""
+"""SI unit (REP 103) of a field by path suffix, because messages contain no units."""
 
 
 @dataclass(frozen=True)
 class Field:
-    """One field of all messages of a topic.
+    """One field of all messages on a topic.
 
     Attributes
     ----------
     path
         Path in a message, such as ``pose.pose.position.x``, or ``position`` for an array.
     values
-        Numbers (N,), numbers (N, k), or texts (N,) as objects.
+        Numbers (N,) or (N, k), or strings (N,) as objects.
     units
-        One for each column; empty if it is not known or there is none.
+        One per column; empty if unknown or not applicable.
     labels
-        Names of the k entries of an array; empty for one value a message.
+        Names of the k array entries; empty for one value per message.
     column_kind
         Kind of the entries: ``joint``, ``thruster``, or ``entry``.
     """
@@ -90,7 +90,7 @@ class Field:
 
     @property
     def columns(self) -> list[str]:
-        """Names of the columns: the path, and in brackets the entry of an array."""
+        """Column names: the path, with the array entry in brackets."""
         if self.values.ndim == 1:
             return [self.path]
         return [f"{self.path}[{label}]" for label in self.labels]
@@ -98,17 +98,17 @@ class Field:
 
 @dataclass(frozen=True)
 class TopicTable:
-    """The messages of a topic as a table, a row each, in the order of their log times.
+    """The messages on a topic as a table, one row each, in log time order.
 
     Attributes
     ----------
     topic, type_name
-        Name of the topic and of the type of its messages.
+        Topic name and message type.
     time
-        Log times in seconds, shape (N,): simulated time in a bag of this stack.
+        Log times in seconds, shape (N,): simulated time in bags from this stack.
     fields
-        The columns, arrays in one piece. The first is ``time_ns``, the log time in whole
-        nanoseconds. If the messages have a header, its time follows: ``stamp`` in seconds and
+        The fields; an array is one field. The first is ``time_ns``, the log time in whole
+        nanoseconds. If the messages have a header, its stamp follows: ``stamp`` in seconds and
         ``stamp_ns``.
     """
 
@@ -131,20 +131,20 @@ class TopicTable:
 
     @property
     def units(self) -> dict[str, str]:
-        """Unit of every column by its name; empty if it is not known or there is none."""
+        """Unit of every column by name; empty if unknown or not applicable."""
         pairs = (zip(field.columns, field.units, strict=True) for field in self.fields)
         return {name: unit for each in pairs for name, unit in each}
 
 
 def table_of(series: TopicSeries, prismatic: Mapping[str, bool] | None = None) -> TopicTable:
-    """Return the messages of a topic as a table.
+    """Return the messages on a topic as a table.
 
-    Numbers and texts become columns; an array that has the same length in every message, of at most
-    a thousand entries, becomes one column per entry, named after the joint or thruster if the
-    messages have names. The keys of a status become one column each, empty if a message lacks the
-    key. All else, such as the points of a path, is JSON in one column of texts.
+    Numbers and strings become columns; an array with the same length (at most a thousand entries)
+    in every message becomes one column per entry, named after the joint or thruster if the messages
+    contain names. Each status key becomes a column, empty if a message lacks the key.
+    Everything else, such as path points, is JSON in one string column.
 
-    Seconds are float64, which loses the last digits of wall time; nanoseconds are integers.
+    Seconds are float64 and lose the last digits of wall time; nanoseconds are integers.
 
     Parameters
     ----------
@@ -192,16 +192,16 @@ def _table_fields(
 def array_field(
     topic: str, path: str, values: NDArray[Any], names: Sequence[str], prismatic: Mapping[str, bool]
 ) -> Field:
-    """Return an array of the messages of a topic as a field, with labels and units.
+    """Return an array in a topic's messages as a field, with labels and units.
 
     Parameters
     ----------
     topic
-        Name of the topic without its namespace.
+        Topic name without its namespace.
     values
         Numbers (N, k).
     names
-        Names in joint states, of joints or thrusters.
+        Joint or thruster names in joint states.
     prismatic
         As of :func:`table_of`.
     """
@@ -223,12 +223,12 @@ def array_field(
 
 
 def number_field(path: str, values: NDArray[Any]) -> Field:
-    """Return one number (N,) of each message as a field, with the unit of its path."""
+    """Return one number per message (N,) as a field, with the unit of its path."""
     return Field(path, values, (_unit_of_path(path),))
 
 
 def with_euler_angles(table: TopicTable) -> TopicTable:
-    """Return a table that also has each attitude as rotations about the fixed axes x, y, z.
+    """Return a table with each attitude also given as rotations about the fixed axes x, y, z.
 
     The fields ``roll``, ``pitch`` and ``yaw`` (rad) are siblings of ``orientation``:
     ``pose.pose.yaw`` and ``pose.pose.orientation.z``.
@@ -289,11 +289,11 @@ def _json_value(value: Any) -> Any:
 
 
 COLUMNS = "_columns.csv"
-"""File next to CSV tables: topic, file, column and unit of every column."""
+"""File stored with CSV tables: topic, file, name and unit of every column."""
 
 _UNSAFE_CHARACTERS = re.compile(r"[^A-Za-z0-9_.-]+")
 _MAX_VARIABLE_NAME = 63
-"""Longest name of a variable in MATLAB, characters."""
+"""Longest variable name in MATLAB, characters."""
 
 _MATLAB_KEYWORD = re.compile(
     "break|case|catch|classdef|continue|else|elseif|end|for|function|global|if|otherwise|parfor|"
@@ -308,7 +308,7 @@ class ExportFormat(str, Enum):
     PARQUET = "parquet"
     MAT = "mat"
     TREE = "tree"
-    """CSV whose columns PlotJuggler shows as a tree: ``joint_states/position/elbow``."""
+    """CSV with columns that PlotJuggler shows as a tree: ``joint_states/position/elbow``."""
 
 
 def to_pandas(table: TopicTable) -> pandas.DataFrame:
@@ -354,31 +354,31 @@ def to_xarray(table: TopicTable) -> xarray.Dataset:
 def export(
     tables: Iterable[TopicTable], path: str | os.PathLike[str], format: ExportFormat
 ) -> dict[str, int]:
-    """Write tables for other programs; return the number of rows of each written topic.
+    """Write tables for other programs; return the number of rows written per topic.
 
-    CSV, tree and Parquet make a folder with a file for each topic that has messages (``odom.csv``,
-    ``planner.status.csv``); MAT makes one file with a struct for each. Nothing is overwritten, and
-    incomplete output is removed.
+    CSV, tree and Parquet create a folder with one file per topic that has messages (``odom.csv``,
+    ``planner.status.csv``); MAT creates one file with a struct per topic. Nothing is overwritten,
+    and incomplete output is removed.
 
     Parameters
     ----------
     tables
         The tables, from :meth:`Bag.table`.
     path
-        The folder, or the file.
+        Output folder or file.
     format
         What to write.
 
     Raises
     ------
     SpaceRobotError
-        ``path`` exists, its suffix belongs to another format, a file cannot be
+        ``path`` exists, its suffix does not match the format, a file cannot be
         written, or a library is not installed.
     """
     target = Path(path)
     _require_suffix(target, format)
     if os.path.lexists(target):
-        raise RecordingError(f"{target} exists already: name another file or folder.")
+        raise RecordingError(f"{target} already exists: name another file or folder.")
     named = _tables_by_file_name(tables)
     if format is ExportFormat.MAT:
         write_output(target, _mat_content(named))
@@ -402,12 +402,12 @@ def _require_suffix(target: Path, format: ExportFormat) -> None:
     if format is ExportFormat.MAT:
         if suffix not in ("", ".mat"):
             raise RecordingError(
-                f"The name of a file for MATLAB must end in .mat; '{target.name}' does not."
+                f"The name of a MATLAB file must end in .mat; '{target.name}' does not."
             )
     elif suffix in {f".{each.value}" for each in ExportFormat}:
         raise RecordingError(
-            f"Tables in {format.value} are a folder with a file for each topic; '{target.name}' is "
-            "the name of one file."
+            f"Tables in {format.value} are written to a folder with one file per topic; "
+            f"'{target.name}' is a file name."
         )
 
 

@@ -1,4 +1,4 @@
-"""Writes a bag: an MCAP file as rosbag2's storage plugin writes it."""
+"""Writes bags as MCAP files in the format of rosbag2's storage plugin."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from spacerobot_ros.messages.definitions import message_definition, type_hash
 
 
 def free_name(path: Path, first: int = 0) -> Path:
-    """Return a path, or the first of ``NAME-1``, ``NAME-2``, ... that does not exist."""
+    """Return a path, or the first of ``NAME-1``, ``NAME-2``, ... that does not exist yet."""
     number = first
     while True:
         name = path.with_name(f"{path.stem}-{number}{path.suffix}") if number else path
@@ -25,41 +25,41 @@ def free_name(path: Path, first: int = 0) -> Path:
 
 
 class BagWriter(AbstractContextManager["BagWriter"]):
-    """Writes serialised ROS 2 messages into a bag that any ROS 2 tool opens.
+    """Writes serialised ROS 2 messages to a bag that any ROS 2 tool can open.
 
-    Messages are collected in a chunk in memory. A full chunk goes to the operating system in one
-    piece: a killed process loses only the chunk in progress (a power failure may lose more). A bag
-    is complete, with its summary, once it is closed; use the writer as a context manager. Only one
-    thread at a time may use it.
+    Messages are collected in a chunk in memory. A full chunk is passed to the operating system in
+    one piece: a killed process loses only the current chunk (a power failure may lose more). A bag
+    is complete, including its summary, once it is closed; use the writer as a context manager. Only
+    one thread at a time may use it.
 
-    If writing a chunk fails, the chunk is lost, and this call and all later ones that add data
-    raise RecordingError. Closing still completes the file if there is space.
+    If writing a chunk fails, the chunk is lost, and this and all later calls that add data raise
+    RecordingError. Closing still completes the file if there is space.
 
     Parameters
     ----------
     path
-        The bag, usually ``*.mcap``; its folders are created.
+        Path of the bag, usually ``*.mcap``; parent folders are created.
     compression
         Of the chunks: ``zstd``, ``lz4`` or ``none``.
     chunk_size
-        Size of a chunk, in bytes before compression.
+        Uncompressed chunk size, bytes.
     overwrite
-        Whether an existing file is replaced, unless it is being written.
+        Whether an existing file is replaced unless it is being written.
     next_free
         Whether to use the next free name if the name exists: ``NAME-1.mcap``,
         ``NAME-2.mcap``, ...
     max_size
-        File size, in bytes, after which the next file begins; 0: unlimited. The files
-        of a bag that may be split are ``NAME_0.mcap``, ``NAME_1.mcap``, ..., each complete, with
+        File size, in bytes, at which a new file is started; 0: unlimited. If the bag may be split,
+        its files are ``NAME_0.mcap``, ``NAME_1.mcap``, ..., each complete, with
         all attachments and metadata.
     max_duration_ns
-        Log time of a file, in nanoseconds, after which the next one begins; 0: unlimited. Both are
-        checked after every chunk.
+        Log time per file, in nanoseconds, after which a new file is started; 0: unlimited. Both
+        limits are checked after every chunk.
 
     Raises
     ------
     RecordingError
-        The file cannot be created, or exists and may not be replaced.
+        The file cannot be created, or it exists and must not be replaced.
     """
 
     def __init__(
@@ -80,15 +80,15 @@ class BagWriter(AbstractContextManager["BagWriter"]):
         self._chunk_size = chunk_size
         self._next_free = next_free
         self.splits = 0
-        """Number of files begun after the first one."""
+        """Number of files started after the first one."""
         self._earlier_counts: Counter[int] = Counter()
         self._repeated: list[Callable[[McapFile], None]] = []
-        """One function for each attachment or metadata record, which adds it to a file."""
+        """One function per attachment or metadata record, which adds it to a file."""
         self._topics: dict[str, tuple[int, str, QosProfile]] = {}
         self._schema_ids: dict[str, int] = {}
         self._channel_ids: set[int] = set()
         self._refusal: str | None = None
-        """Why nothing more can be written; None: more can be written."""
+        """Why nothing more can be written; None: writing is possible."""
         self._closed = False
         self._file = self._open_first_file()
         try:
@@ -101,12 +101,12 @@ class BagWriter(AbstractContextManager["BagWriter"]):
 
     @property
     def path(self) -> Path:
-        """Path of the bag, or of its file that is being written."""
+        """Path of the bag, or of the file being written."""
         return self._file.path
 
     @property
     def message_counts(self) -> dict[str, int]:
-        """Number of messages of each topic in the bag, including the chunk in progress."""
+        """Number of messages on each topic in the bag, including the current chunk."""
         counts = self._earlier_counts + self._file.message_counts
         return {name: counts[channel] for name, (channel, _, _) in self._topics.items()}
 
@@ -117,12 +117,12 @@ class BagWriter(AbstractContextManager["BagWriter"]):
 
     @property
     def bytes_waiting(self) -> int:
-        """Size of the chunk in progress, which is not in the file yet, bytes."""
+        """Size of the current chunk, which is not in the file yet, bytes."""
         return self._file.bytes_waiting
 
     @property
     def messages_written(self) -> int:
-        """Number of messages in the bag, including the chunk in progress."""
+        """Number of messages in the bag, including the current chunk."""
         return sum(self.message_counts.values())
 
     def add_topic(self, name: str, type_name: str, qos: QosProfile | None = None) -> int:
@@ -135,16 +135,16 @@ class BagWriter(AbstractContextManager["BagWriter"]):
         type_name
             Message type, such as ``nav_msgs/msg/Odometry``.
         qos
-            QoS that its publisher offers; reliable, volatile and depth 10 unless given.
+            QoS offered by its publisher; by default reliable, volatile, depth 10.
 
         Returns
         -------
-        The channel for ``write``. A topic that was added before keeps its channel and QoS.
+        The channel for ``write``. A topic added earlier keeps its channel and QoS.
 
         Raises
         ------
         RecordingError
-            The type is not installed, the topic is known with another type, or nothing more can
+            The type is not installed, the topic already has another type, or nothing more can
             be written.
         """
         if self._refusal is not None:
@@ -153,8 +153,8 @@ class BagWriter(AbstractContextManager["BagWriter"]):
             channel_id, known_type, _ = self._topics[name]
             if type_name != known_type:
                 raise RecordingError(
-                    f"The topic {name} has the type {known_type} in the bag {self.path} and cannot "
-                    f"have {type_name} too."
+                    f"The topic {name} has type {known_type} in the bag {self.path}, not "
+                    f"{type_name}."
                 )
             return channel_id
         profile = QosProfile() if qos is None else qos
@@ -169,13 +169,13 @@ class BagWriter(AbstractContextManager["BagWriter"]):
         Parameters
         ----------
         channel_id
-            From ``add_topic``.
+            Return value of ``add_topic``.
         data
-            The serialised message (CDR with its header), as a raw subscription receives it.
+            The serialised message (CDR with header), as received by a raw subscription.
         log_time_ns
-            When it was recorded, in nanoseconds, not negative.
+            Recording time in nanoseconds, not negative.
         publish_time_ns
-            When it was published, in nanoseconds, not negative.
+            Publish time in nanoseconds, not negative.
 
         Raises
         ------
@@ -185,10 +185,10 @@ class BagWriter(AbstractContextManager["BagWriter"]):
         if self._refusal is not None or channel_id not in self._channel_ids:
             raise RecordingError(
                 self._refusal
-                or f"The bag {self.path} has no channel {channel_id}: add_topic returns channels."
+                or f"The bag {self.path} has no channel {channel_id}: use channels from add_topic."
             )
         if log_time_ns < 0 or publish_time_ns < 0:
-            raise RecordingError(f"The bag {self.path} cannot store times before zero.")
+            raise RecordingError(f"The bag {self.path} cannot store negative times.")
         try:
             completed_chunk = self._file.write(channel_id, data, log_time_ns, publish_time_ns)
         except RecordingError as error:
@@ -199,14 +199,14 @@ class BagWriter(AbstractContextManager["BagWriter"]):
                 self._begin_next_file()
 
     def add_attachment(self, name: str, data: bytes, media_type: str, log_time_ns: int) -> None:
-        """Put a whole file into the bag.
+        """Attach a file to the bag.
 
-        ``media_type`` is for example ``application/xml``; ``log_time_ns`` is the time of recording.
+        ``media_type`` is for example ``application/xml``; ``log_time_ns`` is the recording time.
         """
         self._add(lambda file: file.add_attachment(name, data, media_type, log_time_ns))
 
     def add_metadata(self, name: str, data: dict[str, str]) -> None:
-        """Add a record of keys and values to the bag."""
+        """Add a key-value metadata record to the bag."""
         self._add(lambda file: file.add_metadata(name, data))
 
     def _add(self, record: Callable[[McapFile], None]) -> None:
@@ -215,13 +215,14 @@ class BagWriter(AbstractContextManager["BagWriter"]):
             record(self._file)
 
     def flush(self) -> None:
-        """Hand the chunk in progress to the operating system, so that a kill cannot lose it."""
+        """Pass the current chunk to the operating system, so that it survives if the process is
+        killed."""
         with self._adding():
             if self._file.flush() and self._is_full():
                 self._begin_next_file()
 
     def close(self) -> None:
-        """Write pending messages and the summary, and close the file; a second call does nothing.
+        """Write pending messages and the summary, and close the file; further calls do nothing.
 
         After a failure the file is closed incomplete: `spacerobot salvage` completes it.
 
@@ -277,7 +278,7 @@ class BagWriter(AbstractContextManager["BagWriter"]):
             for name in sorted(os.listdir(whole.parent)):
                 if pattern.fullmatch(name):
                     raise BagExistsError(
-                        f"Cannot make the bag {whole.with_name(name)}: File exists; name another "
+                        f"Cannot create the bag {whole.with_name(name)}: File exists; name another "
                         "one, or remove it."
                     )
 

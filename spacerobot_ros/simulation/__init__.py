@@ -1,4 +1,4 @@
-"""Steps the plant: integration, actuator limits."""
+"""The simulated plant: integration and actuator limits."""
 
 from spacerobot_ros.simulation.effort_plant import EffortPlant
 from spacerobot_ros.simulation.plant import InitialState

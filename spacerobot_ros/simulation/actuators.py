@@ -1,6 +1,6 @@
-"""Actuators of a plant: thrusters, actuator faults and disturbances.
+"""Plant actuators: thrusters, actuator faults and disturbances.
 
-:func:`build_plant` builds the plant of a configuration: a :class:`.VelocityPlant` or
+:func:`build_plant` builds a plant from its configuration: a :class:`.VelocityPlant` or
 :class:`.EffortPlant`, wrapped in a :class:`.CapturePlant` if there is a target, in a
 :class:`ThrusterPlant` if thrusters are modelled, and in a :class:`PlantWithFaults`.
 """
@@ -36,7 +36,7 @@ from spacerobot_ros.simulation.plant import InitialState, Plant, WrappedPlant
 from spacerobot_ros.simulation.velocity_plant import VelocityPlant
 
 _FAULT_TIME_ROUNDING = 1e-6
-"""Allowed rounding error in the time of a fault, as a share of a tick."""
+"""Allowed rounding error in a fault time, as a share of a tick."""
 
 _MIN_STEP = 1e-5
 """Shortest Runge-Kutta step, s; shorter steps add more rounding than accuracy."""
@@ -46,29 +46,29 @@ _MAX_STEPS_PER_TICK = 1e6
 
 
 class ThrusterPlant(WrappedPlant):
-    """A plant under efforts whose base wrench is realised by on/off pulses of thrusters.
+    """An effort-driven plant whose base wrench is realised by thruster on/off pulses.
 
-    The dynamics are stepped with the actual wrench of the thrusters, averaged over the tick, so the
-    momentum balance stays exact. In addition to the attributes of :class:`Plant` there are
+    The dynamics are stepped with the actual thruster wrench, averaged over the tick, so the
+    momentum balance stays exact. Attributes in addition to those of :class:`Plant`:
 
     ``wrench``
-        (6,) mean force (N) over torque (N m) of the thrusters in the last tick, at the origin of
-        the base link, base components.
+        (6,) mean force (N) over torque (N m) of the thrusters in the last tick, at the base link
+        origin, in base components.
     ``on_time``, ``duty``, ``thrust``
-        (m,) total on-time of each thruster (s), its duty cycle in the last tick, and its mean force
-        in the last tick (N).
+        (m,) total on-time of each thruster (s), and its duty cycle and mean force (N) in the last
+        tick.
     ``pulses``
-        (m,) number of pulses of each thruster.
+        (m,) pulse count of each thruster.
     ``propellant``
-        Total consumption, kg. It does not change the mass of the robot.
+        Total consumption, kg. It does not change the robot mass.
     ``unmet``, ``unmet_ticks``
         (6,) part of the last commanded wrench that the thrusters could not produce, and the number
         of ticks with such a part.
     ``thruster_health``, ``stuck_on``
-        (m,) real over nominal thrust (1 unless set), and whether a thruster is stuck open. The
-        allocation ignores both; see :meth:`exclude`.
+        (m,) ratio of actual to nominal thrust (1 unless set), and whether a thruster is stuck open.
+        The allocation ignores both; see :meth:`exclude`.
     ``wrench_fault``
-        Factor (6,) on the wrench of the thrusters, and wrench (6,) added to it; None: no fault. The
+        Factor (6,) on the thruster wrench, and wrench (6,) added to it; None: no fault. The
         modulation ignores it.
 
     Parameters
@@ -111,12 +111,12 @@ class ThrusterPlant(WrappedPlant):
 
     @property
     def missing(self) -> str:
-        """Clause on wrenches that the enabled thrusters cannot produce; empty: none."""
+        """Clause describing the wrenches that the enabled thrusters cannot produce; empty: none."""
         return self._modulator.missing
 
     @property
     def unmet_ticks(self) -> int:
-        """Number of ticks in which the thrusters could not produce the whole commanded wrench."""
+        """Number of ticks in which the thrusters could not produce the full commanded wrench."""
         return self._modulator.unmet_periods
 
     def exclude(self, name: str) -> None:
@@ -125,7 +125,7 @@ class ThrusterPlant(WrappedPlant):
         Raises
         ------
         ParameterError
-            There is no thruster of that name.
+            There is no thruster with that name.
         """
         self._modulator.exclude(name)
 
@@ -143,9 +143,9 @@ class ThrusterPlant(WrappedPlant):
         Raises
         ------
         CommandError
-            A command is not finite; the tick is not taken.
+            A command is not finite; the plant does not advance.
         SpaceRobotError
-            The wrapped plant cannot take the tick.
+            The wrapped plant cannot advance.
         """
         wanted = np.broadcast_to(np.asarray(wrench, dtype=float), (6,))
         for command in (effort, wanted):
@@ -168,26 +168,26 @@ class ThrusterPlant(WrappedPlant):
 
 
 def with_thrusters(plant: Plant, control_period: float, source: str, excluded: str = "") -> Plant:
-    """Wrap a plant under efforts in the thrusters of ``source``.
+    """Add the thrusters of ``source`` to an effort-driven plant.
 
     Parameters
     ----------
     plant
-        A plant that takes any wrench.
+        A plant that accepts any wrench.
     control_period
         Duration of a tick, s.
     source
-        ``urdf``: the thrusters of the URDF; the path of a YAML file; empty: returns the plant
-        unchanged.
+        ``urdf``: the thrusters in the URDF; otherwise the path of a YAML file; empty: the plant is
+        returned unchanged.
     excluded
-        Names of disabled thrusters, separated by spaces.
+        Space-separated names of disabled thrusters.
 
     Raises
     ------
     ParameterError
         The file or one of its thrusters is invalid, or an excluded thruster is unknown.
     RobotDescriptionError
-        A thruster of the URDF is invalid, or there is none.
+        A thruster in the URDF is invalid, or there is none.
     """
     if not source:
         return plant
@@ -196,7 +196,7 @@ def with_thrusters(plant: Plant, control_period: float, source: str, excluded: s
 
 
 def thrusters_in(plant: Plant) -> ThrusterPlant | None:
-    """Return the thrusters of a plant, looking through its wrappers; None: it has none."""
+    """Return a plant's thrusters, looking through its wrappers; None: it has none."""
     while isinstance(plant, WrappedPlant) and not isinstance(plant, ThrusterPlant):
         plant = plant.plant
     return plant if isinstance(plant, ThrusterPlant) else None
@@ -205,11 +205,11 @@ def thrusters_in(plant: Plant) -> ThrusterPlant | None:
 class PlantWithFaults(WrappedPlant):
     """A :class:`Plant` with scheduled actuator faults and disturbances.
 
-    Its state arrays are those of the wrapped plant. A reset keeps the time, the faults and the
+    It shares the wrapped plant's state arrays. A reset preserves the time, the faults and the
     disturbances. A tick without faults costs one comparison. Until the first disturbance, the plant
     steps without external loads.
 
-    Bias and noise are added to the command of a joint, which is then scaled if the joint is slow; a
+    Bias and noise are added to a joint command, which is then scaled if the joint is slow; a
     stuck joint is held in place (:meth:`Plant.hold`). Wrench faults act on the commanded wrench, or
     on the thrusters' wrench if thrusters are modelled.
 
@@ -222,18 +222,18 @@ class PlantWithFaults(WrappedPlant):
     control_period
         Duration of a tick, s.
     wrench
-        Whether steps take a wrench.
+        Whether steps accept a wrench.
     seed
-        Seed of the actuators' noise.
+        Seed of the actuator noise.
     disturbances
         The disturbances, one per line (:func:`.parse_disturbance`).
     surroundings
-        Loads of an orbit or a table, which act during the whole flight; None: none.
+        Orbit or table loads, which act during the whole flight; None: none.
 
     Raises
     ------
     ParameterError
-        A line is not a fault or disturbance of this plant.
+        A line is not a valid fault or disturbance for this plant.
     """
 
     def __init__(
@@ -256,7 +256,7 @@ class PlantWithFaults(WrappedPlant):
             faults, FaultTargets(plant.robot.joint_names, wrench, nozzles)
         )
         self.takes_wrench = wrench
-        """Whether a step takes a base wrench in addition to the joint commands."""
+        """Whether a step accepts a base wrench in addition to the joint commands."""
         self.tick = 0
         """Ticks since the beginning."""
         self.step: Callable[..., bool] = self._step
@@ -293,12 +293,12 @@ class PlantWithFaults(WrappedPlant):
         return self._seen
 
     def inject(self, text: str) -> None:
-        """Add faults, one per line, while the plant runs; the text ``clear`` removes all faults.
+        """Add faults, one per line, while the plant runs; ``clear`` removes all faults.
 
         Raises
         ------
         ParameterError
-            A line is not a fault of this robot; none of the lines is added.
+            A line is not a valid fault for this robot; none of the lines is added.
         """
         self.timeline.inject(text, self.time)
         self.apply_active_faults()
@@ -309,7 +309,7 @@ class PlantWithFaults(WrappedPlant):
         Raises
         ------
         ParameterError
-            A line is not a disturbance of this robot; none of the lines is added.
+            A line is not a valid disturbance for this robot; none of the lines is added.
         """
         self._disturbances.inject(text, self.time)
         if self._disturbances.entries and self.loads is None:
@@ -327,7 +327,7 @@ class PlantWithFaults(WrappedPlant):
         self._apply_active_disturbances()
 
     def apply_active_faults(self) -> None:
-        """Apply the faults that are active at the present time."""
+        """Apply the faults that are active at the current time."""
         active = self.timeline.at(self.time + _FAULT_TIME_ROUNDING * self._control_period)
         self._next_tick = self.timeline.next_change / self._control_period - _FAULT_TIME_ROUNDING
         if active is self._seen:
@@ -429,16 +429,17 @@ class PlantWithFaults(WrappedPlant):
 
 @dataclass(frozen=True)
 class PlantKind:
-    """Plant class of an actuation mode.
+    """Plant class for an actuation mode.
 
     Attributes
     ----------
     plant
-        Class, called with robot, control period (s), initial state and integration step (s).
+        Class; its arguments are the robot, control period (s), initial state and integration step
+        (s).
     integration_step
-        Default of the longest Runge-Kutta step, s.
+        Default maximum Runge-Kutta step, s.
     wrench
-        Whether the plant takes a wrench on its base.
+        Whether the plant accepts a wrench on its base.
     """
 
     plant: Callable[..., Plant]
@@ -450,22 +451,22 @@ PLANTS: dict[str, PlantKind] = {
     "velocity": PlantKind(VelocityPlant, integration.DEFAULT_INTEGRATION_STEP, wrench=False),
     "effort": PlantKind(EffortPlant, effort_plant.DEFAULT_INTEGRATION_STEP, wrench=True),
 }
-"""Plant classes by the value of the parameter ``actuation``."""
+"""Plant classes by the value of parameter ``actuation``."""
 
 
 def build_plant(
     robot: SpaceRobot, config: PlantConfig, initial: InitialState | None = None
 ) -> PlantWithFaults:
-    """Build the plant of a configuration, with its thrusters and faults.
+    """Build a plant from its configuration, including thrusters and faults.
 
     Parameters
     ----------
     robot
         The model.
     config
-        The parameters of the plant.
+        The plant parameters.
     initial
-        Initial state, if not the configuration's.
+        Initial state, if it differs from the configuration.
 
     Raises
     ------
@@ -478,20 +479,20 @@ def build_plant(
     control_period = config.control_period
     if 0.0 < step < _MIN_STEP:
         raise ParameterError(
-            f"Parameter 'integration_step' is {step}; it must be 0 (by the actuation) or at least "
+            f"Parameter 'integration_step' is {step}; it must be 0 (automatic) or at least "
             f"{_MIN_STEP:g} s."
         )
     if config.thrusters and not kind.wrench:
         raise ParameterError(
             f"Parameter 'thrusters' is '{config.thrusters}', but actuation "
-            f"'{config.actuation}' has no wrench on the base: set actuation to effort, or "
+            f"'{config.actuation}' has no base wrench: set actuation to effort, or "
             "thrusters to ''."
         )
     if step and control_period / step > _MAX_STEPS_PER_TICK:
         raise ParameterError(
             f"Parameter 'integration_step' is {step:g} s, which is more than "
             f"{_MAX_STEPS_PER_TICK:.0e} steps in a tick of {control_period:g} s; "
-            "choose longer steps or shorter ticks."
+            "use longer steps or shorter ticks."
         )
     start = InitialState.of(config) if initial is None else initial
     surroundings = Surroundings.of(config.orbit, config.table)

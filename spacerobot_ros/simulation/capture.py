@@ -1,9 +1,9 @@
 """A free-floating target and its capture: an inelastic impact, then one body.
 
-Until the capture, robot and target move independently, each with its own momenta. The
-capture (:mod:`spacerobot_ros.model.grasp`) takes place between two ticks. After it the plant
-integrates the joined robot, whose momenta are the sum of both: no rounding of the impact changes
-them. A release separates both without changing their poses and velocities.
+Until the capture, the robot and the target move independently, each with its own momenta. The
+capture (:mod:`spacerobot_ros.model.grasp`) occurs between two ticks. The plant then integrates
+the joined robot, whose momenta are the sum of both, unaffected by rounding errors of the impact. A
+release separates them without changing their poses or velocities.
 """
 
 from __future__ import annotations
@@ -45,11 +45,11 @@ from spacerobot_ros.simulation.plant import Counts, Flags, InitialState, Plant, 
 from spacerobot_ros.simulation.velocity_plant import VelocityPlant
 
 _GENERIC_POSE = Pose(matrix_from_quaternion(unit_quaternion([0.1, 0.2, 0.3, 0.9])), np.ones(3))
-"""A pose in which no entry of the inertia of a held body is zero."""
+"""A pose in which no inertia entry of a held body is zero."""
 
 
 def load_target(config: TargetConfig) -> RobotDescription | None:
-    """Return the target of a configuration; None: it has none.
+    """Return the configured target; None: it has none.
 
     Raises
     ------
@@ -75,23 +75,23 @@ def load_target(config: TargetConfig) -> RobotDescription | None:
 
 
 def target_parameters(text: str) -> dict[str, Any]:
-    """Return the plant's parameters for a target from the URDF text of a loaded target, whose
-    joints are already held.
+    """Return the plant's target parameters from the URDF string of a loaded target, whose joints
+    are already held.
     """
     return {"target.robot_description": text, "target.joint_positions": []}
 
 
 class Target:
-    """A free rigid body: motion at constant momenta, or under the loads of an orbit or a table.
+    """A free rigid body: it moves with constant momenta, or under orbit or table loads.
 
     Attributes
     ----------
     description
         The body.
     inertia
-        Its mass properties in the frame T of its root link.
+        Its mass properties in its root link frame T.
     grapple
-        Pose of the grapple frame in T.
+        Grapple frame pose in T.
     """
 
     def __init__(
@@ -140,13 +140,13 @@ class Target:
         self.release(self._initial)
 
     def release(self, motion: BodyMotion) -> None:
-        """Float freely from a given motion."""
+        """Continue in free flight from a given motion."""
         self._plant.initial = self._start(motion)
         self._plant.reset()
 
     def load(self, loads: PlantLoads) -> None:
-        """Apply the surroundings of the robot's loads from now on, at their time; wrenches on the
-        robot's links do not act on the target.
+        """Apply the surroundings in the robot's loads from now on, at their time; wrenches on robot
+        links do not act on the target.
 
         Raises
         ------
@@ -175,7 +175,7 @@ class Target:
 
 
 class GrappleMotion(RelativeMotion):
-    """The motion of the grapple frame relative to the end-effector."""
+    """Grapple frame motion relative to the end-effector."""
 
     def misses(self, limits: CaptureConfig) -> list[str]:
         """Return a clause for each quantity beyond its limit; empty: a capture is possible."""
@@ -194,22 +194,22 @@ class GrappleMotion(RelativeMotion):
 
 @dataclass(frozen=True)
 class CaptureReport:
-    """A capture: the impact, and the momenta and the motion after it.
+    """A capture: the impact, and the momenta and motion after it.
 
     Attributes
     ----------
     impact
         The impact.
     R_WB
-        Attitude of the base link (3, 3).
+        Base link attitude (3, 3).
     momenta
-        Linear over angular momentum (6,) of robot and target, about their common centre of mass,
-        in W.
+        Linear over angular momentum (6,) of the robot and the target, about their common centre of
+        mass, in W.
     residual
-        Relative difference between these momenta and their sum over the joined bodies after the
+        Relative difference between these momenta and the sum over the joined bodies after the
         impact.
     requested
-        Whether the capture was requested, not automatic.
+        Whether the capture was requested rather than automatic.
     joint_names, joint_impulse_limit
         The joints, and the largest permissible joint impulse, N m s or N s; 0: no limit.
     """
@@ -242,7 +242,7 @@ class CaptureReport:
         }
 
     def event(self, time_s: float) -> Event:
-        """Return the event of the capture; it is a warning if a joint impulse exceeds its limit."""
+        """Return the capture event; it is a warning if a joint impulse exceeds its limit."""
         impact, limit = self.impact, self.joint_impulse_limit
         force, moment = np.linalg.norm(impact.impulse[:3]), np.linalg.norm(impact.impulse[3:])
         message = (
@@ -263,13 +263,13 @@ class CaptureReport:
 
 @dataclass(frozen=True)
 class ReleaseReport:
-    """The target's velocity (3,), m/s, and rate (3,), rad/s, in W at a release."""
+    """Target velocity (3,), m/s, and angular rate (3,), rad/s, in W at the release."""
 
     velocity: Array
     rate: Array
 
     def event(self, time_s: float) -> Event:
-        """Return the event of the release."""
+        """Return the release event."""
         about = {
             "velocity_mps": json.dumps(self.velocity.tolist()),
             "rate_radps": json.dumps(self.rate.tolist()),
@@ -291,28 +291,28 @@ def capture_values(about: Mapping[str, str]) -> dict[str, Any]:
 
 
 class CapturePlant(WrappedPlant):
-    """A plant with a target, which it can capture and release.
+    """A plant with a target that it can capture and release.
 
     It has its own state arrays: the robot's state, alone or joined with the target, is copied into
-    them after each tick. Links, joints and commands stay the same.
+    them after each tick. Links, joints and commands are unchanged.
 
     Attributes
     ----------
     target
         The target.
     target_pose
-        (7,) position (m) and quaternion (x, y, z, w) of its root link in W.
+        (7,) root link position (m) and quaternion (x, y, z, w) in W.
     target_twist
-        (6,) velocity (m/s) and angular velocity (rad/s) of that link, in its frame.
+        (6,) linear (m/s) and angular velocity (rad/s) of the root link, in its frame.
     payload
         The held target; None: it floats freely.
     reports
-        Captures and releases since the owner cleared the list.
+        Captures and releases since the list was last cleared.
 
     Parameters
     ----------
     build
-        Builds the plant of a robot from an initial state.
+        Function that builds a robot's plant from an initial state.
     robot, initial
         The robot alone, and its initial state.
     target
@@ -352,7 +352,7 @@ class CapturePlant(WrappedPlant):
         self._loads: PlantLoads | None = None
         self._counts: dict[str, Counts] = {}
         self._changed: RobotMotion | None = None
-        """The motion after a capture or a release, until the next tick."""
+        """Motion after a capture or release, until the next tick."""
         self._ready = True
         """Whether an automatic capture takes place as soon as its conditions hold."""
         self._compile(initial)
@@ -369,7 +369,7 @@ class CapturePlant(WrappedPlant):
 
     @property
     def present_robot(self) -> SpaceRobot:
-        """The integrated robot: alone, or with the mass properties of the target."""
+        """The integrated robot: alone, or with the target's mass properties."""
         return self.plant.robot
 
     @property
@@ -380,16 +380,16 @@ class CapturePlant(WrappedPlant):
 
     @property
     def expected_momenta(self) -> Array:
-        """Linear over angular momentum (6,) in W: the initial one plus all impulses."""
+        """Linear over angular momentum (6,) in W: the initial value plus all impulses."""
         return self._momenta
 
     def hold(self, joints: Flags) -> None:
-        """Lock the marked joints (n,) at their positions, and release all other joints."""
+        """Lock the marked joints (n,) at their positions, and release all others."""
         self._held_joints = joints.copy()
         self.plant.hold(joints)
 
     def load(self, loads: PlantLoads) -> None:
-        """Apply external loads on the robot from now on, whether it holds the target or not; their
+        """Apply external loads to the robot from now on, whether or not it holds the target; their
         values may change before each step. Surroundings also act on a free target.
         """
         self._loads = loads
@@ -399,7 +399,7 @@ class CapturePlant(WrappedPlant):
             self.plant.load(loads)
 
     def reset(self) -> None:
-        """Return robot and target to their initial states."""
+        """Return the robot and the target to their initial states."""
         self._use(self._alone)
         self._alone.reset()
         self.target.reset()
@@ -407,26 +407,26 @@ class CapturePlant(WrappedPlant):
         self._update()
 
     def resume(self, state: InitialState, payload: Payload | None, body: BodyMotion) -> None:
-        """Continue from a later state of a flight.
+        """Continue from a later state in a flight.
 
         Parameters
         ----------
         state
-            State of the robot; its momenta include the held body.
+            Robot state; its momenta include the held body.
         payload
             The body that the robot holds; None: the target floats freely.
         body
-            Motion of the target.
+            Target motion.
 
         Raises
         ------
         ParameterError
-            Another link holds the body, or the state does not fit this robot.
+            Another link holds the body, or the state does not match this robot.
         """
         robot = self._alone.robot
         if payload is not None and payload.link != self.link:
             raise ParameterError(
-                f"The link '{payload.link}' holds the target, but this plant captures with "
+                f"The link '{payload.link}' holds the target, but this plant captures it with "
                 f"'{self.link}': set parameter 'capture.end_effector'."
             )
         joined = robot if payload is None else payload.attached_to(robot)
@@ -453,7 +453,7 @@ class CapturePlant(WrappedPlant):
         self._continue(robot, motion, momenta)
 
     def step(self, *commands: Any) -> bool:
-        """Advance a tick under the robot's commands; before it, capture the target if captures are
+        """Advance one tick under the robot's commands, after capturing the target if captures are
         automatic and the conditions hold. Returns whether a joint was limited.
         """
         if self._config.mode == "automatic" and self.payload is None:
@@ -479,17 +479,17 @@ class CapturePlant(WrappedPlant):
     # -- captures -----------------------------------------------------------------------------
 
     def approach(self) -> GrappleMotion:
-        """Return the present motion of the grapple frame relative to the end-effector."""
+        """Return the current grapple frame motion relative to the end-effector."""
         end_effector = frame_motion(self.robot, self.link, self._motion())
         return GrappleMotion.between(end_effector, self._body().at(self.target.grapple))
 
     def capture(self) -> CaptureReport:
-        """Capture the target; the next tick begins with the motion after the impact.
+        """Capture the target; the next tick starts from the motion after the impact.
 
         Raises
         ------
         CommandError
-            The target is already held, too far away or too fast; the message states the excess.
+            The target is already held, too far away or too fast; the message states by how much.
         """
         if self.payload is not None:
             raise CommandError(
@@ -498,7 +498,7 @@ class CapturePlant(WrappedPlant):
             )
         misses = self.approach().misses(self._config)
         if misses:
-            raise CommandError(f"The target is missed: its {'; its '.join(misses)}.")
+            raise CommandError(f"The target cannot be captured: its {'; its '.join(misses)}.")
         return self._capture(requested=True)
 
     def release(self) -> ReleaseReport:
@@ -510,7 +510,7 @@ class CapturePlant(WrappedPlant):
             Nothing is held.
         """
         if self.payload is None:
-            raise CommandError(f"'{self.link}' holds no target to release.")
+            raise CommandError(f"'{self.link}' does not hold a target.")
         motion, body, robot = self._motion(), self._body(), self._alone.robot
         # The target takes its share of the momenta along, the robot keeps the rest.
         self.target.release(body)
@@ -613,7 +613,7 @@ class CapturePlant(WrappedPlant):
 
 
 def capture_in(plant: Plant) -> CapturePlant | None:
-    """Return the capturing part of a plant, looking through its wrappers; None: no target."""
+    """Return a plant's :class:`CapturePlant`, looking through its wrappers; None: no target."""
     while isinstance(plant, WrappedPlant) and not isinstance(plant, CapturePlant):
         plant = plant.plant
     return plant if isinstance(plant, CapturePlant) else None

@@ -1,6 +1,6 @@
-"""The clearance of a plant in flight: the smallest distance of its links, and their contacts.
+"""Plant clearance during flight: the smallest distance between links, and contacts.
 
-An exact plant has no contact forces: it continues through a contact, and reports this.
+An exact plant has no contact forces: it moves through contacts and reports them.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ _LOG = logging.getLogger(__name__)
 _OK, _ERROR = 0, 2
 
 _OBSTACLE = "obstacle"
-"""Value of the key ``second_is`` if the second of a pair is an obstacle."""
+"""Value of key ``second_is`` if the second of a pair is an obstacle."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ class ClearanceStatus:
     Attributes
     ----------
     distance
-        m; if the links touch, the negative depth of the contact.
+        m; if the links touch, the negative contact depth.
     links
         The two links.
     time_s
@@ -80,7 +80,7 @@ class ClearanceStatus:
         Raises
         ------
         SpaceRobotError
-            The pairs are not a clearance status.
+            The pairs do not form a clearance status.
         """
         with _FORMAT.reading():
             kind = ObstaclePair if values.get("second_is") == _OBSTACLE else LinkPair
@@ -96,16 +96,16 @@ _FORMAT = KeyValueFormat(
 
 
 class ClearanceMonitor:
-    """Measures the clearance of a robot state by state, and derives events from its contacts.
+    """Measures a robot's clearance in each state, and derives events from its contacts.
 
     Parameters
     ----------
     geometry
-        The robot's solids, with at least one pair and exact distances.
+        The robot's solids, with at least one pair, and exact distances.
     links
-        The links in the order of the poses.
+        The links, in pose order.
     has_contact_forces
-        Whether bodies in contact push each other, for the text of events.
+        Whether bodies in contact exert forces on each other; used in event messages.
     """
 
     def __init__(
@@ -117,7 +117,7 @@ class ClearanceMonitor:
     ) -> None:
         self._nearest, self._pushing = NearestPair(geometry, links), has_contact_forces
         self.touching: frozenset[LinkPair] = frozenset()
-        """The links that touch in the last state."""
+        """Links in contact in the last state."""
         self._capturing: CapturePlant | None = None
         self._from_target: NearestPair | None = None
 
@@ -131,11 +131,11 @@ class ClearanceMonitor:
         capturing: CapturePlant | None = None,
         has_contact_forces: bool = False,
     ) -> ClearanceMonitor | None:
-        """Return the monitor of a robot; None: no links can touch.
+        """Return a robot's monitor; None: no links can touch.
 
-        ``before`` is the monitor for earlier obstacles, whose contacts continue or end. While the
-        target of ``capturing`` is free, only the body of the end-effector may touch it. If the
-        package coal is not installed, the result is None, and a warning is logged.
+        ``before`` is the monitor of the previous obstacles, whose contacts continue or end. While
+        the target of ``capturing`` is free, only the end-effector body may touch it. If the
+        package coal is not installed, a warning is logged and the result is None.
         """
         geometry = CollisionGeometry(robot)
         if not len(geometry.pairs):
@@ -145,7 +145,7 @@ class ClearanceMonitor:
                 _LOG,
                 cache_directory(),
                 "warned_of_clearance",
-                "The plant measures no clearance without the package coal.",
+                "The plant cannot measure clearance without the package coal.",
             )
             return None
         monitor = cls(geometry, links, has_contact_forces=has_contact_forces)
@@ -163,7 +163,7 @@ class ClearanceMonitor:
     def measure(
         self, link_R: Array, link_r: Array, pose: Array, time_s: float
     ) -> tuple[ClearanceStatus, list[Event]]:
-        """Return the clearance, and an event for each contact that has begun or ended.
+        """Return the clearance, and an event for each contact that began or ended.
 
         Parameters
         ----------
@@ -190,7 +190,7 @@ class ClearanceMonitor:
 
     @property
     def contacts(self) -> tuple[str, ...]:
-        """The links that touch in the last state, as in the plant's status."""
+        """Links in contact in the last state, as in the plant's status."""
         return tuple(sorted(each.subject for each in self.touching))
 
     def _begun(self, links: LinkPair, time_s: float) -> Event:

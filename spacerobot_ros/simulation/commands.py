@@ -1,9 +1,9 @@
-"""Validation of commands: the rules by which a plant accepts them, for its node and for bags.
+"""Command validation: the rules by which a plant accepts commands, for its node and for bags.
 
-A command comes from a *source* (one topic) with a stamp and values; the stamp is that of a state.
-In lockstep the command of a tick is the first one with its stamp; if it is refused, the tick is
-taken at rest. In real time a command may carry the stamp of any recent state, and remains in force
-until the timeout; only one publisher may command.
+A command comes from a *source* (one topic) with values and the stamp of a state.
+In lockstep, the first command with a tick's stamp applies to that tick; if it is refused, the
+joints rest during the tick. In real time, a command may carry the stamp of any recent state, and
+remains in force until the timeout; only one publisher may command.
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ NO_STAMP = -math.inf
 
 
 _START_TIME = 1.0
-"""Time after the start in which a zero stamp means the first state, without a timeout, s."""
+"""Time after the start during which a zero stamp means the first state, without a timeout, s."""
 
 _STAMP_ROUNDING = 1_000
-"""Allowed rounding error of stamps, from commanders with floating-point time, ns."""
+"""Allowed rounding error in stamps from commanders with floating-point time, ns."""
 
 _OUTDATED_STATE_CLAUSE = "it is for a state before the last start, reset or stop of the plant"
 
@@ -48,18 +48,18 @@ Quantity = Literal["velocity", "effort", "wrench"]
 
 
 class Reason(str, Enum):
-    """Reason to refuse a command; parameters and diagnostics have its value."""
+    """Reason for refusing a command; parameters and diagnostics contain its value."""
 
     MALFORMED = "malformed"
-    """Unknown or missing joints, wrong lengths, another frame."""
+    """Unknown or missing joints, wrong lengths, or another frame."""
     NOT_FINITE = "not_finite"
     STALE = "stale"
     EARLY = "early"
-    """Stamped ahead of the plant's time."""
+    """Stamped ahead of plant time."""
     UNKNOWN_STATE = "unknown_state"
     """Stamped between two ticks."""
     OUT_OF_ORDER = "out_of_order"
-    """Stamped before the command that is in force."""
+    """Stamped before the command in force."""
     BEYOND_LIMITS = "beyond_limits"
     SECOND_COMMANDER = "second_commander"
     """Another node has already commanded for the same state."""
@@ -76,9 +76,9 @@ class Refusal:
     reason
         Its reason.
     clause
-        The reason in words, with numbers and names; it completes "the command was refused:".
+        The reason as text, with numbers and names; it completes "the command was refused:".
     latches
-        Whether the refusal has latched a fault: nothing moves until the plant is rearmed.
+        Whether the refusal latched a fault: nothing moves until the plant is rearmed.
     """
 
     reason: Reason
@@ -87,12 +87,12 @@ class Refusal:
 
 
 def joint_order(joints: Sequence[str], named: Sequence[str]) -> npt.NDArray[np.intp]:
-    """Return the indices of the named joints of a message among the robot's joints.
+    """Return the indices, among the robot's joints, of the joints named in a message.
 
     Parameters
     ----------
     joints
-        Names of the robot's joints.
+        Joint names of the robot.
     named
         Names in the message: every joint, in any order.
 
@@ -119,16 +119,16 @@ def require_values(named: Sequence[str], quantity: str, count: int) -> None:
     Raises
     ------
     CommandError
-        The number of values differs.
+        The number of values is wrong.
     """
     if count != len(named):
         raise CommandError(f"{len(named)} joint(s) are named but {count} {quantity} value(s) given")
 
 
 def require_frame(frame: str, base_link: str, prefix: str = "") -> None:
-    """Check that a wrench is in the frame of the base link; an empty name means that frame.
+    """Check that a wrench is in the base link frame; an empty name selects that frame.
 
-    The name may have the prefix of the robot's frames.
+    The name may include the robot's frame prefix.
 
     Raises
     ------
@@ -145,27 +145,27 @@ class CommandSource:
     Attributes
     ----------
     topic
-        Name below the robot's namespace.
+        Topic name, relative to the robot's namespace.
     quantity
         Quantity of its commands.
     limits
-        (size,) largest magnitude of each value.
+        (size,) maximum magnitude of each value.
     kept
-        Indices of the values that stay in force if a command is revoked: the rates of reaction
-        wheels, because stopping them would rotate the base.
+        Indices of the values that stay in force if a command is revoked: reaction wheel rates,
+        because stopping the wheels would rotate the base.
     command
-        (size,) command in force: of the joints (m/s, rad/s, N or N m), or force (N) over torque
-        (N m) at the origin of the base link, base components.
+        (size,) command in force: for the joints (m/s, rad/s, N or N m), or force (N) over torque (N
+        m) at the base link origin, in base components.
     stamp_ns
         Stamp of the command in force; :data:`NO_STAMP`: there is none.
     arrived
-        Whether the command of this tick has arrived, accepted or not (lockstep).
+        Whether the command for this tick has arrived, accepted or not (lockstep).
     resting
         Whether the last command was revoked, so that the joints are brought to rest.
     required
-        Whether a lockstep plant waits for its commands.
+        Whether a lockstep plant waits for this source's commands.
     commanders
-        Known number of publishers of the topic.
+        Known number of publishers on the topic.
     """
 
     def __init__(
@@ -192,7 +192,7 @@ class CommandSource:
         self.resting = True
 
     def accept(self, values: Array, stamp_ns: float) -> None:
-        """Put a command into force."""
+        """Bring a command into force."""
         self.command[:] = values
         self.stamp_ns = stamp_ns
         self.arrived = True
@@ -207,19 +207,19 @@ class CommandValidator:
     plant
         The commanded plant.
     config
-        Its configuration: time mode, timeout, limits, and reasons that latch a fault.
+        Its configuration: time mode, timeout, limits, and the reasons that latch a fault.
 
     Raises
     ------
     ParameterError
-        ``latched_faults`` has an unknown word.
+        ``latched_faults`` contains an unknown word.
     """
 
     def __init__(self, plant: Plant, config: PlantConfig) -> None:
         robot = plant.robot
         kept = ReactionWheels.of(robot.description).index
         self.sources = [CommandSource("joint_commands", "velocity", robot.velocity_limit, kept)]
-        """Sources in the order of the arguments of a step: joints first."""
+        """Sources in the order of a step's arguments: joints first."""
         self._brakes: _JointBrakes | None = None
         if config.actuation == "effort":
             self.sources = [
@@ -240,16 +240,16 @@ class CommandValidator:
         self.fault = ""
         """The latched fault, as a clause; empty: none."""
         self.fault_reason = ""
-        """Reason of that fault: the value of a :class:`Reason`, ``abort``, or ``watchdog``."""
+        """Reason for that fault: the value of a :class:`Reason`, ``abort``, or ``watchdog``."""
         self.timed_out = False
         """Whether the last command was revoked because it was too old."""
         self.timeouts = 0
         """Number of such revocations."""
         self.last_stamp_ns: float = NO_STAMP
-        """Stamp of the last command before the latest timeout."""
+        """Stamp of the last command before the most recent timeout."""
 
     def succeed(self, before: CommandValidator) -> None:
-        """Take over the faults and counts of the plant's previous validator."""
+        """Take over the faults and counters of the plant's previous validator."""
         self.counts, self.timeouts = before.counts, before.timeouts
         self.fault, self.fault_reason = before.fault, before.fault_reason
         self.last_stamp_ns, self._earliest = before.last_stamp_ns, before._earliest
@@ -265,7 +265,7 @@ class CommandValidator:
 
     @property
     def in_force(self) -> bool:
-        """Whether a command of any source is in force."""
+        """Whether a command from any source is in force."""
         return any(source.stamp_ns != NO_STAMP for source in self.sources)
 
     def accept_or_refuse(
@@ -280,14 +280,13 @@ class CommandValidator:
         stamp_ns
             Its stamp.
         values
-            Its values, or the error of a malformed message.
+            Its values, or the error in a malformed message.
         now_ns
             Simulated time of the plant's state.
 
         Returns
         -------
-        Refusal or None
-            The refusal; None: the command is in force.
+        Refusal or None The refusal; None: the command is in force.
         """
         unset = False
         if self._lockstep:
@@ -321,11 +320,12 @@ class CommandValidator:
         return refusal
 
     def unreadable(self, source: CommandSource, error: CommandError, now_ns: int) -> Refusal:
-        """Refuse bytes that are not a message; they have no stamp and so belong to no tick."""
+        """Refuse bytes that cannot be decoded as a message; without a stamp, they belong to no
+        tick."""
         return self._refuse(source, Refusal(Reason.MALFORMED, str(error)), now_ns)
 
     def begin_step(self) -> list[Array]:
-        """Return the commands of the next step, a writable array for each source."""
+        """Return the commands for the next step, one writable array per source."""
         for source in self.sources:
             source.arrived = False
         if self._brakes is not None and self.sources[0].resting:
@@ -338,7 +338,8 @@ class CommandValidator:
         self._earliest = now_ns
 
     def reset(self, now_ns: int) -> None:
-        """Restart (:meth:`revoke_before`) with the plant's wheels at rest, as initially."""
+        """Restart (:meth:`revoke_before`) with the plant's wheels at rest, as in the initial
+        state."""
         for source in self.sources:
             source.command[:] = 0.0
         self.revoke_before(now_ns)
@@ -351,8 +352,7 @@ class CommandValidator:
             source.arrived = False
 
     def latch(self, reason: str, clause: str, now_ns: int) -> None:
-        """Bring everything to rest until :meth:`rearm`; if there are several faults, the first is
-        reported.
+        """Bring everything to rest until :meth:`rearm`; of several faults, the first is reported.
 
         Commands for states before the fault are refused even after :meth:`rearm`.
 
@@ -361,7 +361,7 @@ class CommandValidator:
         reason
             The value of a :class:`Reason`, ``abort`` or ``watchdog``.
         clause
-            The fault in words; it completes "a fault is latched:".
+            The fault as text; it completes "a fault is latched:".
         now_ns
             Simulated time of the plant's state.
         """
@@ -373,12 +373,13 @@ class CommandValidator:
             source.rest()
 
     def rearm(self) -> str:
-        """Accept commands again; return the fault that was latched, empty: there was none."""
+        """Accept commands again; return the latched fault; empty: there was none."""
         fault, self.fault, self.fault_reason = self.fault, "", ""
         return fault
 
     def require_commanded(self) -> None:
-        """Wait for wrenches only while a node publishes them; joint commands are always awaited."""
+        """Wait for wrench commands only while a node publishes them; joint commands are always
+        awaited."""
         for source in self.sources[1:]:
             source.required = source.commanders > 0
             if not source.required:
@@ -410,7 +411,7 @@ class CommandValidator:
         if not math.isfinite(sum(values.tolist())):
             return Refusal(Reason.NOT_FINITE, f"a value is not finite: {values.tolist()}")
         if not self._clips and np.any(np.abs(values) > source.limits):
-            limits = f"{values.tolist()} is beyond the limits {source.limits.tolist()}"
+            limits = f"{values.tolist()} exceeds the limits {source.limits.tolist()}"
             return Refusal(Reason.BEYOND_LIMITS, limits)
         return None
 
@@ -432,7 +433,7 @@ class CommandValidator:
             period = self._period / SECOND
             return Refusal(
                 Reason.UNKNOWN_STATE,
-                f"it is stamped {stamp_ns / SECOND:.9g} s, and states have multiples of "
+                f"it is stamped {stamp_ns / SECOND:.9g} s, but state stamps are multiples of "
                 f"{period:.9g} s",
             )
         late = (source.stamp_ns - stamp_ns) / SECOND
@@ -469,8 +470,8 @@ def _parse_latching_reasons(words: str) -> frozenset[Reason]:
     for word in words.split():
         if word not in known:
             raise ParameterError(
-                f"Parameter 'latched_faults' has '{word}'; it takes {', '.join(known)}, separated "
-                "by spaces."
+                f"Parameter 'latched_faults' has '{word}'; it accepts {', '.join(known)}, "
+                "separated by spaces."
             )
     return frozenset(Reason(word) for word in words.split())
 
@@ -490,7 +491,7 @@ class _JointBrakes:
         self._plant = plant
 
     def efforts(self) -> Array:
-        """Return the efforts (n,) of the next tick, N or N m, before limits.
+        """Return the efforts (n,) for the next tick, N or N m, before limits are applied.
 
         The joint rows of ``H+ z0ddot + C+ = Q`` (paper 4, eq. 19), with the base rows inserted.
         """

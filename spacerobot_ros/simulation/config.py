@@ -1,4 +1,4 @@
-"""The parameters of the plant."""
+"""Plant parameters."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from spacerobot_ros.parameters import group, nonnegative, parameter
 from spacerobot_ros.times import SECOND
 
 _MAX_SENSOR_ERROR = 1e6
-"""Largest error of a sensor, m or rad (/s): squares of much larger ones overflow."""
+"""Largest sensor error, m or rad (/s): the squares of much larger errors overflow."""
 
 _MAX_INITIAL_VALUE = 1e9
-"""Largest quantity of an initial state, and longest time, SI."""
+"""Largest initial state value and longest time, SI units."""
 
 _CONTACT_PERIOD = 0.1
-"""Longest simulated time between two contact checks, s."""
+"""Longest simulated time between contact checks, s."""
 
 
 def period_ns(tick_rate: float) -> int:
@@ -57,43 +57,39 @@ def _time(default: float, description: str) -> Any:
 
 @dataclass(frozen=True)
 class SensorConfig:
-    """Errors of the sensors: 1 sigma of their noise, their biases, and the seed."""
+    """Sensor errors: noise (1 sigma), biases, and the seed."""
 
-    position_noise: float = _noise("1 sigma an axis of odom, in world", "m")
-    attitude_noise: float = _noise("1 sigma an axis, of a rotation vector in base", "rad")
-    velocity_noise: float = _noise("1 sigma an axis of the velocity", "m/s")
-    angular_velocity_noise: float = _noise("1 sigma an axis of the angular velocity", "rad/s")
+    position_noise: float = _noise("1 sigma per axis of odom, in world", "m")
+    attitude_noise: float = _noise("1 sigma per axis of a rotation vector, in base", "rad")
+    velocity_noise: float = _noise("1 sigma per velocity axis", "m/s")
+    angular_velocity_noise: float = _noise("1 sigma per angular velocity axis", "rad/s")
     joint_noise: float = _noise("1 sigma of every joint position", "m or rad")
     joint_rate_noise: float = _noise("of every joint velocity", "m/s or rad/s")
     position_bias: tuple[float, ...] = _bias("of odom, in world", "m")
     attitude_bias: tuple[float, ...] = _bias("rotation vector in base", "rad")
-    joint_bias: tuple[float, ...] = _bias("by joint order of the URDF; []: none", "m or rad", ())
-    seed: int = nonnegative(0, "of the noise of sensors and actuators")
+    joint_bias: tuple[float, ...] = _bias("in URDF joint order; []: none", "m or rad", ())
+    seed: int = nonnegative(0, "of the sensor and actuator noise")
 
 
 @dataclass(frozen=True)
 class TargetSensorConfig:
-    """Errors of target/odom: 1 sigma of its noise, biases, delay, loss and rate."""
+    """Errors in target/odom: noise (1 sigma), biases, delay, loss and rate."""
 
-    position_noise: float = _noise("1 sigma an axis of target/odom", "m")
+    position_noise: float = _noise("1 sigma per axis of target/odom", "m")
     attitude_noise: float = _noise(
-        "1 sigma an axis, of a rotation vector in the frame of its root link", "rad"
+        "1 sigma per axis of a rotation vector, in the root link frame", "rad"
     )
-    velocity_noise: float = _noise("1 sigma an axis of the velocity", "m/s")
-    angular_velocity_noise: float = _noise("1 sigma an axis of the angular velocity", "rad/s")
-    position_bias: tuple[float, ...] = _bias(
-        "of target/odom, in the rotating frame of the root link", "m"
-    )
+    velocity_noise: float = _noise("1 sigma per velocity axis", "m/s")
+    angular_velocity_noise: float = _noise("1 sigma per angular velocity axis", "rad/s")
+    position_bias: tuple[float, ...] = _bias("of target/odom, in the rotating root link frame", "m")
     attitude_bias: tuple[float, ...] = _bias("rotation vector in the same frame", "rad")
     delay: float = nonnegative(
-        0.0, "age of the state that target/odom carries, in whole ticks", "s", maximum=60.0
+        0.0, "age of the state in target/odom, in whole ticks", "s", maximum=60.0
     )
-    loss: float = nonnegative(
-        0.0, "share of the measurements that are lost, at random", maximum=1.0
-    )
+    loss: float = nonnegative(0.0, "fraction of measurements lost at random", maximum=1.0)
     rate: float = nonnegative(
         0.0,
-        "measurements a second, with whole ticks between them; 0: one every tick",
+        "measurements per second, a whole number of ticks apart; 0: one every tick",
         "Hz",
         maximum=100000.0,
     )
@@ -105,20 +101,20 @@ class TargetConfig:
 
     robot: str = parameter("", "URDF file of the target, whose joints are locked; '': no target")
     robot_description: str = parameter(
-        "", "URDF text of the target; takes precedence over 'target.robot'"
+        "", "URDF of the target as a string; takes precedence over 'target.robot'"
     )
     joint_positions: tuple[float, ...] = _initial(
-        "locked joint positions of the target, by joint order of its URDF; []: zero",
+        "locked target joint positions, in its URDF joint order; []: zero",
         "m or rad",
         (),
         length=None,
     )
-    grapple_frame: str = parameter("grapple", "link of the target at which it is captured")
+    grapple_frame: str = parameter("grapple", "target link at which it is captured")
     position: tuple[float, ...] = _initial(
         "initial position of the target's root link in the world", "m"
     )
-    orientation: tuple[float, ...] = _orientation("its initial quaternion x, y, z, w in the world")
-    velocity: tuple[float, ...] = _initial("of the origin of its root link, in world", "m/s")
+    orientation: tuple[float, ...] = _orientation("its initial orientation, quaternion x, y, z, w")
+    velocity: tuple[float, ...] = _initial("of its root link origin, in world", "m/s")
     angular_velocity: tuple[float, ...] = _initial("in world", "rad/s")
 
     sensors: TargetSensorConfig = group(TargetSensorConfig())
@@ -131,7 +127,7 @@ class TargetConfig:
 
 @dataclass(frozen=True)
 class CaptureConfig:
-    """Conditions of a capture: on request or automatic, within these bounds."""
+    """Capture conditions: the trigger (manual or automatic) and the bounds."""
 
     mode: str = parameter(
         "manual",
@@ -150,14 +146,14 @@ class CaptureConfig:
     rate: float = nonnegative(0.1, "largest relative angular rate of the two frames", "rad/s")
     joint_impulse_limit: float = nonnegative(
         0.0,
-        "joint impulse of the capture beyond which its event is a warning; 0: none",
+        "joint impulse above which the capture event is a warning; 0: none",
         "N m s or N s",
     )
 
 
 @dataclass(frozen=True)
 class OrbitConfig:
-    """A circular orbit, on which the origin of the world frame is in free fall."""
+    """A circular orbit on which the world frame origin is in free fall."""
 
     altitude: float = nonnegative(
         0.0,
@@ -169,19 +165,19 @@ class OrbitConfig:
         0.0, "mean motion of the orbit, instead of altitude", "rad/s", maximum=100.0
     )
     orientation: tuple[float, ...] = _orientation(
-        "of the orbital frame in the world at time zero (x outward along the radius, z along the "
-        "orbit's normal), a quaternion x, y, z, w"
+        "of the orbital frame in the world at time zero (x radially outward, z along the orbit "
+        "normal), quaternion x, y, z, w"
     )
 
 
 @dataclass(frozen=True)
 class TableConfig:
-    """A table with air bearings, in the x-y plane of the world, for planar robots."""
+    """An air-bearing table in the world's x-y plane, for planar robots."""
 
     tilt: float = nonnegative(0.0, "tilt of the table", "rad", maximum=1.5707963)
     direction: float = parameter(
         0.0,
-        "direction downhill in the x-y plane, from x",
+        "downhill direction in the x-y plane, from x",
         "rad",
         minimum=-6.2831854,
         maximum=6.2831854,
@@ -189,7 +185,7 @@ class TableConfig:
     gravity: float = nonnegative(9.80665, "acceleration of gravity", "m/s^2", maximum=1000.0)
     friction: float = nonnegative(
         0.0,
-        "viscous friction of the bearings: force on a body divided by its momentum",
+        "viscous bearing friction: force on a body divided by its momentum",
         "1/s",
         maximum=1000.0,
     )
@@ -197,63 +193,61 @@ class TableConfig:
 
 @dataclass(frozen=True)
 class PlantConfig(WatchdogConfig, RobotConfig):
-    """Parameters of a plant: actuation, time, limits, initial state, faults, sensors."""
+    """Plant parameters: actuation, time, limits, initial state, faults and sensors."""
 
     actuation: str = parameter(
         "auto",
-        "type of joint_commands; auto: the type of the first command that moves anything",
+        "type of joint_commands; auto: the type of the first non-zero command",
         choices=("auto", "velocity", "effort"),
     )
     engine: str = parameter(
         "exact",
-        "integrator of the motion: the package's equations, without contacts, or MuJoCo, with "
-        "contacts",
+        "motion integrator: the package's own equations (no contacts) or MuJoCo (with contacts)",
         choices=("exact", "mujoco"),
     )
     time_mode: str = parameter(
         "realtime",
-        "driver of time: the commands or the wall clock",
+        "what advances time: the commands or the wall clock",
         choices=("realtime", "lockstep"),
     )
     tick_rate: float = parameter(
-        DEFAULT_TICK_RATE, "ticks a second of simulated time", "Hz", minimum=0.001, maximum=100000.0
+        DEFAULT_TICK_RATE, "ticks per simulated second", "Hz", minimum=0.001, maximum=100000.0
     )
     real_time_factor: float = parameter(
         1.0, "simulated over wall time", minimum=0.001, maximum=1000.0
     )
-    command_timeout: float = _time(0.5, "realtime: older commands stop the joints; 0: never")
+    command_timeout: float = _time(0.5, "realtime: age at which commands expire; 0: never")
     beyond_limits: str = parameter(
-        "clip", "commands beyond the rate or effort limits of the URDF", choices=("clip", "refuse")
+        "clip", "handling of commands beyond the URDF's limits", choices=("clip", "refuse")
     )
     second_commander: str = parameter(
         "refuse",
-        "realtime: a second command for one state while several nodes publish commands",
+        "realtime: handling of a second command for one state while several nodes publish commands",
         choices=("refuse", "accept"),
     )
     latched_faults: str = parameter(
         "second_commander",
-        "reasons to refuse a command that latch a fault until ~/rearm, separated by "
-        "spaces: malformed not_finite stale early unknown_state out_of_order beyond_limits "
-        "second_commander",
+        "refusal reasons that latch a fault until ~/rearm, separated by spaces: malformed "
+        "not_finite stale early unknown_state out_of_order beyond_limits second_commander",
     )
     watchdog_action: str = parameter(
         "report",
         "reaction to a silent commander: report only, or also latch a fault",
         choices=("report", "latch"),
     )
-    integration_step: float = _time(0.0, "longest step; 0: 0.01 (velocity), 0.001 (effort)")
-    thrusters: str = parameter("", "'urdf': those of the robot's URDF; a YAML file; '': any wrench")
-    thrusters_excluded: str = parameter("", "names of disabled thrusters, separated by spaces")
+    integration_step: float = _time(0.0, "maximum step; 0: 0.01 (velocity), 0.001 (effort)")
+    thrusters: str = parameter("", "'urdf': the robot's URDF; or a YAML file; '': any wrench")
+    thrusters_excluded: str = parameter("", "space-separated names of disabled thrusters")
     world_frame: str = parameter("world", "name of the inertial frame")
     end_effector_frame: str = parameter("", "link of end_effector_pose; '': 'end_effector', if any")
     end_effectors: tuple[str, ...] = parameter(
-        (), "links whose measured poses are published on NAME/pose", texts=True
+        (), "links with measured poses published on NAME/pose", texts=True
     )
     base_pose_period: float = _time(
-        0.0, "simulated time between base_pose; 0: every tick. Realtime: at most 0.5 s of wall time"
+        0.0, "simulated time between poses; 0: every tick. Realtime: at most 0.5 s of wall time"
     )
     marker_period: float = _time(
-        0.5, "simulated time between markers; 0: none. Realtime: at most 0.5 s of wall time"
+        0.5, "simulated time between marker messages; 0: none. Realtime: at most 0.5 s of wall time"
     )
     tf_period: float = _time(
         0.1,
@@ -261,12 +255,12 @@ class PlantConfig(WatchdogConfig, RobotConfig):
     )
     tf_links: bool = parameter(
         True,
-        "whether all links are on /tf; false: the base only, for use with robot_state_publisher",
+        "whether all links are on /tf; false: only the base, for use with robot_state_publisher",
     )
     frame_prefix: str = parameter(
         "",
-        "prefix of the robot's frames, such as 'robot_1/', but not of world_frame. '': none, or "
-        "'robot/' if a link has the name of world_frame",
+        "prefix for the robot's frames, such as 'robot_1/', but not for world_frame. '': none, or "
+        "'robot/' if a link is named like world_frame",
     )
     diagnostics_period: float = _time(
         1.0,
@@ -275,19 +269,19 @@ class PlantConfig(WatchdogConfig, RobotConfig):
     )
     clearance_period: float = _time(
         1.0,
-        "simulated time between clearances, the smallest distances between links; 0: none. "
+        "simulated time between clearance messages (smallest distance between links); 0: none. "
         "Realtime: at most 0.5 s of wall time",
     )
     resume_bag: str = parameter(
-        "", "bag from whose last state and time to continue; '': the initial state"
+        "", "bag whose last state and time the plant continues from; '': the initial state"
     )
     initial_position: tuple[float, ...] = _initial("base link in the world", "m")
     initial_orientation: tuple[float, ...] = _orientation("quaternion x, y, z, w")
     initial_joint_positions: tuple[float, ...] = _initial(
-        "by joint order of the URDF; []: zero", "m or rad", (), length=None
+        "in URDF joint order; []: zero", "m or rad", (), length=None
     )
     initial_joint_velocities: tuple[float, ...] = _initial(
-        "by joint order, under efforts; []: zero", "m/s or rad/s", (), length=None
+        "in URDF joint order, under efforts; []: zero", "m/s or rad/s", (), length=None
     )
     initial_center_of_mass: tuple[float, ...] = _initial(
         "of the system in the world, instead of initial_position", "m", ()
@@ -312,10 +306,10 @@ class PlantConfig(WatchdogConfig, RobotConfig):
     capture: CaptureConfig = group(CaptureConfig())
 
     def decided(self, actuation: str = "") -> PlantConfig:
-        """Return the configuration with an actuation instead of ``auto``.
+        """Return the configuration with ``auto`` replaced by an actuation mode.
 
-        ``actuation`` is the type of the commands; empty: velocities, unless thrusters or moving
-        joints need efforts.
+        ``actuation`` is the command type; empty: velocities, unless thrusters or moving joints
+        require efforts.
         """
         if self.actuation != "auto":
             return self
@@ -323,7 +317,8 @@ class PlantConfig(WatchdogConfig, RobotConfig):
         return replace(self, actuation=actuation or ("effort" if needs_efforts else "velocity"))
 
     def prefix_for(self, robot: RobotDescription) -> str:
-        """Return the prefix of a robot's frame names, so that none equals the world's."""
+        """Return the prefix for a robot's frame names that keeps them distinct from the world
+        frame."""
         taken = self.world_frame in robot.frames
         return self.frame_prefix or ("robot/" if taken else "")
 
@@ -334,12 +329,12 @@ class PlantConfig(WatchdogConfig, RobotConfig):
 
     @property
     def clearance_ticks(self) -> int:
-        """Ticks between two clearances in lockstep; 0: none."""
+        """Ticks between clearance measurements in lockstep; 0: none."""
         return self.ticks_of(self.clearance_period)
 
     @property
     def contact_ticks(self) -> int:
-        """Ticks between two contact checks; 0: no checks."""
+        """Ticks between contact checks; 0: no checks."""
         return self.ticks_of(min(self.clearance_period, _CONTACT_PERIOD))
 
     def ticks_of(self, period: float) -> int:

@@ -1,21 +1,22 @@
-"""The plant under efforts: free-flying dynamics driven by joint efforts and a wrench on the base.
+"""The effort-driven plant: free-flying dynamics under joint efforts and a base wrench.
 
-One tick is one compiled function: limits, integration, and every quantity that is published. The
+One tick is one compiled function: limits, integration, and all published quantities. The
 total momenta are states (:mod:`spacerobot_ros.model.composite_rigid_body`): without thrust and
 external loads they are constant to the last bit. A tick in which a joint touches a limit is
 repeated with inelastic stops.
 
-A stop acts between the two links of its joint, along the joint's coordinate: an internal force,
-which changes neither total momentum; the other joints and the base react to it. With ``K`` the
-inertia matrix of the shape, stops do two things:
+A stop acts between the two links of its joint, along the joint's coordinate: as an internal force,
+it leaves both total momenta unchanged; the other joints and the base react. With ``K`` the
+inertia matrix of the configuration, stops do two things:
 
-* Arrival: ``qdot+`` is the nearest to ``qdot-``, in the metric of K, of all rates that exceed no
+* Arrival: ``qdot+`` is nearest to ``qdot-``, in the metric of K, among all rates that violate no
   limit. The joint does not rebound; the energy ``(qdot+ - qdot-)' K (qdot+ - qdot-) / 2`` is lost
   (Carnot). The time of arrival is exact up to rounding.
 * Holding: a joint on its stop stays there through an integration step if it is pushed outwards,
-  that is, if it is at rest in the admissible rates nearest to ``qdot + h K^-1 Q`` (Gauss's
+  that is, if its rate is zero in the admissible rates nearest to ``qdot + h K^-1 Q`` (Gauss's
   principle of least constraint over a step, Moreau's time stepping). It leaves with a delay of at
-  most one step, which ends the ever shorter hops of joints that knock each other off their stops.
+  most one step, which ends the sequence of ever shorter rebounds between joints that push each
+  other off their stops.
 
 A locked joint (a brake, a jam) is brought to rest by the same kind of impulse and held.
 """
@@ -40,7 +41,7 @@ from spacerobot_ros.simulation.loads import LoadedTick, PlantLoads
 from spacerobot_ros.simulation.plant import Flags, InitialState
 
 BISECTIONS = 40
-"""Bisections of the time of arrival: the error is 1e-12 of an integration step."""
+"""Bisection steps for the arrival time: the error is 1e-12 of an integration step."""
 
 _STOP_TOLERANCE = 1e-12
 """Distance beyond a limit at which a joint is considered outside: relative, or absolute (m or rad)
@@ -50,13 +51,13 @@ for limits below one."""
 FAILURES = tuple(
     f"{what}: the commands drive the robot too fast for the integration step. Reduce the commands, "
     "or parameter 'integration_step'."
-    for what in ("The motion is no longer finite", "Joints hit their stops without end")
+    for what in ("The motion is no longer finite", "Joints hit their stops endlessly")
 )
 """Reasons why :class:`JointStops` cannot advance a state."""
 
 MAX_ARRIVALS_PER_STEP = 2
-"""Largest number of arrivals at stops per joint and integration step, averaged over a tick:
-strongly driven joints knock each other off their stops ever more often."""
+"""Largest number of stop arrivals per joint and integration step, averaged over a tick:
+strongly driven joints push each other off their stops ever more often."""
 
 
 class JointStops:
@@ -69,7 +70,8 @@ class JointStops:
     integration_step
         Longest Runge-Kutta step, s.
     loaded
-        Whether external loads act: the state ends with the time, the command with the loads.
+        Whether external loads act; if so, the state vector ends with the time and the command
+        vector with the loads.
     """
 
     def __init__(self, robot: SpaceRobot, integration_step: float, *, loaded: bool = False) -> None:
@@ -82,7 +84,8 @@ class JointStops:
 
     @staticmethod
     def limits(robot: SpaceRobot) -> dict[str, Array]:
-        """Return the joint limits (n,), and those beyond which joints are considered outside."""
+        """Return the joint limits (n,), and the limits beyond which joints are considered
+        outside."""
         return {
             "LOWER": robot.lower,
             "UPPER": robot.upper,
@@ -93,15 +96,15 @@ class JointStops:
     def advance(
         self, state: Array, command: Array, duration: float, locked: Flags | None = None
     ) -> tuple[Array, Flags]:
-        """Return the state after ``duration`` s under a held command, and whether each joint (n,)
-        was stopped or held by its stop.
+        """Return the state after ``duration`` s under a constant command, and whether each joint
+        (n,) was stopped or held by its stop.
 
         ``locked`` (n,) joints are brought to rest at once and held at any position.
 
         Raises
         ------
         SpaceRobotError
-            The motion is no longer finite, or joints hit their stops without end.
+            The motion is no longer finite, or joints hit their stops endlessly.
         """
         x, left = state.copy(), duration
         steps = duration / self._integration_step
@@ -181,7 +184,7 @@ class JointStops:
 
 
 def stop_joints(compliance: Array, rates: Array, joints: Flags) -> tuple[Array, Array]:
-    """Return the rates (n,) after impulses that bring some joints to rest, and the impulses (n,).
+    """Return the rates (n,) after the impulses that stop some joints, and those impulses (n,).
 
     ``compliance`` (n, n) is the inverse of K.
     """
@@ -194,7 +197,7 @@ def stop_joints(compliance: Array, rates: Array, joints: Flags) -> tuple[Array, 
 
 
 def joints_stopped(compliance: Array, rates: Array, inward: Array, guess: Flags) -> Flags:
-    """Return which joints (n,) their stops bring to rest, so that ``inward * rates >= 0``.
+    """Return which joints (n,) are brought to rest by their stops, so that ``inward * rates >= 0``.
 
     ``inward`` is 1 or -1 on a stop and 0 elsewhere. The rates after the impulses are the nearest to
     the rates before in the metric of K. The linear complementarity problem is solved by Murty's
@@ -216,8 +219,9 @@ def joints_stopped(compliance: Array, rates: Array, inward: Array, guess: Flags)
 DEFAULT_INTEGRATION_STEP = 0.001
 """Longest Runge-Kutta step, s.
 
-With this step the energy of a tumbling six-joint arm whose joints rotate at several rad/s drifts by
-about 1e-12 in 100 s, relative; with four times the step, by 2e-10. A step takes some microseconds.
+With this step, the energy of a tumbling six-joint arm with joint rates of several rad/s drifts
+by about 1e-12 in 100 s, relative; with four times the step, by 2e-10. A step
+takes a few microseconds.
 """
 
 _MAX_FINITE_STATE = 1e100
@@ -225,30 +229,30 @@ _MAX_FINITE_STATE = 1e100
 
 
 class EffortPlant:
-    """A free-flying robot under held joint efforts and a held wrench on its base.
+    """A free-flying robot under constant joint efforts and a constant base wrench per tick.
 
-    After :meth:`step`, the attributes are those of :class:`Plant`, where ``effort`` is that of the
-    last tick after clipping, without the efforts of stops, and
+    After :meth:`step`, the attributes are those of :class:`Plant`, where ``effort`` is the last
+    tick's effort after clipping, without stop efforts, and
 
     ``wrench``
-        (6,) force (N) over torque (N m) of the last tick at the origin of the base link, base
+        (6,) force (N) over torque (N m) of the last tick at the base link origin, in base
         components.
 
     Parameters
     ----------
     robot
-        The model; its efforts are clipped to the limits of its description.
+        The model; efforts are clipped to the limits in its description.
     control_period
         Duration of a tick, s.
     initial
         Initial state.
     integration_step
-        Longest Runge-Kutta step within a tick, s.
+        Maximum Runge-Kutta step within a tick, s.
 
     Raises
     ------
     ParameterError
-        The initial shape has the wrong length or lies outside the joint limits, or a number is
+        The initial configuration has the wrong length or violates joint limits, or a value is
         invalid.
     """
 
@@ -290,12 +294,12 @@ class EffortPlant:
 
     @property
     def expected_momenta(self) -> Array:
-        """Linear over angular momentum (6,) in W: the initial one plus thrust and loads."""
+        """Linear over angular momentum (6,) in W: the initial value plus thrust and loads."""
         _, _, _, p_W, L_W, _ = state_slices(self.robot.n)
         return self._next_state[p_W.start : L_W.stop]
 
     def reset(self) -> None:
-        """Return to the initial state, without efforts; the limit counters continue."""
+        """Return to the initial state, with zero efforts; the limit counters continue."""
         start, robot = self.initial, self.robot
         self._state[:] = np.concatenate(
             [
@@ -311,7 +315,7 @@ class EffortPlant:
 
     @property
     def state(self) -> Array:
-        """The present state (2 n + 13,) of :mod:`spacerobot_ros.model.composite_rigid_body`."""
+        """The current state (2 n + 13,) of :mod:`spacerobot_ros.model.composite_rigid_body`."""
         return self._next_state
 
     def place(self, state: Array) -> None:
@@ -319,9 +323,9 @@ class EffortPlant:
         self._next_state[:] = state
 
     def hold(self, joints: Flags) -> None:
-        """Lock the marked joints (n,) at their positions, and release all other joints.
+        """Lock the marked joints (n,) at their positions, and release all others.
 
-        A moving joint is stopped by an internal impulse; neither total momentum changes.
+        A moving joint is stopped by an internal impulse; both total momenta are unchanged.
         """
         self._held[:] = joints
         self._holding = bool(joints.any())
@@ -337,19 +341,21 @@ class EffortPlant:
         self._stops = JointStops(robot, self.control_period / substeps, loaded=True)
 
     def step(self, effort: npt.ArrayLike, wrench: npt.ArrayLike = 0.0) -> bool:
-        """Advance one tick under joint efforts (n,), clipped to their limits, and a base wrench.
+        """Advance one tick under joint efforts (n,), clipped to their limits, and under a base
+        wrench.
 
-        ``wrench`` (6,) is force (N) over torque (N m) at the origin of the base link, in base
-        components; it rotates with the base during the tick. A joint that reaches its limit stops
+        ``wrench`` (6,) is force (N) over torque (N m) at the base link origin, in base components;
+        it rotates with the base during the tick. A joint that reaches its limit stops
         there without rebound and is held while something pushes it outwards. Returns whether any
-        joint was limited; ``effort_limited`` and ``stroke_limited`` count the ticks by joint.
+        joint was limited; ``effort_limited`` and ``stroke_limited`` count these ticks for each
+        joint.
 
         Raises
         ------
         CommandError
-            A command is not finite; the tick is not taken.
+            A command is not finite; the plant does not advance.
         SpaceRobotError
-            The motion is no longer finite; the tick is not taken.
+            The motion is no longer finite; the plant does not advance.
         """
         n = self.robot.n
         self._state[:] = self._next_state
@@ -397,9 +403,9 @@ class EffortPlant:
 def tick_function(
     robot: SpaceRobot, model: Composition, substeps: int, *, loaded: bool = False
 ) -> ca.Function:
-    """Compose the tick from the model's functions; see :class:`EffortPlant` for its results.
+    """Compose the tick from model functions; see :class:`EffortPlant` for its results.
 
-    With ``loaded``, the vector of external loads is the last input.
+    With ``loaded``, the external load vector is the last input.
     """
     n = robot.n
     parts = state_slices(n)

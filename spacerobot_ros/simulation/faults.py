@@ -1,12 +1,12 @@
-"""Fault lines, lines of disturbances, and their timelines.
+"""Fault lines, disturbance lines, and their timelines.
 
 A fault is ``KIND TARGET [VALUE] [at SECONDS] [until SECONDS]``, for example
-``joint_stuck joint_2 at 10 until 50``; :data:`FAULT_KINDS` has the kinds with their targets and
-values. A disturbance is a constant wrench from outside on a link,
+``joint_stuck joint_2 at 10 until 50``; :data:`FAULT_KINDS` lists the kinds with their targets and
+values. A disturbance is a constant external wrench on a link,
 ``LINK [force X Y Z] [torque X Y Z] [in world|link] [at SECONDS] [until SECONDS]``, for example
 ``hand force 1 0 0 torque 0 0 0.2 in link at 10 until 50``. Force (N) and torque (N m) act at the
-origin of the link's frame, in components of the world or of the link; the latter rotate with the
-link. Without ``at`` a fault or disturbance begins at once, without ``until`` it never ends.
+link frame origin, in world or link components; the latter rotate with the link. Without ``at``, a
+fault or disturbance begins immediately; without ``until``, it never ends.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ from typing import Generic, Protocol, TypeVar
 from spacerobot_ros.errors import ParameterError
 
 _MAX_FAULT_VALUE = 1e6
-"""Largest value of a fault, in its unit: squares of much larger ones overflow."""
+"""Largest fault value, in its unit: the squares of much larger values overflow."""
 
 WRENCH_AXES = ("force_x", "force_y", "force_z", "torque_x", "torque_y", "torque_z")
-"""Components of the wrench on the base, in base components."""
+"""Axes of the base wrench, in base components."""
 
 POSE_AXES = (
     "position_x",
@@ -33,10 +33,10 @@ POSE_AXES = (
     "attitude_y",
     "attitude_z",
 )
-"""Components of the measured pose: position in W, rotation vector in B."""
+"""Axes of the measured pose: position in W, rotation vector in B."""
 
 SENSOR_GROUPS = ("position", "attitude", "velocity", "angular_velocity", "joints", "joint_rates")
-"""Groups of measured quantities: the base's pose and twist, joint positions and rates."""
+"""Groups of measured quantities: base pose and twist, joint positions and rates."""
 
 
 @dataclass(frozen=True)
@@ -46,9 +46,9 @@ class FaultKind:
     Attributes
     ----------
     targets
-        Names of targets; ``joint`` and ``nozzle`` represent all joint and thruster names.
+        Names of targets; ``joint`` and ``nozzle`` stand for all joint and thruster names.
     value
-        Meaning of its value; empty: it has none.
+        Meaning of its value; empty: it takes no value.
     minimum, maximum
         Range of that number.
     sensor
@@ -66,8 +66,8 @@ FAULT_KINDS: dict[str, FaultKind] = {
     "joint_stuck": FaultKind(("joint",)),
     "joint_slow": FaultKind(("joint",), "factor on the command", 0.0, 1.0),
     "actuator_bias": FaultKind(("joint",), "added to the command, in its unit"),
-    "actuator_noise": FaultKind(("joint",), "1 sigma on the command, in its unit", 0.0),
-    "thruster_stuck": FaultKind(WRENCH_AXES, "held whatever is commanded, N or N m"),
+    "actuator_noise": FaultKind(("joint",), "1 sigma, added to the command, in its unit", 0.0),
+    "thruster_stuck": FaultKind(WRENCH_AXES, "held regardless of the command, N or N m"),
     "thruster_off": FaultKind((*WRENCH_AXES, "all")),
     "thruster_weak": FaultKind((*WRENCH_AXES, "all"), "factor on the command", 0.0, 1.0),
     "nozzle_open": FaultKind(("nozzle",)),
@@ -77,17 +77,17 @@ FAULT_KINDS: dict[str, FaultKind] = {
         (*POSE_AXES, "joint"), "added to the measurement, m or rad", sensor=True
     ),
     "sensor_noise": FaultKind(
-        SENSOR_GROUPS, "1 sigma a component, m or rad (/s)", 0.0, sensor=True
+        SENSOR_GROUPS, "1 sigma per component, m or rad (/s)", 0.0, sensor=True
     ),
     "sensor_dropout": FaultKind(("odom",), sensor=True),
     "sensor_delay": FaultKind(("odom",), "s, to whole ticks", 0.0, 60.0, sensor=True),
 }
-"""Kinds of faults by name."""
+"""Fault kinds by name."""
 
 
 @dataclass(frozen=True)
 class Fault:
-    """One fault: active from ``start`` s on and until before ``end`` s of simulated time."""
+    """One fault, active from ``start`` s until just before ``end`` s of simulated time."""
 
     kind: str
     target: str
@@ -102,8 +102,8 @@ class Fault:
 
 @dataclass(frozen=True)
 class FaultTargets:
-    """Targets of faults: joint names, the wrench on the base if there is one, and thruster names if
-    thrusters are modelled.
+    """Fault targets: joint names, the base wrench if there is one, and thruster names if thrusters
+    are modelled.
     """
 
     joints: Sequence[str] = ()
@@ -111,7 +111,7 @@ class FaultTargets:
     nozzles: Sequence[str] = ()
 
     def of(self, kind: FaultKind) -> list[str]:
-        """Return the targets of a kind."""
+        """Return the targets of a fault kind."""
         names: list[str] = []
         for target in kind.targets:
             if target == "joint":
@@ -124,7 +124,7 @@ class FaultTargets:
 
 
 def parse_fault(line: str, targets: FaultTargets, now: float = 0.0) -> Fault:
-    """Read a fault from its line.
+    """Parse a fault line.
 
     Parameters
     ----------
@@ -133,12 +133,12 @@ def parse_fault(line: str, targets: FaultTargets, now: float = 0.0) -> Fault:
     targets
         Targets of this plant.
     now
-        Start time of the fault if the line has none, s.
+        Start time of the fault if the line specifies none, s.
 
     Raises
     ------
     ParameterError
-        The line is not a fault of this plant; the message quotes it.
+        The line is not a valid fault for this plant; the message quotes it.
     """
     refusal = line_refusal(line, "fault")
     words = line.split()
@@ -146,13 +146,13 @@ def parse_fault(line: str, targets: FaultTargets, now: float = 0.0) -> Fault:
         raise refusal("it must be KIND TARGET [VALUE] [at SECONDS] [until SECONDS]")
     name, target, *rest = words
     if name not in FAULT_KINDS:
-        raise refusal(f"there is no kind '{name[:40]}'; there are {', '.join(FAULT_KINDS)}")
+        raise refusal(f"there is no kind '{name[:40]}'; the kinds are {', '.join(FAULT_KINDS)}")
     kind = FAULT_KINDS[name]
     known = targets.of(kind)
     if not known:
-        raise refusal(f"this plant has no target of {name}")
+        raise refusal(f"this plant has no target for {name}")
     if target not in known:
-        raise refusal(f"the target of {name} is one of {', '.join(known)}")
+        raise refusal(f"the target of {name} must be one of {', '.join(known)}")
     value = 0.0
     if kind.value:
         if not rest or rest[0] in ("at", "until"):
@@ -160,17 +160,17 @@ def parse_fault(line: str, targets: FaultTargets, now: float = 0.0) -> Fault:
         value = parse_number(rest.pop(0), refusal)
         if not kind.minimum <= value <= kind.maximum:
             raise refusal(
-                f"its value is {value:g} and must be from {kind.minimum:g} to {kind.maximum:g}"
+                f"its value is {value:g} but must be from {kind.minimum:g} to {kind.maximum:g}"
             )
     start, end = parse_times(rest, f"{name} {target}", now, refusal)
     return Fault(name, target, value, start, end)
 
 
 def edited_fault(line: str, part: str, text: str) -> str:
-    """Return the line of a fault with one part replaced: ``kind``, ``target``, ``value``, ``at``,
+    """Return a fault line with one component replaced: ``kind``, ``target``, ``value``, ``at``,
     or ``until``.
 
-    If the new kind has no value, the value of the line is dropped.
+    If the new kind takes no value, the line's value is dropped.
     """
     kind, target, *times = line.split()
     value = [times.pop(0)] if FAULT_KINDS[kind].value else []
@@ -189,12 +189,12 @@ def edited_fault(line: str, part: str, text: str) -> str:
 
 
 def fault_timeline(lines: Iterable[str], targets: FaultTargets) -> Timeline[Fault]:
-    """Return the faults of one plant by time.
+    """Return the fault timeline of one plant.
 
     Raises
     ------
     ParameterError
-        A line is not a fault of this plant, or there are too many.
+        A line is not a valid fault for this plant, or there are too many lines.
     """
     return Timeline(lines, lambda line, now: parse_fault(line, targets, now), "fault")
 
@@ -211,10 +211,10 @@ _LINE_FORMAT = (
 
 @dataclass(frozen=True)
 class Disturbance:
-    """One disturbance: active from ``start`` s on and until before ``end`` s of simulated time.
+    """One disturbance, active from ``start`` s until just before ``end`` s of simulated time.
 
-    ``force`` (3,), N, and ``torque`` (3,), N m, act at the origin of the frame of ``link``, in
-    components of that frame if ``in_link``, else of the world.
+    ``force`` (3,), N, and ``torque`` (3,), N m, act at the frame origin of ``link``, in link
+    components if ``in_link``, otherwise in world components.
     """
 
     link: str
@@ -234,21 +234,21 @@ class Disturbance:
 
 
 def parse_disturbance(line: str, links: Sequence[str], now: float = 0.0) -> Disturbance:
-    """Read a disturbance from its line.
+    """Parse a disturbance line.
 
     Parameters
     ----------
     line
         As the module describes.
     links
-        Names of the robot's links.
+        Link names of the robot.
     now
-        Start time of the disturbance if the line has none, s.
+        Start time of the disturbance if the line specifies none, s.
 
     Raises
     ------
     ParameterError
-        The line is not a disturbance of this robot; the message quotes it.
+        The line is not a valid disturbance for this robot; the message quotes it.
     """
     refusal = line_refusal(line, "disturbance")
     link, *rest = line.split() or [""]
@@ -269,7 +269,7 @@ def parse_disturbance(line: str, links: Sequence[str], now: float = 0.0) -> Dist
     in_link = False
     if rest[:1] == ["in"]:
         if rest[1:2] not in (["world"], ["link"]):
-            raise refusal("its frame is world or link")
+            raise refusal("its frame must be world or link")
         in_link, rest = rest[1] == "link", rest[2:]
     start, end = parse_times(rest, f"the {given[-1]}", now, refusal)
     if start < 0.0:
@@ -278,12 +278,12 @@ def parse_disturbance(line: str, links: Sequence[str], now: float = 0.0) -> Dist
 
 
 def disturbance_timeline(lines: Iterable[str], links: Sequence[str]) -> Timeline[Disturbance]:
-    """Return the disturbances of one plant by time.
+    """Return the disturbance timeline of one plant.
 
     Raises
     ------
     ParameterError
-        A line is not a disturbance of this robot, or there are too many.
+        A line is not a valid disturbance for this robot, or there are too many lines.
     """
     return Timeline(lines, lambda line, now: parse_disturbance(line, links, now), "disturbance")
 
@@ -294,14 +294,14 @@ MAX_TIME = 1e9
 """Largest time in a line, s."""
 
 _MAX_ENTRIES = 1000
-"""Largest number of entries in a timeline; searching more would take longer than a tick."""
+"""Largest number of entries in a timeline; searching more would exceed a tick."""
 
 Refusal = Callable[[str], ParameterError]
-"""Returns the error that refuses a line, given the reason as a clause."""
+"""Function that returns the error for an invalid line, given the reason as a clause."""
 
 
 class Timed(Protocol):
-    """An entry that is active from ``start`` s on and until before ``end`` s."""
+    """An entry that is active from ``start`` s until just before ``end`` s."""
 
     @property
     def start(self) -> float:
@@ -313,17 +313,17 @@ class Timed(Protocol):
 
 
 def line_refusal(line: str, noun: str) -> Refusal:
-    """Return the refusal of a line; its message quotes the line."""
+    """Return the error for an invalid line; its message quotes the line."""
     return lambda reason: ParameterError(f"The {noun} '{line.strip()[:80]}' is refused: {reason}.")
 
 
 def parse_number(text: str, refusal: Refusal) -> float:
-    """Return a number in a line, which must be finite.
+    """Parse a finite number in a line.
 
     Raises
     ------
     ParameterError
-        The text is not a finite number.
+        The string is not a finite number.
     """
     try:
         number = float(text)
@@ -337,23 +337,23 @@ def parse_number(text: str, refusal: Refusal) -> float:
 def parse_times(
     words: Sequence[str], before: str, now: float, refusal: Refusal
 ) -> tuple[float, float]:
-    """Return start and end (s) from the last words of a line, ``[at SECONDS] [until SECONDS]``.
+    """Return the start and end (s) from the last words of a line, ``[at SECONDS] [until SECONDS]``.
 
     Parameters
     ----------
     words
         The words.
     before
-        The part of the line before them, for messages.
+        The preceding part of the line, for messages.
     now
-        Start time if the words have none, s.
+        Start time if the words specify none, s.
     refusal
         Of the line.
 
     Raises
     ------
     ParameterError
-        The words are not times, or the end is not after the start.
+        The words are not valid times, or the end is not after the start.
     """
     times = {"at": now, "until": math.inf}
     if words[0::2] not in ([], ["at"], ["until"], ["at", "until"]) or len(words) % 2:
@@ -361,9 +361,9 @@ def parse_times(
     for word, text in zip(words[0::2], words[1::2], strict=True):
         times[word] = parse_number(text, refusal)
         if abs(times[word]) > MAX_TIME:
-            raise refusal(f"its time is {times[word]:g} s and must be at most {MAX_TIME:g} s")
+            raise refusal(f"its time is {times[word]:g} s but must be at most {MAX_TIME:g} s")
     if not times["until"] > times["at"]:
-        raise refusal(f"it ends at {times['until']:g} s and begins at {times['at']:g} s")
+        raise refusal(f"it ends at {times['until']:g} s but begins at {times['at']:g} s")
     return times["at"], times["until"]
 
 
@@ -371,12 +371,12 @@ _TIME = re.compile(r"\b(at|until) [\d.e+-]+")
 
 
 def with_seconds(line: str) -> str:
-    """Return the line of a fault or disturbance with the unit of its times, for display."""
+    """Return a fault or disturbance line with units on its times, for display."""
     return _TIME.sub(r"\g<0> s", line)
 
 
 def format_times(start: float, end: float) -> str:
-    """Return start and end as the last words of a line."""
+    """Return the start and end formatted as the last words of a line."""
     # With six digits, an entry that is short and late would begin and end at the same time.
     until = f" until {end:.12g}" if math.isfinite(end) else ""
     return f"at {start:.12g}{until}"
@@ -386,16 +386,17 @@ Entry = TypeVar("Entry", bound=Timed)
 
 
 class Timeline(Generic[Entry]):
-    """Entries of one plant by time.
+    """Timed entries of one plant.
 
     Parameters
     ----------
     lines
         One entry per line.
     parse
-        Reads an entry from its line; the second argument is its start time if the line has none, s.
+        Function that parses an entry line; the second argument is the start time if the line
+        specifies none, s.
     noun
-        Name of an entry, for messages.
+        Noun for an entry, for messages.
     """
 
     def __init__(
@@ -406,7 +407,7 @@ class Timeline(Generic[Entry]):
         self.active: tuple[Entry, ...] = ()
         """Active entries; a new tuple object after every change."""
         self.next_change = -math.inf
-        """Time of the next change of ``active``, s."""
+        """Time of the next change in ``active``, s."""
         self.read(lines)
 
     def read(self, lines: Iterable[str], now: float = 0.0) -> None:
@@ -415,19 +416,19 @@ class Timeline(Generic[Entry]):
         Raises
         ------
         ParameterError
-            A line is refused, or there are too many; none is added.
+            A line is invalid, or there are too many; none is added.
         """
         added = [self._parse(line, now) for line in lines if line.strip()]
         if len(self.entries) + len(added) > _MAX_ENTRIES:
             raise ParameterError(
-                f"{len(added)} more {self._noun}(s) are refused: there are {len(self.entries)}, "
-                f"and at most {_MAX_ENTRIES}; inject 'clear' first."
+                f"{len(added)} more {self._noun}(s) are refused: there are already "
+                f"{len(self.entries)} of at most {_MAX_ENTRIES}; inject 'clear' first."
             )
         self.entries += added
         self.next_change = -math.inf
 
     def inject(self, text: str, now: float) -> None:
-        """Add the entries of a text, one per line, or remove all entries (``clear``), including
+        """Add the entries in a string, one per line, or remove all entries (``clear``), including
         future ones.
 
         Raises
@@ -441,16 +442,16 @@ class Timeline(Generic[Entry]):
             self.read(text.splitlines(), now)
 
     def copy_from(self, other: Timeline[Entry]) -> None:
-        """Replace the entries by those of another timeline."""
+        """Replace the entries with those of another timeline."""
         self.entries, self.next_change = list(other.entries), -math.inf
 
     def clear(self) -> None:
-        """Remove all entries, including future entries."""
+        """Remove all entries, including future ones."""
         self.entries.clear()
         self.next_change = -math.inf
 
     def at(self, time: float) -> tuple[Entry, ...]:
-        """Return the entries that are active at a time (s), which must not decrease."""
+        """Return the entries active at a time (s), which must not decrease between calls."""
         if time >= self.next_change:
             active = tuple(each for each in self.entries if each.start <= time < each.end)
             if active != self.active:

@@ -1,4 +1,4 @@
-"""External loads of a plant as numbers, and ticks with loads."""
+"""External load values of a plant, and ticks with loads."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from spacerobot_ros.model.rotations import matrix_from_quaternion, unit_quaterni
 from spacerobot_ros.simulation.config import OrbitConfig, TableConfig
 
 _PLANE_TOLERANCE = 1e-9
-"""Largest component of a planar robot's normal along the table."""
+"""Largest component, along the table, of a planar robot's normal."""
 
 
 @dataclass(frozen=True)
@@ -28,13 +28,13 @@ class Surroundings:
     Attributes
     ----------
     mean_motion
-        Of the circular orbit, rad/s; zero: none.
+        Mean motion of the circular orbit, rad/s; zero: no orbit.
     quaternion_WO
         (4,) attitude (x, y, z, w) of the orbital frame in W at time zero.
     gravity_W
         (3,) uniform acceleration, m/s^2.
     friction
-        Viscous friction force on a body divided by its momentum, 1/s.
+        Viscous friction force on a body divided by the body's momentum, 1/s.
     """
 
     mean_motion: float = 0.0
@@ -44,7 +44,7 @@ class Surroundings:
 
     @classmethod
     def of(cls, orbit: OrbitConfig, table: TableConfig) -> Surroundings:
-        """Return the surroundings of a configuration.
+        """Return the configured surroundings.
 
         Raises
         ------
@@ -70,14 +70,14 @@ class Surroundings:
         )
         if found.mean_motion and found.on_table:
             raise ParameterError(
-                "Parameters 'table.*' and 'orbit.*' are both set: a robot is on a table or in "
-                "an orbit."
+                "Parameters 'table.*' and 'orbit.*' are both set: a robot is either on a table or "
+                "in an orbit."
             )
         return found
 
     @property
     def on_table(self) -> bool:
-        """Whether a table acts, by slope or friction."""
+        """Whether table slope or friction acts."""
         return bool(any(self.gravity_W) or self.friction)
 
     @property
@@ -86,13 +86,13 @@ class Surroundings:
         return bool(self.mean_motion or self.on_table)
 
     def require_suitable(self, robot: SpaceRobot, quaternion_WB: Array) -> None:
-        """Refuse a robot that does not fit on the table.
+        """Reject a robot that does not fit on the table.
 
         Raises
         ------
         ParameterError
             The robot is not planar, or with the attitude ``quaternion_WB`` (4,) its plane is not
-            the table's.
+            the table plane.
         """
         if not self.on_table:
             return
@@ -100,32 +100,29 @@ class Surroundings:
         if normal is None:
             raise ParameterError(
                 f"Parameters 'table.*' are set, but robot '{robot.description.name}' is not "
-                "planar: on a table with air bearings all joints move in its plane."
+                "planar: on an air-bearing table, all joints must move in the table plane."
             )
         normal_W = matrix_from_quaternion(quaternion_WB) @ normal
         if np.abs(normal_W[:2]).max() > _PLANE_TOLERANCE:
             raise ParameterError(
                 f"Parameters 'table.*' are set, but the plane of robot '{robot.description.name}' "
-                "is not the x-y plane of the world: change 'initial_orientation'."
+                "is not the world's x-y plane: change 'initial_orientation'."
             )
 
     def require_flat(self, name: str, motion: BodyMotion, inertia: Inertia) -> None:
-        """Refuse a free body that would not stay in the plane of the table.
+        """Reject a free body that would leave the table plane.
 
         Parameters
         ----------
-        name
-            Of the body.
-        motion
-            Its motion.
+        name Name of the body. motion Its motion.
         inertia
             Its mass properties, in its frame.
 
         Raises
         ------
         ParameterError
-            It moves out of the plane, or rotates about an axis other than its normal or a
-            non-principal axis.
+            It moves out of the plane, or rotates about an axis other than the plane's normal, or
+            about a non-principal axis.
         """
         if not self.on_table:
             return
@@ -135,33 +132,32 @@ class Surroundings:
         tilting = about[:2, 2] / np.trace(about)
         if np.abs(np.append(out_of_plane, tilting)).max() > _PLANE_TOLERANCE:
             raise ParameterError(
-                f"Parameters 'table.*' are set, but the target '{name}' does not stay in the x-y "
-                "plane of the world: it must move in this plane and rotate about a principal axis "
-                "along z."
+                f"Parameters 'table.*' are set, but the target '{name}' leaves the world's x-y "
+                "plane: it must move in this plane and rotate about a principal axis along z."
             )
 
 
 class PlantLoads:
-    """The loads on a robot, which change in place; initially there are no wrenches.
+    """The loads on a robot, updated in place; initially there are no wrenches.
 
     Parameters
     ----------
     robot
         The model.
     surroundings
-        Loads that do not change; None: none.
+        Constant loads; None: none.
 
     Attributes
     ----------
     vector
-        All numbers, in the order of :class:`.LoadLayout`.
+        All values, in the order of :class:`.LoadLayout`.
     in_link, in_world
-        (L, 6) force (N) over torque (N m) at the origin of every link, in the order of
-        ``robot.link_names``: in components of the link, and in those of W.
+        (L, 6) force (N) over torque (N m) at each link origin, in the order of
+        ``robot.link_names``: in link components, and in W.
     last
         ``vector`` of the last tick.
     surroundings
-        The loads that do not change.
+        The constant loads.
     """
 
     def __init__(self, robot: SpaceRobot, surroundings: Surroundings | None = None) -> None:
@@ -203,19 +199,19 @@ class PlantLoads:
 
 
 class LoadedTick:
-    """A tick with loads, evaluated on the buffers of the tick without loads.
+    """A tick with loads, which uses the buffers of the tick without loads.
 
     Parameters
     ----------
     plain
         The tick without loads, whose inputs and outputs are read and written.
     loaded
-        The tick with loads: it has the vector of loads as its last input, and may have further
+        The tick with loads: its last input is the load vector; it may have additional
         outputs.
     loads
         The loads.
     further
-        Arrays for the further outputs.
+        Arrays for the additional outputs.
     """
 
     def __init__(
@@ -231,7 +227,7 @@ class LoadedTick:
         self._outputs = list(zip([*plain.outputs, *further], loaded.outputs, strict=True))
 
     def evaluate(self) -> None:
-        """Evaluate the outputs at the inputs."""
+        """Evaluate the outputs for the current inputs."""
         for to, given in self._inputs:
             to[...] = given
         self._vector[:] = self._loads.vector

@@ -1,4 +1,4 @@
-"""MuJoCo's model of a robot with obstacles and a target, and external loads on its bodies."""
+"""MuJoCo model of a robot with obstacles and a target, and external loads on its bodies."""
 
 from __future__ import annotations
 
@@ -23,40 +23,40 @@ from spacerobot_ros.model.rotations import (
 )
 
 TARGET = "target/"
-"""Prefix of the names of the target's bodies and shapes."""
+"""Prefix of target body and geometry names."""
 
 _OBSTACLE = "obstacle/"
-"""Prefix of the names of obstacle shapes."""
+"""Prefix of obstacle geometry names."""
 
 _CONTACT_TIME_CONSTANT = 2.0
-"""Time constant of contacts, stops and welds, in steps: the smallest that MuJoCo recommends."""
+"""Time constant of contacts, stops and welds, in steps: MuJoCo's recommended minimum."""
 
 _MIN_INERTIA = 1e-12
 """Smallest principal inertia, kg m^2: MuJoCo does not accept point masses."""
 
 
 def import_mujoco() -> Any:
-    """Return the module of MuJoCo; see :func:`.optional_module`."""
+    """Return the MuJoCo module; see :func:`.optional_module`."""
     return optional_module("mujoco", "mujoco", "Flights in MuJoCo need")
 
 
 def body_name(link: str) -> str:
-    """Return the name of a link's body in MuJoCo, where ``world`` is reserved."""
+    """Return the MuJoCo body name for a link; ``world`` is reserved."""
     return "link world" if link == "world" else link
 
 
 def robot_spec(mujoco: Any, description: RobotDescription) -> Any:
-    """Return MuJoCo's specification of a robot with a free base; its shapes are omitted.
+    """Return the MuJoCo specification of a robot with a free base, without its geometries.
 
     Raises
     ------
     RobotDescriptionError
-        MuJoCo refuses the robot, or a joint follows another one.
+        MuJoCo rejects the robot, or a joint mimics another.
     """
     if description.has_mimic_joints:
         raise RobotDescriptionError(
-            f"Robot '{description.name}' has joints that follow others (<mimic>), which MuJoCo "
-            "does not read from a URDF."
+            f"Robot '{description.name}' has mimic joints (<mimic>), which MuJoCo does not read "
+            "from a URDF."
         )
     root = ElementTree.fromstring(description.urdf)
     for link in root.iter("link"):
@@ -91,14 +91,14 @@ def _add_motors(mujoco: Any, spec: Any, description: RobotDescription) -> None:
 
 
 def joint_addresses(model: Any, description: RobotDescription) -> tuple[list[int], list[int]]:
-    """Return the indices of the joints, in the robot's order, in ``qpos`` and in ``qvel``."""
+    """Return the joint indices, in the robot's order, in ``qpos`` and in ``qvel``."""
     joints = [model.joint(name) for name in description.joint_names]
     return [int(each.qposadr[0]) for each in joints], [int(each.dofadr[0]) for each in joints]
 
 
 def _refused(description: RobotDescription, error: ValueError) -> RobotDescriptionError:
     reason = str(error).removesuffix(".")
-    return RobotDescriptionError(f"MuJoCo refuses robot '{description.name}': {reason}.")
+    return RobotDescriptionError(f"MuJoCo rejects robot '{description.name}': {reason}.")
 
 
 def build_model(
@@ -109,7 +109,8 @@ def build_model(
     *,
     contacts: bool = True,
 ) -> tuple[Any, list[str]]:
-    """Return MuJoCo's model of robot, obstacles and target, and the names of the target's shapes.
+    """Return the MuJoCo model of the robot, obstacles and target, and the names of the target
+    geometries.
 
     Parameters
     ----------
@@ -120,16 +121,16 @@ def build_model(
     target
         The target, and the link that captures it; None: there is none.
     step
-        Step of its Runge-Kutta 4, s.
+        Step of MuJoCo's Runge-Kutta 4 integrator, s.
     contacts
-        Whether there are contact forces and joint stops, and the masses are the description's,
-        which may differ from the URDF's; otherwise the robot moves freely, with the model as MuJoCo
-        reads it from the URDF.
+        Whether there are contact forces and joint stops, with the masses in the description, which
+        may differ from the URDF; otherwise the robot moves freely, with the model as MuJoCo reads
+        it from the URDF.
 
     Raises
     ------
     RobotDescriptionError
-        MuJoCo refuses the robot, or a joint follows another one.
+        MuJoCo rejects the robot, or a joint mimics another.
     """
     spec, shapes = robot_spec(mujoco, robot), list[str]()
     _add_motors(mujoco, spec, robot)
@@ -274,7 +275,7 @@ def _set_options(mujoco: Any, model: Any, step: float) -> None:
 
 
 class MujocoLoads:
-    """External loads on the bodies of a robot in MuJoCo; see :mod:`.model.external_loads`.
+    """External loads on robot bodies in MuJoCo; see :mod:`.model.external_loads`.
 
     Parameters
     ----------
@@ -283,19 +284,19 @@ class MujocoLoads:
     model, data
         MuJoCo's model and state.
     links
-        Names of the robot's links.
+        Link names of the robot.
     """
 
     def __init__(self, mujoco: Any, model: Any, data: Any, links: Sequence[str]) -> None:
         self._mujoco, self._model, self._data = mujoco, model, data
         self._layout = LoadLayout(len(links))
         self.bodies = np.array([model.body(body_name(name)).id for name in links])
-        """Indices of the links' bodies."""
+        """Indices of the link bodies."""
 
     def apply(self, vector: Array, time: float) -> None:
-        """Apply the loads of a vector at a time, s, to all bodies in their present motion.
+        """Apply a load vector at a time, s, to all bodies in their current motion.
 
-        Poses and velocities of the bodies must belong to MuJoCo's present state.
+        Body poses and velocities must belong to MuJoCo's current state.
         """
         model, data, layout = self._model, self._data, self._layout
         in_link = vector[layout.in_link].reshape(-1, 6)
@@ -321,7 +322,7 @@ class MujocoLoads:
             data.xfrc_applied[body] = np.concatenate([force, torque])
 
     def momentum_rates(self, center: Array) -> Array:
-        """Return force over moment (6,) about a centre (3,) of the last applied loads, in W."""
+        """Return the force over moment (6,) of the last applied loads about a centre (3,), in W."""
         F, T = self._data.xfrc_applied[self.bodies].T.reshape(2, 3, -1)
         arms = self._data.xipos[self.bodies] - center
         return np.append(F.sum(axis=1), T.sum(axis=1) + cross(arms, F.T).sum(axis=0))

@@ -1,13 +1,14 @@
-"""The plant in MuJoCo, with contact forces between links, obstacles and target; a grasp is a weld.
+"""The plant in MuJoCo, with contact forces between the links, obstacles and target; a grasp is a
+weld.
 
 The parameter ``engine`` selects it instead of :class:`.EffortPlant` or :class:`.VelocityPlant`;
 commands, states and topics are the same. MuJoCo integrates by Runge-Kutta 4; contacts, joint stops,
 locked joints and welds are its soft constraints, with a time constant of two steps. They are
-internal forces, so that total momentum changes only by the integration error: with steps of 1 ms by
-about 1e-9 of its largest value in free motion, and by 1e-5 during a grasp.
+internal forces, so total momentum changes only by the integration error: with 1 ms steps, by about
+1e-9 of its largest value in free motion, and by 1e-5 during a grasp.
 
-Under velocities, a change of the commanded rates takes effect within a step. Apart from that, the
-servos provide at most the effort limits of the URDF: a joint that meets an obstacle stalls.
+Under velocity commands, a change in the commanded rates takes effect within a step. Otherwise,
+servo efforts stay within the URDF effort limits: a joint that meets an obstacle stalls.
 """
 
 from __future__ import annotations
@@ -45,10 +46,10 @@ DEFAULT_INTEGRATION_STEP = 0.001
 """Longest Runge-Kutta step, s."""
 
 _STOP_DISTANCE = 1e-4
-"""Distance from its limit, m or rad, at which a joint is considered stopped: stops are soft."""
+"""Distance to the limit, m or rad, at which a joint is considered stopped: stops are soft."""
 
 _SHARES = (1 / 6, 2 / 6, 2 / 6, 1 / 6)
-"""Weights of the Runge-Kutta 4 stages in a step."""
+"""Stage weights in a Runge-Kutta 4 step."""
 
 _CONTROL_CALLBACK = Lock()
 """MuJoCo has one callback per process: plants in threads take turns."""
@@ -63,35 +64,35 @@ class MujocoPlant:
     After :meth:`step`, the attributes are those of :class:`.Plant`, and
 
     ``wrench``
-        (6,) force (N) over torque (N m) of the last tick at the origin of the base link, base
+        (6,) force (N) over torque (N m) of the last tick at the base link origin, in base
         components.
     ``holds_target``
-        Whether the target is welded to the robot; if so, momenta include the target.
+        Whether the target is welded to the robot; if so, the momenta include the target.
 
     Parameters
     ----------
     robot
-        The model; MuJoCo reads its URDF, so masses must not differ from it.
+        The model; MuJoCo reads its URDF, so its masses must match the URDF.
     control_period
         Duration of a tick, s.
     initial
         Initial state.
     integration_step
-        Longest Runge-Kutta step within a tick, s.
+        Maximum Runge-Kutta step within a tick, s.
     actuation
-        ``velocity`` or ``effort``, like the parameter.
+        ``velocity`` or ``effort``, as in parameter ``actuation``.
     target
         The target, and the link that captures it; None: there is none.
     contacts
-        Whether there are contacts, joint stops and locks. Without them, the model is as MuJoCo
-        reads it from the URDF, and joints under velocity commands keep their rates exactly.
+        Whether there are contacts, joint stops and locks. Without them, the model is exactly as
+        MuJoCo reads it from the URDF, and joints under velocity commands keep their rates exactly.
 
     Raises
     ------
     ParameterError
         The initial state is invalid.
     RobotDescriptionError
-        MuJoCo refuses the robot or the target, or a joint follows another one.
+        MuJoCo rejects the robot or the target, or a joint mimics another.
     SpaceRobotError
         MuJoCo is not installed.
     """
@@ -145,14 +146,14 @@ class MujocoPlant:
             np.zeros((3, len(robot.link_names))),
         )
         self.expected_momenta = np.zeros(6)
-        """Linear over angular momentum (6,) in W: the initial one plus thrust and loads."""
+        """Linear over angular momentum (6,) in W: the initial value plus thrust and loads."""
         self.limit_counts: dict[str, Counts] = {
             kind: np.zeros(n, dtype=np.int64)
             for kind in ("rate" if self._velocity else "effort", "stroke")
         }
         self.holds_target = False
         self._aim = np.zeros(n)
-        """Rates commanded to the servos in the last tick."""
+        """Servo rates commanded in the last tick."""
         self._held: Flags = np.zeros(n, dtype=np.bool_)
         self._loads: PlantLoads | None = None
         self._loaded, self._stage = False, 0
@@ -161,13 +162,13 @@ class MujocoPlant:
     # -- the plant ----------------------------------------------------------------------------
 
     def reset(self) -> None:
-        """Return to the initial state, without efforts; the limit counters continue."""
+        """Return to the initial state, with zero efforts; the limit counters continue."""
         start, robot, data = self.initial, self.robot, self._data
         rates = start.rates(robot)
         if self._velocity and rates.any():
             raise ParameterError(
-                "Joints under velocity commands start at rest: leave the initial joint velocities "
-                "out, or command them."
+                "Joints under velocity commands start at rest: omit the initial joint velocities, "
+                "or command them."
             )
         quaternion, q, momenta = start.attitude(), start.shape(robot), start.momenta()
         self._mujoco.mj_resetData(self._model, data)
@@ -189,7 +190,7 @@ class MujocoPlant:
     def go_on(
         self, motion: RobotMotion, target: BodyMotion | None = None, *, welded: bool = False
     ) -> None:
-        """Continue from the given motions of robot and target, welded together or not."""
+        """Continue from the given motions of the robot and the target, welded together or not."""
         data = self._data
         data.qpos[:3], data.qpos[3:7] = motion.pose[:3], np.roll(motion.pose[3:], 1)
         data.qpos[self._q], data.qvel[self._qdot] = motion.q, motion.qdot
@@ -203,7 +204,7 @@ class MujocoPlant:
             self._update()
 
     def hold(self, joints: Flags) -> None:
-        """Lock the marked joints (n,) at their positions, and release all other joints."""
+        """Lock the marked joints (n,) at their positions, and release all others."""
         for joint in np.flatnonzero(joints & ~self._held | (joints & (self._locked() == 0))):
             self._model.eq_data[self._locks[joint], 0] = self._data.qpos[self._q[joint]]
         self._data.eq_active[self._locks] = joints
@@ -214,14 +215,14 @@ class MujocoPlant:
         self._loads = loads
 
     def step(self, command: npt.ArrayLike, wrench: npt.ArrayLike = 0.0) -> bool:
-        """Advance one tick under joint velocities, or joint efforts and a wrench (6,) on the base.
+        """Advance one tick under joint velocities, or under joint efforts and a base wrench (6,).
 
         Returns whether any joint was limited.
 
         Raises
         ------
         CommandError
-            A command is not finite; the tick is not taken.
+            A command is not finite; the plant does not advance.
         SpaceRobotError
             The motion is no longer finite.
         """
@@ -262,8 +263,8 @@ class MujocoPlant:
     # -- the target ---------------------------------------------------------------------------
 
     def weld(self) -> None:
-        """Weld the target to the capturing link in their present poses, and disable contacts
-        between both.
+        """Weld the target to the capturing link in their current poses, and disable contacts
+        between them.
         """
         model, data = self._model, self._data
         weld = model.equality("grasp").id
@@ -287,7 +288,7 @@ class MujocoPlant:
 
     @property
     def target_motion(self) -> BodyMotion:
-        """The present motion of the target's root link."""
+        """The current motion of the target's root link."""
         joint, data = self._model.joint(f"{TARGET}free"), self._data
         at, rate = int(joint.qposadr[0]), int(joint.dofadr[0])
         R = matrix_from_quaternion(np.roll(data.qpos[at + 3 : at + 7], -1))
@@ -436,7 +437,7 @@ class MujocoTarget(Target):
     Attributes
     ----------
     initial
-        Its motion at the beginning.
+        Its initial motion.
     """
 
     def __init__(
@@ -452,17 +453,17 @@ class MujocoTarget(Target):
         return np.concatenate(self.motion.momenta(self.inertia))
 
     def reset(self) -> None:
-        """Copy the initial state, to which the plant has already returned."""
+        """Copy the initial state, after the plant has returned to it."""
         self.step()
 
     def release(self, motion: BodyMotion) -> None:
-        """Float freely from the present motion on."""
+        """Float freely from the current motion."""
         assert self.plant is not None
         self.plant.unweld()
         self.step()
 
     def step(self) -> None:
-        """Copy the state of the plant."""
+        """Copy the plant state."""
         assert self.plant is not None
         motion = self.plant.target_motion
         self.pose[:3], self.pose[3:] = motion.r_WT, quaternion_from_matrix(motion.R_WT)
@@ -471,7 +472,7 @@ class MujocoTarget(Target):
 
 
 class MujocoCapturePlant(CapturePlant):
-    """A plant in MuJoCo with a target, which is captured by a weld."""
+    """A MuJoCo plant with a target, which is captured by a weld."""
 
     def __init__(
         self,
@@ -487,11 +488,11 @@ class MujocoCapturePlant(CapturePlant):
 
     @property
     def present_robot(self) -> SpaceRobot:
-        """The robot alone, or with the mass properties of the target."""
+        """The robot alone, or with the target's mass properties."""
         return self._joined or self._alone.robot
 
     def reset(self) -> None:
-        """Return robot and target to their initial states."""
+        """Return the robot and the target to their initial states."""
         self._joined = None
         super().reset()
 
@@ -524,14 +525,14 @@ def build_mujoco_plant(
     step: float,
     target: RobotDescription | None,
 ) -> MujocoPlant | MujocoCapturePlant:
-    """Return the plant of a configuration, without thrusters and faults.
+    """Return the configured plant, without thrusters and faults.
 
     Parameters
     ----------
     robot
         The model.
     config
-        The parameters of the plant.
+        The plant parameters.
     initial
         Initial state.
     step
@@ -542,9 +543,9 @@ def build_mujoco_plant(
     Raises
     ------
     ParameterError
-        The robot has no end-effector to capture the target with, or the initial state is invalid.
+        The robot has no end-effector for capturing the target, or the initial state is invalid.
     RobotDescriptionError
-        MuJoCo refuses the robot or the target.
+        MuJoCo rejects the robot or the target.
     SpaceRobotError
         MuJoCo is not installed.
     """

@@ -1,4 +1,4 @@
-"""The interface of plants, a base class for wrapping plants, and the initial state."""
+"""Plant interface, a base class for plant wrappers, and the initial state."""
 
 from __future__ import annotations
 
@@ -21,23 +21,24 @@ Flags = npt.NDArray[np.bool_]
 
 
 class Plant(Protocol):
-    """A simulated robot that advances by ticks; attributes hold its state after the last tick.
+    """A simulated robot that advances tick by tick; its attributes hold the state after the last
+    tick.
 
     ``pose``
         (7,) position ``r_WB`` in m and quaternion ``R_WB`` (x, y, z, w) of the base link.
     ``twist``
         (6,) ``v_WB_B`` in m/s and ``omega_WB_B`` in rad/s.
     ``q``, ``qdot``
-        (n,) joint positions (m or rad) and velocities (per second).
+        (n,) joint positions (m or rad) and velocities (m/s or rad/s).
     ``effort``
-        (n,) efforts of the joints' actuators, N or N m.
+        (n,) joint actuator efforts, N or N m.
     ``momentum``
         (7,) linear momentum (kg m/s), angular momentum about the system's centre of mass
         (kg m^2/s), both in W, and kinetic energy (J), summed over the bodies.
     ``link_R``, ``link_r``
-        (3, 3 L) and (3, L): pose in B of every link, in the order of ``robot.link_names``.
+        (3, 3 L) and (3, L): pose of each link in B, in the order of ``robot.link_names``.
 
-    The arrays belong to the plant and change in place: copy values that are kept.
+    The arrays belong to the plant and change in place: copy any values you keep.
     """
 
     robot: SpaceRobot
@@ -55,14 +56,14 @@ class Plant(Protocol):
         """Return to the initial state."""
 
     def hold(self, joints: Flags) -> None:
-        """Lock the marked joints (n,) at their positions, and release all other joints."""
+        """Lock the marked joints (n,) at their positions, and release all others."""
 
     def load(self, loads: PlantLoads) -> None:
         """Apply external loads; their values may change before each step."""
 
     @property
     def step(self) -> Callable[..., bool]:
-        """Advance a tick under the plant's commands; return whether a joint was limited."""
+        """Advance one tick under the plant's commands; return whether a joint was limited."""
 
     @property
     def limit_counts(self) -> Mapping[str, Counts]:
@@ -70,11 +71,12 @@ class Plant(Protocol):
 
     @property
     def expected_momenta(self) -> Array:
-        """Linear over angular momentum (6,) in W: the initial one plus thrust and loads."""
+        """Linear over angular momentum (6,) in W: the initial value plus thrust and loads."""
 
 
 class WrappedPlant:
-    """Base class of plants that wrap another and share its state arrays; subclasses add a step."""
+    """Base class of plants that wrap another and share its state arrays; subclasses implement
+    ``step``."""
 
     def __init__(self, plant: Plant) -> None:
         self.plant = plant
@@ -90,11 +92,11 @@ class WrappedPlant:
 
     @property
     def expected_momenta(self) -> Array:
-        """Linear over angular momentum (6,) in W: the initial one plus thrust and loads."""
+        """Linear over angular momentum (6,) in W: the initial value plus thrust and loads."""
         return self.plant.expected_momenta
 
     def hold(self, joints: Flags) -> None:
-        """Lock the marked joints (n,) at their positions, and release all other joints."""
+        """Lock the marked joints (n,) at their positions, and release all others."""
         self.plant.hold(joints)
 
     def load(self, loads: PlantLoads) -> None:
@@ -108,12 +110,12 @@ class WrappedPlant:
 
 @dataclass(frozen=True)
 class InitialState:
-    """Initial state of a plant: base pose in W (m; quaternion x, y, z, w), shape, momenta in W.
+    """Initial plant state: base pose in W (m; quaternion x, y, z, w), configuration, momenta in W.
 
     ``joint_positions`` None means zero, or the nearest limit if a joint's range excludes zero.
     ``angular_momentum`` (kg m^2/s) is about the system's centre of mass. ``joint_velocities`` None
-    means zero; the base's twist follows from them and the momenta. ``center_of_mass`` (m, in W)
-    places the system's centre of mass instead of the base link.
+    means zero; the base twist follows from them and the momenta. ``center_of_mass`` (m, in W)
+    positions the system's centre of mass instead of the base link.
 
     Raises
     ------
@@ -131,7 +133,7 @@ class InitialState:
 
     @classmethod
     def of(cls, config: PlantConfig) -> InitialState:
-        """Return the initial state of a configuration; empty lists select defaults.
+        """Return the configured initial state; empty lists select defaults.
 
         Raises
         ------
@@ -151,12 +153,11 @@ class InitialState:
     def __post_init__(self) -> None:
         if self.center_of_mass is not None and np.any(self.position):
             raise ParameterError(
-                "The initial position is set for both the base and the centre of mass: "
-                "leave one out."
+                "The initial position is set for both the base and the centre of mass: omit one."
             )
 
     def attitude(self) -> Array:
-        """Return the unit quaternion (x, y, z, w) of the base.
+        """Return the base unit quaternion (x, y, z, w).
 
         Raises
         ------
@@ -187,7 +188,7 @@ class InitialState:
         Raises
         ------
         ParameterError
-            The number of joints is wrong, or a position lies outside its limits.
+            The number of joints is wrong, or a position violates its limits.
         """
         if self.joint_positions is None:
             return np.clip(np.zeros(robot.n), robot.lower, robot.upper)
@@ -220,7 +221,7 @@ class InitialState:
         Raises
         ------
         ParameterError
-            The position is not finite, or the shape or the orientation is invalid.
+            The position is not finite, or the configuration or the orientation is invalid.
         """
         if self.center_of_mass is not None:
             r_WC_W = np.asarray(self.center_of_mass, dtype=float)
@@ -240,7 +241,7 @@ def _require_joint_values(robot: SpaceRobot, given: Array, quantity: str) -> Arr
     values = np.asarray(given, dtype=float)
     if values.shape != (robot.n,):
         raise ParameterError(
-            f"The initial joint {quantity} are {values.size} numbers; robot "
+            f"There are {values.size} initial joint {quantity}; robot "
             f"'{robot.description.name}' has {robot.n} joints: {', '.join(robot.joint_names)}."
         )
     if not np.all(np.isfinite(values)):

@@ -1,4 +1,4 @@
-"""Sensors of a plant, and its measured and true state as published on topics."""
+"""Plant sensors, and the measured and true state as published on topics."""
 
 from __future__ import annotations
 
@@ -34,18 +34,18 @@ _NOISE_PARAMETERS = {
 
 
 class Sensors:
-    """Measurements of the state of a plant, with bias, noise, delay and dropouts.
+    """Plant state measurements, with bias, noise, delay and dropouts.
 
-    ``pose`` (7,), ``twist`` (6,), ``q`` and ``qdot`` (n,) are the last measurements, arranged as
-    the state of the plant. Each call of :meth:`measure` draws new noise; flights with the same seed
+    ``pose`` (7,), ``twist`` (6,), ``q`` and ``qdot`` (n,) are the last measurements, arranged like
+    the plant state. Each call of :meth:`measure` draws new noise; flights with the same seed
     are identical.
 
-    A delay starts with the state at its onset: pose and twist are frozen until it has passed.
+    When a delay begins, pose and twist stay frozen until it has elapsed.
 
     Parameters
     ----------
     plant
-        The measured plant, with the faults of its sensors.
+        The measured plant, with its sensor faults.
     config
         Errors without faults.
     control_period
@@ -54,14 +54,14 @@ class Sensors:
     Raises
     ------
     ParameterError
-        The bias of the joints has the wrong length.
+        The joint bias has the wrong length.
     """
 
     def __init__(self, plant: PlantWithFaults, config: SensorConfig, control_period: float) -> None:
         n = plant.robot.n
         if len(config.joint_bias) not in (0, n):
             raise ParameterError(
-                f"Parameter 'sensors.joint_bias' has {len(config.joint_bias)} number(s); the robot "
+                f"Parameter 'sensors.joint_bias' has {len(config.joint_bias)} value(s); the robot "
                 f"has {n} joints."
             )
         self._plant, self._config, self._control_period = plant, config, control_period
@@ -70,25 +70,24 @@ class Sensors:
         self.pose, self.twist = plant.pose.copy(), plant.twist.copy()
         self.q, self.qdot = plant.q.copy(), plant.qdot.copy()
         self.dropout = False
-        """Whether the pose is missing because of a dropout."""
+        """Whether the pose is missing due to a dropout."""
         self._pose_bias, self._joint_bias = np.zeros(6), np.zeros(n)
         self._noise = dict.fromkeys(_NOISE_PARAMETERS, 0.0)
         self.pose_covariance, self.twist_covariance = np.zeros(36), np.zeros(36)
-        """Covariances of pose and twist, each 6 x 6 in row-major order, of the noise alone: bias
-        and delay are unknown to a sensor."""
+        """Covariances of pose and twist, each 6 x 6 in row-major order, for the noise
+        only: a sensor does not know its bias and delay."""
         self._delay = 0
         self._past: deque[tuple[Array, Array]] = deque(maxlen=1)
-        """Copies of the true poses and twists of the last ticks."""
+        """Copies of the true poses and twists in the last ticks."""
         self._apply_faults(plant.active)
         self.used = self.is_imperfect or any(
             FAULT_KINDS[f.kind].sensor for f in plant.timeline.entries
         )
-        """Whether measurements differ from the truth at any time: so far, now or due to a known
-        fault."""
+        """Whether measurements ever differ from the truth: so far, now or due to a known fault."""
 
     @property
     def is_imperfect(self) -> bool:
-        """Whether measurements presently differ from the truth."""
+        """Whether measurements currently differ from the truth."""
         return bool(
             self.dropout
             or self._delay
@@ -98,7 +97,7 @@ class Sensors:
         )
 
     def measure(self) -> None:
-        """Measure the present state of the plant; does nothing for sensors without errors."""
+        """Measure the plant's current state; does nothing for sensors without errors."""
         if self._plant.active is not self._faults:
             self._apply_faults(self._plant.active)
             self.used = self.used or self.is_imperfect
@@ -151,12 +150,13 @@ class Sensors:
 
 
 class TargetSensors:
-    """Measurements of the motion of a target, with bias, noise, delay, loss and a rate.
+    """Target motion measurements, with bias, noise, delay, loss and a rate.
 
-    ``pose`` (7,) and ``twist`` (6,) are the last measurement, arranged as those of the target.
-    Each call of :meth:`measure` draws the same number of random numbers, from a separate stream.
+    ``pose`` (7,) and ``twist`` (6,) are the last measurement, arranged like the target's pose and
+    twist. Each call of :meth:`measure` draws the same number of random numbers, from a separate
+    stream.
 
-    A delay starts with the state at its onset: pose and twist are frozen until it has passed.
+    When a delay begins, pose and twist stay frozen until it has elapsed.
 
     Parameters
     ----------
@@ -165,7 +165,7 @@ class TargetSensors:
     config
         The errors.
     seed
-        Seed of the noise of all sensors.
+        Noise seed of all sensors.
     control_period
         Duration of a tick, s.
     """
@@ -193,7 +193,7 @@ class TargetSensors:
         self._past: deque[tuple[Array, Array]] = deque(maxlen=self._delay + 1)
 
     def measure(self) -> None:
-        """Measure the present state of the target; does nothing without errors."""
+        """Measure the target's current state; does nothing for sensors without errors."""
         if not self.used:
             return
         config, truth = self._config, self._capturing
@@ -213,14 +213,14 @@ class TargetSensors:
 
 
 class ReportedState:
-    """The measured and true state of a plant, as published on its topics.
+    """A plant's measured and true state, as published on its topics.
 
     Parameters
     ----------
     plant
         The plant.
     config
-        Its configuration: sensors and end-effector.
+        The plant configuration: sensors and end-effector.
 
     Attributes
     ----------
@@ -229,9 +229,9 @@ class ReportedState:
     target_sensors
         Source of target/odom; None: there is no target.
     quantities
-        Arrays by the names of :attr:`StateField.quantity`, which change in place. The dictionary is
-        replaced when the sensors begin to err. It lacks quantities that the plant does not have
-        (thrusters, an end-effector, true values separate from measurements).
+        Arrays by :attr:`StateField.quantity` name, updated in place. The dictionary is
+        replaced when the sensors begin to deviate from the truth. It omits quantities that the
+        plant does not have (thrusters, an end-effector, true values that differ from measurements).
 
     Raises
     ------
@@ -263,7 +263,7 @@ class ReportedState:
 
     @property
     def topics(self) -> list[Topic]:
-        """The state topics that this plant presently publishes, in the order of publication."""
+        """The state topics that this plant currently publishes, in publication order."""
         return [
             topic
             for topic in state_topics(self._end_effectors)
@@ -271,7 +271,7 @@ class ReportedState:
         ]
 
     def names(self, topic: Topic) -> tuple[str, ...]:
-        """Return the names of the entries of a topic's arrays: joints or thrusters."""
+        """Return the entry names of a topic's arrays: joints or thrusters."""
         if topic.array_entries_of == "thrusters" and self._thrusters is not None:
             return tuple(self._thrusters.table.names)
         return tuple(self._plant.robot.joint_names)
@@ -282,7 +282,7 @@ class ReportedState:
         return self.target_sensors is not None and self.target_sensors.missing
 
     def update(self) -> bool:
-        """Measure the present state of the plant.
+        """Measure the plant's current state.
 
         Returns
         -------
@@ -363,7 +363,7 @@ def _link_indices(robot: SpaceRobot, names: Sequence[str]) -> list[int]:
             )
     if len({pose_topic(name).name for name in names}) < len(names):
         raise ParameterError(
-            "Parameter 'end_effectors' names links that share a topic NAME/pose: "
+            "Parameter 'end_effectors' names links that share the topic NAME/pose: "
             f"{', '.join(names)}; name only one of them."
         )
     return [links.index(name) for name in names]

@@ -26,63 +26,63 @@ from spacerobot_ros.times import SECOND
 
 
 def latched_text(fault: str) -> str:
-    """Return the effect of a latched fault as a sentence without a full stop."""
+    """Return the effect of a latched fault as a sentence without a final full stop."""
     return f"The joints brake and the thrusters are off until the plant is rearmed: {fault}"
 
 
 class PlantState(str, Enum):
-    """State of a plant regarding time and commands; the value of ``state`` in plant/status."""
+    """Plant state regarding time and commands; the value of ``state`` in plant/status."""
 
     INACTIVE = "inactive"
     """The plant publishes no states and accepts no commands."""
     RUNNING = "running"
-    """A command is in force, or a plant in lockstep waits for a command."""
+    """A command is in force, or a lockstep plant waits for a command."""
     RESTING = "resting"
-    """Time advances without a command in force: none has arrived yet, or the last is too old."""
+    """Time advances without a command in force: none has arrived yet, or the last one expired."""
     PAUSED = "paused"
     """Time is stopped; commands are accepted."""
     LATCHED = "latched"
     """Time advances with everything at rest, until the plant is rearmed."""
     FAILED = "failed"
-    """An error has stopped the plant: it is inactive until configured or activated again."""
+    """An error stopped the plant: it is inactive until configured or activated again."""
 
 
 @dataclass(frozen=True)
 class PlantStatus:
-    """A status of the plant, as plant/status carries it.
+    """A plant status, as published on plant/status.
 
     Attributes
     ----------
     state
         State of the plant.
     message
-        State and reason as text for the user.
+        State and reason, as a message for the user.
     reason
-        Reason as a word. Latched, or paused and latched: the reason to refuse a command, ``abort``
+        Reason as a word. Latched, or paused and latched: the refusal reason, ``abort``
         or ``watchdog``; resting: ``no_command`` or ``timeout``; failed: ``model`` or ``exception``;
         empty otherwise.
     latched_fault
-        The fault that is latched until ``~/rearm``, in any state of the plant; empty: none.
+        The fault latched until ``~/rearm``, in any plant state; empty: none.
     time_s
         Simulated time of the last change, s.
     rearms, resets
-        Number of rearms and resets, for subscribers that missed a status.
+        Number of rearms and resets; lets subscribers detect a missed status.
     faults
         Lines of the active injected faults.
     disturbances
         Lines of the active disturbances.
     payload
-        The body that the robot holds, as the text of a :class:`.Payload`; empty: none. With it the
-        robot has another mass, inertia and momentum.
+        The body that the robot holds, as a :class:`.Payload` string; empty: none. It changes
+        the robot's mass, inertia and momentum.
     contacts
         Links in contact, also with obstacles and the target; the end-effector may touch the target.
     timeouts
-        Number of times that the joints were brought to rest because no command came in time.
+        Number of times the joints were brought to rest because no command arrived in time.
     last_command_s
-        Stamp of the last command before the latest timeout, s; None: there was none.
+        Stamp of the last command before the most recent timeout, s; None: there was none.
     actuation
-        What joint_commands carry: ``velocity`` or ``effort``; ``auto``: either, until a command
-        decides; empty: the plant is not configured.
+        What joint_commands carry: ``velocity`` or ``effort``; ``auto``: not yet determined by a
+        command; empty: the plant is not configured.
     tick_rate_hz
         Ticks per second of simulated time, Hz; 0: the plant is not configured.
     time_mode
@@ -124,7 +124,7 @@ class PlantStatus:
         Raises
         ------
         SpaceRobotError
-            The pairs are not a plant's status.
+            The pairs do not form a plant status.
         """
         return _FORMAT.from_values(cls, values, message=message)
 
@@ -155,9 +155,10 @@ class PlantMonitor:
     Parameters
     ----------
     commands, plant
-        The plant and the validator of its commands.
+        The plant and its command validator.
     config
-        Configuration of the plant. In lockstep the plant waits for commands and so never rests.
+        Configuration of the plant. In lockstep, the plant waits for commands and is therefore never
+        ``resting``.
     """
 
     def __init__(
@@ -175,14 +176,14 @@ class PlantMonitor:
         )
         """Status of the last update."""
         self.contacts: tuple[str, ...] = ()
-        """The links that touch, set by the owner."""
+        """Links in contact, set by the owner."""
         self.failure = "", ""
-        """Reason and message of the error that stopped the plant, set by the owner."""
+        """Reason for and message of the error that stopped the plant, set by the owner."""
 
     def observe(
         self, commands: CommandValidator, plant: PlantWithFaults, config: PlantConfig
     ) -> None:
-        """Use another validator, plant and configuration from now on."""
+        """Replace the validator, plant and configuration."""
         self._commands, self._plant, self._config = commands, plant, config
 
     def update(self, activity: PlantState, time_s: float) -> list[Event]:
@@ -191,14 +192,14 @@ class PlantMonitor:
         Parameters
         ----------
         activity
-            Activity of the plant: inactive, running, paused or failed.
+            Plant activity: inactive, running, paused or failed.
         time_s
             Simulated time, s.
 
         Returns
         -------
         list[Event]
-            Events since the last update; empty: the status is unchanged.
+            Events since the last update; empty if the status is unchanged.
         """
         before, reports = self.status, self._take_reports()
         now = replace(
@@ -247,14 +248,14 @@ class PlantMonitor:
                 reason, message = self.failure
                 return PlantStatus(activity, message, reason, fault)
             case PlantState.PAUSED:
-                message = "Time is stopped until '~/pause' resumes it"
+                message = "Time is stopped; '~/pause' resumes it"
                 if fault:
                     message += f", and a fault is latched: {fault}"
             case _ if fault:
                 activity = PlantState.LATCHED
                 message = latched_text(fault)
             case _ if self._config.time_mode == "lockstep":
-                message = "Every tick takes the command that answers its state"
+                message = "Each tick uses the command for its state"
             case _ if commands.in_force:
                 message = "A command is in force"
             case _:
@@ -289,7 +290,7 @@ def _events_between(before: PlantStatus, now: PlantStatus) -> list[Event]:
     for fault in ended:
         add(EventKind.FAULT_ENDED, f"A fault has ended: {with_seconds(fault)}.", fault=fault)
     if ended and not now.faults:
-        add(EventKind.FAULTS_CLEARED, "No fault is active any longer.")
+        add(EventKind.FAULTS_CLEARED, "No fault is active any more.")
     for each in now.disturbances:
         if each not in before.disturbances:
             message = f"A disturbance begins: {with_seconds(each)}."

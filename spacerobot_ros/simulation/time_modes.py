@@ -8,19 +8,19 @@ from spacerobot_ros.simulation.commands import CommandValidator
 from spacerobot_ros.times import SECOND
 
 _MAX_LATE_TICKS = 10
-"""Largest number of late ticks that a real-time plant catches up on; further ticks are lost."""
+"""Largest number of late ticks that a real-time plant catches up; further ticks are lost."""
 
 _MAX_TICKS_AT_ONCE = 2
 """Largest number of ticks that a late plant takes before it reads commands again."""
 
 
 class Lockstep:
-    """Steps as soon as all commands of a tick have arrived.
+    """Steps as soon as all commands for a tick have arrived.
 
     Parameters
     ----------
     commands
-        The commands of the plant.
+        The plant's command validator.
     """
 
     def __init__(self, commands: CommandValidator) -> None:
@@ -31,15 +31,15 @@ class Lockstep:
 
     @property
     def may_step(self) -> bool:
-        """Whether the commands of this tick are complete."""
+        """Whether all commands for this tick have arrived."""
         return self._commands.complete
 
     def must_step_at_check(self, tick: int, *, pose_lost: bool) -> bool:
         """Return whether a plant that checks periodically must step.
 
-        A state without a pose may receive no command: a commander learns only from the next state
-        that the pose is missing. So the plant steps without a command if it was already waiting in
-        the same tick at its last check.
+        A state without a pose may receive no command: the commander only learns from the next state
+        that the pose is missing. The plant therefore steps without a command if it was already
+        waiting in the same tick at the previous check.
         """
         self.waits, self._looked_at = self._looked_at == tick, tick
         return (self.waits and pose_lost) or self.may_step
@@ -47,20 +47,20 @@ class Lockstep:
 
 @dataclass(frozen=True)
 class TimingStatistics:
-    """Deadline statistics of a plant in real time, and of its commander.
+    """Deadline statistics of a real-time plant and its commander.
 
     Attributes
     ----------
     tick_rate
         Ticks per second of wall time since the last report.
     ticks, ticks_late, worst_tick
-        Number of ticks; number of ticks taken after the next was due; largest delay, s.
+        Number of ticks; number taken after the next tick was due; largest delay, s.
     commands, commands_late, worst_command
         Number of commanded states; number commanded after the next tick was due; largest delay, s.
     command_age
-        Age of the state of the command in force, simulated s.
+        Age of the state that the command in force is for, simulated s.
     worse
-        Whether there are more delays than at the last report.
+        Whether there have been delays since the last report.
     """
 
     tick_rate: float
@@ -105,11 +105,11 @@ class RealTime:
         return self._pace / SECOND
 
     def start(self, now_ns: int, tick: int) -> None:
-        """Start at a tick whose state is due now."""
+        """Start with a tick whose state is due now."""
         self._origin = now_ns - tick * self._pace
 
     def due_ticks(self, now_ns: int, tick: int) -> int:
-        """Return the number of ticks to take now, after ``tick``; lost ticks are dropped."""
+        """Return the number of ticks due now, after ``tick``; lost ticks are dropped."""
         behind = int((now_ns - self._origin) / self._pace) - tick
         if behind > _MAX_LATE_TICKS:
             self.ticks_lost += behind - _MAX_LATE_TICKS
@@ -126,7 +126,7 @@ class RealTime:
             self._worst_tick = max(self._worst_tick, late)
 
     def count_command(self, now_ns: int, stamp_ns: float) -> None:
-        """Count a command in force for the state of a stamp (simulated time)."""
+        """Count a command in force for the state with a given stamp (simulated time)."""
         if stamp_ns <= self._answered_ns:
             return  # A refused command leaves the command in force unchanged.
         self._answered_ns = stamp_ns
@@ -137,7 +137,7 @@ class RealTime:
             self._worst_answer = max(self._worst_answer, late)
 
     def report(self) -> TimingStatistics:
-        """Return the statistics, and the rate of ticks since the last call."""
+        """Return the statistics, and the tick rate since the last call."""
         late = self._ticks_late, self._answers_late
         worse, self._reported = late != self._reported, late
         elapsed = (self._now - self._reported_at) / SECOND

@@ -1,8 +1,8 @@
-"""The plant under velocity actuation: servos hold joint velocities, the base follows from momentum.
+"""The velocity-driven plant: servos hold joint velocities, and momentum determines the base motion.
 
-One tick is one compiled function: limits, step, and every quantity that is published. The total
+One tick is one compiled function: limits, step, and all published quantities. The total
 linear and angular momenta are constants of the motion, initially zero by default; under external
-loads they are states, which the impulses change.
+loads, they are states that change with the impulses.
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ from spacerobot_ros.simulation.loads import LoadedTick, PlantLoads
 from spacerobot_ros.simulation.plant import Flags, InitialState
 
 _ROUNDING = 1e-9
-"""Share of a rate, and motion in a tick (m or rad), beyond a limit that are considered rounding."""
+"""Excess over a limit considered as rounding: share of a rate, and motion in a tick (m or rad)."""
 
 
 class VelocityPlant:
-    """A free-floating robot whose servos realise held joint velocities.
+    """A free-floating robot whose servos hold the commanded joint velocities.
 
     After :meth:`step`, the attributes are those of :class:`Plant`: ``qdot`` holds the velocities of
-    the last tick, and ``effort`` the efforts of the servos, from inverse dynamics with the mean of
-    the velocities before and in the tick, and their difference divided by the tick. Effort limits
-    do not restrict servos.
+    the last tick, and ``effort`` the efforts of the servos, from inverse dynamics with the mean
+    velocity before and during the tick, and the velocity difference divided by the tick length.
+    Effort limits do not apply to servos.
 
     Parameters
     ----------
@@ -42,13 +42,13 @@ class VelocityPlant:
     initial
         Initial state.
     integration_step
-        Longest Runge-Kutta step of the attitude within a tick, s.
+        Maximum Runge-Kutta step of the attitude within a tick, s.
 
     Raises
     ------
     ParameterError
-        The initial shape has the wrong length or lies outside the joint limits, its joints move, or
-        a number is invalid.
+        The initial configuration has the wrong length or violates joint limits, the joints are
+        moving, or a value is invalid.
     """
 
     def __init__(
@@ -85,7 +85,7 @@ class VelocityPlant:
 
     @property
     def expected_momenta(self) -> Array:
-        """Linear over angular momentum (6,) in W: the initial one plus external loads."""
+        """Linear over angular momentum (6,) in W: the initial value plus external loads."""
         return self._momenta
 
     def reset(self) -> None:
@@ -93,8 +93,8 @@ class VelocityPlant:
         start, robot = self.initial, self.robot
         if np.any(start.rates(robot)):
             raise ParameterError(
-                "Joints under velocity commands start at rest: leave the initial joint velocities "
-                "out, or command them."
+                "Joints under velocity commands start at rest: omit the initial joint velocities, "
+                "or command them."
             )
         self._state[: robot.n] = start.shape(robot)
         self._state[robot.n :] = start.attitude()
@@ -107,7 +107,7 @@ class VelocityPlant:
         self._h[:] = self.control_period
 
     def hold(self, joints: Flags) -> None:
-        """Lock the marked joints (n,) at their positions, and release all other joints."""
+        """Lock the marked joints (n,) at their positions, and release all others."""
         self._held = joints.copy() if joints.any() else None
 
     def load(self, loads: PlantLoads) -> None:
@@ -120,11 +120,11 @@ class VelocityPlant:
         self._tick = LoadedTick(self._advance, loaded, loads, [self._momenta])
 
     def step(self, command: Array) -> bool:
-        """Advance one tick under the joint velocities ``command`` (n,), clipped to its limits.
+        """Advance one tick under the joint velocities ``command`` (n,), clipped to their limits.
 
-        If a joint would pass its limit within the tick, its rate is reduced to end at the limit.
-        Returns whether any joint was limited; ``velocity_limited`` and ``stroke_limited`` count
-        the ticks by joint.
+        If a joint would pass its limit within the tick, its rate is reduced so that it ends at the
+        limit. Returns whether any joint was limited; ``velocity_limited`` and ``stroke_limited``
+        count these ticks for each joint.
         """
         self._state[:] = self._next_state
         self._before[:] = self.qdot
@@ -148,11 +148,12 @@ def tick_function(
     loaded: bool = False,
     momentumless: bool = False,
 ) -> ca.Function:
-    """Compose the tick from the model's functions; see :class:`VelocityPlant` for its results.
+    """Compose the tick from model functions; see :class:`VelocityPlant` for its results.
 
-    With ``loaded``, the vector of external loads is the last input, and the momenta after the tick
+    With ``loaded``, the external load vector is the last input, and the momenta after the tick
     are the last output. ``momentumless`` ticks have fewer operations and the same results if the
-    angular momentum is zero; they ignore the argument for it. The model has an argument ``p``.
+    angular momentum is zero; they ignore the argument for it. The model has a parameter argument
+    ``p``.
     """
     n = robot.n
     state, command = ca.MX.sym("state", n + 4), ca.MX.sym("command", n)

@@ -148,7 +148,7 @@ def test_a_path_that_cannot_be_followed_is_told_by_its_reason(tmp_path: Path) ->
         with pytest.raises(RecordingError) as caught:
             writer.check()
         reason = os.strerror(errno.ELOOP)
-        assert str(caught.value) == f"The bag {path} is lost while it is written: {reason}."
+        assert str(caught.value) == f"The bag {path} was lost during recording: {reason}."
         path.unlink()
         (tmp_path / "b.mcap").rename(path)
 
@@ -173,7 +173,7 @@ def test_a_file_that_goes_while_it_is_written_is_missed(
     recording.check()
     recording.check()
     (failure,) = failures
-    assert f"The bag {path} is lost while it is written: " in str(failure)
+    assert f"The bag {path} was lost during recording: " in str(failure)
     assert recording.failure is failure
     assert not recording.running
     recording.close()

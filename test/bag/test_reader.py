@@ -290,7 +290,7 @@ def test_the_topics_of_one_robot_are_found_by_their_names(tmp_path: Path) -> Non
     assert RecordedRobot(bag).urdf is None
     assert craft.get("odom") is None, "it has no message"
     assert RecordedRobot(bag).get("odom") is None, "it is of another type"
-    with pytest.raises(RecordingError, match="nothing is on /craft/odom"):
+    with pytest.raises(RecordingError, match="no messages on /craft/odom"):
         craft["odom"]
 
 
@@ -317,7 +317,7 @@ def test_the_truth_is_what_was_measured_until_it_is_published(tmp_path: Path) ->
     assert truth("") == [[0, 0.1, -0.1], [1, 1.1, -1.1], [2, 2.0, -2.0], [3, 3.0, -3.0]]
     assert truth("/perfect") == [[0, 5.0, -5.0]]
     assert truth("/alone") == [[0, 6.0, -6.0]]
-    with pytest.raises(RecordingError, match="nothing is on /nobody/joint_states"):
+    with pytest.raises(RecordingError, match="no messages on /nobody/joint_states"):
         RecordedRobot(bag, "/nobody")["joint_states"]
 
 
@@ -376,14 +376,14 @@ def test_bags_of_the_mcap_library(tmp_path: Path, options: dict[str, Any]) -> No
 
 def test_a_folder_with_one_bag(good: Path, tmp_path: Path) -> None:
     (tmp_path / "rosbag2").mkdir()
-    with pytest.raises(RecordingError, match="rosbag2 holds no bag: name an MCAP file"):
+    with pytest.raises(RecordingError, match="rosbag2 contains no bag: name an MCAP file"):
         read_bag(tmp_path / "rosbag2")
     (tmp_path / "rosbag2" / "rosbag2_0.mcap").write_bytes(good.read_bytes())
     (tmp_path / "rosbag2" / "metadata.yaml").touch()
     assert read_bag(tmp_path / "rosbag2").message_count() == 100
     assert len(list(iterate_raw(tmp_path / "rosbag2"))) == 100
     (tmp_path / "rosbag2" / "rosbag2_1.mcap").touch()
-    with pytest.raises(RecordingError, match="holds 2 MCAP files: name one of them"):
+    with pytest.raises(RecordingError, match="contains 2 MCAP files: name one of them"):
         read_bag(tmp_path / "rosbag2")
 
 

@@ -233,7 +233,7 @@ def test_a_bag_of_too_many_topics_is_played_by_name(
 ) -> None:
     monkeypatch.setattr("spacerobot_ros.bag.playback._MAX_REPLAYED_TOPICS", 2)
     bag = read_bag(path)
-    with pytest.raises(RecordingError, match="has 3 topics, and only 2 can be replayed at once"):
+    with pytest.raises(RecordingError, match="has 3 topics, but only 2 can be replayed at once"):
         Playback(bag)
     assert [topic.name for topic in Playback(bag, topics=["/a", "/b"]).topics] == ["/a", "/b"]
 

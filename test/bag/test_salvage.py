@@ -324,7 +324,7 @@ def test_each_robot_has_its_own(tmp_path: Path) -> None:
         say_state(say, 1.0, 2, "/b")
     assert_state(tmp_path / "a.mcap", 0.5, 1, "/a")
     assert_state(tmp_path / "a.mcap", 1.0, 2, "/b")
-    with pytest.raises(RecordingError, match="nothing is on /odom"):
+    with pytest.raises(RecordingError, match="no messages on /odom"):
         last_state(tmp_path / "a.mcap")
 
 

@@ -127,7 +127,7 @@ def test_a_split_bag_is_one_bag(split_bag: Path, tmp_path: Path) -> None:
         result = CliRunner().invoke(main, [*words, str(split_bag), "-o", out])
         assert result.exit_code == 0, result.output
     (split_bag / "metadata.yaml").unlink()
-    with pytest.raises(RecordingError, match="holds 11 MCAP files: name one of them"):
+    with pytest.raises(RecordingError, match="contains 11 MCAP files: name one of them"):
         read_bag(split_bag)
 
 
@@ -210,7 +210,7 @@ def test_a_compressed_file_is_read(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match="inflates to more than the 32000000 bytes"):
         read_bag(file)
     refused = CliRunner().invoke(main, ["salvage", str(file)]).stderr
-    assert_one_sentence(refused, "is compressed: unpack it by 'zstd -d'")
+    assert_one_sentence(refused, "is compressed: unpack it with 'zstd -d'")
 
 
 def test_a_bag_in_sqlite_says_how_to_convert_it(tmp_path: Path) -> None:
@@ -219,7 +219,7 @@ def test_a_bag_in_sqlite_says_how_to_convert_it(tmp_path: Path) -> None:
     for path in (folder, file):
         with pytest.raises(RecordingError, match=f"The bag {file} is in SQLite: ") as caught:
             read_bag(path)
-    command = str(caught.value).split("convert it by '")[1].split("', or")[0]
+    command = str(caught.value).split("convert it with '")[1].split("', or")[0]
     if "'" in command:
         command = command.partition(" --dst ")[0] + " --dst NEW_FOLDER --dst-storage mcap"
     program, *words = shlex.split(command.replace("NEW_FOLDER", shlex.quote(f"{tmp_path}/new")))
@@ -405,7 +405,7 @@ def make_device(path: Path) -> None:
         (make_pipe, "it is a pipe"),
         (make_socket, "it is a socket"),
         (make_device, "it is a device"),
-        (make_folder, "it is a folder|holds no bag"),
+        (make_folder, "it is a folder|contains no bag"),
     ],
 )
 def test_what_is_no_file_is_neither_read_nor_written(
@@ -443,7 +443,7 @@ def test_a_message_may_hold_nothing_and_has_a_whole_head(tmp_path: Path) -> None
 def test_a_chunk_and_its_index_agree(tmp_path: Path) -> None:
     path, data = tmp_path / "a.mcap", message(string("x"))
     path.write_bytes(bag(Part("", data, len(data), indexed_size=len(data) + 1)))
-    with pytest.raises(RecordingError, match="and its index claim different sizes"):
+    with pytest.raises(RecordingError, match="and its index state different sizes"):
         read_bag(path)["/a"]
 
 
@@ -455,5 +455,5 @@ def test_a_file_that_is_too_short_for_a_footer_is_damaged_at_its_begin(
     path.write_bytes(MCAP0_MAGIC + bytes([1] * length) + MCAP0_MAGIC)
     # The footer takes 29 bytes, and what the file ends with 8.
     place = max(8 + length - 29, 0)
-    with pytest.raises(RecordingError, match=f"is damaged: the record at byte {place} claims"):
+    with pytest.raises(RecordingError, match=f"is damaged: the record at byte {place} declares"):
         read_bag(path)

@@ -95,7 +95,7 @@ def test_a_bag_is_a_mapping_of_topics_with_and_without_the_slash(bag: Bag) -> No
     assert bag.get("event") is None
     assert bag.get("event", 7) == 7
     for no_name in (7, None, ["events"]):
-        with pytest.raises(TypeError, match="The name of a topic is a text"):
+        with pytest.raises(TypeError, match="A topic name must be a string"):
             bag.to_pandas(no_name) if no_name else bag[no_name]  # type: ignore[index,call-overload]
     with pytest.raises(RecordingError, match="no topic event: it has"):
         bag["event"]
@@ -286,8 +286,8 @@ def test_what_cannot_be_exported_leaves_nothing_behind(tmp_path: Path, bag: Bag)
     for name, kind, mention in (
         ("flight.csv", ExportFormat.MAT, "must end in .mat; 'flight.csv' does not."),
         ("flight.xlsx", ExportFormat.MAT, "must end in .mat"),
-        ("flight.CSV", ExportFormat.CSV, "in csv are a folder"),
-        ("flight.mat", ExportFormat.PARQUET, "in parquet are a folder"),
+        ("flight.CSV", ExportFormat.CSV, "in csv are written to a folder"),
+        ("flight.mat", ExportFormat.PARQUET, "in parquet are written to a folder"),
     ):
         with pytest.raises(RecordingError) as refusal:
             export([], tmp_path / name, kind)
@@ -545,5 +545,5 @@ def test_the_command_that_a_cut_bag_asks_for_can_be_pasted(tmp_path: Path) -> No
     bag.path.write_bytes(bag.path.read_bytes()[:-40])
     result = CliRunner().invoke(main, ["export", str(bag.path)])
     assert result.exit_code == 2
-    command = result.stderr.partition("'spacerobot")[2].rpartition("' makes")[0]
+    command = result.stderr.partition("'spacerobot")[2].rpartition("' recovers")[0]
     assert shlex.split(f"spacerobot{command}") == ["spacerobot", "salvage", str(bag.path)]

@@ -77,7 +77,7 @@ def test_a_target_is_captured_and_released_on_request(harness: Harness) -> None:
     refused = rig.trigger("plant/release")
     assert (refused.success, refused.message) == (
         False,
-        "'end_effector' holds no target to release.",
+        "'end_effector' does not hold a target.",
     )
     first = rig.wait("target/odom", 1)
     assert (first.header.frame_id, first.child_frame_id) == ("world", "block")

@@ -255,7 +255,7 @@ def test_a_bag_that_goes_is_reported_within_a_second(
             errors = process.communicate(timeout=20)[1]
     (status,) = probe.last("/diagnostics").status
     assert status.level == DiagnosticStatus.ERROR
-    assert "is lost while it is written: it was removed or moved" in status.message
+    assert "was lost during recording: it was removed or moved" in status.message
     assert seconds < 1.0
     assert process.returncode == 1
     assert "is lost while it is written" in errors

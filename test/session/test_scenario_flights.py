@@ -216,7 +216,7 @@ def test_thrusters_of_a_robot_that_nothing_pushes_are_refused(tmp_path: Path) ->
     scenario = load_scenario("servicer_thrusters").with_overrides(
         "plant", {"actuation": "velocity"}
     )
-    with pytest.raises(ParameterError, match="has no wrench on the base"):
+    with pytest.raises(ParameterError, match="has no base wrench"):
         run_scenario(scenario, tmp_path / "no.mcap")
 
 

@@ -288,9 +288,10 @@ def test_refusals() -> None:
     with pytest.raises(CommandError) as error:
         capturing.capture()
     assert str(error.value) == (
-        "The target is missed: its angle is 0.4067 rad, 0.3067 rad more than 'capture.angle', 0.1."
+        "The target cannot be captured: its angle is 0.4067 rad, 0.3067 rad more than "
+        "'capture.angle', 0.1."
     )
-    with pytest.raises(CommandError, match=r"^'end_effector' holds no target to release"):
+    with pytest.raises(CommandError, match=r"^'end_effector' does not hold a target"):
         capturing.release()
     assert capturing.reports == []
     capturing = capturing_of(plant_of(PAPER_ROBOT))
@@ -649,7 +650,7 @@ def test_a_target_slides_on_a_table_with_the_robot() -> None:
         wobbly,
     ):
         name = "tumbler" if flaw is wobbly else "block"
-        with pytest.raises(ParameterError, match=f"the target '{name}' does not stay in the x-y"):
+        with pytest.raises(ParameterError, match=f"the target '{name}' leaves the world's x-y"):
             plant_of(PAPER_ROBOT, **{"table.tilt": 0.1, **flaw})
 
 

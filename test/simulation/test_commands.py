@@ -357,7 +357,7 @@ def test_in_lockstep_a_refusal_names_both_times(stamp: float, now: float, clause
     [
         (6.65, 7.4, "it is 0.75 s old"),
         (7.65, 7.4, "it is 0.25 s ahead of time"),
-        (7.12, 7.4, "it is stamped 7.12 s, and states have multiples of 0.05 s"),
+        (7.12, 7.4, "it is stamped 7.12 s, but state stamps are multiples of 0.05 s"),
     ],
 )
 def test_in_real_time_a_refusal_says_how_far_off_it_is(
@@ -405,7 +405,7 @@ def test_a_limit_is_named_beside_what_is_beyond_it() -> None:
     refusal = Rig(beyond_limits="refuse").offer(0, 0, np.array([0.0, 0.5, -9.0]))
     assert refusal is not None
     limits = SLIDERS.velocity_limit.tolist()
-    assert refusal.clause == f"[0.0, 0.5, -9.0] is beyond the limits {limits}"
+    assert refusal.clause == f"[0.0, 0.5, -9.0] exceeds the limits {limits}"
 
 
 def test_names_and_lengths() -> None:

@@ -94,12 +94,12 @@ FORM = (
         ("hand torque 1 inf 2", "'inf' is not a finite number"),
         ("hand force 1 -2e6 0", "components of its force must be at most 1e+06"),
         ("hand force 1 2 3 torque 0 0 -1.1e6", "components of its torque must be at most 1e+06"),
-        ("hand force 1 2 3 in space", "its frame is world or link"),
-        ("hand force 1 2 3 in", "its frame is world or link"),
+        ("hand force 1 2 3 in space", "its frame must be world or link"),
+        ("hand force 1 2 3 in", "its frame must be world or link"),
         ("hand force 1 2 3 at -1", "it begins at -1 s, before the simulation begins"),
-        ("hand force 1 2 3 at 5 until 5", "it ends at 5 s and begins at 5 s"),
+        ("hand force 1 2 3 at 5 until 5", "it ends at 5 s but begins at 5 s"),
         ("hand force 1 2 3 at nan", "'nan' is not a finite number"),
-        ("hand force 1 2 3 until 2e9", "its time is 2e+09 s and must be at most 1e+09 s"),
+        ("hand force 1 2 3 until 2e9", "its time is 2e+09 s but must be at most 1e+09 s"),
         (
             "hand torque 1 2 3 for 5",
             "only 'at SECONDS' and 'until SECONDS' may follow the torque",
@@ -121,7 +121,8 @@ def test_too_many_disturbances_are_refused_together() -> None:
     with pytest.raises(ParameterError) as refused:
         timeline.read(["base force 0 1 0", " ", "base force 0 2 0"])
     assert str(refused.value) == (
-        "2 more disturbance(s) are refused: there are 999, and at most 1000; inject 'clear' first."
+        "2 more disturbance(s) are refused: there are already 999 of at most 1000; inject "
+        "'clear' first."
     )
     timeline.read(["base force 0 1 0"], now=2.5)
     assert (len(timeline.entries), timeline.entries[-1].start) == (1000, 2.5)

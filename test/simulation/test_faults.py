@@ -180,7 +180,7 @@ def test_the_largest_faults_leave_numbers_finite_or_stop_the_plant_with_a_senten
 
 def test_a_plant_without_thrusters_has_no_faults_of_thrusters() -> None:
     for line in ("thruster_off all", "thruster_stuck force_x 1", "nozzle_open plus_x"):
-        with pytest.raises(ParameterError, match="has no target of"):
+        with pytest.raises(ParameterError, match="has no target for"):
             arm(line)
 
 

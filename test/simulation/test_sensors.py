@@ -169,7 +169,7 @@ def test_a_late_pose_is_that_of_as_many_ticks_before() -> None:
 
 
 def test_a_bias_of_other_joints_is_refused() -> None:
-    with pytest.raises(ParameterError, match=r"'sensors.joint_bias' has 2 number.*has 3 joints"):
+    with pytest.raises(ParameterError, match=r"'sensors.joint_bias' has 2 value.*has 3 joints"):
         Flight(SensorConfig(joint_bias=(0.1, 0.2)), ticks=1)
 
 

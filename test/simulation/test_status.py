@@ -328,5 +328,5 @@ def test_thrusters_need_a_plant_that_takes_a_wrench() -> None:
         "velocity": False,
         "effort": True,
     }
-    with pytest.raises(ParameterError, match="has no wrench on the base"):
+    with pytest.raises(ParameterError, match="has no base wrench"):
         build_plant(ARM, config(actuation="velocity", thrusters="urdf"))

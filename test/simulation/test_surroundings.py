@@ -279,20 +279,20 @@ TABLE = TableConfig(tilt=0.01)
         (
             "planar_manipulator",
             {"orbit": OrbitConfig(mean_motion=0.001), "table": TABLE},
-            "Parameters 'table.*' and 'orbit.*' are both set: a robot is on a table or in an "
-            "orbit.",
+            "Parameters 'table.*' and 'orbit.*' are both set: a robot is either on a table or in "
+            "an orbit.",
         ),
         (
             "servicer",
             {"table": TABLE},
-            "Parameters 'table.*' are set, but robot 'servicer' is not planar: on a table with air "
-            "bearings all joints move in its plane.",
+            "Parameters 'table.*' are set, but robot 'servicer' is not planar: on an air-bearing "
+            "table, all joints must move in the table plane.",
         ),
         (
             "planar_manipulator",
             {"table": TableConfig(friction=0.1), "initial_orientation": (0.1, 0.0, 0.0, 0.99)},
             "Parameters 'table.*' are set, but the plane of robot 'planar_manipulator' is not the "
-            "x-y plane of the world: change 'initial_orientation'.",
+            "world's x-y plane: change 'initial_orientation'.",
         ),
     ],
 )
@@ -420,7 +420,7 @@ def test_without_coal_or_pairs_a_plant_measures_no_clearance(
     finally:
         monkeypatch.undo()
         distances_module._coal.cache_clear()
-    assert "The plant measures no clearance without the package coal." in caplog.messages
+    assert "The plant cannot measure clearance without the package coal." in caplog.messages
 
 
 def ball_at(x: float, name: str = "ball") -> str:

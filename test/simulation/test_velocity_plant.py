@@ -344,8 +344,8 @@ def test_a_bad_tick_period_is_refused(period: float) -> None:
 @pytest.mark.parametrize(
     ("initial", "mentions"),
     [
-        ({"joint_positions": [0.0, 0.0]}, ["2 numbers", "slider_1, slider_2, slider_3"]),
-        ({"joint_positions": [0.0] * 4}, ["4 numbers", "3 joints"]),
+        ({"joint_positions": [0.0, 0.0]}, ["are 2 initial", "slider_1, slider_2, slider_3"]),
+        ({"joint_positions": [0.0] * 4}, ["are 4 initial", "3 joints"]),
         ({"joint_positions": [0.0, 2.6, 0.0]}, ["'slider_2'", "2.6", "[-2.5, 2.5]"]),
         ({"joint_positions": [0.0, 0.0, -2.51]}, ["'slider_3'", "-2.51"]),
         ({"joint_positions": [np.nan, 0.0, 0.0]}, ["joint positions", "nan"]),
@@ -412,11 +412,11 @@ def test_joints_under_velocity_commands_start_at_rest() -> None:
 @pytest.mark.parametrize(
     ("given", "sentence"),
     [
-        ({"joint_positions": np.zeros(2)}, r"joint positions are 2 numbers; robot 'random' has 3"),
+        ({"joint_positions": np.zeros(2)}, r"are 2 initial joint positions; robot 'random' has 3"),
         ({"joint_positions": np.array([0.0, 3.5, 3.5])}, "outside its limits"),
         ({"joint_positions": np.array([0.0, math.nan, 0.0])}, "positions must be finite"),
         ({"joint_positions": np.array([math.inf] * 3)}, "positions must be finite"),
-        ({"joint_velocities": np.zeros(4)}, "joint velocities are 4 numbers"),
+        ({"joint_velocities": np.zeros(4)}, "are 4 initial joint velocities"),
         ({"joint_velocities": np.array([0.0, math.inf, 0.0])}, "velocities must be finite"),
         ({"quaternion": np.zeros(4)}, "initial orientation is refused"),
         ({"position": np.array([0.0, math.nan, 0.0])}, "initial position must be finite"),
