@@ -317,7 +317,7 @@ class Flights:
         match self.program:
             case FollowedSchedule(positions=positions):
                 if self.actuation != "velocity":
-                    raise ParameterError("A schedule needs velocity actuation.")
+                    raise ParameterError("A schedule requires velocity actuation.")
                 _require_rows("positions", positions, count, self.robot.n)
             case HeldCommands(table=table):
                 _require_rows("commands", table, count, self.command_size)
@@ -455,7 +455,7 @@ class BatchResult:
 
     @classmethod
     def empty(cls, flights: Flights) -> BatchResult:
-        """Return a result for the flights to fill."""
+        """Return an empty result to be filled by the flights."""
         N, n = len(flights), flights.robot.n
         instants = N, len(flights.report_ticks)
         states = np.full((*instants, state_size(n)), np.nan)

@@ -142,11 +142,11 @@ class LaneBlock:
         self._ended: dict[int, int] = {}
         """Ticks at which flights failed, by lane in the block."""
         self._profiles: dict[int, ReferenceProfile] = {}
-        """Reference profiles of flights with a controller, by lane in the block."""
+        """Reference profiles of controlled flights, by lane in the block."""
         self._write_starts(p[rows])
         self._write_errors_and_gains()
         self._loops = len(rows) if self._target.threads else self._groups
-        """Number of flights or groups whose ticks are counted, each for itself."""
+        """Number of flights or groups whose ticks are counted separately."""
         arrays = self._target.arrays
         self._at = arrays.zeros(self._loops, np.int64)
         self._pending = arrays.zeros(self._loops, np.uint8)
@@ -242,7 +242,7 @@ class LaneBlock:
         return np.ascontiguousarray(table)
 
     def fly(self) -> None:
-        """Fly the flights and write their results."""
+        """Fly the flights and write the results."""
         flights, job, library = self._flights, self._job, self._tick.library
         # A tick of no duration under no command reports the start.
         library.start_flights(job)

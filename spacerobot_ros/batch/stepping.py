@@ -43,7 +43,7 @@ from spacerobot_ros.simulation.plant import Plant
 class SteppedFlights:
     """N flights of one robot, advanced together tick by tick under given commands.
 
-    A flight that has ended keeps the state of its last tick.
+    An ended flight keeps the state of its last tick.
 
     Parameters
     ----------
@@ -123,7 +123,7 @@ class SteppedFlights:
         self.require_startable(starts, None)
         self._engine = self._choose_engine(link, plants, in_lanes, target)
         self.engine = self._engine.name
-        """Name of the engine: lanes with their registers, or ``scalar``."""
+        """Engine name: lanes with their registers, or ``scalar``."""
         self.failures = self._engine.failures
         """The messages of flights that failed since their last reset, by row."""
         self._reports = np.zeros((count, state_size(robot.n) + (3 if link else 0)))
@@ -177,7 +177,7 @@ class SteppedFlights:
         self._begin(chosen)
 
     def require_startable(self, starts: InitialStates, inertial: InertialParameters | None) -> None:
-        """Refuse starts (K rows) and masses as :meth:`reset` does, without a reset.
+        """Validate start states (K rows) and masses as in :meth:`reset`, without a reset.
 
         Raises
         ------
@@ -222,7 +222,7 @@ class SteppedFlights:
             raise ParameterError(f"A step of {ticks} ticks is too short: use at least 1.")
         bad = np.flatnonzero(self.has_not_ended & ~np.isfinite(commands).all(axis=1))
         if bad.size:
-            raise CommandError(f"The command of flight {bad[0]} is not finite.")
+            raise CommandError(f"The command for flight {bad[0]} is not finite.")
         reports = self._engine.step(commands, ticks, self.has_not_ended)
         self.has_not_ended[list(self.failures)] = False
         self._reports[self.has_not_ended] = reports[self.has_not_ended]

@@ -121,9 +121,9 @@ class ExactDistances:
     ) -> tuple[Array, Array]:
         """Return the distances (N,), m, and planes and points (N, 7) between the solids.
 
-        A plane touches the first solid at its point nearest to the second. It is a unit normal (3,)
-        toward the second solid and the distance from the origin, m, in the frame of the first link.
-        The point (3,) is the nearest point of the second solid in the frame of its link, m.
+        A plane touches the first solid at its point nearest to the second. It is given by a unit
+        normal (3,) toward the second solid and the distance from the origin, m, in the first link
+        frame. The point (3,) is the nearest point on the second solid in its link frame, m.
         """
         (_, R_a, r_a), (_, R_b, r_b) = self._geometries[first], self._geometries[second]
         distances, planes = np.empty(len(R_1)), np.empty((len(R_1), 7))
@@ -237,6 +237,6 @@ DistanceFunction = ExactDistances | EnclosureDistances
 
 
 def distance_function(solids: Sequence[Solid]) -> DistanceFunction:
-    """Return exact distances, or bounds if the package coal is not installed."""
+    """Return an exact distance function, or lower bounds if the package coal is not installed."""
     coal = _coal()
     return EnclosureDistances(solids) if coal is None else ExactDistances(solids, coal)

@@ -275,7 +275,7 @@ class CollisionGeometry:
     def planes(self, pair: int, poses: Poses) -> tuple[Array, Array]:
         """Return the distances (N,) of a pair, m, with planes and points (N, 7).
 
-        Planes are in the frame of the first link, points in that of the second one
+        Planes are in the first link frame, points in the second one
         (:meth:`.ExactDistances.planes`). For a link and an obstacle, planes belong to the
         obstacle and are in W.
         """

@@ -200,8 +200,7 @@ def nearest_approaches(
         (N + 1, n) configurations at the ticks, with straight lines in between; m or rad.
     required
         (P,) smallest allowed distances of the pairs, m; minus infinity: any distance.
-    base
-        Poses of the base at the ticks; None: obstacles are ignored.
+    base Base poses at the ticks; None: obstacles are ignored.
     """
     if not len(geometry.pairs):
         return []
@@ -216,7 +215,7 @@ def nearest_approach(
 ) -> Approach | None:
     """Return the nearest approach of all pairs along a path (N + 1, n); None without pairs.
 
-    ``base`` has the poses of the base at the ticks; None: obstacles are ignored.
+    ``base`` has the base poses at the ticks; None: obstacles are ignored.
     """
     if not len(geometry.pairs):
         return None

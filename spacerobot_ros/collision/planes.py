@@ -60,7 +60,8 @@ class PlaneDistance:
     def of(
         cls, geometry: CollisionGeometry, pair: int, center_of_mass: ca.Function
     ) -> PlaneDistance:
-        """Derive the distance of a pair, given by index; ``center_of_mass`` is ``q -> r_BC``."""
+        """Derive the distance function of a pair, given by index; ``center_of_mass`` is
+        ``q -> r_BC``."""
         robot, n = geometry.robot, len(geometry.robot.joint_names)
         y, plane = ca.SX.sym("y", n + 4), ca.SX.sym("plane", PLANE_SIZE)
         multiplier, q = ca.SX.sym("lambda"), y[:n]

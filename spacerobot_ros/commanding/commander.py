@@ -242,7 +242,7 @@ class Commander(ABC):
         return accepted
 
     def receive_fly_to(self, goal_id: str, read: Callable[[], FlyTo], client: FlyToClient) -> None:
-        """Accept or refuse the goal of an action; the client receives feedback and a result.
+        """Accept or reject an action goal; the client receives feedback and a result.
 
         ``read`` returns the goal, or raises PlanningError with the message of the refusal.
         """
@@ -608,7 +608,7 @@ class Commander(ABC):
         """Have the executive command a robot of the same joints and other masses."""
 
     def reconfigure(self, config: Any) -> None:
-        """Use the live parameters of another configuration from now on."""
+        """Set the live parameters from another configuration."""
         adapted = self._adapted(config)
         self._given, self.config = config, adapted
         if self.executive is not None:

@@ -155,7 +155,9 @@ class ControllerCommander(Commander):
         before = self._references.get(topic)
         self._references[topic] = _ReferenceWait()
         if before is not None and before.silent:
-            self.host.log("info", f"'{topic}' is no longer silent: it is followed again.")
+            self.host.log(
+                "info", f"'{topic}' is no longer silent: the controller follows it again."
+            )
         self.answer()
 
     def take_odom(self, stamp_ns: int, odom: Any) -> None:

@@ -22,14 +22,14 @@ class CommanderActivity(Enum):
     INACTIVE = "inactive"
     ACTIVE = "active"
     DECIDED = "decided"
-    """The commander has stopped after a decision about its goal (``stop_when_decided``)."""
+    """The commander has stopped after its goal ended (``stop_when_decided``)."""
 
 
 class CommanderHost(Protocol):
     """The host of a commander: a node, a loop without ROS, or a test."""
 
     def send_command(self, stamp_ns: int) -> None:
-        """Send the commander's present values as the command for the state with a stamp."""
+        """Send the commander's current values as the command for the state with a stamp."""
 
     def publish_status(self, status: Any) -> None:
         """Publish a status of the goal."""
@@ -41,7 +41,7 @@ class CommanderHost(Protocol):
         """Publish the start of a schedule; only planners have schedules."""
 
     def publish_path(self, path: BasePath, stamp_ns: int) -> None:
-        """Publish the path of a planned reference that begins; only controllers have them."""
+        """Publish the path of a planned reference that starts; only controllers have references."""
 
     def log(self, level: LogLevel, message: str) -> None:
         """Write a line into the log."""
@@ -50,36 +50,36 @@ class CommanderHost(Protocol):
         """Whether a publisher of odom, or of a reference, is connected."""
 
     def waiting_states(self) -> tuple[Sequence[Stamped], Sequence[Stamped]]:
-        """Return received odoms and joints that the commander has not taken yet."""
+        """Return received odoms and joints that the commander has not processed yet."""
 
 
 class StateDecoder(Protocol):
-    """Reads the messages of one robot, which are opaque to a commander."""
+    """Reads the messages for one robot, which are opaque to a commander."""
 
     q: Array
-    """Positions (n,) of the latest accepted joints, m or rad."""
+    """Latest accepted joint positions (n,), m or rad."""
     qdot: Array
-    """Rates (n,) of the latest accepted joints, m/s or rad/s."""
+    """Latest accepted joint rates (n,), m/s or rad/s."""
 
     def check_robot(self, joints: Any) -> None:
-        """Raise CommandError if the joint states are of another robot."""
+        """Raise CommandError if the joint states are from another robot."""
 
     def decode_joints(self, joints: Any) -> int:
         """Read joints into ``q`` and ``qdot``; return their stamp, ns, or raise CommandError."""
 
     def decode_base(self, odom: Any) -> tuple[Array, Array]:
-        """Return pose (7,) and twist (6,) of an odom or base reference, or raise CommandError."""
+        """Return pose (7,) and twist (6,) from an odom or base reference, or raise CommandError."""
 
     def target(self, odom: Any) -> tuple[Array, Array]:
-        """Return pose (7,) and twist (6,) of an odom of the target, or raise CommandError."""
+        """Return pose (7,) and twist (6,) from a target odom, or raise CommandError."""
 
     def joint_reference(self, message: Any) -> tuple[Array, Array]:
-        """Return positions and rates (n,) of a joint reference, or raise CommandError."""
+        """Return positions and rates (n,) from a joint reference, or raise CommandError."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StateArrays:
-    """A whole state as arrays: the joints, and the base if it is measured."""
+    """A complete state as arrays: the joints, and the base if measured."""
 
     stamp_ns: int
     q: Array

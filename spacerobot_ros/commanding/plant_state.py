@@ -67,7 +67,7 @@ class StampFilter:
 
     Any other state is a *time jump*, and is deferred. If a state with the current time follows, the
     jump is ignored and counted. If none follows for 0.5 s of wall time, the time has really
-    changed, for example after a restart of the plant, and the jump is accepted. A plant in lockstep
+    changed, for example after a plant restart, and the jump is accepted. A plant in lockstep
     waits that long for its command. ``clock`` returns the wall time, s.
     """
 
@@ -211,8 +211,8 @@ class StateSynchroniser:
     * *Pose optional:* a state is ready with its joints; odom that arrives after them is returned as
       a :attr:`Pairing.LATE_POSE`.
 
-    Further topics can be required as well (:meth:`require`): a state then waits for a message of
-    its stamp on each of these topics.
+    Further topics can be required (:meth:`require`): a state then waits for a message with its
+    stamp on each of these topics.
     """
 
     def __init__(self, *, pose_required: bool) -> None:
@@ -423,8 +423,8 @@ def _timeout_rest(status: PlantStatus) -> PlantStopped | None:
 # -- inputs that do not come ------------------------------------------------------------------
 
 _LONGEST_SILENCE, _SILENT_PERIODS = 1.0, 5
-"""Time without a state after which it is reported as missing, wall s, and at least in control
-periods."""
+"""Time without a state after which it is reported as missing, s of wall time, and minimum in
+control periods."""
 
 _SUSPENSION_TIME = 0.5
 """Wall time between two checks beyond which this process itself was suspended, s."""
@@ -443,7 +443,7 @@ class InputWatch:
         self._states, self._plant = states, plant
         self._has_publisher, self._clock = has_publisher, clock
         self.refusal = ""
-        """Why the last joint states were refused, as a clause; empty: not refused."""
+        """Why the last joint states were rejected, as a clause; empty: not rejected."""
         self.begin()
 
     def begin(self) -> None:
@@ -470,7 +470,7 @@ class InputWatch:
         """Return a clause that names the messages for which states wait; empty: none."""
         topics = {"joint_states": self._states.joints, "odom": self._states.odom}
         absent = [topic for topic, message in topics.items() if message is None]
-        refused = f", whose messages are refused: {self.refusal}" if self.refusal else ""
+        refused = f", whose messages are rejected: {self.refusal}" if self.refusal else ""
         if absent:
             unheard = [t for t in absent if not (self.just_begun or self._has_publisher(t))]
             nobody = f", and no node publishes {_quoted(unheard)}" if unheard else ""

@@ -172,7 +172,7 @@ class ArmReach:
         """Present shape (n,)."""
 
     def distance_to(self, motion: FrameMotion, k: int) -> float:
-        """Return the smallest distance (m or rad) of the arm from the k-th pose of a motion."""
+        """Return the smallest distance (m or rad) of the arm from pose k of a motion."""
         return self._arm.nearest_shape(self.q, Pose(motion.R[k], motion.r[k]))[1]
 
     def shapes_along(self, motion: FrameMotion, period: float) -> tuple[Array, str]:
@@ -367,7 +367,7 @@ class _RefusalReasons:
         excess, limit = self.limit
         if excess > 1.0:
             return (
-                "The target moves too fast to be met: the end-effector's reference would need "
+                "The target moves too fast to be reached: the end-effector's reference would need "
                 f"{limit}."
             )
         within = f"within the next {horizon:g} s"

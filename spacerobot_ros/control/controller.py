@@ -212,8 +212,8 @@ class CoordinatedController:
     def plan_grapple(
         self, time: float, state: ControlState, grapple: Grapple, lead: float
     ) -> PlanningJob[GrappleReference]:
-        """Return the job that plans a reference to a target, whose motion is given from ``time``
-        on. The plan begins ``lead`` s later, from the reference and target predicted for that time.
+        """Return a job that plans a reference to a target with known motion from ``time`` on. The
+        plan begins ``lead`` s later, from the reference and the target predicted for that time.
         """
         planner = self.planner
         assert planner is not None
@@ -234,7 +234,7 @@ class CoordinatedController:
             self.law.start(time, profile.start, profile.goal)
 
     def require_bounded_duration(self, state: ControlState, goals: Reference) -> None:
-        """Refuse goals whose reference would take longer than any flight.
+        """Reject goals whose reference would take longer than any flight.
 
         Raises
         ------
@@ -329,7 +329,8 @@ class CoordinatedController:
         return Detumbling(self.law.robot, payload, force, torque, torque_limit, period)
 
     def reference_at(self, time: float, state: ControlState) -> Reference:
-        """Return the reference at a time; before the first one, the pose of the robot at rest."""
+        """Return the reference at a given time; before the first reference, the pose of the robot
+        at rest."""
         if self.profile is not None:
             return self.profile.at(time - self._began)
         link = self.law.outputs.selection.end_effector_link
@@ -404,7 +405,7 @@ class CoordinatedController:
     def apply_limits(
         self, state: ControlState, commanded: Actuation, periods: int = 1
     ) -> Saturated:
-        """Return the realised part of a command that is held for some control periods."""
+        """Return the realised part of a command held for several control periods."""
         given = self._realised(commanded)
         kept = self.joint_rate_limits.apply(state, given, self._limits.effort, periods)
         if self.wheels is not None and kept is not given:

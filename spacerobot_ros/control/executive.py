@@ -109,13 +109,13 @@ class ControlExecutive:
         self._goals: dict[str, IdentifiedGoal] = {}
         """Goals pursued together, by frame."""
         self._goal_id = ""
-        """Id of the latest goal, which statuses carry."""
+        """Id of the latest goal, included in status messages."""
         self._watch = GoalWatch()
         self._was_measured = False
         self.servicing.end()
         self._after_tasks: dict[str, IdentifiedGoal] = {}
         self._requested: tuple[Task, ...] | None = None
-        """Tasks that were requested without a goal, and wait for the next measured state."""
+        """Tasks requested without a goal, waiting for the next measured state."""
         self._guided = False
         """Whether the last command followed an external reference."""
         self._next_report = 0.0
@@ -170,7 +170,7 @@ class ControlExecutive:
 
     @property
     def unfinished_goals(self) -> frozenset[str]:
-        """Ids of pursued and waiting goals, including those whose abort is not reported yet."""
+        """Ids of pursued and waiting goals, including aborted goals not reported yet."""
         present = self._next is _Next.ABORT or self._pursues
         pursued = self._goals.values() if present else ()
         return self.waiting_goals.union(goal.goal_id for goal in pursued)
@@ -207,7 +207,7 @@ class ControlExecutive:
         self._requested = (task,)
 
     def refuse(self, message: str, goal_id: str = "") -> None:
-        """Report the refusal of a goal; an earlier goal is still pursued."""
+        """Report that a goal was refused; an earlier goal is still pursued."""
         self._publish_decision(ControllerState.REFUSED, message, goal_id)
 
     def resume(self, saved: Mapping[str, IdentifiedGoal]) -> None:
@@ -239,7 +239,7 @@ class ControlExecutive:
     def plant_stopped(
         self, why: str, commanded_until_ns: int | None = None, rests_since_ns: int = 0
     ) -> bool:
-        """Give up every goal at once, because the plant ignores commands from now on."""
+        """Abort all goals immediately, because the plant ignores commands from now on."""
         if commanded_until_ns is not None:
             began_ns = round(self._watch.monitor.started * SECOND)
             if not self._pursues or commanded_until_ns < began_ns:
@@ -684,4 +684,4 @@ class ControlExecutive:
 
 
 _LATE_POSE_PERIODS = 1.5
-"""Longest time without a measurement of the base that is not reported, in control periods."""
+"""Longest unreported time without a base measurement, in control periods."""

@@ -49,10 +49,10 @@ class GoalPlanning:
     def __init__(self, *, in_background: bool) -> None:
         self.in_background = in_background
         self.time = 0.0
-        """Total wall time of planning references, s."""
+        """Total wall time spent planning references, s."""
         self._plan: PlannedGoals | None = None
         self._job: PlanningJob[PlannedReference] | None = None
-        """The last job, which may still run although it is cancelled."""
+        """The last job, which may still be running although cancelled."""
         self._lead = PLANNING_TIME
 
     @property

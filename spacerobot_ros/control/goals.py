@@ -38,19 +38,19 @@ from spacerobot_ros.planning.core.goal import (
 from spacerobot_ros.planning.execution.goal_file import BASE_GOAL_KEY, IdentifiedGoal
 
 END_EFFECTOR = "end_effector"
-"""Key of the goal of the end-effector in files of goals."""
+"""Key of the end-effector goal in goal files."""
 
 GOAL_KEYS = (BASE_GOAL_KEY, END_EFFECTOR)
-"""Keys of goals: the frames of the robot that have goal poses."""
+"""Goal keys: robot frames that have goal poses."""
 
 _FREE_AXIS_MARGIN = 5.0
-"""Number of tolerances by which a goal may differ from the pose in an uncontrolled axis: noise
+"""Number of tolerances by which a goal may differ from the pose along an uncontrolled axis: noise
 moves a measured pose out of the plane of a planar robot."""
 
 _NO_ROTATION = np.array([0.0, 0.0, 0.0, 1.0])
 
 _PLACE: frozenset[Controlled] = frozenset({"position"})
-"""What an end-effector goal requests if its attitude is free."""
+"""Components requested by an end-effector goal with free attitude."""
 
 
 def goal_parts(
@@ -64,7 +64,7 @@ def goal_parts(
     Raises
     ------
     PlanningError
-        The law does not control the frame, or the goal's shape has another number of joints.
+        The law does not control the frame, or the goal's shape has the wrong number of joints.
     """
     hands = identified.goal.end_effectors
     if key == END_EFFECTOR:
@@ -105,7 +105,7 @@ def _parts_of(
         if quaternion is None:
             if any(axis.startswith("r") for axis in axes):
                 raise PlanningError(
-                    f"The goal of '{each.link}' is a position only, and the law '{law.name}' "
+                    f"The goal of '{each.link}' is a position only, but the law '{law.name}' "
                     "controls its attitude: add an orientation."
                 )
             asked, quaternion = _PLACE, _NO_ROTATION
@@ -140,7 +140,7 @@ def _require_controlled(
 
 
 def controlled_parts(axes: Sequence[str], joints: Sequence[str] = ()) -> frozenset[Controlled]:
-    """Return the parts of a goal that outputs control: axes of a pose, and joints."""
+    """Return the goal components controlled by outputs: pose axes and joints."""
     parts: set[Controlled] = {"attitude" if axis.startswith("r") else "position" for axis in axes}
     return frozenset(parts | {"shape"} if joints else parts)
 
@@ -148,15 +148,16 @@ def controlled_parts(axes: Sequence[str], joints: Sequence[str] = ()) -> frozens
 def require_controlled_axes(
     law: ControlLaw, state: ControlState, config: ControllerConfig, goals: Reference
 ) -> None:
-    """Refuse goals that differ from the present pose in an axis that the law does not control.
+    """Reject goals that differ from the current pose along an axis not controlled by the law.
 
-    The law of a planar robot controls only the axes of its plane. A position or an attitude
-    without any controlled axis is not checked: that part is not controlled at all.
+    For a planar robot, the law controls only the axes in its plane. A position or attitude
+    without any controlled axis is not checked.
 
     Raises
     ------
     PlanningError
-        A goal is several tolerances away from the pose; the message names the axes.
+        A goal is several tolerances away from the pose along such an axis; the message names
+        it.
     """
     selection, labels = law.outputs.selection, ", ".join(law.outputs.labels)
     here = Reference.present(law.robot, state, selection.end_effector_link)
@@ -175,8 +176,9 @@ def require_controlled_axes(
             off = float(np.linalg.norm(error[left]))
             if 0 < len(left) < 3 and off > _FREE_AXIS_MARGIN * tolerance:
                 raise PlanningError(
-                    f"The goal {part} of the {name.replace('_', '-')} is {off:.4g} {unit} from "
-                    f"the present one in {' and '.join(axes[i] for i in left)} of the world, "
+                    f"The goal {part} of the {name.replace('_', '-')} is {off:.4g} {unit} "
+                    f"from the current one along {' and '.join(axes[i] for i in left)} of the "
+                    "world, "
                     f"which the law '{law.name}' does not control; its outputs are {labels}."
                 )
 
@@ -253,13 +255,13 @@ class GoalWatch:
     def __init__(self) -> None:
         self.monitor, self.stall = GoalMonitor(), StallMonitor()
         self._error_bounds: Array | None = None
-        """Errors (m,) of the outputs beyond which control is lost."""
+        """Output errors (m,) beyond which control is lost."""
         self._contacts: tuple[str, ...] = ()
         """The links that touch."""
         self.asked: dict[str, frozenset[Controlled]] = dict.fromkeys(GOAL_KEYS, frozenset())
         """Parts of the poses of base and end-effector that the present goals request."""
         self.touched = ""
-        """The first contact on the way to the present goal, and when; empty: there was none."""
+        """First contact on the way to the current goal, and its time; empty: none."""
 
     def begin(self, time: float) -> None:
         """Begin a goal or a task at a time, s."""
@@ -375,10 +377,10 @@ def decided_message(
     missed: Mapping[str, str] | None = None,
     touched: str = "",
 ) -> str:
-    """Return the message about a reached or failed goal, with the distance from it.
+    """Return the message for a reached or failed goal, including the distance from it.
 
-    ``cause`` is the known reason why the robot came no closer; ``missed`` are the missed parts of a
-    partly reached goal; ``touched`` is the contact that makes the goal fail.
+    ``cause`` is the reason, if known, why the robot came no closer; ``missed`` lists the missed
+    components of a partly reached goal; ``touched`` is the contact that made the goal fail.
     """
     limits = (
         (distance.position, config.position_tolerance),

@@ -258,7 +258,7 @@ class JointRateLimits:
         return ca.logic_and(near > 0, ca.sum1(ca.vertcat(*beyond)) > 0)
 
     def largest_rate_share(self, qdot: Array) -> float:
-        """Return the largest of the rates (n,) as a share of its limit."""
+        """Return the largest of the rates (n,) as a fraction of its limit."""
         return float(np.abs(qdot * (1 / self.rates)).max(initial=0.0))
 
     def braking_command(self, state: ControlState) -> Actuation:

@@ -222,7 +222,7 @@ class ReferencePlanner:
         self._planner = ThrustPlanner(robot, propulsion, options, outputs.end_effector_link)
 
     def use_obstacles(self, world: RobotDescription | None) -> None:
-        """Plan around other obstacles from the next plan on; None: around none."""
+        """Use other obstacles from the next plan on; None: around none."""
         self._planner.use_obstacles(world)
 
     def time_until_blocked(self, profile: PlannedReference, time: float) -> float:

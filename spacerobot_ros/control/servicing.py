@@ -124,8 +124,8 @@ _LATEST_BEGIN = 0.1
 
 
 class ApproachTask:
-    """One approach, planned at its first state and replanned if the target deviates from its
-    prediction.
+    """An approach, planned at its first state and replanned if the target deviates from its
+    predicted motion.
     """
 
     def __init__(self, target: MeasuredTarget, config: ControllerConfig) -> None:
@@ -454,7 +454,7 @@ class Servicing:
         return "" if self._present is None else self._present.message
 
     def begin(self, tasks: Sequence[Task]) -> None:
-        """Begin with the first task at the next state."""
+        """Begin the first task at the next state."""
         self.restart()
         self._remaining_tasks = list(tasks)
 

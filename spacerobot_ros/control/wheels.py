@@ -200,7 +200,8 @@ class WheelControl:
 
     @property
     def torque_about_every_axis(self) -> float:
-        """Largest torque that the wheels in use provide about every axis, N m; 0: not about all."""
+        """Largest torque that the wheels in use provide about every axis, N m; 0 if not about all
+        axes."""
         return self._allocate.within(self.wheels.torque[self._used])
 
     # -- measurements -------------------------------------------------------------------------

@@ -105,8 +105,8 @@ class EpisodeConfig:
         kind = TASKS[self.task]
         if self.link and not kind.has_link:
             raise ParameterError(
-                f"Argument 'link' is '{self.link}', but task '{self.task}' has no link: "
-                "leave it out, or use spacerobot/Reach-v0."
+                f"Argument 'link' is '{self.link}', but task '{self.task}' has no link: omit it, "
+                "or use spacerobot/Reach-v0."
             )
         return kind
 
@@ -130,7 +130,7 @@ class _Start:
 
 
 class _Starts:
-    """Starts of episodes, from a scenario or from the draws of a campaign.
+    """Episode starts, from a scenario or from campaign draws.
 
     Draws without a valid robot or start are omitted, with a warning.
     """
@@ -152,7 +152,7 @@ class _Starts:
             or (plant.orbit, plant.table) != (OrbitConfig(), TableConfig())
             or any(name.startswith(_BEYOND_LANES) for name in dispersed)
         )
-        """Whether each robot needs its own plant, for features that lanes lack."""
+        """Whether each robot needs its own plant, for features not supported by lanes."""
         self.nominal = _Start.of(self.robot, self.scenario)
         self.has_sensor_errors = bool(self.nominal.sensors.is_active[0]) or any(
             name.startswith("plant.sensors.") for name in dispersed

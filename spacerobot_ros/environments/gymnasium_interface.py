@@ -29,9 +29,7 @@ def _prepare(
     """Give an environment its episodes; return the spaces of an observation and an action."""
     if render_mode not in (None, "rgb_array"):
         # Libraries make environments without one after this type of error.
-        raise TypeError(
-            f"There is no render_mode '{render_mode}': use 'rgb_array', or leave it out."
-        )
+        raise TypeError(f"There is no render_mode '{render_mode}': use 'rgb_array', or omit it.")
     episodes = Episodes(EpisodeConfig.of(arguments), count, in_lanes=lanes)
     environment.episodes, environment.render_mode = episodes, render_mode
     fps = {"render_modes": ["rgb_array"], "render_fps": 1.0 / episodes.step_duration}
@@ -44,7 +42,7 @@ def _prepare(
 def _begin_options(options: Mapping[str, Any] | None) -> dict[str, Any]:
     """Return the goal and start of the options of a reset; refuse others."""
     if not isinstance(options, Mapping | None):
-        raise ParameterError(f"The options of a reset are {options!r}: give a dictionary.")
+        raise ParameterError(f"The reset options are {options!r}: pass a dictionary.")
     require_names("A reset has no option", options or {}, ("goal", "start", "reset_mask"))
     return {name: value for name, value in (options or {}).items() if name != "reset_mask"}
 

@@ -77,7 +77,7 @@ class FlightClearance:
 
     @cached_property
     def nearest(self) -> Approach:
-        """The nearest approach of two links, also between the states."""
+        """The smallest distance between two links, also between the states."""
         found = nearest_approach(self.geometry, self.shapes, self.base)
         assert found is not None
         return found

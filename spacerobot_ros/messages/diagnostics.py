@@ -113,7 +113,7 @@ class PlantDiagnostics:
         self._unmet_reported = 0
 
     def observe(self, commands: CommandValidator, plant: PlantWithFaults) -> None:
-        """Report on these from now on."""
+        """Set the objects to report on."""
         self._commands, self._plant, self._thrusters = commands, plant, thrusters_in(plant)
 
     def note_refusal(self, source: CommandSource, refusal: Refusal) -> str:

@@ -21,7 +21,7 @@ DEFAULT_TICK_RATE = 20.0
 _MIN_RATE = 0.001  # Hz
 
 _MAX_STATE_GAP, _MAX_STATE_GAP_PERIODS = 1.0, 10
-"""Longest gap between two states, s, and in control periods; longer gaps are jumps of time."""
+"""Longest gap between two states, s, and in control periods; longer gaps are time jumps."""
 
 DEFAULT_POSITION_TOLERANCE = 1e-3
 """Automatic position tolerance if no robot is known, m."""

@@ -135,7 +135,7 @@ class PlannerNode(CommanderNode):
         self.commander.reconfigure(self.config)
 
     def use(self, robot: SpaceRobot) -> None:
-        """Plan for this robot from now on."""
+        """Set the robot for planning."""
         self.goal_shape = None
         self.commander.use_robot(robot, self.decoder_of(robot))
         self._message = joint_template(robot.joint_names)

@@ -260,7 +260,7 @@ class MultiProcessStack:
         return self._statistics
 
     def start(self, goal: Goal | None) -> None:
-        """Activate all nodes and send the goal, if there is one; the plant begins last."""
+        """Activate all nodes and send the goal, if any; the plant starts last."""
         self.client.node.destroy_subscription(self._heartbeats)
         for name in reversed(self.names[1:]):
             self._change_states(Transition.TRANSITION_ACTIVATE, [name])

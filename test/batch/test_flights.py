@@ -71,7 +71,7 @@ NOT_A_NUMBER[1, 2, 0] = np.nan
          "The instants (-1, 5) are not ascending ticks of a flight of 10."),
         (STILL, {"sensors": range(3)}, "There are sensors for 3 flights, not 2."),
         (FollowedSchedule(np.zeros((5, 3))), {"actuation": "effort"},
-         "A schedule needs velocity actuation."),
+         "A schedule requires velocity actuation."),
         (FollowedSchedule(np.zeros((5, 2))), {}, "The positions are (5, 2), not (ticks, 3)."),
         (FollowedSchedule(np.zeros((3, 5, 3))), {}, "There are positions of 3 flights, not 2."),
         (HeldCommands(np.zeros(3)), {}, "The commands are (3,), not (ticks, 3)."),

@@ -355,8 +355,11 @@ def test_a_robot_whose_loops_turn_nothing_has_no_picture(tmp_path: Path) -> None
         (["three_joint_arm", "--shape", "0 1"], "The shape has 2 number(s)"),
         (["three_joint_arm", "--shape", "0 1 nan"], "The shape has 3 number(s)"),
         (["three_joint_arm", "--shape", "0 1 two"], "it must have one number per joint"),
-        (["planar_chain", "--end-effector", "hand"], "has no link 'hand' besides its base; its "),
-        (["planar_chain", "--end-effector", "base_link"], "has no link 'base_link' besides"),
+        (
+            ["planar_chain", "--end-effector", "hand"],
+            "has no link 'hand' other than its base; its ",
+        ),
+        (["planar_chain", "--end-effector", "base_link"], "has no link 'base_link' other"),
     ],
 )
 def test_what_is_refused_with_a_sentence(arguments: list[str], sentence: str) -> None:

@@ -614,7 +614,7 @@ class ControlLaw(ABC):
         return self._out["error"].copy()
 
     def largest_error_share(self, bounds: Array) -> float:
-        """Return the largest error at the last command as a share of its bound (m,), > 0."""
+        """Return the largest error at the last command as a fraction of its bound (m,), > 0."""
         # Of numpy's, as the largest number of Python may hide one that is none: it must not count
         # as reached.
         return float(np.abs(self._out["error"] / bounds).max(initial=0.0))

@@ -263,7 +263,7 @@ class CommanderNode(FlightNode):
             self.get_logger().info(line)
 
     def read_goal(self, key: str, message: PoseStamped) -> Goal:
-        """Return the goal of a message for the base or an end-effector.
+        """Return the goal from a message for the base or an end-effector.
 
         If the orientation of an end-effector is all zeros, any attitude is accepted.
 

@@ -89,7 +89,7 @@ class PlantReport:
         )
 
     def limited(self) -> None:
-        """Log that joints were held back in the last step, unless they merely rest on a stop."""
+        """Log that limits restricted joints in the last step, unless they only rest on a stop."""
         plant, texts = self._node.plant, []
         resting = np.zeros(plant.robot.n, dtype=np.bool_)
         if plant.takes_wrench:

@@ -11,7 +11,7 @@ from typing import Generic, TypeVar
 from spacerobot_ros.errors import PlanningError
 
 MAX_THREAD_END_TIME = 1.5
-"""Largest wall time for a planning thread to end after its cancellation, s."""
+"""Largest wall time for a planning thread to end after cancellation, s."""
 
 
 class PlanningCancelled(PlanningError):  # noqa: N818 - a request, not a failure
@@ -60,7 +60,8 @@ class PlanningJob(Generic[_Plan]):
     work
         Returns the plan, or raises an error.
     begins
-        Start time of the plan if it is ready by then, s; minus infinity: as soon as it is ready.
+        Start time of the plan, s, if the plan is ready by then; minus infinity: as soon as it is
+        ready.
     """
 
     def __init__(self, work: Callable[[Cancellation], _Plan], begins: float = -math.inf) -> None:

@@ -197,7 +197,7 @@ class Clearance:
             )
 
     def is_roomy(self, shapes: Array) -> npt.NDArray[np.bool_]:
-        """Return (N,) whether all links have room for loops in configurations (N, n)."""
+        """Return whether (N,) all links have room for loops in configurations (N, n)."""
         return self._keep_distances(shapes, _CLEARANCE_FACTOR_FOR_LOOPS * self.distance)
 
     def is_clear(self, shapes: Array, required: Array) -> bool:

@@ -102,9 +102,9 @@ class Executive:
         self._replan_ns = 0
         """Stamp from which the remaining motion is replanned, ns."""
         self._commanded_from_ns = 0
-        """Stamp of the first state of the present schedule or plan, ns."""
+        """Stamp of the first state of the current schedule or plan, ns."""
         self.statistics = PlannerStatistics()
-        """Time and number of plans for the latest goal, and the number of commands."""
+        """Planning time and number of plans for the latest goal, and the number of commands."""
         self._teleoperation = Teleoperation(robot, config, worker.clearance)
 
     @property
@@ -114,7 +114,7 @@ class Executive:
 
     @property
     def measuring(self) -> bool:
-        """Whether the executive will plan from the next measured base, or evaluate it."""
+        """Whether the executive will use the next measured base state to plan or evaluate."""
         return self._new_goal is not None or self.phase in (Phase.EVALUATING, Phase.TELEOPERATING)
 
     # -- requests of the owner ----------------------------------------------------------------
@@ -147,13 +147,13 @@ class Executive:
 
     @property
     def unfinished_goals(self) -> frozenset[str]:
-        """Ids of the goals that are pursued, being planned, or waiting for a plan."""
+        """Ids of goals being pursued, being planned, or waiting for a plan."""
         active = self._active_goal
         return self.waiting_goals | ({active.identified.goal_id} if active is not None else set())
 
     @property
     def waiting_goals(self) -> frozenset[str]:
-        """Ids of the goals being planned or waiting for a plan, including one that is replanned."""
+        """Ids of goals being planned or waiting for a plan, including a goal being replanned."""
         goals = (self._new_goal, self._planned_goal)
         return frozenset(goal.goal_id for goal in goals if goal is not None)
 
@@ -492,7 +492,7 @@ class Executive:
         left = active.time_left(self._stamp_ns)
         active = replace(active, identified=identified, corrections=0, manoeuvre_time=left)
         self._accept_goal(active)
-        message = "The present schedule also leads to this goal."
+        message = "The current schedule also leads to this goal."
         self.outputs.append(active.status(PlannerState.EXECUTING, message))
 
     def _check_path(self, active: ActiveGoal, measured: MeasuredState) -> None:
@@ -644,7 +644,7 @@ class Executive:
             previous=None if active is None else active.schedule,
         )
         reason = job.reason.value
-        message = f"A plan is made: {reason}."
+        message = f"Planning: {reason}."
         self._add_event(EventKind.PLAN_STARTED, message, job.identified, about={"reason": reason})
         fresh = job.reason.is_for_new_goal or not self._tracker.is_active
         if fresh and self._worker.plans_in_background:
@@ -770,7 +770,7 @@ class Executive:
 
     def _correct_path(self, active: ActiveGoal, error: TrackingError) -> None:
         active.corrections += 1
-        message = f"{error}: the remaining motion is planned again."
+        message = f"{error}: the remaining motion is replanned."
         self._add_warning(EventKind.CORRECTION, message, active.identified, active.counted)
 
     # -- ends of schedules and goals ----------------------------------------------------------

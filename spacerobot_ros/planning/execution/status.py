@@ -35,7 +35,7 @@ from spacerobot_ros.planning.execution.goal_file import IdentifiedGoal, PursuedG
 from spacerobot_ros.times import SECOND
 
 _LATE_TIME_SHARE = 1 / 3
-"""Remaining share of a motion's duration from which on the motion counts as late."""
+"""Remaining fraction of a motion's duration from which the motion counts as late."""
 
 
 class PlannerState(str, Enum):
@@ -264,7 +264,7 @@ class Phase(Enum):
 
 
 class Event(Enum):
-    """Cause of a change of phase."""
+    """Cause of a phase change."""
 
     NEW_GOAL = "new goal"
     TWIST = "twist"  # The first twist of a teleoperation.
@@ -288,7 +288,7 @@ class Event(Enum):
 
 
 class Transition(NamedTuple):
-    """A change of phase and its cause."""
+    """A phase change and its cause."""
 
     source: Phase
     event: Event
@@ -296,7 +296,7 @@ class Transition(NamedTuple):
 
 
 Output = PlannerStatus | ScheduleStart | Notice | Transition | FlightEvent | PursuedGoals
-"""An output of an executive other than its setpoints."""
+"""Output of an executive other than setpoints."""
 
 
 @dataclass
@@ -328,7 +328,7 @@ class PlannerStatistics:
 
 
 class PlanReason(Enum):
-    """Reason of a request for a plan; events have its value under ``reason``."""
+    """Reason for a plan request; events contain its value under ``reason``."""
 
     NEW_GOAL = "new goal"  # A new goal, from rest.
     BLEND = "blend"  # A new goal while the joints move: the plan begins with braking.
@@ -348,26 +348,26 @@ class PlanReason(Enum):
 
 @dataclass
 class ActiveGoal:
-    """An accepted goal, its present schedule, and the number of corrections so far."""
+    """An accepted goal, its current schedule, and the number of corrections so far."""
 
     identified: IdentifiedGoal
     schedule: GaitSchedule
     """The latest executed schedule."""
     begins_ns: int
-    """Stamp of the state from which the first schedule was planned, ns."""
+    """Stamp of the state used to plan the first schedule, ns."""
     corrections: int = 0
     manoeuvre_time: float = 0.0
     """Duration of all schedules for the goal, s."""
     ends_at: float = 0.0
     """Simulated time at which the latest schedule ends, s."""
     next_plan: PlanReason = PlanReason.CORRECTION
-    """Reason of the next plan, if one is needed."""
+    """Reason for the next plan, if one is needed."""
     stuck_positions: dict[str, float] = field(default_factory=dict)
-    """Positions of the stuck joints, m or rad, as measured for the last plan."""
+    """Stuck joint positions, m or rad, as measured for the last plan."""
     required: frozenset[Controlled] = frozenset()
-    """Parts of the goal that plans without the stuck joints must control."""
+    """Goal components that plans without the stuck joints must control."""
     not_flown_reason: str = ""
-    """Clause that says why no schedule is flown any longer; empty: schedules are flown."""
+    """Clause with the reason why schedules are no longer flown; empty if they are."""
 
     def begin(self, schedule: GaitSchedule, stamp_ns: int) -> None:
         """Pursue the goal by another schedule, from the stamp of its first tick on."""

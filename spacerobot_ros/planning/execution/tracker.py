@@ -110,7 +110,7 @@ class ScheduleFollower:
         return stamp_ns - self._end_ns > _MAX_SETTLING_TIME * SECOND
 
     def covers(self, stamp_ns: int) -> bool:
-        """Whether the schedule, or the settling after it, covers a time."""
+        """Whether the schedule, or the settling time after it, covers a given time."""
         return self.start_ns <= stamp_ns <= self._end_ns + _MAX_SETTLING_TIME * SECOND
 
     def take_over(self, stamp_ns: int, after: float) -> TakeOver | None:
@@ -125,7 +125,7 @@ class ScheduleFollower:
         return TakeOver(self.start_ns + tick * self._period_ns, shapes, motion)
 
     def command(self, stamp_ns: int, q: Array, position: Array, velocity: Array) -> None:
-        """Write the wanted shape now (n,) and the velocities to hold from now (n,)."""
+        """Write the current desired shape (n,) and the velocities to hold from now on (n,)."""
         k = (stamp_ns - self.start_ns) // self._period_ns
         k = 0 if k < 0 else min(k, self._last_tick)
         position[:] = self._positions[k]
@@ -157,7 +157,7 @@ class BrakingFollower:
     stamp_ns
         Start of braking, ns.
     duration
-        T, s; the gait continues for half of it.
+        T, s; the gait continues for half this time.
     """
 
     def __init__(self, follower: ScheduleFollower, stamp_ns: int, duration: float) -> None:

@@ -298,7 +298,7 @@ class PlanningWorker:
             job.cancel()
 
     def close(self) -> None:
-        """Cancel the present plan, and wait until its thread has ended."""
+        """Cancel the current plan, and wait until its thread has ended."""
         if self._job is not None:
             self._job.close()
 

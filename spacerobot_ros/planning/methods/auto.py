@@ -37,7 +37,7 @@ class AutoGait(GaitMethod):
     Parameters
     ----------
     candidates
-        The methods by name; of equally long manoeuvres, that of the first method is taken.
+        Methods by name; among equally long manoeuvres, that of the first method is selected.
     build
         Returns the method of a name with its options for the robot.
     """

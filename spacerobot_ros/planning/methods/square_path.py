@@ -96,12 +96,12 @@ class SquarePathOptions:
 
 @dataclass(frozen=True)
 class SquareLoop:
-    """A square in shape space that rotates the base by the wanted angle.
+    """A square in shape space that rotates the base by the desired angle.
 
     Attributes
     ----------
     pair
-        Indices (i, j) of the joints that move.
+        Indices (i, j) of the moving joints.
     centre
         (2,) ``psi*``, rad.
     side
@@ -109,7 +109,7 @@ class SquareLoop:
     loops
         Number of loops.
     clockwise
-        Sense of travel in the plane (psi_i, psi_j).
+        Direction of travel in the plane (psi_i, psi_j).
     corners
         (4, n) shapes in the order of travel; the first is the corner nearest to ``psi_e``.
     """
@@ -135,7 +135,7 @@ class _SquareFamily:
 
     @property
     def largest(self) -> float:
-        """The largest rotation of the base by one loop, rad."""
+        """Largest base rotation by one loop, rad."""
         return float(np.abs(self.geometric_phases).max())
 
 
@@ -275,7 +275,7 @@ class SquarePathGait(GaitMethod):
                     return loop
                 obstacle = obstacle or too_near
         raise PlanningError(
-            f"On square loops within the joint limits, links come too near to each other with up "
+            f"On square loops within the joint limits, links come too close to each other with up "
             f"to most_loops = {self.options.most_loops} loops: {obstacle}."
         )
 

@@ -193,7 +193,7 @@ class EndEffectorRows:
         )
 
     def turns_along_direct_path(self, start: Array, ends: Array) -> Array:
-        """Return the rotations (K, 4) of the base on straight paths from a shape to ends (K, n)."""
+        """Return the base rotations (K, 4) along straight paths from a shape to ends (K, n)."""
         step = ((ends - start) / _DIRECT_PATH_STEPS)[:, np.newaxis]
         shapes = start + step * np.arange(_DIRECT_PATH_STEPS)[:, np.newaxis]
         steps = np.broadcast_to(step, shapes.shape)

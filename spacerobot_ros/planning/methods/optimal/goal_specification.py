@@ -407,7 +407,7 @@ def shape_for_center(
 def nearest_shape_for_center(
     robot: SpaceRobot, limits: MotionLimits, near: Array, wanted: Array
 ) -> Array | None:
-    """Return the shape nearest to ``near`` whose centre of mass is at ``wanted`` (3,) exactly."""
+    """Return the shape nearest to ``near`` whose centre of mass is exactly at ``wanted`` (3,)."""
     q = near.copy()
     for _ in range(20):
         miss = wanted - robot.center_of_mass(q)

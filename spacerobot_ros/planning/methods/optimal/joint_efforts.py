@@ -68,7 +68,7 @@ class LimitedEfforts(JointEfforts):
         return cls(robot, limit, control_period) if np.any(np.isfinite(limit)) else None
 
     def slowed(self, trajectory: Trajectory, boundary: BoundaryConditions) -> Trajectory:
-        """Return the trajectory, slowed along its path until its efforts keep the limits."""
+        """Return the trajectory, slowed along its path until its efforts satisfy the limits."""
         q, v = trajectory.shapes, trajectory.velocities
         a = np.diff(v, axis=0) / trajectory.step
         L_B = boundary.momenta_in_base(trajectory.quaternions)

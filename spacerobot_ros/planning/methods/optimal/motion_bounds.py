@@ -182,7 +182,7 @@ class ConnectionBounds:
 
     @classmethod
     def of(cls, robot: SpaceRobot, axes: Array) -> ConnectionBounds:
-        """Return the bounds of a robot whose base rotates about ``axes`` (m, 3), in the base."""
+        """Return the bounds for a robot whose base rotates about ``axes`` (m, 3), in the base."""
         tree = _Tree.of(robot, robot.lower, robot.upper)
         least, base = sum(tree.least_moments), tree.least_moments[0]
         if len(axes) == 1:
@@ -197,7 +197,7 @@ class ConnectionBounds:
         return cls(_coupled(robot, turn), _coupled(robot, center), least)
 
     def of_link(self, robot: SpaceRobot, link: str) -> LinkBounds:
-        """Return the bounds of the motion of a link of the robot."""
+        """Return bounds on the motion of a link of the robot."""
         tree, (body, pose) = (
             _Tree.of(robot, robot.lower, robot.upper),
             robot.description.frames[link],

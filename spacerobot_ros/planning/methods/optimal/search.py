@@ -212,7 +212,7 @@ class SearchClock:
         return time.monotonic() - self.began
 
     def is_over(self, *, found: bool) -> bool:
-        """Whether the wall time is used up; ``found``: there is a manoeuvre."""
+        """Whether the wall time is used up; ``found``: whether there is a manoeuvre."""
         factor = 1.0 if found else _BUDGET_FACTOR_WITHOUT_SOLUTION
         return self.budget > 0 and self.elapsed > factor * self.budget
 
@@ -226,7 +226,7 @@ class SearchProblem:
     request
         The request. If the joints move, the remainder of their motion is the first guess.
     boundary, limits
-        Both ends, and the limits of the joints.
+        Both ends, and the joint limits.
     options
         The options of this search.
     clock, cancellation
@@ -234,7 +234,7 @@ class SearchProblem:
     guess
         The first guess; None: any.
     max_failed_starts
-        Guesses without any solution after which the search ends.
+        Number of guesses without any solution after which the search ends.
     """
 
     request: PlanRequest
@@ -253,7 +253,7 @@ class SearchProblem:
 
     @property
     def velocity(self) -> Array | float:
-        """Joint velocities (n,) that are held before the start."""
+        """Joint velocities (n,) held before the start."""
         return self.boundary.velocity if self.motion is None else self.motion.velocity
 
     @property
@@ -338,7 +338,8 @@ class _SearchState:
         return self.work > most or self.problem.clock.is_over(found=found)
 
     def stop_rule(self, *, found: bool = False, work: float = 0.0) -> StopRule:
-        """Return when the solver stops in the present phase; ``work`` is that of each step."""
+        """Return the solver's stop conditions in the current phase; ``work`` is the work per
+        step."""
         problem, iterations = self.problem, self.problem.options.iterations
         if self.phase in (SearchPhase.CLEARING, SearchPhase.SHORTENING):
             iterations = min(iterations, _MAX_CLEARING_ITERATIONS)

@@ -102,7 +102,7 @@ class Bodies:
     robot
         The model.
     clearance
-        The distances of links and obstacles; None: they are not checked.
+        Distances between links and obstacles; None: not checked.
     start
         Where the motion begins.
     link, grapple
@@ -111,7 +111,7 @@ class Bodies:
     Raises
     ------
     PlanningError
-        The start is too near, or the robot touches an obstacle or the target.
+        Links are too close at the start, or the robot touches an obstacle or the target.
     """
 
     def __init__(
@@ -149,7 +149,8 @@ class Bodies:
                     each.required[pair] = min(each.required[pair], grasped)
 
     def require_end(self, shape: Array, pose: Array) -> None:
-        """Refuse a goal, a shape (n,) and a pose (7,) of the base, at which links are too near."""
+        """Reject a goal, given by a shape (n,) and a base pose (7,), at which links are too
+        close."""
         for each in self._around:
             each.clearance.require_shape(shape, each.required, _poses(pose))
 
@@ -258,7 +259,7 @@ class Bodies:
         return sorted(found, key=lambda each: each.distance)
 
     def is_in_the_way(self, near: Sequence[Approach]) -> bool:
-        """Whether an obstacle or the target is among pairs."""
+        """Whether an obstacle or the target is among the pairs."""
         pairs = [self._pair(each.pair) for each in near]
         return any(around.geometry.with_obstacles[pair] for around, pair in pairs)
 

@@ -130,7 +130,7 @@ class ThrustMotion:
 
     @property
     def spent(self) -> float:
-        """Cost of the levels: kg of propellant of thrusters in a table, else N s."""
+        """Cost of the levels: kg of propellant with a thruster table, else N s."""
         return self.step * float(self.propulsion.cost_of(ca.DM(self.levels.T)))
 
     def _through(self, k: int, state: Array) -> Array:
@@ -141,7 +141,7 @@ class ThrustMotion:
         return np.asarray(self._functions.interval(begin, controls, t).full().T)
 
     def defects(self) -> Array:
-        """Return the defects (N, 12) with which the knots would be an exact flight."""
+        """Return the defects (N, 12) for which the knots would be an exact flight."""
         states = self._knots.states
         ends = np.array([self._through(k, x)[-1] for k, x in enumerate(states[:-1])])
         # Knots obey the program with their own defects: what they miss is the rest.
@@ -150,7 +150,7 @@ class ThrustMotion:
         return rest if self._knots.defects is None else self._knots.defects + rest
 
     def at(self, time: float) -> MotionSample:
-        """Return the motion at a time since its start, s; after its end, the state at the end."""
+        """Return the motion at a time since its start, s; after its end, the final state."""
         time = min(max(time, 0.0), self.duration)
         t = self.step / EXACT_STEPS
         row = min(int(time / t), len(self._grid) - 2)
@@ -175,7 +175,7 @@ class ThrustMotion:
         return float(np.max(tau / limit[limited, np.newaxis], initial=0.0))
 
     def path(self) -> tuple[Array, BasePoses]:
-        """Return shapes (K, n) and poses of the base at all instants of the exact integration."""
+        """Return shapes (K, n) and base poses at all instants of the exact integration."""
         return state_parts(self._grid)[4], base_poses(self._functions.robot, self._grid)
 
     def joined_momentum(self, target: TorqueFreeMotion) -> Array:

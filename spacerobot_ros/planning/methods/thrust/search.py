@@ -421,13 +421,13 @@ class _Search:
         self.planner, self.boundary, self.kind, self.stop = planner, boundary, kind, stop
         self.bodies, self.grapple = bodies, grapple
         self.left = np.zeros(3) if left is None else left
-        """Angular momentum of robot and target in the end, N m s."""
+        """Final angular momentum of the robot and the target, N m s."""
         self.path: ThrustKnots
         """The knots of the last exact motion."""
         self.is_timed = False
         """Whether the duration is given, or follows from the shortest one."""
         self.earliest = self.latest = 0.0
-        """When a target is met, s."""
+        """Time at which a target is met, s."""
 
     def _bowed(self, base: Array, shape: Array, side: Array, height: float) -> ThrustKnots:
         """Return a guess to a pose (7,) and a shape (n,) on a way that bows out to a side (3,), by
@@ -438,7 +438,7 @@ class _Search:
         return self.planner.guess(self.boundary, base, shape, bow)
 
     def _bows(self, path: ThrustKnots, near: Sequence[Approach]) -> Iterator[ThrustKnots]:
-        """Yield straight guesses and clear guesses beside them, in the time of a path, the
+        """Yield straight guesses and clear guesses near them, with the duration of a path, the
         straightest first.
         """
         position, X = base_poses(self.planner.robot, path.states[-1:])
@@ -507,7 +507,7 @@ class _Search:
             raise self._failure("no motion to the goal was found")
         if 0 < options.duration < fastest.duration:
             raise UnreachableError(
-                f"The motion takes {fastest.duration:.4g} s at least, and plan.duration is "
+                f"The motion takes {fastest.duration:.4g} s at least, but plan.duration is "
                 f"{options.duration:g} s: set it to more, or to 0.",
                 Proof.LIMITS,
             )
@@ -528,7 +528,7 @@ class _Search:
         raise self._failure(f"its joints need {share:.3g} times the efforts that a plan may use")
 
     def run_near(self, other: _Search) -> ThrustMotion:
-        """Return the motion near that of another search, in its time."""
+        """Return the motion near that of another search, with its duration."""
         self.is_timed, path = True, replace(other.path, multipliers=None)
         self.earliest = self.latest = path.duration
         path = self._solve(path, _NEAREST, center=path) or path

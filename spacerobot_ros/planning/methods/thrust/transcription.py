@@ -111,7 +111,7 @@ _OPTIONS: Mapping[str, Mapping[str, object]] = {
         "ipopt.tol": 1e-8,
     },
 }
-"""Options of IPOPT by its starting point."""
+"""IPOPT options by starting point."""
 
 
 def state_parts(states: Array) -> list[Array]:
@@ -129,7 +129,7 @@ def with_joints_moved(states: Array, time: float) -> Array:
 
 @dataclass(frozen=True)
 class ThrustKnots:
-    """N intervals of ``step`` seconds: states at N + 1 knots, controls of N intervals.
+    """N intervals of ``step`` seconds: states at N + 1 knots, controls in N intervals.
 
     ``states`` (N + 1, 13 + 2 n) are ``[X; L; r; V; q; qdot]``: the quaternion of R_WB, the angular
     momentum about the centre of mass, N m s, its position and velocity, all in W, and positions and
@@ -170,7 +170,7 @@ class ThrustBoundary:
     start
         (13 + 2 n,) state at the start (:class:`ThrustKnots`).
     goals
-        Values that are given at the end (:class:`.EndKind`).
+        Values given at the end (:class:`.EndKind`).
     bounds
         (2, N + 1, 13 + 2 n) least and largest states at the knots, with the vertices of the joints'
         parabolas in place of their positions.
@@ -182,11 +182,11 @@ class ThrustBoundary:
 
 
 class Weights(NamedTuple):
-    """Weights of the terms that a motion minimises.
+    """Weights of the terms in the objective.
 
-    They are those of the duration (1/s), of the cost of propulsion, of the squares of joint
-    accelerations over their limits, and of those of levels; of the missing distance of pairs (1/m),
-    and the level at which the cost of a norm is rounded off.
+    They weight the duration (1/s), the propulsion cost, the squares of joint accelerations over
+    their limits and of levels, and the missing distance of pairs (1/m); the last value is the level
+    at which the cost of a norm is smoothed.
     """
 
     duration: float
@@ -367,10 +367,10 @@ def thrust_program(
 ) -> tuple[Layout, Program]:
     """Assemble the program from the stages of a problem.
 
-    Its parameters are the start of the shape (n,), those of the end (:attr:`EndKind.size`), the
-    wrenches (6 m,); the defects (12 N,); typical accelerations (n,); weights of the duration,
-    of the propellant, of the squares of accelerations and levels, of the lack, and the level at
-    which the cost of a norm is rounded off (6,); centres of the squares (n + m, N); and the planes
+    Its parameters are the initial shape (n,), the end parameters (:attr:`EndKind.size`), the
+    wrenches (6 m,); the defects (12 N,); typical accelerations (n,); weights of the duration, of
+    the propellant, of the squares of accelerations and levels, of the lack, and the level at which
+    the cost of a norm is smoothed (6,); centres of the squares (n + m, N); and the planes
     (8,) of every pair at its places (:data:`KeptPlaces`).
     """
     n, N, m = stages[0].rows, intervals, propulsion.size
@@ -437,7 +437,7 @@ class ThrustSolver:
     acceleration
         (n,) largest accelerations of the joints.
     pairs
-        The distances of pairs that are kept apart, and where (:data:`KeptPlaces`).
+        Distances of the pairs kept apart, and their places (:data:`KeptPlaces`).
     """
 
     def __init__(
@@ -451,7 +451,7 @@ class ThrustSolver:
         self.end = stages[2]
         """Rows of the last knot."""
         self.lack = 0.0
-        """Distance by which pairs are nearer in the last solution than required, m."""
+        """Distance by which pairs are closer than required in the last solution, m."""
         self._propulsion, self._acceleration = propulsion, acceleration
         self._layout, self._program = thrust_program(stages, propulsion, intervals, pairs)
         program = self._program
@@ -475,7 +475,7 @@ class ThrustSolver:
     ) -> ThrustKnots | None:
         """Return the best motion near ``guess``; None if none.
 
-        The solver continues at a guess that is a solution, also one without the pairs.
+        If the guess is a solution, even one without the pairs, the solver continues from it.
 
         Parameters
         ----------
