@@ -200,7 +200,8 @@ def nearest_approaches(
         (N + 1, n) configurations at the ticks, with straight lines in between; m or rad.
     required
         (P,) smallest allowed distances of the pairs, m; minus infinity: any distance.
-    base Base poses at the ticks; None: obstacles are ignored.
+    base
+        Base poses at the ticks; None: obstacles are ignored.
     """
     if not len(geometry.pairs):
         return []
