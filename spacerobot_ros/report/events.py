@@ -66,13 +66,18 @@ _DETAIL_KEYS = (
 
 @dataclass(frozen=True)
 class _Mark:
-    """How events of a kind are drawn: ``row`` 0 is for goals and plans, 1 for the robot."""
+    """How events of a kind are drawn.
+
+    ``row`` 0 is for goals and plans, 1 for faults, 2 for the robot; ``strong`` ones are marked over
+    the full height of a chart.
+    """
 
     label: str
     marker: str
     colour: str
     row: int
     hollow: bool = False
+    strong: bool = False
 
 
 _MARKS = {
@@ -87,38 +92,38 @@ _MARKS = {
     EventKind.GOAL_REACHED: _Mark("goal reached", "*", _GOOD, 0),
     EventKind.GOAL_REACHED_PARTLY: _Mark("goal reached in part", "*", _WARN, 0),
     EventKind.GOAL_FAILED: _Mark("goal failed", "X", _BAD, 0),
-    EventKind.GOAL_ABORTED: _Mark("aborted", "X", _WARN, 0),
-    EventKind.FAULT_INJECTED: _Mark("fault on", "^", _WARN, 1),
-    EventKind.FAULT_ENDED: _Mark("fault off", "^", _WARN, 1, hollow=True),
-    EventKind.FAULTS_CLEARED: _Mark("faults off", "^", _WARN, 1, hollow=True),
-    EventKind.DISTURBANCE: _Mark("disturbance", "<", _WARN, 1),
-    EventKind.DISTURBANCE_ENDED: _Mark("disturbance over", "<", _WARN, 1, hollow=True),
-    EventKind.WHEEL_NEAR_LIMIT: _Mark("wheel near its limit", "o", _WARN, 1, hollow=True),
-    EventKind.WHEEL_SATURATED: _Mark("wheel saturated", "o", _WARN, 1),
-    EventKind.WHEEL_FAILED: _Mark("wheel failed", "o", _BAD, 1),
-    EventKind.DUMP_STARTED: _Mark("momentum dump", "o", _PLAIN, 1),
-    EventKind.DUMP_ENDED: _Mark("momentum dumped", "o", _GOOD, 1),
-    EventKind.CONTACT: _Mark("contact", "P", _BAD, 1),
-    EventKind.CONTACT_ENDED: _Mark("contact over", "P", _BAD, 1, hollow=True),
-    EventKind.APPROACH_STARTED: _Mark("approach", ">", _PLAIN, 1, hollow=True),
-    EventKind.DETUMBLE_STARTED: _Mark("detumbling", "v", _PLAIN, 1, hollow=True),
-    EventKind.DETUMBLED: _Mark("detumbled", "v", _GOOD, 1),
-    EventKind.CAPTURED: _Mark("captured", "D", _GOOD, 1),
-    EventKind.RELEASED: _Mark("released", "D", _GOOD, 1, hollow=True),
-    EventKind.LATCHED: _Mark("latched", "s", _BAD, 1),
-    EventKind.REARMED: _Mark("rearmed", "s", _GOOD, 1, hollow=True),
-    EventKind.STUCK_JOINT: _Mark("stuck joint", "D", _BAD, 1),
-    EventKind.FAILED: _Mark("node failed", "X", _BAD, 1),
-    EventKind.RESTING: _Mark("at rest", "|", SECONDARY_COLOUR, 1),
-    EventKind.RUNNING: _Mark("running", "|", _GOOD, 1),
-    EventKind.PAUSED: _Mark("paused", "|", TEXT_COLOUR, 1),
-    EventKind.RESUMED: _Mark("resumed", "|", _PLAIN, 1),
-    EventKind.RESET: _Mark("reset", "P", TEXT_COLOUR, 1),
-    EventKind.RECORDING_FAILED: _Mark("recording failed", "d", _BAD, 1),
-    EventKind.FILE_SPLIT: _Mark("next file", "d", SECONDARY_COLOUR, 1, hollow=True),
-    EventKind.NODE_SILENT: _Mark("node silent", "h", _BAD, 1),
-    EventKind.NODE_BACK: _Mark("node back", "h", _GOOD, 1, hollow=True),
-    EventKind.NODE_RESTARTED: _Mark("node restarted", "h", _WARN, 1),
+    EventKind.GOAL_ABORTED: _Mark("aborted", "X", _WARN, 0, strong=True),
+    EventKind.FAULT_INJECTED: _Mark("fault on", "^", _WARN, 1, strong=True),
+    EventKind.FAULT_ENDED: _Mark("fault off", "^", _WARN, 1, hollow=True, strong=True),
+    EventKind.FAULTS_CLEARED: _Mark("faults off", "^", _WARN, 1, hollow=True, strong=True),
+    EventKind.DISTURBANCE: _Mark("disturbance", "<", _WARN, 1, strong=True),
+    EventKind.DISTURBANCE_ENDED: _Mark("disturbance over", "<", _WARN, 1, hollow=True, strong=True),
+    EventKind.WHEEL_NEAR_LIMIT: _Mark("wheel near its limit", "o", _WARN, 2, hollow=True),
+    EventKind.WHEEL_SATURATED: _Mark("wheel saturated", "o", _WARN, 2),
+    EventKind.WHEEL_FAILED: _Mark("wheel failed", "o", _BAD, 2, strong=True),
+    EventKind.DUMP_STARTED: _Mark("momentum dump", "o", _PLAIN, 2),
+    EventKind.DUMP_ENDED: _Mark("momentum dumped", "o", _GOOD, 2),
+    EventKind.CONTACT: _Mark("contact", "P", _BAD, 2, strong=True),
+    EventKind.CONTACT_ENDED: _Mark("contact over", "P", _BAD, 2, hollow=True),
+    EventKind.APPROACH_STARTED: _Mark("approach", ">", _PLAIN, 2, hollow=True),
+    EventKind.DETUMBLE_STARTED: _Mark("detumbling", "v", _PLAIN, 2, hollow=True),
+    EventKind.DETUMBLED: _Mark("detumbled", "v", _GOOD, 2),
+    EventKind.CAPTURED: _Mark("captured", "D", _GOOD, 2, strong=True),
+    EventKind.RELEASED: _Mark("released", "D", _GOOD, 2, hollow=True),
+    EventKind.LATCHED: _Mark("latched", "s", _BAD, 2, strong=True),
+    EventKind.REARMED: _Mark("rearmed", "s", _GOOD, 2, hollow=True),
+    EventKind.STUCK_JOINT: _Mark("stuck joint", "D", _BAD, 2, strong=True),
+    EventKind.FAILED: _Mark("node failed", "X", _BAD, 2),
+    EventKind.RESTING: _Mark("at rest", "|", SECONDARY_COLOUR, 2),
+    EventKind.RUNNING: _Mark("running", "|", _GOOD, 2),
+    EventKind.PAUSED: _Mark("paused", "|", TEXT_COLOUR, 2),
+    EventKind.RESUMED: _Mark("resumed", "|", _PLAIN, 2),
+    EventKind.RESET: _Mark("reset", "P", TEXT_COLOUR, 2),
+    EventKind.RECORDING_FAILED: _Mark("recording failed", "d", _BAD, 2),
+    EventKind.FILE_SPLIT: _Mark("next file", "d", SECONDARY_COLOUR, 2, hollow=True),
+    EventKind.NODE_SILENT: _Mark("node silent", "h", _BAD, 2),
+    EventKind.NODE_BACK: _Mark("node back", "h", _GOOD, 2, hollow=True),
+    EventKind.NODE_RESTARTED: _Mark("node restarted", "h", _WARN, 2),
 }
 """Event marks by kind; other kinds, such as node starts and stops, are not drawn."""
 
@@ -140,25 +145,6 @@ _GLYPHS = {
 }
 """matplotlib markers as characters, filled and hollow."""
 
-_FAULT_KINDS = frozenset(
-    (
-        EventKind.FAULT_INJECTED,
-        EventKind.FAULT_ENDED,
-        EventKind.FAULTS_CLEARED,
-        EventKind.DISTURBANCE,
-        EventKind.DISTURBANCE_ENDED,
-    )
-)
-_PROMINENT_KINDS = _FAULT_KINDS | {
-    EventKind.STUCK_JOINT,
-    EventKind.LATCHED,
-    EventKind.GOAL_ABORTED,
-    EventKind.CONTACT,
-    EventKind.WHEEL_FAILED,
-    EventKind.CAPTURED,
-}
-"""Event kinds marked over the full height of a chart."""
-
 
 def event_style(kind: EventKind) -> dict[str, Any]:
     """Return the appearance of an event kind on a page."""
@@ -167,9 +153,8 @@ def event_style(kind: EventKind) -> dict[str, Any]:
         "kind": kind.value,
         "glyph": _GLYPHS[mark.marker][mark.hollow],
         "colour": mark.colour,
-        # Faults have a row of their own between, so that texts do not overlap.
-        "row": 1 if kind in _FAULT_KINDS else 2 * mark.row,
-        "strong": kind in _PROMINENT_KINDS,
+        "row": mark.row,
+        "strong": mark.strong,
     }
 
 
@@ -218,7 +203,9 @@ def draw_events(axes: Axes, events: Sequence[FlightEvent]) -> None:
     for kind, mark in _MARKS.items():
         times = [each.time for each in shown if each.event.kind is kind]
         if times:
-            lane.plot(times, [1 - mark.row] * len(times), clip_on=False, **_marker_style(mark))
+            # Without texts, faults need no row of their own.
+            height = 0 if mark.row else 1
+            lane.plot(times, [height] * len(times), clip_on=False, **_marker_style(mark))
     kinds = {each.event.kind for each in shown}
     keys = [
         Line2D([], [], label=mark.label, **_marker_style(mark))
