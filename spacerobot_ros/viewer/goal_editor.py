@@ -27,11 +27,7 @@ from spacerobot_ros.model.rotations import (
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.core.goal import EndEffectorGoal
 from spacerobot_ros.planning.execution.goal_file import BASE_GOAL_KEY
-from spacerobot_ros.viewer.content import (
-    COLORS,
-    check_html,
-    hint_html,
-)
+from spacerobot_ros.viewer.content import COLORS, check_html, hint_html
 from spacerobot_ros.viewer.reachability import GoalCheck, Verdict
 from spacerobot_ros.viewer.scene import RobotDrawing, wxyz, xyzw
 from spacerobot_ros.viewer.state import Part
@@ -403,9 +399,7 @@ class GoalEditor:
     def show_check(self, check: GoalCheck) -> None:
         """Show the goal check result."""
         self._check = check
-        text = check_html(check)
-        if text != self._verdict.content:
-            self._verdict.content = text
+        self._verdict.content = check_html(check)
         if self._ghost is not None:
             self._ghost.paint(COLORS[check.verdict])
             for mark in self._marks.values():

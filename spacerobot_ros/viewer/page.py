@@ -47,7 +47,6 @@ if TYPE_CHECKING:
 RequestAction = Callable[[Action], None]
 """Function that receives a user action."""
 
-_MAX_NOTICES = 200
 _MAX_SHOWN_NOTICES = 60
 
 _CURVE_COLORS = (
@@ -197,9 +196,7 @@ class LookBack:
         if self.time_s is not None:
             self.time_s = min(max(self.time_s, low), high)
         at = high if self.time_s is None else self.time_s
-        for name, value in (("max", high), ("min", low)):
-            if getattr(self._slider, name) != value:
-                setattr(self._slider, name, value)
+        self._slider.max, self._slider.min = high, low
         if self._left_alone_until is None:
             self._slider.value = at
         elif time.monotonic() >= self._left_alone_until:
@@ -256,9 +253,7 @@ class FaultPanel:
         if state.measured is not None:
             self._now_s = state.measured.time_s
         faults = () if state.plant is None else state.plant.faults
-        text = content.faults_html(faults)
-        if text != self._active.content:
-            self._active.content = text
+        self._active.content = content.faults_html(faults)
 
     def _show_kind(self) -> None:
         names = self._names.get(self._kind.value, ["-"])
@@ -352,9 +347,7 @@ class Plots:
 
     def show_budget(self, state: StackState) -> None:
         """Show the current momentum budget of a robot with wheels."""
-        text = content.momentum_html(state)
-        if text != self._budget_text.content:
-            self._budget_text.content = text
+        self._budget_text.content = content.momentum_html(state)
 
     def _show_parts(self, errors: Mapping[Part, content.GoalDistance]) -> None:
         """Show one plot for each part with an error, and none for others.
@@ -483,21 +476,17 @@ class LogPanel:
 
     def __init__(self, gui: viser.GuiApi) -> None:
         self._html = gui.add_html(content.log_html(()))
-        self._notices: deque[Notice] = deque(maxlen=_MAX_NOTICES)
-        self._changed = False
+        self._notices: deque[Notice] = deque(maxlen=_MAX_SHOWN_NOTICES)
 
     def add(self, notice: Notice) -> None:
         """Add a line to the log."""
         if self._notices and self._notices[0] == notice:
             return  # An immediate repetition is shown once.
         self._notices.appendleft(notice)
-        self._changed = True
 
     def draw(self) -> None:
-        """Redraw the lines that have changed."""
-        if self._changed:
-            self._changed = False
-            self._html.content = content.log_html(list(self._notices)[:_MAX_SHOWN_NOTICES])
+        """Redraw the lines."""
+        self._html.content = content.log_html(self._notices)
 
 
 _ROBOT_PATH = "/robot"
@@ -689,8 +678,6 @@ class Page:
         reach = 1.0 if robot is None else scene.reach_of(robot)
         self._reach = reach
         self._trails: dict[Part, Trail] = {}
-        self._planned: tuple[Array | None, Array | None] = None, None
-        """The planned path and motion being drawn."""
         self.editor.show_robot(robot, reach)
         self._plots.show_robot(robot)
         if robot is None:
@@ -857,13 +844,10 @@ class Page:
         around.draw_paths("flown", {part: x.points(until) for part, x in self._trails.items()})
         assert self._robot is not None
         assert self._kinematics is not None
-        planned = state.planned_path, state.planned_motion
-        if any(each is not drawn for each, drawn in zip(planned, self._planned, strict=True)):
-            self._planned = planned
-            paths = content.planned_positions(state, self._robot, self._kinematics)
-            if state.planned_path is not None:
-                paths[BASE_GOAL_KEY] = state.planned_path
-            around.draw_paths("planned", paths)
+        paths = content.planned_positions(state, self._robot, self._kinematics)
+        if state.planned_path is not None:
+            paths[BASE_GOAL_KEY] = state.planned_path
+        around.draw_paths("planned", paths)
 
     def _goal_errors(self, state: StackState) -> dict[Part, content.GoalDistance]:
         return {} if self._kinematics is None else content.goal_errors(state, self._kinematics)
@@ -877,8 +861,7 @@ class Page:
             text = content.line_html(self._announced[0].message, self._announced[0].level) + text
         if shown is not state:
             text = content.look_back_html(shown, state) + text
-        if text != self._status.content:
-            self._status.content = text
+        self._status.content = text
         flown = content.progress(shown)
         self._bar.visible = flown is not None
         self._bar.value = 0.0 if flown is None else round(100 * flown, 1)

@@ -93,7 +93,7 @@ class RobotDrawing:
         color: Color | None = None,
         on_note: Callable[[str], None] = lambda message: None,
     ) -> None:
-        self._scene, self._path, self._color = scene, path, color
+        self._scene, self._path = scene, path
         self._kinematics = kinematics = ForwardKinematics(robot)
         self.base = scene.add_frame(path, show_axes=False)
         paths = self._node_paths(robot)
@@ -153,10 +153,8 @@ class RobotDrawing:
 
     def paint(self, color: Color) -> None:
         """Set the color of all parts."""
-        if color != self._color:
-            self._color = color
-            for solid in self._solids:
-                solid.color = color
+        for solid in self._solids:
+            solid.color = color
 
     def place(self, pose: Array) -> None:
         """Move the base to a pose (7,) in the frame of its parent node."""
