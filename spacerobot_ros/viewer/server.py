@@ -65,8 +65,6 @@ class ViewerConfig(WatchdogConfig):
     )
 
 
-_PORTS_TRIED = 100
-
 _NO_FRAMING_HEADERS = {
     "Content-Security-Policy": "frame-ancestors 'none'",
     "X-Frame-Options": "DENY",
@@ -104,35 +102,17 @@ def is_loopback(host: str) -> bool:
         return host == "localhost"
 
 
-def free_port(host: str, port: int) -> int:
-    """Return ``port`` or the next free one; if it is 0, any free port.
-
-    Raises
-    ------
-    ParameterError
-        The address does not belong to this machine, or a hundred ports are in use.
-    """
+def _require_address(host: str) -> None:
+    """Check an address of the page: viser would look for a free port there forever."""
     try:
-        family, _, _, _, _ = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
+        family, _, _, _, _ = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM)[0]
+        with socket.socket(family, socket.SOCK_STREAM) as probe:
+            probe.bind((host, 0))
     except OSError as error:
         raise ParameterError(
-            f"Parameter 'host' is '{host}', which is not an address: {error}."
+            f"Parameter 'host' is '{host}', which is not an address of this machine: "
+            f"{error.strerror}."
         ) from None
-    last = min(port + _PORTS_TRIED, 65536) if port else 1
-    problem: OSError | None = None
-    for each in range(port, last):
-        with socket.socket(family, socket.SOCK_STREAM) as probe:
-            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            try:
-                probe.bind((host, each))
-            except OSError as error:
-                problem = error
-                continue
-            return int(probe.getsockname()[1])
-    raise ParameterError(
-        f"No port at '{host}' from {port} to {last - 1} is free for the viewer: "
-        f"{problem.strerror if problem else 'none is left'}."
-    )
 
 
 def is_own_page(origin: str | None, host: str | None, served: str) -> bool:
@@ -211,7 +191,7 @@ def start_server(host: str, port: int, title: str = "") -> viser.ViserServer:
     Raises
     ------
     SpaceRobotError
-        viser is not installed, the address does not exist, or no port is free.
+        viser is not installed, or the address is not one of this machine.
     """
     require_viser()
     import viser
@@ -223,8 +203,7 @@ def start_server(host: str, port: int, title: str = "") -> viser.ViserServer:
             """Return None: sharing is not requested."""
             return None
 
-    # viser looks for a free port as well, but waits forever if an address is wrong.
-    port = free_port(host, port)
+    _require_address(host)
     # It prints its address; so does the node, in the format of the other commands.
     with _server_start_lock, _guarded_websockets(host), redirect_stdout(io.StringIO()):
         server = LocalServer(host=host, port=port, label=title, verbose=False)

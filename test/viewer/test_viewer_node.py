@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import socket
 import time
 from dataclasses import replace
 from typing import Any
@@ -31,7 +32,6 @@ from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus
 from spacerobot_ros.resources import robot_file
 from spacerobot_ros.simulation.status import PlantState, PlantStatus
 from spacerobot_ros.viewer.reachability import GoalCheck, Verdict, make_question
-from spacerobot_ros.viewer.server import free_port
 from spacerobot_ros.viewer.state import Measured, StackState
 
 URDF = load_robot(robot_file("sliding_masses")).urdf
@@ -201,7 +201,9 @@ def test_the_page_is_as_its_parameters_say(
     monkeypatch.setattr(
         viser.GuiApi, "configure_theme", lambda _, dark_mode, **__: themes.append(dark_mode)
     )
-    port = free_port("127.0.0.1", 0)
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
     stack = Stack(
         harness, port=port, update_rate=40.0, dark=True, world_frame="orbit", check_goals=False
     )

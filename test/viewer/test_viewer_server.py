@@ -21,7 +21,6 @@ from websockets.typing import Origin, Subprotocol
 from spacerobot_ros import viewer
 from spacerobot_ros.errors import ParameterError, SpaceRobotError
 from spacerobot_ros.viewer.server import (
-    free_port,
     is_loopback,
     is_own_page,
     start_server,
@@ -133,7 +132,6 @@ def test_a_port_that_is_taken_is_left_to_its_owner() -> None:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
         port = taken.getsockname()[1]
-        assert port < free_port("127.0.0.1", port) < port + 100
         second = start_server("127.0.0.1", port)
         try:
             assert second.get_port() > port
