@@ -23,7 +23,8 @@ from contextlib import suppress
 from dataclasses import dataclass
 from enum import Enum
 from functools import reduce
-from typing import IO
+from multiprocessing.connection import Connection
+from queue import SimpleQueue
 
 import numpy as np
 
@@ -233,15 +234,13 @@ class GoalChecker:
 
     def __init__(self) -> None:
         self._process: subprocess.Popen[bytes] | None = None
-        self._answer_thread: threading.Thread | None = None
+        self._answers: Connection | None = None
         self._number = self._begun = 0
         self._last: GoalQuestion | None = None
         self._progress = ""
         self._asked_at = 0.0
         self._cancelled_at: float | None = None
         self._answered = True
-        self._answers: dict[int, GoalCheck] = {}
-        self._lock = threading.Lock()
 
     def ask(self, question: GoalQuestion) -> None:
         """Cancel the check in progress, and start checking a question."""
@@ -268,9 +267,7 @@ class GoalChecker:
         spent on it."""
         if self._answered:
             return None
-        with self._lock:
-            answer = self._answers.get(self._number)
-            self._answers = {n: a for n, a in self._answers.items() if n >= self._number}
+        answer = self._received_answer()
         if answer is not None:
             self._answered, self._cancelled_at = True, None
             return answer
@@ -295,10 +292,8 @@ class GoalChecker:
         since = self._cancelled_at
         if since is None or time.monotonic() - since < _MAX_CANCELLATION_S:
             return False
-        with self._lock:
-            begun = self._begun
         self._cancelled_at = None
-        return begun != self._number
+        return self._begun != self._number
 
     def _running_process(self) -> subprocess.Popen[bytes]:
         if self._process is None or self._process.poll() is not None:
@@ -307,10 +302,7 @@ class GoalChecker:
             words = ["-c", f"from {__name__} import main; main()"]
             self._process = start_child(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
             assert self._process.stdout is not None
-            self._answer_thread = threading.Thread(
-                target=self._receive_answers, args=(self._process.stdout,), daemon=True
-            )
-            self._answer_thread.start()
+            self._answers = Connection(os.dup(self._process.stdout.fileno()), writable=False)
         return self._process
 
     def _send_question(
@@ -322,17 +314,18 @@ class GoalChecker:
             pickle.dump((self._number, question), process.stdin)
             process.stdin.flush()
 
-    def _receive_answers(self, answers: IO[bytes]) -> None:
-        with suppress(ValueError, OSError, EOFError):  # Closed.
-            while True:
-                number, answer = pickle.load(answers)
-                with self._lock:
-                    if answer is None:
-                        self._begun, self._progress = number, ""
-                    elif isinstance(answer, str):
-                        self._progress = f": {answer}"
-                    else:
-                        self._answers[number] = answer
+    def _received_answer(self) -> GoalCheck | None:
+        """Return the answer to the last question, if it is there; note what comes before."""
+        with suppress(OSError, EOFError):  # The process has ended.
+            while self._answers is not None and self._answers.poll():
+                number, answer = self._answers.recv()
+                if answer is None:
+                    self._begun, self._progress = number, ""
+                elif isinstance(answer, str):
+                    self._progress = f": {answer}"
+                elif number == self._number:
+                    return answer
+        return None
 
 
 # -- in the process -----------------------------------------------------------------------------
@@ -435,48 +428,27 @@ def _check_arm(question: GoalQuestion, tool: Goal) -> GoalCheck:
     return GoalCheck(Verdict.REFUSED, message, shape=shape)
 
 
-class _LastQuestion:
-    """The last question, for the thread that plans; a new one cancels the plan in progress."""
-
-    def __init__(self) -> None:
-        self._condition = threading.Condition()
-        self._question: tuple[int, GoalQuestion | None] | None = None
-        self._cancellation = Cancellation()
-
-    def put(self, question: tuple[int, GoalQuestion | None]) -> None:
-        with self._condition:
-            self._question = question
-            self._cancellation.cancel()
-            self._condition.notify()
-
-    def take(self) -> tuple[tuple[int, GoalQuestion | None], Cancellation]:
-        with self._condition:
-            while self._question is None:
-                # A bounded wait lets signals through.
-                self._condition.wait(0.5)
-            question, self._question = self._question, None
-            self._cancellation = Cancellation()
-            return question, self._cancellation
-
-
 def main() -> None:
     """Answer questions until standard input ends."""
     with guarded(), suppress(Terminated):
         os.nice(_NICENESS)
         # Keep output of libraries out of the answers.
-        answers = os.fdopen(os.dup(1), "wb")
+        answers = Connection(os.dup(1), readable=False)
         os.dup2(2, 1)
-        last = _LastQuestion()
+        questions: SimpleQueue[tuple[int, GoalQuestion | None, Cancellation]] = SimpleQueue()
 
         def receive_questions() -> None:
+            cancellation = Cancellation()
             with suppress(EOFError):
                 while True:
-                    last.put(pickle.load(sys.stdin.buffer))
+                    number, question = pickle.load(sys.stdin.buffer)
+                    cancellation.cancel()
+                    cancellation = Cancellation()
+                    questions.put((number, question, cancellation))
             os._exit(0)
 
         def send_answer(number: int, answer: GoalCheck | str | None) -> None:
-            pickle.dump((number, answer), answers)
-            answers.flush()
+            answers.send((number, answer))
 
         threading.Thread(target=receive_questions, daemon=True).start()
         planner, number = Planner(), 0
@@ -486,8 +458,8 @@ def main() -> None:
 
         with report_progress(send_progress):
             while True:
-                (number, question), cancellation = last.take()
+                number, question, cancellation = questions.get()
                 send_answer(number, None)
-                if question is not None:
+                if question is not None and not cancellation.requested:
                     with suppress(PlanningCancelled):
                         send_answer(number, planner.answer(question, cancellation))
