@@ -30,6 +30,7 @@ from trajectory_msgs.msg import JointTrajectory
 from spacerobot_ros.bag.playback import ReplayStatus
 from spacerobot_ros.control.status import ControllerState, ControllerStatus
 from spacerobot_ros.errors import SpaceRobotError
+from spacerobot_ros.flight.series import Signal
 from spacerobot_ros.messages.statuses import read_status
 from spacerobot_ros.model.description import Array, RobotDescription
 from spacerobot_ros.nodes.common.messages import goal_of, pose_array
@@ -133,10 +134,12 @@ class Listener:
         """Nodes whose reports are hidden, and the node whose next heartbeat shows them again."""
         self._last_call = time.monotonic()
         self._planned: Array | None = None
-        self._path: _PlannedPath | None = None
+        self._path: tuple[int, Signal] | None = None
+        """Begin, ns, and poses (k, 7) of the base that a planner predicts."""
         self._last_schedule: JointTrajectory | None = None
-        """It is latched, so it may arrive before the corresponding robot."""
-        self._schedule: _Schedule | None = None
+        """It is latched, so it may arrive before the robot whose joints it moves."""
+        self._schedule: tuple[int, Signal] | None = None
+        """Begin, ns, and planned positions (m, n) of the joints."""
         self._motion: Array | None = None
         self._goals: dict[Part, Goal] = {}
         self._pursued_goals: dict[Part, Goal] = {}
@@ -392,7 +395,7 @@ class Listener:
         times = np.array([stamp_to_ns(p.header.stamp) for p in kept]) / SECOND
         begin = stamp_to_ns(message.header.stamp)
         complete = len(whole) == len(kept) > 1
-        self._path = _PlannedPath(begin, times, np.array(whole)) if complete else None
+        self._path = (begin, Signal(times, np.array(whole))) if complete else None
         self._combine_path_and_schedule()
 
     def _on_schedule(self, message: JointTrajectory) -> None:
@@ -406,19 +409,19 @@ class Listener:
             begin = stamp_to_ns(message.header.stamp)
             since = [stamp_to_ns(point.time_from_start) for point in message.points]
             times = (np.array(since) + begin) / SECOND
-            self._schedule = _Schedule(begin, times, np.array(positions)[:, places])
+            self._schedule = begin, Signal(times, np.array(positions)[:, places])
         self._combine_path_and_schedule()
 
     def _combine_path_and_schedule(self) -> None:
-        path, schedule = self._path, self._schedule
         self._motion = None
-        if path is not None and schedule is not None and path.begin_ns == schedule.begin_ns:
-            step = -(-len(path.times) // _MAX_MOTION_POINTS)
-            kept = [*range(0, len(path.times) - 1, step), len(path.times) - 1]
-            times = path.times[kept]
-            shapes = [np.interp(times, schedule.times, q) for q in schedule.positions.T]
-            motion = np.column_stack([path.poses[kept], *shapes])
-            self._motion = motion if np.all(np.isfinite(motion)) else None
+        if self._path is None or self._schedule is None or self._path[0] != self._schedule[0]:
+            return
+        (_, path), (_, schedule) = self._path, self._schedule
+        step = -(-len(path) // _MAX_MOTION_POINTS)
+        kept = [*range(0, len(path) - 1, step), len(path) - 1]
+        shapes = [np.interp(path.time[kept], schedule.time, q) for q in schedule.values.T]
+        motion = np.column_stack([path.values[kept], *shapes])
+        self._motion = motion if np.all(np.isfinite(motion)) else None
 
     def _on_goal(self, part: Part, message: PoseStamped) -> None:
         try:
@@ -457,24 +460,6 @@ class Listener:
                 # The recorded reports are of nodes without heartbeats here.
                 recorded = set(self._reporters.values()) - set(self._beats)
                 self._hidden.update(dict.fromkeys(recorded, name))
-
-
-@dataclass(frozen=True)
-class _PlannedPath:
-    """Poses (k, 7) of the base that a planner predicts, and their simulated times (k,), s."""
-
-    begin_ns: int
-    times: Array
-    poses: Array
-
-
-@dataclass(frozen=True)
-class _Schedule:
-    """Planned positions (m, n) of the joints, and their simulated times (m,), s."""
-
-    begin_ns: int
-    times: Array
-    positions: Array
 
 
 @dataclass(frozen=True)
