@@ -15,7 +15,8 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from spacerobot_ros.errors import RobotDescriptionError, sentence_case, shortened
-from spacerobot_ros.flight.captures import BUDGET_PARTS
+from spacerobot_ros.flight.captures import BUDGET_PARTS, momentum_budget_over_time
+from spacerobot_ros.flight.reading import impulse
 from spacerobot_ros.flight.series import Signal
 from spacerobot_ros.measures import momentum_change
 from spacerobot_ros.model.description import Array, Joint
@@ -511,6 +512,7 @@ def twist_figure(flight: FlightReport) -> ReportFigure | str | None:
 
 
 _MOMENTUM_DECADES = 4
+_MAX_BUDGET_STATES = 2000
 
 _MAX_PEAK_SHARE = 0.02
 """Largest share of samples that may be clipped as peaks."""
@@ -579,9 +581,10 @@ def thrusters_figure(flight: FlightReport) -> ReportFigure | str | None:
     tints = [colour(k) for k in range(len(used))]
     label, unit = "thrusters", "share of each tick during which they are on"
     groups = [TraceGroup(duty, [shortened(names[k]) for k in used], label, unit, tints, rows=True)]
-    impulse, propellant = flight.impulse, flight.series.get("propellant")
-    groups.append(TraceGroup(impulse, ["impulse"], "impulse given", "N s", [PALETTE[0]]))
-    caption = "Share of each tick during which each thruster was on; below: total impulse"
+    thrust, propellant = flight.signal("thruster_force"), flight.series.get("propellant")
+    total = impulse(thrust, np.ones(thrust.width))
+    groups.append(TraceGroup(total, ["impulse"], "impulse given", "N s", [PALETTE[0]]))
+    caption = "Share of each tick that each thruster was on; below, their total impulse"
     if propellant is not None:
         grams = Signal(propellant.time, 1e3 * propellant.values)
         groups.append(TraceGroup(grams, ["propellant"], "propellant", "g", [PALETTE[1]]))
@@ -624,19 +627,17 @@ def momentum_figure(flight: FlightReport) -> ReportFigure | str:
 
 
 def momentum_budget_figure(flight: FlightReport) -> ReportFigure | str | None:
-    """Angular momentum of the base, arm, wheels and total; None if there are neither wheels nor a
-    capture."""
+    """Angular momentum of base, arm, wheels and all; None without wheels and without a capture."""
+    robot, captured = flight.robot, flight.capture.get("captured", False)
+    if robot is None or not (robot.wheel_names or captured):
+        return None
     try:
-        budget = flight.momentum_budget
+        budget = momentum_budget_over_time(flight, _MAX_BUDGET_STATES)
     except RobotDescriptionError as error:
         return f"The momentum budget is not drawn. {error}"
     if not len(budget):
         return None
-    parts = [
-        part
-        for part in BUDGET_PARTS
-        if part != "wheels" or (flight.robot is not None and flight.robot.wheel_names)
-    ]
+    parts = [part for part in BUDGET_PARTS if part != "wheels" or robot.wheel_names]
     columns = [BUDGET_PARTS.index(part) for part in parts]
     signal = Signal(budget.time, budget.values[:, columns])
     tints = [colour(column) for column in columns]

@@ -14,15 +14,10 @@ from spacerobot_ros.collision.geometry import obstacle_visuals
 from spacerobot_ros.commanding.goal_follower import Status
 from spacerobot_ros.control.status import ControllerStatus
 from spacerobot_ros.errors import MeshError
-from spacerobot_ros.flight.captures import (
-    BUDGET_PARTS,
-    momentum_budget_over_time,
-)
 from spacerobot_ros.flight.flight import Flight
 from spacerobot_ros.flight.reading import (
     WRENCH_COLUMNS,
     FlightBag,
-    impulse,
     namespaces,
     open_flight_bag,
     read_flight,
@@ -41,7 +36,7 @@ from spacerobot_ros.model.rotations import (
 from spacerobot_ros.model.visuals import Visual, meshes_from_attachments
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.core.goal import EndEffectorGoal
-from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus, time_to_end
+from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus
 from spacerobot_ros.planning.methods.registry import METHODS
 from spacerobot_ros.report.events import FlightEvent, timed_events
 from spacerobot_ros.report.signals import (
@@ -55,7 +50,6 @@ from spacerobot_ros.report.signals import (
 from spacerobot_ros.scenario import COMMANDERS
 from spacerobot_ros.times import SECOND
 
-_MAX_BUDGET_STATES = 2000
 _MAX_LINK_ERROR_STATES = 2000
 
 
@@ -143,30 +137,14 @@ class FlightReport(Flight):
         return Signal(balance.time, values)
 
     @cached_property
-    def momentum_budget(self) -> Signal:
-        """Angular momentum (N, 4), N m s, of the base, arm, wheels and total, at up to two thousand
-        states; empty unless the robot has wheels or captured a target.
-
-        Raises
-        ------
-        RobotDescriptionError
-            The described robot has no positive inertia.
-        """
-        robot, captured = self.robot, self.capture.get("captured", False)
-        if robot is None or not (robot.wheel_names or captured):
-            return Signal.empty(len(BUDGET_PARTS))
-        return momentum_budget_over_time(self, _MAX_BUDGET_STATES)
-
-    @cached_property
     def tool(self) -> Signal:
         """End-effector pose in the world (N, 7)."""
         return self.signal("end_effector_pose")
 
     @property
     def wrench(self) -> Signal:
-        """Commanded thruster force (N) and torque (N m), in the base link frame (N, 6)."""
-        wrench = self.bag.signal("base_wrench", WRENCH_COLUMNS, 6)
-        return _shift_time(wrench, self.bag.began)
+        """Commanded force (N) and torque (N m) of the thrusters, in the base link (N, 6)."""
+        return self._of_bag("base_wrench", WRENCH_COLUMNS, 6)
 
     @property
     def efforts(self) -> Signal:
@@ -177,10 +155,12 @@ class FlightReport(Flight):
         given = [] if velocity else self.bag.names("joint_commands")
         if not given or sorted(given) != sorted(names):
             return Signal.empty(len(names))
-        efforts = _shift_time(
-            self.bag.signal("joint_commands", ["effort"], len(names)), self.bag.began
-        )
+        efforts = self._of_bag("joint_commands", ["effort"], len(names))
         return Signal(efforts.time, efforts.values[:, [given.index(name) for name in names]])
+
+    def _of_bag(self, topic: str, columns: Sequence[str], width: int) -> Signal:
+        signal = self.bag.signal(topic, columns, width)
+        return Signal(signal.time - self.bag.began, signal.values)
 
     @cached_property
     def planned(self) -> list[Array]:
@@ -388,14 +368,6 @@ class FlightReport(Flight):
         return flown_time(self.reports, self.end)
 
     @property
-    def time_to_end(self) -> float | None:
-        """Time from the first schedule of the last goal to its end, s, including waits; None if no
-        schedule was flown.
-        """
-        planned = [(time, each) for time, each in self.reports if isinstance(each, PlannerStatus)]
-        return time_to_end(planned, self.end)
-
-    @property
     def hidden_links_text(self) -> str:
         """A message about data missing for robot pictures; empty: nothing is missing."""
         lacking = []
@@ -474,12 +446,6 @@ class FlightReport(Flight):
         return float(np.median(np.diff(self.position.time))) if len(self.position) > 1 else 0.0
 
     @cached_property
-    def impulse(self) -> Signal:
-        """Total impulse of all thrusters (N, 1), N s."""
-        thrust = self.signal("thruster_force")
-        return impulse(thrust, np.ones(thrust.width))
-
-    @cached_property
     def wheel_columns(self) -> tuple[int, ...]:
         """Columns of reaction wheel joints."""
         wheels = self.robot.wheel_names if self.robot is not None else ()
@@ -505,11 +471,6 @@ def _method_of(status: Status) -> str:
 
 def _timed_goals(goals: Sequence[SentGoal]) -> list[tuple[float, Goal]]:
     return [(sent.time, sent.goal) for sent in goals]
-
-
-def _shift_time(signal: Signal, start: float) -> Signal:
-    """Return a signal over the time since ``start``, s."""
-    return Signal(signal.time - start, signal.values)
 
 
 def pose_errors(pose: Signal, targets: Sequence[GoalSpan]) -> Signal:

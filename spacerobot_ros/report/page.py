@@ -170,12 +170,14 @@ def _table_html(identity: str, given: Table) -> str:
 
 
 def _figures_html(figures: Figures) -> list[str]:
-    parts, numbers = [], chart_numbers(figures)
+    parts, first_chart = [], 0
     for sentence in dict.fromkeys(each for each in figures if isinstance(each, str)):
         parts.append(f'<p class="missing">{escape(sentence)}</p>')
     drawn = [each for each in figures if isinstance(each, ReportFigure)]
     for number, each in enumerate(drawn, start=1):
-        charts = f' data-charts="{numbers[each.name]}"' if each.name in numbers else ""
+        numbers = " ".join(str(first_chart + k) for k in range(len(each.groups)))
+        first_chart += len(each.groups)
+        charts = f' data-charts="{numbers}"' if numbers else ""
         heading = escape(each.heading)
         caption = f"<b>Figure {number}. {heading}.</b> {_caption_html(each)}"
         shown = figure(each.name, each.svg, each.heading, caption, charts)
@@ -239,7 +241,7 @@ def _footer_text(flight: FlightReport) -> str:
 def charts_of(flight: FlightReport, figures: Figures) -> PagePart:
     """Return the charts of all figures over time.
 
-    Each figure element lists its chart numbers in ``data-charts`` (:func:`chart_numbers`).
+    The element of a figure lists the numbers of its charts in ``data-charts``.
     """
     groups = [group for each in figures if isinstance(each, ReportFigure) for group in each.groups]
     if not groups:
@@ -267,16 +269,6 @@ def _chart_events(flight: FlightReport) -> list[dict[str, Any]]:
         sentences.append(each.event.message)
         shown = {"time": each.time, "sentence": " ".join(sentences), "text": text}
         found.append(shown | event_style(each.event.kind))
-    return found
-
-
-def chart_numbers(figures: Figures) -> dict[str, str]:
-    """Return the chart numbers of each figure, by figure name."""
-    found, first = {}, 0
-    for each in figures:
-        if isinstance(each, ReportFigure) and each.groups:
-            found[each.name] = " ".join(str(first + k) for k in range(len(each.groups)))
-            first += len(each.groups)
     return found
 
 

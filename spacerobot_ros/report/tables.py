@@ -18,6 +18,7 @@ from spacerobot_ros.model.payload_estimation import PayloadEstimate
 from spacerobot_ros.model.rotations import rotvec_from_quaternion
 from spacerobot_ros.planning import PoseError
 from spacerobot_ros.planning.core.goal import EndEffectorGoal
+from spacerobot_ros.planning.execution.status import PlannerStatus, time_to_end
 from spacerobot_ros.report.flight import FlightReport, joint_unit
 from spacerobot_ros.scenario import Published
 
@@ -287,7 +288,8 @@ def _tolerance_text(flight: FlightReport, part: Literal["position", "attitude"])
 
 def _time_to_end_texts(flight: FlightReport) -> list[str]:
     """Return the time to the end if it differs from that of the schedules; else nothing."""
-    whole, flown = flight.time_to_end, flight.time_flown
+    planned = [(time, each) for time, each in flight.reports if isinstance(each, PlannerStatus)]
+    whole, flown = time_to_end(planned, flight.end), flight.time_flown
     if whole is None or flown is None or abs(whole - flown) < _EQUAL_TIME_TICKS * flight.tick:
         return []
     return [f"{whole:.6g} s from the first schedule to the end"]

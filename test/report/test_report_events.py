@@ -18,11 +18,11 @@ from spacerobot_ros.bag import read_bag
 from spacerobot_ros.cli.main import main
 from spacerobot_ros.errors import RobotDescriptionError, SpaceRobotError, shortened
 from spacerobot_ros.events import EventKind
+from spacerobot_ros.flight.captures import momentum_budget_over_time
 from spacerobot_ros.model.payload_estimation import PayloadEstimate
 from spacerobot_ros.model.urdf import parse_robot
 from spacerobot_ros.model.visuals import visuals_of
 from spacerobot_ros.report import figures_over_time
-from spacerobot_ros.report import flight as report_flight
 from spacerobot_ros.report import tables as report_tables
 from spacerobot_ros.report.events import _MARKS
 from spacerobot_ros.report.figures import ReportFigure, drawing
@@ -162,7 +162,7 @@ BAGS = Path(__file__).parents[2] / "bags"
 def _few_states() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("SPACEROBOT_COMPILE", "0")
-        patch.setattr(report_flight, "_MAX_BUDGET_STATES", 30)
+        patch.setattr(figures_over_time, "_MAX_BUDGET_STATES", 30)
         yield
 
 
@@ -191,7 +191,8 @@ def test_a_robot_that_captures_has_no_trace_of_wheels_that_it_lacks() -> None:
     assert list(group.names) == ["base", "arm", "sum"]
     assert "wheels" not in figure.caption
     report = read_report(BAGS / "capture.mcap")
-    np.testing.assert_array_equal(group.signal.values, report.momentum_budget.values[:, [0, 1, 3]])
+    budget = momentum_budget_over_time(report, 30)
+    np.testing.assert_array_equal(group.signal.values, budget.values[:, [0, 1, 3]])
 
 
 def test_the_table_has_the_estimated_body(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -240,7 +241,7 @@ def test_a_robot_without_inertia_has_a_sentence(monkeypatch: pytest.MonkeyPatch)
     def refuse(*_: object) -> None:
         raise RobotDescriptionError("The robot has no inertia.")
 
-    monkeypatch.setattr(report_flight, "momentum_budget_over_time", refuse)
+    monkeypatch.setattr(figures_over_time, "momentum_budget_over_time", refuse)
     assert figure_of("capture") == "The momentum budget is not drawn. The robot has no inertia."
 
 
