@@ -133,14 +133,26 @@ def drawing(
 
 
 def _apply_style(path: Path) -> None:
-    with _collected_warnings() as warnings:
-        try:
-            settings = _read_style(path)
-        except (OSError, ValueError, KeyError) as error:
-            why = getattr(error, "strerror", None) or error
-            raise SpaceRobotError(f"The style file {path} cannot be read: {why}.") from error
-    if warnings.messages:
-        raise SpaceRobotError(f"The style file {path} is refused: {warnings.messages[0]}.")
+    warnings: list[str] = []
+
+    def collect(record: logging.LogRecord) -> bool:
+        """Keep a warning from being shown, such as one of a line that matplotlib does not know."""
+        if record.levelno < logging.WARNING:
+            return True
+        warnings.append(record.getMessage().strip().splitlines()[0].rstrip("."))
+        return False
+
+    log = logging.getLogger("matplotlib")
+    log.addFilter(collect)
+    try:
+        settings = _read_style(path)
+    except (OSError, ValueError, KeyError) as error:
+        why = getattr(error, "strerror", None) or error
+        raise SpaceRobotError(f"The style file {path} cannot be read: {why}.") from error
+    finally:
+        log.removeFilter(collect)
+    if warnings:
+        raise SpaceRobotError(f"The style file {path} is refused: {warnings[0]}.")
     mpl.rcParams.update(settings)
 
 
@@ -184,40 +196,11 @@ def _require_fonts(path: Path) -> None:
 
 
 def _is_font_installed(family: str) -> bool:
-    with _collected_warnings():
-        try:
-            findfont(FontProperties(family=[family]), fallback_to_default=False)
-        except ValueError:
-            return False
-    return True
-
-
-@contextmanager
-def _collected_warnings() -> Iterator[_Warnings]:
-    warnings = _Warnings()
-    loggers = [logging.getLogger(name) for name in ("matplotlib", "matplotlib.font_manager")]
-    for logger in loggers:
-        logger.addFilter(warnings)
     try:
-        yield warnings
-    finally:
-        for logger in loggers:
-            logger.removeFilter(warnings)
-
-
-class _Warnings(logging.Filter):
-    """Collects warnings of matplotlib, such as a line of a style file that it does not know."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.messages: list[str] = []
-
-    def filter(self, record: logging.LogRecord) -> bool:
-        """Store the first line of a warning and suppress its display."""
-        if record.levelno < logging.WARNING:
-            return True
-        self.messages.append(record.getMessage().strip().splitlines()[0].rstrip("."))
+        findfont(FontProperties(family=[family]), fallback_to_default=False)
+    except ValueError:
         return False
+    return True
 
 
 def width() -> float:
@@ -505,14 +488,13 @@ def log_range(values: Array, decades: int) -> tuple[float, float]:
     return 10.0 ** (top - decades), 10.0**top
 
 
-def set_time(axes: Axes, start: float, end: float, label: bool = True) -> None:
-    """Set the x axis to a time span in s."""
+def set_time(axes: Axes, start: float, end: float) -> None:
+    """Set the x axis to a span of time in s."""
     if end - start < 1e-9:
         start, end = start - 0.5, end + 0.5
     axes.set_xlim(start, end)
     axes.xaxis.set_major_locator(MaxNLocator(8, steps=[1, 2, 2.5, 5, 10]))
-    if label:
-        axes.set_xlabel("time (s)")
+    axes.set_xlabel("time (s)")
 
 
 def end_labels(axes: Axes, labels: Sequence[tuple[float, str, str]]) -> None:
