@@ -105,21 +105,12 @@ def rotvecs(quaternions: Array) -> Array:
     previous one.
     """
     wrapped = rotvecs_from_quaternions(quaternions)
-    jumps = np.linalg.norm(np.diff(wrapped, axis=0), axis=1) > np.pi
-    if not jumps.any():
-        return wrapped
-    # Between its passages through half turns and through zero a vector keeps its number of turns.
-    flips = np.einsum("ij,ij->i", wrapped[1:], wrapped[:-1]) < 0
-    breaks = np.append(np.flatnonzero(jumps | flips) + 1, len(wrapped))
-    continuous = wrapped.copy()
-    for first, last in zip(breaks[:-1].tolist(), breaks[1:].tolist(), strict=True):
-        before = continuous[first - 1]
-        turns = nearest_rotvec(wrapped[first], before) - wrapped[first]
-        direction = wrapped[first:last]
-        lengths = np.linalg.norm(direction, axis=1, keepdims=True)
-        added = float(turns @ wrapped[first]) / max(float(lengths[0, 0]), 1e-12)
-        continuous[first:last] += added * direction / np.maximum(lengths, 1e-12)
-    return continuous
+    lengths = np.linalg.norm(wrapped, axis=1)
+    # The direction turns over at half turns and at zero: there the angle about it changes its sign.
+    turned_over = np.einsum("ij,ij->i", wrapped[1:], wrapped[:-1]) < 0
+    signs = np.append(1, np.cumprod(1 - 2 * turned_over))[: len(wrapped)]
+    added = signs * np.unwrap(signs * lengths) - lengths
+    return wrapped + added[:, np.newaxis] * wrapped / np.maximum(lengths, 1e-12)[:, np.newaxis]
 
 
 def nearest_rotvec(rotvec: Array, near: Array) -> Array:
