@@ -47,9 +47,6 @@ _SUN = np.array([0.55, 0.65, 0.52]) / np.linalg.norm([0.55, 0.65, 0.52])
 _SUN_COLOR: Color = (255, 244, 214)
 _SUN_INTENSITY, _SKY_INTENSITY = 3.0, 0.35
 
-_MIN_LINE_SEGMENTS = 32
-"""Smallest line capacity, in segments."""
-
 _GRID: tuple[Color, Color] = (150, 150, 155), (120, 120, 128)
 """Cell and section colours, visible on white and black."""
 
@@ -216,9 +213,6 @@ def reach_of(robot: RobotDescription) -> float:
 class Lines:
     """Connected points in the scene, such as a path.
 
-    A node has a fixed segment capacity and is replaced by a larger one if necessary: browsers do
-    not redraw a node if its number of segments changes.
-
     Parameters
     ----------
     scene, path
@@ -228,16 +222,20 @@ class Lines:
     """
 
     def __init__(self, scene: viser.SceneApi, path: str, color: Color) -> None:
-        self._scene, self._path, self._color = scene, path, color
-        self._capacity = 0
-        self._handle: Any = None
+        self._handle: Any = scene.add_line_segments(
+            path,
+            np.zeros((1, 2, 3), np.float32),
+            color,
+            thickness=_LINE_WIDTH,
+            thickness_units="screen",
+            visible=False,
+        )
         self._shown, self._empty = True, True
 
     def show(self, *, visible: bool) -> None:
         """Show or hide the line."""
         self._shown = visible
-        if self._handle is not None:
-            self._handle.visible = visible and not self._empty
+        self._handle.visible = visible and not self._empty
 
     def draw(self, points: Array) -> None:
         """Connect points (k, 3), m; fewer than two points clear the line."""
@@ -246,23 +244,9 @@ class Lines:
     def draw_segments(self, segments: Array) -> None:
         """Draw segments (k, 2, 3), m; an empty array clears the line."""
         self._empty = not len(segments)
-        if self._empty:
-            if self._handle is not None:
-                self._handle.visible = False
-            return
-        larger = len(segments) > self._capacity
-        if larger:
-            self._capacity = max(_MIN_LINE_SEGMENTS, 2 ** (len(segments) - 1).bit_length())
-        # Unused segments have zero length, at the end of the last one.
-        filled = np.broadcast_to(segments[-1, 1], (self._capacity, 2, 3)).astype(np.float32)
-        filled[: len(segments)] = segments
-        if larger:
-            self._handle = self._scene.add_line_segments(
-                self._path, filled, self._color, thickness=_LINE_WIDTH, thickness_units="screen"
-            )
-        else:
-            self._handle.points = filled
-        self._handle.visible = self._shown
+        if not self._empty:
+            self._handle.points = segments.astype(np.float32)
+        self.show(visible=self._shown)
 
 
 def plume_lines(table: ThrusterTable, names: tuple[str, ...], duty: Array, length: float) -> Array:
