@@ -25,6 +25,7 @@ from spacerobot_ros.model.rotations import (
     quaternion_multiply,
     rotvecs_from_quaternions,
 )
+from spacerobot_ros.planning import Goal
 from spacerobot_ros.report.events import EVENT_STRIP_HEIGHT, draw_events
 from spacerobot_ros.report.figures import (
     LIMIT,
@@ -49,7 +50,7 @@ from spacerobot_ros.report.figures import (
     set_time,
     sheet,
 )
-from spacerobot_ros.report.flight import FlightReport, joint_unit, pose_errors
+from spacerobot_ros.report.flight import FlightReport, GoalSpan, joint_unit, pose_errors
 from spacerobot_ros.report.signals import Cycles, Indices, envelope
 
 SHOWN_CYCLES = 3
@@ -341,7 +342,7 @@ def _draw_last_cycles(axes: Axes, group: TraceGroup, cycles: Cycles) -> None:
     axes.set_ylabel(unit)
 
 
-JOINTS_PER_PANEL = 6
+_JOINTS_PER_PANEL = 6
 
 NO_POSES_TEXT = "The bag contains no base poses (odom); base figures are missing."
 
@@ -350,25 +351,23 @@ NO_JOINTS_TEXT = "The bag contains no joint positions (joint_states)."
 
 def position_group(flight: FlightReport) -> TraceGroup:
     """Return the base position and its goals."""
-    goals = [
-        (t.start, t.end, i, x)
-        for t in flight.targets
-        for i, x in enumerate(t.goal.position)
-        if flight.position_counts
-    ]
+    targets = flight.targets if flight.position_counts else []
+    goals = _goal_lines(targets, lambda goal: goal.position)
     return TraceGroup(flight.position, ["x", "y", "z"], "base position", "m", PALETTE[:3], goals)
 
 
 def attitude_group(flight: FlightReport) -> TraceGroup:
-    """Return the base attitude as a rotation vector, and its goals."""
-    goals = [
-        (t.start, t.end, i, x)
-        for t in flight.targets
-        for i, x in enumerate(flight.goal_rotvec(t.goal))
-    ]
+    """Return the base attitude as rotation vector, and its goals."""
+    goals = _goal_lines(flight.targets, flight.goal_rotvec)
     return TraceGroup(
         flight.attitude, ["x", "y", "z"], "rotation vector", "rad", PALETTE[:3], goals
     )
+
+
+def _goal_lines(
+    targets: Sequence[GoalSpan], values: Callable[[Goal], Array]
+) -> list[tuple[float, float, int, float]]:
+    return [(t.start, t.end, i, x) for t in targets for i, x in enumerate(values(t.goal))]
 
 
 def shape_groups(flight: FlightReport) -> list[TraceGroup]:
@@ -379,15 +378,11 @@ def shape_groups(flight: FlightReport) -> list[TraceGroup]:
     def bounds(joint: Joint) -> list[float]:
         return [joint.limits.lower, joint.limits.upper]
 
-    units, most = {"m": "m", "rad": "rad"}, JOINTS_PER_PANEL
-    positions, rates = flight.shape, flight.rates
-    groups = joint_groups(
-        flight, positions, "joint position", units, bounds, most, flight.shape_columns
-    )
-    if len(rates):
-        of_wheels = flight.wheel_columns
-        units = {"rad": "rad/s"}
-        groups += joint_groups(flight, rates, "wheel rate", units, _rate_bounds, most, of_wheels)
+    units, columns = {"m": "m", "rad": "rad"}, flight.shape_columns
+    groups = joint_groups(flight, flight.shape, "joint position", units, bounds, columns)
+    if len(flight.rates):
+        units, columns = {"rad": "rad/s"}, flight.wheel_columns
+        groups += joint_groups(flight, flight.rates, "wheel rate", units, _rate_bounds, columns)
     return groups
 
 
@@ -396,9 +391,9 @@ def joint_groups(
     signal: Signal,
     label: str,
     units: dict[str, str],
-    bounds: Callable[[Joint], list[float]],
-    most: int,
+    bounds: Callable[[Joint], list[float]] = lambda joint: [],
     columns: Sequence[int] | None = None,
+    most: int = _JOINTS_PER_PANEL,
 ) -> list[TraceGroup]:
     """Group the columns (N, n) of a signal by unit; ``units`` maps the position unit to the signal
     unit.
@@ -487,9 +482,7 @@ def rates_figure(flight: FlightReport) -> ReportFigure | str | None:
     if not len(flight.rates):
         return "The bag contains no joint velocities."
     units, columns = {"m": "m/s", "rad": "rad/s"}, flight.shape_columns
-    groups = joint_groups(
-        flight, flight.rates, "velocity", units, _rate_bounds, JOINTS_PER_PANEL, columns
-    )
+    groups = joint_groups(flight, flight.rates, "velocity", units, _rate_bounds, columns)
     if not groups:
         return None
     return time_figure(flight, "velocities", "Joint velocities", "Velocity of each joint", groups)
@@ -786,9 +779,7 @@ def sensors_figure(flight: FlightReport) -> ReportFigure | str | None:
     if len(shape):
         off = Signal(shape.time, shape.values - flight.shape.values[at])
         units = {"m": "m", "rad": "rad"}
-        groups += joint_groups(
-            flight, off, "joint position error", units, lambda joint: [], JOINTS_PER_PANEL
-        )
+        groups += joint_groups(flight, off, "joint position error", units)
     groups = [g for g in groups if np.abs(g.signal.values).max(initial=0.0) > _SENSOR_ROUNDING]
     if not groups:
         return None
