@@ -269,7 +269,10 @@ def path_figure(flight: FlightReport, beside: Sequence[FlightReport] = ()) -> Re
             )
         for goal in goals:
             axes.plot(*goal[[i, j]], "x", color=GHOST_COLOUR, ms=8, mew=2, zorder=5)
-        _set_square_limits(axes, middle[[i, j]], half)
+        axes.set_xlim(middle[i] - half, middle[i] + half)
+        axes.set_ylim(middle[j] - half, middle[j] + half)
+        axes.set_box_aspect(1.0)
+        axes.locator_params(nbins=5)
         axes.set_xlabel(f"{'xyz'[i]} (m)")
         axes.set_ylabel(f"{'xyz'[j]} (m)")
         axes.set_title(title)
@@ -286,13 +289,6 @@ def path_figure(flight: FlightReport, beside: Sequence[FlightReport] = ()) -> Re
         + ". All recorded states are drawn."
     )
     return ReportFigure("path", "Paths", caption, figure)
-
-
-def _set_square_limits(axes: Axes, middle: Array, half: float) -> None:
-    axes.set_xlim(middle[0] - half, middle[0] + half)
-    axes.set_ylim(middle[1] - half, middle[1] + half)
-    axes.set_box_aspect(1.0)
-    axes.locator_params(nbins=5)
 
 
 def _square_panels(

@@ -185,10 +185,10 @@ def _place(path: str, pose: Array) -> Command:
 def _set_object(path: str, points: Array, material: Command, kind: str, index: Any = ()) -> Command:
     """Set the object at a path: points (k, 3), and how they are connected."""
     names = {"geometry": f"{path} geometry", "material": f"{path} material"}
-    position = {"itemSize": 3, "normalized": False, **_array("Float32Array", _rounded(points))}
-    data: Command = {"attributes": {"position": position}}
+    position = {"itemSize": 3, "normalized": False, "type": "Float32Array"}
+    data: Command = {"attributes": {"position": position | {"array": _rounded(points)}}}
     if len(index):
-        data["index"] = _array("Uint32Array", np.ravel(index).tolist())
+        data["index"] = {"type": "Uint32Array", "array": np.ravel(index).tolist()}
     return {
         "type": "set_object",
         "path": path,
@@ -199,10 +199,6 @@ def _set_object(path: str, points: Array, material: Command, kind: str, index: A
             "object": {"uuid": path, "type": kind, "matrix": np.eye(4).ravel().tolist(), **names},
         },
     }
-
-
-def _array(kind: str, values: list[Any]) -> Command:
-    return {"type": kind, "array": values}
 
 
 def _lines(path: str, points: Array, color: str, opacity: float = 1.0) -> Command:

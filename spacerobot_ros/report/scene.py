@@ -108,7 +108,11 @@ def bodies_of(flight: FlightReport, rows: Sequence[int], most: int) -> list[Body
 def obstacles_of(flight: FlightReport) -> list[Body]:
     """Return the obstacles around a robot, with the geometry used to measure distances."""
     return [
-        Body(f"obstacle {number} {visual.link}", (visual,), _as_values(pose))
+        Body(
+            f"obstacle {number} {visual.link}",
+            (visual,),
+            np.concatenate([pose.r, quaternion_from_matrix(pose.R)])[np.newaxis],
+        )
         for number, (visual, pose) in enumerate(flight.obstacles)
     ]
 
@@ -144,7 +148,3 @@ def _moved(visual: Visual, frame: Pose) -> Visual:
     """Return a solid whose link has a pose in another frame, in that frame."""
     shape = replace(visual.shape, pose=frame @ visual.shape.pose)
     return replace(visual, shape=shape, mesh=visual.mesh.moved(frame))
-
-
-def _as_values(pose: Pose) -> Array:
-    return np.concatenate([pose.r, quaternion_from_matrix(pose.R)])[np.newaxis]

@@ -211,7 +211,8 @@ class GoalEditor:
         now
             Wall time, s.
         """
-        before, links = self._followed, _links_of(goals)
+        before = self._followed
+        links = {aim.link: aim for goal in goals.values() for aim in goal.end_effectors}
         same = goals.keys() == before.keys() and all(goals[x].equals(before[x]) for x in goals)
         if not goals or not self.placed or same:
             return
@@ -699,10 +700,6 @@ def _fields_of(pose: Array) -> tuple[tuple[float, ...], tuple[float, ...]]:
         for part, digits in zip(numbers, _DECIMALS, strict=True)
     )
     return position, angles
-
-
-def _links_of(goals: Mapping[Part, Goal]) -> dict[str, EndEffectorGoal]:
-    return {aim.link: aim for goal in goals.values() for aim in goal.end_effectors}
 
 
 def _link_gizmo(link: str) -> str:

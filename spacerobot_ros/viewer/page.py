@@ -10,7 +10,7 @@ import math
 import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from queue import Empty, SimpleQueue
+from queue import SimpleQueue
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -761,7 +761,8 @@ class Page:
     def update(self, state: StackState, now: float) -> list[Action]:
         """Draw a state; return the user actions since the last call. ``now``: wall time, s."""
         before, self._state, self._now = self._state, state, now
-        self._handle_inbox()
+        while not self._inbox.empty():
+            self._inbox.get()()
         with self._server.atomic():
             replays = state.replay is not None
             if replays != (before.replay is not None):
@@ -907,14 +908,6 @@ class Page:
             client.camera.position, client.camera.look_at = position + way, look_at + way
 
     # -- actions of users -----------------------------------------------------------------------
-
-    def _handle_inbox(self) -> None:
-        while True:
-            try:
-                act = self._inbox.get_nowait()
-            except Empty:
-                return
-            act()
 
     def _request(self, action: Action) -> None:
         self._actions.append(action)

@@ -350,7 +350,10 @@ class Planner:
                 return _check_arm(question, question.tool)
             built = question.urdf, question.parameters
             if built != self._built:
-                self._build_planner(*built)
+                self._built = None
+                self._config = planner_config(question.parameters)
+                self._robot = robot_from_text(question.urdf, self._config)
+                self._worker = PlanningWorker(self._robot, self._config)
                 self._built = built
             request = PlanRequest(question.state, question.goal, self._config.tolerance)
             schedule = self._worker.plan(PlanningTask(request), cancellation)
@@ -365,12 +368,6 @@ class Planner:
         )
         verdict = Verdict.PARTLY if left_out else Verdict.REACHABLE
         return GoalCheck(verdict, message, schedule.positions[-1], base)
-
-    def _build_planner(self, urdf: str, parameters: Mapping[str, str]) -> None:
-        self._built = None
-        self._config = planner_config(parameters)
-        self._robot = robot_from_text(urdf, self._config)
-        self._worker = PlanningWorker(self._robot, self._config)
 
 
 def _predicted_end(robot: SpaceRobot, request: PlanRequest, schedule: GaitSchedule) -> Array:

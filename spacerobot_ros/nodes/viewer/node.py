@@ -28,7 +28,7 @@ from spacerobot_ros.events import Event, EventKind
 from spacerobot_ros.messages.builders import goal_message
 from spacerobot_ros.messages.statuses import read_status
 from spacerobot_ros.model.description import DEFAULT_END_EFFECTOR, RobotDescription
-from spacerobot_ros.model.thrusters import ThrusterTable, find_thrusters
+from spacerobot_ros.model.thrusters import find_thrusters
 from spacerobot_ros.model.urdf import parse_robot
 from spacerobot_ros.model.world import obstacles_from_topic
 from spacerobot_ros.nodes.common.messages import shape_message
@@ -247,7 +247,9 @@ class ViewerNode(FlightNode):
             return
         goals = editor.settled_goals(now)
         if goals is not None:
-            question = self._question(state, goals)
+            question: GoalQuestion | str = "Parameter 'check_goals' is false."
+            if self.config.check_goals:
+                question = make_question(state, goals, self._robot, self._remote_values)
             if isinstance(question, GoalQuestion):
                 self._checker.ask(question)
             else:
@@ -256,11 +258,6 @@ class ViewerNode(FlightNode):
         check = self._checker.latest_answer()
         if check is not None and not editor.moving:
             editor.show_check(check)
-
-    def _question(self, state: StackState, goals: Mapping[Part, Goal]) -> GoalQuestion | str:
-        if not self.config.check_goals:
-            return "Parameter 'check_goals' is false."
-        return make_question(state, goals, self._robot, self._remote_values)
 
     # -- messages of the stack ------------------------------------------------------------------
 
@@ -386,19 +383,14 @@ class ViewerNode(FlightNode):
             self._page.faults.offer(FaultTargets())
             return
         takes_wrench = json.loads(values.get("actuation", '""')) in ("auto", "effort")
-        table = self._thruster_table(json.loads(values.get("thrusters", '""')))
+        source, table = json.loads(values.get("thrusters", '""')), None
+        try:
+            table = find_thrusters(source, self._robot) if source else None
+        except SpaceRobotError as error:
+            self._note(str(error), 1)
         nozzles = () if table is None else table.names
         self._page.show_thrusters(table)
         self._page.faults.offer(FaultTargets(self._robot.joint_names, takes_wrench, nozzles))
-
-    def _thruster_table(self, source: str) -> ThrusterTable | None:
-        if not source or self._robot is None:
-            return None
-        try:
-            return find_thrusters(source, self._robot)
-        except SpaceRobotError as error:
-            self._note(str(error), 1)
-            return None
 
     def _note(self, message: str, level: int = 0, source: str = "") -> None:
         self._page.note(Notice(message, level, None, source))
