@@ -12,7 +12,6 @@ from typing import Generic, TypeVar
 import numpy as np
 
 from spacerobot_ros.errors import ParameterError, numbers, quantity, shortened
-from spacerobot_ros.measures import momentum_change
 from spacerobot_ros.model.description import DEFAULT_END_EFFECTOR, Array, RobotDescription
 from spacerobot_ros.model.kinematics import ForwardKinematics
 from spacerobot_ros.planning import Goal, PoseError
@@ -27,7 +26,7 @@ from spacerobot_ros.planning.execution.status import PlannerState
 from spacerobot_ros.simulation.faults import FAULT_KINDS, FaultTargets, parse_fault, with_seconds
 from spacerobot_ros.simulation.status import PlantState
 from spacerobot_ros.viewer.reachability import GoalCheck, Verdict
-from spacerobot_ros.viewer.state import Measured, Momenta, Notice, Part, StackState
+from spacerobot_ros.viewer.state import Measured, Notice, Part, StackState
 
 Color = tuple[int, int, int]
 
@@ -480,16 +479,6 @@ def flown_check(state: StackState) -> GoalCheck | None:
     return GoalCheck(verdict, message, shape=motion[-1, 7:], base=base, source=motion)
 
 
-def momentum_drift(momenta: Momenta, first: Array) -> tuple[float, float]:
-    """Return the linear and angular momentum drift, kg m/s and kg m^2/s.
-
-    It is relative to the expected momenta or, if the plant publishes none, to ``first`` (6,).
-    """
-    expected = first if momenta.expected is None else momenta.expected
-    linear, angular = momentum_change(momenta.actual, expected).tolist()
-    return linear, angular
-
-
 MOMENTUM_PARTS = ("base", "arm", "wheels", "sum")
 """Components of the momentum budget, in page order."""
 
@@ -531,12 +520,6 @@ def has_tool(state: StackState) -> bool:
 
 
 # -- faults -------------------------------------------------------------------------------------
-
-
-def fault_kinds(targets: FaultTargets) -> dict[str, list[str]]:
-    """Return the possible targets of each fault kind that has targets."""
-    found = {name: targets.of(kind) for name, kind in FAULT_KINDS.items()}
-    return {name: names for name, names in found.items() if names}
 
 
 def fault_line(

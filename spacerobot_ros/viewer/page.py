@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from spacerobot_ros.errors import GoalError, ParameterError, shortened
+from spacerobot_ros.measures import momentum_change
 from spacerobot_ros.model.description import Array, RobotDescription
 from spacerobot_ros.model.kinematics import ForwardKinematics
 from spacerobot_ros.model.thrusters import ThrusterTable
@@ -234,7 +235,9 @@ class FaultPanel:
         """Offer the faults that are possible for a plant's targets."""
         if targets == self._targets:
             return
-        self._targets, self._names = targets, content.fault_kinds(targets)
+        self._targets = targets
+        names = {kind: targets.of(about) for kind, about in FAULT_KINDS.items()}
+        self._names = {kind: each for kind, each in names.items() if each}
         before = self._kind.value
         self._kind.options = tuple(self._names) or ("-",)
         if before in self._names:
@@ -336,8 +339,11 @@ class Plots:
         if state.momenta is not None:
             if self._first is None:
                 self._first = state.momenta.actual
-            drift = content.momentum_drift(state.momenta, self._first)
-            self._momentum.add(time_s, 1e6 * np.array(drift))
+            expected = state.momenta.expected
+            drift = momentum_change(
+                state.momenta.actual, self._first if expected is None else expected
+            )
+            self._momentum.add(time_s, 1e6 * drift)
         budget = content.momentum_budget(state)
         if budget:
             self._budget.handle.visible = True

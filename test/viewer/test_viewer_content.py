@@ -38,7 +38,7 @@ from spacerobot_ros.viewer import content
 from spacerobot_ros.viewer.content import RecentItems, Trail
 from spacerobot_ros.viewer.goal_editor import move_along
 from spacerobot_ros.viewer.reachability import GoalCheck, Verdict
-from spacerobot_ros.viewer.state import Measured, Momenta, Notice, StackState
+from spacerobot_ros.viewer.state import Measured, Notice, StackState
 
 HERE = np.array([1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 1.0])
 STATE = StackState(Measured(4.0, HERE, np.zeros(3), np.zeros(3), np.zeros(3)), age_s=0.1)
@@ -306,15 +306,6 @@ def test_what_a_controller_does_not_control_is_said_beside_its_number() -> None:
     assert f"end_effector is {placed}." in head("base.y", "base.rx", "end_effector.x")
 
 
-def test_momenta_are_compared_with_what_they_should_be() -> None:
-    actual, first = np.arange(6.0), np.zeros(6)
-    alone = Momenta(actual, None)
-    assert content.momentum_drift(alone, actual) == (0.0, 0.0)
-    assert content.momentum_drift(alone, first) == pytest.approx((math.sqrt(5), math.sqrt(50)))
-    pushed = Momenta(actual, actual - [0, 0, 2, 0, 3, 0])
-    assert content.momentum_drift(pushed, first) == pytest.approx((2.0, 3.0))
-
-
 def controlled(**report: Any) -> StackState:
     command = CommandReport("model_based", False, 1.0, 0.0, 0.0, 0.0, 0.0, **report)
     return replace(STATE, controller=ControllerStatus(ControllerState.TRACKING, command=command))
@@ -367,10 +358,6 @@ def test_without_a_momentum_budget_there_is_no_panel() -> None:
 
 def test_faults_are_written_for_the_plant() -> None:
     targets = FaultTargets(("elbow",), wrench=False)
-    kinds = content.fault_kinds(targets)
-    assert kinds["joint_stuck"] == ["elbow"]
-    assert "thruster_off" not in kinds
-    assert "nozzle_open" not in kinds
     line = content.fault_line("joint_slow", "elbow", 0.5, 10.0, 2.5, targets)
     assert line == "joint_slow elbow 0.5 until 12.5"
     assert content.fault_line("joint_stuck", "elbow", 9.0, 0.0, 2.5, targets) == "joint_stuck elbow"

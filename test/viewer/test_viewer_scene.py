@@ -204,6 +204,20 @@ def test_the_momentum_budget_is_plotted_while_a_controller_reports_it(server: An
     assert not handle.visible
 
 
+def test_momenta_are_compared_with_what_they_should_be(server: Any) -> None:
+    server.gui.reset()
+    plots, zeros, actual = Plots(server.gui), np.zeros(3), np.arange(6.0)
+    plots.show_robot(load_robot(robot_file("sliding_masses")))
+    pushed = Momenta(actual, actual - [0, 0, 2, 0, 3, 0])
+    for time_s, momenta in enumerate((Momenta(actual, None), Momenta(2 * actual, None), pushed)):
+        measured = Measured(time_s, np.eye(7)[6], zeros, zeros, zeros)
+        plots.add(StackState(measured, momenta=momenta), {})
+    plots.draw()
+    handle = plots._momentum.handle
+    np.testing.assert_allclose(handle.data[1], [0.0, 1e6 * np.sqrt(5), 2e6])
+    np.testing.assert_allclose(handle.data[2], [0.0, 1e6 * np.sqrt(50), 3e6])
+
+
 def test_each_link_with_a_goal_has_a_plot_of_its_own(server: Any) -> None:
     server.gui.reset()
     plots, zeros = Plots(server.gui), np.zeros(6)
