@@ -489,7 +489,7 @@ def log_range(values: Array, decades: int) -> tuple[float, float]:
 
 
 def set_time(axes: Axes, start: float, end: float) -> None:
-    """Set the x axis to a span of time in s."""
+    """Set the x axis to a time span in s."""
     if end - start < 1e-9:
         start, end = start - 0.5, end + 0.5
     axes.set_xlim(start, end)

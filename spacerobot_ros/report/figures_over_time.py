@@ -357,7 +357,7 @@ def position_group(flight: FlightReport) -> TraceGroup:
 
 
 def attitude_group(flight: FlightReport) -> TraceGroup:
-    """Return the base attitude as rotation vector, and its goals."""
+    """Return the base attitude as a rotation vector, and its goals."""
     goals = _goal_lines(flight.targets, flight.goal_rotvec)
     return TraceGroup(
         flight.attitude, ["x", "y", "z"], "rotation vector", "rad", PALETTE[:3], goals
@@ -577,7 +577,7 @@ def thrusters_figure(flight: FlightReport) -> ReportFigure | str | None:
     thrust, propellant = flight.signal("thruster_force"), flight.series.get("propellant")
     total = impulse(thrust, np.ones(thrust.width))
     groups.append(TraceGroup(total, ["impulse"], "impulse given", "N s", [PALETTE[0]]))
-    caption = "Share of each tick that each thruster was on; below, their total impulse"
+    caption = "Share of each tick during which each thruster was on; below: total impulse"
     if propellant is not None:
         grams = Signal(propellant.time, 1e3 * propellant.values)
         groups.append(TraceGroup(grams, ["propellant"], "propellant", "g", [PALETTE[1]]))
@@ -620,7 +620,8 @@ def momentum_figure(flight: FlightReport) -> ReportFigure | str:
 
 
 def momentum_budget_figure(flight: FlightReport) -> ReportFigure | str | None:
-    """Angular momentum of base, arm, wheels and all; None without wheels and without a capture."""
+    """Angular momentum of the base, arm, wheels and total; None if there are neither wheels nor a
+    capture."""
     robot, captured = flight.robot, flight.capture.get("captured", False)
     if robot is None or not (robot.wheel_names or captured):
         return None

@@ -143,7 +143,7 @@ class FlightReport(Flight):
 
     @property
     def wrench(self) -> Signal:
-        """Commanded force (N) and torque (N m) of the thrusters, in the base link (N, 6)."""
+        """Commanded thruster force (N) and torque (N m), in the base link frame (N, 6)."""
         return self._of_bag("base_wrench", WRENCH_COLUMNS, 6)
 
     @property

@@ -137,7 +137,7 @@ class Listener:
         self._path: tuple[int, Signal] | None = None
         """Begin, ns, and poses (k, 7) of the base that a planner predicts."""
         self._last_schedule: JointTrajectory | None = None
-        """It is latched, so it may arrive before the robot whose joints it moves."""
+        """It is latched, so it may arrive before the corresponding robot."""
         self._schedule: tuple[int, Signal] | None = None
         """Begin, ns, and planned positions (m, n) of the joints."""
         self._motion: Array | None = None
